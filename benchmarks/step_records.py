@@ -62,8 +62,9 @@ def drawn(seed: int, rest: int, noise: float, order: int, late: bool) -> Step:
     den = np.ones(1)
     if order == 3 and rng.random() < 0.3:
         zeta = float(rng.uniform(0.2, 0.7))
-        den = np.polymul([lags[1] * lags[2], 2.0 * zeta * np.sqrt(lags[1] * lags[2]), 1.0],
-                         [lags[0], 1.0])
+        den = np.polymul(
+            [lags[1] * lags[2], 2.0 * zeta * np.sqrt(lags[1] * lags[2]), 1.0], [lags[0], 1.0]
+        )
     else:
         for lag in lags:
             den = np.polymul(den, [lag, 1.0])

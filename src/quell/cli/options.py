@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, Token
 
+from quell.reading import MAX_SIZE
+
 
 def whole_number(kind: Any, tokens: Sequence[Token]) -> int:
     """Return the whole number in an option; the parser's own conversion would round 1.5 to 2."""
@@ -80,3 +82,57 @@ class RunOutputs(Outputs):
 
 
 OUTPUTS, RUN_OUTPUTS = Outputs(), RunOutputs()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ReadOptions:
+    """How a record is read.
+
+    Parameters
+    ----------
+    columns
+        Names or numbers (from 1 on) of a table's columns: t,u,y by default.
+    time_unit
+        Unit of its times: s, ms, us, ns, min, h or d; s by default.
+    max_size
+        Limit of what a file that is read may unpack to [MB].
+    """
+
+    columns: str = ""
+    time_unit: str | None = None
+    max_size: MaxSize = MAX_SIZE
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ModelOptions:
+    """What the model of a record has.
+
+    Parameters
+    ----------
+    zeros
+        Number of zeros; as many as poles if u acts on y at once.
+    integrators
+        Number of poles at s = 0; by default as many as the record shows.
+    friction
+        Whether there is Coulomb friction.
+    rest
+        Whether the plant was at rest before the record; by default this is assumed where the gain
+        is not known without it and the first samples support it.
+    max_delay
+        Longest delay of u to search [s].
+    held_out
+        Share of the record, at its end, on which the model is judged; by default 0.3, or none
+        where u does not move there.
+    """
+
+    zeros: Whole = 0
+    integrators: WholeOrNone = None
+    friction: bool | None = None
+    rest: bool | None = None
+    max_delay: float | None = None
+    held_out: float | None = None
+
+
+READ_OPTIONS, MODEL_OPTIONS = ReadOptions(), ModelOptions()

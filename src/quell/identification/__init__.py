@@ -14,7 +14,7 @@ from quell.identification.experiment.measured import Measured, excited
 from quell.identification.experiment.record_file import read_record
 from quell.identification.friction_plant import simulated_plant
 from quell.identification.identify import identify
-from quell.identification.input_gain import InputGain, identify_b0
+from quell.identification.input_gain import Bandwidth, InputGain, MarginError, identify_b0
 from quell.identification.model.roots import Root
 from quell.identification.result import Identified
 from quell.identification.validation import Residuals
@@ -22,10 +22,12 @@ from quell.suggestions import suggest_names
 
 __all__ = [
     "Alternative",
+    "Bandwidth",
     "Excitation",
     "FrequencyResponse",
     "Identified",
     "InputGain",
+    "MarginError",
     "Measured",
     "Residuals",
     "Root",

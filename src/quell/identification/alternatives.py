@@ -100,7 +100,7 @@ class Alternative:
 
     def describe(self, than: Identified) -> str:
         """Return a line of text that compares it with ``than``, empty if it is of no use."""
-        key = "held out" if {"held out"} <= than.fits.keys() & self.model.fits.keys() else "estimation"
+        key = "held out" if "held out" in than.fits else "estimation"
         fits = f"{self.model.fits[key]:.2f} instead of {than.fits[key]:.2f} % ({key})"
         known = "no friction" if than.friction is None else "friction"
         here = f"order {than.den.size - 1}" if self.name.startswith("order") else known
@@ -108,15 +108,15 @@ class Alternative:
             here = f"{here} without friction"
         if self.verdict == "better":
             return (
-                f"NOT the best model: {self.name} ({self.options}) fits better: {fits}, "
-                f"{self._measure}"
+                f"NOT: {self.name} ({self.options}) fits better: {fits}, {self._measure}; take it"
             )
         hinted = "friction" in self.name and self.z > _HINT * self.limit
         if self.verdict == "worse" or not (self.smaller or hinted):
             return ""
         taken = f"{self.name} ({self.options})" if self.smaller else here
         return (
-            f"the record cannot decide between {here} and {self.name}: {fits}, {self._measure}; take {taken}, which has fewer parameters, or record more"
+            f"the record cannot decide between {here} and {self.name}: {fits}, {self._measure}; "
+            f"take {taken}, which has fewer parameters, or record more"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -216,7 +216,7 @@ def decided(found: Identified, delay: Delay = OF_MODEL, **given: Any) -> Identif
     """Return the model that the record supports: with friction if it fits better, of least order.
 
     First a better alternative is taken, then, one after the other, smaller ones that may be as
-    good. ``delay`` and ``given`` are arguments of ``alternatives``.
+    good, or that replace a model with ``faults`` at hardly any loss. ``delay`` and ``given`` are arguments of ``alternatives``.
     """
     return not_told_apart(found, delay, **given)[0]
 
@@ -239,10 +239,15 @@ def not_told_apart(
             progress(step / (step + 2.0))
         others = alternatives(found, delay, **given)
         better = [one for one in others if one.verdict == "better" and one.model.converged]
-        smaller = [one for one in others if one.smaller and one.may_be_as_good]
+        doubtful = bool(found.faults) or not found.converged
+        smaller = [
+            one
+            for one in others
+            if one.smaller and (one.may_be_as_good or (doubtful and one.gain > -_EQUAL))
+        ]
         if not better and not smaller:
             break
-        kept = [] if better else [*kept, found]
+        kept = [] if better or doubtful else [*kept, found]
         found = max(better or smaller, key=lambda one: one.z).model
     return (found, *(one for one in kept if not one.faults))
 
@@ -259,7 +264,7 @@ def _options(change: dict[str, Any]) -> str:
 def _compared(
     found: Identified, model: Identified, smaller: bool
 ) -> tuple[float, float, float, bool]:
-    """Return the mean of D, L or z, above zero if ``model`` is better, its limit, and if it is L."""
+    """Return the mean of D, L or z, above zero if ``model`` is better, the limit, and if it is L."""
     from scipy.signal import lfilter
     from scipy.stats import chi2
 

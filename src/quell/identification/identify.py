@@ -284,6 +284,7 @@ def _validated(
         friction_std=friction_std,
         gain_interval=(low, high),
         delay_interval=_delay_interval(fitted, dt),
+        delay_covariance=_delay_covariance(fitted, seconds, dt),
         delays_searched=(fitted.searched[0] * dt, fitted.searched[1] * dt),
         rest=fitted.rest.assumed,
         rest_given=fitted.rest.given,
@@ -304,6 +305,12 @@ def _validated(
         converged=fitted.estimate.converged,
         method=_METHODS[r is not None],
     )
+
+
+def _delay_covariance(fitted: Fit, seconds: Vector, dt: float) -> Vector:
+    """Return the covariance of the delay with a and b, and its variance, in seconds."""
+    found = fitted.delay_covariance
+    return found * np.append(seconds[: found.size - 1], dt) * dt
 
 
 def _delay_interval(fitted: Fit, dt: float) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from quell.identification import plots
 from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
-from quell.identification.model.roots import Root
+from quell.identification.model.roots import WITHIN_95, Root
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
 from quell.plants.labelled import labelled
@@ -52,6 +52,8 @@ class Identified:
     #: 95 % interval of ``gain``; infinite at an end that the record does not tell
     gain_interval: tuple[float, float]
     delay_interval: tuple[float, float]  #: 95 % interval of the delay [s], if it was searched
+    #: covariance of the delay with the coefficients in ``covariance``, then its variance [s²]
+    delay_covariance: Vector
     delays_searched: tuple[float, float]  #: range in which the delay was searched [s]
     rest: bool  #: whether the model starts at rest
     rest_given: bool  #: whether the start at rest was given, not assumed
@@ -63,7 +65,9 @@ class Identified:
     #: samples, also with ``", predicted"``
     fits: dict[str, float]
     residuals: Residuals  #: tests of the error, on the last of the samples in ``fits``
-    one_more_pole: float  #: χ² of a further response to u in the error of the fit; see ``validation``
+    one_more_pole: (
+        float  #: χ² of a further response to u in the error of the fit; see ``validation``
+    )
     one_more_pole_limit: float  #: limit that it exceeds by chance in one of a thousand records
     resolution: float  #: step that y is rounded to, 0.0 if it is not rounded [y-unit]
     held_from: int  #: index of the first held-out sample; N if none was held out
@@ -104,15 +108,31 @@ class Identified:
         return self.one_more_pole <= self.one_more_pole_limit
 
     @property
+    def _gain_text(self) -> str:
+        low, high = self.gain_interval
+        return (
+            f"it is {self.gain:.4g}, 95 %: {low:.4g} to {high:.4g}; record more rest before the first "
+            "step, more steps, or a longer time"
+        )
+
+    @property
+    def _gain_is_wide(self) -> bool:
+        low, high = self.gain_interval
+        return not high - low <= _WIDE * abs(self.gain)
+
+    @property
+    def _input_is_certain(self) -> bool:
+        """Whether the effect of u on the highest derivative is certain, whatever the gain is."""
+        return bool(_WIDE * abs(self.num[0]) > 2.0 * WITHIN_95 * np.sqrt(self.covariance[-1, -1]))
+
+    @property
     def undecided(self) -> tuple[str, ...]:
         """What the record does not decide, and what to do; empty if it decides all."""
         found, (low, high) = [], self.gain_interval
-        remedy = "record more rest before the first step, more steps, or a longer time"
-        value = f"it is {self.gain:.4g}, 95 %: {low:.4g} to {high:.4g}; {remedy}"
-        if low <= 0.0 <= high and low < high:
-            found.append(f"the record does not decide the sign of the gain: {value}")
-        elif not high - low <= _WIDE * abs(self.gain):
-            found.append(f"the record does not decide the size of the gain: {value}")
+        if low <= 0.0 <= high and low < high and not self._input_is_certain:
+            found.append(f"the record does not decide the sign of the gain: {self._gain_text}")
+        elif self._gain_is_wide and not self._input_is_certain:
+            found.append(f"the record does not decide the size of the gain: {self._gain_text}")
         if self.rest and not self.rest_given and self.rest_probability < _SURE:
             found.append(
                 "the record does not decide whether the plant was at rest before it, on which the gain "
@@ -153,6 +173,11 @@ class Identified:
         a start that is not at rest although ``rest`` says so.
         """
         found = [*self.faults, *self.undecided]
+        if self._gain_is_wide and self._input_is_certain:
+            found.append(
+                "the record does not decide the size of the gain, as the slowest pole may be at "
+                f"s = 0: {self._gain_text}; if the plant integrates, set integrators"
+            )
         if not self.explained:
             found.append(
                 "the response to u is not of this form "

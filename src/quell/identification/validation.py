@@ -172,7 +172,8 @@ def residuals(error: Vector, u: Vector, lags: int) -> Residuals:
     # Without any error there is no correlation.
     power = re[lags] or 1.0
     auto = re[lags:] / power
-    scale = float(np.sqrt(power * ru[lags]))
+    # Nor is there one with a u that does not move.
+    scale = float(np.sqrt(power * ru[lags])) or 1.0
     # Correlations at greater lags count as zero.
     variance = max(float(np.sum(re * ru)), 0.0) / scale**2
     return Residuals(

@@ -8,9 +8,8 @@ are farthest in the direction of each coefficient and of the gain K::
     θ ± k P c/√(cᵀ P c),     c = e_i for each coefficient, and ∂K/∂θ
 
 so that each coefficient and the gain have their whole joint interval in the set (Scheffé's
-intervals: Seber & Lee, *Linear Regression Analysis*, 2nd ed. 2003, sec. 5.1.1). The model is there
-with the shortest delay of its interval, too; all points have the longest one, which is the worse
-side. Other models that the record does not tell apart from it are plants of the set, too.
+intervals: Seber & Lee, *Linear Regression Analysis*, 2nd ed. 2003, sec. 5.1.1). A delay that was
+searched is one of the coefficients: a longer one goes with faster poles. Other models that the record does not tell apart from it are plants of the set, too.
 """
 
 from __future__ import annotations
@@ -50,38 +49,46 @@ def identified_plants(
     if found.undecided:
         raise ValueError(f"found: {'; '.join(found.undecided)}")
     free = found.den.size - 1 - found.integrators
-    theta = np.concatenate([found.den[::-1][found.integrators : -1], found.num[::-1]])
-    P = found.covariance
+    theta = np.concatenate(
+        [found.den[::-1][found.integrators : -1], found.num[::-1], [found.delay]]
+    )
+    size = theta.size - 1
+    P = np.zeros((theta.size, theta.size))
+    P[:size, :size], P[size], P[:, size] = found.covariance, *[found.delay_covariance] * 2
     if not np.all(np.isfinite(P)):
         raise ValueError("found: its deviations are not finite; identify with a lower order")
-
-    def plant(values: Vector) -> tuple[Vector, Vector]:
-        den = np.concatenate([[1.0], values[:free][::-1], np.zeros(found.integrators)])
-        return values[free:][::-1].copy(), den
-
-    k = float(np.sqrt(chi2.ppf(_INSIDE, theta.size)))
     directions = list(np.eye(theta.size))
     if free and theta[0] != 0.0:
         of_gain = np.zeros(theta.size)
         of_gain[free], of_gain[0] = 1.0 / theta[0], -theta[free] / theta[0] ** 2
         directions.append(of_gain)
+    known = int(np.sum(np.diag(P) > 0.0))
+    k = float(np.sqrt(chi2.ppf(_INSIDE, known))) if known else 0.0
     points = [theta]
     for c in directions:
         spread = float(np.sqrt(max(c @ P @ c, 0.0)))
-        step = k * (P @ c) / spread if spread > 0.0 else np.zeros(theta.size)
-        points += [theta + step, theta - step] if np.any(step != 0.0) else []
-    if any(point[-1] * theta[-1] <= 0.0 for point in points):
-        spread = float(np.sqrt(P[-1, -1]))
-        raise ValueError(
-            f"gain = {theta[-1]:.3g} ± {spread:.2g}: the record does not tell its sign; "
-            "excite more, for a longer time, or lower the order"
-        )
-    plants = [plant(point) for point in points]
-    shortest, longest = found.delay_interval
-    delays = [found.delay] + [longest] * (len(points) - 1)
-    if shortest < found.delay:
-        plants, delays = [*plants, plants[0]], [*delays, shortest]
+        if spread > 0.0:
+            step = k * (P @ c) / spread
+            points += [_moved(theta, step, size), _moved(theta, -step, size)]
+    plants = []
+    for point in points:
+        den = np.concatenate([[1.0], point[:free][::-1], np.zeros(found.integrators)])
+        plants.append((point[free:size][::-1].copy(), den))
+    delays = [max(float(point[size]), 0.0) for point in points]
     for other in others:
         plants.append((other.num, other.den))
         delays.append(other.delay)
     return plants, delays
+
+
+def _moved(theta: Vector, step: Vector, size: int) -> Vector:
+    """Return θ after a step; relative, ``θ exp(step/θ)``, if the sign of the highest b would change.
+
+    Then a fast pole is uncertain, which changes all coefficients by the same factor.
+    """
+    point = theta + step
+    if point[size - 1] * theta[size - 1] <= 0.0:
+        known = theta[:size] != 0.0
+        part = np.where(known, theta[:size], 1.0)
+        point[:size] = np.where(known, part * np.exp(step[:size] / part), point[:size])
+    return point

@@ -6,10 +6,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-from quell.cli.options import MaxSize, Overwrite, Trust, WholeOrNone
+from quell.cli.options import READ_OPTIONS, Overwrite, ReadOptions, Trust, WholeOrNone
 from quell.cli.output import Console, print_line
 from quell.cli.records import measured
-from quell.reading import MAX_SIZE
 
 
 def b0(
@@ -17,13 +16,11 @@ def b0(
     *,
     loop: Path | None = None,
     order: WholeOrNone = None,
-    columns: str = "",
     dt: float | None = None,
-    time_unit: str | None = None,
     max_delay: float | None = None,
     phase_margin: float = 60.0,
     ratio: float | None = None,
-    max_size: MaxSize = MAX_SIZE,
+    read: ReadOptions = READ_OPTIONS,
     json: Path | None = None,
     trust: Trust = False,
     overwrite: Overwrite = False,
@@ -34,18 +31,14 @@ def b0(
     ----------
     record
         The record: a recording of `quell run-rig` (.mcap or .csv), a run that was saved (.nc), or a
-        CSV table of t,u,y, where u is what reached the plant.
+        table of t,u,y in text, where u is what reached the plant.
     loop
         Setup, in TOML, of the controller that ran: it tells the order, omega_o over omega_c, and
         which b0 it had. Without one the controller may be any.
     order
         Order of the plant for ADRC: u acts on this derivative of y. That of the loop by default.
-    columns
-        Names or numbers (from 1 on) of the columns of a CSV table: t,u,y by default.
     dt
         Sample time [s] of a table without times; columns are then u,y by default.
-    time_unit
-        Unit of the times of the table: s, ms, us or ns; s by default.
     max_delay
         Longest delay or lag to look for [s]; 20 samples by default.
     phase_margin
@@ -61,8 +54,8 @@ def b0(
 
     if json is not None:
         check_writable(json, overwrite)
-    read = measured(record, columns, dt, time_unit, max_size)
-    ran = {} if loop is None else _of_loop(loop, read.dt, trust)
+    samples = measured(record, read.columns, dt, read.time_unit, read.max_size)
+    ran = {} if loop is None else _of_loop(loop, samples.dt, trust)
     order = ran.get("order") if order is None else order
     if order is None:
         raise ValueError(
@@ -71,8 +64,9 @@ def b0(
     ratio = ran.get("ratio") if ratio is None else ratio
     console = Console()
     with console.status("Searching; the first time, code is compiled for some seconds."):
-        found = identify_b0(read.u, read.y, read.dt, order, max_delay=max_delay)
-    print_line(console, f"{record.name}: {read.y.size} samples, dt = {read.dt:g} s, order {order}")
+        found = identify_b0(samples.u, samples.y, samples.dt, order, max_delay=max_delay)
+    count = f"{samples.y.size} samples, dt = {samples.dt:g} s"
+    print_line(console, f"{record.name}: {count}, order {order}")
     print_line(console, found.describe())
     results: dict[str, Any] = found.to_json() | {"phase_margin": phase_margin}
     if "b0" in ran:

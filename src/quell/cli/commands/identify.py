@@ -5,9 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quell.cli.options import OUTPUTS, MaxSize, Outputs, Whole, WholeOrNone
+from quell.cli.options import (
+    MODEL_OPTIONS,
+    OUTPUTS,
+    READ_OPTIONS,
+    ModelOptions,
+    Outputs,
+    ReadOptions,
+    Whole,
+)
 from quell.cli.output import Console, check_outputs, print_line, table, write_results
-from quell.reading import MAX_SIZE
+from quell.cli.records import measured_records
 
 if TYPE_CHECKING:
     from quell.identification import Alternative, Identified, Root
@@ -16,22 +24,15 @@ _HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad
 
 
 def identify(
-    data: Path,
-    *,
+    *data: Path,
     order: Whole = 4,
-    zeros: Whole = 0,
-    integrators: WholeOrNone = None,
-    columns: str = "",
-    dt: float | None = None,
-    time_unit: str | None = None,
     delay: float = 0.0,
-    max_delay: float | None = None,
-    friction: bool = False,
-    held_out: float = 0.3,
+    dt: float | None = None,
     horizon: Whole = 10,
     validate: Path | None = None,
     alternatives: bool = True,
-    max_size: MaxSize = MAX_SIZE,
+    read: ReadOptions = READ_OPTIONS,
+    of_model: ModelOptions = MODEL_OPTIONS,
     outputs: Outputs = OUTPUTS,
 ) -> None:
     """Fit a continuous transfer function to recorded input and output.
@@ -39,61 +40,69 @@ def identify(
     Parameters
     ----------
     data
-        CSV file of the record, with or without a line of names; commas, semicolons or tabs between.
+        Records: tables t,u,y in text, recordings of quell run-rig, saved runs (.nc). Several have
+        one model, each its own initial state and constant force. A further column of --columns is
+        the external input of a closed loop.
     order
         Number of poles.
-    zeros
-        Number of zeros; as many as poles if u acts on y at once.
-    integrators
-        Number of poles at s = 0; by default one if the slowest pole cannot be
-        distinguished from it.
-    columns
-        Names or numbers (from 1 on) of the columns: t,u,y by default, or t,u,y,r with the external
-        input of a closed loop.
+    delay
+        Delay of u [s]; with --max-delay the shortest one.
     dt
         Sample time [s] of a record without times; columns are then u,y by default.
-    time_unit
-        Unit of the times of the record: s, ms, us or ns; s by default.
-    delay
-        Delay of u [s].
-    max_delay
-        Search the delay from --delay up to this [s].
-    friction
-        Estimate Coulomb friction, too.
-    held_out
-        Share of the record, at its end, on which the model is judged.
     horizon
         Number of samples of the prediction ahead.
     validate
-        CSV file of another record, with the same columns, on which the model is judged, too.
+        Another record, with the same columns, on which the model is judged, too.
     alternatives
         Fit other orders, with and without friction, and say what the record decides.
     """
     from quell.identification import alternatives as other_structures
-    from quell.identification import identify, read_record
+    from quell.identification import identify
 
-    names = tuple(name.strip() for name in columns.split(",")) if columns else ("t", "u", "y")
-    if dt is not None and not columns:
-        names = ("u", "y")
-    record = read_record(data, names, dt, time_unit=time_unit, max_size=max_size)
-    delays = delay if max_delay is None else (delay, max_delay)
-    options: dict[str, Any] = {"friction": friction, "held_out": held_out, "horizon": horizon}
-    options |= {"delay": delays, "integrators": integrators, "reference": record.reference}
+    how = read.columns, dt, read.time_unit, read.max_size
+    records = measured_records(data, *how)
+    record, several = records[0], len(records) > 1
+    most = of_model.max_delay
+    delays = delay if most is None else (delay, most)
+    options: dict[str, Any] = {
+        "friction": bool(of_model.friction),
+        "held_out": of_model.held_out,
+        "horizon": horizon,
+        "delay": delays,
+        "integrators": of_model.integrators,
+        "rest": of_model.rest,
+        "signals": record.signals,
+    }
+    if read.columns:  # a recording of a loop has a reference, which need not be used
+        options["reference"] = record.reference
     if validate is not None:
-        other = read_record(validate, names, dt, time_unit=time_unit, max_size=max_size)
-        if abs(other.dt - record.dt) > 1e-6 * record.dt:
-            rule = f"must be that of {data.name}, {record.dt:g} s"
-            raise ValueError(f"validate = {str(validate)!r}: dt = {other.dt:g} s: {rule}")
+        _, other = measured_records([data[0], validate], *how)
         options["validation"] = other.u, other.y
     outputs = check_outputs(outputs, ["identified"])
     console = Console()
+    u, y = [one.u for one in records], [one.y for one in records]
     with console.status("Searching; the first time, code is compiled for some seconds."):
-        model = identify(record.u, record.y, record.dt, order, zeros, **options)
-    _print(console, model, data.name)
+        model = identify(
+            u if several else u[0],
+            y if several else y[0],
+            record.dt,
+            order,
+            of_model.zeros,
+            **options,
+        )
+    _print(console, model, ", ".join(path.name for path in data))
+    if model.held_from == model.y.size and of_model.held_out is None and not several:
+        print_line(console, "nothing is held out: u does not move at the end of the record")
     others: tuple[Alternative, ...] = ()
     if alternatives:
+        given: dict[str, Any] = {
+            "integrators": of_model.integrators,
+            "friction": of_model.friction,
+        }
+        if most is not None:
+            given["delay"] = delays
         with console.status("Fitting other structures."):
-            others = other_structures(model, delays if isinstance(delays, tuple) else None)
+            others = other_structures(model, **given)
     for line in filter(None, (one.describe(model) for one in others)):
         print_line(console, line)
     paths: list[Path] = []
@@ -122,7 +131,7 @@ def _print(console: Console, model: Identified, source: str) -> None:
         ahead = f" {model.horizon} samples ahead" if name.endswith("predicted") else ""
         fits.add_row(name + ahead, percent(value))
     console.print(fits)
-    rest = lines[next(i for i, line in enumerate(lines) if line.startswith("constant force")) :]
+    rest = lines[next(i for i, line in enumerate(lines) if line.startswith("gain ")) :]
     print_line(console, "\n".join(line for line in rest if not line.startswith("fit, ")))
 
 

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from quell.cli.commands.run_rig import exit_code
 from quell.cli.commands.tune_sources import (
-    RECORD_OPTIONS,
-    RECORDS,
     RIG_OPTIONS,
-    RecordOptions,
+    Asked,
     Rig,
     RigOptions,
     from_record,
@@ -23,13 +21,25 @@ from quell.cli.commands.tune_sources import (
     with_rig_table,
 )
 from quell.cli.exit_codes import ExitCode
-from quell.cli.options import OUTPUTS, Outputs, Trust, WholeOrNone
+from quell.cli.options import (
+    MODEL_OPTIONS,
+    OUTPUTS,
+    READ_OPTIONS,
+    ModelOptions,
+    Outputs,
+    ReadOptions,
+    Trust,
+    WholeOrNone,
+)
 from quell.cli.output import Console, check_outputs, print_line, progress_bar, table, write_results
+from quell.cli.records import is_record
 
 if TYPE_CHECKING:
     from quell.commissioning import Verification
     from quell.tuning import Tuned
 
+# Poles of a record's model at first: a flexible axis has four.
+_MODEL_ORDER = 4
 _HEADINGS = ("IAE", "M_s", "M_t", "M_ks", "delay\nmargin")
 
 
@@ -50,7 +60,9 @@ def tune(
     out: Path | None = None,
     save_record: Path | None = None,
     trust: Trust = False,
-    record: RecordOptions = RECORD_OPTIONS,
+    model_order: WholeOrNone = None,
+    read: ReadOptions = READ_OPTIONS,
+    of_model: ModelOptions = MODEL_OPTIONS,
     rig: RigOptions = RIG_OPTIONS,
     outputs: Outputs = OUTPUTS,
 ) -> int:
@@ -65,7 +77,7 @@ def tune(
     ----------
     setup
         The file, in TOML, with [plant], and [tune] for all options; docs/tuning. Or a record: a
-        recording of quell run-rig (.mcap or .csv), a saved run (.nc), or a table t,u,y (.csv).
+        recording of quell run-rig (.mcap or .csv), a saved run (.nc), or a table t,u,y in text.
     num
         Numerator of the transfer function, highest power of s first: 1 or 2,1.
     den
@@ -95,6 +107,9 @@ def tune(
         Write a setup file with the tuned controller, for quell run and quell run-rig.
     save_record
         Write the samples of the experiment to this file, as t,u,y.
+    model_order
+        Poles of a record's model at first, 4 by default; fewer, more, or friction, where the record
+        shows it.
     """
     from quell.files import check_writable
 
@@ -112,10 +127,11 @@ def tune(
     for file in files:
         check_writable(file, outputs.overwrite)
     console = Console()
-    measured = rig.device is not None or (setup is not None and setup.suffix in RECORDS)
+    measured = rig.device is not None or (setup is not None and is_record(setup))
     if trials is not None and (measured or setup is None):
         raise ValueError(f"--trials = {trials}: needs a setup file with a scenario")
     if not measured:
+        _check_no_record(model_order, read, of_model)
         plant, dt, options, name = _plant(setup, num, den, dt, options, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
@@ -127,15 +143,16 @@ def tune(
     limits = {"u_min": rig.u_min, "u_max": rig.u_max}
     options |= {key: value for key, value in limits.items() if value is not None}
     place: Rig | None = None
+    asked = Asked(dt, read, of_model, _MODEL_ORDER if model_order is None else model_order)
     if rig.device is not None:
         place = rig_at(rig, dt, trust)
-        shown = from_rig(console, place, float(dt or 0.0), record, save_record, outputs.overwrite)
+        shown = from_rig(console, place, float(dt or 0.0), asked, save_record, outputs.overwrite)
         if shown is None:
             return ExitCode.DONE
         plant, dt, more, model, y_now = shown
     else:
         assert setup is not None
-        plant, dt, more, model = from_record(console, setup, dt, record)
+        plant, dt, more, model = from_record(console, setup, asked)
     tuned = replace(_tuned(console, plant, dt, options | more), signals=model.signals)
     _print(console, tuned, rig.device or str(setup))
     step = None
@@ -144,6 +161,17 @@ def tune(
         step = verified(console, place, tuned, model, y_now)
     _write(console, tuned, out, outputs, {"model": model.to_json()}, step)
     return ExitCode.DONE if step is None else exit_code(step.run)
+
+
+def _check_no_record(order: int | None, read: ReadOptions, model: ModelOptions) -> None:
+    """Raise ``ValueError`` for options of records where nothing is identified."""
+    names = [] if order is None else ["model_order"]
+    for given, default in ((read, READ_OPTIONS), (model, MODEL_OPTIONS)):
+        pairs = vars(given).items()
+        names += [name for name, value in pairs if value != getattr(default, name)]
+    if names:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+        raise ValueError(f"{flags}: goes with a record or --device, which is identified")
 
 
 def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:

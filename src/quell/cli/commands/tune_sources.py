@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from cyclopts import Parameter
 
 from quell.cli.confirm import confirm
-from quell.cli.options import Switch, Whole, WholeOrNone
+from quell.cli.options import ModelOptions, ReadOptions, Switch
 from quell.cli.output import Console, print_line, progress_bar
 from quell.cli.records import measured
 
@@ -21,50 +21,19 @@ if TYPE_CHECKING:
     from quell.realtime.devices.base import Device
     from quell.tuning import Tuned
 
-RECORDS = (".csv", ".mcap", ".nc")
-"""Suffixes of files that are records, not setups."""
-
 # The verifying step's length in units of 1/(frequency of the phase margin), chosen by hand.
 _STEP_LENGTH = 60.0
 # Safe actions for twins in this process: nothing is lost if a deadline is, as no plant moves.
 _TWIN = {"hold": 10_000, "most_overruns": 10_000}
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class RecordOptions:
-    """Options for reading and identifying a record.
+class Asked(NamedTuple):
+    """How a record is read and identified."""
 
-    Parameters
-    ----------
-    columns
-        Names or numbers (from 1 on) of a table's columns: t,u,y by default.
-    time_unit
-        Unit of its times: s, ms, us or ns; s by default.
-    model_order
-        Poles of the model at first; fewer, or friction, where the record shows it.
-    max_delay
-        Longest delay to search [s]; by default 20 samples, and more where the longest is the best.
-    integrators
-        Poles of the model at s = 0; by default as many as the record shows.
-    friction
-        Whether the model has Coulomb friction; by default where the record shows it.
-    rest
-        Whether the plant was at rest before the record; by default this is assumed where the gain
-        is not known without it and the first samples support it.
-    held_out
-        Share of the record, at its end, on which the model is judged; 0.3 by default, none where u
-        does not move there.
-    """
-
-    columns: str = ""
-    time_unit: str | None = None
-    model_order: Whole = 4
-    max_delay: float | None = None
-    integrators: WholeOrNone = None
-    friction: bool | None = None
-    rest: bool | None = None
-    held_out: float | None = None
+    dt: float | None
+    read: ReadOptions
+    model: ModelOptions
+    order: int
 
 
 @Parameter(name="*")
@@ -105,11 +74,11 @@ class RigOptions:
     yes: Switch = False
 
 
-RECORD_OPTIONS, RIG_OPTIONS = RecordOptions(), RigOptions()
+RIG_OPTIONS = RigOptions()
 
 
 def identified(
-    console: Console, record: Measured, options: RecordOptions
+    console: Console, record: Measured, asked: Asked
 ) -> tuple[Identified, list[Any], list[float]]:
     """Identify a record; print the model, return it and the plants for tuning with their delays.
 
@@ -119,16 +88,15 @@ def identified(
     from quell.identification import identify, not_told_apart
     from quell.tuning.identified import identified_plants
 
-    dt = record.dt
+    options = asked.model
     delay = None if options.max_delay is None else (0.0, options.max_delay)
-    given = {"integrators": options.integrators, "friction": options.friction}
     with progress_bar(console, "identifying") as report:
-        report("identifying: first model", 0.0)
         first = identify(
             record.u,
             record.y,
-            dt,
-            options.model_order,
+            record.dt,
+            asked.order,
+            options.zeros,
             delay=delay,
             integrators=options.integrators,
             friction=bool(options.friction),
@@ -136,8 +104,13 @@ def identified(
             held_out=options.held_out,
             signals=record.signals,
         )
-        progress = partial(report, "identifying: other orders, and friction")
-        model, *others = not_told_apart(first, delay, progress=progress, **given)
+        model, *others = not_told_apart(
+            first,
+            delay,
+            integrators=options.integrators,
+            friction=options.friction,
+            progress=partial(report, "identifying: other orders, and friction"),
+        )
     print_line(console, model.describe())
     if model.held_from == model.y.size and options.held_out is None:
         print_line(console, "nothing is held out: u does not move at the end of the record")
@@ -152,15 +125,13 @@ def identified(
 
 
 def from_record(
-    console: Console,
-    path: Path,
-    dt: float | None,
-    options: RecordOptions,
+    console: Console, path: Path, asked: Asked
 ) -> tuple[list[Any], float, dict[str, Any], Identified]:
     """Return the plants that a record shows, its sample time, options of ``tune``, the model."""
-    record = measured(path, options.columns, dt, options.time_unit)
+    read = asked.read
+    record = measured(path, read.columns, asked.dt, read.time_unit, read.max_size)
     print_line(console, f"{path.name}: {record.y.size} samples, dt = {record.dt:g} s")
-    model, plants, delays = identified(console, record, options)
+    model, plants, delays = identified(console, record, asked)
     return plants, record.dt, {"delay": delays}, model
 
 
@@ -203,7 +174,7 @@ def from_rig(
     console: Console,
     rig: Rig,
     dt: float,
-    options: RecordOptions,
+    asked: Asked,
     record: Path | None,
     overwrite: bool,
 ) -> tuple[list[Any], float, dict[str, Any], Identified, float] | None:
@@ -229,7 +200,7 @@ def from_rig(
         with written_atomically(record, overwrite) as part:
             np.savetxt(part, table, delimiter=",", header="t,u,y", comments="", fmt="%.10g")
         print_line(console, f"Record: {record}")
-    model, plants, delays = identified(console, done.measured, options)
+    model, plants, delays = identified(console, done.measured, asked)
     last = float(done.runs[-1].record["y"][-1])
     y_now = last if model.integrators else done.y_rest
     return plants, dt, {"delay": delays}, model, y_now

@@ -130,9 +130,7 @@ class Structure(NamedTuple):
         numerators = [unit ** (n - np.arange(degree + 1.0)) for degree in self.degrees]
         direct = np.ones(int(self.direct))
         start = np.ones(1) if self.at_rest else unit ** (n - 1.0 - np.arange(n))
-        return np.concatenate(
-            [a, *numerators, direct, np.tile(start, max(len(self.samples), 1))]
-        )
+        return np.concatenate([a, *numerators, direct, np.tile(start, max(len(self.samples), 1))])
 
     def records(self, count: int) -> list[slice]:
         """Return the places of each record in ``count`` samples."""

@@ -64,8 +64,9 @@ def probability(
     ``structure`` is at rest, ``v`` are its inputs; ``rounding`` is the step that y is rounded to.
     """
     place = structure.records(y.size)[0]
-    single, theta = structure.single(), np.append(
-        estimate.theta[: structure.common], estimate.theta[structure.common]
+    single, theta = (
+        structure.single(),
+        np.append(estimate.theta[: structure.common], estimate.theta[structure.common]),
     )
     v, y = v[place], y[place]
     with np.errstate(all="ignore"):

@@ -119,9 +119,7 @@ def _from_smaller(
     if lower is None or _white(structure, _best(found), v, y):
         return []
     theta = best_start(lower, v, y).estimate.theta
-    return [
-        descend(structure, more, v, y, _STEPS) for more in extended(structure, lower, theta)
-    ]
+    return [descend(structure, more, v, y, _STEPS) for more in extended(structure, lower, theta)]
 
 
 def _best(found: list[ParameterEstimate]) -> ParameterEstimate:

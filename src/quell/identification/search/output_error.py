@@ -155,8 +155,7 @@ def _coloured(structure: Structure, psi: Matrix, error: Vector) -> tuple[Matrix,
     if c.size == 1:
         return psi, variance
     parts = [
-        lfilter([1.0], c, psi[place][::-1], axis=0)[::-1]
-        for place in structure.records(error.size)
+        lfilter([1.0], c, psi[place][::-1], axis=0)[::-1] for place in structure.records(error.size)
     ]
     return np.concatenate(parts), variance
 

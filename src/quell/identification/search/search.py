@@ -65,6 +65,8 @@ _SELDOM = 1e-3
 # Delays on each side of the best that are looked at, steps of the refinement at each, and χ² of one
 # degree of freedom at 95 %.
 _MOST_DELAYS, _DELAY_STEPS, _WITHIN_95 = 10, 12, 3.84
+# Variance of a delay whose nearest whole number of samples is known.
+_WHOLE = 1.0 / 12.0
 _NONE = ParameterEstimate(np.zeros(0), np.zeros((0, 0)), np.inf, False)
 
 
@@ -76,6 +78,7 @@ class Fit(NamedTuple):
     delay: int  # delay of u [samples]
     delays: tuple[int, int]  # delays that the record does not tell apart, at 95 % [samples]
     searched: tuple[int, int]  # range of delays in which it was searched [samples]
+    delay_covariance: Vector  # of the delay with a and b, and its variance
     bias: bool
     rest: AtRest
 
@@ -181,12 +184,11 @@ def _relative_width(found: Fit) -> float:
     return abs((high - low) / (high + low)) if np.isfinite(high - low) and high + low else np.inf
 
 
-def _fitted(
-    structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: Known | None
-) -> Fit:
+def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: Known | None) -> Fit:
     """Return the model of one structure; at rest, ``u`` is without its first value."""
     friction, delays, bias = wanted.friction, wanted.delays, wanted.bias and not structure.at_rest
-    first = Fit(structure, _NONE, delays[0], delays, delays, bias, AtRest(False, False, np.nan))
+    unknown = np.zeros(0), bias, AtRest(False, False, np.nan)
+    first = Fit(structure, _NONE, delays[0], delays, delays, *unknown)
     v = first.inputs(u)
     if friction:
         v[:, -1] = measured_sign(structure, y, _HALF_WIDTH)
@@ -213,11 +215,14 @@ def _fitted(
             delay, v = again, with_delay(structure, v, u, again)
             estimate, v = _settle_signs(structure, near, v, y)
     estimate = estimate._replace(converged=estimate.converged and start.confirmed)
-    certain = delay, delay
-    if searched[0] < searched[1]:
-        estimate, certain = _over_delays(structure, estimate, u, v, y, delay, searched)
+    estimate, certain, of_delay = _over_delays(structure, estimate, u, v, y, delay, searched)
     return first._replace(
-        structure=structure, estimate=estimate, delay=delay, delays=certain, searched=searched
+        structure=structure,
+        estimate=estimate,
+        delay=delay,
+        delays=certain,
+        searched=searched,
+        delay_covariance=of_delay,
     )
 
 
@@ -266,19 +271,23 @@ def _over_delays(
     y: Vector,
     delay: int,
     searched: tuple[int, int],
-) -> tuple[ParameterEstimate, tuple[int, int]]:
+) -> tuple[ParameterEstimate, tuple[int, int], Vector]:
     """Return the estimate with a covariance that has the delays in it, and their 95 % range.
 
-    With the errors whitened by one model of the noise, ``ΔL = N log(Σ e²/Σ e_0²)`` is χ² with one
+    The last value is the covariance of the delay with a and b, and its variance, with 1/12 for a
+    delay that is no whole number; both are zero if the delay was given. With the errors whitened by one model of the noise, ``ΔL = N log(Σ e²/Σ e_0²)`` is χ² with one
     degree of freedom; the models have the weights ``exp(−ΔL/2)`` of a mixture.
     """
     from scipy.signal import lfilter
 
+    size = structure.free + structure.degrees[0] + 1
+    if searched[0] == searched[1]:
+        return estimate, (delay, delay), np.zeros(size + 1)
     error = y - output(structure, estimate.theta, v)
     c, power = noise_model(error)
     least = max(power, _ROUNDING * float(np.mean(y**2))) * y.size
     low = high = delay
-    found = [(1.0, estimate)]
+    found = [(1.0, 0, estimate)]
     for step in (-1, 1):
         near, other = estimate, delay + step
         for _ in range(_MOST_DELAYS):
@@ -294,16 +303,16 @@ def _over_delays(
                 break
             low, high = min(low, other), max(high, other)
             near = near._replace(covariance=covariance(structure, near.theta, inputs, y))
-            found.append((float(np.exp(-0.5 * max(change, 0.0))), near))
+            found.append((float(np.exp(-0.5 * max(change, 0.0))), other - delay, near))
             other += step
-    if len(found) > 1:
-        total = sum(weight for weight, _ in found)
-        parts = [
-            weight / total * (one.covariance + np.outer(*[one.theta - estimate.theta] * 2))
-            for weight, one in found
-        ]
-        estimate = estimate._replace(covariance=np.sum(parts, axis=0))
-    return estimate, (low, high)
+    total = sum(weight for weight, _, _ in found)
+    cov, of_delay = np.zeros_like(estimate.covariance), np.zeros(size + 1)
+    of_delay[-1] = _WHOLE
+    for weight, late, one in found:
+        moved = one.theta - estimate.theta
+        cov += weight / total * (one.covariance + np.outer(moved, moved))
+        of_delay += weight / total * late * np.append(moved[:size], late)
+    return estimate._replace(covariance=cov), (low, high), of_delay
 
 
 def measured_sign(structure: Structure, y: Vector, half_width: int) -> Vector:
