@@ -8,9 +8,10 @@ or 50 samples of rest before the step, and noise of 0.1, 0.5 or 2 % of the motio
 of the same size in half of the draws. The record lasts for 3 to 8 times the sum of the lags and the
 dead time. It is identified with the order that the plant has and a delay that is searched; a record
 is *right* if the true gain is within the stated 95 % interval, *not decided* if a line begins with
-NOT, and *wrong* otherwise. With ``--set`` the model is chosen as ``quell tune`` does, and the set of
-plants for tuning is asked whether the true plant is inside: whether in gain and in the frequency
-response at the frequencies of the controller the true one lies within the range of the set.
+NOT, and *wrong* otherwise. With ``--set`` the model is chosen as ``quell tune`` does it, from order
+4 on, and the true plant is *inside* the set of plants for tuning if its gain, and its size and
+phase at twelve frequencies up to three times its second pole, are within the range of those of the
+set, to 0.1 % and half a degree.
 """
 
 from __future__ import annotations

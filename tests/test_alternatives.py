@@ -49,7 +49,7 @@ def test_friction_is_suggested_where_it_is_and_its_model_is_the_decision() -> No
     found = ql.identify(u, y, DT, order=2)
     other = by_name(found)["Coulomb friction"]
     assert other.verdict == "better"
-    assert "SUGGESTION: Coulomb friction (--friction) fits better" in other.describe(found)
+    assert "NOT: Coulomb friction (--friction) fits better" in other.describe(found)
     chosen = decided(found)
     assert chosen.friction == pytest.approx(0.2, rel=0.05)
     assert chosen.den.size == 3
@@ -115,14 +115,15 @@ def test_the_command_validates_and_suggests(quell: Callable[..., Shown], tmp_pat
     shown = quell(*order, "--validate", "other.csv", "--json", "out.json")
     assert shown.code == 0, shown.err
     assert "validation" in shown.out
-    assert "SUGGESTION: Coulomb friction (--friction)" in shown.out
+    assert "NOT: Coulomb friction (--friction)" in shown.out
     told = json.loads((tmp_path / "out.json").read_text())
     assert {one["name"]: one["verdict"] for one in told["alternatives"]} == {
         "order 1": "worse",
         "Coulomb friction": "better",
+        "order 3": "undecided",
     }
     shown = quell(*order, "--no-alternatives")
-    assert "SUGGESTION" not in shown.out
+    assert "fits better" not in shown.out
 
 
 @pytest.mark.skipif(not RECORDS.is_dir(), reason="the public records are not on this machine")

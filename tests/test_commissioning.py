@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.cli.commands.tune_sources import RecordOptions, identified
+from quell.cli.commands.tune_sources import Asked, identified
+from quell.cli.options import ModelOptions, ReadOptions
 from quell.commissioning import Experiment, Limits, experiment, verify
 from quell.identification import Measured, decided, excitation, identify
 from quell.kernels import dispatch
@@ -163,21 +164,25 @@ def test_the_verifying_step_is_as_predicted() -> None:
 
 
 def test_the_deviations_of_a_model_are_plants_around_it() -> None:
-    """Each of the points lies within three deviations in each coefficient, in pairs; a pole at s = 0 stays there."""
+    """The points are on the 95 % ellipsoid of a, b and delay, in pairs, as far out as it is in each of them; a pole at s = 0 stays there."""
     rng = np.random.default_rng(0)
     u = excitation("prbs", (0.5, 10.0), 20.0, 0.02).u
     y = answer(([5.0], [1.0, 0.8, 0.0]), u, 0.02) + 0.02 * rng.standard_normal(u.size)
-    found = ql.identify(u, y, 0.02, order=2)
-    plants, delays = identified_plants(found, late=0.01)
-    assert len(plants) == 5
-    assert delays == [0.0, 0.01, 0.01, 0.01, 0.01]
+    found = ql.identify(u, y, 0.02, order=2, delay=(0.0, 0.1))
+    plants, delays = identified_plants(found)
+    assert len(plants) == 9
+    assert delays[0] == 0.0
+    assert max(delays) >= 0.01
     assert all(den[-1] == 0.0 and den[0] == 1.0 for _, den in plants)
     spread = np.sqrt(np.diag(found.covariance))
     b = np.array([num[0] for num, _ in plants])
-    assert np.max(np.abs(b - b[0])) < 3.0 * spread[-1]
+    radius = np.sqrt(7.815)  # χ² of three degrees of freedom at 95 %
+    assert np.max(np.abs(b - b[0])) == pytest.approx(radius * spread[-1], rel=1e-3)
     assert np.mean(b[1:]) == pytest.approx(b[0], rel=1e-9)
+    a = np.array([den[1] for _, den in plants])
+    assert np.max(np.abs(a - a[0])) == pytest.approx(radius * spread[0], rel=1e-3)
     quiet = ql.identify(u, 1e-3 * y + rng.standard_normal(u.size), 0.02, order=1, held_out=0.0)
-    with pytest.raises(ValueError, match="the record does not tell its sign"):
+    with pytest.raises(ValueError, match="does not decide the sign of the gain"):
         identified_plants(quiet)
 
 
@@ -199,7 +204,7 @@ def test_a_record_is_identified_and_tuned(
     assert shown.code == 0, shown.err
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["model"]["den"] == pytest.approx([1.0, 3.0], rel=0.05)
-    assert told["plants"] == 5
+    assert told["plants"] == 7  # the model, and two for each of pole, b and gain
     assert ql.setup.load(tmp_path / "tuned.toml").controller.dt == pytest.approx(0.02)
     refused = quell("tune", "--device", "twin:two-mass", "--u-max", "1")
     assert refused.code == 2
@@ -220,6 +225,6 @@ def test_a_faulty_model_is_not_tuned_for() -> None:
         identified(
             Console(quiet=True),
             Measured(u, y, 0.02, None),
-            RecordOptions(model_order=1, max_delay=0.0),
+            Asked(None, ReadOptions(), ModelOptions(max_delay=0.0), 1),
         )
     assert decided(identify(u, y, 0.02, order=1)).shortcomings

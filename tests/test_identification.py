@@ -384,17 +384,17 @@ def test_the_report_says_what_speaks_against_the_model() -> None:
 
 
 def test_a_record_that_ends_at_rest_is_refused_with_what_to_do() -> None:
-    """On samples where nothing moves no model can be judged; with none held out the step is enough."""
+    """On samples where nothing moves no model can be judged; by default none are held out, and the step is enough."""
     u = np.append(0.0, np.ones(1999))
     y = answer(([3.0], [1.0, 2.0]), u, 0.01)
     with pytest.raises(
         ValueError,
         match=r"held_out = 0\.3: u is 1 all through these samples.*hold fewer out, or none",
     ):
-        ql.identify(u, y, 0.01, order=1)
-    assert ql.identify(u, y, 0.01, order=1, held_out=0.0).poles[0].value == pytest.approx(
-        -2.0, rel=1e-6
-    )
+        ql.identify(u, y, 0.01, order=1, held_out=0.3)
+    found = ql.identify(u, y, 0.01, order=1)
+    assert found.held_from == u.size
+    assert found.poles[0].value == pytest.approx(-2.0, rel=1e-6)
 
 
 def test_the_report_has_all_of_it() -> None:
@@ -449,7 +449,10 @@ U = np.sign(np.sin(0.05 * np.arange(2000.0) ** 1.1))
         ({"zeros": 3}, "zeros = 3: must be a whole number from 0 to 2"),
         ({"integrators": 5}, "integrators = 5: must be a whole number from 0 to 2"),
         ({"delay": 0.0155}, "delay = 0.0155 s with dt = 0.01 s: must be a whole number of samples"),
-        ({"delay": (0.1, 0.0)}, "delay = (0.1, 0.0): the smallest comes first"),
+        (
+            {"delay": (0.1, 0.0)},
+            "delay = (0.1, 0.0): must be from 0 on, and the smallest comes first",
+        ),
         ({"held_out": 0.95}, "held_out = 0.95: must be from 0 to 0.9"),
         ({"held_out": 0.01}, "held_out = 0.01: of 2000 samples these are 20"),
         ({"friction": 1}, "friction = 1: must be True or False"),

@@ -8,8 +8,8 @@ likelihoods decides. With both errors whitened by the noise model of the larger 
 is χ² with as many degrees of freedom as it has more parameters, p, if the smaller one is true
 (Ljung, *System Identification*, 2nd ed. 1999, sec. 16.4). This holds also where all information is
 in a few samples, as in the record of one step. A needless pole is put where it explains most of the
-noise: of about N/2 frequencies that is χ² of 2 log N and more. So L has to exceed Schwarz's
-``p log N`` (*Annals of Statistics* 6, 1978) and log N besides, too.
+noise: of some N frequencies, dampings and delays that is χ² of 2 log N and more. So L has to exceed
+Schwarz's ``p log N`` (*Annals of Statistics* 6, 1978) and 2 log N besides, too.
 
 Where neither model is true, as with most machines, a needless pole always explains something. Then
 two models are compared by their errors e and e' of simulation, over blocks of the record::
@@ -180,7 +180,8 @@ def alternatives(
     models = []
     for name, smaller, change in tried:
         # A smaller model is compared under the same assumption on the start, and found from this.
-        rest = found.rest if smaller or found.rest_given else None
+        rest = found.rest or (None if found.undecided else False) if smaller else None
+        rest = True if found.rest_given else rest
         options = same._replace(**change, rest=rest and not change.get("friction", rubs))
         known = _known(found) if options.order == order - 1 and not options.friction else None
         try:
@@ -216,7 +217,8 @@ def decided(found: Identified, delay: Delay = OF_MODEL, **given: Any) -> Identif
     """Return the model that the record supports: with friction if it fits better, of least order.
 
     First a better alternative is taken, then, one after the other, smaller ones that may be as
-    good, or that replace a model with ``faults`` at hardly any loss. ``delay`` and ``given`` are arguments of ``alternatives``.
+    good, or that replace a model with ``faults`` at hardly any loss. ``delay`` and ``given`` are
+    arguments of ``alternatives``.
     """
     return not_told_apart(found, delay, **given)[0]
 
@@ -264,7 +266,7 @@ def _options(change: dict[str, Any]) -> str:
 def _compared(
     found: Identified, model: Identified, smaller: bool
 ) -> tuple[float, float, float, bool]:
-    """Return the mean of D, L or z, above zero if ``model`` is better, the limit, and if it is L."""
+    """Return the mean of D, L or z (above zero if ``model`` is better), the limit, if it is L."""
     from scipy.signal import lfilter
     from scipy.stats import chi2
 
@@ -278,7 +280,7 @@ def _compared(
     powers = [float(np.sum(lfilter(c, [1.0], error) ** 2)) + least for error in errors]
     ratio = errors[0].size * float(np.log(powers[0] / powers[1]))
     more = max(larger.parameters - less.parameters, 1)
-    limit = max(float(chi2.isf(_LEVEL, more)), (more + 1) * float(np.log(errors[0].size)))
+    limit = max(float(chi2.isf(_LEVEL, more)), (more + 2) * float(np.log(errors[0].size)))
     return gain, -ratio if smaller else ratio, limit, True
 
 

@@ -102,8 +102,8 @@ def identify(
     rest
         whether the plant was at rest under the first u before the record began. By default this is
         assumed where the record alone does not tell the gain within ±10 % and where it is more
-        likely than not (``quell.identification.search.at_rest``), never with friction; ``rest_probability`` and
-        ``shortcomings`` of the result say how much the record supports it.
+        likely than not (``quell.identification.search.at_rest``), never with friction;
+        ``rest_probability`` and ``shortcomings`` of the result say how much the record supports it.
     held_out
         share of the record, its end, that is not used for the fit but for its validation; 0 to 0.9.
         By default 0.3, or none of several records, and none if u does not move there, as in the
@@ -207,7 +207,18 @@ def identified(
     least = max(least, 4 * delays[1])
     held_from = first_held_out(records, order, held_out, least, least_held)
     other = None if validation is None else other_record(*validation, least_held)
-    wanted = Wanted(order, zeros, integrators, delays, delay is None, bias, friction, rest, known)
+    wanted = Wanted(
+        order=order,
+        zeros=zeros,
+        integrators=integrators,
+        delays=delays,
+        grows=delay is None,
+        bias=bias,
+        friction=friction,
+        rest=rest,
+        resolution=resolution_of(y),
+        known=known,
+    )
     # An unstable trial of the search may overflow; its cost is then infinite.
     with one_blas_thread(), np.errstate(all="ignore"):
         fitted = fit(u[:held_from], y[:held_from], records.samples, wanted)

@@ -111,8 +111,8 @@ class Identified:
     def _gain_text(self) -> str:
         low, high = self.gain_interval
         return (
-            f"it is {self.gain:.4g}, 95 %: {low:.4g} to {high:.4g}; record more rest before the first "
-            "step, more steps, or a longer time"
+            f"it is {self.gain:.4g}, 95 %: {low:.4g} to {high:.4g}; record more rest before the "
+            "first step, more steps, or a longer time"
         )
 
     @property
@@ -135,15 +135,15 @@ class Identified:
             found.append(f"the record does not decide the size of the gain: {self._gain_text}")
         if self.rest and not self.rest_given and self.rest_probability < _SURE:
             found.append(
-                "the record does not decide whether the plant was at rest before it, on which the gain "
-                f"depends (probability {self.rest_probability:.2g}): if it was, give rest=True (--rest); "
-                "if not, record more rest before the first step"
+                "the record does not decide whether the plant was at rest before it, on which the "
+                f"gain depends (probability {self.rest_probability:.2g}): if it was, give "
+                "rest=True (--rest); if not, record more rest before the first step"
             )
         shortest, longest = self.delays_searched
         if shortest < longest <= self.delay + 0.5 * self.dt:
             found.append(
-                f"the record does not decide the delay: {self.delay:.4g} s is the longest one that was "
-                "searched; search longer ones (delay, --max-delay), or record longer"
+                f"the record does not decide the delay: {self.delay:.4g} s is the longest one that "
+                "was searched; search longer ones (delay, --max-delay), or record longer"
             )
         return tuple(found)
 
@@ -169,8 +169,8 @@ class Identified:
     def shortcomings(self) -> tuple[str, ...]:
         """Reasons not to rely on the model, each with what to do; empty for a good one.
 
-        They are the ``faults``, what is ``undecided``, a response to u that it does not explain, and
-        a start that is not at rest although ``rest`` says so.
+        They are the ``faults``, what is ``undecided``, a response to u that it does not explain,
+        and a start that is not at rest although ``rest`` says so.
         """
         found = [*self.faults, *self.undecided]
         if self._gain_is_wide and self._input_is_certain:
@@ -180,10 +180,10 @@ class Identified:
             )
         if not self.explained:
             found.append(
-                "the response to u is not of this form "
-                f"(one more pole: {self.one_more_pole:.3g}, limit {self.one_more_pole_limit:.3g}), so "
-                "gain and poles may be farther from the plant's than their deviations say; use a "
-                "higher order, zeros, friction, or another delay"
+                f"the response to u is not of this form (one more pole: {self.one_more_pole:.3g}, "
+                f"limit {self.one_more_pole_limit:.3g}), so gain and poles may be farther from the "
+                "plant's than their deviations say; use a higher order, zeros, friction, or "
+                "another delay"
             )
         if self.rest and self.rest_probability < _CONTRADICTED:
             found.append(
@@ -318,9 +318,11 @@ class Identified:
 
         None for a model without friction, or whose speed jumps with u.
         """
-        if not self.friction or self.friction < 0.0 or self.num.size >= self.den.size - 1:
+        order = self.den.size - 1
+        if not self.friction or self.friction < 0.0 or (order > 1 and self.num.size >= order):
             return None
-        speed = np.diff(self.simulated[: self.held_from]) / self.dt
+        y = self.simulated[: self.held_from]
+        speed = y if order == 1 else np.diff(y) / self.dt
         return _FRICTION_WIDTH * float(np.sqrt(np.mean(speed**2))) or None
 
     def to_json(self) -> dict[str, Any]:

@@ -15,12 +15,12 @@ tests a model of the noise, which an output-error model does not have; the secon
 the plant.
 
 *One more pole*: a pole λ in the model changes its output by ``−p/(p + λ) ŷ_u``, ŷ_u being the
-response to u. For some λ, slower and faster than the poles of the model, these changes are regressed
-on ε together with the derivatives ψ of the output by θ, all of them whitened by the model of the
-noise of ``output_error``. The reduction of ``Σ w²/σ_w²`` that they bring is χ² with as many degrees
-of freedom if ε has nothing of u (Lagrange-multiplier test; Breusch & Pagan, *Review of Economic
-Studies* 47, 1980). It also shows an order that is too low in the record of one step, where the
-correlation with u does not.
+response to u. For some λ, slower and faster than the poles of the model, these changes are
+regressed on ε together with the derivatives ψ of the output by θ, all of them whitened by the model
+of the noise of ``output_error``. The reduction of ``Σ w²/σ_w²`` that they bring is χ² with as many
+degrees of freedom if ε has nothing of u (Lagrange-multiplier test; Breusch & Pagan, *Review of
+Economic Studies* 47, 1980). It also shows an order that is too low in the record of one step, where
+the correlation with u does not.
 """
 
 from __future__ import annotations

@@ -2,14 +2,15 @@
 
 The coefficients θ of the model have a covariance P. With 95 % all of them together are in the
 ellipsoid ``(θ' − θ)ᵀ P⁻¹ (θ' − θ) ≤ k²``, k² being the 95 % quantile of χ² with as many degrees of
-freedom as there are coefficients. The set has the model itself, and the points of the ellipsoid that
-are farthest in the direction of each coefficient and of the gain K::
+freedom as there are coefficients. The set has the model itself, and the points of the ellipsoid
+that are farthest in the direction of each coefficient and of the gain K::
 
     θ ± k P c/√(cᵀ P c),     c = e_i for each coefficient, and ∂K/∂θ
 
 so that each coefficient and the gain have their whole joint interval in the set (Scheffé's
 intervals: Seber & Lee, *Linear Regression Analysis*, 2nd ed. 2003, sec. 5.1.1). A delay that was
-searched is one of the coefficients: a longer one goes with faster poles. Other models that the record does not tell apart from it are plants of the set, too.
+searched is one of the coefficients: a longer one goes with faster poles. Other models that the
+record does not tell apart from it are plants of the set, too.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def identified_plants(
     k = float(np.sqrt(chi2.ppf(_INSIDE, known))) if known else 0.0
     points = [theta]
     for c in directions:
-        spread = float(np.sqrt(max(c @ P @ c, 0.0)))
+        spread = float(np.sqrt(max(float(c @ P @ c), 0.0)))
         if spread > 0.0:
             step = k * (P @ c) / spread
             points += [_moved(theta, step, size), _moved(theta, -step, size)]
@@ -82,7 +83,7 @@ def identified_plants(
 
 
 def _moved(theta: Vector, step: Vector, size: int) -> Vector:
-    """Return θ after a step; relative, ``θ exp(step/θ)``, if the sign of the highest b would change.
+    """Return θ after a step, ``θ exp(step/θ)`` if else the sign of the highest b would change.
 
     Then a fast pole is uncertain, which changes all coefficients by the same factor.
     """

@@ -63,7 +63,7 @@ from quell.types import Matrix, Vector
 
 
 class Structure(NamedTuple):
-    """The parameters θ: a_q … a_{n−1}; the numerator of each input; D_u; D or y_0 of each record."""
+    """The parameters θ: a_q … a_{n−1}; numerators of the inputs; D_u; D or y_0 of each record."""
 
     order: int  #: n
     integrators: int  #: q, the number of poles that are set to s = 0

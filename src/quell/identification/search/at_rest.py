@@ -5,8 +5,8 @@ apart: after the step only 1 and the free motions e^(p_i t) are there, n + 1 sha
 numbers. A plant that was at rest at u_0 before the record (``structure``) has n unknowns less. This
 start is a hypothesis, which the record may contradict, support, or not show.
 
-At rest the derivatives ``w = (y', …, y^(n))`` at the start are zero. If it was not at rest, they may
-have any size that they have later in the record, s_i (the largest of the model's response).
+At rest the derivatives ``w = (y', …, y^(n))`` at the start are zero. If it was not at rest, they
+may have any size that they have later in the record, s_i (the largest of the model's response).
 The ratio of the evidence of ``w = 0`` and of ``w_i`` normal with deviation s_i is, for the error e
 of the model at rest, noise of variance σ², and the responses G to w without what the parameters at
 rest explain as well::
@@ -15,7 +15,8 @@ rest explain as well::
 
 (Bayes factor of two nested linear Gaussian models; MacKay, *Information Theory, Inference, and
 Learning Algorithms*, 2003, eqs. (28.6)–(28.10).) A direction of w that the record does not show has
-a factor of one. With equal chances before, the probability of rest is K/(1 + K).
+a factor of one. Three of four records whose u is steady at first are taken to begin at rest, so the
+probability of rest is ``3 K/(1 + 3 K)``.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from quell.types import Matrix, Vector
 
 # Relative singular value that counts as zero.
 _RANK = 1e-12
+# Odds of a start at rest before the record is looked at: chosen by hand.
+_ODDS = 3.0
 # Largest logarithm of the evidence ratio: beyond it nothing changes.
 _MOST = 500.0
 
@@ -89,7 +92,7 @@ def probability(
     fits = float(of_error @ np.linalg.solve(gram, of_error))
     ratio = 0.5 * float(np.linalg.slogdet(gram)[1]) - 0.5 * fits
     ratio = min(max(ratio, -_MOST), _MOST)
-    return float(1.0 / (1.0 + np.exp(-ratio)))
+    return float(1.0 / (1.0 + np.exp(-ratio) / _ODDS))
 
 
 def _motions(structure: Structure, theta: Vector, v: Matrix) -> tuple[Matrix, Vector]:
@@ -122,7 +125,7 @@ def general(
 ) -> tuple[Structure, ParameterEstimate]:
     """Return a model at rest as one with constant forces and initial states, from ``u``.
 
-    ``A y_0 = B u_0 + c`` at rest gives the force c of each record, and ``D = y_0 (A − a_0)/p`` keeps
+    ``A y_0 = B u_0 + c`` at rest gives the force c of each record; ``D = y_0 (A − a_0)/p`` keeps
     y at y_0. The covariance of A and B is the same; that of c and D is not used.
     """
     theta, forces = estimate.theta, max(len(structure.samples), 1)

@@ -4,7 +4,8 @@ A model with a wrong delay has other poles, so the error of one model at several
 and it has a local minimum for each period of a resonance. Therefore a model is estimated at every
 delay of the range (at evenly spread ones of a long range, then at all between the best of them)
 from the part of the record in which u moves most. The best delays and the shortest one, in which
-such an estimate may fail, are searched in full, and small steps lead to the nearest minimum of each.
+such an estimate may fail, are searched in full, and small steps lead to the nearest minimum of
+each.
 
 Where the best delay is among the longest ones of a range that may grow, the range is doubled, until
 it is not, or the record is too short.

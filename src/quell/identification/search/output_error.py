@@ -164,8 +164,8 @@ def noise_model(error: Vector) -> tuple[Vector, float]:
     """Return ``C = (1, c_1, …)`` of ``e = w/C(q)``, and the variance of w.
 
     The coefficients solve the Yule-Walker equations by Levinson's recursion (Stoica & Moses,
-    *Spectral Analysis of Signals*, 2005, sec. 3.5.1), so that 1/C is stable; the order has the least
-    ``N log σ_w² + p log N`` (Schwarz, *Annals of Statistics* 6, 1978).
+    *Spectral Analysis of Signals*, 2005, sec. 3.5.1), so that 1/C is stable; the order has the
+    least ``N log σ_w² + p log N`` (Schwarz, *Annals of Statistics* 6, 1978).
     """
     most = min(_MOST_COLOUR, error.size // _PER_COLOUR)
     power = float(np.mean(error**2))

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.given_record import resolution_of
 from quell.identification.model.roots import gain_interval, squared_distance_from_zero
 from quell.identification.model.structure import Structure, free_run, output
 from quell.identification.search.at_rest import (
@@ -20,6 +19,7 @@ from quell.identification.search.at_rest import (
 from quell.identification.search.best_start import Start, best_start
 from quell.identification.search.delay import (
     from_poles,
+    longest,
     nearest_delay,
     start_with_delay,
     with_delay,
@@ -116,7 +116,8 @@ class Wanted(NamedTuple):
     bias: bool
     friction: bool
     rest: bool | None  # None: if the record needs it, and does not contradict
-    known: Known | None = None  # a larger model, from which the search begins
+    resolution: float  # step that y is rounded to, 0.0 if it is not rounded
+    known: Known | None  # a larger model, from which the search begins
 
 
 def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
@@ -134,11 +135,15 @@ def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
     needless = not wanted.bias or wanted.friction or _relative_width(found) <= _CERTAIN
     if wanted.rest is False or needless:
         return found
-    at_rest = _fit_at_rest(structure, u, y, wanted, found)
     # Without need, only what is certain is assumed.
-    least = _SURE if _relative_width(found) <= _USEFUL else _LIKELY
-    refused = at_rest.rest.probability < least or _contradicts(found, at_rest, u, y)
-    return found if refused else at_rest
+    needed = _relative_width(found) > _USEFUL
+    least = _LIKELY if needed else _SURE
+    # Where the model from any start is far off, its poles may lead nowhere.
+    for from_any in (found, None)[: 1 + needed]:
+        at_rest = _fit_at_rest(structure, u, y, wanted, from_any)
+        if at_rest.rest.probability >= least and not _contradicts(found, at_rest, u, y):
+            return at_rest
+    return found
 
 
 def _contradicts(found: Fit, at_rest: Fit, u: Vector, y: Vector) -> bool:
@@ -170,7 +175,7 @@ def _fit_at_rest(
     resting = structure_at_rest(structure)
     found = _fitted(resting, from_rest(structure, u), y, wanted, known)
     v = found.inputs(from_rest(structure, u))
-    chance = probability(found.structure, found.estimate, v, y, resolution_of(y))
+    chance = probability(found.structure, found.estimate, v, y, wanted.resolution)
     free, estimate = general(found.structure, found.estimate, u)
     rest = AtRest(True, bool(wanted.rest), chance)
     return found._replace(structure=free, estimate=estimate, bias=True, rest=rest)
@@ -239,6 +244,8 @@ def _from_known(
         searched = wanted.delays
     poles = [known.a] if known.a.size == structure.order else _without_one(known.a)
     delay, estimate = from_poles(structure, poles, u, v, y, searched)
+    if wanted.grows and delay == searched[1] < longest(structure, y, True):
+        return start_with_delay(structure, u, v, y, searched, True)
     if known.a.size == structure.order:
         return searched, delay, Start(estimate, math.isfinite(estimate.cost))
     start = best_start(structure, with_delay(structure, v, u, delay), y)
@@ -259,7 +266,7 @@ def _without_one(a: Vector) -> list[Vector]:
             rest = np.delete(poles, i)
         else:
             continue
-        found.append(np.poly(rest).real[:0:-1])
+        found.append(np.asarray(np.poly(rest).real[:0:-1], dtype=np.float64))
     return found
 
 
@@ -275,8 +282,9 @@ def _over_delays(
     """Return the estimate with a covariance that has the delays in it, and their 95 % range.
 
     The last value is the covariance of the delay with a and b, and its variance, with 1/12 for a
-    delay that is no whole number; both are zero if the delay was given. With the errors whitened by one model of the noise, ``ΔL = N log(Σ e²/Σ e_0²)`` is χ² with one
-    degree of freedom; the models have the weights ``exp(−ΔL/2)`` of a mixture.
+    delay that is no whole number; both are zero if the delay was given. With the errors whitened
+    by one model of the noise, ``ΔL = N log(Σ e²/Σ e_0²)`` is χ² with one degree of freedom; the
+    models have the weights ``exp(−ΔL/2)`` of a mixture.
     """
     from scipy.signal import lfilter
 

@@ -2,10 +2,12 @@
 
 ::
 
-    x' = A x + B (u + w − F tanh(y'/v)),      y = x_1
+    x' = A x + B (u + w − σ F tanh(y'/v)),      y = x_1
 
-v is small against the speeds of motion. The sign of the speed is smooth, so that Runge-Kutta steps
-solve the equation; a plant at rest creeps slowly under less than F.
+σ is the sign of the gain from u to the motion, so that friction acts against it. In order 1 y is
+the speed, and stands in the place of y'. v is small against the speeds of motion. The sign of the
+speed is smooth, so that Runge-Kutta steps solve the equation; a plant at rest creeps slowly under
+less than F.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ class FrictionModel(NamedTuple):
 
     A: Matrix  # observable companion form (n, n)
     B: Vector  # (n,)
-    force: float  # F [u-unit]
+    force: float  # σ F [u-unit]
     width: float  # v [y-unit/s]
     step: float  # length of a sub-step [s]
     substeps: int
@@ -54,7 +56,8 @@ def _derivatives(
         for j in range(n):
             total += plant.A[i, j] * x[j]
         dx[i] = total
-    drive = u + w[0] - plant.force * tanh(dx[0] / plant.width)
+    speed = dx[0] if n > 1 else x[0]
+    drive = u + w[0] - plant.force * tanh(speed / plant.width)
     for i in range(n):
         dx[i] += plant.B[i] * drive
 
@@ -64,7 +67,7 @@ advance.register(FrictionModel)(runge_kutta)
 
 @dataclass(frozen=True, eq=False)
 class FrictionPlant:
-    """A transfer function of relative degree 2 or more with Coulomb friction.
+    """A transfer function with Coulomb friction: of order 1, or of relative degree 2 or more.
 
     Parameters
     ----------
@@ -92,7 +95,7 @@ class FrictionPlant:
         checks.positive("width", self.width, "y-unit/s")
         if self.den[0] == 0.0:
             raise ValueError(f"den[0] = {self.den[0]}: must not be zero; leave it out")
-        if len(self.num) > self.order - 1:
+        if self.order > 1 and len(self.num) > self.order - 1:
             raise ValueError(
                 f"num has {len(self.num)} coefficients, den {len(self.den)}: the relative degree "
                 "must be 2 or more, or u moves the speed at once"
@@ -110,8 +113,11 @@ class FrictionPlant:
         A[:, 0] -= np.asarray(self.den[1:], dtype=np.float64) / lead
         B = np.zeros(n)
         B[n - len(self.num) :] = np.asarray(self.num, dtype=np.float64) / lead
-        at_rest = A - self.force / self.width * np.outer(B, A[0])
+        # Friction acts against the motion that u causes, whichever sign the gain has.
+        force = math.copysign(self.force, self.num[0] / lead)
+        speed = A[0] if n > 1 else np.ones(1)
+        at_rest = A - force / self.width * np.outer(B, speed)
         fastest = float(np.max(np.abs(np.linalg.eigvals(at_rest))))
         wanted = checks.positive("dt", dt, "s") * fastest / _LARGEST_STEP
         substeps = min(max(math.ceil(wanted), 1), _MOST_SUBSTEPS)
-        return FrictionModel(A, B, self.force, self.width, dt / substeps, substeps)
+        return FrictionModel(A, B, force, self.width, dt / substeps, substeps)
