@@ -1,6 +1,7 @@
 """Step records: how often the stated intervals hold, and whether the set for tuning has the plant.
 
-    python benchmarks/step_records.py [--draws N] [--seed S] [--json FILE] [--set] [--verbose]
+    python benchmarks/step_records.py [--draws N] [--seed S] [--json FILE] [--verbose]
+    python benchmarks/step_records.py --set [--tune STRUCTURE] [--draws N] [--seed S]
 
 Each draw is the record of one step from rest: a plant of order 1, 2 or 3 (lags, at order 3 also an
 oscillating pair), with or without a dead time of up to 40 samples, of either sign of the gain, 1, 5
@@ -11,7 +12,8 @@ is *right* if the true gain is within the stated 95 % interval, *not decided* if
 NOT, and *wrong* otherwise. With ``--set`` the model is chosen as ``quell tune`` does it, from order
 4 on, and the true plant is *inside* the set of plants for tuning if its gain, and its size and
 phase at twelve frequencies up to three times its second pole, are within the range of those of the
-set, to 0.1 % and half a degree.
+set, to 0.1 % and half a degree. With ``--tune`` a controller of a structure is tuned for the set
+and put around the true plant: whether the loop is stable, and its M_s over the one promised.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ import numpy as np
 from scipy import signal
 
 import quell as ql
+from quell.identification import not_told_apart
+from quell.tuning.identified import identified_plants
 from quell.types import Vector
 
 RESTS, NOISES = (1, 5, 50), (0.001, 0.005, 0.02)
@@ -111,6 +115,49 @@ def judged(step: Step, order: int) -> dict[str, Any]:
     }
 
 
+def judged_set(step: Step, structure: str | None) -> dict[str, Any]:
+    """Return how the set of plants does that ``quell tune`` uses, and a controller tuned for it."""
+    begin = time.perf_counter()
+    result: dict[str, Any] = {"text": step.text, "refused": "", "inside": None, "gain_inside": None}
+    result |= {"stable": None, "M_s": None}
+    try:
+        found, *others = not_told_apart(ql.identify(step.u, step.y, step.dt, 4, delay=None), None)
+        if found.faults:
+            raise ValueError(found.faults[0])
+        plants, delays = identified_plants(found, others)
+    except ValueError as error:
+        return result | {"refused": str(error)[:80], "seconds": time.perf_counter() - begin}
+    result["seconds"] = time.perf_counter() - begin
+    poles = np.sort(np.abs(np.roots(step.den)))
+    omega = np.append(1e-6 * poles[0], np.geomspace(poles[0] / 5.0, 3.0 * poles[:2][-1], 12))
+
+    def response(num: Vector, den: Vector, delay: float) -> Any:
+        s = 1j * omega
+        return np.polyval(num, s) / np.polyval(den, s) * np.exp(-s * delay)
+
+    true = response(step.num, step.den, step.delay)
+    ratios = np.array([response(*plant, T) for plant, T in zip(plants, delays, strict=True)]) / true
+    size, phase = np.abs(ratios), np.angle(ratios, deg=True)
+    result["inside"] = bool(
+        np.all(size.min(axis=0) <= 1.001)
+        and np.all(size.max(axis=0) >= 0.999)
+        and np.all(phase.min(axis=0) <= 0.5)
+        and np.all(phase.max(axis=0) >= -0.5)
+    )
+    result["gain_inside"] = bool(size[:, 0].min() <= 1.0 <= size[:, 0].max())
+    if structure is not None:
+        try:
+            tuned = ql.tune(plants, step.dt, delay=delays, structure=structure, compare=())
+        except ValueError as error:
+            return result | {"refused": str(error)[:80]}
+        plant = (step.num, step.den)
+        loop = ql.analysis.analyse(plant, tuned.controller, delay=step.delay)
+        result["stable"] = bool(loop.stable)
+        if loop.stable:
+            result["M_s"] = 1.0 / loop.margins.modulus / tuned.constraints.m_s
+    return result
+
+
 def _z(found: Any, step: Step) -> float:
     """Return the error of the slowest pole in its standard deviations."""
     true = np.roots(step.den)
@@ -126,21 +173,48 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--set", action="store_true")
+    parser.add_argument("--tune", help="structure, for example bandwidths")
     args = parser.parse_args()
     cases = list(itertools.product((1, 2, 3), (False, True), RESTS, NOISES))
     each = max(args.draws // len(cases), 1)
     results = []
     for order, late, rest, noise in cases:
         for i in range(each):
-            step = drawn(1000 * args.seed + i, rest, noise, order, late)
-            result = judged(step, order) | {"order": order, "rest_samples": rest, "late": late}
-            results.append(result | {"noise": noise, "seed": 1000 * args.seed + i})
-            bad = not result["covered"] and not result["said_not"]
-            if args.verbose and bad:
+            seed = 1000 * args.seed + i
+            step = drawn(seed, rest, noise, order, late)
+            result = judged_set(step, args.tune) if args.set else judged(step, order)
+            result |= {"order": order, "rest_samples": rest, "late": late, "noise": noise}
+            results.append(result | {"seed": seed})
+            wrong = result["inside"] is False if args.set else _is_wrong(result)
+            if args.verbose and wrong:
                 print(results[-1])
-    _summary(results)
+    if args.set:
+        _summary_of_sets(results)
+    else:
+        _summary(results)
     if args.json is not None:
         args.json.write_text(json.dumps(results))
+
+
+def _is_wrong(result: dict[str, Any]) -> bool:
+    return not result["covered"] and not result["said_not"]
+
+
+def _summary_of_sets(results: list[dict[str, Any]]) -> None:
+    used = [one for one in results if not one["refused"]]
+    print(f"{len(results)} records, {len(results) - len(used)} refused:")
+    for reason in sorted({one["refused"] for one in results if one["refused"]}):
+        print(f"  {sum(one['refused'] == reason for one in results)} × {reason}")
+    for name in ("inside", "gain_inside", "stable"):
+        values = [one[name] for one in used if one[name] is not None]
+        if values:
+            print(f"{name}: {np.mean(values):.1%} of {len(values)}")
+    ratios = [one["M_s"] for one in used if one["M_s"] is not None]
+    if ratios:
+        within = np.mean(np.array(ratios) <= 1.2)
+        print(f"M_s over the promised one: at most 1.2 in {within:.1%}, largest {max(ratios):.3f}")
+    print(f"{np.mean([one['seconds'] for one in results]):.2f} s of identification a record")
 
 
 def _summary(results: list[dict[str, Any]]) -> None:
