@@ -101,8 +101,9 @@ def identify(
         with a numerator of its own of degree n − 2. In order 1 y is the speed.
     rest
         whether the plant was at rest under the first u before the record began. By default this is
-        assumed where the record alone does not tell the gain within ±10 % and where it is more
-        likely than not (``quell.identification.search.at_rest``), never with friction;
+        assumed where u moves through its range ten times at most, as in the record of a step, the
+        record alone does not tell the gain within ±10 %, and it is more likely than not
+        (``quell.identification.search.at_rest``); never with friction;
         ``rest_probability`` and ``shortcomings`` of the result say how much the record supports it.
     held_out
         share of the record, its end, that is not used for the fit but for its validation; 0 to 0.9.

@@ -60,6 +60,8 @@ _ROUNDING = 1e-18
 # A gain whose interval is within ±2 % needs no assumption on the start, one within ±10 % only
 # if it is sure: chosen by hand. A start at rest is sure, and likely, from these probabilities on.
 _CERTAIN, _USEFUL, _SURE, _LIKELY = 0.02, 0.1, 0.95, 0.5
+# With more movements of u through its range than these the start matters little: chosen by hand.
+_MOST_SWINGS = 10.0
 # Probability with which a start at rest is refused by chance.
 _SELDOM = 1e-3
 # Delays on each side of the best that are looked at, steps of the refinement at each, and χ² of one
@@ -132,8 +134,8 @@ def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
     if wanted.rest and wanted.bias:
         return _fit_at_rest(structure, u, y, wanted)
     found = _fitted(structure, u, y, wanted, wanted.known)
-    needless = not wanted.bias or wanted.friction or _relative_width(found) <= _CERTAIN
-    if wanted.rest is False or needless:
+    excluded = wanted.rest is False or not wanted.bias or wanted.friction
+    if excluded or _swings(structure, u) > _MOST_SWINGS or _relative_width(found) <= _CERTAIN:
         return found
     # Without need, only what is certain is assumed.
     needed = _relative_width(found) > _USEFUL
@@ -144,6 +146,12 @@ def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
         if at_rest.rest.probability >= least and not _contradicts(found, at_rest, u, y):
             return at_rest
     return found
+
+
+def _swings(structure: Structure, u: Vector) -> float:
+    """Return how often u moves through its whole range, the most of all records."""
+    parts = [u[place] for place in structure.records(u.size)]
+    return max(float(np.sum(np.abs(np.diff(part))) / (np.ptp(part) or 1.0)) for part in parts)
 
 
 def _contradicts(found: Fit, at_rest: Fit, u: Vector, y: Vector) -> bool:
