@@ -37,14 +37,15 @@ def identified(record: Measured, order: int, zeros: int, most: int) -> Identifie
     delay = (0.0, most * record.dt) if most else 0.0
     first = ql.identify(record.u, record.y, record.dt, order, zeros, delay=delay)
     for one in alternatives(first):
-        fit = one.model.fits["held out"]
-        print(f"  against {one.name}: {one.verdict}, z = {one.z:.1f}, held out {fit:.2f} %")
+        fit = one.model.fits.get("held out", one.model.fits["estimation"])
+        measure = "likelihood ratio" if one.by_likelihood else "z"
+        print(f"  against {one.name}: {one.verdict}, {measure} {one.z:.1f}, fit {fit:.2f} %")
     return decided(first)
 
 
-def tuned(model: Identified, late: float, **options: Any) -> Any:
+def tuned(model: Identified, **options: Any) -> Any:
     """Return the tuned controllers for a model and its deviations."""
-    plants, delays = identified_plants(model, late)
+    plants, delays = identified_plants(model)
     return ql.tune(plants, model.dt, delay=delays, compare=("pi", "pid", "bandwidths"), **options)
 
 
@@ -69,7 +70,7 @@ def emps(model: Identified, record: Measured) -> None:
         reference=ql.signals.Samples(t, record.reference), duration=float(t[-1]) - record.dt
     )
     bounds = ql.tuning.Constraints(m_ks=abs(float(gains[0])))
-    found = tuned(model, 0.0, constraints=bounds, u_min=-10.0, u_max=10.0)
+    found = tuned(model, constraints=bounds, u_min=-10.0, u_max=10.0)
     for name in ("pi", "pid", "bandwidths", "freed"):
         controller = found.designs[name].controller
         if controller is None:
@@ -108,7 +109,7 @@ def main() -> None:
         elif name == "emps":
             emps(model, record)
         else:
-            found = tuned(model, 0.5 * record.dt if most else 0.0)
+            found = tuned(model)
             duration = 100.0 / found.analysis.margins.phase_omega
             for one in ("pi", "pid", "bandwidths", "freed"):
                 design = found.designs[one]
