@@ -374,3 +374,16 @@ def test_the_command_identifies_several_records(
     assert shown.code == 0, shown.err
     assert "step0.csv, step1.csv" in shown.out
     assert "gain 0.7" in shown.out or "gain 0.69" in shown.out
+
+
+def test_noise_and_swapped_columns_are_said(quell: Callable[..., Shown], tmp_path: Path) -> None:
+    """U that has nothing to do with y, and y in the place of u: lines with NOT say it."""
+    rng = np.random.default_rng(0)
+    saved(tmp_path / "noise.csv", rng.standard_normal(600), rng.standard_normal(600))
+    shown = quell("identify", "noise.csv", "--order", "1", "--no-figures")
+    assert "NOT: u explains hardly anything of y" in shown.out
+    u = excitation("prbs", (0.005, 0.3), 600.0, 1.0, 0.0, 50.0).u
+    y = answer(([0.014], [1.0, 0.02]), u, 1.0) + 0.1 * rng.standard_normal(u.size)
+    saved(tmp_path / "swapped.csv", y, u)
+    shown = quell("identify", "swapped.csv", "--order", "1", "--no-figures", "--no-alternatives")
+    assert "NOT: u and y look swapped" in shown.out

@@ -28,6 +28,8 @@ _DEVIATIONS = 3.0
 # A gain whose 95 % interval is wider than this share of it is not decided: then it may be half or
 # twice of what it is, beyond what a design allows for. A probability from here on is certain.
 _WIDE, _SURE = 1.0, 0.95
+# A fit below it explains nothing that could be used [%]: chosen by hand.
+_NOTHING = 10.0
 # From here down a start at rest that was given is contradicted: three standard deviations.
 _CONTRADICTED = 0.003
 
@@ -169,10 +171,16 @@ class Identified:
     def shortcomings(self) -> tuple[str, ...]:
         """Reasons not to rely on the model, each with what to do; empty for a good one.
 
-        They are the ``faults``, what is ``undecided``, a response to u that it does not explain,
-        and a start that is not at rest although ``rest`` says so.
+        They are the ``faults``, what is ``undecided``, a u that explains nothing, a response to u
+        that the model does not explain, and a start not at rest although ``rest`` says so.
         """
         found = [*self.faults, *self.undecided]
+        fit = self.fits.get("held out", self.fits["estimation"])
+        if fit < _NOTHING:
+            found.append(
+                f"u explains hardly anything of y (fit {percent(fit, 1)} %); check that they belong "
+                "to each other, which is which, the order and the delay"
+            )
         if self._gain_is_wide and self._input_is_certain:
             found.append(
                 "the record does not decide the size of the gain, as the slowest pole may be at "

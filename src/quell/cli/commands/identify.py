@@ -20,6 +20,8 @@ from quell.cli.records import measured_records
 if TYPE_CHECKING:
     from quell.identification import Alternative, Identified, Root
 
+# Fits below which u and y may be swapped, and above which they are [%]: chosen by hand.
+_COLLAPSED, _GOOD = 20.0, 60.0
 _HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping")
 
 
@@ -93,6 +95,8 @@ def identify(
     _print(console, model, ", ".join(path.name for path in data))
     if model.held_from == model.y.size and of_model.held_out is None and not several:
         print_line(console, "nothing is held out: u does not move at the end of the record")
+    if not several and _look_swapped(model, order, delays):
+        print_line(console, "NOT: u and y look swapped: the reverse fits well; see --columns")
     others: tuple[Alternative, ...] = ()
     if alternatives:
         given: dict[str, Any] = {
@@ -113,6 +117,19 @@ def identify(
         paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
     results = model.to_json() | {"alternatives": [one.to_json() for one in others]}
     write_results(console, results, outputs, paths)
+
+
+def _look_swapped(model: Identified, order: int, delays: Any) -> bool:
+    """Return whether y explains u where u explains nothing of y."""
+    from quell.identification import identify
+
+    if model.fits["estimation"] > _COLLAPSED:
+        return False
+    try:
+        other = identify(model.y, model.u, model.dt, order, delay=delays, rest=False, held_out=0.0)
+    except ValueError:
+        return False
+    return other.fits["estimation"] > _GOOD
 
 
 def _print(console: Console, model: Identified, source: str) -> None:
