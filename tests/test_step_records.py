@@ -130,10 +130,8 @@ def test_a_gain_interval_is_that_of_small_deviations_and_opens_where_the_pole_ma
     low, high = gain_interval(a, b, np.diag([1.5, 0.01]))
     assert high == np.inf
     assert 1.0 < low < 3.0
-    assert (
-        gain_interval(a, b, np.diag([0.1, 100.0])) == (-np.inf, np.inf)
-        or gain_interval(a, b, np.diag([0.1, 100.0]))[0] < 0.0
-    )
+    low, high = gain_interval(a, b, np.diag([0.1, 100.0]))
+    assert low < 0.0 < high
     # A fast pole that is uncertain by half multiplies a_0, a_1 and b by the same factor.
     a, b = np.array([100.0, 102.0]), 300.0
     direction = np.array([100.0, 100.0, 300.0])

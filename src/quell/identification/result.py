@@ -178,8 +178,8 @@ class Identified:
         fit = self.fits.get("held out", self.fits["estimation"])
         if fit < _NOTHING:
             found.append(
-                f"u explains hardly anything of y (fit {percent(fit, 1)} %); check that they belong "
-                "to each other, which is which, the order and the delay"
+                f"u explains hardly anything of y (fit {percent(fit, 1)} %); check that they "
+                "belong to each other, which is which, the order and the delay"
             )
         if self._gain_is_wide and self._input_is_certain:
             found.append(
