@@ -385,3 +385,11 @@ def test_noise_and_swapped_columns_are_said(quell: Callable[..., Shown], tmp_pat
     saved(tmp_path / "swapped.csv", y, u)
     shown = quell("identify", "swapped.csv", "--order", "1", "--no-figures", "--no-alternatives")
     assert "NOT: u and y look swapped" in shown.out
+
+
+def test_a_step_at_the_second_sample_is_drawn() -> None:
+    """It has no empirical response; output, error and tests are in the picture."""
+    u, y = heated(1)
+    axes = ql.identify(u, y, 1.0, order=2).plot()
+    assert axes[3].lines
+    assert axes[0].texts

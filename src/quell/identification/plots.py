@@ -43,8 +43,15 @@ def draw_bode(
     response: Callable[[Any], Any],
     signals: Signals,
 ) -> None:
-    """Draw gain, phase and coherence of the empirical response, and the model's response."""
+    """Draw gain, phase and coherence of the empirical response, and the model's response.
+
+    The record of a step soon after the start has no empirical response, as u rests in all segments.
+    """
     gain, phase, coherence = axes
+    if measured.omega.size == 0:
+        for each in axes:
+            each.text(0.5, 0.5, "u moves too little", ha="center", transform=each.transAxes)
+        return
     good = measured.coherence > _COHERENT
     omega = np.geomspace(measured.omega[0], measured.omega[-1], 2000)
     model = response(omega)
