@@ -137,7 +137,8 @@ def alternatives(
     They are: one pole less, and one zero less; if the error is not white, also the opposite of the
     given assumption on Coulomb friction, and for a larger model without friction that of a mass
     with friction, unless friction would drive the plant; and one pole more, if the model does not
-    explain the response to u and has no ``faults``. A structure that cannot be fitted is left out.
+    explain the response to u or leaves something ``undecided``, and has no ``faults``. A structure
+    that cannot be fitted is left out.
 
     Parameters
     ----------
@@ -163,7 +164,8 @@ def alternatives(
             tried.append((name, rubs, {"friction": not rubs}))
             if order > _LEAST_WITH_FRICTION and not rubs:
                 tried.append((_RIGID, True, {"order": 2, "zeros": 0, "friction": True}))
-    if order < _MOST_ORDER and not found.explained and not found.faults:
+    doubtful = not found.explained or bool(found.undecided)
+    if order < _MOST_ORDER and doubtful and not found.faults:
         tried.append((f"order {order + 1}", False, {"order": order + 1, "zeros": zeros + direct}))
     held_out = None if found.samples else 1.0 - found.held_from / found.y.size
     same = Options(
