@@ -107,7 +107,7 @@ class ReadOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ModelOptions:
-    """What the model of a record has.
+    """Structure and search of the model of a record.
 
     Parameters
     ----------

@@ -32,10 +32,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quell.identification.given_record import given_records
+from quell.identification.given_record import Records
 from quell.identification.identify import Options, identified
 from quell.identification.result import Identified
-from quell.identification.search.output_error import noise_model
+from quell.identification.search.output_error import likelihood_ratio
 from quell.identification.search.search import Known
 
 # Blocks: each should be longer than the correlation of the errors, and there should be enough of
@@ -179,16 +179,14 @@ def alternatives(
         held_out,
         found.horizon,
     )
-    models = []
+    records, models = Records(found.u, found.y, found.samples), []
     for name, smaller, change in tried:
-        # A smaller model is compared under the same assumption on the start, and found from this.
-        rest = found.rest or (None if found.undecided else False) if smaller else None
-        rest = True if found.rest_given else rest
-        options = same._replace(**change, rest=rest and not change.get("friction", rubs))
+        options = same._replace(**change)
+        options = options._replace(rest=_rest(found, smaller, options.friction))
         known = _known(found) if options.order == order - 1 and not options.friction else None
         try:
             model = identified(
-                given_records(*found.records),
+                records,
                 found.dt,
                 options,
                 found.reference,
@@ -206,6 +204,16 @@ def alternatives(
         measures = _compared(found, model, smaller) if nested else _by_blocks(found, model)
         models.append(Alternative(name, smaller, *measures, model, flags))
     return tuple(models)
+
+
+def _rest(found: Identified, smaller: bool, friction: bool) -> bool | None:
+    """Return the assumption on the start for another structure; None if it is to be tested again.
+
+    A smaller model is compared under the same assumption, if that has decided the gain.
+    """
+    if found.rest_given or (smaller and found.rest):
+        return not friction
+    return False if smaller and not found.undecided else None
 
 
 def _known(found: Identified) -> Known:
@@ -269,20 +277,18 @@ def _compared(
     found: Identified, model: Identified, smaller: bool
 ) -> tuple[float, float, float, bool]:
     """Return the mean of D, L or z (above zero if ``model`` is better), the limit, if it is L."""
-    from scipy.signal import lfilter
     from scipy.stats import chi2
 
     gain, z, limit, _ = _by_blocks(found, model)
     larger, less = (found, model) if smaller else (model, found)
     if not larger.explained:
         return gain, z, limit, False
-    errors = [(one.y - one.simulated)[: one.held_from] for one in (less, larger)]
-    c, _ = noise_model(errors[1])
+    count = found.held_from
     least = _EXACT * float(np.sum((found.y - np.mean(found.y)) ** 2))
-    powers = [float(np.sum(lfilter(c, [1.0], error) ** 2)) + least for error in errors]
-    ratio = errors[0].size * float(np.log(powers[0] / powers[1]))
+    errors = (less.y - less.simulated)[:count], (larger.y - larger.simulated)[:count]
+    ratio = likelihood_ratio(errors, least)
     more = max(larger.parameters - less.parameters, 1)
-    limit = max(float(chi2.isf(_LEVEL, more)), (more + 2) * float(np.log(errors[0].size)))
+    limit = max(float(chi2.isf(_LEVEL, more)), (more + 2) * float(np.log(count)))
     return gain, -ratio if smaller else ratio, limit, True
 
 

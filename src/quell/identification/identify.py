@@ -225,7 +225,8 @@ def identified(
         fitted = fit(u[:held_from], y[:held_from], records.samples, wanted)
         if reference is not None:
             fitted = _with_instruments(fitted, u[:held_from], y[:held_from], reference[:held_from])
-        found = _validated(fitted, u, y, reference, dt, held_from, horizon, other)
+        rounding = wanted.resolution
+        found = _validated(fitted, u, y, reference, dt, held_from, horizon, other, rounding)
     return replace(found, signals=Signals(signals.y, signals.u))
 
 
@@ -245,6 +246,7 @@ def _validated(
     held_from: int,
     horizon: int,
     other: tuple[Vector, Vector] | None,
+    resolution: float,
 ) -> Identified:
     """Return the result in seconds, with fits and tests."""
     structure, v = fitted.structure, fitted.inputs(u)
@@ -308,7 +310,7 @@ def _validated(
         one_more_pole=statistic,
         one_more_pole_limit=limit,
         residuals=residuals(error, tested_u, min(_LAGS, error.size // 4)),
-        resolution=resolution_of(y),
+        resolution=resolution,
         held_from=held_from,
         u=u,
         y=y,
@@ -343,11 +345,7 @@ def _friction(
     """
     if not structure.friction:
         return None, math.nan
-    slope, at = np.zeros(theta.size), structure.free
-    places = []
-    for degree in structure.degrees:
-        places.append(at)
-        at += degree + 1
+    slope, places = np.zeros(theta.size), structure.places
     rubbing = places[len(places) - len(structure.friction) :]
     force = float(np.sum(theta[rubbing]))
     slope[rubbing] = 1.0 / abs(gain)

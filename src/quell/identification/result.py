@@ -12,6 +12,7 @@ import numpy as np
 from quell.identification import plots
 from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.model.roots import WITHIN_95, Root
+from quell.identification.search.at_rest import SURE
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
 from quell.plants.labelled import labelled
@@ -26,8 +27,8 @@ _FRICTION_WIDTH = 0.02
 # A pole and a zero within three standard deviations may be equal (99.7 %).
 _DEVIATIONS = 3.0
 # A gain whose 95 % interval is wider than this share of it is not decided: then it may be half or
-# twice of what it is, beyond what a design allows for. A probability from here on is certain.
-_WIDE, _SURE = 1.0, 0.95
+# twice of what it is, beyond what a design allows for.
+_WIDE = 1.0
 # A fit below it explains nothing that could be used [%]: chosen by hand.
 _NOTHING = 10.0
 # From here down a start at rest that was given is contradicted: three standard deviations.
@@ -129,13 +130,13 @@ class Identified:
 
     @property
     def undecided(self) -> tuple[str, ...]:
-        """What the record does not decide, and what to do; empty if it decides all."""
+        """Things that the record does not decide, each with what to do."""
         found, (low, high) = [], self.gain_interval
         if low <= 0.0 <= high and low < high and not self._input_is_certain:
             found.append(f"the record does not decide the sign of the gain: {self._gain_text}")
         elif self._gain_is_wide and not self._input_is_certain:
             found.append(f"the record does not decide the size of the gain: {self._gain_text}")
-        if self.rest and not self.rest_given and self.rest_probability < _SURE:
+        if self.rest and not self.rest_given and self.rest_probability < SURE:
             found.append(
                 "the record does not decide whether the plant was at rest before it, on which the "
                 f"gain depends (probability {self.rest_probability:.2g}): if it was, give "

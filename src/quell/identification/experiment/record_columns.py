@@ -13,7 +13,7 @@ UNITS = {
 """Units of times, in seconds."""
 
 ROLES = ("t", "u", "y", "r")
-"""What the columns of a record are, in the order in which they are given."""
+"""Meanings of a record's columns, in the order in which they are given."""
 
 # Names of units of times, in lower case.
 _TIMES = {

@@ -103,12 +103,17 @@ class Structure(NamedTuple):
         a[self.integrators :] = theta[: self.free]
         return a
 
+    @property
+    def places(self) -> list[int]:
+        """Places in θ where the numerator of each input begins."""
+        sizes = [degree + 1 for degree in self.degrees[:-1]]
+        return list(accumulate(sizes, initial=self.free))
+
     def numerators(self, theta: Vector) -> Matrix:
         """Return the numerators (inputs, n), in ascending powers."""
-        found, at = np.zeros((len(self.degrees), self.order)), self.free
-        for row, degree in zip(found, self.degrees, strict=True):
+        found = np.zeros((len(self.degrees), self.order))
+        for row, degree, at in zip(found, self.degrees, self.places, strict=True):
             row[: degree + 1] = theta[at : at + degree + 1]
-            at += degree + 1
         return found
 
     def initial(self, theta: Vector) -> Vector:
@@ -214,10 +219,9 @@ def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Ma
             psi[place, :common], psi[place, start] = part[:, :common], part[:, common:]
         return y, psi
     n, degrees = structure.order, structure.degrees
-    columns, at = np.full((n, len(degrees) + 1), -1), structure.free
-    for j, degree in enumerate(degrees):
+    columns = np.full((n, len(degrees) + 1), -1)
+    for j, (degree, at) in enumerate(zip(degrees, structure.places, strict=True)):
         columns[: degree + 1, j] = np.arange(at, at + degree + 1)
-        at += degree + 1
     if not structure.at_rest:
         columns[:, -1] = np.arange(structure.common, structure.size)
     a, B = structure.denominator(theta), structure.numerators(theta)[:, ::-1].T

@@ -32,6 +32,9 @@ from quell.types import Matrix, Vector
 
 # Relative singular value that counts as zero.
 _RANK = 1e-12
+SURE = 0.95
+"""Probability from which on a start at rest is certain."""
+
 # Odds of a start at rest before the record is looked at: chosen by hand.
 _ODDS = 3.0
 # Largest logarithm of the evidence ratio: beyond it nothing changes.
@@ -39,7 +42,7 @@ _MOST = 500.0
 
 
 class AtRest(NamedTuple):
-    """What a record says of a start at rest."""
+    """The assumption of a start at rest, and how likely a record makes it."""
 
     assumed: bool  # whether the model starts at rest
     given: bool  # whether this was given

@@ -186,6 +186,19 @@ def noise_model(error: Vector) -> tuple[Vector, float]:
     return chosen
 
 
+def likelihood_ratio(errors: tuple[Vector, Vector], least: float) -> float:
+    """Return ``N log(Σ w²/Σ w_0²)`` of the errors of a smaller and of a larger model.
+
+    Both are whitened by the model of the noise of the larger one's error, and ``least`` is added to
+    both sums. It is χ² if the smaller model is true (Ljung 1999, sec. 16.4).
+    """
+    from scipy.signal import lfilter
+
+    c, _ = noise_model(errors[1])
+    powers = [float(np.sum(lfilter(c, [1.0], error) ** 2)) + least for error in errors]
+    return errors[0].size * float(np.log(powers[0] / powers[1]))
+
+
 def gauss_newton(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
     """Return the mean square error that a Gauss-Newton step predicts, and θ after it."""
     found = _error_and_gradient(structure, theta, v, y)

@@ -10,6 +10,7 @@ import numpy as np
 from quell.identification.model.roots import gain_interval, squared_distance_from_zero
 from quell.identification.model.structure import Structure, free_run, output
 from quell.identification.search.at_rest import (
+    SURE,
     AtRest,
     from_rest,
     general,
@@ -29,6 +30,7 @@ from quell.identification.search.output_error import (
     covariance,
     descend,
     gauss_newton,
+    likelihood_ratio,
     noise_model,
     refine,
 )
@@ -58,8 +60,8 @@ _SLOWER = 10.0
 _MOST_COST, _FIT_SHARE = {1: 30.0, 2: 1.05}, 0.005
 _ROUNDING = 1e-18
 # A gain whose interval is within ±2 % needs no assumption on the start, one within ±10 % only
-# if it is sure: chosen by hand. A start at rest is sure, and likely, from these probabilities on.
-_CERTAIN, _USEFUL, _SURE, _LIKELY = 0.02, 0.1, 0.95, 0.5
+# if it is sure: chosen by hand. A start at rest is likely from this probability on.
+_CERTAIN, _USEFUL, _LIKELY = 0.02, 0.1, 0.5
 # With more movements of u through its range than these the start matters little: chosen by hand.
 _MOST_SWINGS = 10.0
 # Probability with which a start at rest is refused by chance.
@@ -69,7 +71,6 @@ _SELDOM = 1e-3
 _MOST_DELAYS, _DELAY_STEPS, _WITHIN_95 = 10, 12, 3.84
 # Variance of a delay whose nearest whole number of samples is known.
 _WHOLE = 1.0 / 12.0
-_NONE = ParameterEstimate(np.zeros(0), np.zeros((0, 0)), np.inf, False)
 
 
 class Fit(NamedTuple):
@@ -92,12 +93,17 @@ class Fit(NamedTuple):
         structure = self.structure
         if structure.samples and sum(structure.samples) != u.size:
             structure = structure.single()
-        v = np.zeros((u.size, len(self.structure.degrees)))
-        v[:, 0] = with_delay(structure, v, u, self.delay)[:, 0]
-        if self.bias:
-            for i, place in enumerate(structure.records(u.size)):
-                v[place, 1 + i] = 1.0
-        return v
+        return _inputs(structure, u, self.delay, self.bias)
+
+
+def _inputs(structure: Structure, u: Vector, delay: int, bias: bool) -> Matrix:
+    """Return the inputs (N, inputs) for ``u``: late, constant forces, and zeros for friction."""
+    v = np.zeros((u.size, len(structure.degrees)))
+    v[:, 0] = with_delay(structure, v, u, delay)[:, 0]
+    if bias:
+        for i, place in enumerate(structure.records(u.size)):
+            v[place, 1 + i] = 1.0
+    return v
 
 
 class Known(NamedTuple):
@@ -108,7 +114,7 @@ class Known(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """What a model is to have."""
+    """The structure that is wanted of a model, and where its search begins."""
 
     order: int
     zeros: int
@@ -139,7 +145,7 @@ def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
         return found
     # Without need, only what is certain is assumed.
     needed = _relative_width(found) > _USEFUL
-    least = _LIKELY if needed else _SURE
+    least = _LIKELY if needed else SURE
     # Where the model from any start is far off, its poles may lead nowhere.
     for from_any in (found, None)[: 1 + needed]:
         at_rest = _fit_at_rest(structure, u, y, wanted, from_any)
@@ -156,16 +162,12 @@ def _swings(structure: Structure, u: Vector) -> float:
 
 def _contradicts(found: Fit, at_rest: Fit, u: Vector, y: Vector) -> bool:
     """Return whether the model at rest fits worse than chance explains, by the likelihood ratio."""
-    from scipy.signal import lfilter
     from scipy.stats import chi2
 
-    errors = [
-        y - output(one.structure, one.estimate.theta, one.inputs(u)) for one in (found, at_rest)
-    ]
-    c, _ = noise_model(errors[0])
-    powers = [float(np.sum(lfilter(c, [1.0], error) ** 2)) for error in errors]
-    least = _ROUNDING * float(y @ y)
-    ratio = y.size * np.log((powers[1] + least) / (powers[0] + least))
+    at_rest_error, error = (
+        y - output(one.structure, one.estimate.theta, one.inputs(u)) for one in (at_rest, found)
+    )
+    ratio = likelihood_ratio((at_rest_error, error), _ROUNDING * float(y @ y))
     return bool(not ratio <= chi2.isf(_SELDOM, found.structure.order))
 
 
@@ -200,9 +202,7 @@ def _relative_width(found: Fit) -> float:
 def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: Known | None) -> Fit:
     """Return the model of one structure; at rest, ``u`` is without its first value."""
     friction, delays, bias = wanted.friction, wanted.delays, wanted.bias and not structure.at_rest
-    unknown = np.zeros(0), bias, AtRest(False, False, np.nan)
-    first = Fit(structure, _NONE, delays[0], delays, delays, *unknown)
-    v = first.inputs(u)
+    v = _inputs(structure, u, delays[0], bias)
     if friction:
         v[:, -1] = measured_sign(structure, y, _HALF_WIDTH)
     if known is None:
@@ -229,14 +229,8 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
             estimate, v = _settle_signs(structure, near, v, y)
     estimate = estimate._replace(converged=estimate.converged and start.confirmed)
     estimate, certain, of_delay = _over_delays(structure, estimate, u, v, y, delay, searched)
-    return first._replace(
-        structure=structure,
-        estimate=estimate,
-        delay=delay,
-        delays=certain,
-        searched=searched,
-        delay_covariance=of_delay,
-    )
+    rest = AtRest(False, False, np.nan)
+    return Fit(structure, estimate, delay, certain, searched, of_delay, bias, rest)
 
 
 def _from_known(
@@ -379,7 +373,7 @@ def _add_driven_friction(
         return structure, estimate, v
     # A coefficient is added before those of friction on the measured side; it takes over the value
     # of their first one.
-    at = structure.free + sum(structure.degrees[:-1]) + len(structure.degrees) - 1
+    at = structure.places[-1]
     start = np.insert(estimate.theta, at, estimate.theta[at])
     start[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
     wider = structure._replace(degrees=(*structure.degrees[:-1], 0, structure.degrees[-1]))
