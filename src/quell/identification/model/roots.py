@@ -89,7 +89,9 @@ def _fieller(a: float, b: float, covariance: Matrix) -> tuple[float, float]:
     z2 = WITHIN_95**2
     of_a, of_b, both = float(covariance[0, 0]), float(covariance[1, 1]), float(covariance[0, 1])
     square, linear, constant = a * a - z2 * of_a, a * b - z2 * both, b * b - z2 * of_b
-    root = linear * linear - square * constant
+    # linear² − square · constant, without the terms that cancel
+    spread = a * a * of_b + b * b * of_a - 2.0 * a * b * both
+    root = z2 * spread + z2 * z2 * (both * both - of_a * of_b)
     if square > 0.0:
         half = math.sqrt(max(root, 0.0))
         return (linear - half) / square, (linear + half) / square

@@ -71,7 +71,9 @@ def instrumental_variables(
             converged = True
             break
     scores = block_sums(projected, target - regressors @ theta, max(_BLOCKS, 4 * theta.size))
-    half = np.linalg.pinv(left, rcond=_RANK) @ scores.T
+    U, S, Vt = np.linalg.svd(left)
+    # What the reference does not show has a large deviation, not none.
+    half = Vt.T / np.maximum(S, _RANK * S[0]) @ U.T @ scores.T
     covariance = half @ half.T / np.outer(size, size)
     return ParameterEstimate(theta, covariance, cost(structure, theta, v, y), converged)
 

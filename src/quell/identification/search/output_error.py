@@ -56,6 +56,9 @@ _CONVERGED = 1e-7
 _MU, _LEAST_MU, _MOST_MU = 1e-3, 1e-8, 1e8
 # Relative singular value that counts as zero: some 50 units of rounding.
 _RANK = 1e-14
+# Relative singular value of the gradient from which on a direction is shown by the record: some
+# hundred units of rounding. What is not shown has a large deviation, not none.
+_LEAST_SHOWN = 1e-13
 # Relative mean square that counts as zero: rounding in long simulations adds up to errors of 1e-12.
 _ROUNDING = 1e-24
 # Least number of blocks for the covariance: longer ones hold more correlation, fewer make the
@@ -136,11 +139,14 @@ def covariance(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Mat
     if found is None:
         return np.full((theta.size, theta.size), np.inf)
     error, psi, size = found
-    inverse = np.linalg.pinv(psi.T @ psi, rcond=_RANK, hermitian=True)
+    # With ψ = U S Vᵀ, H⁻¹ = V S⁻² Vᵀ; without squares, as a few samples may have all information.
+    _, S, Vt = np.linalg.svd(_triangle(psi))
+    half = Vt.T / np.maximum(S, _LEAST_SHOWN * S[0])
     filtered, variance = _coloured(structure, psi, error)
-    cov = variance * inverse @ (filtered.T @ filtered) @ inverse
-    scores = block_sums(psi, error, min(max(4 * theta.size, _BLOCKS), y.size))
-    by_blocks = np.sum((inverse @ scores.T) ** 2, axis=1)
+    shown = filtered @ half
+    cov = variance * half @ (shown.T @ shown) @ half.T
+    scores = block_sums(psi @ half, error, min(max(4 * theta.size, _BLOCKS), y.size))
+    by_blocks = np.sum((half @ scores.T) ** 2, axis=1)
     own = np.diag(cov)
     wider = np.sqrt(np.maximum(by_blocks / np.where(own > 0.0, own, 1.0), 1.0))
     return cov * np.outer(wider, wider) / np.outer(size, size)
