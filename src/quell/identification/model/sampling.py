@@ -115,10 +115,27 @@ def _gradient(
 
 
 @compiled
+def _mean_sign(now: float, free: float, gain: float) -> float:
+    """Return the mean over a sample of minus the sign of a speed; see ``structure``.
+
+    The speed is ``now`` at the start, and ``free + gain v`` at the end if v acts all along.
+    """
+    if gain <= 0.0:  # it drives the motion: a model on the way of the search
+        return -1.0 if now > 0.0 else (1.0 if now < 0.0 else 0.0)
+    sign = 1.0 if now > 0.0 else (-1.0 if now < 0.0 else 0.0)
+    change = free - sign * gain - now
+    if now * (now + change) > 0.0:
+        return -sign
+    if sign != 0.0 and (change + 2.0 * sign * gain) * sign < 0.0:
+        return sign * (1.0 + 2.0 * now / change)
+    return min(max(-free / gain, -1.0), 1.0)
+
+
+@compiled
 def _states_with_friction(
     phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, offset: float, x: Vector, out: Matrix
 ) -> None:
-    """Write the states and the last inputs: minus the signs of ``speeds`` times the state.
+    """Write the states and the last inputs: minus the mean signs of ``speeds`` times the state.
 
     ``offset`` is added to the speeds.
     """
@@ -127,18 +144,22 @@ def _states_with_friction(
     for k in range(v.shape[0]):
         for i in range(n):
             out[k, i] = x[i]
-        for j in range(first, m):
-            rate = offset
-            for i in range(n):
-                rate += speeds[j - first, i] * x[i]
-            v[k, j] = -1.0 if rate > 0.0 else (1.0 if rate < 0.0 else 0.0)
         for i in range(n):
-            total = 0.0
+            x[i] = 0.0
             for j in range(n):
-                total += phi[i, j] * out[k, j]
-            for j in range(m):
-                total += gamma[i, j] * v[k, j]
-            x[i] = total
+                x[i] += phi[i, j] * out[k, j]
+            for j in range(first):
+                x[i] += gamma[i, j] * v[k, j]
+        for j in range(first, m):
+            now = free = offset
+            gain = 0.0
+            for i in range(n):
+                now += speeds[j - first, i] * out[k, i]
+                free += speeds[j - first, i] * x[i]
+                gain += speeds[j - first, i] * gamma[i, j]
+            v[k, j] = _mean_sign(now, free, gain)
+            for i in range(n):
+                x[i] += gamma[i, j] * v[k, j]
 
 
 def companion(a: Vector) -> tuple[Matrix, Matrix]:
@@ -183,7 +204,7 @@ def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
 def states_with_friction(
     system: Sampled, v: Matrix, speeds: Matrix, x0: Vector, offset: float = 0.0
 ) -> tuple[Matrix, Matrix]:
-    """Return states and inputs; the last are minus the signs of ``speeds`` times the state.
+    """Return states and inputs; the last are minus the mean signs of ``speeds`` times the state.
 
     ``offset`` is added to the speeds.
     """

@@ -19,8 +19,14 @@ A`` with as many zeros as poles. D_u is a linear parameter as b is, and its deri
 
 For known v the model is linear in F. The v are taken from the motion of the last model (at first v₂
 from the measured motion), then the parameters are fitted for these v, and so on until the v no
-longer change. A simulated model takes them from its own speeds. At standstill the sign changes at
-each sample, and its mean has the effect of sticking.
+longer change; the last steps are those of the simulated model, which takes v from its own speeds.
+
+v is held over a sample as u is, so it is the mean of −sign(w) of a speed w. To first order w is a
+straight line in a sample: it ends at ``w_0 + Δ`` where v = −sign(w_0) acts all along. If it keeps
+its sign, this is v. Else w is zero after the share ``λ = −w_0/Δ`` of the sample. If u overcomes the
+friction, w goes on with the other sign, and ``v = (1 − 2 λ) sign(w_0)``; if not, the side sticks,
+and v is the value within ±1 for which w ends at zero (the implicit step of Acary & Brogliato,
+*Numerical Methods for Nonsmooth Dynamical Systems*, 2008, ch. 1).
 
 Friction on the measured side acts on y″ directly: F₂ has degree n − 2. Friction on the driven side
 enters like u: F₁ has degree 0. Up to order 3 the sides move as one, and there is only v₂. From

@@ -139,17 +139,22 @@ def covariance(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Mat
     if found is None:
         return np.full((theta.size, theta.size), np.inf)
     error, psi, size = found
+    return covariance_of(structure, psi, error) / np.outer(size, size)
+
+
+def covariance_of(structure: Structure, psi: Matrix, error: Vector) -> Matrix:
+    """Return the covariance of θ from the gradient (N, size) and the error at an optimum."""
     # With ψ = U S Vᵀ, H⁻¹ = V S⁻² Vᵀ; without squares, as a few samples may have all information.
     _, S, Vt = np.linalg.svd(_triangle(psi))
     half = Vt.T / np.maximum(S, _LEAST_SHOWN * S[0])
     filtered, variance = _coloured(structure, psi, error)
     shown = filtered @ half
     cov = variance * half @ (shown.T @ shown) @ half.T
-    scores = block_sums(psi @ half, error, min(max(4 * theta.size, _BLOCKS), y.size))
+    scores = block_sums(psi @ half, error, min(max(4 * psi.shape[1], _BLOCKS), error.size))
     by_blocks = np.sum((half @ scores.T) ** 2, axis=1)
     own = np.diag(cov)
     wider = np.sqrt(np.maximum(by_blocks / np.where(own > 0.0, own, 1.0), 1.0))
-    return cov * np.outer(wider, wider) / np.outer(size, size)
+    return cov * np.outer(wider, wider)
 
 
 def _coloured(structure: Structure, psi: Matrix, error: Vector) -> tuple[Matrix, float]:

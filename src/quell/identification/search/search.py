@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.identification.model.roots import gain_interval, squared_distance_from_zero
-from quell.identification.model.structure import Structure, free_run, output
+from quell.identification.model.structure import Structure, output
 from quell.identification.search.at_rest import (
     SURE,
     AtRest,
@@ -25,28 +25,26 @@ from quell.identification.search.delay import (
     start_with_delay,
     with_delay,
 )
+from quell.identification.search.friction import (
+    add_driven_friction,
+    least_simulated,
+    measured_sign,
+    simulated_delay,
+)
 from quell.identification.search.output_error import (
     ParameterEstimate,
     covariance,
     descend,
-    gauss_newton,
     likelihood_ratio,
     noise_model,
     refine,
 )
 from quell.types import Matrix, Vector
 
-# Half width of the mean slope that stands for the measured speed until there is a model [samples]:
-# chosen by hand, the sign of the model's own speed replaces it.
-_HALF_WIDTH = 10
-# Most passes until the signs of friction settle, and the share of them that may still change:
-# chosen by hand; not tuned further.
-_PASSES, _SETTLED = 12, 5e-4
-# Range of ω_a²/ω_r² and most trials for the driven side. The ratio is J₁'s share of both inertias;
-# a driven side of less than a tenth of them is rare. The number of trials is chosen by hand.
-_SHARES, _TRIALS = (0.1, 1.0), 10
 # Steps of the refinement on the way, and most of them at the end: chosen by hand, not tuned.
 _FEW_STEPS, _STEPS = 2, 60
+# Most rounds of the delay with friction: chosen by hand.
+_ROUNDS = 4
 # A pole is set to s = 0 within three standard deviations of it (99.7 %), or if its time constant is
 # more than ten times the record (chosen by hand). For two poles, χ² with two degrees of freedom
 # exceeds 11.8 as rarely.
@@ -204,7 +202,7 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
     friction, delays, bias = wanted.friction, wanted.delays, wanted.bias and not structure.at_rest
     v = _inputs(structure, u, delays[0], bias)
     if friction:
-        v[:, -1] = measured_sign(structure, y, _HALF_WIDTH)
+        v[:, -1] = measured_sign(structure, y)
     if known is None:
         searched, delay, start = start_with_delay(structure, u, v, y, delays, wanted.grows)
     else:
@@ -217,16 +215,24 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
     if wanted.integrators is None:
         structure, estimate = _set_integrators(structure, estimate, v, y)
     if friction and wanted.order > 3:
-        structure, estimate, v = _add_driven_friction(structure, estimate, v, y)
+        structure, estimate, v = add_driven_friction(structure, estimate, v, y)
         if wanted.integrators is None:
             structure, estimate = _set_integrators(structure, estimate, v, y)
-    estimate, v = _settle_signs(structure, estimate, v, y)
+    if friction:
+        estimate, v = least_simulated(structure, estimate, v, y)
+    else:
+        estimate = refine(structure, estimate.theta, v, y, _STEPS)
     if friction and searched[0] < searched[1]:
         # With wrong signs of the speed another delay may have been the best.
-        again, near = nearest_delay(structure, estimate, u, v, y, searched, delay)
-        if again != delay:
-            delay, v = again, with_delay(structure, v, u, again)
-            estimate, v = _settle_signs(structure, near, v, y)
+        for _ in range(_ROUNDS):
+            again = simulated_delay(structure, estimate.theta, u, v, y, searched, delay)
+            if again == delay:
+                break
+            inputs = with_delay(structure, v, u, again)
+            moved, inputs = least_simulated(structure, estimate, inputs, y)
+            if moved.cost >= estimate.cost:
+                break
+            delay, estimate, v = again, moved, inputs
     estimate = estimate._replace(converged=estimate.converged and start.confirmed)
     estimate, certain, of_delay = _over_delays(structure, estimate, u, v, y, delay, searched)
     rest = AtRest(False, False, np.nan)
@@ -323,84 +329,6 @@ def _over_delays(
         cov += weight / total * (one.covariance + np.outer(moved, moved))
         of_delay += weight / total * late * np.append(moved[:size], late)
     return estimate._replace(covariance=cov), (low, high), of_delay
-
-
-def measured_sign(structure: Structure, y: Vector, half_width: int) -> Vector:
-    """Return minus the sign of the speed: the mean slope of y over ``half_width`` samples each way.
-
-    In order 1 the speed is y itself.
-    """
-    if structure.order == 1:
-        return -np.sign(y)
-    found = []
-    for place in structure.records(y.size):
-        part = y[place]
-        index = np.arange(part.size)
-        ahead, behind = index + half_width, index - half_width
-        after, before = np.minimum(ahead, part.size - 1), np.maximum(behind, 0)
-        found.append(-np.sign(part[after] - part[before]))
-    return np.concatenate(found)
-
-
-def _settle_signs(
-    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
-) -> tuple[ParameterEstimate, Matrix]:
-    """Return refined parameters, and inputs with friction from the model's own speeds."""
-    best = (np.inf, estimate, v)
-    for _ in range(_PASSES if structure.friction else 0):
-        predicted, own = free_run(structure, estimate.theta, v, own_friction=True)
-        error = float(np.mean((y - predicted) ** 2))
-        best = min(best, (error, estimate, own), key=lambda one: one[0])
-        if np.mean(np.any(own != v, axis=1)) <= _SETTLED:
-            break
-        v = own
-        estimate = refine(structure, estimate.theta, v, y, _FEW_STEPS)
-    # An earlier pass may have been better than the last one.
-    _, estimate, v = best
-    return refine(structure, estimate.theta, v, y, _STEPS), v
-
-
-def _add_driven_friction(
-    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
-) -> tuple[Structure, ParameterEstimate, Matrix]:
-    """Add friction on the driven side if there is a resonance; return model and inputs."""
-    from scipy.optimize import minimize_scalar
-
-    v = free_run(structure, estimate.theta, v, own_friction=True)[1]
-    estimate = refine(structure, estimate.theta, v, y, _FEW_STEPS)
-    omega = _resonance(structure.denominator(estimate.theta))
-    if omega == 0.0:
-        return structure, estimate, v
-    # A coefficient is added before those of friction on the measured side; it takes over the value
-    # of their first one.
-    at = structure.places[-1]
-    start = np.insert(estimate.theta, at, estimate.theta[at])
-    start[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
-    wider = structure._replace(degrees=(*structure.degrees[:-1], 0, structure.degrees[-1]))
-    v = np.column_stack([v, v[:, -1]])
-    tried: list[tuple[float, Structure, Vector]] = []
-
-    def error(share: float) -> float:
-        candidate = wider._replace(friction=(1.0 / (share * omega**2), 0.0))
-        theta, predicted = min(tried, key=lambda one: one[0])[2] if tried else start, 0.0
-        for _ in range(2):
-            own = free_run(candidate, theta, v, own_friction=True)[1]
-            predicted, theta = gauss_newton(candidate, theta, own, y)
-        tried.append((predicted, candidate, theta))
-        return predicted
-
-    options = {"xatol": 1e-2, "maxiter": _TRIALS}
-    minimize_scalar(error, bounds=_SHARES, method="bounded", options=options)
-    _, wider, theta = min(tried, key=lambda one: one[0])
-    v = free_run(wider, theta, v, own_friction=True)[1]
-    return wider, refine(wider, theta, v, y, _FEW_STEPS), v
-
-
-def _resonance(a: Vector) -> float:
-    """Return |p| of the least damped pair of poles [1/sample]; 0.0 if there is no stable pair."""
-    poles = np.roots(np.append(1.0, a[::-1]))
-    pairs = poles[(poles.imag > 0.0) & (poles.real <= 0.0)]
-    return float(np.abs(pairs[np.argmin(-pairs.real / np.abs(pairs))])) if pairs.size else 0.0
 
 
 def _set_integrators(
