@@ -84,9 +84,9 @@ def main() -> None:
     given: list[Any] = []
     original = designs._best
 
-    def noted(problem: Any, structure: Any, known: Any) -> Any:
-        given.append((problem, structure))
-        return original(problem, structure, known)
+    def noted(task: Any, structure: Any, known: Any) -> Any:
+        given.append((task.problem(), structure))
+        return original(task, structure, known)
 
     designs._best = noted
     shares, seconds = [], 0.0
@@ -95,6 +95,7 @@ def main() -> None:
         given.clear()
         bounds, began = Constraints(m_s=m_s, m_t=None), time.process_time()
         options: dict[str, Any] = {"structure": "model-based", "constraints": bounds, "compare": ()}
+        options["objective"] = "load"
         try:
             k_i = ql.tune((num, den), sample_time(num, den), **options).design.k_i
         except ValueError:

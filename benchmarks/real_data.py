@@ -46,7 +46,8 @@ def identified(record: Measured, order: int, zeros: int, most: int) -> Identifie
 def tuned(model: Identified, **options: Any) -> Any:
     """Return the tuned controllers for a model and its deviations."""
     plants, delays = identified_plants(model)
-    return ql.tune(plants, model.dt, delay=delays, compare=("pi", "pid", "bandwidths"), **options)
+    how = {"delay": delays, "objective": "load"} | options
+    return ql.tune(plants, model.dt, structure="freed", compare=("pi", "pid", "bandwidths"), **how)
 
 
 def load_step(model: Identified, controller: Any, duration: float) -> tuple[float, float]:

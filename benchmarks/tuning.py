@@ -99,12 +99,11 @@ def trial(plant: tuple[str, list[float], list[float], float], m_s: float) -> dic
     dt = sample_time(num, den, delay)
     began = time.process_time()
     free = Constraints(m_s=m_s, m_t=None, noise_over_pi=None)
-    pi = ql.tune(
-        (num, den), dt, structure="pi-unfiltered", constraints=free, delay=delay, compare=()
-    )
+    how = {"objective": "load", "delay": delay}
+    pi = ql.tune((num, den), dt, structure="pi-unfiltered", constraints=free, compare=(), **how)
     m_ks = pi.design.measures["M_ks"]
     bounds = Constraints(m_s=m_s, m_t=None, m_ks=m_ks)
-    tuned = ql.tune((num, den), dt, constraints=bounds, delay=delay, compare=NAMES)
+    tuned = ql.tune((num, den), dt, structure="freed", constraints=bounds, compare=NAMES, **how)
     row: dict[str, object] = {"plant": name, "m_s": m_s, "m_ks": m_ks, "k_i": pi.design.k_i}
     for key, design in tuned.designs.items():
         row[key] = design.k_i / pi.design.k_i

@@ -30,11 +30,11 @@ def costs(plant: tuple[str, list[float], list[float], float]) -> list[str]:
     _, num, den, delay = plant
     dt = sample_time(num, den, delay)
     free = Constraints(m_s=1.4, m_t=None, noise_over_pi=None)
-    how = {"delay": delay}
+    how = {"delay": delay, "objective": "load"}
     pi = ql.tune((num, den), dt, structure="pi-unfiltered", constraints=free, compare=(), **how)
     unit = pi.design
     bounds = Constraints(m_s=1.4, m_t=None, m_ks=NOISE * unit.measures["M_ks"])
-    tuned = ql.tune((num, den), dt, constraints=bounds, compare=NAMES, **how)
+    tuned = ql.tune((num, den), dt, structure="freed", constraints=bounds, compare=NAMES, **how)
     found = []
     for name in NAMES:
         design = tuned.designs[name]

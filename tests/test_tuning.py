@@ -38,8 +38,9 @@ def loop_of(plant: Any, dt: float, delay: float = 0.0) -> Any:
 
 @pytest.fixture(scope="module")
 def tuned() -> ql.Tuned:
-    """Three lags under the usual constraints."""
-    return ql.tune(LAGS, DT, order=2, compare=("pi", "pid", "bandwidths"))
+    """Three lags under the usual constraints, tuned for the integral gain."""
+    how: dict[str, Any] = {"structure": "freed", "objective": "load"}
+    return ql.tune(LAGS, DT, order=2, compare=("pi", "pid", "bandwidths"), **how)
 
 
 # ---- structures
@@ -159,7 +160,7 @@ def test_freed_poles_are_better_than_bandwidths_and_pid(tuned: ql.Tuned) -> None
 
 def test_a_result_does_not_depend_on_what_it_is_compared_with(tuned: ql.Tuned) -> None:
     """A freed ADRC starts at the optimal PID controller also if that is not shown."""
-    alone = ql.tune(LAGS, DT, order=2, compare=())
+    alone = ql.tune(LAGS, DT, order=2, structure="freed", objective="load", compare=())
     assert set(alone.designs) == {"freed"}
     assert alone.design.k_i == pytest.approx(tuned.design.k_i, rel=1e-3)
 
@@ -167,9 +168,77 @@ def test_a_result_does_not_depend_on_what_it_is_compared_with(tuned: ql.Tuned) -
 def test_the_integral_gain_of_a_design_with_a_model_stands_for_its_load_response() -> None:
     """Without a bound a second slow pole gave a motor k_i = 19 000, with y swinging."""
     motor = ([50.0], [1.0, 22.0, 40.0, 0.0])
-    found = ql.tune(motor, 1e-3, structure="model-based", compare=()).design
+    how: dict[str, Any] = {"objective": "load", "compare": ()}
+    free = Constraints(noise_over_pi=None)
+    pi = ql.tune(motor, 1e-3, structure="pi-unfiltered", constraints=free, **how).design
+    bounds = Constraints(m_ks=10.0 * pi.measures["M_ks"])
+    found = ql.tune(motor, 1e-3, structure="model-based", constraints=bounds, **how).design
     assert 1.0 <= found.k_i * found.measures["iae"] <= 3.0
     assert "k_i |P S/ω|" in [each.name for each in found.active]
+
+
+@pytest.fixture(scope="module")
+def by_default() -> ql.Tuned:
+    """Three lags by default."""
+    return ql.tune(LAGS, DT)
+
+
+def test_the_default_is_as_good_as_the_best_structure_that_was_tried(by_default: ql.Tuned) -> None:
+    """Its IAE is within 5 % of the least one; no simpler structure's is."""
+    iae = {name: design.measures["iae"] for name, design in by_default.designs.items()}
+    chosen = by_default.design.measures["iae"]
+    assert chosen <= 1.05 * min(iae.values())
+    simpler = ("pi", "pid", "bandwidths")[: ("pi", "pid", "bandwidths").index("pid")]
+    assert all(iae[name] > 1.05 * min(iae.values()) for name in simpler)
+
+
+def test_the_default_does_not_ring(by_default: ql.Tuned) -> None:
+    """All poles of its closed loop have a damping of 0.4 or more, as those of the plant have."""
+    z = np.asarray(by_default.analysis.poles, dtype=complex)
+    poles = np.log(z) / DT
+    slow = poles[np.abs(poles) < 0.5 * np.pi / DT]
+    assert np.min(-slow.real / np.abs(slow)) > 0.4
+
+
+def test_a_prefilter_is_offered_where_the_step_overshoots(by_default: ql.Tuned) -> None:
+    """With it a simulated step overshoots by 5 % and settles when the report says."""
+    found = by_default.reference_step
+    assert found.overshoot > 0.05
+    assert "[prefilter]" in str(found)
+    controller = ql.controllers.Prefiltered(by_default.controller, found.prefilter)
+    scenario = ql.Scenario(reference=ql.signals.Step(), duration=60.0)
+    plant = ql.plants.LinearPlant.of(LAGS)
+    for one, overshoot in ((controller, 0.05), (by_default.controller, found.overshoot)):
+        y = ql.simulate(plant, one, scenario)["y"]
+        assert np.max(y) - 1.0 == pytest.approx(overshoot, abs=2e-3)
+
+
+def test_the_worst_case_of_a_set_is_that_of_all_its_plants() -> None:
+    """The search looks at few plants at a time; the objective is that of the worst one."""
+    gains = np.linspace(0.8, 1.2, 7)
+    plants = [([gain], [1.0, 2.0, 1.0]) for gain in gains.tolist()]
+    found = ql.tune(plants, DT, structure="bandwidths", order=2, compare=())
+    assert found.design.objective == pytest.approx(found.design.measures["iae"], rel=1e-9)
+
+
+def test_noise_and_limits_of_u_give_the_bound_of_noise() -> None:
+    """std(u) is at most 2 % of half the range of u, for the rounding of the encoder."""
+    motor, step = ([45_000.0], [1.0, 3.3, 0.0]), 360.0 / 2**16
+    bounds = Constraints(resolution=step)
+    how: dict[str, Any] = {"structure": "bandwidths", "compare": (), "delay": 2e-3}
+    found = ql.tune(motor, 1e-3, constraints=bounds, u_min=-0.5, u_max=0.5, **how)
+    assert found.constraints.u_std == pytest.approx(0.01)
+    assert found.design.measures["noise_gain"] * step / np.sqrt(12.0) <= 0.0101
+    assert "2 % of half the range of u" in found.noise_bound
+
+
+def test_without_a_pi_controller_of_use_the_bound_of_noise_is_that_of_a_pid_controller() -> None:
+    """An integrated inertia has no PI controller, a damped one a bad one: k_i of 1e-4 for 1."""
+    for den, least in (([1.0, 0.0, 0.0], 100.0), ([1.0, 3.3, 0.0], 30.0)):
+        found = ql.tune(([1.0], den), 0.01, structure="pid", objective="load", compare=())
+        assert "PID" in found.noise_bound
+        assert "a guess" in found.noise_bound
+        assert found.design.k_i > least
 
 
 def test_the_law_of_a_freed_adrc_is_well_damped(tuned: ql.Tuned) -> None:

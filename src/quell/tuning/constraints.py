@@ -7,6 +7,7 @@ With ``S = 1/(1 + L)``, ``T = 1 − S`` and the controller C_y from −y to u, t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from quell import checks
@@ -26,9 +27,15 @@ class Constraints:
     m_ks
         largest gain from a sinusoid in y to u [u-unit/y-unit]; it bounds what noise does to u.
     u_std
-        largest standard deviation of u [u-unit] that white noise of ``noise_std`` in y causes.
+        largest standard deviation of u [u-unit] that the noise of y causes; by default
+        ``noise_share`` of half the range of u, where the noise and the limits of u are known.
     noise_std
-        standard deviation of the noise of y in each sample [y-unit]; goes with ``u_std``.
+        standard deviation of the white noise of y in each sample [y-unit].
+    resolution
+        step to which y is rounded [y-unit], as 360/2^16 degrees: noise of ``step/√12`` (Widrow,
+        Kollár & Liu, *IEEE Trans. Instrumentation and Measurement* 45, 1996) besides the other.
+    noise_share
+        share of half the range of u that noise may use, as a standard deviation.
     delay_margin
         least additional dead time at which the loop becomes unstable [s].
     u_max
@@ -36,9 +43,11 @@ class Constraints:
     rate_max
         largest rate of u in them [u-unit/s].
     noise_over_pi
-        without ``m_ks`` and ``u_std``, M_ks is bounded by this multiple of that of the optimal PI
-        controller under the other constraints; None for no bound. Without one, an optimum with a
-        derivative has the fastest filter that ``omega_o_dt`` allows.
+        where neither ``m_ks`` nor the noise of y is known, M_ks is bounded by this multiple of that
+        of the optimal PI controller under the other constraints, or, where no PI controller is of
+        use, by that of the optimal PID controller with ``T_f = T_d/noise_over_pi``; None for no
+        bound. Without one, an optimum with a derivative has the fastest filter that ``omega_o_dt``
+        allows.
     omega_o_dt
         largest ``|p| dt`` of the poles of an observer or of a filter of the measurement; beyond
         0.5 sampling costs margin (docs/design).
@@ -47,7 +56,7 @@ class Constraints:
     ------
     ValueError
         for a bound that is not positive, M_s or M_t that no loop has, or ``u_std`` without
-        ``noise_std``.
+        ``noise_std`` or ``resolution``.
     """
 
     m_s: float | None = 1.6
@@ -55,6 +64,8 @@ class Constraints:
     m_ks: float | None = None
     u_std: float | None = None
     noise_std: float | None = None
+    resolution: float | None = None
+    noise_share: float = 0.02
     delay_margin: float | None = None
     u_max: float | None = None
     rate_max: float | None = None
@@ -64,8 +75,9 @@ class Constraints:
     def __post_init__(self) -> None:
         for name in ("m_s", "m_t", "m_ks", "u_std", "noise_std", "delay_margin", "u_max"):
             checks.optional(checks.positive, name, getattr(self, name))
-        for name in ("rate_max", "noise_over_pi"):
+        for name in ("rate_max", "noise_over_pi", "resolution"):
             checks.optional(checks.positive, name, getattr(self, name))
+        checks.positive("noise_share", self.noise_share)
         checks.positive("omega_o_dt", self.omega_o_dt)
         for name in ("m_s", "m_t"):
             value = getattr(self, name)
@@ -74,12 +86,18 @@ class Constraints:
                     f"{name} = {value!r}: must be above 1; |S| exceeds 1 at some frequency "
                     "in every loop, and |T| is 1 at low ones (1.4 is cautious, 2 is bold)"
                 )
-        if self.u_std is not None and self.noise_std is None:
+        if self.u_std is not None and self.noise == 0.0:
             raise ValueError(
-                f"u_std = {self.u_std!r}: needs noise_std, the noise of y that causes it"
+                f"u_std = {self.u_std!r}: needs noise_std or resolution, the noise of y that "
+                "causes it"
             )
         if self.m_s is None and self.m_t is None:
             raise ValueError("m_s = None, m_t = None: one of them must bound the loop")
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the noise of y, rounding included [y-unit]; zero: not known."""
+        return math.hypot(self.noise_std or 0.0, (self.resolution or 0.0) / math.sqrt(12.0))
 
     def __str__(self) -> str:
         """Return the bounds that hold, as text."""
@@ -87,7 +105,7 @@ class Constraints:
             ("M_s ≤ {:g}", self.m_s),
             ("M_t ≤ {:g}", self.m_t),
             ("M_ks ≤ {:g}", self.m_ks),
-            ("std(u) ≤ {:g}" + f" for noise of {self.noise_std}", self.u_std),
+            ("std(u) ≤ {:.4g}" + f" for noise of {self.noise:.3g} in y", self.u_std),
             ("delay margin ≥ {:g} s", self.delay_margin),
             ("|u| ≤ {:g}", self.u_max),
             ("|u'| ≤ {:g}/s", self.rate_max),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +14,7 @@ from quell.analysis.loop import LoopAnalysis
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.extras import extras_of
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.objectives import cost_of, load_cost
+from quell.tuning.optimiser.objectives import cost_of, load_cost, scores
 from quell.tuning.optimiser.problem import Extra, Problem, Solution
 from quell.tuning.optimiser.requirements import Bound, bounds_of
 from quell.tuning.optimiser.search import best_solution, search
@@ -33,6 +34,9 @@ _NEARBY_ROUNDS = 6
 _OTHER_LIMITS = (0.85, 1.2, 2.0)
 # Rounds of a search over time, from the optimum for the integral gain.
 _ROUNDS = 15
+# Plants of a set that its worst case over time is first taken from, how much worse another one must
+# be to come in, and how often: chosen by hand.
+_MEMBERS, _WORSE, _EXCHANGES = 2, 1.005, 4
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
 _RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0, 100.0, 1e3, 1e4, 1e5), 6
 # Structures whose optima stand for starts of another one. They are always tuned before it, so that
@@ -43,6 +47,18 @@ _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
     "delay-freed": ("pi", "pid", "bandwidths", "delay"),
     "model-based-freed": ("model-based",),
 }
+# A PI controller is of use as a reference for noise unless a PID controller with filter has so many
+# times its integral gain; chosen by hand. Plants below this relative degree are not in doubt.
+_OF_USE, _INERTIA = 10.0, 2
+SIMPLEST = "simplest"
+"""Name for the simplest structure whose objective is near the best one's."""
+# A simpler structure may have an objective that is worse by this factor.
+_NEAR_BEST = 1.05
+# The structures, simple ones first: by what a user has to know, and by the number of parameters.
+_FROM_SIMPLE = (
+    *("pi-unfiltered", "pi", "pid", "bandwidths", "reduced", "half-gain", "half-gain-law"),
+    *("freed", "delay", "delay-freed", "model-based", "model-based-freed", "lqg"),
+)
 # Largest order of an ADRC that has an equivalent PI or PID controller.
 _LIKE_PID = 2
 
@@ -60,29 +76,74 @@ class Task:
     order: int | None
     u: Mapping[str, Any]  # limits of the controllers
 
-    def problem(self) -> Problem:
-        """Return the problem of the optimiser."""
+    def problem(self, members: Sequence[int] | None = None) -> Problem:
+        """Return the problem of the optimiser; the objective is that of ``members`` of the set."""
         over = SetResponses(self.plants, self.inputs)
-        cost = cost_of(self.objective, over, self.quantile)
+        for_cost = over if members is None else SetResponses(self.plants, self.inputs, members)
+        cost = cost_of(self.objective, for_cost, self.quantile)
         extras = extras_of(self.constraints, over)
         return Problem(self.plants, bounds_of(self.constraints), extras, self.objective, cost)
 
 
 def with_noise_bound(task: Task) -> tuple[Task, str]:
-    """Return the task with M_ks bounded by a multiple of the optimal PI's, and how it came."""
+    """Return the task with a bound for what noise does to u, and how it came.
+
+    Where the noise of y and the limits of u are known, the standard deviation of u is bounded by a
+    share of half their range. Else M_ks is bounded by a multiple of that of the optimal PI
+    controller; where a PI controller is of no use, as for an inertia, by that of a PID controller
+    with the usual filter, ``T_f = T_d/10``.
+    """
     given = task.constraints
-    if given.noise_over_pi is None or given.m_ks is not None or given.u_std is not None:
+    if given.m_ks is not None or given.u_std is not None:
         return task, ""
-    found = _solutions("pi-unfiltered", task, {})
-    usable = [solution for solution in found if solution.feasible]
-    if not usable:
-        return task, "no bound of M_ks: no PI controller meets the other constraints"
-    pi = min(usable, key=lambda solution: solution.cost)
-    reference = design_of("pi", task.problem(), pi, given, {}).measures["M_ks"]
-    bounded = replace(given, m_ks=given.noise_over_pi * reference)
-    model = task.model._replace(constraints=bounded)
-    how = f"M_ks: {given.noise_over_pi:g} times that of the optimal PI controller, {reference:.4g}"
-    return replace(task, constraints=bounded, model=model), how
+    low, high = task.u.get("u_min"), task.u.get("u_max")
+    if given.noise and low is not None and high is not None:
+        half = 0.5 * (float(high) - float(low))
+        how = (
+            f"std(u): {100.0 * given.noise_share:g} % of half the range of u, {half:.4g}, for "
+            f"noise of {given.noise:.3g} in y"
+        )
+        return _bounded(task, u_std=given.noise_share * half), how
+    if given.noise_over_pi is None:
+        return task, ""
+    ratio, by_gain = given.noise_over_pi, replace(task, objective="load")
+    remedy = (
+        "; a guess: give the limits of u, and noise_std or resolution of y (--u-min, --u-max, "
+        "--noise, --resolution), to have what noise may do to u"
+    )
+    pi = _reference(by_gain, FilteredPID(task.model, derivative=False, filtered=False))
+    pid = FilteredPID(task.model, derivative=True, filtered=False, ratio=ratio)
+    if pi is not None and task.model.degree < _INERTIA:
+        size = _m_ks(task, pi)
+        how = f"M_ks: {ratio:g} times that of the optimal PI controller, {size:.4g}"
+        return _bounded(task, m_ks=ratio * size), how + remedy
+    best = _reference(by_gain, pid)
+    if pi is not None and (best is None or best.cost > pi.cost - math.log(_OF_USE)):
+        size = _m_ks(task, pi)
+        how = f"M_ks: {ratio:g} times that of the optimal PI controller, {size:.4g}"
+        return _bounded(task, m_ks=ratio * size), how + remedy
+    if best is None:
+        return task, f"no bound of M_ks: no PI or PID controller meets the constraints{remedy}"
+    how = f"M_ks: that of the optimal PID controller with T_f = T_d/{ratio:g}"
+    return _bounded(task, m_ks=_m_ks(task, best)), how + remedy
+
+
+def _bounded(task: Task, **bound: float) -> Task:
+    constraints = replace(task.constraints, **bound)
+    model = task.model._replace(constraints=constraints)
+    return replace(task, constraints=constraints, model=model)
+
+
+def _reference(task: Task, structure: FilteredPID) -> Solution | None:
+    """Return the controller of a reference with the largest integral gain, if there is any."""
+    best = _best(task, structure, _known_starts(structure, {}))
+    usable = best is not None and best.feasible and _is_stable(task.plants, best)
+    return best if usable else None
+
+
+def _m_ks(task: Task, solution: Solution) -> float:
+    found = design_of("", task.problem(), solution, task.constraints, {})
+    return float(found.measures["M_ks"])
 
 
 def tuned_designs(
@@ -116,6 +177,28 @@ def tuned_designs(
     return {name: designs[name] for name in names}
 
 
+def simplest(designs: Mapping[str, Design], objective: str) -> Design:
+    """Return the simplest design whose objective is within 5 % of the best of all.
+
+    Without any controller it is one that says why.
+    """
+    usable = {name: each for name, each in designs.items() if each.controller is not None}
+    if not usable:
+        return next(iter(designs.values()))
+    best = max(usable.values(), key=lambda each: -cost_by(each, objective))
+    near = cost_by(best, objective) + math.log(_NEAR_BEST)
+    good = [name for name, each in usable.items() if cost_by(each, objective) <= near]
+    return usable[min(good, key=_FROM_SIMPLE.index)]
+
+
+def cost_by(design: Design, objective: str) -> float:
+    """Return the logarithm of what a design minimises."""
+    size = design.objective
+    if not size > 0.0:
+        return math.inf if objective == "load" else -math.inf
+    return -math.log(size) if objective == "load" else math.log(size)
+
+
 def _order(names: Sequence[str], task: Task) -> list[str]:
     """Return the structures to tune: each behind those that it starts at."""
     found: list[str] = []
@@ -132,27 +215,45 @@ def _rank(solution: Solution) -> tuple[bool, float, float]:
 
 def _solutions(name: str, task: Task, solved: Mapping[str, Sequence[Solution]]) -> list[Solution]:
     """Return the best solution for each order of a structure that has any."""
-    problem, found = task.problem(), []
+    found = []
     for order in orders_of(name, task.model, task.order):
         structure = make_structure(name, task.model, order)
-        best = _best(problem, structure, _known_starts(structure, solved))
+        best = _best(task, structure, _known_starts(structure, solved))
         if best is not None and _is_stable(task.plants, best):
             found.append(best)
     return found
 
 
-def _best(problem: Problem, structure: Structure, known: Matrix) -> Solution | None:
+def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     """Return the best solution.
 
-    What is about responses over time is slow: it comes in at the optimum for the integral gain.
+    What is about responses over time is slow: it comes in at the optimum for the integral gain. The
+    worst case of a set is that of few plants: those that are the worst at the optima so far.
     """
+    problem = task.problem()
     slow = [extra for extra in problem.extras if extra.over_time]
     if problem.objective == "load" and not slow:
         return _best_gain(problem, structure, known)
     quick = tuple(extra for extra in problem.extras if not extra.over_time)
     by_gain = replace(problem, objective="load", cost=load_cost, extras=quick)
-    first = _best_gain(by_gain, structure, known)
-    return None if first is None else search(problem, structure, first.values, _ROUNDS)
+    best = _best_gain(by_gain, structure, known)
+    if best is None:
+        return None
+    if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
+        return search(problem, structure, best.values, _ROUNDS)
+    over, members = SetResponses(task.plants, task.inputs), list[int]()
+    for _ in range(_EXCHANGES):
+        each = scores(task.objective, structure, best.values, over)
+        worst = np.argsort(-each)[:_MEMBERS].tolist()
+        if members and float(np.max(each)) <= _WORSE * float(np.max(each[members])):
+            break
+        members = list(dict.fromkeys([*members, *worst]))
+        found = search(task.problem(members), structure, best.values, _ROUNDS)
+        if found is None:
+            break
+        best = found
+    cost = float(problem.cost(structure, best.values[None, :])[0])
+    return replace(best, cost=cost)
 
 
 def _best_gain(problem: Problem, structure: Structure, known: Matrix) -> Solution | None:

@@ -16,7 +16,7 @@ from quell.plants.labelled import signals_of
 from quell.plants.linear import LinearPlant
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints
-from quell.tuning.designs import Task, tuned_designs, with_noise_bound
+from quell.tuning.designs import SIMPLEST, Task, simplest, tuned_designs, with_noise_bound
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import OBJECTIVES
 from quell.tuning.optimiser.time_responses import Inputs, load_step
@@ -28,7 +28,7 @@ from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Check, Uncertain, checked
 from quell.types import Progress
 
-COMPARED = ("pi", "pid", "bandwidths", "freed", "half-gain", "reduced", "model-based")
+COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "freed", "model-based")
 """The structures that a result is compared with by default."""
 # Names of the limits of a controller.
 _LIMITS = ("u_min", "u_max", "rate_limit")
@@ -38,9 +38,9 @@ def tune(
     plant: Any,
     dt: float,
     *,
-    structure: str = "freed",
+    structure: str = SIMPLEST,
     order: int | None = None,
-    objective: Any = "load",
+    objective: Any = "load-iae",
     constraints: Constraints | None = None,
     compare: Sequence[str] = COMPARED,
     reference: Any = None,
@@ -75,15 +75,18 @@ def tune(
     dt
         sample time [s].
     structure
-        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own.
+        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own. By
+        default, ``"simplest"``, the simplest of ``compare`` whose objective is within 5 % of the
+        best of them.
     order
         order of an ADRC without model; 1 and 2 are tried by default.
     objective
-        ``"load"``: largest integral gain, the least integral of y after a step of the load;
-        ``"load-iae"``: least integral of ``|y|``; ``"tracking"``: least RMS of ``r − y``.
+        ``"load-iae"``: least integral of ``|y|`` after a step of the load; ``"load"``: largest
+        integral gain, the least integral of y, whose optima may ring, as y of both signs counts
+        for nothing; ``"tracking"``: least RMS of ``r − y``.
     constraints
-        the bounds; by default M_s = M_t = 1.6 and an M_ks of ten times that of the optimal PI
-        controller.
+        the bounds; by default M_s = M_t = 1.6, and one for what noise does to u, which follows from
+        the noise of y and the limits of u where they are given (``Constraints``).
     compare
         names of other structures.
     reference, duration
@@ -133,8 +136,9 @@ def tune(
     Examples
     --------
     >>> import quell as ql
-    >>> tuned = ql.tune(([1.0], [1.0, 3.0, 3.0, 1.0]), dt=0.02, structure="pi-unfiltered",
-    ...                 constraints=ql.tuning.Constraints(m_s=1.4, m_t=None), compare=())
+    >>> how = {"structure": "pi-unfiltered", "objective": "load", "compare": ()}
+    >>> bounds = ql.tuning.Constraints(m_s=1.4, m_t=None)
+    >>> tuned = ql.tune(([1.0], [1.0, 3.0, 3.0, 1.0]), dt=0.02, constraints=bounds, **how)
     >>> round(tuned.design.values["K"], 2), round(tuned.design.values["T_i"], 2)
     (0.63, 1.96)
     """
@@ -173,8 +177,9 @@ def tune(
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task)
-        designs = tuned_designs(list(dict.fromkeys([*compare, structure])), task, report)
-        chosen = designs[structure]
+        names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
+        designs = tuned_designs(list(dict.fromkeys(names)), task, report)
+        chosen = simplest(designs, objective) if structure == SIMPLEST else designs[structure]
         if chosen.controller is None:
             raise ValueError(f"structure = {structure!r}: {chosen.reason} ({task.constraints})")
         check = None
@@ -196,7 +201,7 @@ def tune(
 
 
 def _check_names(structure: str, compare: Sequence[str], objective: str) -> None:
-    checks.one_of("structure", structure, STRUCTURES)
+    checks.one_of("structure", structure, (SIMPLEST, *STRUCTURES))
     for name in compare:
         checks.one_of("compare", name, STRUCTURES)
     checks.one_of("objective", objective, OBJECTIVES)

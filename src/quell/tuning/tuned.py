@@ -21,6 +21,7 @@ from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.result import report
 from quell.tuning.result.design import Design
 from quell.tuning.result.plots import draw
+from quell.tuning.result.reference_step import ReferenceStep, reference_step
 from quell.tuning.result.setup_file import toml_text
 from quell.tuning.simulated import Checked, Search
 from quell.tuning.uncertain import Check
@@ -92,6 +93,14 @@ class Tuned:
         with one_blas_thread():
             return tradeoff(self.task, self.design)
 
+    @cached_property
+    def reference_step(self) -> ReferenceStep:
+        """Overshoot and settling time of a step of the reference, and a prefilter if it needs one.
+
+        That of the linear loop with the first plant, without the controller's feedforward.
+        """
+        return reference_step(self.plants, self.controller)
+
     @property
     def active(self) -> tuple[str, ...]:
         """The constraints at their limits, as text."""
@@ -112,8 +121,13 @@ class Tuned:
         lines += [self.noise_bound] if self.noise_bound else []
         for row in report.rows(self.designs, self.objective):
             name, value, *rest = row
-            lines.append(f"{name}: {report.quantity(self.objective)} {value}; " + _measures(rest))
+            quantity, second = (
+                report.quantity(self.objective),
+                report.second_quantity(self.objective),
+            )
+            lines.append(f"{name}: {quantity} {value}; " + _measures(second, rest))
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
+        lines += [str(self.reference_step)]
         lines += report.tradeoff_lines(self.tradeoff, self.objective)
         lines += [str(self.check)] if self.check is not None else []
         for name, each in (self.simulated_check or {}).items():
@@ -140,7 +154,7 @@ class Tuned:
         An ADRC has the feedforward of the setup that was tuned: it is no matter of the loop.
         """
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
-        comment += f"active: {', '.join(self.active) or 'none'}"
+        comment += f"active: {', '.join(self.active) or 'none'}\n{self.reference_step}"
         replaced = ("observer", "controller")
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
         designed = {key: dict(table) for key, table in self.design.tables.items()}
@@ -169,6 +183,11 @@ class Tuned:
                 "design": self.design.to_json(),
                 "designs": {name: each.to_json() for name, each in self.designs.items()},
                 "costs": self.costs,
+                "reference_step": {
+                    "overshoot": self.reference_step.overshoot,
+                    "settling": self.reference_step.settling,
+                    "prefilter_omega": getattr(self.reference_step.prefilter, "omega", None),
+                },
                 "tradeoff": [
                     {"constraint": name, "limit": limit, "objective": value}
                     for name, limit, value in self.tradeoff
@@ -185,9 +204,9 @@ class Tuned:
         return found
 
 
-def _measures(cells: list[str]) -> str:
+def _measures(second: str, cells: list[str]) -> str:
     *numbers, reason = cells
     if reason:
         return reason
-    iae, m_s, m_t, m_ks, margin = numbers
-    return f"IAE {iae}, M_s {m_s}, M_t {m_t}, M_ks {m_ks}, delay margin {margin}"
+    value, m_s, m_t, m_ks, margin = numbers
+    return f"{second} {value}, M_s {m_s}, M_t {m_t}, M_ks {m_ks}, delay margin {margin}"

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 
 # Poles of a record's model at first: a flexible axis has four.
 _MODEL_ORDER = 4
-_HEADINGS = ("IAE", "M_s", "M_t", "M_ks", "delay\nmargin")
+_BOUNDS = ("m_s", "m_t", "m_ks", "noise_std", "resolution")
+_HEADINGS = ("M_s", "M_t", "M_ks", "delay\nmargin")
 
 
 def tune(
@@ -56,6 +57,8 @@ def tune(
     m_s: float | None = None,
     m_t: float | None = None,
     m_ks: float | None = None,
+    noise: float | None = None,
+    resolution: float | None = None,
     trials: WholeOrNone = None,
     out: Path | None = None,
     save_record: Path | None = None,
@@ -88,18 +91,24 @@ def tune(
         Dead time of the plant [s].
     structure
         bandwidths, freed, half-gain, half-gain-law, reduced, model-based, model-based-freed,
-        delay, delay-freed, pi, pi-unfiltered, pid or lqg; freed by default.
+        delay, delay-freed, pi, pi-unfiltered, pid or lqg; by default simplest: the simplest whose
+        objective is within 5 % of the best.
     order
         Order of an ADRC without model; 1 and 2 are tried by default.
     objective
-        load (integral gain), load-iae or tracking; load by default. With --trials the name of a
-        metric.
+        load-iae (integral of |y| after a step of the load), load (integral gain) or tracking;
+        load-iae by default. With --trials the name of a metric.
     m_s
         Largest sensitivity; 1.6 by default.
     m_t
         Largest complementary sensitivity; 1.6 by default.
     m_ks
-        Largest gain from y to u; ten times that of the optimal PI controller by default.
+        Largest gain from y to u. By default noise may use 2 % of the range of u if --noise or
+        --resolution and --u-min, --u-max are given, else it follows from a PI or PID controller.
+    noise
+        Standard deviation of the noise of y in each sample [y-unit].
+    resolution
+        Step to which y is rounded [y-unit]: 360/2^16 degrees of a 16-bit encoder.
     trials
         Of a setup: tune on by simulation in its scenario, with this many candidates and all that
         is not linear in the plant; --objective is then a metric, as iae, which is the default.
@@ -121,6 +130,7 @@ def tune(
         "trials": trials,
     }
     named |= {"m_s": m_s, "m_t": m_t, "m_ks": m_ks}
+    named |= {"noise_std": noise, "resolution": resolution}
     options = {name: value for name, value in named.items() if value is not None}
     files = [file for file in (out, save_record) if file is not None]
     outputs = check_outputs(outputs, ["tuned", "verified"], files)
@@ -211,7 +221,7 @@ def _bounds(options: dict[str, Any]) -> None:
     """Put the constraints of the command line together."""
     from quell.tuning import Constraints
 
-    bounds = {key: options.pop(key) for key in ("m_s", "m_t", "m_ks") if key in options}
+    bounds = {key: options.pop(key) for key in _BOUNDS if key in options}
     options["constraints"] = Constraints(**bounds)
 
 
@@ -261,7 +271,8 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
     if tuned.noise_bound:
         print_line(console, tuned.noise_bound)
     quantity = report.quantity(tuned.objective)
-    rows = table("Optima under these constraints", "structure", quantity, *_HEADINGS)
+    headings = ("structure", quantity, report.second_quantity(tuned.objective), *_HEADINGS)
+    rows = table("Optima under these constraints", *headings)
     reasons = []
     for label, *cells, reason in report.rows(tuned.designs, tuned.objective):
         rows.add_row(f"[bold]{label}[/]" if label == tuned.design.name else label, *cells)
@@ -271,6 +282,7 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
         print_line(console, line)
     for line in report.tradeoff_lines(tuned.tradeoff, tuned.objective):
         print_line(console, f"with {line}")
+    print_line(console, str(tuned.reference_step))
     if tuned.check is not None:
         print_line(console, str(tuned.check))
     values = ", ".join(f"{key} = {value:.5g}" for key, value in tuned.design.values.items())

@@ -28,8 +28,7 @@ def extras_of(constraints: Constraints, over: SetResponses) -> tuple[Extra, ...]
     plants = over.plants
     found = []
     if constraints.u_std is not None:
-        assert constraints.noise_std is not None
-        gain = constraints.u_std / constraints.noise_std
+        gain = constraints.u_std / constraints.noise
 
         def noise(structure: Structure, values: Matrix) -> Vector:
             return noise_gain(plants, structure.response(values, plants.omega)) / gain
@@ -124,7 +123,7 @@ def _limit_of_u(name: str, limit: float, over: SetResponses) -> Extra:
         found = np.empty(values.shape[0])
         for i, row in enumerate(values):
             largest = 0.0
-            for _, u in over.of(structure, row):
+            for u in over.of(structure, row, "u"):
                 if name == "rate_max":
                     u = np.diff(u, prepend=0.0) / over.plants.dt
                 largest = max(largest, float(np.max(np.abs(u))))

@@ -36,7 +36,7 @@ def load_cost(structure: Structure, values: Matrix) -> Vector:
 
 def scores(objective: str, structure: Structure, values: Vector, over: SetResponses) -> Vector:
     """Return the objective of each plant (J,)."""
-    found = [each.y for each in over.of(structure, values)]
+    found = over.of(structure, values)
     if objective == "tracking":
         return np.array([np.sqrt(np.mean((over.inputs.r - y) ** 2)) for y in found])
     return np.array([over.plants.dt * np.sum(np.abs(y)) for y in found])

@@ -8,6 +8,8 @@ pulse response with the input. The pulse response ``D, C B, C A B, …`` is comp
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +22,7 @@ from quell.lti.system import System
 from quell.plants.sampled import SampledPlant
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.structures.base import Structure
-from quell.types import Vector
+from quell.types import DesignWarning, Vector
 
 # Controllers whose responses are kept: those of one difference quotient, and some more.
 _KEPT = 64
@@ -35,13 +37,6 @@ class Inputs(NamedTuple):
 
     r: Vector  # (k,) [y-unit]
     d: Vector  # (k,) [u-unit]
-
-
-class Responses(NamedTuple):
-    """The responses of a loop from rest."""
-
-    y: Vector  # (k,) [y-unit]
-    u: Vector  # (k,) [u-unit]
 
 
 def law_of(controller: Controller) -> LinearLaw:
@@ -82,45 +77,55 @@ def load_step(plants: PlantSet, size: float = 1.0, duration: float | None = None
 
 
 class SetResponses:
-    """The responses of all plants of a set, kept for the last controllers that were asked for."""
+    """The responses of plants of a set, kept for the last controllers that were asked for.
 
-    def __init__(self, plants: PlantSet, inputs: Inputs) -> None:
+    ``members`` are the numbers of these plants, all by default.
+    """
+
+    def __init__(
+        self, plants: PlantSet, inputs: Inputs, members: Sequence[int] | None = None
+    ) -> None:
         self.plants, self.inputs = plants, inputs
-        self._scaled = plants.scaled()
-        self._known: dict[tuple[int, bytes], list[Responses]] = {}
+        scaled = plants.scaled()
+        self._scaled = scaled if members is None else [scaled[i] for i in members]
+        self._known: dict[tuple[int, bytes, str], list[Vector]] = {}
 
-    def of(self, structure: Structure, values: Vector) -> list[Responses]:
-        """Return the responses with the controller of values (p,), one for each plant."""
-        key = id(structure), values.tobytes()
+    def of(self, structure: Structure, values: Vector, target: str = "y") -> list[Vector]:
+        """Return y or u with the controller of values (p,), one array (k,) for each plant."""
+        key = id(structure), values.tobytes(), target
         if key not in self._known:
             if len(self._known) >= _KEPT:
                 self._known.clear()
-            law = law_of(structure.controller(values))
-            self._known[key] = [responses(plant, law, self.inputs) for plant in self._scaled]
+            with warnings.catch_warnings():
+                # Of controllers on the way of a search; the result's own is made with warnings.
+                warnings.simplefilter("ignore", DesignWarning)
+                law = law_of(structure.controller(values))
+            self._known[key] = [response(p, law, self.inputs, target) for p in self._scaled]
         return self._known[key]
 
 
-def responses(plant: SampledPlant, law: LinearLaw, inputs: Inputs) -> Responses:
-    """Return y and u of a loop from rest; infinite for an unstable one that overflows."""
+def response(plant: SampledPlant, law: LinearLaw, inputs: Inputs, target: str = "y") -> Vector:
+    """Return y or u (k,) of a loop from rest; infinite for an unstable one that overflows."""
     size = inputs.r.size
-    found = []
-    for target in ("y", "u"):
-        total = np.zeros(size)
-        for source, given in (("r", inputs.r), ("d", inputs.d)):
-            if np.any(given):
-                pulse = _pulse(closed_loop(plant, law, source, target), size)
-                if not np.max(np.abs(pulse)) < _DIVERGED:
-                    return Responses(np.full(size, np.inf), np.full(size, np.inf))
-                total = total + _convolved(pulse, given)
-        found.append(total)
-    return Responses(*found)
+    total = np.zeros(size)
+    for source, given in (("r", inputs.r), ("d", inputs.d)):
+        if np.any(given):
+            pulse = _pulse(closed_loop(plant, law, source, target), size)
+            if not np.max(np.abs(pulse)) < _DIVERGED:
+                return np.full(size, np.inf)
+            total += _convolved(pulse, given)
+    return total
 
 
 def _convolved(one: Vector, other: Vector) -> Vector:
     """Return the first terms of the convolution of two vectors of the same length."""
+    found: Vector
+    if np.ptp(other) == 0.0:
+        found = other[0] * np.cumsum(one)
+        return found
     length = 1 << (2 * one.size - 1).bit_length()
     product = np.fft.rfft(one, length) * np.fft.rfft(other, length)
-    found: Vector = np.fft.irfft(product, length)[: one.size]
+    found = np.fft.irfft(product, length)[: one.size]
     return found
 
 

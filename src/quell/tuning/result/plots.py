@@ -14,7 +14,7 @@ from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.requirements import sizes
-from quell.tuning.optimiser.time_responses import Inputs, law_of, responses
+from quell.tuning.optimiser.time_responses import Inputs, law_of, response
 from quell.tuning.result.design import Design
 from quell.types import Vector
 
@@ -69,7 +69,7 @@ def draw(
                 sensitivity.loglog(omega, size, **look)
                 largest = max(largest, float(np.max(size)))
             for axis, inputs in ((step, Inputs(unit, none)), (load, Inputs(none, unit))):
-                y = responses(scaled[j], law, inputs).y
+                y = response(scaled[j], law, inputs)
                 axis.plot(t, y, **style)
                 last = max(last, float(t[_settled(y)]))
     for limit, style_of in ((constraints.m_s, "-"), (constraints.m_t, "--")):

@@ -17,6 +17,11 @@ def quantity(objective: str) -> str:
     return _UNITS.get(objective, objective)
 
 
+def second_quantity(objective: str) -> str:
+    """Return the name of the measure beside the objective."""
+    return "k_i" if objective == "load-iae" else "IAE"
+
+
 def relative(design: Design, other: Design, objective: str) -> float:
     """Return how many times as good ``design`` is as ``other``."""
     better, worse = design.objective, other.objective
@@ -35,7 +40,7 @@ def active_text(active: Active, plants: int) -> str:
 
 
 def rows(designs: Mapping[str, Design], objective: str) -> list[tuple[str, ...]]:
-    """Return rows: name, objective, IAE, M_s, M_t, M_ks, delay margin, a reason."""
+    """Return rows: name, objective, IAE (or k_i), M_s, M_t, M_ks, delay margin, a reason."""
     found: list[tuple[str, ...]] = []
     for design in designs.values():
         if design.controller is None:
@@ -44,9 +49,17 @@ def rows(designs: Mapping[str, Design], objective: str) -> list[tuple[str, ...]]
         m = design.measures
         numbers = (f"{m[kind]:.3f}" for kind in ("M_s", "M_t"))
         margin = duration(m["delay_margin"])
-        iae = f"{m['iae']:.3g}"
+        second = design.k_i if objective == "load-iae" else m["iae"]
         found.append(
-            (design.name, f"{design.objective:.4g}", iae, *numbers, f"{m['M_ks']:.4g}", margin, "")
+            (
+                design.name,
+                f"{design.objective:.4g}",
+                f"{second:.3g}",
+                *numbers,
+                f"{m['M_ks']:.4g}",
+                margin,
+                "",
+            )
         )
     return found
 

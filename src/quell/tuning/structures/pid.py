@@ -30,15 +30,19 @@ class FilteredPID:
     """``u = K (1 + 1/(T_i s) + T_d s) / F(s) · (r − y)``, with F of first or second order.
 
     A PI controller has ``F = 1 + T_f s`` or none, a PID controller ``F = 1 + T_f s + (T_f s)²/2``
-    (Åström & Hägglund, *Advanced PID Control*, ISA 2006, section 3.3).
+    (Åström & Hägglund, *Advanced PID Control*, ISA 2006, section 3.3). With ``ratio``, T_f is
+    ``T_d/ratio`` and no parameter.
     """
 
     gain_power = 1
     may_swing = False
 
-    def __init__(self, model: Model, *, derivative: bool, filtered: bool) -> None:
+    def __init__(
+        self, model: Model, *, derivative: bool, filtered: bool, ratio: float = 0.0
+    ) -> None:
         self.name = ("pid" if derivative else "pi") + ("" if filtered else "-unfiltered")
         self.model, self.derivative, self.filtered = model, derivative, filtered
+        self.ratio = ratio
         unit, dt = 1.0 / model.omega, model.dt
         times = (_TIMES[0] * unit, _TIMES[1] * unit)
         # The poles of F are at √2/T_f with a derivative, at 1/T_f without.
@@ -47,9 +51,13 @@ class FilteredPID:
         self.parameters = (
             Parameter("K", "u-unit/y-unit", 1e-8 * K, 1e8 * K),
             Parameter("T_i", "s", *times),
-            *([Parameter("T_d", "s", *times)] if derivative else []),
+            *([Parameter("T_d", "s", *self._derivative_times(times))] if derivative else []),
             *([Parameter("T_f", "s", self._shortest, max(10.0 * unit, 20.0 * dt))] * filtered),
         )
+
+    def _derivative_times(self, times: tuple[float, float]) -> tuple[float, float]:
+        low = max(times[0], self.ratio * self._shortest)
+        return low, max(times[1], 100.0 * low)
 
     def shapes(self) -> Matrix:
         """Return times around those of common rules, with slow to fast filters."""
@@ -59,7 +67,8 @@ class FilteredPID:
                 for tf in (0.02, 0.1, 0.4) if self.filtered else (0.0,):
                     Tf = max(tf * unit * min(Ti, 2.0), 1.05 * self._shortest)
                     row = [1.0, Ti * unit]
-                    row += [ratio * Ti * unit] if self.derivative else []
+                    T_d = max(ratio * Ti * unit, 1.05 * self.ratio * self._shortest)
+                    row += [T_d] if self.derivative else []
                     rows.append(row + ([Tf] if self.filtered else []))
         if self.derivative and self.filtered:
             # A filter below an undamped resonance lags there by more than the derivative leads.
@@ -88,6 +97,9 @@ class FilteredPID:
             kd = K * values[:, 2]
         if self.filtered and self.derivative:
             f1, f2 = values[:, 3], 0.5 * values[:, 3] ** 2
+        elif self.derivative and self.ratio:
+            f1 = values[:, 2] / self.ratio
+            f2 = 0.5 * f1**2
         elif self.filtered:
             f1 = values[:, 2]
         return K, K / Ti, kd, f1, f2
@@ -127,7 +139,7 @@ class FilteredPID:
         arguments: dict[str, Any] = {"kp": sign * kp, "ki": sign * ki}
         if self.derivative:
             arguments["kd"] = sign * kd
-        if self.filtered:
+        if self.filtered or self.ratio:
             arguments["tf"] = (f1, f2)
         return arguments
 
