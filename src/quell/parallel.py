@@ -43,7 +43,7 @@ def in_parallel(
 
 
 def part_of(
-    progress: Callable[[float], None] | None, first: int, last: int, total: int
+    progress: Callable[[float], None] | None, first: float, last: float, total: float
 ) -> Callable[[float], None] | None:
     """Return a callback for the share done of the part from ``first`` to ``last`` of ``total``."""
     if progress is None:
