@@ -293,11 +293,9 @@ def _row(plant: Any, delay: float) -> dict[str, str]:
     integrators = int(np.argmax(den[::-1] != 0.0))
     gain = f"{num[-1] / den[den.size - 1 - integrators]:.4g}"
     of = {0: "", 1: " of s G", 2: " of s² G"}.get(integrators, f" of s^{integrators} G")
-    return {
-        "poles": format_roots(np.roots(den).astype(np.complex128)),
-        "gain": gain + of,
-        "delay": f"{delay:.3g}",
-    }
+    poles = format_roots(np.roots(den).astype(np.complex128))
+    cells = {"poles": poles, "gain": gain + of, "delay": f"{delay:.3g}"}
+    return {key: text.replace("-", "−") for key, text in cells.items()}
 
 
 def _curves(found: RecordModel, wide: int) -> dict[str, Any]:
