@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import threading
 import time
@@ -9,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 
 from quell.studio.frames import parsed
@@ -51,6 +53,18 @@ def running(tables: Any = None, port: int = 0, token: str | None = None) -> Iter
         studio.close()
 
 
+def step_test(samples: int = 400, noise: float = 0.005) -> bytes:
+    """Return a CSV file of a heater's step test: a lag of 2 s, a gain of 1.5, dt = 0.1 s."""
+    random = np.random.default_rng(0)
+    u = np.where(np.arange(samples) % 150 < 30, 0.0, 1.0)
+    y = np.zeros(samples)
+    for k in range(samples - 1):
+        y[k + 1] = np.exp(-0.05) * y[k] + 1.5 * (1.0 - np.exp(-0.05)) * u[k]
+    y += noise * random.standard_normal(samples)
+    rows = [f"{0.1 * k:.1f},{u[k]:g},{y[k]:.5f}" for k in range(samples)]
+    return "\n".join(["t,u,y", *rows]).encode()
+
+
 class Client:
     """A page without a browser."""
 
@@ -79,13 +93,23 @@ class Client:
 
     def ask(self, last: str, **message: Any) -> dict[str, Any]:
         """Send a message; return its frames by kind, up to the one of the kind ``last``."""
-        number = self.send(**message)
+        return self.answer(last, self.send(**message))
+
+    def answer(self, last: str, number: int) -> dict[str, Any]:
+        """Return the frames that answer a message by kind, up to the one of the kind ``last``."""
         found: dict[str, Any] = {}
         while last not in found and "error" not in found:
             header, arrays, content = self.next()
             if header.get("id") == number:
                 found[header["kind"]] = header, arrays, content
         return found
+
+    def send_record(self, content: bytes, **message: Any) -> int:
+        """Send the file of a record in two parts, and the message about it; return its id."""
+        half = len(content) // 2
+        for at, part in ((0, content[:half]), (half, content[half:])):
+            self.send(do="part", at=at, data=base64.b64encode(part).decode())
+        return self.send(do="record", **{"name": "step.csv", "size": len(content), **message})
 
     def close(self) -> None:
         """Leave."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -549,3 +550,19 @@ def test_blas_has_one_thread_until_the_last_of_several_blocks_ends() -> None:
         assert threads() == {1}
         second.__exit__(None, None, None)
         assert threads() == {2}
+
+
+def test_blas_has_one_thread_in_any_thread_whichever_had_a_block_before() -> None:
+    """Threadpoolctl would let only the first of them set it."""
+
+    def threads() -> set[int]:
+        with one_blas_thread():
+            return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
+
+    before = threadpool_info()
+    assert threads() == {1}
+    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as other:
+        assert one.submit(threads).result() == {1}
+        assert other.submit(threads).result() == {1}
+        assert threads() == {1}
+    assert threadpool_info() == before

@@ -53,7 +53,6 @@ ROWS = (
         "cli.options",
         "cli.exit_codes",
         "cli.output",
-        "cli.records",
         "cli.confirm",
         "cli.report",
         "cli.sweep_report",

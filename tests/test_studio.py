@@ -24,6 +24,7 @@ from quell.setup.vary import changed
 from quell.studio import messages
 from quell.studio.designs import varied
 from quell.studio.frames import Columns, frame, parsed
+from quell.studio.records import PageRecord
 from quell.studio.runs import Maker, loop_of
 from quell.studio.tasks import frames_for
 from quell.studio.texts import python_of, toml_of
@@ -230,7 +231,8 @@ def test_the_script_analyses_what_the_page_does(tmp_path: Path) -> None:
         tables = TABLES | each
         granted, make = messages.Granted(messages.files_of(tables), trust=True), Maker(trust=True)
         message = {"id": 1, "do": "toml", "setup": tables}
-        (answer,) = frames_for(message, make, granted, lambda: False, lambda part, share: None)
+        how = PageRecord(), lambda: False, lambda part, share: None
+        (answer,) = frames_for(message, make, granted, *how)
         script, setup = parsed(answer)[0]["python"], make(tables)
         (line,) = (line for line in script.splitlines() if "analyse(" in line)
         found = eval(line.removeprefix("print(").removesuffix(")"), {"ql": ql, "setup": setup})

@@ -15,8 +15,9 @@ import pytest
 from quell.realtime import LiveSink
 from quell.realtime.telemetry.channels import LOOP_WIDTH, K, R, U, Y, row_channels
 from quell.realtime.telemetry.header import Header
+from quell.studio.texts import toml_of
 
-from .studio_server import TABLES, Client, running
+from .studio_server import TABLES, Client, running, step_test
 
 CHROMIUM = Path("/usr/bin/chromium")
 OPTIONS = [
@@ -216,3 +217,52 @@ def test_all_controls_have_names_and_the_page_fits_a_phone(page: Any) -> None:
     assert nameless == []
     page.set_viewport_size({"width": 375, "height": 812})
     wait_for(lambda: page.evaluate("document.documentElement.scrollWidth <= 375"))
+
+
+def drop(page: Any, *files: tuple[str, bytes]) -> None:
+    """Drop files on the page."""
+    transfer = page.evaluate_handle(
+        "(files) => { const d = new DataTransfer(); files.forEach(([name, text]) =>"
+        " d.items.add(new File([text], name))); return d; }",
+        [[name, content.decode()] for name, content in files],
+    )
+    page.dispatch_event("body", "drop", {"dataTransfer": transfer})
+
+
+def test_a_record_that_is_opened_is_shown_and_tuned_for(page: Any) -> None:
+    """Plots, report and set of plants; the form has the model; a dropped one replaces it."""
+    page.click("#record-box summary")
+    page.fill("#record-order", "2")
+    page.fill("#record-max_delay", "0.3")
+    page.set_input_files(
+        "#record-file", {"name": "heater.csv", "mimeType": "text/csv", "buffer": step_test()}
+    )
+    wait_for(lambda: page.is_visible("#record"))
+    assert page.inner_text("#record-name").startswith("heater.csv: 400 samples, dt = 0.1 s")
+    assert "gain 1.499" in page.text_content("#record-report")
+    count = page.locator("#record-plants tr").count()
+    assert page.text_content("#record-count") == f"Set of plants: {count}"
+    assert page.locator("#plot-record-y canvas").count() == 1
+    wait_for(lambda: page.input_value('input[type=number][data-path="dt"]') == "0.1")
+    wait_for(lambda: not page.is_disabled("#record-go"))
+    page.click("#tune-box summary")
+    page.select_option("#tune-structure", "pi")
+    page.click("#tune")
+    wait_for(lambda: f"for the {count} plants of the record" in page.inner_text("#tune-result"))
+    wait_for(lambda: not page.is_disabled("#tune"))
+    drop(page, ("other.txt", step_test(300)))
+    wait_for(lambda: page.inner_text("#record-name").startswith("other.txt: 300 samples"))
+    wait_for(lambda: not page.is_disabled("#record-close"))
+    page.click("#record-close")
+    assert page.is_hidden("#record")
+
+
+def test_a_file_that_is_dropped_is_read_or_refused(page: Any) -> None:
+    """A setup is opened; a table without the columns names the field; two files are too many."""
+    drop(page, ("a.csv", b"x"), ("b.csv", b"x"))
+    assert "Drop one file" in page.inner_text("#record-state")
+    drop(page, ("table.csv", b"time,power,heat\n" + b"0.1,1,2\n" * 20))
+    wait_for(lambda: "the field Columns" in page.inner_text("#record-state"))
+    assert page.is_hidden("#record")
+    drop(page, ("setup.toml", toml_of(TABLES | {"dt": 0.004}).encode()))
+    wait_for(lambda: page.input_value('input[type=number][data-path="dt"]') == "0.004")

@@ -43,7 +43,7 @@ def in_parallel(
 
 
 def part_of(
-    progress: Callable[[float], None] | None, first: int, last: int, total: int
+    progress: Callable[[float], None] | None, first: float, last: float, total: float
 ) -> Callable[[float], None] | None:
     """Return a callback for the share done of the part from ``first`` to ``last`` of ``total``."""
     if progress is None:
@@ -61,14 +61,28 @@ def one_blas_thread() -> Iterator[None]:
     """
     # The setting holds for the whole process: the first block makes it, the last one restores it.
     with _BLAS_LOCK:
-        _BLAS_LIMITS.append(None if _BLAS_LIMITS else _blas().limit(limits=1, user_api="blas"))
+        first = not _BLAS_LIMITS
+        _BLAS_LIMITS.append(_controlled().limit(limits=1, user_api="blas") if first else None)
     try:
         yield
     finally:
         with _BLAS_LOCK:
-            first = _BLAS_LIMITS.pop()
-            if first is not None:
-                first.restore_original_limits()
+            limit = _BLAS_LIMITS.pop()
+            if limit is not None:
+                _controlled()
+                limit.restore_original_limits()
+
+
+def _controlled() -> Any:
+    """Return the controller of the BLAS libraries, which the present thread may set from now on.
+
+    threadpoolctl 3.8 lets only the thread that was the first to set OpenBLAS do it again, and
+    ignores all others without a word. Here the lock, held by the caller, keeps them apart.
+    """
+    for library in _blas().lib_controllers:
+        if hasattr(library, "clear_controlling_thread"):
+            library.clear_controlling_thread(force=True)
+    return _blas()
 
 
 @cache

@@ -1,5 +1,7 @@
 """From a rig to a tuned controller: an experiment within limits, and a verifying step.
 
+``records`` reads input and output from files of any kind, recordings and saved runs included.
+
 May import ``realtime``, ``tuning``, ``identification`` and what they import.
 """
 

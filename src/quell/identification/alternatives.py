@@ -37,6 +37,7 @@ from quell.identification.identify import Options, identified
 from quell.identification.result import Identified
 from quell.identification.search.output_error import likelihood_ratio
 from quell.identification.search.search import Known
+from quell.parallel import part_of
 
 # Blocks: each should be longer than the correlation of the errors, and there should be enough of
 # them for their variance. Chosen by hand.
@@ -131,6 +132,7 @@ def alternatives(
     *,
     integrators: int | None = None,
     friction: bool | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> tuple[Alternative, ...]:
     """Fit other structures to the record of a model, and compare them with it.
 
@@ -150,6 +152,8 @@ def alternatives(
     integrators, friction
         what all alternatives have: number of poles at s = 0, and whether there is friction; by
         default both are open.
+    progress
+        gets the share of the structures that are fitted; an exception in it ends the work.
     """
     order, zeros, rubs = found.den.size - 1, found.num.size - 1, found.friction is not None
     direct = zeros == order
@@ -180,7 +184,7 @@ def alternatives(
         found.horizon,
     )
     records, models = Records(found.u, found.y, found.samples), []
-    for name, smaller, change in tried:
+    for i, (name, smaller, change) in enumerate(tried):
         options = same._replace(**change)
         options = options._replace(rest=_rest(found, smaller, options.friction))
         known = _known(found) if options.order == order - 1 and not options.friction else None
@@ -193,6 +197,7 @@ def alternatives(
                 None,
                 found.signals,
                 known,
+                part_of(progress, i, i + 1, len(tried)),
             )
         except ValueError:  # too short a record for it, or no such model
             continue
@@ -247,9 +252,9 @@ def not_told_apart(
     """
     kept: list[Identified] = []
     for step in range(_MOST_ORDER):
-        if progress is not None:
-            progress(step / (step + 2.0))
-        others = alternatives(found, delay, **given)
+        # The share that is done after each step: a half, two thirds, three quarters, …
+        first, last = (k / (k + 1.0) for k in (step, step + 1))
+        others = alternatives(found, delay, progress=part_of(progress, first, last, 1.0), **given)
         better = [one for one in others if one.verdict == "better" and one.model.converged]
         doubtful = bool(found.faults) or not found.converged
         smaller = [

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +42,8 @@ _METHODS = (
 )
 # Number of lags in the tests of the error, fewer for short records: chosen by hand.
 _LAGS = 50
+# Parts of a search after which half of the work counts as done: those of a search for the delay.
+_HALF = 30.0
 # Least number of samples for each parameter: chosen by hand; real records have many more.
 _SAMPLES_PER_PARAMETER = 10
 
@@ -61,6 +65,7 @@ def identify(
     reference: Any = None,
     validation: tuple[Any, Any] | None = None,
     signals: Signals = UNKNOWN,
+    progress: Callable[[float], None] | None = None,
 ) -> Identified:
     """Fit a continuous transfer function to recorded input and output.
 
@@ -119,6 +124,10 @@ def identify(
         the tests of the error are those of this record.
     signals
         names and units of u and y, as a run has them (``run.signals``): for the plot and the plant.
+    progress
+        called between parts of the search with a share of the work that is done. How much work
+        there is is not known before: the share rises and stays below 1. An exception in it ends
+        the search.
 
     Raises
     ------
@@ -146,7 +155,8 @@ def identify(
     ([3.0], [1.0, 2.0])
     """
     options = Options(order, zeros, integrators, delay, bias, friction, rest, held_out, horizon)
-    return identified(given_records(u, y), dt, options, reference, validation, signals)
+    records = given_records(u, y)
+    return identified(records, dt, options, reference, validation, signals, progress=progress)
 
 
 class Options(NamedTuple):
@@ -171,6 +181,7 @@ def identified(
     validation: tuple[Any, Any] | None,
     signals: Signals,
     known: Known | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Identified:
     """Return the result of ``identify``; the search begins at a model that is ``known``, if any."""
     u, y = records.u, records.y
@@ -219,6 +230,7 @@ def identified(
         rest=rest,
         resolution=resolution_of(y),
         known=known,
+        report=_counted(progress),
     )
     # An unstable trial of the search may overflow; its cost is then infinite.
     with one_blas_thread(), np.errstate(all="ignore"):
@@ -368,3 +380,15 @@ def _numerator(structure: Structure, theta: Vector, covariance: Matrix) -> tuple
     slope[free + structure.integrators : size, :free] = direct * np.eye(free)
     slope[free:size, at], slope[size, at] = a, 1.0
     return np.append(b + direct * a, direct), slope @ covariance @ slope.T
+
+
+def _counted(progress: Callable[[float], None] | None) -> Callable[[], None]:
+    """Return a function that calls ``progress`` with a share that rises at each call."""
+    numbers = count()
+
+    def report() -> None:
+        if progress is not None:
+            done = next(numbers)
+            progress(done / (done + _HALF))
+
+    return report

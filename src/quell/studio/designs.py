@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,17 @@ from quell.setup.loading import Setup
 from quell.simulation import simulate
 from quell.studio.frames import Columns, frame
 from quell.studio.messages import columns, number
-from quell.studio.runs import Maker, StoppedError, linear_of, run_frames, watched
+from quell.studio.records import PageRecord
+from quell.studio.runs import (
+    Maker,
+    Report,
+    Stale,
+    StoppedError,
+    run_frames,
+    stoppable,
+    watched,
+)
 from quell.tuning import Constraints, tune
-
-Stale = Callable[[], bool]
-Report = Callable[[str, float], None]
 
 # Structures that a page may ask for, and the bounds of M_s in the trade-off. Chosen by hand.
 STRUCTURES = ("freed", "bandwidths", "model-based", "pid", "pi")
@@ -36,19 +42,12 @@ _EXACT = (
 )
 
 
-def stoppable(report: Report, stale: Stale) -> Report:
-    """Return a report of progress that ends the work when nobody waits for it."""
-
-    def progress(part: str, share: float) -> None:
-        if stale():
-            raise StoppedError
-        report(part, share)
-
-    return progress
-
-
 def tuned_frames(
-    setup: Setup, message: Mapping[str, Any], stale: Stale, report: Report
+    setup: Setup,
+    record: PageRecord,
+    message: Mapping[str, Any],
+    stale: Stale,
+    report: Report,
 ) -> Iterator[bytes]:
     """Yield the tuned controller's tables, and then the trade-off between M_s and load rejection.
 
@@ -57,7 +56,7 @@ def tuned_frames(
     structure = checks.one_of("structure", message.get("structure", "freed"), STRUCTURES)
     bounds = _bounds(message)
     dt = float(setup.controller.dt)
-    plant, delay = linear_of(setup)
+    plant, delay = record.plants(setup, message)
     options: dict[str, Any] = {"structure": structure, "delay": delay, "compare": ()}
     options["progress"] = stoppable(report, stale)
     limits = _limits(setup)
@@ -80,6 +79,7 @@ def tuned_frames(
             "k_i": design.k_i,
             "active": list(best.active),
             "constraints": str(best.constraints),
+            "plants": len(best.plants.plants),
         }
     )
     for at in sorted({*_TRADEOFF, bounds.m_s or _TRADEOFF[0]}):
@@ -93,7 +93,11 @@ def tuned_frames(
 
 
 def compared_frames(
-    setup: Setup, message: Mapping[str, Any], stale: Stale, report: Report
+    setup: Setup,
+    record: PageRecord,
+    message: Mapping[str, Any],
+    stale: Stale,
+    report: Report,
 ) -> Iterator[bytes]:
     """Yield runs and loops of PID and LQG controllers that were tuned for the same plant.
 
@@ -101,7 +105,7 @@ def compared_frames(
     """
     bounds = _bounds(message)
     wide, dt = columns(message), float(setup.controller.dt)
-    plant, delay = linear_of(setup)
+    plant, delay = record.plants(setup, message)
     entries, _ = tuned_references(
         plant,
         dt,

@@ -30,7 +30,7 @@ _FROM_FILES = {"fmu": ("path",), "identified": ("path",), "python": ("source", "
 FILE_KINDS = tuple(_FROM_FILES)
 """Kinds of plants that are files, some of them programs."""
 
-TASKS = ("run", "band", "compare", "tune", "export", "toml", "open", "cancel")
+TASKS = ("run", "band", "compare", "tune", "export", "toml", "open", "part", "record", "cancel")
 
 
 class Granted(NamedTuple):

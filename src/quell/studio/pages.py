@@ -15,6 +15,7 @@ from quell.kernels.compile_time import compile_time
 from quell.studio import messages
 from quell.studio.frames import frame
 from quell.studio.lanes import Lane
+from quell.studio.records import PageRecord
 from quell.studio.runs import Maker, StoppedError
 from quell.studio.tasks import LONG, frames_for
 
@@ -56,7 +57,7 @@ class Page:
     def __init__(self, websocket: Any, workers: Workers, granted: messages.Granted) -> None:
         self._websocket, self._workers = websocket, workers
         self._lanes = {"short": Lane(), "long": Lane()}
-        self._granted = granted
+        self._granted, self._record = granted, PageRecord()
         self._makers = {name: Maker(trust=granted.trust) for name in self._lanes}
         self._sending = asyncio.Lock()
 
@@ -80,6 +81,11 @@ class Page:
         """Put a message where a thread takes it; answer a malformed one with its error."""
         try:
             message = messages.parsed(text)
+            if message["do"] == "part":
+                self._record.take_part(message)
+                return
+            if message["do"] == "record":
+                message["content"] = self._record.content(message.get("size"))
         except ValueError as error:
             await self._send(_problem(error, messages.identity(text)))
             return
@@ -95,7 +101,8 @@ class Page:
             message = await lane.next()
             report = self._reporter(message["id"])
             make = self._makers[name]
-            found = frames_for(message, make, self._granted, lane.stale, report)
+            about = self._granted, self._record, lane.stale, report
+            found = frames_for(message, make, *about)
             try:
                 await self._send_all(found, name, message["id"])
             except StoppedError:

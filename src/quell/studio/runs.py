@@ -33,8 +33,23 @@ _CHANNELS = ("r", "y", "u", "f_hat", "f_learned", "authority")
 _MARGIN_FREQUENCIES = 400  # of the Bode diagram, chosen by hand: a point for each second pixel
 
 
+Stale = Callable[[], bool]
+Report = Callable[[str, float], None]
+
+
 class StoppedError(Exception):
     """The run was stopped: a newer message came, or the page is gone."""
+
+
+def stoppable(report: Report, stale: Stale) -> Report:
+    """Return a report of progress that ends the work when nobody waits for it."""
+
+    def progress(part: str, share: float) -> None:
+        if stale():
+            raise StoppedError
+        report(part, share)
+
+    return progress
 
 
 _CATCHING = threading.Lock()  # Python's filters of warnings belong to all threads

@@ -9,10 +9,11 @@ from quell.studio.designs import band_frames, compared_frames, tuned_frames
 from quell.studio.downloads import exported
 from quell.studio.frames import file_frame, frame
 from quell.studio.messages import Granted, columns, setup_tables
+from quell.studio.records import PageRecord, record_frames
 from quell.studio.runs import Maker, delay_beside, run_frames
 from quell.studio.texts import python_of, tables_of_text, toml_of
 
-LONG = ("compare", "tune", "export")
+LONG = ("compare", "tune", "export", "record")
 """Tasks that take seconds: they have a thread of their own, so that sliders go on moving."""
 
 
@@ -20,6 +21,7 @@ def frames_for(
     message: Mapping[str, Any],
     make: Maker,
     granted: Granted,
+    record: PageRecord,
     stale: Callable[[], bool],
     report: Callable[[str, float], None],
 ) -> Iterator[bytes]:
@@ -38,6 +40,9 @@ def frames_for(
         make(tables)
         yield frame({"kind": "opened", "setup": tables, **about})
         return
+    if task == "record":
+        yield from record_frames(record, message, stale, report)
+        return
     tables = setup_tables(message, granted)
     setup = make(tables)
     if task == "run":
@@ -46,7 +51,7 @@ def frames_for(
         yield from band_frames(setup, tables, message, stale)
     elif task in ("compare", "tune"):
         work = compared_frames if task == "compare" else tuned_frames
-        yield from work(setup, message, stale, report)
+        yield from work(setup, record, message, stale, report)
         yield frame({"kind": "done", **about})
     elif task == "export":
         name, content = exported(setup, message)

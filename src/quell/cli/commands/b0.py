@@ -8,7 +8,6 @@ from typing import Any
 
 from quell.cli.options import READ_OPTIONS, Overwrite, ReadOptions, Trust, WholeOrNone
 from quell.cli.output import Console, print_line
-from quell.cli.records import measured
 
 
 def b0(
@@ -49,6 +48,7 @@ def b0(
     json
         Write the results to this file, for programs.
     """
+    from quell.commissioning.records import measured
     from quell.files import check_writable, write_json
     from quell.identification import identify_b0
 

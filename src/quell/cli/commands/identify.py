@@ -15,7 +15,6 @@ from quell.cli.options import (
     Whole,
 )
 from quell.cli.output import Console, check_outputs, print_line, table, write_results
-from quell.cli.records import measured_records
 
 if TYPE_CHECKING:
     from quell.identification import Alternative, Identified, Root
@@ -58,6 +57,7 @@ def identify(
     alternatives
         Fit other orders, with and without friction, and say what the record decides.
     """
+    from quell.commissioning.records import measured_records
     from quell.identification import alternatives as other_structures
     from quell.identification import identify
 

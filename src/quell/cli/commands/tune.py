@@ -32,14 +32,11 @@ from quell.cli.options import (
     WholeOrNone,
 )
 from quell.cli.output import Console, check_outputs, print_line, progress_bar, table, write_results
-from quell.cli.records import is_record
 
 if TYPE_CHECKING:
     from quell.commissioning import Verification
     from quell.tuning import Tuned
 
-# Poles of a record's model at first: a flexible axis has four.
-_MODEL_ORDER = 4
 _BOUNDS = ("m_s", "m_t", "m_ks", "noise_std", "resolution")
 _HEADINGS = ("M_s", "M_t", "M_ks", "delay\nmargin")
 
@@ -120,6 +117,7 @@ def tune(
         Poles of a record's model at first, 4 by default; fewer, more, or friction, where the record
         shows it.
     """
+    from quell.commissioning.records import is_record
     from quell.files import check_writable
 
     named: dict[str, Any] = {
@@ -153,7 +151,7 @@ def tune(
     limits = {"u_min": rig.u_min, "u_max": rig.u_max}
     options |= {key: value for key, value in limits.items() if value is not None}
     place: Rig | None = None
-    asked = Asked(dt, read, of_model, _MODEL_ORDER if model_order is None else model_order)
+    asked = Asked(dt, read, of_model, model_order)
     if rig.device is not None:
         place = rig_at(rig, dt, trust)
         shown = from_rig(console, place, float(dt or 0.0), asked, save_record, outputs.overwrite)

@@ -13,13 +13,13 @@ from cyclopts import Parameter
 from quell.cli.confirm import confirm
 from quell.cli.options import ModelOptions, ReadOptions, Switch
 from quell.cli.output import Console, print_line, progress_bar
-from quell.cli.records import measured
 
 if TYPE_CHECKING:
     from quell.commissioning import Limits, Verification
     from quell.identification import Identified, Measured
     from quell.realtime.devices.base import Device
     from quell.tuning import Tuned
+    from quell.tuning.record_model import RecordModel
 
 # The verifying step's length in units of 1/(frequency of the phase margin), chosen by hand.
 _STEP_LENGTH = 60.0
@@ -33,7 +33,7 @@ class Asked(NamedTuple):
     dt: float | None
     read: ReadOptions
     model: ModelOptions
-    order: int
+    order: int | None
 
 
 @Parameter(name="*")
@@ -77,62 +77,36 @@ class RigOptions:
 RIG_OPTIONS = RigOptions()
 
 
-def identified(
-    console: Console, record: Measured, asked: Asked
-) -> tuple[Identified, list[Any], list[float]]:
-    """Identify a record; print the model, return it and the plants for tuning with their delays.
+def identified(console: Console, record: Measured, asked: Asked) -> RecordModel:
+    """Identify a record; print the model, and return it with the plants for tuning.
 
     Raises ``ValueError`` for a model with faults that no controller should be tuned for, and for
     what the record does not decide.
     """
-    from quell.identification import identify, not_told_apart
-    from quell.tuning.identified import identified_plants
+    from quell.tuning.record_model import record_model
 
-    options = asked.model
-    delay = None if options.max_delay is None else (0.0, options.max_delay)
+    options = vars(asked.model) | ({} if asked.order is None else {"order": asked.order})
     with progress_bar(console, "identifying") as report:
-        first = identify(
-            record.u,
-            record.y,
-            record.dt,
-            asked.order,
-            options.zeros,
-            delay=delay,
-            integrators=options.integrators,
-            friction=bool(options.friction),
-            rest=options.rest,
-            held_out=options.held_out,
-            signals=record.signals,
-        )
-        model, *others = not_told_apart(
-            first,
-            delay,
-            integrators=options.integrators,
-            friction=options.friction,
-            progress=partial(report, "identifying: other orders, and friction"),
-        )
-    print_line(console, model.describe())
-    if model.held_from == model.y.size and options.held_out is None:
-        print_line(console, "nothing is held out: u does not move at the end of the record")
-    for other in others:
-        print_line(console, f"the record does not tell it from {other!r}, which is tuned for, too")
-    reasons = [*model.faults, *model.undecided]
-    if reasons:
-        raise ValueError(
-            f"record: no plant to tune for: {'; '.join(reasons)}; or give --model-order"
-        )
-    return model, *identified_plants(model, others)
+        progress = partial(report, "identifying")
+        found = record_model(record, **options, progress=progress)
+    print_line(console, "\n".join(found.lines))
+    if found.refusal:
+        raise ValueError(f"record: no plant to tune for: {found.refusal}; or give --model-order")
+    return found
 
 
 def from_record(
     console: Console, path: Path, asked: Asked
 ) -> tuple[list[Any], float, dict[str, Any], Identified]:
     """Return the plants that a record shows, its sample time, options of ``tune``, the model."""
+    from quell.commissioning.records import measured
+
     read = asked.read
     record = measured(path, read.columns, asked.dt, read.time_unit, read.max_size)
     print_line(console, f"{path.name}: {record.y.size} samples, dt = {record.dt:g} s")
-    model, plants, delays = identified(console, record, asked)
-    return plants, record.dt, {"delay": delays}, model
+    found = identified(console, record, asked)
+    plants, delays = found.plants
+    return plants, record.dt, {"delay": delays}, found.model
 
 
 @dataclass(frozen=True)
@@ -200,7 +174,8 @@ def from_rig(
         with written_atomically(record, overwrite) as part:
             np.savetxt(part, table, delimiter=",", header="t,u,y", comments="", fmt="%.10g")
         print_line(console, f"Record: {record}")
-    model, plants, delays = identified(console, done.measured, asked)
+    found = identified(console, done.measured, asked)
+    (plants, delays), model = found.plants, found.model
     last = float(done.runs[-1].record["y"][-1])
     y_now = last if model.integrators else done.y_rest
     return plants, dt, {"delay": delays}, model, y_now

@@ -108,7 +108,7 @@ def tuned(
     *,
     order: int | None = None,
     limits: Mapping[str, Any] | None = None,
-    delay: float = 0.0,
+    delay: Any = 0.0,
     progress: Progress | None = None,
 ) -> tuple[dict[str, Entry], Constraints]:
     """Tune structures for a linear plant; return them by name, and the constraints.
@@ -116,7 +116,7 @@ def tuned(
     Parameters
     ----------
     plant, delay
-        as for ``analyse``.
+        as for ``quell.tune``: also a list of plants, the nominal one first, and their delays [s].
     dt
         sample time [s].
     names
@@ -149,7 +149,7 @@ def tuned(
             design = designs[structure]
             made = design.controller
             if made is not None:
-                made = shaped(given.linear[0], made, delay)
+                made = shaped(given.linear[0], made, float(given.delays[0]))
             entries[name] = Entry(structure, made, design.values, design.reason)
     return entries, task.constraints
 

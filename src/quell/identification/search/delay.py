@@ -48,11 +48,18 @@ def with_delay(structure: Structure, v: Matrix, u: Vector, delay: int) -> Matrix
 
 
 def start_with_delay(
-    structure: Structure, u: Vector, v: Matrix, y: Vector, delays: tuple[int, int], grows: bool
+    structure: Structure,
+    u: Vector,
+    v: Matrix,
+    y: Vector,
+    delays: tuple[int, int],
+    grows: bool,
+    report: Callable[[], None],
 ) -> tuple[tuple[int, int], int, Start]:
     """Return the range that was searched, the delay of least output error, and the model at it.
 
-    ``delays`` is the range at first; it is extended if it ``grows``.
+    ``delays`` is the range at first; it is extended if it ``grows``. ``report`` is called between
+    the parts of the search.
     """
     if delays[0] == delays[1]:
         return delays, delays[0], best_start(structure, with_delay(structure, v, u, delays[0]), y)
@@ -60,11 +67,13 @@ def start_with_delay(
     single, of_part = from_any_start(structure, v[part])
 
     def costs(delays: range) -> dict[int, float]:
+        report()
         return _costs(single, u[part], of_part, y[part], delays)
 
     low, (high, stride, found) = delays[0], _scanned(costs, delays, longest(structure, y, grows))
     near = []
     for delay in dict.fromkeys([*_minima(found, stride), low]):
+        report()
         start = best_start(structure, with_delay(structure, v, u, delay), y)
         found_near = nearest_delay(structure, start.estimate, u, v, y, (low, high), delay, stride)
         near.append((found_near[0], start._replace(estimate=found_near[1])))
@@ -78,10 +87,11 @@ def from_poles(
     v: Matrix,
     y: Vector,
     delays: tuple[int, int],
+    report: Callable[[], None],
 ) -> tuple[int, ParameterEstimate]:
     """Return the delay of least output error in a range, and the model at it, from given poles.
 
-    ``poles`` are the coefficients a (n,) of polynomials.
+    ``poles`` are the coefficients a (n,) of polynomials. ``report`` is called at each delay.
     """
     stride = -(-(delays[1] - delays[0] + 1) // _SCANNED)
     starts = [with_poles(structure, a) for a in poles]
@@ -89,6 +99,7 @@ def from_poles(
     known: dict[int, ParameterEstimate] = {}
     before: list[Vector] = []
     for delay in range(delays[0], delays[1] + 1, stride):
+        report()
         inputs = with_delay(structure, v, u, delay)
         tried = [descend(structure, one, inputs, y, _FEW_STEPS) for one in (*starts, *before)]
         known[delay] = min(tried, key=lambda one: one.cost)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -124,6 +125,7 @@ class Wanted(NamedTuple):
     rest: bool | None  # None: if the record needs it, and does not contradict
     resolution: float  # step that y is rounded to, 0.0 if it is not rounded
     known: Known | None  # a larger model, from which the search begins
+    report: Callable[[], None]  # called between parts of the search; may end it by an exception
 
 
 def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
@@ -204,12 +206,15 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
     if friction:
         v[:, -1] = measured_sign(structure, y)
     if known is None:
-        searched, delay, start = start_with_delay(structure, u, v, y, delays, wanted.grows)
+        searched, delay, start = start_with_delay(
+            structure, u, v, y, delays, wanted.grows, wanted.report
+        )
     else:
         searched, delay, start = _from_known(structure, known, u, v, y, wanted)
     if not np.isfinite(start.estimate.cost):
         none = "no model was found whose output is finite; lower the order, or scale u and y"
         raise ValueError(f"order = {wanted.order}, zeros = {wanted.zeros}: {none}")
+    wanted.report()
     v = with_delay(structure, v, u, delay)
     estimate = refine(structure, start.estimate.theta, v, y, _STEPS)
     if wanted.integrators is None:
@@ -251,9 +256,9 @@ def _from_known(
     if not wanted.grows:
         searched = wanted.delays
     poles = [known.a] if known.a.size == structure.order else _without_one(known.a)
-    delay, estimate = from_poles(structure, poles, u, v, y, searched)
+    delay, estimate = from_poles(structure, poles, u, v, y, searched, wanted.report)
     if wanted.grows and delay == searched[1] < longest(structure, y, True):
-        return start_with_delay(structure, u, v, y, searched, True)
+        return start_with_delay(structure, u, v, y, searched, True, wanted.report)
     if known.a.size == structure.order:
         return searched, delay, Start(estimate, math.isfinite(estimate.cost))
     start = best_start(structure, with_delay(structure, v, u, delay), y)

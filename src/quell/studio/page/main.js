@@ -7,6 +7,7 @@ import { Designs } from "./panels/design.js";
 import { download, Files } from "./panels/files.js";
 import { Forms } from "./panels/forms.js";
 import { boundFields, usual } from "./panels/numbers.js";
+import { MachineRecord } from "./panels/record.js";
 import { Pins } from "./panels/pins.js";
 import { tabs } from "./panels/tabs.js";
 import { Tours } from "./panels/tours.js";
@@ -32,6 +33,7 @@ const forms = new Forms(home("forms"), (path, value, structure, source) => {
 const server = new Connection(onFrame, (text) => {
   home("state").textContent = text === "connected" ? "connected" : "connection lost; trying again …";
   home("state").dataset.connection = text;
+  if (text !== "connected") record.lost();
 });
 
 // For measurements from outside.
@@ -101,7 +103,7 @@ function askPins() {
 }
 
 function onFrame(header, arrays, bytes, asked) {
-  if (designs.take(header, arrays)) return;
+  if (designs.take(header, arrays) || record.takeFrame(header, arrays)) return;
   if (header.kind === "hello") begin(header);
   else if (header.kind === "run" && asked) picture.takeRun(header, arrays, asked);
   else if (header.kind === "loop" && asked) {
@@ -141,7 +143,7 @@ function keepPins() {
 }
 
 const designs = new Designs(
-  send,
+  (task) => send({ ...task, record: record.shown }),
   () => server.send({ do: "cancel" }),
   (setup) => {
     pinNow("before tuning");
@@ -153,7 +155,18 @@ const designs = new Designs(
   },
 );
 
-const files = new Files(send, (text) => server.send({ do: "open", text }));
+const openText = (text) => server.send({ do: "open", text });
+const files = new Files(send, openText);
+const record = new MachineRecord(
+  (message) => (server.connected ? server.send({ ...message, columns: picture.columns }) : null),
+  (setup) => {
+    home("preset").value = home("preset-about").textContent = "";
+    forms.anchors.clear();
+    pins.clear();
+    set({ setup, pins: [] });
+  },
+  openText,
+);
 
 // ---- tabs
 
@@ -244,4 +257,5 @@ theme(() => {
   picture.draw();
   picture.views.redraw();
   pins.show();
+  record.redraw();
 });

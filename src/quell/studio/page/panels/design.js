@@ -63,7 +63,7 @@ export class Designs {
     const active = header.active.length ? `Active: ${header.active.join(", ")}.` : "No constraint is active.";
     const noise = header.active.some((text) => text.startsWith("M_ks"));
     const hint = noise ? "More noise in u (a larger M_ks) would allow better load rejection. " : "";
-    home("tune-result").textContent = `${header.name}: ${values.join(", ")}; integral gain ${short(header.k_i)}. ${active} ${hint}Computing the trade-off …`;
+    home("tune-result").textContent = `${header.name} for ${header.plants > 1 ? `the ${header.plants} plants of the record` : "the plant in the form"}: ${values.join(", ")}; integral gain ${short(header.k_i)}. ${active} ${hint}Computing the trade-off …`;
     this.use(header.setup);
   }
 
