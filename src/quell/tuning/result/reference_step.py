@@ -37,7 +37,7 @@ class ReferenceStep(NamedTuple):
         if math.isnan(self.settling):
             return "step of the reference: it does not settle in the time that was looked at"
         text = (
-            f"step of the reference: overshoots by {100.0 * self.overshoot:.3g} %, settles within "
+            f"step of the reference: overshoots by {100.0 * self.overshoot:.1f} %, settles within "
             f"2 % in {self.settling:.3g} s"
         )
         if self.prefilter is None:
