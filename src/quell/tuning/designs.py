@@ -16,7 +16,7 @@ from quell.tuning.optimiser.extras import extras_of
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import cost_of, load_cost, scores
 from quell.tuning.optimiser.problem import Extra, Problem, Solution
-from quell.tuning.optimiser.requirements import Bound, bounds_of
+from quell.tuning.optimiser.requirements import Bound, bounds_of, sizes
 from quell.tuning.optimiser.search import best_solution, search
 from quell.tuning.optimiser.time_responses import Inputs, SetResponses, law_of
 from quell.tuning.result.design import Design, design_of, impossible, measured
@@ -34,6 +34,8 @@ _NEARBY_ROUNDS = 6
 _OTHER_LIMITS = (0.85, 1.2, 2.0)
 # Rounds of a search over time, from the optimum for the integral gain.
 _ROUNDS = 15
+# Shares of the M_ks of an optimum without a bound of noise, at whose optima the search starts again.
+_LESS_NOISE = (0.3, 0.1)
 # Plants of a set that its worst case over time is first taken from, how much worse another one must
 # be to come in, and how often: chosen by hand.
 _MEMBERS, _WORSE, _EXCHANGES = 2, 1.005, 4
@@ -265,7 +267,31 @@ def _best_gain(problem: Problem, structure: Structure, known: Matrix) -> Solutio
         start = best_solution(relaxed(problem, share), structure, known)
         found = None if start is None else search(problem, structure, start.values, _ROUNDS)
         best = min((each for each in (best, found) if each is not None), key=_rank, default=None)
-    return best
+    noisy = all(bound.kind != "M_ks" for bound in problem.bounds)
+    if best is None or not noisy or any(extra.name == "u_std" for extra in problem.extras):
+        return best
+    return _from_less_noise(problem, structure, best)
+
+
+def _from_less_noise(problem: Problem, structure: Structure, best: Solution) -> Solution:
+    """Return the best solution of a problem without a bound of noise, also from those with one.
+
+    Without it the search may end where a fast filter costs robustness, at less than what a bound
+    of M_ks leads to.
+    """
+    plants = problem.plants
+    C = structure.response(best.values[None, :], plants.omega)[0]
+    largest = float(np.max(sizes("M_ks", plants.P, C)))
+    ends, start = [best], best
+    for share in _LESS_NOISE:
+        bounded = replace(problem, bounds=(*problem.bounds, Bound("M_ks", share * largest)))
+        near = search(bounded, structure, start.values, _ROUNDS)
+        if near is None:
+            break
+        start = near
+        found = search(problem, structure, near.values, _ROUNDS)
+        ends += [] if found is None else [found]
+    return min(ends, key=_rank)
 
 
 def _is_stable(plants: PlantSet, solution: Solution) -> bool:
