@@ -34,7 +34,7 @@ _NEARBY_ROUNDS = 6
 _OTHER_LIMITS = (0.85, 1.2, 2.0)
 # Rounds of a search over time, from the optimum for the integral gain.
 _ROUNDS = 15
-# Shares of the M_ks of an optimum without a bound of noise, at whose optima the search starts again.
+# Shares of the M_ks of an optimum without a bound of noise, with which the search starts again.
 _LESS_NOISE = (0.3, 0.1)
 # Plants of a set that its worst case over time is first taken from, how much worse another one must
 # be to come in, and how often: chosen by hand.
