@@ -549,3 +549,13 @@ def test_blas_has_one_thread_until_the_last_of_several_blocks_ends() -> None:
         assert threads() == {1}
         second.__exit__(None, None, None)
         assert threads() == {2}
+
+
+def test_a_number_as_a_channel_of_a_batch_names_the_run() -> None:
+    """Runs are no entries of the record."""
+    plants = ql.plants.batch(ql.plants.two_mass_spring, m1=[1.0, 1.5])
+    controller = ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 0.01), 1.0)
+    runs = ql.simulate(plants, controller, ql.Scenario(duration=0.1))
+    with pytest.raises(ValueError, match=r"run number 1 is runs\.run\(1\)"):
+        runs[1]
+    assert runs.run(1)["y"].shape == runs["y"][1].shape

@@ -57,7 +57,7 @@ def _check_run(plant: DelayedPlantModel, scratch: Vector) -> None:
     check_run(plant.inner, scratch)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DelayedPlant(PlantWrapper):
     """A plant whose control signal arrives ``samples`` samples of ``dt`` [s] late.
 

@@ -96,6 +96,7 @@ class LQG(LinearController):
         n = A.shape[0]
         omega_c = checks.positive("omega_c", omega_c, "rad/s")
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
+        self.omega_c, self.omega_o = omega_c, omega_o
         check_reachable(A, B, "plant is not stabilisable from u")
         check_reachable(A.T, C.T, "plant is not detectable from y")
         _check_zero(A, B, C)
@@ -123,6 +124,10 @@ class LQG(LinearController):
         self.N = 1.0 / float(C[0] @ np.linalg.solve(closed_loop, gamma))
         law = feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N)
         super().__init__(law, dt, **({"name": "LQG"} | options))
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: the arguments, and the gains that follow from them."""
+        return super().described() | {"K": self.K, "L": self.L, "N": self.N}
 
 
 def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
