@@ -97,7 +97,8 @@ class ESO:
             whether to halve the gains; not for the reduced form. It reduces the noise in f̂ by 30 %
             at order 1, by 20 % at order 3, and not at all from order 5 on.
         delay
-            time after which u reaches the plant [s], a whole number of samples.
+            time after which u reaches the plant [s], a whole number of samples: give the nearest
+            one of a delay with a part of a sample, whose effect is then in f̂.
         poles
             poles in units of omega_o, instead of all at −1: negative numbers, and pairs (real,
             imaginary) for two conjugate ones; order + 1 in all, or order for the reduced form.
