@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 from quell.cli.commands.run_rig import exit_code
 from quell.cli.commands.tune_sources import (
     RIG_OPTIONS,
+    WORKS,
     Asked,
     Rig,
     RigOptions,
+    Works,
     from_record,
     from_rig,
+    rest_of_model,
     rig_at,
     verified,
     with_rig_table,
@@ -63,6 +66,7 @@ def tune(
     model_order: WholeOrNone = None,
     read: ReadOptions = READ_OPTIONS,
     of_model: ModelOptions = MODEL_OPTIONS,
+    works: Works = WORKS,
     rig: RigOptions = RIG_OPTIONS,
     outputs: Outputs = OUTPUTS,
 ) -> int:
@@ -131,8 +135,12 @@ def tune(
     if trials is not None and (measured or setup is None):
         raise ValueError(f"--trials = {trials}: needs a setup file with a scenario")
     if not measured:
-        _check_no_record(model_order, read, of_model)
-        plant, dt, options, name = _plant(setup, num, den, dt, options, trust)
+        unused = {"model_order": (model_order, None)} | _set_of(read, READ_OPTIONS)
+        unused |= _set_of(of_model, MODEL_OPTIONS)
+        _refuse(unused, "goes with a record or --device, which is identified")
+        more = {"save_record": (save_record, None)} | _set_of(rig, RIG_OPTIONS)
+        _refuse(more, "goes with --device, an experiment at a rig")
+        plant, dt, options, name = _plant(setup, num, den, dt, options, works, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
         _write(console, tuned, out, outputs)
@@ -140,19 +148,23 @@ def tune(
     if num or den or (delay is not None) or (rig.device is not None and setup is not None):
         raise ValueError("setup: a record or --device goes without --num, --den and --delay")
     _bounds(options)
-    limits = {"u_min": rig.u_min, "u_max": rig.u_max}
-    options |= {key: value for key, value in limits.items() if value is not None}
+    options |= works.limits()
     place: Rig | None = None
     asked = Asked(dt, read, of_model, _MODEL_ORDER if model_order is None else model_order)
     if rig.device is not None:
-        place = rig_at(rig, dt, trust)
+        place = rig_at(rig, works, dt, trust)
         shown = from_rig(console, place, float(dt or 0.0), asked, save_record, outputs.overwrite)
         if shown is None:
             return ExitCode.DONE
         plant, dt, more, model, y_now = shown
+        more |= rest_of_model(model, y_now)
     else:
         assert setup is not None
+        more_of_rig = {"save_record": (save_record, None), "trust": (trust, False)}
+        _refuse(more_of_rig | _set_of(rig, RIG_OPTIONS), "goes with --device")
+        given_rest = works.rest()
         plant, dt, more, model = from_record(console, setup, asked)
+        more |= given_rest or rest_of_model(model)
     tuned = replace(_tuned(console, plant, dt, options | more), signals=model.signals)
     _print(console, tuned, rig.device or str(setup))
     step = None
@@ -163,15 +175,17 @@ def tune(
     return ExitCode.DONE if step is None else exit_code(step.run)
 
 
-def _check_no_record(order: int | None, read: ReadOptions, model: ModelOptions) -> None:
-    """Raise ``ValueError`` for options of records where nothing is identified."""
-    names = [] if order is None else ["model_order"]
-    for given, default in ((read, READ_OPTIONS), (model, MODEL_OPTIONS)):
-        pairs = vars(given).items()
-        names += [name for name, value in pairs if value != getattr(default, name)]
+def _set_of(given: Any, default: Any) -> dict[str, tuple[Any, Any]]:
+    """Return the options of a group by name, each with its value and its default."""
+    return {name: (value, getattr(default, name)) for name, value in vars(given).items()}
+
+
+def _refuse(options: Mapping[str, tuple[Any, Any]], rule: str) -> None:
+    """Raise ``ValueError`` for options that have no effect here and are not at their defaults."""
+    names = [name for name, (value, default) in options.items() if value != default]
     if names:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise ValueError(f"{flags}: goes with a record or --device, which is identified")
+        raise ValueError(f"{flags}: {rule}")
 
 
 def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:
@@ -225,6 +239,7 @@ def _plant(
     den: str,
     dt: float | None,
     options: dict[str, Any],
+    works: Works,
     trust: bool,
 ) -> tuple[Any, float, dict[str, Any], str]:
     """Return the plant, the sample time, the options of ``tune``, and the plant's name."""
@@ -233,13 +248,18 @@ def _plant(
     if setup is not None:
         if num or den or dt is not None:
             raise ValueError("setup: goes without --num, --den and --dt, which are in the file")
+        rest = {"u_rest": (works.u_rest, None), "y_rest": (works.y_rest, None)}
+        _refuse(rest, "is the operating_point of [plant], and scenario.x0, in a setup")
         task = tuning_task(setup, options, trust)
-        return task.plant, task.dt, task.options, task.setup.title
+        return task.plant, task.dt, task.options | works.limits(), task.setup.title
     if not num or not den or dt is None:
         raise ValueError(
             "setup: missing; must be a TOML file, or give --num 1 --den 1,3,3,1 --dt 0.01"
         )
+    if trust:
+        raise ValueError("--trust: goes with a setup or --device, whose plant may run a program")
     _bounds(options)
+    options |= works.limits() | works.rest()
     plant = (_numbers("num", num), _numbers("den", den))
     return plant, dt, options, f"({num})/({den})"
 

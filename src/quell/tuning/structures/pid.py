@@ -39,6 +39,7 @@ class FilteredPID:
     def __init__(self, model: Model, *, derivative: bool, filtered: bool) -> None:
         self.name = ("pid" if derivative else "pi") + ("" if filtered else "-unfiltered")
         self.model, self.derivative, self.filtered = model, derivative, filtered
+        self.gain_sign = model.sign
         unit, dt = 1.0 / model.omega, model.dt
         times = (_TIMES[0] * unit, _TIMES[1] * unit)
         # The poles of F are at √2/T_f with a derivative, at 1/T_f without.
@@ -141,4 +142,5 @@ class FilteredPID:
         arguments = self._arguments(values)
         if "tf" in arguments:
             arguments["tf"] = list(arguments["tf"])
-        return {"controller": {"kind": "pid"} | arguments}
+        name = {} if self.derivative else {"name": "PI"}
+        return {"controller": {"kind": "pid"} | arguments | name}
