@@ -14,7 +14,7 @@ from quell.cli.commands.compare_report import (
     print_two_mass,
 )
 from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import OUTPUTS, Outputs, Trust, Whole
+from quell.cli.options import OUTPUTS, Outputs, Trust, Whole, refuse
 from quell.cli.output import COMPILING, Console, check_outputs, progress_bar, write_results
 
 if TYPE_CHECKING:
@@ -138,6 +138,10 @@ def _compare_setup(
     from quell.setup import SetupError
 
     names = _names(controllers, ("setup", *STRUCTURES))
+    if not set(names) & set(STRUCTURES):
+        bounds = dict(zip(("m_s", "m_t", "m_ks"), limits, strict=True))
+        unused = {name: (value, None) for name, value in bounds.items()}
+        refuse(unused, "is a bound of tuned controllers, and none of them is compared")
     outputs = check_outputs(outputs, [f"{stem}-compare"])
     console = Console()
     with progress_bar(console, COMPILING) as report:

@@ -33,6 +33,8 @@ from quell.cli.options import (
     ReadOptions,
     Trust,
     WholeOrNone,
+    options_of,
+    refuse,
 )
 from quell.cli.output import Console, check_outputs, print_line, progress_bar, table, write_results
 from quell.cli.records import is_record
@@ -135,11 +137,11 @@ def tune(
     if trials is not None and (measured or setup is None):
         raise ValueError(f"--trials = {trials}: needs a setup file with a scenario")
     if not measured:
-        unused = {"model_order": (model_order, None)} | _set_of(read, READ_OPTIONS)
-        unused |= _set_of(of_model, MODEL_OPTIONS)
-        _refuse(unused, "goes with a record or --device, which is identified")
-        more = {"save_record": (save_record, None)} | _set_of(rig, RIG_OPTIONS)
-        _refuse(more, "goes with --device, an experiment at a rig")
+        unused = {"model_order": (model_order, None)} | options_of(read, READ_OPTIONS)
+        unused |= options_of(of_model, MODEL_OPTIONS)
+        refuse(unused, "goes with a record or --device, which is identified")
+        more = {"save_record": (save_record, None)} | options_of(rig, RIG_OPTIONS)
+        refuse(more, "goes with --device, an experiment at a rig")
         plant, dt, options, name = _plant(setup, num, den, dt, options, works, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
@@ -160,8 +162,8 @@ def tune(
         more |= rest_of_model(model, y_now)
     else:
         assert setup is not None
-        more_of_rig = {"save_record": (save_record, None), "trust": (trust, False)}
-        _refuse(more_of_rig | _set_of(rig, RIG_OPTIONS), "goes with --device")
+        more_of_rig = {"save_record": (save_record, None)}
+        refuse(more_of_rig | options_of(rig, RIG_OPTIONS), "goes with --device")
         given_rest = works.rest()
         plant, dt, more, model = from_record(console, setup, asked)
         more |= given_rest or rest_of_model(model)
@@ -173,19 +175,6 @@ def tune(
         step = verified(console, place, tuned, model, y_now)
     _write(console, tuned, out, outputs, {"model": model.to_json()}, step)
     return ExitCode.DONE if step is None else exit_code(step.run)
-
-
-def _set_of(given: Any, default: Any) -> dict[str, tuple[Any, Any]]:
-    """Return the options of a group by name, each with its value and its default."""
-    return {name: (value, getattr(default, name)) for name, value in vars(given).items()}
-
-
-def _refuse(options: Mapping[str, tuple[Any, Any]], rule: str) -> None:
-    """Raise ``ValueError`` for options that have no effect here and are not at their defaults."""
-    names = [name for name, (value, default) in options.items() if value != default]
-    if names:
-        flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise ValueError(f"{flags}: {rule}")
 
 
 def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:
@@ -249,15 +238,13 @@ def _plant(
         if num or den or dt is not None:
             raise ValueError("setup: goes without --num, --den and --dt, which are in the file")
         rest = {"u_rest": (works.u_rest, None), "y_rest": (works.y_rest, None)}
-        _refuse(rest, "is the operating_point of [plant], and scenario.x0, in a setup")
+        refuse(rest, "is the operating_point of [plant], and scenario.x0, in a setup")
         task = tuning_task(setup, options, trust)
         return task.plant, task.dt, task.options | works.limits(), task.setup.title
     if not num or not den or dt is None:
         raise ValueError(
             "setup: missing; must be a TOML file, or give --num 1 --den 1,3,3,1 --dt 0.01"
         )
-    if trust:
-        raise ValueError("--trust: goes with a setup or --device, whose plant may run a program")
     _bounds(options)
     options |= works.limits() | works.rest()
     plant = (_numbers("num", num), _numbers("den", den))
