@@ -84,8 +84,19 @@ def run_rig(
     """
     from quell.setup import EXAMPLES, made, read
 
-    numbers = {"seconds": seconds, "omega_c": omega_c, "omega_o": omega_o, "spin": spin}
-    others = {"device": device, "priority": priority, "mcap": mcap, "csv": csv, "live": live}
+    numbers: dict[str, Any] = {
+        "seconds": seconds,
+        "omega_c": omega_c,
+        "omega_o": omega_o,
+        "spin": spin,
+    }
+    others: dict[str, Any] = {
+        "device": device,
+        "priority": priority,
+        "mcap": mcap,
+        "csv": csv,
+        "live": live,
+    }
     others |= numbers | {"live_origin": live_origin}
     file = setup or EXAMPLES / "torsional_rig.toml"
     if example:
