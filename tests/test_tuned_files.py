@@ -190,3 +190,18 @@ def test_a_delay_of_the_table_tune_is_in_the_plant_of_the_file(
     assert again.code == 0, again.err
     other = load(tmp_path / "again.toml")
     assert other.controller.ki == pytest.approx(setup.controller.ki, rel=1e-6)
+
+
+def test_the_table_of_a_tuning_is_not_cut_in_80_columns(
+    quell: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names of structures stand in one line, beside numbers of eight digits."""
+    monkeypatch.setenv("COLUMNS", "80")
+    Path("plant.toml").write_text(
+        SETUP.replace("num = [-2.0]", "num = [-2.0e-5]"), encoding="utf-8"
+    )
+    command = ("tune", "plant.toml", "--structure", "half-gain-law", "--order", "2", "--no-figures")
+    shown: Shown = quell(*command)  # type: ignore[operator]
+    assert "…" not in shown.out
+    rows = [line for line in shown.out.splitlines() if line.startswith("half-gain-law of order 2 ")]
+    assert rows, shown.out

@@ -268,7 +268,8 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
     if tuned.noise_bound:
         print_line(console, tuned.noise_bound)
     quantity = report.quantity(tuned.objective)
-    rows = table("Optima under these constraints", "structure", quantity, *_HEADINGS)
+    tight = {"padding": (0, 1, 0, 0), "pad_edge": False}  # 80 columns hold all names
+    rows = table("Optima under these constraints", "structure", quantity, *_HEADINGS, **tight)
     reasons = []
     for label, *cells, reason in report.rows(tuned.designs, tuned.objective):
         rows.add_row(f"[bold]{label}[/]" if label == tuned.design.name else label, *cells)
