@@ -53,11 +53,11 @@ LEARNERS: dict[str, Callable[[], Any]] = {
     "RLS with u": lambda: learners.RLS(
         features.State() + features.Polynomial(3) + features.Bias() + features.Input()
     ),
-    "MLP": lambda: learners.MLP(5),
-    "GaussianProcess": lambda: learners.GaussianProcess(15),
+    "MLP": lambda: learners.MLP(hidden=5),
+    "GaussianProcess": lambda: learners.GaussianProcess(budget=15),
     "BatchGradient": learners.BatchGradient,
     "BatchGradient, scaled": lambda: learners.BatchGradient(
-        1e-3, features=features.State() + features.Bias()
+        features.State() + features.Bias(), 1e-3
     ),
 }
 CONTROLLERS: dict[str, tuple[Callable[[], Any], Any]] = {

@@ -97,7 +97,7 @@ class PythonLms:
 LEARNERS: dict[str, Any] = {
     "none": ql.learners.NoLearner(),
     "BatchGradient (Algorithm 1)": ql.learners.BatchGradient(
-        study.gradient_rate(SETTINGS), study.GRADIENT_BATCH
+        rate=study.gradient_rate(SETTINGS), batch=study.GRADIENT_BATCH
     ),
     "NLMS": ql.learners.NLMS(),
     "RLS": ql.learners.RLS(),

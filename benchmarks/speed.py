@@ -65,7 +65,7 @@ def algorithm_1(rows: list[dict[str, object]]) -> None:
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     scenario = study.scenario(settings)
     small, large = (
-        study.controller(settings, learner=ql.learners.BatchGradient(1e-5 / n, n))
+        study.controller(settings, learner=ql.learners.BatchGradient(rate=1e-5 / n, batch=n))
         for n in (10, 10_000)
     )
     few, many = best(

@@ -65,7 +65,7 @@ def cases() -> list[Case]:
     pid = ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits)
     learners = ql.learners
     guarded = law(learners.Kalman(), ql.Guard())
-    network, process = law(learners.MLP(5)), law(learners.GaussianProcess(20))
+    network, process = law(learners.MLP(hidden=5)), law(learners.GaussianProcess(budget=20))
     l_eso = "L-ESO, order 4, Kalman, guard"
     small = {"instructions": 220.0, "state": 100.0}
     large = {"instructions": 2200.0, "state": 700.0, "stack": 250.0}
@@ -78,8 +78,8 @@ def cases() -> list[Case]:
         Case(l_eso, m7, "single", two_mass, guarded),
         Case(l_eso, m7, "double", two_mass, guarded),
         Case(l_eso, m4, "double", two_mass, guarded),
-        Case("L-ESO, order 4, MLP(5)", m4, "single", two_mass, network),
-        Case("L-ESO, order 4, GaussianProcess(20)", m4, "single", two_mass, process),
+        Case("L-ESO, order 4, MLP(hidden=5)", m4, "single", two_mass, network),
+        Case("L-ESO, order 4, GaussianProcess(budget=20)", m4, "single", two_mass, process),
     ]
 
 

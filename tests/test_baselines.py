@@ -416,3 +416,16 @@ def test_an_unsymmetric_weight_is_named() -> None:
     """It would be half ignored."""
     with pytest.raises(ValueError, match="Q: must be symmetric"):
         LQG(ql.plants.two_mass_spring(), 1.0, 5.0, 0.01, Q=np.triu(np.ones((4, 4))))
+
+
+@pytest.mark.parametrize("omega", [1e2, 1e4])
+def test_a_quick_undamped_mode_is_seen_and_reached_in_any_units(omega: float) -> None:
+    """LQG takes an oscillator, and one behind a drive; one that is not in y is still refused."""
+    drive = np.polymul([1.0, 0.0, omega**2], [1.0, 3.3, 0.0])
+    for plant in (([1.0], [1.0, 0.0, omega**2]), ([omega**2], drive)):
+        LQG(plant, 0.1 * omega, omega, 0.05 / omega)
+    A = np.zeros((3, 3))
+    A[0, 0], A[1, 2], A[2, 1] = -1.0, 1.0, -(omega**2)
+    hidden = ql.plants.LinearPlant(A, [1.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="plant is not detectable from y"):
+        LQG(hidden, 0.1 * omega, omega, 0.05 / omega)

@@ -566,3 +566,13 @@ def test_blas_has_one_thread_in_any_thread_whichever_had_a_block_before() -> Non
         assert other.submit(threads).result() == {1}
         assert threads() == {1}
     assert threadpool_info() == before
+
+
+def test_a_number_as_a_channel_of_a_batch_names_the_run() -> None:
+    """Runs are no entries of the record."""
+    plants = ql.plants.batch(ql.plants.two_mass_spring, m1=[1.0, 1.5])
+    controller = ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 0.01), 1.0)
+    runs = ql.simulate(plants, controller, ql.Scenario(duration=0.1))
+    with pytest.raises(ValueError, match=r"run number 1 is runs\.run\(1\)"):
+        runs[1]
+    assert runs.run(1)["y"].shape == runs["y"][1].shape

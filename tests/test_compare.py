@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell import setup as setup_room
 from quell.cli.app import app
 from quell.experiments import compare
 from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
@@ -279,3 +280,22 @@ def test_tuned_controllers_keep_to_the_gains_of_the_setups_own(
     ):
         with pytest.raises(ValueError, match=message):
             app(["compare", *arguments])
+
+
+def test_all_controllers_of_a_setup_are_compared_alike(tmp_path: Path) -> None:
+    """Behind the delay of [tune], under its bounds, and without feedforward, which PID does not have; a note says so."""
+    text = SETUP.replace("omega_c = 3.0,", "omega_c = 3.0, feedforward = true,")
+    text = text.replace("omega_o = 20.0", "omega_o = 12.0")
+    (tmp_path / "drive.toml").write_text(text + "[tune]\ndelay = 0.012\nm_s = 2.5\n")
+    given = setup_room.load(tmp_path / "drive.toml")
+    none = (None, None, None)
+    found = compare.of_setup(given, ["setup", "tuned-bandwidths"], none, None, lambda *_: None)
+    assert not found.controllers["setup"].feedforward
+    assert found.notes == ("setup: without its feedforward, which PID and LQG do not have",)
+    assert found.constraints.m_s == 2.5
+    assert found.plant.endswith("0.012 s late")
+    for name, controller in found.controllers.items():
+        late = ql.simulate(ql.plants.delayed(given.plant, 0.012, 0.005), controller, given.scenario)
+        np.testing.assert_array_equal(found.result.runs[name]["y"], late["y"])
+    alone = compare.of_setup(given, ["setup"], none, None, lambda *_: None)
+    assert alone.controllers["setup"].feedforward

@@ -287,7 +287,7 @@ def test_the_refusal_names_what_would_help() -> None:
     """For a process whose points are too close, their distance; else the rounding of y."""
     worse = Comparison(0.2, 0.01, None, None, False)
     for novelty, remedy in ((0.01, "novelty=0.1 of GaussianProcess"), (0.1, "lower omega_o")):
-        learner = ql.learners.GaussianProcess(5, novelty=novelty)
+        learner = ql.learners.GaussianProcess(budget=5, novelty=novelty)
         with pytest.raises(ValueError, match=f"changes u by 20 % RMS.*{remedy}.*or double"):
             worse.check(ql.ADRC(ADRC.observer, 2.0, learner=learner))
 

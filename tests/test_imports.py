@@ -14,7 +14,17 @@ import pytest
 # the file that gathers the public names of folder x and its subfolders. A new folder needs an entry
 # here.
 ROWS = (
-    ("types", "warn", "suggestions", "checks", "files", "reading", "parallel", "optional"),
+    (
+        "types",
+        "warn",
+        "suggestions",
+        "described",
+        "checks",
+        "files",
+        "reading",
+        "parallel",
+        "optional",
+    ),
     ("executors", "quantities"),
     ("kernels",),
     ("lti", "signals", "observers", "plants", "features"),

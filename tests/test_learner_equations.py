@@ -189,7 +189,7 @@ LINEAR = {
         bias_bandwidth=1e9,
     ),
     "NLMS, given": ql.learners.NLMS(
-        5.0, State() + Input(), regularisation=0.2, gain_interval=(0.8, 1.1)
+        State() + Input(), 5.0, regularisation=0.2, gain_interval=(0.8, 1.1)
     ),
 }
 
@@ -271,7 +271,7 @@ class Descent:
 
 def test_algorithm_1_on_scaled_features_follows_its_equations(rng: np.random.Generator) -> None:
     """With the plain estimate for the scale and the residual for the step; θ is in the plant's units."""
-    learner = ql.learners.BatchGradient(0.01, 5, State() + Bias() + Input())
+    learner = ql.learners.BatchGradient(State() + Bias() + Input(), 0.01, 5)
     reference, design = Descent(learner, 0.01), learner.design(OBSERVER, FREQUENCY)
     memory, theta = learner.memory(design), np.zeros(4)
     for k in range(400):
@@ -308,7 +308,7 @@ def test_a_learner_around_a_model_follows_its_equations(
     bias_bandwidth: float | None, rng: np.random.Generator
 ) -> None:
     """Which pairs the model is shown, and when; its bias, and what it predicts."""
-    learner = ql.learners.MLP(3, bias_bandwidth=bias_bandwidth)
+    learner = ql.learners.MLP(hidden=3, bias_bandwidth=bias_bandwidth)
     design = learner.design(OBSERVER, FREQUENCY)
     memory, delay = learner.memory(design), round(group_delay(OBSERVER))
     gate, model = Gate(), learner.model.memory(design.model)

@@ -383,13 +383,13 @@ def test_what_a_model_learned_is_kept_unless_it_is_no_number(rng: np.random.Gene
             lambda: ql.learners.Online(Plain(), bias_bandwidth=-1.0),
             "bias_bandwidth = -1.0: must be finite and not negative",
         ),
-        (lambda: ql.learners.MLP(0), "hidden = 0: must be a whole number of at least 1"),
+        (lambda: ql.learners.MLP(hidden=0), "hidden = 0: must be a whole number of at least 1"),
         (lambda: ql.learners.MLP(memory_time=0.0), "memory_time = 0.0: must be greater than zero"),
         (lambda: ql.learners.MLP(noise=0.0), "noise = 0.0: must be finite and greater than zero"),
         (lambda: ql.learners.MLP(every=0), "every = 0: must be a whole number of at least 1"),
         (lambda: ql.learners.MLP(seed=-1), "seed = -1: must be a whole number of at least 0"),
         (
-            lambda: ql.learners.GaussianProcess(0),
+            lambda: ql.learners.GaussianProcess(budget=0),
             "budget = 0: must be a whole number of at least 1",
         ),
         (

@@ -15,6 +15,7 @@ from scipy.signal import cont2discrete
 
 import quell as ql
 from quell.plants.base import advance, measure
+from quell.plants.linear_part import linear_part
 from quell.plants.nonlinear.plant import CompiledNonlinear, PythonNonlinear
 
 pytestmark = pytest.mark.compiled
@@ -273,3 +274,31 @@ def test_a_mistake_is_named(make: object, message: str) -> None:
     """With the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message):
         make()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("delay", [0.0025, 0.0125, 0.03])
+def test_a_delay_with_a_part_of_a_sample_is_exact_for_a_held_control_signal(
+    delay: float, rng: np.random.Generator
+) -> None:
+    """As a plant of a quarter of the sample time with a whole number of samples of delay; analysis sees the same delay."""
+    inner = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
+    late, fine = ql.plants.delayed(inner, delay, 0.01), ql.plants.delayed(inner, delay, 0.0025)
+    assert late.delay == pytest.approx(delay)
+    coarse_model, fine_model = late.sampled(0.01), fine.sampled(0.0025)
+    x, z = np.zeros(late.order), np.zeros(fine.order)
+    scratch, w = np.zeros(6 * z.size), np.zeros(1)
+    for u, w[0] in rng.normal(size=(40, 2)):
+        advance(coarse_model, x, scratch, 0.0, u, w)
+        for _ in range(4):
+            advance(fine_model, z, scratch, 0.0, u, w)
+        np.testing.assert_allclose(x[:2], z[:2], rtol=0.0, atol=1e-13)
+    assert linear_part(late, 0.01)[1] == pytest.approx(delay)
+
+
+def test_a_delay_with_a_part_of_a_sample_of_another_plant_is_refused_with_the_remedy() -> None:
+    """A nonlinear plant takes whole samples, and so does an observer."""
+    swing = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - x[0]), order=2)
+    with pytest.raises(ValueError, match=r"nearest are 0.01 and 0.02 s, for a plant that is not"):
+        ql.plants.delayed(swing, 0.0125, 0.01)
+    with pytest.raises(ValueError, match=r"0.02 s; give the observer the nearer one"):
+        ql.ESO.model_free(2, 1.0, 10.0, 0.01, delay=0.0125)

@@ -164,8 +164,8 @@ def test_an_output_that_adds_to_the_disturbance_is_found() -> None:
 @pytest.mark.parametrize(
     ("learner", "guard", "forgets"),
     [
-        (ql.learners.BatchGradient(0.0, 1), None, True),
-        (ql.learners.BatchGradient(0.0, 1), ql.Guard(), False),
+        (ql.learners.BatchGradient(rate=0.0, batch=1), None, True),
+        (ql.learners.BatchGradient(rate=0.0, batch=1), ql.Guard(), False),
         (ql.envs.Policy(), None, False),
     ],
     ids=["alone", "with a guard", "from outside"],

@@ -129,7 +129,7 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
             "plant: given: num; must be num and den, or A, B and C",
         ),
         (
-            "[plant]\nkind = 'delayed'\nplant = 'two-mass'\ndelay = 0.015",
+            "[plant]\nkind = 'delayed'\nplant = 'dc-motor'\ndelay = 0.015",
             "plant.delay = 0.015 s with dt = 0.01 s: must be a whole number",
         ),
         (

@@ -181,7 +181,7 @@ def test_rounded_parameters_keep_shared_memory_and_kinds() -> None:
     ("learner", "rests"),
     [
         *[(None, True), (None, False), (ql.learners.Kalman(), True), (ql.learners.Kalman(), False)],
-        *[(ql.learners.RLS(), False), (ql.learners.MLP(3), False)],
+        *[(ql.learners.RLS(), False), (ql.learners.MLP(hidden=3), False)],
     ],
 )
 def test_bad_samples_do_what_they_do_in_double_precision(learner: Any, rests: bool) -> None:

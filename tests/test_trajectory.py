@@ -86,7 +86,9 @@ STEP = ("overshoot", "settling_time", "rise_time")
         ([1, 1, 1, 1], [0, 0.5, 1, 1], (), {}),
         ([1, 1, 1, 1], [1, 1.1, 1, 1], (), dict.fromkeys(STEP, "y is at the target at the start of the window: no step")),
         ([0, 1, 2, 2], [0, 1, 2, 2], (), dict.fromkeys(STEP, "r changes within the window: give target to judge it as a move to there")),
-        ([0, 0, 2, 2], [0, 0, 1, 2], (), dict.fromkeys(STEP, "r steps at 0.2 s, within the window: start the window there")),
+        ([0, 0, 2, 2], [0, 0, 1, 2], (), {}),
+        ([0, 0, 2, 1], [0, 0, 1, 2], (), dict.fromkeys(STEP, "r changes within the window: give target to judge it as a move to there")),
+        ([0, 0, 2], [0, 0, 0], (), dict.fromkeys(STEP, "there is only one sample in the window: no step response")),
         ([2, 2, 2, 2], [0, 1, 2, 2], (0.2,), dict.fromkeys(STEP, "y is at the target at the start of the window: no step")),
         ([2, 2, 2, 2, 2], [0, 0, 0, 1, 2], (0.2,), dict.fromkeys(STEP, "r does not step at the start of the window: no step")),
         ([0, 0, 2, 2, 2], [0, 0, 0, 1, 2], (0.2,), {}),
@@ -175,6 +177,15 @@ def test_a_window_without_samples_says_why(window: tuple[float, ...], message: s
     with pytest.raises(ValueError, match=message) as raised:
         record_of([1] * 5, [0] * 5).metrics(*window)
     assert "problem" not in str(raised.value)
+
+
+def test_a_step_within_the_window_is_judged_from_where_it_begins() -> None:
+    """As in a window that begins there: overshoot and times from the step on; the integrals are those of the whole window."""
+    r, y = [0.0] * 5 + [1.0] * 6, [0.0] * 6 + [0.6, 1.2, 1.0, 1.0, 1.0]
+    whole, part = record_of(r, y).metrics(), record_of(r, y).metrics(start=0.5)
+    assert whole["overshoot"] == pytest.approx(0.2)
+    assert {name: whole[name] for name in STEP} == {name: part[name] for name in STEP}
+    assert whole["rms"] < part["rms"]
 
 
 def test_a_record_without_samples_says_so() -> None:

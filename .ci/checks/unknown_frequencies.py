@@ -49,7 +49,8 @@ print("frequencies a factor of two apart are found, and one from any start, guar
 
 def rms(rate):
     """RMS error from the step on, with Algorithm 1 at a rate per sample."""
-    learner, guard = (None, None) if rate is None else (ql.learners.BatchGradient(rate), ql.Guard())
+    learner = None if rate is None else ql.learners.BatchGradient(rate=rate)
+    guard = None if rate is None else ql.Guard()
     law = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard)
     return study.score(study.quick_run(settings, law))["rms_from_step"]
 

@@ -96,15 +96,18 @@ def interval(low_name: str, low: Any, high_name: str, high: Any) -> tuple[float,
     return low_value, high_value
 
 
-def samples(name: str, value: Any, dt: float) -> int:
-    """Return the time ``value`` [s] as a whole number of samples of ``dt`` [s]."""
+def samples(name: str, value: Any, dt: float, remedy: str = "") -> int:
+    """Return the time ``value`` [s] as a whole number of samples of ``dt`` [s].
+
+    ``remedy`` ends the message for other times.
+    """
     time = non_negative(name, value, "s")
     count = round(time / dt)
     if abs(time / dt - count) > 1e-6:  # far above rounding errors; chosen by hand
         below = math.floor(time / dt)
         raise ValueError(
             f"{name} = {value!r} s with dt = {dt!r} s: must be a whole number of samples; "
-            f"the nearest are {below * dt:.9g} and {(below + 1) * dt:.9g} s"
+            f"the nearest are {below * dt:.9g} and {(below + 1) * dt:.9g} s{remedy}"
         )
     return count
 

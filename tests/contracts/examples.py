@@ -43,6 +43,7 @@ PLANTS: dict[str, Any] = {
     for name, make in registry.PLANTS.items()
     if name not in FROM_FILES
 } | {
+    "delayed, by part of a sample": ql.plants.delayed(_LAG, delay=0.0125, dt=0.01),
     "torsional, late": ql.plants.torsional(late=2),
     "torsional, not rounded": ql.plants.torsional(dac_bits=None, counts=None),
     "CubicSpringPlant": ql.plants.lagged_two_mass_spring(k_cubic=0.3),

@@ -97,7 +97,7 @@ def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_wha
     """Rates above about 2e-5 per 1 ms sample diverge once the disturbance starts; the batch size does not matter."""
     for batch in (1, 10, 1000):
         for rate, stable in ((0.01, True), (0.03, False)):
-            learner = study.BatchGradient(rate * 1e-3 / batch, batch)
+            learner = study.BatchGradient(rate=rate * 1e-3 / batch, batch=batch)
             settings = study.Settings()
             run = study.quick_run(settings, study.controller(settings, learner=learner))
             assert run.diverged == (not stable), (batch, rate)

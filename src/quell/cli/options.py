@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,6 +38,23 @@ Switch = Annotated[bool, Parameter(negative="")]
 Overwrite = Annotated[
     bool, Parameter(negative="", help="Replace files that exist; they are refused otherwise.")
 ]
+
+
+def options_of(given: Any, default: Any) -> dict[str, tuple[Any, Any]]:
+    """Return the options of a group by name, each with its value and its default."""
+    return {name: (value, getattr(default, name)) for name, value in vars(given).items()}
+
+
+def refuse(options: Mapping[str, tuple[Any, Any]], rule: str) -> None:
+    """Raise ``ValueError`` for options that would have no effect and are not at their defaults.
+
+    ``options`` are pairs of value and default by name; ``rule`` says what they go with.
+    """
+    names = [name for name, (value, default) in options.items() if value != default]
+    if names:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+        raise ValueError(f"{flags}: {rule}")
+
 
 FIGURES = Path("quell-figures")
 """Folder for figures if none is named; if it exists, the new one gets a number."""

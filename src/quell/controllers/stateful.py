@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ from quell import checks
 from quell.controllers.base import set_applied_control
 from quell.controllers.compiled_step import PackedController, entry_point, step_packed
 from quell.controllers.limits import Limits, RateLimit, changed_limits
+from quell.described import Described
 from quell.kernels.dispatch import dispatcher_for
 from quell.kernels.sized import layout_of
 from quell.kernels.user_types import explain_compile_errors
@@ -20,7 +22,7 @@ from quell.kernels.user_types import explain_compile_errors
 _NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
 
 
-class StatefulController:
+class StatefulController(Described):
     """A controller with its own running state, which ``simulate`` does not touch.
 
     A subclass sets its attributes, then calls ``_initialise``. It defines ``_update_parameters``,
@@ -34,6 +36,19 @@ class StatefulController:
     _limits: Limits
     _packed: Any
     _step: Callable[[Any, float, float], float]
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: arguments by name, and finite limits of u and its rate."""
+        found, dt = super().described(), float(getattr(self, "dt", math.nan))
+        limits = vars(self).get("_limits")
+        if limits is None:
+            return found
+        rates = tuple(change / dt for change in (limits.least_change, limits.most_change))
+        known = {"u_min": limits.low, "u_max": limits.high}
+        found |= {name: value for name, value in known.items() if math.isfinite(value)}
+        if any(map(math.isfinite, rates)):
+            found["rate_limit"] = rates[1] if rates[0] == -rates[1] else rates
+        return found
 
     def _initialise(self) -> None:
         self._update_parameters()

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from quell.described import Described
 from quell.kernels import validation
 from quell.kernels.dispatch import generic, generic_with_default
 from quell.observers.eso import ESO
@@ -139,7 +140,7 @@ def checked_design(learner: Learner, observer: ESO, omega_c: float) -> Any:
     return parameters
 
 
-class NoLearner:
+class NoLearner(Described):
     """The absence of a learner: the L-ESO is a plain ESO."""
 
     def design(self, observer: ESO, omega_c: float) -> NoLearnerDesign:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from quell import checks
+from quell.described import Described
 from quell.features import Bias, Features, State
 from quell.features.base import checked_design, write, write_physical
 from quell.features.scaling import Scaling, initial_scale, scaling
@@ -20,6 +21,7 @@ from quell.learners.lag import startup_samples
 from quell.learners.noise_gate import NoiseGate, gated, noise_gate
 from quell.observers.eso import ESO
 from quell.types import Vector
+from quell.warn import warn
 
 
 class Inputs(NamedTuple):
@@ -77,7 +79,23 @@ def update_feature_sizes(inputs: Inputs, memory: Any, seen: Vector, u: float) ->
     return update_sizes(inputs.unscaled, memory.sizes, memory.features)
 
 
-class FeatureLearner:
+def features_first(features: Any, number: Any, default: Any, name: str) -> tuple[Any, Any]:
+    """Return features and the number behind them; a call in the old order warns.
+
+    The number came first before version 0.2. The types of the arguments tell the orders apart.
+    """
+    if isinstance(features, int | float) and (number is default or isinstance(number, Features)):
+        features, number = None if number is default else number, features
+    elif isinstance(number, Features) and features is None:
+        features, number = number, default
+    else:
+        return features, number
+    rule = f"features are the first argument now; give {name}= by its name"
+    warn(f"{name} = {number!r} came first: {rule}", DeprecationWarning)
+    return features, number
+
+
+class FeatureLearner(Described):
     """Base class of the learners that are given scaled features of the state and of u.
 
     Parameters

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell.described import text
 from quell.lti.models import ZERO_TOLERANCE, StateSpace, TransferFunction, read_model
 from quell.types import Matrix, Vector
 
@@ -55,6 +56,9 @@ class Canonical(NamedTuple):
     f_gain: float  #: f over the disturbance that enters through E (without E: through B, as u)
     zeros: Vector  #: the n − degree zeros from u to y [rad/s], complex
     condition: float  #: condition number of S with rows of length 1; unobservable from 1e10 on
+
+    def __repr__(self) -> str:
+        return text(self)
 
     @property
     def matched(self) -> bool:

@@ -5,6 +5,10 @@ missing response for a disturbance and counteracts it. An ESO that is fed ``u(t 
 signals of the same time (Zhao & Gao, *ISA Transactions* 53, 2014). The control law does not change:
 it acts on present estimates, and the delay remains in the loop.
 
+A part of a sample is not represented: the observer is given the nearest whole number of samples and
+takes the effect of the rest, at most half a sample, for a disturbance. The plant, analysis and
+tuning have the whole delay.
+
 The running state is that of the inner observer, followed by the last d values of u, newest first.
 """
 
@@ -20,6 +24,7 @@ from quell.types import Vector
 # The longest delay. All stored values of u are shifted in each sample, so the cost grows with it.
 # Chosen by hand; not tuned further. Its main use is to detect a delay that is not in seconds.
 _MOST_SAMPLES = 10_000
+_PART = "; give the observer the nearer one, the rest of a delay counts as a disturbance"
 
 
 class DelayedModel(NamedTuple):
@@ -66,7 +71,7 @@ def _acting_control(model: DelayedModel, z: Vector, u: float) -> float:
 
 def delayed_model(model: Any, delay: float, dt: float) -> Any:
     """Return ``model`` with a delay [s] of u; ``model`` itself if the delay is zero."""
-    samples = checks.samples("delay", delay, dt)
+    samples = checks.samples("delay", delay, dt, _PART)
     if samples > _MOST_SAMPLES:
         raise ValueError(
             f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples"

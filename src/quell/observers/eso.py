@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.described import text
 from quell.lti.canonical import Canonical, canonical, format_roots
 from quell.observers.cascade import cascade_model, level_bandwidths
 from quell.observers.delay import delayed_model, without_delay
@@ -96,7 +97,8 @@ class ESO:
             whether to halve the gains; not for the reduced form. It reduces the noise in f̂ by 30 %
             at order 1, by 20 % at order 3, and not at all from order 5 on.
         delay
-            time after which u reaches the plant [s], a whole number of samples.
+            time after which u reaches the plant [s], a whole number of samples: give the nearest
+            one of a delay with a part of a sample, whose effect is then in f̂.
         poles
             poles in units of omega_o, instead of all at −1: negative numbers, and pairs (real,
             imaginary) for two conjugate ones; order + 1 in all, or order for the reduced form.
@@ -289,10 +291,14 @@ class ESO:
         return replace(self, model=model, has_one_pole=False)
 
     def __repr__(self) -> str:
-        kind = type(self.model).__name__.removesuffix("Model")
+        inner = without_delay(self.model)
+        kind = type(inner).__name__.removesuffix("Model")
+        more = "" if self.poles is None else f", poles={text(self.poles)}"
+        if inner is not self.model:
+            more += f", delay={self.model.samples * self.dt:g}"
         return (
             f"ESO(order={self.order}, b0={self.b0:g}, omega_o={self.omega_o:g}, dt={self.dt:g}, "
-            f"form={self.form!r}) [{kind}]"
+            f"form={self.form!r}{more}) [{kind}]"
         )
 
     @property

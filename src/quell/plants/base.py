@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from quell.described import Described
 from quell.kernels.dispatch import generic, generic_with_default
 from quell.types import Vector
 
@@ -38,7 +39,7 @@ class Plant(Protocol):
         """
 
 
-class PlantWrapper:
+class PlantWrapper(Described):
     """The properties that a wrapper takes over from the plant inside."""
 
     plant: Plant

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.described import Described
 from quell.plants.base import Plant, check_plant
 
 
-class PlantBatch(Sequence[Plant]):
+class PlantBatch(Described, Sequence[Plant]):
     """Plants of one kind, order and number of disturbances.
 
     ``batch[i]`` is a plant, ``batch[i:j]`` a batch again.
@@ -61,6 +62,12 @@ class PlantBatch(Sequence[Plant]):
                 )
             array.flags.writeable = False
         self.parameters: Mapping[str, NDArray[Any]] = MappingProxyType(arrays)
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: how many plants of which kind, and what they differ in."""
+        parameters = dict(self.parameters)
+        found: dict[str, Any] = {"plants": f"{len(self)} of {self.name}", "order": self.order}
+        return found | ({"parameters": parameters} if parameters else {})
 
     @property
     def name(self) -> str:

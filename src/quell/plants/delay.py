@@ -1,11 +1,16 @@
 """A plant with an input delay.
 
-``x' = f(x, u(t − τ), w)`` with ``τ = d dt``. The state is that of the plant, followed by the last d
-values of u, newest first. The record shows this state, and a start from rest sets it to zero.
+``x' = f(x, u(t − τ), w)`` with ``τ = d dt + l``, ``0 ≤ l < dt``. The state is that of the plant,
+followed by the last d values of u, d + 1 with a part l of a sample, newest first. The record shows
+this state, and a start from rest sets it to zero.
+
+With a part of a sample the plant sees ``u_(k−d−1)`` for the first l of each sample and ``u_(k−d)``
+for the rest: two exact steps of a linear plant.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,7 +25,11 @@ from quell.plants.base import (
     check_run,
     measure,
 )
+from quell.plants.linear import LinearPlant
 from quell.types import Vector
+
+# Part of a sample that is rounding. Chosen by hand, as in ``checks.samples``.
+_ROUNDING = 1e-6
 
 
 class DelayedPlantModel(NamedTuple):
@@ -57,9 +66,38 @@ def _check_run(plant: DelayedPlantModel, scratch: Vector) -> None:
     check_run(plant.inner, scratch)
 
 
-@dataclass(frozen=True, eq=False)
+class PartlyDelayedModel(NamedTuple):
+    """A sampled plant with a delay that has a part of a sample."""
+
+    first: Any  # parameters for the part of a sample in which the older u still acts
+    rest: Any  # for the rest of it
+    late: float  # length of that part [s]
+    size: Size  # number of states of the plant without delay
+
+
+@measure.register(PartlyDelayedModel)
+def _measure_partly(plant: PartlyDelayedModel, x: Vector) -> float:
+    return measure(plant.first, x[: plant.size])
+
+
+@advance.register(PartlyDelayedModel)
+def _advance_partly(
+    plant: PartlyDelayedModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
+    last = x.size - 1
+    older, newer = x[last], u
+    if last > plant.size:
+        newer = x[last - 1]
+    for i in range(last, plant.size, -1):
+        x[i] = x[i - 1]
+    x[plant.size] = u
+    advance(plant.first, x[: plant.size], scratch, t, older, w)
+    advance(plant.rest, x[: plant.size], scratch, t + plant.late, newer, w)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class DelayedPlant(PlantWrapper):
-    """A plant whose control signal arrives ``samples`` samples of ``dt`` [s] late.
+    """A plant that u reaches ``samples`` samples of ``dt`` [s] and ``late`` [s] late.
 
     Make it with ``delayed``.
     """
@@ -67,23 +105,34 @@ class DelayedPlant(PlantWrapper):
     plant: Plant
     samples: int
     dt: float
+    late: float = 0.0
+
+    @property
+    def delay(self) -> float:
+        """The whole delay [s]."""
+        return self.samples * self.dt + self.late
 
     @property
     def name(self) -> str:
         """Name for tables and plots."""
-        return f"{self.plant.name}, {self.samples * self.dt:g} s late"
+        return f"{self.plant.name}, {self.delay:g} s late"
 
     @property
     def order(self) -> int:
         """Number of states, including the delayed values of u."""
-        return self.plant.order + self.samples
+        return self.plant.order + self.samples + (self.late > 0.0)
 
-    def sampled(self, dt: float, interpret: bool = False) -> DelayedPlantModel:
+    def sampled(self, dt: float, interpret: bool = False) -> DelayedPlantModel | PartlyDelayedModel:
         """Return the parameters for the sample time ``dt`` [s] of the delay."""
         if abs(dt - self.dt) > 1e-9 * self.dt:
             raise ValueError(
                 f"dt = {dt!r} s: this delayed plant was made for {self.dt!r} s; make another one"
             )
+        if self.late > 0.0:
+            first, rest = (
+                self.plant.sampled(part, interpret) for part in (self.late, dt - self.late)
+            )
+            return PartlyDelayedModel(first, rest, self.late, self.plant.order)
         return DelayedPlantModel(self.plant.sampled(dt, interpret), self.plant.order)
 
 
@@ -95,15 +144,16 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     plant
         any plant.
     delay
-        [s], at least one sample and a whole number of samples.
+        [s]. That of a linear plant may have a part of a sample, which is exact for a u that is held
+        for a sample; other plants are solved in whole samples and take whole numbers of them.
     dt
         sample time of the later runs [s]; it decides how many values of u are stored.
 
     Raises
     ------
     ValueError
-        if the delay is shorter than a sample or no whole number of samples, or ``plant`` is not a
-        plant.
+        if the delay is not positive, or for a plant that is not linear no whole number of samples;
+        or if ``plant`` is not a plant.
 
     Examples
     --------
@@ -113,6 +163,12 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     6
     """
     check_plant(plant)
-    checks.positive("delay", delay, "s")
-    samples = checks.samples("delay", delay, checks.positive("dt", dt, "s"))
-    return DelayedPlant(plant, samples, float(dt))
+    delay, dt = checks.positive("delay", delay, "s"), checks.positive("dt", dt, "s")
+    if type(plant) is not LinearPlant:
+        rule = ", for a plant that is not linear; or take a smaller dt"
+        return DelayedPlant(plant, checks.samples("delay", delay, dt, rule), dt)
+    samples = round(delay / dt)
+    if abs(delay / dt - samples) <= _ROUNDING:
+        return DelayedPlant(plant, samples, dt) if samples else DelayedPlant(plant, 0, dt, delay)
+    samples = math.floor(delay / dt)
+    return DelayedPlant(plant, samples, dt, delay - samples * dt)

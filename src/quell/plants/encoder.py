@@ -61,7 +61,7 @@ def _check_run(plant: EncodedPlantModel, scratch: Vector) -> None:
     check_run(plant.inner, scratch)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EncodedPlant(PlantWrapper):
     """A plant whose output [rad] is read by an encoder of ``counts`` a turn.
 

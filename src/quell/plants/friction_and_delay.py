@@ -30,12 +30,13 @@ def with_friction_and_delay(
         Coulomb friction [u-unit] and the speed at which three quarters of it act [y-unit/s]; None
         or zero for none.
     delay
-        [s], rounded to a whole number of samples.
+        [s]; with friction rounded to a whole number of samples.
     dt
         sample time of the loop [s].
     """
     plant: Plant = linear
     if force and width:
         plant = FrictionPlant(linear, num, den, force, width, linear.name)
-    late = round(delay / dt)
-    return delayed(plant, late * dt, dt) if late else plant
+    if plant is not linear:
+        delay = round(delay / dt) * dt
+    return delayed(plant, delay, dt) if delay > 0.0 else plant

@@ -28,7 +28,7 @@ def identified(path: str | os.PathLike[str], dt: float) -> Plant:
     path
         the file of results, in JSON; relative to the folder where the command is run.
     dt
-        sample time of the loop [s]; the delay is rounded to a whole number of samples.
+        sample time of the loop [s]; with friction the delay is rounded to whole samples.
 
     Raises
     ------

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.described import Described
 from quell.lti.discretize import zero_order_hold
 from quell.lti.models import TransferFunction, check_matrices, read_model, to_state_space
 from quell.plants.base import advance, measure
@@ -46,8 +47,8 @@ def _advance(plant: LinearModel, x: Vector, scratch: Vector, t: float, u: float,
         x[i] = scratch[i]
 
 
-@dataclass(frozen=True, eq=False)
-class LinearPlant:
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearPlant(Described):
     """A linear plant ``x' = A x + B u + E w``, ``y = C x`` of any size with one input and output.
 
     Parameters

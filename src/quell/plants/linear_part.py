@@ -73,9 +73,9 @@ def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any
                 raise ValueError(
                     f"plant is delayed by samples of {plant.dt!r} s, the controller has dt = "
                     f"{dt!r} s: must be the same; pass the plant inside, and delay = "
-                    f"{plant.samples * plant.dt!r}"
+                    f"{plant.delay!r}"
                 )
-            delay += plant.samples * dt
+            delay += plant.delay
         plant = plant.plant
     if operating_point is not None:
         return linearised(plant, *checked_point(operating_point)), delay

@@ -79,6 +79,15 @@ class BatchTrajectory(Record):
             sentences.append(f"The first to diverge was run {first}, at {self.ended[first]:.6g} s.")
         return " ".join(sentences) or f"No step reported a problem in any of {len(self)} runs."
 
+    def __getitem__(self, name: Any) -> Vector:
+        """Return a channel; a ``ValueError`` names the channels, or ``run`` for a number."""
+        if isinstance(name, int | np.integer):
+            raise ValueError(
+                f"channel = {name!r}: must be a name, as runs['y']; run number {name} is "
+                f"runs.run({name})"
+            )
+        return super().__getitem__(name)
+
     def __len__(self) -> int:
         """Return the number of runs."""
         return int(self.log.shape[0])

@@ -79,14 +79,18 @@ def measured(
     t, r, y, u, r_before, u_before = window
     error = r - y
     goal = float(r[-1]) if target is None else checks.finite("target", target)
-    band, initial = checks.positive("band", band), float(y[0])
+    band = checks.positive("band", band)
     values, missing = {}, dict[str, str]()
     step = [name for name in STEP_MEASURES if name in names]
     if step:
-        fault = incomplete or _no_step(t, r, r_before, goal, initial, target is not None)
+        k = 0 if target is not None else _only_change(r)
+        if k:
+            r_before = r[max(k - 2, 0) : k]
+        initial = float(y[k])
+        fault = incomplete or _no_step(r[k:], r_before, goal, initial, target is not None)
         missing = dict.fromkeys(step, fault) if fault else {}
         if not fault:
-            values = _step_measures(step, t, y, goal, band, initial)
+            values = _step_measures(step, t[k:], y[k:], goal, band, initial)
             times = [name for name in step if name != "overshoot"]
             missing = {name: _never(name, band) for name in times if math.isnan(values[name])}
     with np.errstate(over="ignore", invalid="ignore"):
@@ -127,13 +131,18 @@ def _never(name: str, band: float) -> str:
     return f"at the end of the window y is not within ±{100.0 * band:g} % of the step"
 
 
-def _no_step(
-    t: Vector, r: Vector, r_before: Vector, goal: float, initial: float, asked: bool
-) -> str | None:
-    """Return why a window has no step to ``goal``, None if it has one.
+def _only_change(r: Vector) -> int:
+    """Return the index from which the reference has its last value, if it changes once; else 0."""
+    changes = np.flatnonzero(np.diff(r))
+    # A change at the second sample is a step at the start of the window, a sample off.
+    return int(changes[0]) + 1 if changes.size == 1 and changes[0] > 0 else 0
 
-    With a target it is a step if the user ``asked`` for it. Else the reference must step at the
-    start of the window, or a sample off, and stay there; at 0 s there always is a step.
+
+def _no_step(r: Vector, r_before: Vector, goal: float, initial: float, asked: bool) -> str | None:
+    """Return why there is no step to ``goal`` at the first sample, None if there is one.
+
+    With a target it is a step if the user ``asked`` for it. Else the reference must step there, or
+    a sample off, and stay; at 0 s there always is a step.
     """
     if goal == initial:
         return "y is at the target at the start of the window: no step"
@@ -141,9 +150,6 @@ def _no_step(
         return None
     if r.size == 1:
         return "there is only one sample in the window: no step response"
-    changes = np.flatnonzero(np.diff(r))
-    if changes.size == 1 and changes[0] > 0:
-        return f"r steps at {t[changes[0] + 1]:.6g} s, within the window: start the window there"
     if bool((r[1:] != goal).any()):
         return "r changes within the window: give target to judge it as a move to there"
     if r_before.size and not bool((r_before != goal).any() or r[0] != goal):

@@ -103,8 +103,8 @@ class Trajectory(Record):
         Metrics
             a dictionary with ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y,
             ``control_variation`` and ``total_variation`` of u, which also has the jump from the u
-            before the window (zero before the run); if the reference steps at the start of the
-            window or ``target`` is given, also ``overshoot`` (fraction of the step),
+            before the window (zero before the run); if the reference steps once in the window, and
+            from there on, or ``target`` is given, also ``overshoot`` (fraction of the step),
             ``settling_time`` and ``rise_time`` [s], NaN if y does not reach the target. Its
             ``missing`` has the reason for each of these that does not exist. If the run diverged in
             the window, there is no step, and the others are those of the samples up to there.

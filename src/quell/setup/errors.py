@@ -17,6 +17,14 @@ _TYPES = {
 }
 
 
+# What to add where a table or key is missing, by its path; {} is the name of the file.
+_REMEDIES = {
+    "controller": "give tables [controller] and [observer]; quell tune {} --out tuned.toml finds "
+    "both for the plant",
+    "dt": "give the sample time of the loop [s] at the top of the file, dt = 0.001",
+}
+
+
 class SetupError(ValueError):
     """A setup that cannot be used; ``mistakes`` has a line for each error."""
 
@@ -50,7 +58,8 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
             start, known = f"{path}." if path else "", context["known"]
             lines += [f"{start}{key}: unknown; {_hint(key, known)}" for key in context["keys"]]
         elif kind == "missing":
-            lines.append(f"{path}: missing")
+            remedy = f"; {_REMEDIES[path].format(name)}" if path in _REMEDIES else ""
+            lines.append(f"{path}: missing{remedy}")
         elif kind == "union_tag_invalid" and isinstance(value, Mapping):
             hint = nearest(str(value["kind"]), _tags(context))
             lines.append(f"{path}.kind = {_short(value['kind'])}: unknown; {hint}")

@@ -27,6 +27,13 @@ from quell.simulation.scenario import Scenario
 Known: TypeAlias = dict[str, tuple[tuple[Any, ...], Any]]
 """Inputs and object of each part that was built, for ``assembled``."""
 
+# Tables that commands ask for, as short as they can be.
+_EXAMPLES = {
+    "scenario": "scenario = {duration = 10.0, reference = {kind = 'step'}}",
+    "plant": "plant = {kind = 'linear', num = [1.0], den = [1.0, 1.0]}",
+    "rig": "rig = {device = 'twin:'}",
+}
+
 EXAMPLES = Path(__file__).parent / "examples"
 """The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
 
@@ -62,7 +69,8 @@ class Setup:
     def needed(self, table: str) -> Any:
         """Return the object of an optional table; raise a ``SetupError`` if it is missing."""
         if getattr(self, table) is None:
-            raise SetupError([f"{self.file}: {table}: missing; give a table [{table}]"])
+            example = f", {_EXAMPLES[table]}" if table in _EXAMPLES else ""
+            raise SetupError([f"{self.file}: {table}: missing; give a table [{table}]{example}"])
         return getattr(self, table)
 
 

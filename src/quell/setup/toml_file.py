@@ -52,8 +52,8 @@ def _of_another_kind(path: str | os.PathLike[str], name: str) -> SetupError | No
     kind = kind_of(begin)
     text = begin.decode(encoding_of(begin), errors="replace")
     if Path(path).suffix.lower() in (".mcap", ".nc") or seems_record(text.splitlines()[:-1]):
-        rule = f"quell identify {name} finds a model in it, quell tune {name} a controller, and "
-        rule += f"quell b0 {name} the gain of the input"
+        rule = f"quell identify {name} finds a model in it, quell tune {name} --out tuned.toml a "
+        rule += f"controller, as a setup, and quell b0 {name} the gain of the input"
         return SetupError([f"{name}: is a record, not a setup: {rule}"])
     if kind is not None:
         return SetupError([f"{name}: is {kind.what}, not a setup; give a file in TOML"])

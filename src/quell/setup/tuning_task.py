@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
+from quell.plants.delay import delayed
 from quell.plants.linear_part import linear_model
 from quell.setup.errors import SetupError
 from quell.setup.loading import Setup, made
 from quell.setup.toml_file import read
 from quell.setup.vary import changed
+from quell.tuning.result.scenario import late_tables, rest_of_plant
 
 # What a tuning replaces. A law without effect stands in for the controller.
 _REPLACED = ("observer", "controller", "learner", "guard", "prefilter")
@@ -54,6 +57,19 @@ def tuning_task(
         limits = ("u_min", "u_max", "rate_limit")
         options = {key: given[key] for key in limits if key in given} | options
     options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
+    delay = options.get("delay", 0.0)
+    if isinstance(delay, float) and delay > 0.0:  # the plant of the tuned file has it, too
+        try:
+            samples = delayed(plant, delay, setup.controller.dt).order - plant.order
+        except ValueError as error:
+            raise SetupError([f"{setup.file}: tune: {error}"]) from None
+        options["setup"] = late_tables(options["setup"], delay, samples)
+        if "tune" in data:
+            kept_keys = {key: value for key, value in data["tune"].items() if key != "delay"}
+            options["setup"]["tune"] = kept_keys
+    if "scenario" not in data:
+        with suppress(ValueError):  # of a plant without operating point, which tune refuses
+            options["rest"] = rest_of_plant(plant, setup.controller.dt)
     if isinstance(given, Mapping) and "feedforward" in given and "search" not in options:
         options["setup"]["controller"] = {"feedforward": given["feedforward"]}
     part = linear_model

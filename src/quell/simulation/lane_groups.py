@@ -77,7 +77,8 @@ def linear_runs(
     for i, plant in enumerate(plants):
         form, scenario, delay = forms[id(controllers[i])], scenarios[i], 0
         # A delay that was made for another sample time is left to the plant's own check.
-        while isinstance(plant, DelayedPlant) and plant.dt == scenario.dt:
+        # One with a part of a sample takes two steps in each: it is run by the exact loop, too.
+        while isinstance(plant, DelayedPlant) and plant.dt == scenario.dt and plant.late == 0.0:
             delay, plant = delay + plant.samples, plant.plant
         if form is not None and type(plant) is LinearPlant:
             found.append(LinearRun(i, plant, delay, form, scenario, keys[id(scenario)]))

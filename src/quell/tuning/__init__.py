@@ -8,10 +8,11 @@ and returns a ``Tuned``.
 
 from quell.suggestions import suggest_names
 from quell.tuning.constraints import Constraints
+from quell.tuning.identified import identified_plants
 from quell.tuning.structures import STRUCTURES
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 
-__all__ = ["STRUCTURES", "Constraints", "Tuned", "tune"]
+__all__ = ["STRUCTURES", "Constraints", "Tuned", "identified_plants", "tune"]
 
 suggest_names(__name__, __all__)

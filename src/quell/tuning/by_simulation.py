@@ -171,7 +171,10 @@ def tune_by_simulation(
     progress = how.get("progress")
     report = None if progress is None else lambda share: progress("simulations", share)
     given = {"violation": bounds, "seed": seed, "progress": report, **options}
-    trials = tune_structure(build, problem, found.design.values, **given)
+    first_values = found.design.solution.values
+    names = [parameter.name for parameter in build.structure.parameters]
+    start = dict(zip(names, map(float, first_values), strict=True))
+    trials = tune_structure(build, problem, start, **given)
     best = trials.best if len(trials.objectives) == 1 else trials.front[0]
     first = trials.objectives[0]
     design = _design(found, best.parameters, best.values[first])

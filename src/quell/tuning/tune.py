@@ -22,6 +22,14 @@ from quell.tuning.optimiser.objectives import OBJECTIVES
 from quell.tuning.optimiser.time_responses import Inputs, load_step
 from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set
 from quell.tuning.result.design import Design
+from quell.tuning.result.scenario import (
+    Rest,
+    checked_rest,
+    rest_of_linear,
+    rest_of_plant,
+    scenario_tables,
+    windows_of,
+)
 from quell.tuning.result.setup_file import plant_table
 from quell.tuning.structures.registry import STRUCTURES
 from quell.tuning.tuned import Tuned
@@ -56,6 +64,7 @@ def tune(
     check_samples: int = 400,
     seed: int = 0,
     setup: Mapping[str, Any] | None = None,
+    rest: Any = None,
     scenario: Any = None,
     search: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
@@ -107,6 +116,9 @@ def tune(
         of the samples.
     setup
         tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default.
+    rest
+        u and y at rest, where the plant works: the scenario of ``Tuned.toml`` begins there. Of a
+        nonlinear plant the operating point by default, else zero.
     scenario
         tunes by simulation (extra ``tuning``), for saturation, friction, encoders and criteria of
         your own: a ``Scenario`` that the plants, which need not be linear, run through, or one for
@@ -148,7 +160,7 @@ def tune(
         how |= {"operating_point": operating_point, "uncertain": uncertain, "b_range": b_range}
         how |= {"samples": samples, "check_samples": check_samples, "seed": seed}
         how |= {"progress": progress, **limits}
-        linear = partial(tune, dt=dt)
+        linear = partial(tune, dt=dt, rest=rest)
         return tune_by_simulation(linear, plant, scenario, objective, search or {}, how)
     if search is not None:
         raise ValueError("search = {...}: is for a tuning by simulation; give a scenario, too")
@@ -170,6 +182,9 @@ def tune(
     if box is not None:
         plant = box.plants(box.design_set(checks.whole("samples", samples, 1), seed))
     given = given_plants(plant, dt, **how)
+    known_rest = checked_rest(rest)
+    if known_rest is None and box is None:
+        known_rest = rest_of_plant(as_list(plant)[0], dt, operating_point)
     plants = plant_set(given, dt)
     bounds = constraints or Constraints()
     inputs = _inputs(objective, reference, duration, load, plants)
@@ -194,7 +209,7 @@ def tune(
         objective=objective,
         task=task,
         check=check,
-        setup=_setup(given, dt, plants, setup),
+        setup=_setup(given, plants, setup, known_rest),
         noise_bound=noise_bound,
         signals=signals_of(as_list(plant)[0]),
     )
@@ -259,18 +274,25 @@ def _check(
 
 
 def _setup(
-    given: Given, dt: float, plants: PlantSet, known: Mapping[str, Any] | None
+    given: Given, plants: PlantSet, known: Mapping[str, Any] | None, rest: Rest | None
 ) -> dict[str, Any]:
-    """Return the tables of a setup file: ``known``, else the first plant, a step, a load."""
-    linear, delay = LinearPlant.of(given.linear[0]), float(given.delays[0])
-    last = float(f"{load_step(plants).r.size * dt:.2g}")
+    """Return the tables of a setup file: ``known``, else the first plant, a step, a load.
+
+    What is not in ``known`` is added: ``[[metrics]]`` have a window for each part of the scenario.
+    """
+    linear, delay, dt = LinearPlant.of(given.linear[0]), float(given.delays[0]), plants.dt
     tables: dict[str, Any] = {"title": "Tuned controller", "dt": dt} | dict(known or {})
     if "plant" not in tables:
-        late = round(delay / dt) * dt
-        tables["plant"] = plant_table(linear, given.actuator_lag, late)
-    if "scenario" in tables:
-        return tables
-    scenario: dict[str, Any] = {"duration": last, "reference": {"kind": "step"}}
-    if linear.disturbances == 1:
-        scenario["disturbances"] = [{"kind": "step", "at": 0.5 * last}]
-    return tables | {"scenario": scenario}
+        if linear.disturbances == 0:
+            linear = LinearPlant(linear.A, linear.B, linear.C)
+        rest = None if rest is None or not any(rest[:2]) else rest_of_linear(linear, rest)
+        tables["plant"], waiting = plant_table(linear, given.actuator_lag, delay, dt)
+        if rest is not None:
+            rest = rest._replace(x0=(*rest.x0, *[rest.u] * waiting))
+    if "scenario" not in tables:
+        last = float(f"{load_step(plants).r.size * dt:.2g}")
+        rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
+        tables |= scenario_tables(last, linear.disturbances, rest)
+    elif "metrics" not in tables:
+        tables["metrics"] = windows_of(tables["scenario"])
+    return tables

@@ -14,8 +14,15 @@ from quell.cli.commands.compare_report import (
     print_two_mass,
 )
 from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import OUTPUTS, Outputs, Trust, Whole
-from quell.cli.output import COMPILING, Console, check_outputs, progress_bar, write_results
+from quell.cli.options import OUTPUTS, Outputs, Trust, Whole, refuse
+from quell.cli.output import (
+    COMPILING,
+    Console,
+    check_outputs,
+    print_line,
+    progress_bar,
+    write_results,
+)
 
 if TYPE_CHECKING:
     from quell.analysis import Certificate
@@ -138,6 +145,10 @@ def _compare_setup(
     from quell.setup import SetupError
 
     names = _names(controllers, ("setup", *STRUCTURES))
+    if not set(names) & set(STRUCTURES):
+        bounds = dict(zip(("m_s", "m_t", "m_ks"), limits, strict=True))
+        unused = {name: (value, None) for name, value in bounds.items()}
+        refuse(unused, "is a bound of tuned controllers, and none of them is compared")
     outputs = check_outputs(outputs, [f"{stem}-compare"])
     console = Console()
     with progress_bar(console, COMPILING) as report:
@@ -157,12 +168,14 @@ def _compare_setup(
         f"In the units of the setup{scored}. –: not settled, no step, or diverged before."
     )
     print_gains(console, gains, run.entries, run.constraints)
+    for note in run.notes:
+        print_line(console, note)
     paths = []
     if outputs.figures:
         name = f"{stem}-compare"
         paths = figures.save(run.result, outputs.figures, outputs.overwrite, name)
     results = as_json(run.result, stable, gains, run.entries, run.constraints)
-    about = {"setup": given.as_json(), "load_at": run.load_at}
+    about = {"setup": given.as_json(), "load_at": run.load_at, "notes": list(run.notes)}
     write_results(console, {**about, **results}, outputs, paths)
     exit_if_diverged(run.result.runs.values())
 

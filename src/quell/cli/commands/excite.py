@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from quell.cli.options import Overwrite, Whole
+from quell.cli.options import Overwrite, Whole, refuse
 from quell.cli.output import Console, print_line
 
 
@@ -47,6 +47,8 @@ def excite(
     from quell.files import check_writable
     from quell.identification import excitation
 
+    if kind == "chirp":
+        refuse({"seed": (seed, 0)}, "a chirp has nothing random")
     check_writable(out, overwrite)
     design = excitation(kind, (low, high), duration, dt, u_min, u_max, seed=seed)
     design.save(out, overwrite)

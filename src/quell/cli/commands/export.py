@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from quell.cli.options import Overwrite, Switch, Trust
+from quell.cli.options import Overwrite, Switch, Trust, refuse
 from quell.cli.output import Console, print_line
 
 if TYPE_CHECKING:
@@ -63,6 +63,8 @@ def export(
         return
     if what != "controller":
         raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
+    if precision == "double":
+        refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
     given = load(setup, trust)
     if precision == "single" and not accept:
         given.needed("plant")

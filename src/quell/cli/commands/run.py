@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, Trust
+from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, Trust, options_of, refuse
 from quell.cli.output import (
     COMPILING,
     Console,
@@ -40,6 +40,8 @@ def run(
     from quell.simulation import simulate
 
     if example:
+        unused = {"setup": (setup, None)} | options_of(outputs, RUN_OUTPUTS)
+        refuse(unused, "has no effect beside --example, which only prints a file")
         print((EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"), end="")
         return
     if setup is None:

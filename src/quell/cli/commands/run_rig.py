@@ -11,7 +11,15 @@ from cyclopts import Parameter
 
 from quell.cli.exit_codes import ExitCode
 from quell.cli.interrupt import exit_on_signal
-from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, Trust, WholeOrNone
+from quell.cli.options import (
+    RUN_OUTPUTS,
+    RunOutputs,
+    Switch,
+    Trust,
+    WholeOrNone,
+    options_of,
+    refuse,
+)
 from quell.cli.output import Console, check_outputs, print_line, table, write_record, write_results
 from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
 from quell.realtime.devices.registry import examples
@@ -76,8 +84,25 @@ def run_rig(
     """
     from quell.setup import EXAMPLES, made, read
 
+    numbers: dict[str, Any] = {
+        "seconds": seconds,
+        "omega_c": omega_c,
+        "omega_o": omega_o,
+        "spin": spin,
+    }
+    others: dict[str, Any] = {
+        "device": device,
+        "priority": priority,
+        "mcap": mcap,
+        "csv": csv,
+        "live": live,
+    }
+    others |= numbers | {"live_origin": live_origin}
     file = setup or EXAMPLES / "torsional_rig.toml"
     if example:
+        unused = options_of(outputs, RUN_OUTPUTS) | {"setup": (setup, None)}
+        unused |= {name: (value, None) for name, value in others.items()}
+        refuse(unused, "has no effect beside --example, which only prints a file")
         print((EXAMPLES / "torsional_rig.toml").read_text(encoding="utf-8"), end="")
         return
     changes = {
@@ -115,6 +140,8 @@ def _run(
     console = Console()
     what = f"{setup.title}: {url}, dt = {dt:g} s, for {scenario.duration:g} s"
     print_line(console, f"{what}. Ctrl-C ramps u to zero.")
+    if port is None:
+        refuse({"live_origin": (origins, [])}, "goes with --live, a port to watch at")
     # The port first: if it is in use no file is created.
     sinks = files if port is None else [LiveSink(port, origins=origins), *files]
     run = _close_loop(console, setup, url, options, sinks)

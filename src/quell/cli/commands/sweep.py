@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import RUN_OUTPUTS, RunOutputs, Trust, Whole, WholeOrNone
+from quell.cli.options import (
+    RUN_OUTPUTS,
+    RunOutputs,
+    Trust,
+    Whole,
+    WholeOrNone,
+    refuse,
+)
 from quell.cli.output import (
     COMPILING,
     Console,
@@ -30,6 +37,7 @@ if TYPE_CHECKING:
     from quell.setup import Setup
     from quell.sweeping import Sweep
 
+_WORST = 5
 _LABEL = "simulating (the first runs compile for some seconds)"
 
 
@@ -40,7 +48,7 @@ def sweep(
     dask: Annotated[str | None, Parameter(show_default=False)] = None,
     workers: WholeOrNone = None,
     repeat: WholeOrNone = None,
-    worst: Whole = 5,
+    worst: Whole = _WORST,
     trust: Trust = False,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
@@ -72,6 +80,8 @@ def sweep(
     where = Path(f"{setup.stem}-sweep") if folder is None else folder
     console = Console()
     if repeat is not None:
+        many = {"dask": (dask, None), "workers": (workers, None), "worst": (worst, _WORST)}
+        refuse(many, "is for many runs; --repeat does one")
         _repeat(console, given, plan, repeat, where, outputs)
         return
     if outputs.save is not None:
@@ -84,6 +94,8 @@ def sweep(
     # One process does no more than one thread of this one, and takes longer to start.
     if dask is not None and "://" not in dask:
         raise ValueError(f"dask = {dask!r}: must be the address of a scheduler, tcp://HOST:PORT")
+    if dask is not None:
+        refuse({"workers": (workers, None)}, "is for this machine; --dask names other workers")
     executor = dask or ("threads" if workers == 1 else "processes")
     with _progress(console) as report:
         try:

@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 from quell.cli.commands.run_rig import exit_code
 from quell.cli.commands.tune_sources import (
     RIG_OPTIONS,
+    WORKS,
     Asked,
     Rig,
     RigOptions,
+    Works,
     from_record,
     from_rig,
+    rest_of_model,
     rig_at,
     verified,
     with_rig_table,
@@ -30,6 +33,8 @@ from quell.cli.options import (
     ReadOptions,
     Trust,
     WholeOrNone,
+    options_of,
+    refuse,
 )
 from quell.cli.output import Console, check_outputs, print_line, progress_bar, table, write_results
 
@@ -63,6 +68,7 @@ def tune(
     model_order: WholeOrNone = None,
     read: ReadOptions = READ_OPTIONS,
     of_model: ModelOptions = MODEL_OPTIONS,
+    works: Works = WORKS,
     rig: RigOptions = RIG_OPTIONS,
     outputs: Outputs = OUTPUTS,
 ) -> int:
@@ -139,8 +145,12 @@ def tune(
     if trials is not None and (measured or setup is None):
         raise ValueError(f"--trials = {trials}: needs a setup file with a scenario")
     if not measured:
-        _check_no_record(model_order, read, of_model)
-        plant, dt, options, name = _plant(setup, num, den, dt, options, trust)
+        unused = {"model_order": (model_order, None)} | options_of(read, READ_OPTIONS)
+        unused |= options_of(of_model, MODEL_OPTIONS)
+        refuse(unused, "goes with a record or --device, which is identified")
+        more = {"save_record": (save_record, None)} | options_of(rig, RIG_OPTIONS)
+        refuse(more, "goes with --device, an experiment at a rig")
+        plant, dt, options, name = _plant(setup, num, den, dt, options, works, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
         _write(console, tuned, out, outputs)
@@ -148,19 +158,23 @@ def tune(
     if num or den or (delay is not None) or (rig.device is not None and setup is not None):
         raise ValueError("setup: a record or --device goes without --num, --den and --delay")
     _bounds(options)
-    limits = {"u_min": rig.u_min, "u_max": rig.u_max}
-    options |= {key: value for key, value in limits.items() if value is not None}
+    options |= works.limits()
     place: Rig | None = None
     asked = Asked(dt, read, of_model, model_order)
     if rig.device is not None:
-        place = rig_at(rig, dt, trust)
+        place = rig_at(rig, works, dt, trust)
         shown = from_rig(console, place, float(dt or 0.0), asked, save_record, outputs.overwrite)
         if shown is None:
             return ExitCode.DONE
         plant, dt, more, model, y_now = shown
+        more |= rest_of_model(model, y_now)
     else:
         assert setup is not None
+        more_of_rig = {"save_record": (save_record, None)}
+        refuse(more_of_rig | options_of(rig, RIG_OPTIONS), "goes with --device")
+        given_rest = works.rest()
         plant, dt, more, model = from_record(console, setup, asked)
+        more |= given_rest or rest_of_model(model)
     tuned = replace(_tuned(console, plant, dt, options | more), signals=model.signals)
     _print(console, tuned, rig.device or str(setup))
     step = None
@@ -169,17 +183,6 @@ def tune(
         step = verified(console, place, tuned, model, y_now)
     _write(console, tuned, out, outputs, {"model": model.to_json()}, step)
     return ExitCode.DONE if step is None else exit_code(step.run)
-
-
-def _check_no_record(order: int | None, read: ReadOptions, model: ModelOptions) -> None:
-    """Raise ``ValueError`` for options of records where nothing is identified."""
-    names = [] if order is None else ["model_order"]
-    for given, default in ((read, READ_OPTIONS), (model, MODEL_OPTIONS)):
-        pairs = vars(given).items()
-        names += [name for name, value in pairs if value != getattr(default, name)]
-    if names:
-        flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise ValueError(f"{flags}: goes with a record or --device, which is identified")
 
 
 def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:
@@ -233,6 +236,7 @@ def _plant(
     den: str,
     dt: float | None,
     options: dict[str, Any],
+    works: Works,
     trust: bool,
 ) -> tuple[Any, float, dict[str, Any], str]:
     """Return the plant, the sample time, the options of ``tune``, and the plant's name."""
@@ -241,13 +245,16 @@ def _plant(
     if setup is not None:
         if num or den or dt is not None:
             raise ValueError("setup: goes without --num, --den and --dt, which are in the file")
+        rest = {"u_rest": (works.u_rest, None), "y_rest": (works.y_rest, None)}
+        refuse(rest, "is the operating_point of [plant], and scenario.x0, in a setup")
         task = tuning_task(setup, options, trust)
-        return task.plant, task.dt, task.options, task.setup.title
+        return task.plant, task.dt, task.options | works.limits(), task.setup.title
     if not num or not den or dt is None:
         raise ValueError(
             "setup: missing; must be a TOML file, or give --num 1 --den 1,3,3,1 --dt 0.01"
         )
     _bounds(options)
+    options |= works.limits() | works.rest()
     plant = (_numbers("num", num), _numbers("den", den))
     return plant, dt, options, f"({num})/({den})"
 
@@ -270,7 +277,11 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
         print_line(console, tuned.noise_bound)
     quantity = report.quantity(tuned.objective)
     headings = ("structure", quantity, report.second_quantity(tuned.objective), *_HEADINGS)
-    rows = table("Optima under these constraints", *headings)
+    tight: dict[str, Any] = {
+        "padding": (0, 1, 0, 0),
+        "pad_edge": False,
+    }  # 80 columns hold all names
+    rows = table("Optima under these constraints", *headings, **tight)
     reasons = []
     for label, *cells, reason in report.rows(tuned.designs, tuned.objective):
         rows.add_row(f"[bold]{label}[/]" if label == tuned.design.name else label, *cells)

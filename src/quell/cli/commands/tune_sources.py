@@ -38,6 +38,56 @@ class Asked(NamedTuple):
 
 @Parameter(name="*")
 @dataclass(frozen=True)
+class Works:
+    """Where the loop works: limits of u, and the operating point.
+
+    Parameters
+    ----------
+    u_min
+        Least u, of the controller and of an experiment.
+    u_max
+        Largest u.
+    u_rest
+        u at the operating point; of a record, as its model has it at the mean of y.
+    y_rest
+        y there. The scenario of the tuned file begins at rest at this point, by default at zero.
+    """
+
+    u_min: float | None = None
+    u_max: float | None = None
+    u_rest: float | None = None
+    y_rest: float | None = None
+
+    def limits(self) -> dict[str, float]:
+        """Return the limits that are given, as ``tune`` takes them."""
+        known = {"u_min": self.u_min, "u_max": self.u_max}
+        return {name: value for name, value in known.items() if value is not None}
+
+    def rest(self) -> dict[str, tuple[float, float]]:
+        """Return the operating point that is given, as ``tune`` takes it; refuse half of one."""
+        if (self.u_rest is None) != (self.y_rest is None):
+            raise ValueError("--u-rest and --y-rest: go together, they are one operating point")
+        if self.u_rest is None or self.y_rest is None:
+            return {}
+        return {"rest": (self.u_rest, self.y_rest)}
+
+
+WORKS = Works()
+
+
+def rest_of_model(model: Identified, y: float | None = None) -> dict[str, tuple[float, float]]:
+    """Return the operating point of a model: u at the mean of y, or at ``y``."""
+    import numpy as np
+
+    y = float(np.mean(model.y)) if y is None else y
+    u = -model.bias
+    if not model.integrators:
+        u += y * float(model.den[-1] / model.num[-1])
+    return {"rest": (u, y)} if np.isfinite(u) else {}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
 class RigOptions:
     """An experiment at a rig, and its limits.
 
@@ -45,18 +95,12 @@ class RigOptions:
     ----------
     device
         Device for an experiment, as for quell run-rig; then no file is read.
-    u_min
-        Least u, also of the controller.
-    u_max
-        Largest u, also of the controller.
     y_min
         Least y during the experiment; beyond it u is ramped to zero.
     y_max
         Largest y during the experiment.
     seconds
         Duration of the experiment [s].
-    u_rest
-        u at the operating point.
     excite
         prbs, relay, or auto: a relay where the plant drifts.
     yes
@@ -64,12 +108,9 @@ class RigOptions:
     """
 
     device: str | None = None
-    u_min: float | None = None
-    u_max: float | None = None
     y_min: float | None = None
     y_max: float | None = None
     seconds: float = 30.0
-    u_rest: float = 0.0
     excite: Annotated[str, Parameter(name="--excite")] = "auto"
     yes: Switch = False
 
@@ -120,7 +161,7 @@ class Rig:
     how: dict[str, Any]  # further arguments of ``experiment`` and ``verify``
 
 
-def rig_at(options: RigOptions, dt: float | None, trust: bool) -> Rig:
+def rig_at(options: RigOptions, at: Works, dt: float | None, trust: bool) -> Rig:
     """Return the rig of the options, all of them checked.
 
     Raises ``ValueError`` for limits that are missing.
@@ -128,14 +169,16 @@ def rig_at(options: RigOptions, dt: float | None, trust: bool) -> Rig:
     from quell.commissioning import Limits
     from quell.realtime import TwinDevice, open_device
 
-    names = ("u_min", "u_max", "y_min", "y_max")
-    missing = [name for name in names if getattr(options, name) is None]
+    values = {"u_min": at.u_min, "u_max": at.u_max, "y_min": options.y_min, "y_max": options.y_max}
+    missing = [name for name, value in values.items() if value is None]
     missing += ["dt"] if dt is None else []
     if missing:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in missing)
         raise ValueError(f"device = {options.device!r}: an experiment also needs {flags}")
-    values = {name: getattr(options, name) for name in names}
-    limits = Limits(**values, duration=options.seconds, u_rest=options.u_rest)
+    if at.y_rest is not None:
+        raise ValueError(f"--y-rest = {at.y_rest!r}: goes without --device, which is measured")
+    bounds: dict[str, Any] = values
+    limits = Limits(**bounds, duration=options.seconds, u_rest=at.u_rest or 0.0)
     url = str(options.device)
     first = open_device(url, float(dt or 0.0), trust)
     if isinstance(first, TwinDevice):  # it keeps its state between the parts

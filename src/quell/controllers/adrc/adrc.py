@@ -154,6 +154,13 @@ class ADRC(StatefulController):
             window=window_samples(observer) if learns else 0,
         )
 
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints; no learner is none."""
+        found = super().described()
+        if isinstance(self.learner, NoLearner):
+            del found["learner"]
+        return found
+
     @property
     def dt(self) -> float:
         """Sample time [s]."""

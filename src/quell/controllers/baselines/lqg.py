@@ -27,6 +27,7 @@ from quell import checks
 from quell.controllers.baselines.observer_law import (
     check_reachable,
     feedback_law,
+    is_singular,
     stationary_gain,
     with_disturbance,
 )
@@ -96,6 +97,7 @@ class LQG(LinearController):
         n = A.shape[0]
         omega_c = checks.positive("omega_c", omega_c, "rad/s")
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
+        self.omega_c, self.omega_o = omega_c, omega_o
         check_reachable(A, B, "plant is not stabilisable from u")
         check_reachable(A.T, C.T, "plant is not detectable from y")
         _check_zero(A, B, C)
@@ -124,10 +126,13 @@ class LQG(LinearController):
         law = feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N)
         super().__init__(law, dt, **({"name": "LQG"} | options))
 
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: the arguments, and the gains that follow from them."""
+        return super().described() | {"K": self.K, "L": self.L, "N": self.N}
+
 
 def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
-    singular = np.linalg.svd(np.block([[A, B], [C, np.zeros((1, 1))]]), compute_uv=False)
-    if singular[-1] <= 1e-12 * singular[0]:  # singular, to rounding
+    if is_singular(np.block([[A, B], [C, np.zeros((1, 1))]])):
         raise ValueError("plant has a zero at s = 0: y cannot follow a constant reference")
 
 

@@ -84,17 +84,28 @@ class PID(LinearController):
         self.kd = checks.finite("kd", kd)
         self.b, self.c = checks.finite("b", b), checks.finite("c", c)
         self.filter = _filter(tf)
+        self.tf = tf
         if self.kd != 0.0 and self.filter == (0.0, 0.0):
             rule = "a derivative needs a filter, tf greater than zero; a tenth of kd/kp is usual"
             raise ValueError(f"kd = {kd!r}, tf = {tf!r}: {rule}")
         self.tt = checks.optional(checks.positive, "tt", tt, "s") or self._tracking_time()
-        usual = (self.kd * self.c, self.kp * self.b, self.ki)
+        usual = self._usual_setpoint()
         self.setpoint = usual if setpoint is None else tuple(checks.vector("setpoint", setpoint))
         if not self.setpoint:
             raise ValueError(f"setpoint = {setpoint!r}: must be a polynomial in s")
         system, dt = realised(*self.polynomials()), checks.positive("dt", dt, "s")
         law = sampled_law(system, dt, prewarp=self._prewarp, tracking_time=self.tt)
         super().__init__(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints; the polynomial of the reference only if it was given."""
+        found = super().described()
+        if self.setpoint == self._usual_setpoint():
+            del found["setpoint"]
+        return found
+
+    def _usual_setpoint(self) -> tuple[float, ...]:
+        return self.kd * self.c, self.kp * self.b, self.ki
 
     def polynomials(self) -> tuple[list[Any], Any]:
         """Return the numerators from r and y and their common denominator, polynomials in s."""

@@ -98,9 +98,12 @@ class ResonanceRatio(LinearController):
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         if not checks.positive("ratio", ratio) > 1.0:
             raise ValueError(f"ratio = {ratio!r}: must be above 1, as the resonance always is")
+        self.m1, self.m2, self.k, self.ratio, self.measured = m1, m2, k, ratio, measured
+        self.omega_o = omega_o
         w_a = math.sqrt(k / m2)
         self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)  # 4 for √5, not 4.000000000000001
         omega_d = checks.optional(checks.positive, "omega_d", omega_d, "rad/s") or 0.5 * w_a
+        self.omega_d = omega_d
         kp, kv = w_a**2, 4.0 * w_a
         torque = (1.0 - self.kappa) * k
         self.K = np.array([m1 * kp - torque, torque, m1 * kv, 0.0])
@@ -123,3 +126,7 @@ class ResonanceRatio(LinearController):
         self.L = stationary_gain(model, W, 1.0 / dt)
         law = feedback_law(model, self.L, np.append(self.K, self.K_d), m1 * kp)
         super().__init__(law, dt, **({"name": "resonance ratio"} | options))
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: the arguments, and the gains that follow from them."""
+        return super().described() | {"K": self.K, "L": self.L}

@@ -27,7 +27,6 @@ from quell.tuning.designs import Task, tuned_designs, with_noise_bound
 from quell.tuning.optimiser.time_responses import Inputs
 from quell.tuning.plants import Given, given_plants, model_of, plant_set
 from quell.tuning.result.design import Design
-from quell.tuning.structures.base import vector
 from quell.tuning.structures.registry import make_structure
 from quell.types import Matrix, Progress, Vector
 
@@ -179,7 +178,8 @@ def _tuned_pid(given: Given, task: Task, progress: Progress) -> Design:
     if found.controller is None:
         return found
     structure = make_structure("pid", task.model)
-    row = vector(structure, found.values)
+    assert found.solution is not None
+    row = found.solution.values
     return replace(found, controller=structure.controller(row, **task.u))
 
 

@@ -200,7 +200,7 @@ _DRAWS: dict[str, Callable[[np.random.Generator], Learner]] = {
         log_uniform(rng, 0.05, 30.0),
         seed=_seed(rng),
     ),
-    "Algorithm 1": lambda rng: BatchGradient(log_uniform(rng, 1e-7, 1.0)),
+    "Algorithm 1": lambda rng: BatchGradient(rate=log_uniform(rng, 1e-7, 1.0)),
     "turncoat": lambda rng: Turncoat(
         Kalman() if rng.random() < 0.5 else Harmonic(),
         rng.uniform(20.0, 130.0),

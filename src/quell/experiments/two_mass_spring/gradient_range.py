@@ -46,7 +46,7 @@ def trials(
     every = max(round(0.1 / coarse.dt), 1)
 
     def trial(batch: int, rate: float) -> Trial:
-        learner = BatchGradient(rate * coarse.dt / batch, batch)
+        learner = BatchGradient(rate=rate * coarse.dt / batch, batch=batch)
         run = simulate(plant, controller(coarse, learner=learner), long, record_every=every)
         return Trial(batch, rate, run.ended, run.ended > END, score(run)["disturbance_peak"])
 

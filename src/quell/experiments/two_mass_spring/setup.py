@@ -89,7 +89,9 @@ def controllers(settings: Settings) -> dict[str, ADRC]:
         MF: controller(settings),
         MB: controller(settings, model=True),
         L: controller(settings, learner=Kalman()),
-        L1: controller(settings, learner=BatchGradient(gradient_rate(settings), GRADIENT_BATCH)),
+        L1: controller(
+            settings, learner=BatchGradient(rate=gradient_rate(settings), batch=GRADIENT_BATCH)
+        ),
         MF3: controller(settings, bandwidth=3.0),
         MB3: controller(settings, bandwidth=3.0, model=True),
     }

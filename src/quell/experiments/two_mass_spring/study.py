@@ -121,7 +121,9 @@ def _bandwidth_for(
 def _batch_variations(settings: Settings) -> tuple[float | None, float | None]:
     """Return Algorithm 1's variation with ten times the batch, at equal rate per sample or time."""
     rate, batch = gradient_rate(settings), 10 * GRADIENT_BATCH
-    candidates = [controller(settings, learner=BatchGradient(r, batch)) for r in (rate, rate / 10)]
+    candidates = [
+        controller(settings, learner=BatchGradient(rate=r, batch=batch)) for r in (rate, rate / 10)
+    ]
     jobs = [partial(simulate, two_mass_spring(), c, scenario(settings)) for c in candidates]
     same, slower = map(score, in_parallel(jobs))
     return same["control_variation"], slower["control_variation"]

@@ -10,6 +10,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from quell import checks
+from quell.described import Described
 from quell.features import Features, State
 from quell.features.base import checked_design
 from quell.learners.adapters.instances import (
@@ -49,7 +50,7 @@ class Snapshot:
     failures: int
 
 
-class PythonModel:
+class PythonModel(Described):
     """A learner whose model is a Python object.
 
     The loop stays compiled. Every ``period`` samples it calls the model with the pairs collected
@@ -97,6 +98,12 @@ class PythonModel:
         check_methods("model", model, ("learn", "predict"), rule)
         self._set_up(type(model).__name__, model, **options)
 
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: the model, its features, and when it is called."""
+        found = {"model": self._source, "features": self._online.features, "period": self.period}
+        more = {"budget": self.budget, "frequency": self.frequency, "scale": self.scale}
+        return found | {name: value for name, value in more.items() if value is not None}
+
     def _set_up(
         self,
         name: str,
@@ -107,7 +114,7 @@ class PythonModel:
         frequency: float | None = None,
         scale: Any = None,
     ) -> None:
-        self.name = name
+        self.name, self.frequency, self.scale = name, frequency, scale
         self.period = checks.whole("period", period, 1)
         self.budget = checks.optional(checks.positive, "budget", budget, "s")
         self._online = Online(

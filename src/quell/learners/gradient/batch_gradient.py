@@ -91,14 +91,14 @@ class BatchGradient:
 
     Parameters
     ----------
+    features
+        other features, which are scaled to O(1), as is Δf̂ (``scaled_features.py``); those of the
+        paper, unscaled, by default.
     rate
         learning rate α, per sample. The cost is a sum over the batch, so the step grows with
         ``batch`` and, per unit of time, with 1/dt.
     batch
         size n of the three buffers, in samples.
-    features
-        other features, which are scaled to O(1), as is Δf̂ (``scaled_features.py``); those of the
-        paper, unscaled, by default.
 
     Raises
     ------
@@ -106,15 +106,17 @@ class BatchGradient:
         for a negative rate, a batch below 1, or something that is no block of features.
     """
 
+    features: Features | None = None
     rate: float = 1e-6
     batch: int = 10
-    features: Features | None = None
 
     def __post_init__(self) -> None:
+        given: Any = self.features
+        if not isinstance(given, Features | None):
+            rule = "must be made of blocks, or None; give rate= and batch= by their names"
+            raise ValueError(f"features = {self.features!r}: {rule}")
         checks.non_negative("rate", self.rate)
         checks.whole("batch", self.batch, 1)
-        if not isinstance(self.features, Features | None):
-            raise ValueError(f"features = {self.features!r}: must be made of blocks, or None")
 
     def design(self, observer: ESO, omega_c: float) -> BatchDesign | ScaledDesign:
         """Return the parameters for an observer.

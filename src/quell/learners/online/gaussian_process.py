@@ -27,6 +27,7 @@ from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import exp, sqrt
 from quell.kernels.sized import Buffer, Size
+from quell.learners.feature_learner import features_first
 from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
 from quell.observers.eso import ESO
@@ -265,10 +266,10 @@ class GaussianProcess(Online):
 
     Parameters
     ----------
-    budget
-        largest number M of points. A sample costs O(M²).
     features
         blocks of features; the state by default.
+    budget
+        largest number M of points. A sample costs O(M²).
     length
         distance over which f varies, in scaled features, which lie in [−1, 1].
     memory_time
@@ -298,8 +299,8 @@ class GaussianProcess(Online):
 
     def __init__(
         self,
-        budget: int = 40,
         features: Features | None = None,
+        budget: int = 40,
         *,
         length: float = 0.5,
         memory_time: float | None = None,
@@ -311,11 +312,20 @@ class GaussianProcess(Online):
         bias_bandwidth: float | None = None,
     ) -> None:
         self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
+        features, budget = features_first(features, budget, 40, "budget")
         model = GaussianProcessModel(budget, length, every, 1.0, noise, 1.0, novelty)
         features = State() if features is None else features
         super().__init__(
             model, features, frequency=frequency, scale=scale, bias_bandwidth=bias_bandwidth
         )
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: features, and the numbers of the process."""
+        numbers = {
+            name: getattr(self.model, name)
+            for name in ("budget", "length", "every", "noise", "novelty")
+        }
+        return super().described() | numbers
 
     def fitted_model(self, observer: ESO, omega_c: float) -> GaussianProcessModel:
         """Return the process with the memory time and the noise's correlation time."""

@@ -21,6 +21,7 @@ from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import tanh
 from quell.kernels.sized import Size
+from quell.learners.feature_learner import features_first
 from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
@@ -163,10 +164,10 @@ class MLP(Online):
 
     Parameters
     ----------
-    hidden
-        number of hidden units h. A sample costs O(h²).
     features
         blocks of features; the state by default.
+    hidden
+        number of hidden units h. A sample costs O(h²).
     memory_time
         time after which a sample has the weight 1/e, where new samples come [s]; ``100/omega_c`` by
         default.
@@ -193,8 +194,8 @@ class MLP(Online):
 
     def __init__(
         self,
-        hidden: int = 10,
         features: Features | None = None,
+        hidden: int = 10,
         *,
         memory_time: float | None = None,
         every: int = 1,
@@ -205,11 +206,18 @@ class MLP(Online):
         bias_bandwidth: float | None = None,
     ) -> None:
         self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
+        features, hidden = features_first(features, hidden, 10, "hidden")
         model = Network(hidden, seed, every, memory_time=1.0, noise=noise, noise_time=1.0)
         features = State() if features is None else features
         super().__init__(
             model, features, frequency=frequency, scale=scale, bias_bandwidth=bias_bandwidth
         )
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints: features, and the numbers of the network."""
+        model = self.model
+        numbers = {"hidden": model.hidden, "every": model.every, "noise": model.noise}
+        return super().described() | numbers | {"seed": model.seed}
 
     def fitted_model(self, observer: ESO, omega_c: float) -> Network:
         """Return the network with the memory time and the noise's correlation time."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from quell import checks
 from quell.features import Features
+from quell.learners.feature_learner import features_first
 from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.linear import Linear
 from quell.observers.eso import ESO
@@ -54,6 +55,8 @@ class NLMS(Linear):
 
     Parameters
     ----------
+    features
+        blocks of features; the state and a bias by default.
     rate
         rate at which an observed error decays [1/s]; ``omega_c`` of the controller by default.
     regularisation
@@ -74,8 +77,8 @@ class NLMS(Linear):
 
     def __init__(
         self,
-        rate: float | None = None,
         features: Features | None = None,
+        rate: float | None = None,
         *,
         regularisation: float = 1e-2,
         frequency: float | None = None,
@@ -83,6 +86,7 @@ class NLMS(Linear):
         gain_interval: tuple[float, float] = (0.5, 2.0),
         bias_bandwidth: float | None = None,
     ) -> None:
+        features, rate = features_first(features, rate, None, "rate")
         super().__init__(features, frequency, scale, gain_interval, bias_bandwidth)
         self.rate = checks.optional(checks.positive, "rate", rate, "1/s")
         self.regularisation = checks.positive("regularisation", regularisation)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.described import Described
 from quell.kernels.function_pointers import call
 from quell.plants.base import advance, begin_run, check_run, measure
 from quell.plants.fmu.instances import INSTANCES, Instance, begin, callback_address
@@ -53,8 +54,8 @@ def _check_run(plant: FMUModel, scratch: Vector) -> None:
     INSTANCES[int(scratch[0])].raise_problem()
 
 
-@dataclass(frozen=True, eq=False)
-class FMU:
+@dataclass(frozen=True, eq=False, repr=False)
+class FMU(Described):
     """A plant that a co-simulation FMU, of FMI 2.0 or 3.0, computes through FMPy.
 
     **An FMU is a program.** From the first run on, its binary runs in this process with all rights

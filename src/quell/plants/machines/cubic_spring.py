@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.described import Described
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.labelled import labelled
@@ -54,8 +55,8 @@ def _apply_cubic_force(plant: CubicSpringModel, x: Vector) -> None:
     x[3] += plant.impulse2 * cube
 
 
-@dataclass(frozen=True, eq=False)
-class CubicSpringPlant:
+@dataclass(frozen=True, eq=False, repr=False)
+class CubicSpringPlant(Described):
     """Two masses with a cubic spring; ``lagged_two_mass_spring`` makes it.
 
     It is solved by Strang splitting (Hairer, Lubich & Wanner, *Geometric Numerical Integration*,

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.described import Described
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Buffer
 from quell.plants.base import advance, measure
@@ -109,8 +110,8 @@ def cogging_torque(table: Vector, angle: float) -> float:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class DcMotor:
+@dataclass(frozen=True, eq=False, repr=False)
+class DcMotor(Described):
     """A motor with friction, cogging and encoder; ``dc_motor`` makes it.
 
     Its states are the angle [rad], the speed [rad/s] and, with inductance, the current [A].

@@ -31,6 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.described import Described
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.delay import DelayedPlantModel
@@ -97,8 +98,8 @@ def _stopping_torque(speed: float, gain: float, largest: float) -> float:
     return min(max(-speed / gain, -largest), largest)
 
 
-@dataclass(frozen=True, eq=False)
-class TorsionalPlant:
+@dataclass(frozen=True, eq=False, repr=False)
+class TorsionalPlant(Described):
     """Two disks with friction, drive and encoder; ``torsional`` makes it.
 
     Its states are those of ``linear``, followed by the delayed values of u.

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.described import Described
 from quell.kernels.functions import tanh
 from quell.plants.base import advance, measure
 from quell.plants.linear import LinearPlant
@@ -65,8 +66,8 @@ def _derivatives(
 advance.register(FrictionModel)(runge_kutta)
 
 
-@dataclass(frozen=True, eq=False)
-class FrictionPlant:
+@dataclass(frozen=True, eq=False, repr=False)
+class FrictionPlant(Described):
     """A transfer function with Coulomb friction: of order 1, or of relative degree 2 or more.
 
     Parameters

@@ -13,6 +13,7 @@ import numpy as np
 from numba.core import types as nb_types
 
 from quell import checks
+from quell.described import Described
 from quell.kernels import function_pointers, validation
 from quell.kernels.function_pointers import POINTER
 from quell.plants.labelled import labelled, signals_of
@@ -40,8 +41,8 @@ _RATE_SIGNATURE = nb_types.void(nb_types.float64, POINTER, nb_types.float64, POI
 _OUTPUT_SIGNATURE = nb_types.float64(POINTER)
 
 
-@dataclass(frozen=True, eq=False)
-class NonlinearPlant:
+@dataclass(frozen=True, eq=False, repr=False)
+class NonlinearPlant(Described):
     """A plant ``x' = f(t, x, u, w, …)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
 
     Parameters

@@ -36,7 +36,7 @@ class Design:
 
     name: str  #: name of the structure, with its order
     controller: Controller | None  #: None if ``reason`` says why there is none
-    values: Mapping[str, float]  #: the free parameters by name
+    values: Mapping[str, float]  #: the free parameters by name; b0 and K with their sign
     #: what was optimised: k_i for load rejection [u-unit/(y-unit s)], which is to be large; else
     #: the integral of ``|y|`` or the RMS of r − y, which are to be small
     objective: float
@@ -83,7 +83,7 @@ def design_of(
     return Design(
         name=name,
         controller=structure.controller(values, **u),
-        values={p.name: float(v) for p, v in zip(structure.parameters, values, strict=True)},
+        values=_signed(solution),
         objective=k_i if problem.objective == "load" else size,
         k_i=k_i,
         measures=measures,
@@ -91,6 +91,14 @@ def design_of(
         tables=tables,
         solution=solution,
     )
+
+
+def _signed(solution: Solution) -> dict[str, float]:
+    """Return the values by name, the gain with its sign: the search is about its size."""
+    names = [parameter.name for parameter in solution.structure.parameters]
+    values = dict(zip(names, map(float, solution.values), strict=True))
+    values[names[0]] *= solution.structure.gain_sign
+    return values
 
 
 def measured(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from quell.plants.delay import delayed
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix
 
@@ -61,8 +62,13 @@ def _value(value: Any) -> str:
     return repr(float(value))
 
 
-def plant_table(linear: LinearPlant, actuator_lag: float, delay: float) -> dict[str, Any]:
-    """Return the table of a linear plant behind a lag and a delay [s] of u."""
+def plant_table(
+    linear: LinearPlant, actuator_lag: float, delay: float, dt: float
+) -> tuple[dict[str, Any], int]:
+    """Return the table of a linear plant behind a lag and a delay [s] of u, sampled at ``dt`` [s].
+
+    Beside it, how many states lag and delay append, which are u at rest.
+    """
     if actuator_lag > 0.0:
         n = linear.order
         A = np.block([[linear.A, linear.B], [np.zeros((1, n)), np.full((1, 1), -1 / actuator_lag)]])
@@ -76,7 +82,11 @@ def plant_table(linear: LinearPlant, actuator_lag: float, delay: float) -> dict[
         "C": linear.C[0].tolist(),
         "E": _rows(linear.E),
     }
-    return table if delay == 0.0 else {"kind": "delayed", "plant": table, "delay": delay}
+    appended = int(actuator_lag > 0.0)
+    if delay == 0.0:
+        return table, appended
+    appended += delayed(linear, delay, dt).order - linear.order
+    return {"kind": "delayed", "plant": table, "delay": delay}, appended
 
 
 def _rows(matrix: Matrix) -> list[list[float]]:

@@ -20,6 +20,7 @@ from quell.analysis.frequency_response import Complex
 from quell.controllers.adrc.adrc import ADRC
 from quell.lti.canonical import Canonical, canonical
 from quell.observers.eso import ESO
+from quell.plants.linear import LinearPlant
 from quell.tuning.structures import sampled_adrc
 from quell.tuning.structures.base import Model, Parameter
 from quell.types import Matrix, Vector
@@ -69,6 +70,7 @@ class AdrcStructure:
 
     def __init__(self, model: Model, name: str, order: int, form: Form) -> None:
         self.name, self.model, self.form = name, model, form
+        self.gain_sign = model.sign
         # With s^(n+1) A + b0 B = p_law p_observer the poles of 1/A are as fast as the loop's. With
         # a model, D s A + b0 N B has A less the model's own poles: it may have a slow one.
         self.may_swing = form.based
@@ -288,6 +290,10 @@ class AdrcStructure:
         if not self.form.based:
             observer["order"] = self.order
         observer |= {"b0": b0, "omega_o": omega_o}
+        if self.form.based:  # the plant of the file may be late, or not linear
+            linear = LinearPlant.of(self.model.plant)
+            parts = zip("ABC", (linear.A, linear.B, linear.C), strict=True)
+            observer["plant"] = {"kind": "linear"} | {key: part.tolist() for key, part in parts}
         if poles is not None:
             observer["poles"] = _listed(poles)
         if self.form.reduced:

@@ -46,6 +46,7 @@ class Structure(Protocol):
 
     name: str
     parameters: tuple[Parameter, ...]
+    gain_sign: float  # sign of the first parameter where it is printed, +1 or −1
     gain_power: int  # 1 if C_y is proportional to the first parameter, −1 if to its inverse
     may_swing: bool  # whether a second slow pole can make k_i large, so that this must be bounded
 

@@ -47,6 +47,7 @@ class LqgStructure:
     """An LQG controller by bandwidths, for a plant of a factor times the real gain."""
 
     name = "lqg"
+    gain_sign = 1.0  # a factor of the plant's own gain
     gain_power = -1
     may_swing = False
 

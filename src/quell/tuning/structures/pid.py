@@ -43,6 +43,7 @@ class FilteredPID:
         self.name = ("pid" if derivative else "pi") + ("" if filtered else "-unfiltered")
         self.model, self.derivative, self.filtered = model, derivative, filtered
         self.ratio = ratio
+        self.gain_sign = model.sign
         unit, dt = 1.0 / model.omega, model.dt
         times = (_TIMES[0] * unit, _TIMES[1] * unit)
         # The poles of F are at √2/T_f with a derivative, at 1/T_f without.
@@ -153,4 +154,5 @@ class FilteredPID:
         arguments = self._arguments(values)
         if "tf" in arguments:
             arguments["tf"] = list(arguments["tf"])
-        return {"controller": {"kind": "pid"} | arguments}
+        name = {} if self.derivative else {"name": "PI"}
+        return {"controller": {"kind": "pid"} | arguments | name}

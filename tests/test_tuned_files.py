@@ -1,0 +1,207 @@
+"""Setup files of tuned controllers: what they contain, and that ``quell run`` accepts them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.setup import load
+from quell.tuning import STRUCTURES
+from tests.commands import Shown, in_this_process
+
+DRIVE = ([-2.0], [1.0, 3.0, 2.0])
+DT = 0.05
+NUMBERS = ("--num", "-2", "--den", "1,3,2", "--dt", "0.05")
+FEW = ("--structure", "pi", "--no-figures")
+
+
+@pytest.fixture
+def quell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> object:
+    """Return the function that runs a command in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: in_this_process(arguments, monkeypatch, capsys)
+
+
+# The rule of thumb that warns of bandwidths beside a delay is more careful than M_s.
+@pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")
+@pytest.mark.parametrize("delay", [0.0, 0.12])
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_the_file_of_every_structure_is_the_tuned_loop(
+    quell: object, tmp_path: Path, structure: str, delay: float
+) -> None:
+    """With and without a delay, which has a part of a sample: ``quell run`` accepts it, and plant and controller are those of the tuning."""
+    bounds, order = ql.tuning.Constraints(m_ks=10.0), None if structure.startswith("pi") else 2
+    how = {"constraints": bounds, "order": order, "compare": (), "u_min": -30.0}
+    tuned = ql.tune(DRIVE, DT, structure=structure, delay=delay, **how)
+    tuned.save(tmp_path / "tuned.toml")
+    shown: Shown = quell("run", "tuned.toml", "--no-figures", "--json", "run.json")  # type: ignore[operator]
+    assert shown.code == 0, shown.err
+    setup = load(tmp_path / "tuned.toml")
+    assert repr(setup.controller) == repr(tuned.controller)
+    assert setup.controller.limits.low == -30.0
+    loop = ql.analysis.analyse(setup.plant, setup.controller)
+    assert loop.margins.modulus == pytest.approx(tuned.analysis.margins.modulus, rel=1e-9)
+    step, load_window = json.loads((tmp_path / "run.json").read_text())["metrics"]
+    assert step["overshoot"] is not None
+    assert load_window["start"] == step["stop"]
+    assert "overshoot" not in load_window
+    assert load_window["missing"]["overshoot"].endswith("no step")
+    assert load_window["peak_error"] > 0.0
+
+
+def test_the_gain_is_printed_with_its_sign(quell: object) -> None:
+    """Of ADRC and of PI, as text and in the JSON; K is positive for a positive plant."""
+    for structure, name in (("bandwidths", "b0"), ("pi", "K")):
+        command = ("tune", *NUMBERS, "--structure", structure, "--no-figures")
+        shown: Shown = quell(*command, "--json", f"{name}.json")  # type: ignore[operator]
+        assert f"{name} = -" in shown.out, shown.err
+        values = json.loads(Path(f"{name}.json").read_text())["design"]["values"]
+        assert values[name] < 0.0
+    assert (
+        ql.tune(([2.0], [1.0, 3.0, 2.0]), DT, structure="pi", compare=()).design.values["K"] > 0.0
+    )
+
+
+SETUP = """dt = 0.05
+plant = { kind = "linear", num = [-2.0], den = [1.0, 3.0, 2.0] }
+controller = { kind = "pid", kp = 1.0, u_max = 9.0 }
+[tune]
+compare = []
+"""
+
+
+def record(path: Path) -> None:
+    """Write a record around an operating point: u = 3, and y = −3 with a constant force of −1 in u."""
+    rng = np.random.default_rng(1)
+    u = 3.0 + np.where(rng.integers(0, 2, 120).repeat(10) > 0, 0.5, -0.5)
+    plant = ql.plants.LinearPlant.of(DRIVE)
+    x0 = np.linalg.solve(plant.A, -plant.B[:, 0] * 2.0)
+    t = np.arange(u.size) * DT
+    model, x, y = plant.sampled(DT), x0.copy(), np.empty(u.size)
+    for k, value in enumerate(u):
+        y[k] = model.output @ x
+        x = model.transition @ x + model.input * (value - 1.0)
+    y += 1e-4 * rng.normal(size=y.size)
+    np.savetxt(path, np.column_stack([t, u, y]), delimiter=",", header="t,u,y", comments="")
+
+
+@pytest.mark.parametrize("route", ["numbers", "setup", "record", "model"])
+def test_limits_of_u_reach_the_file_by_every_route(
+    quell: object, tmp_path: Path, route: str
+) -> None:
+    """Plant by numbers, by setup, by record and by the file of an identified model; those of the command go before the setup's."""
+    (tmp_path / "plant.toml").write_text(SETUP, encoding="utf-8")
+    source: tuple[str, ...] = NUMBERS
+    if route == "setup":
+        source = ("plant.toml",)
+    if route in ("record", "model"):
+        record(tmp_path / "record.csv")
+        source = ("record.csv", "--model-order", "2")
+    if route == "model":
+        identify = ("identify", "record.csv", "--order", "2", "--no-figures", "--no-alternatives")
+        assert quell(*identify, "--json", "model.json").code == 0  # type: ignore[operator]
+        text = 'dt = 0.05\nplant = { kind = "identified", path = "model.json" }\n'
+        (tmp_path / "model.toml").write_text(text + 'controller = { kind = "pid", kp = 1.0 }\n')
+        source = ("model.toml",)
+    limits = ("--u-min", "0.5", "--u-max", "4.5")
+    shown: Shown = quell("tune", *source, *limits, *FEW, "--out", "tuned.toml")  # type: ignore[operator]
+    assert shown.code == 0, shown.err
+    setup = load(tmp_path / "tuned.toml")
+    assert (setup.controller.limits.low, setup.controller.limits.high) == (0.5, 4.5)
+
+
+def test_the_scenario_begins_at_the_operating_point_of_the_record(
+    quell: object, tmp_path: Path
+) -> None:
+    """A plant that works at u = 3 is judged there, and not at zero, where its limits are."""
+    record(tmp_path / "record.csv")
+    command = ("tune", "record.csv", "--model-order", "2", "--u-min", "0", "--u-max", "6", *FEW)
+    assert quell(*command, "--out", "tuned.toml").code == 0  # type: ignore[operator]
+    setup = load(tmp_path / "tuned.toml")
+    run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    step, load_window = (run.metrics(**window) for window in setup.windows)
+    before = run.window(0.0, setup.windows[0]["start"])
+    assert run["u"][before][-1] == pytest.approx(3.0, abs=0.1)
+    assert run["y"][before][-1] == pytest.approx(-2.0, abs=0.1)
+    assert abs(step["overshoot"]) < 0.6
+    assert math.isfinite(step["settling_time"])
+    assert "overshoot" not in load_window
+
+
+def test_an_operating_point_that_is_given_is_where_the_scenario_begins(quell: object) -> None:
+    """By numbers, with a delay and a lag whose states are at rest, too; half of one is refused, and one beside a setup."""
+    at = ("--u-rest", "3", "--y-rest", "-2.5", "--delay", "0.12")
+    assert quell("tune", *NUMBERS, *at, *FEW, "--out", "tuned.toml").code == 0  # type: ignore[operator]
+    setup = load("tuned.toml")
+    model, x = setup.plant.sampled(DT, interpret=True), np.array(setup.scenario.x0)
+    from quell.plants.base import advance, measure
+
+    w = np.array([signal(np.zeros(1))[0] for signal in setup.scenario.seeded_signals(1)[1]])
+    assert measure(model, x) == pytest.approx(-2.5)
+    later = x.copy()
+    advance(model, later, np.zeros(6 * x.size), 0.0, 3.0, w)
+    np.testing.assert_allclose(later, x, atol=1e-12)
+    Path("plant.toml").write_text(SETUP, encoding="utf-8")
+    for command, message in (
+        ((*NUMBERS, "--u-rest", "3"), "--u-rest and --y-rest: go together"),
+        (("plant.toml", "--y-rest", "3"), "--y-rest: is the operating_point of [plant]"),
+    ):
+        shown: Shown = quell("tune", *command, *FEW)  # type: ignore[operator]
+        assert shown.code == 2
+        assert message in shown.err
+
+
+def test_a_nonlinear_plant_is_judged_at_its_operating_point(tmp_path: Path) -> None:
+    """A tank: outflow with the root of its level, a tenth of a volt to a centimetre."""
+    tank = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (u + w[0] - math.sqrt(max(x[0], 0.0)),),
+        order=1,
+        operating_point=([9.0], 3.0),
+    )
+    tuned = ql.tune(tank, 0.1, structure="pi", compare=(), u_min=0.0, u_max=10.0)
+    tuned.save(tmp_path / "tuned.toml")
+    setup = load(tmp_path / "tuned.toml")
+    run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    start = setup.windows[0]["start"]
+    assert run["y"][run.window(0.0, start)][-1] == pytest.approx(9.0, abs=0.05)
+    assert run["u"][run.window(0.0, start)][-1] == pytest.approx(3.0, abs=0.05)
+    assert run.metrics(**setup.windows[0])["overshoot"] < 0.5
+
+
+def test_a_delay_of_the_table_tune_is_in_the_plant_of_the_file(
+    quell: object, tmp_path: Path
+) -> None:
+    """Once: the file's own [tune] has none any more; ranges of the plant keep their place."""
+    text = SETUP.replace("[tune]", "[tune]\ndelay = 0.12").replace("num = [-2.0]", "num = [-2.0]")
+    (tmp_path / "plant.toml").write_text(text, encoding="utf-8")
+    shown: Shown = quell("tune", "plant.toml", *FEW, "--out", "tuned.toml")  # type: ignore[operator]
+    assert shown.code == 0, shown.err
+    setup = load(tmp_path / "tuned.toml")
+    assert setup.plant.delay == pytest.approx(0.12)
+    assert "delay" not in setup.tune
+    again: Shown = quell("tune", "tuned.toml", *FEW, "--out", "again.toml")  # type: ignore[operator]
+    assert again.code == 0, again.err
+    other = load(tmp_path / "again.toml")
+    assert other.controller.ki == pytest.approx(setup.controller.ki, rel=1e-6)
+
+
+def test_the_table_of_a_tuning_is_not_cut_in_80_columns(
+    quell: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names of structures stand in one line, beside numbers of eight digits."""
+    monkeypatch.setenv("COLUMNS", "80")
+    Path("plant.toml").write_text(
+        SETUP.replace("num = [-2.0]", "num = [-2.0e-5]"), encoding="utf-8"
+    )
+    command = ("tune", "plant.toml", "--structure", "half-gain-law", "--order", "2", "--no-figures")
+    shown: Shown = quell(*command)  # type: ignore[operator]
+    assert "…" not in shown.out
+    rows = [line for line in shown.out.splitlines() if line.startswith("half-gain-law of order 2 ")]
+    assert rows, shown.out
