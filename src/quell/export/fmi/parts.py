@@ -33,7 +33,6 @@ class ControllerPart:
     """A controller in C."""
 
     source: CSource
-    derivatives: int  # of the reference that it takes as inputs
     limits: tuple[float, float]  # of u
     limits_path: str  # of ``Limits`` in its parameters
     bandwidths: Bandwidths | None
@@ -49,7 +48,6 @@ class ControllerPart:
         limits = at_path(parameters, path)
         return cls(
             source,
-            controller.derivatives if "set_derivatives" in source.operations else 0,
             (limits.low, limits.high),
             path,
             bandwidths(controller),
@@ -70,7 +68,7 @@ class ControllerPart:
         described = "derivative {i} of the reference"
         return [
             Variable("r", INPUT, "reference"),
-            *several("r_derivative", self.derivatives, INPUT, described),
+            *several("r_derivative", self.source.derivatives, INPUT, described),
         ]
 
     @property
