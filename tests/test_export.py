@@ -70,6 +70,12 @@ RLS = ql.ADRC(OBSERVER, 1.5, learner=ql.learners.RLS(State() + Periodic(highest=
 MOVING = ql.ADRC(
     OBSERVER, 1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), feedforward=True, **LIMITS
 )
+BY_MODEL = ql.ADRC(
+    ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT, delay=DT),
+    1.5,
+    feedforward=ql.Feedforward((0.3, 0.1, 0.7), coulomb=0.2, coulomb_speed=0.5, constant=-0.1),
+    **LIMITS,
+)
 NONLINEAR = ql.ADRC(ql.ESO.nonlinear(2, 1.5, 12.0, DT, delta=0.05), 1.5)
 
 
@@ -86,6 +92,8 @@ NONLINEAR = ql.ADRC(ql.ESO.nonlinear(2, 1.5, 12.0, DT, delta=0.05), 1.5)
         pytest.param(RLS, "single", id="RLS, single"),
         pytest.param(MOVING, "double", id="feedforward"),
         pytest.param(MOVING, "single", id="feedforward, learner and guard, single"),
+        pytest.param(BY_MODEL, "double", id="feedforward by a model"),
+        pytest.param(BY_MODEL, "single", id="feedforward by a model, single"),
     ],
 )
 def test_the_c_code_repeats_the_kernels_bit_for_bit(
@@ -131,6 +139,8 @@ def test_a_step_without_the_derivatives_of_the_reference_does_not_compile(tmp_pa
         (MOVING, "1.0, 0.0", False),
         (MOVING, "1.0, 0.0, 0.1", False),
         (MOVING, "1.0, 0.0, 0.1, 0.2", True),
+        (BY_MODEL, "1.0, 0.0, 0.1, 0.2", False),
+        (BY_MODEL, "1.0, 0.0, 0.1, 0.2, 0.3", True),
         (ADRC, "1.0, 0.0", True),
     ):
         exported(tmp_path, controller, overwrite=True)

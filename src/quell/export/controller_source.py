@@ -34,6 +34,7 @@ _CHANNELS = {
     "x_hat": "y and its derivatives",
     "f_residual": "the observer's share of f",
     "f_learned": "the learner's share of f",
+    "u_feedforward": "feedforward of the model, a part of u",
     "status": "flags of the last sample",
     "authority": "share of its output that the guard allows the learner",
     "error_plain": "RMS error in f of an ESO without learner",

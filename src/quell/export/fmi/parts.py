@@ -16,6 +16,7 @@ _DESCRIPTIONS = {
     "f_hat": "estimate of the total disturbance: f_residual + f_learned",
     "f_residual": "the observer's share of it",
     "f_learned": "the learner's share of it",
+    "u_feedforward": "feedforward of the model, a part of u",
     "status": "flags of the last sample, see the enumeration in the header of the controller",
     "authority": "share of its output that the guard allows the learner",
     "error_plain": "RMS error in f of an observer without learner",
