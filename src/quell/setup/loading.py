@@ -27,6 +27,9 @@ from quell.simulation.scenario import Scenario
 Known: TypeAlias = dict[str, tuple[tuple[Any, ...], Any]]
 """Inputs and object of each part that was built, for ``assembled``."""
 
+# Objects that tables within a table may need.
+_FOR_TABLES_INSIDE = {"controller": {"plant"}}
+
 EXAMPLES = Path(__file__).parent / "examples"
 """The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
 
@@ -116,7 +119,8 @@ def assembled(
         table = getattr(tables, key)
         if table is None:
             return None
-        context = {each: context[each] for each in parameters_of(table.function) & context.keys()}
+        takes = parameters_of(table.function).keys() | _FOR_TABLES_INSIDE.get(key, set())
+        context = {each: context[each] for each in takes & context.keys()}
         inputs = table, dt, *context, *context.values()
         return made_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
 
@@ -129,7 +133,9 @@ def assembled(
     if unused:
         rule = f"a controller of the kind {kind} does not use it"
         raise SetupError([f"{name}: {key}: {rule}" for key in unused])
-    controller = build("controller", plant=model, **parts)
+    # A controller is designed for the linear part; a feedforward also uses friction and delay.
+    designs = "plant" in parameters_of(tables.controller.function)
+    controller = build("controller", plant=model if designs else plant, **parts)
     prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
     if rig is not None and plant is not None and signals_of(plant).known:
         rig = {"signals": signals_of(plant), **rig}

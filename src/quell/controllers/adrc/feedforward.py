@@ -213,6 +213,16 @@ class Feedforward:
         highest = min(len(self.coefficients), _MOST)
         return highest if self.derivatives is None else self.derivatives
 
+    def describe(self) -> str:
+        """Return u_ff as a formula."""
+        names = ["r" + "'" * i if i < 4 else f"r^({i})" for i in range(len(self.coefficients))]
+        terms = [f"{c:.4g} {name}" for c, name in zip(self.coefficients, names, strict=True) if c]
+        terms += [f"{self.coulomb:.4g} sign(r')"] if self.coulomb else []
+        terms += [f"{self.constant:.4g}"] if self.constant else []
+        late = "the delay that the observer knows" if self.delay is None else f"{self.delay:g} s"
+        total = " + ".join(terms).replace("+ -", "- ") or "0"
+        return f"u = {total}, ahead by half a sample and {late}"
+
     def table(self) -> dict[str, Any]:
         """Return it as a table of a setup file."""
         found: dict[str, Any] = {"kind": "series", "coefficients": list(self.coefficients)}
