@@ -95,8 +95,8 @@ class Feedforward:
     >>> observer = ql.ESO.model_free(order=2, b0=4000.0, omega_o=500.0, dt=2.5e-4)
     >>> axis = Feedforward.rigid(1.27e-3, coulomb=0.02)
     >>> controller = ql.ADRC(observer, omega_c=100.0, feedforward=axis)
-    >>> round(controller.step(0.0, 0.0, 0.0, 100.0), 6)
-    0.127
+    >>> round(controller.step(0.0, 0.0, 0.0, 100.0), 6)  # J r'' + F, half a sample ahead
+    0.147
     """
 
     coefficients: Sequence[float]
