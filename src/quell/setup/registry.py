@@ -151,8 +151,12 @@ LEARNERS = _call_tables(
 )
 Notch = call_table("notch", notch.Notch.at, only=True)
 Feedback = call_table("nonlinear-feedback", NonlinearFeedback, only=True)
-_MODELS = {"series": Feedforward, "rigid": Feedforward.rigid, "model": Feedforward.of}
-FEEDFORWARDS = _call_tables(_MODELS, {"plant": Plant | None}, _MODEL)
+_SERIES: Mapping[str, Callable[..., Any]] = {
+    "series": Feedforward,
+    "rigid": Feedforward.rigid,
+    "model": Feedforward.of,
+}
+FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
 _LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True)}
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
 _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)

@@ -151,7 +151,7 @@ class ADRC(StatefulController):
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
             feedback=feedback_design(self.feedback, observer.degree, omega_c),
-            feedforward=feedforward_design(self.feedforward, observer, gains),
+            feedforward=feedforward_design(self.feedforward, observer),
             fade=math.exp(-omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,

@@ -233,8 +233,8 @@ class Feedforward:
                 found[name] = value
         return found
 
-    def design(self, observer: ESO, gains: Vector) -> ModelFeedforward:
-        """Return the parameters for an observer and the gains k (degree,) of the law.
+    def design(self, observer: ESO) -> ModelFeedforward:
+        """Return the parameters for an observer.
 
         Raises ``ValueError`` for an observer whose f enters elsewhere than u.
         """
@@ -254,7 +254,6 @@ class Feedforward:
         own[: given.size] = given
         inverse = inverse_series(plant, m)
         wish = np.zeros(m + 1)
-        wish[:degree] = gains
         wish[degree] = 1.0
         acting = shifted(own, lead - known)
         return ModelFeedforward(
@@ -317,10 +316,10 @@ def checked_feedforward(feedforward: Any) -> bool | Feedforward:
     )
 
 
-def feedforward_design(feedforward: bool | Feedforward, observer: ESO, gains: Vector) -> Any:
+def feedforward_design(feedforward: bool | Feedforward, observer: ESO) -> Any:
     """Return the parameters of the feedforward, also without a model."""
     if isinstance(feedforward, Feedforward):
-        return feedforward.design(observer, gains)
+        return feedforward.design(observer)
     return ReferenceOnly()
 
 

@@ -16,7 +16,7 @@ class ModelFeedforward(NamedTuple):
     """Parameters of the feedforward by a model, with m derivatives of the reference."""
 
     control: Vector  # c (m + 1,): u_ff from r, r', …, at the time when u acts
-    wish: Vector  # (m + 1,): what the numerator of the law takes from r, r', …, without u_ff
+    wish: Vector  # (m + 1,): of r^(n) − D r in the numerator of the law, from r, r', …
     share: Vector  # (m + 1,): f_m from r, r', …
     b0: float
     coulomb: float
@@ -39,8 +39,12 @@ def reference_part(feedforward: Any, law: Vector, r: float, reference: Vector) -
 
 @reference_part.register(ModelFeedforward)
 def _by_model(feedforward: ModelFeedforward, law: Vector, r: float, reference: Vector) -> float:
+    total = law[0] * r
+    for i in range(1, law.size):
+        if i <= reference.size:
+            total += law[i] * reference[i - 1]
     control = control_by_model(feedforward, r, reference)
-    return _series(feedforward.wish, r, reference) + feedforward.b0 * control
+    return total + _series(feedforward.wish, r, reference) + feedforward.b0 * control
 
 
 @generic_with_default
