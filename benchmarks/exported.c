@@ -2,7 +2,8 @@
  *
  * The program reads rows (action, reference, noise, share) from its standard input: the actions are
  * those of quell.export.library.vectors. It writes what the controller was given and what it
- * returned. HAS_TRACK, HAS_START, LIMITS and DERIVATIVES say what the controller has.
+ * returned. HAS_TRACK, HAS_START and LIMITS say what the controller has, and HALVES(x)
+ * is the list of its last arguments, one x for each derivative of the reference.
  *
  * The plant is x'' = 1.5 u - 0.5 x' - 2 x + 0.3 sin(3 x) + 0.5 sin(0.7 t), in double precision.
  */
@@ -51,17 +52,11 @@ static real play(servo_state *state, int action, real r, real y, real given, rea
     if (action == START)
         servo_start(state, y, given, r);
 #endif
-#if DERIVATIVES
-    real derivatives[DERIVATIVES];
-    for (int i = 0; i < DERIVATIVES; i++)
-        derivatives[i] = (real)0.5 * r;
-    servo_set_derivatives(state, derivatives);
-#endif
 #ifdef HAS_TRACK
     if (action == TRACK)
-        return servo_track(state, r, y, given);
+        return servo_track(state, r, y, given HALVES((real)0.5 * r));
 #endif
-    return servo_step(state, r, y);
+    return servo_step(state, r, y HALVES((real)0.5 * r));
 }
 
 static double clipped(double u, double most)
@@ -87,7 +82,7 @@ int main(void)
         const double t = (double)k * SERVO_SAMPLE_TIME;
 
         u = (double)play(&state, action, r, y, given, limit);
-        servo_step(&other, y, r);
+        servo_step(&other, y, r HALVES((real)0.0));
         const result found = {r, y, given, (real)u, (real)servo_status(&state)};
         fwrite(&found, sizeof found, 1, stdout);
         /* The actuator of the plant has limits of its own. */

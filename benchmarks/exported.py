@@ -181,7 +181,7 @@ def compiled(
 ) -> np.ndarray:
     """Return u of the compiled methods for the measurements ``y``."""
     runner, path = copy.deepcopy(controller), limits_path(controller)
-    derivatives = int(getattr(controller, "derivatives", 0)) if "set_derivatives" in names else 0
+    derivatives = int(getattr(controller, "derivatives", 0))
     u = np.empty(given.size)
     for k, row in enumerate(given):
         action = available(Action(int(rows[k, 0])), names, path)
@@ -221,13 +221,12 @@ def judged(name: str, controller: Any, precision: str, options: argparse.Namespa
         inner = ql.controllers.prefilters.prefilter.without_prefilters(controller)
         if "start" in names and samples_to_settle(inner.observer) > 20_000:
             names.discard("start")  # interpreted it would take minutes
-        derivatives = int(getattr(shown, "derivatives", 0)) if "set_derivatives" in names else 0
         defines = tuple(
             f"-D{each}"
             for each in (
                 *(f"HAS_{what.upper()}" for what in ("track", "start") if what in names),
                 *([f"LIMITS={path}"] if path else []),
-                f"DERIVATIVES={derivatives}",
+                f"HALVES(x)={', x' * done.source.derivatives}",
             )
         )
         runs = {each: played(build(folder, each, defines), rows, single) for each in COMPILERS}

@@ -67,6 +67,15 @@ def outcome(program: Path, *arguments: str) -> tuple[int, str]:
 
 
 RLS = ql.ADRC(OBSERVER, 1.5, learner=ql.learners.RLS(State() + Periodic(highest=2)), **LIMITS)
+MOVING = ql.ADRC(
+    OBSERVER, 1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), feedforward=True, **LIMITS
+)
+BY_MODEL = ql.ADRC(
+    ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT, delay=DT),
+    1.5,
+    feedforward=ql.Feedforward((0.3, 0.1, 0.7), coulomb=0.2, coulomb_speed=0.5, constant=-0.1),
+    **LIMITS,
+)
 NONLINEAR = ql.ADRC(ql.ESO.nonlinear(2, 1.5, 12.0, DT, delta=0.05), 1.5)
 
 
@@ -81,6 +90,10 @@ NONLINEAR = ql.ADRC(ql.ESO.nonlinear(2, 1.5, 12.0, DT, delta=0.05), 1.5)
         pytest.param(HAN, "double", id="prefilter"),
         pytest.param(NONLINEAR, "single", id="nonlinear observer, single"),
         pytest.param(RLS, "single", id="RLS, single"),
+        pytest.param(MOVING, "double", id="feedforward"),
+        pytest.param(MOVING, "single", id="feedforward, learner and guard, single"),
+        pytest.param(BY_MODEL, "double", id="feedforward by a model"),
+        pytest.param(BY_MODEL, "single", id="feedforward by a model, single"),
     ],
 )
 def test_the_c_code_repeats_the_kernels_bit_for_bit(
@@ -116,6 +129,29 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
         assert vectors.rows[at].u == pytest.approx(before, rel=1e-6)
     limited = vectors.rows[names.index("LIMIT") : names.index("FREE")]
     assert max(row.u for row in limited) == vectors.limit < 3.0
+
+
+@needs_gcc
+def test_a_step_without_the_derivatives_of_the_reference_does_not_compile(tmp_path: Path) -> None:
+    """They are arguments of step and track, as many as are fed forward; none without feedforward."""
+    program = tmp_path / "forgets.c"
+    for controller, given, fits in (
+        (MOVING, "1.0, 0.0", False),
+        (MOVING, "1.0, 0.0, 0.1", False),
+        (MOVING, "1.0, 0.0, 0.1, 0.2", True),
+        (BY_MODEL, "1.0, 0.0, 0.1, 0.2", False),
+        (BY_MODEL, "1.0, 0.0, 0.1, 0.2, 0.3", True),
+        (ADRC, "1.0, 0.0", True),
+    ):
+        exported(tmp_path, controller, overwrite=True)
+        calls = f"servo_step(s, {given}) + servo_track(s, 1.0, {given});"
+        program.write_text(
+            f'#include "servo.h"\ndouble u(servo_state *s)\n{{\n    return {calls}\n}}\n'
+        )
+        command = ["gcc", "-fsyntax-only", "-I", tmp_path / "out/src", program]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode == 0) is fits, done.stderr
+        assert fits or "too few arguments" in done.stderr
 
 
 @needs_gcc

@@ -445,3 +445,81 @@ def test_a_signal_without_a_known_derivative_says_so() -> None:
     """And what to do."""
     with pytest.raises(ValueError, match="Chirp has none: take another signal"):
         s.Chirp().derivative()
+
+
+@pytest.mark.parametrize(
+    ("distance", "v_max", "a_max", "j_max"),
+    [
+        (1.6, 20.0, 500.0, 2e4),  # all seven parts
+        (1.0, 20.0, 500.0, 2e4),  # without cruise
+        (0.01, 20.0, 500.0, 2e4),  # jerk alone
+        (-3.0, 2.0, 5.0, 9.0),  # the largest acceleration is not reached
+        (0.0, 1.0, 1.0, 1.0),
+    ],
+)
+def test_a_limited_move_reaches_its_limits_and_no_more(
+    distance: float, v_max: float, a_max: float, j_max: float
+) -> None:
+    """Where the distance leaves room; it ends at rest at the distance, and the derivatives are exact."""
+    move: Any = s.LimitedMove(distance, v_max, a_max, j_max, start=0.5)
+    t = np.linspace(0.5, 0.5 + move.duration, 100_001)
+    assert move(0.4) == 0.0
+    assert move(t[-1]) == distance == move(9.0)
+    reached, signal = [], move
+    for i, limit in enumerate((math.inf, v_max, a_max, j_max)):
+        reached.append(float(np.max(np.abs(signal(t)))) / limit)
+        assert np.max(np.abs(signal(t))) <= limit * (1.0 + 1e-9)
+        following = signal.derivative()
+        if distance and i < 2:  # the jerk jumps
+            slope = np.diff(signal(t)) / np.diff(t)
+            known = following(0.5 * (t[1:] + t[:-1]))
+            np.testing.assert_allclose(slope, known, atol=1e-4 * np.max(np.abs(known)))
+        signal = following
+    assert np.all(signal(t) == 0.0)
+    if distance:
+        assert reached[3] == pytest.approx(1.0)
+        parts = move.phases
+        assert parts.cruise == 0.0 or reached[1] == pytest.approx(1.0)
+        assert parts.acceleration == 0.0 or reached[2] == pytest.approx(1.0)
+
+
+def test_samples_along_a_spline_have_four_continuous_derivatives() -> None:
+    """Those of the move that they are from, zero before and after; a spline needs no others."""
+    move: Any = s.SmoothMove(2.0, 1.0, smoothness=4, start=0.5)
+    times = np.linspace(0.5, 1.5, 101)
+    spline: Any = s.Samples(times, move(times), hold="spline")
+    t = np.linspace(0.0, 2.0, 1237)
+    for tolerance in (1e-9, 1e-7, 1e-5, 1e-3, 0.05):
+        np.testing.assert_allclose(
+            spline(t), move(t), atol=tolerance * max(float(np.max(np.abs(move(t)))), 1.0)
+        )
+        spline, move = spline.derivative(), move.derivative()
+    for _ in range(3):
+        spline = spline.derivative()
+    assert spline(t).tolist() == np.zeros(t.size).tolist()
+    with pytest.raises(ValueError, match="derivatives: are those of the spline"):
+        s.Samples(times, times, hold="spline", derivatives=[times])
+
+
+def test_samples_have_the_derivatives_that_are_given() -> None:
+    """And zero where the samples are held."""
+    times = np.linspace(1.0, 2.0, 11)
+    samples = s.Samples(times, times**2, derivatives=[2.0 * times, np.full(11, 2.0)])
+    first = samples.derivative()
+    assert first([0.5, 1.0, 1.55, 2.5]).tolist() == pytest.approx([0.0, 2.0, 3.1, 0.0])
+    assert first.derivative()([0.5, 1.2, 2.5]).tolist() == [0.0, 2.0, 0.0]
+    with pytest.raises(ValueError, match=r"derivatives\[0\]"):
+        s.Samples(times, times, derivatives=[[1.0]])
+
+
+def test_a_controller_with_feedforward_is_warned_of_samples_without_derivatives() -> None:
+    """Once, by simulate; without feedforward there is nothing to warn of."""
+    import quell as ql
+
+    times = np.linspace(0.0, 1.0, 11)
+    scenario = ql.Scenario(reference=s.Samples(times, times**2), duration=0.1)
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
+    observer = ql.ESO.model_free(2, 1.0, 20.0, 0.01)
+    with pytest.warns(UserWarning, match="feedforward gets zero"):
+        ql.simulate(plant, ql.ADRC(observer, 5.0, feedforward=True), scenario, interpret=True)
+    ql.simulate(plant, ql.ADRC(observer, 5.0), scenario, interpret=True)

@@ -203,5 +203,9 @@ def test_the_table_of_a_tuning_is_not_cut_in_80_columns(
     command = ("tune", "plant.toml", "--structure", "half-gain-law", "--order", "2", "--no-figures")
     shown: Shown = quell(*command)  # type: ignore[operator]
     assert "…" not in shown.out
-    rows = [line for line in shown.out.splitlines() if line.strip().startswith("half-gain-law of order 2 ")]
+    rows = [
+        line
+        for line in shown.out.splitlines()
+        if line.strip().startswith("half-gain-law of order 2 ")
+    ]
     assert rows, shown.out

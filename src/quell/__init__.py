@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from quell.controllers import baselines
     from quell.controllers.adrc.adrc import ADRC
     from quell.controllers.adrc.estimate import Estimate
+    from quell.controllers.adrc.feedforward import Feedforward
     from quell.controllers.bandwidth import omega_c_for
     from quell.guard import Guard, Reason
     from quell.identification.identify import identify
@@ -63,6 +64,7 @@ _HOME = {
     "BatchTrajectory": "quell.records.batch_trajectory",
     "ESO": "quell.observers.eso",
     "Estimate": "quell.controllers.adrc.estimate",
+    "Feedforward": "quell.controllers.adrc.feedforward",
     "Guard": "quell.guard",
     "Reason": "quell.guard",
     "Scenario": "quell.simulation.scenario",
@@ -79,11 +81,11 @@ _HOME = {
 _MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
 
 __all__ = [
-    "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Guard", "Reason", "Scenario",
-    "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers",
-    "envs", "experiments", "export", "features", "identification", "identify", "learners",
-    "metrics", "observers", "omega_c_for", "plants", "realtime", "setup", "signals", "simulate",
-    "sweep", "sweeping", "tune", "tuning",
+    "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Feedforward", "Guard",
+    "Reason", "Scenario", "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical",
+    "controllers", "envs", "experiments", "export", "features", "identification", "identify",
+    "learners", "metrics", "observers", "omega_c_for", "plants", "realtime", "setup", "signals",
+    "simulate", "sweep", "sweeping", "tune", "tuning",
 ]  # fmt: skip
 
 

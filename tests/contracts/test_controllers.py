@@ -48,6 +48,10 @@ CONTROLLERS: dict[str, Any] = {
     "Prefiltered feedforward": room.Prefiltered(
         ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.ReferenceModel(3.0)
     ),
+    "Prefiltered feedforward by a model": room.Prefiltered(
+        ql.ADRC(ESO, 1.5, feedforward=ql.Feedforward((0.3, 0.1, 0.7), 0.2, 0.5, -0.1), **LIMITS),
+        room.ReferenceModel(3.0, order=3),
+    ),
     "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
 }
 PLANTS = {"ResonanceRatio": ql.plants.two_mass_spring()}
@@ -141,7 +145,8 @@ def awaited(controller: Any, y: float) -> float:
     if not isinstance(law, ql.ADRC):
         return y
     loop = law._state.loop[0]
-    return expected_measurement(law.parameters.eso, law._state.z, loop.u, loop.f_learned)
+    known = loop.f_learned + loop.f_known
+    return expected_measurement(law.parameters.eso, law._state.z, loop.u, known)
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

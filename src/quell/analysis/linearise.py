@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from quell.analysis.frozen_learner import Frozen, copy_state, frozen
 from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.feedforward_law import without_forces
 from quell.controllers.base import Controller, control
 from quell.controllers.limits import NO_LIMITS
 from quell.controllers.linear.law import LinearLaw
@@ -55,7 +56,8 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     learner = at if isinstance(at, Frozen) else frozen(controller, at)
     design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
-    design, nothing = design._replace(limits=NO_LIMITS), np.zeros(0)
+    forward = without_forces(design.feedforward)
+    design, nothing = design._replace(limits=NO_LIMITS, feedforward=forward), np.zeros(0)
     nothing_learned, unguarded = NoLearnerMemory(nothing), UnguardedMemory(nothing)
     state = controller.initial_state()._replace(learner=nothing_learned, guard=unguarded)
     control(design, state, 0.0, 0.0)

@@ -13,6 +13,7 @@ from quell.controllers.adrc.dead_time import (
 )
 from quell.controllers.adrc.estimate import Estimate
 from quell.controllers.adrc.feedback import NonlinearFeedback
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.bandwidth import omega_c_for
 from quell.controllers.base import Controller
 from quell.controllers.design_checks import warn_if_unwise
@@ -29,6 +30,7 @@ __all__ = [
     "Controller",
     "DeadTimeTuning",
     "Estimate",
+    "Feedforward",
     "LinearController",
     "LinearLaw",
     "NonlinearFeedback",

@@ -68,6 +68,8 @@ class CSource:
         names and widths of the estimate; none for a plant.
     operations
         names of the functions, without the prefix.
+    derivatives
+        number of derivatives of the reference that ``step`` takes as its last arguments.
     externals
         names of functions in C that the user has to link.
     """
@@ -78,6 +80,7 @@ class CSource:
     precision: str
     channels: tuple[tuple[str, int], ...]
     operations: tuple[str, ...]
+    derivatives: int = 0
     externals: tuple[str, ...] = ()
 
     @property
@@ -150,14 +153,20 @@ class CFiles:
         )
 
     def write(
-        self, title: list[str], channels: tuple[tuple[str, int], ...], defines: list[str]
+        self,
+        title: list[str],
+        channels: tuple[tuple[str, int], ...],
+        defines: list[str],
+        derivatives: int = 0,
     ) -> CSource:
         """Return the files."""
         source = self._source()
         header = self._header(title, defines)
         precision = "single" if self.single else "double"
         operations, externals = tuple(self.operations), tuple(self.program.externals)
-        return CSource(self.name, header, source, precision, channels, operations, externals)
+        return CSource(
+            self.name, header, source, precision, channels, operations, derivatives, externals
+        )
 
     def _header(self, title: list[str], defines: list[str]) -> str:
         name, upper, structs = self.name, self.name.upper(), self.program.structs

@@ -34,6 +34,7 @@ _CHANNELS = {
     "x_hat": "y and its derivatives",
     "f_residual": "the observer's share of f",
     "f_learned": "the learner's share of f",
+    "u_feedforward": "feedforward of the model, a part of u",
     "status": "flags of the last sample",
     "authority": "share of its output that the guard allows the learner",
     "error_plain": "RMS error in f of an ESO without learner",
@@ -102,6 +103,11 @@ class _Writer:
         self.files = CFiles(name, parameters_of(controller), controller.initial_state(), findings)
         self.real = self.files.real
         self.state = f"{name}_state *state"
+        has_own = isinstance(self.described, Prefiltered)  # derivatives, from its prefilter
+        self.derivatives = 0 if has_own else int(getattr(self.described, "derivatives", 0))
+        # They are arguments of each step: whoever forgets them gets an error of the compiler.
+        self.names = [f"r{i + 1}" for i in range(self.derivatives)]
+        self.arguments = "".join(f", {self.real} {each}" for each in self.names)
 
     def write(self) -> CSource:
         """Return the files."""
@@ -131,17 +137,18 @@ class _Writer:
             defines.append(f"#define {upper}_ORDER {inner.observer.order}")
         self.files.enums += self._enums(channels)
         self.files.structs += self._estimate_struct(channels)
-        return self.files.write(title, channels, defines)
+        return self.files.write(title, channels, defines, self.derivatives)
 
     def _add_step(self) -> None:
         files, real, both = self.files, self.real, self.files.both
         r, y, u = map(files.number, "ryu")
         files.add(
             "step",
-            f"{real} NAME({self.state}, {real} r, {real} y)",
+            f"{real} NAME({self.state}, {real} r, {real} y{self.arguments})",
             "Take one sample: return the control signal u for reference r and measurement y.\n\n"
-            "A value that is not finite is replaced; the status says so. The controller assumes\n"
-            "that u is applied until the next sample.",
+            f"{self._about_derivatives()}A value that is not finite is replaced; the status says\n"
+            "so. The controller assumes that u is applied until the next sample.",
+            *self._derivatives(),
             f"    return {files.call(control, *both, r, y)};",
         )
         files.add(
@@ -150,15 +157,26 @@ class _Writer:
             "Set the control signal that was really applied since the last step.",
             f"    {files.call(set_applied_control, *both, u)};",
         )
-        count = int(getattr(self.described, "derivatives", 0))
-        if count > 0 and not isinstance(self.described, Prefiltered):
-            given = Value(Array((count,), Number.REAL), "derivatives", root="derivatives")
-            files.add(
-                "set_derivatives",
-                f"void NAME({self.state}, const {real} derivatives[{count}])",
-                "Set r', r'', ... for the next step; what is not finite counts as zero.",
-                f"    {files.call(set_reference_derivatives, *both, given)};",
-            )
+
+    def _about_derivatives(self) -> str:
+        """Return the sentence on the last arguments of a step."""
+        if not self.names:
+            return ""
+        verb = "are the derivatives" if self.derivatives > 1 else "is the derivative"
+        primes = ", ".join("r" + "'" * (i + 1) for i in range(self.derivatives))
+        return f"{', '.join(self.names)} {verb} {primes} at this sample, fed forward.\n"
+
+    def _derivatives(self) -> list[str]:
+        """Return the lines that hand the last arguments of a step over."""
+        if not self.names:
+            return []
+        given = Value(Array((self.derivatives,), Number.REAL), "derivatives", root="derivatives")
+        set_them = self.files.call(set_reference_derivatives, *self.files.both, given)
+        values = ", ".join(self.names)
+        return [
+            f"    const {self.real} derivatives[{self.derivatives}] = {{{values}}};",
+            f"    {set_them};",
+        ]
 
     def _add_counts(self, resolution: float) -> None:
         files, real, write = self.files, self.real, self.files.program.literals.write_real
@@ -167,8 +185,9 @@ class _Writer:
         files.includes.append("#include <stdint.h>")
         files.add(
             "step_counts",
-            f"{real} NAME({self.state}, int32_t r, int32_t count)",
+            f"{real} NAME({self.state}, int32_t r, int32_t count{self.arguments})",
             f"Take one sample with r and y as encoder counts of {resolution!r} y-units.\n\n"
+            f"{self._about_derivatives()}"
             "Differences are taken as integers, which may overflow: the position is always exact.\n"
             "y is then counted from this sample's count: servo_start and servo_track take y and r\n"
             "as differences to state->origin.".replace("servo", self.name),
@@ -176,7 +195,7 @@ class _Writer:
             f"    {files.call(operations.move_origin, *files.both, files.number(moved))};",
             "    state->origin = count;",
             f"    return {self.name}_step(state, ({real})(int32_t)((uint32_t)r - (uint32_t)count) *"
-            f" resolution, {write(0.0)});",
+            f" resolution, {write(0.0)}{''.join(f', {each}' for each in self.names)});",
         )
 
     def _add_start(self, samples: int) -> None:
@@ -197,9 +216,10 @@ class _Writer:
         r, y, u = map(files.number, "ryu")
         files.add(
             "track",
-            f"{real} NAME({self.state}, {real} r, {real} y, {real} u)",
+            f"{real} NAME({self.state}, {real} r, {real} y, {real} u{self.arguments})",
             "Take one sample in manual operation: u is applied, unlimited, until the next sample."
             "\n\nReturn the control signal that the controller would have applied.",
+            *self._derivatives(),
             f"    return {files.call(operations.track, *files.both, r, y, u)};",
         )
         files.add(

@@ -21,6 +21,7 @@ _DESCRIPTIONS = {
     "x": ("state of the plant", "state-unit"),
     "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),
     "f_residual": ("residual total disturbance estimated by the observer", "y-unit/s^n"),
+    "u_feedforward": ("feedforward of the model", "u-unit"),
     "f_learned": ("total disturbance fed forward by the learner", "y-unit/s^n"),
     "f_hat": ("estimated total disturbance", "y-unit/s^n"),
     "authority": ("share of its output that the guard lets the learner have", "1"),

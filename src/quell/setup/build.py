@@ -52,7 +52,7 @@ class Builder:
         arguments = {
             key: value for key, value in context.items() if key in takes and value is not None
         }
-        inner = {"dt": context["dt"]} if "dt" in context else {}
+        inner: dict[str, Any] = {key: context[key] for key in ("dt", "plant") if key in context}
         for key, value in table.written().items():
             arguments[key] = self._value(value, f"{path}.{key}", key != "disturbances", inner)
         for key, parameter in takes.items():

@@ -84,7 +84,7 @@ def _hint(key: str, known: Sequence[str]) -> str:
 
 def _tags(context: Mapping[str, Any]) -> list[str]:
     tags = [tag.strip().strip("'") for tag in str(context.get("expected_tags", "")).split(",")]
-    return [tag for tag in tags if tag not in ("number", "list")]
+    return [tag for tag in tags if tag not in ("number", "list", "flag")]
 
 
 def _path(loc: Sequence[str | int], data: Any, absent: bool) -> str:

@@ -33,6 +33,8 @@ _EXAMPLES = {
     "plant": "plant = {kind = 'linear', num = [1.0], den = [1.0, 1.0]}",
     "rig": "rig = {device = 'twin:'}",
 }
+# Objects that tables within a table may need.
+_FOR_TABLES_INSIDE = {"controller": {"plant"}}
 
 EXAMPLES = Path(__file__).parent / "examples"
 """The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
@@ -124,7 +126,8 @@ def assembled(
         table = getattr(tables, key)
         if table is None:
             return None
-        context = {each: context[each] for each in parameters_of(table.function) & context.keys()}
+        takes = parameters_of(table.function).keys() | _FOR_TABLES_INSIDE.get(key, set())
+        context = {each: context[each] for each in takes & context.keys()}
         inputs = table, dt, *context, *context.values()
         return made_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
 
@@ -137,7 +140,9 @@ def assembled(
     if unused:
         rule = f"a controller of the kind {kind} does not use it"
         raise SetupError([f"{name}: {key}: {rule}" for key in unused])
-    controller = build("controller", plant=model, **parts)
+    # A controller is designed for the linear part; a feedforward also uses friction and delay.
+    designs = "plant" in parameters_of(tables.controller.function)
+    controller = build("controller", plant=model if designs else plant, **parts)
     prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
     if rig is not None and plant is not None and signals_of(plant).known:
         rig = {"signals": signals_of(plant), **rig}

@@ -11,6 +11,7 @@ from typing import Any
 from quell import features, guard, learners, signals
 from quell.controllers import (
     ADRC,
+    Feedforward,
     LinearController,
     NonlinearFeedback,
     ReferenceModel,
@@ -150,12 +151,18 @@ LEARNERS = _call_tables(
 )
 Notch = call_table("notch", notch.Notch.at, only=True)
 Feedback = call_table("nonlinear-feedback", NonlinearFeedback, only=True)
-_FEEDBACK = {"feedback": Feedback | None}
+_SERIES: Mapping[str, Callable[..., Any]] = {
+    "series": Feedforward,
+    "rigid": Feedforward.rigid,
+    "model": Feedforward.of,
+}
+FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
+_LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True)}
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
 _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)
 _CONTROLLERS = (
-    call_table("adrc", ADRC, types=_FEEDBACK),
-    call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=_FEEDBACK),
+    call_table("adrc", ADRC, types=_LAW),
+    call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=_LAW),
     call_table("pid", PID, forwards_to=_LINEAR),
     call_table("pid-simc", PID.simc, forwards_to=_PID),
     call_table(_DOUBLE_INTEGRATOR, PID.simc_double_integrator, forwards_to=_PID),
@@ -190,7 +197,11 @@ Tune = call_table(
     tuning,
     only=True,
     forwards_to=(tune, Constraints),
-    types={"reference": Signal | None, "objective": str},
+    types={
+        "reference": Signal | None,
+        "objective": str,
+        "feedforward": one_of(FEEDFORWARDS, flag=True),
+    },
     without=_NOT_IN_FILES,
 )
 _NO_KEYS = ("duration", "on_change", "overwrite")

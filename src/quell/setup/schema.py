@@ -122,13 +122,19 @@ def call_table(
 
 
 def one_of(
-    tables: Mapping[str, Any], default: str | None = None, *, number: bool = False, many: Any = None
+    tables: Mapping[str, Any],
+    default: str | None = None,
+    *,
+    number: bool = False,
+    flag: bool = False,
+    many: Any = None,
 ) -> Any:
     """Return the type of a table of one of several kinds; a text in its place is its kind.
 
     ``default`` is the kind of a table without the key ``kind``. In place of the table there may be
-    a number if ``number``, and a list of ``many``, if it is given.
+    a number if ``number``, true or false if ``flag``, and a list of ``many``, if it is given.
     """
+    plain = "number" if number else "flag" if flag else None
 
     def tag(value: Any) -> str | None:
         if isinstance(value, CallTable):
@@ -137,10 +143,11 @@ def one_of(
             return value.get("kind", default)
         if isinstance(value, tuple) and many is not None:
             return "list"
-        return "number" if number else None
+        return plain
 
     choices: list[Any] = [Annotated[model, Tag(kind)] for kind, model in tables.items()]
     choices += [Annotated[float, Tag("number")]] if number else []
+    choices += [Annotated[bool, Tag("flag")]] if flag else []
     choices += [Annotated[list_of(many), Tag("list")]] if many is not None else []
     return Annotated[_union(choices), Discriminator(tag), BeforeValidator(_text_to_table)]
 

@@ -19,14 +19,16 @@ from typing import Any
 from quell import checks
 from quell.signals.base import Constant, Scaled, Signal, Sum, Switched, as_signal, seeded_apart
 from quell.signals.excitation import PRBS, Multisine
+from quell.signals.limited_move import LimitedMove
 from quell.signals.noise import BandLimitedNoise
 from quell.signals.repeated import Repeated
-from quell.signals.shapes import Chirp, Ramp, Samples, Sinusoid, SmoothMove, Step, Trapezoid
+from quell.signals.samples import Samples
+from quell.signals.shapes import Chirp, Ramp, Sinusoid, SmoothMove, Step, Trapezoid
 from quell.suggestions import suggest_names
 
 __all__ = [
-    "KINDS", "PRBS", "BandLimitedNoise", "Chirp", "Constant", "Multisine", "Ramp", "Repeated",
-    "Samples", "Scaled", "Signal", "Sinusoid", "SmoothMove", "Step", "Sum", "Switched",
+    "KINDS", "PRBS", "BandLimitedNoise", "Chirp", "Constant", "LimitedMove", "Multisine", "Ramp",
+    "Repeated", "Samples", "Scaled", "Signal", "Sinusoid", "SmoothMove", "Step", "Sum", "Switched",
     "Trapezoid", "as_signal", "make", "seeded_apart",
 ]  # fmt: skip
 
@@ -41,6 +43,7 @@ KINDS: Mapping[str, type[Signal]] = {
     "trapezoid": Trapezoid,
     "move": SmoothMove,
     "smooth-move": SmoothMove,  # the same, by the name of the class
+    "limited-move": LimitedMove,
     "samples": Samples,
     "repeated": Repeated,
     "noise": BandLimitedNoise,

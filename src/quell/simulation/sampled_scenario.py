@@ -18,6 +18,7 @@ from quell.controllers.base import Controller
 from quell.plants.base import Plant
 from quell.records.sample_times import first_sample_at, in_steps
 from quell.signals import BandLimitedNoise, Constant, Signal
+from quell.signals.samples import check_derivative
 from quell.simulation.scenario import Scenario
 from quell.types import Matrix, Vector
 from quell.warn import warn
@@ -84,6 +85,7 @@ class SampledScenario:
         rests = frozenset(first_sample_at(time, dt, samples) for time in scenario.rest_at)
         derivative, derivatives = signals[0], []
         for _ in range(getattr(controller, "derivatives", 0)):
+            check_derivative(derivative)
             derivative = derivative.derivative()
             derivatives.append(derivative)
         usual = _UNUSUAL * size

@@ -17,6 +17,7 @@ _NESTED = {
     **dict.fromkeys(("reference", "noise", "then", "cycle"), "signal"),
     "notch": "notch",
     "feedback": "feedback",
+    "feedforward": "feedforward",
     "signals": "labels",
 }
 _LISTS = {"disturbances": "signal", "features": "feature"}
@@ -41,6 +42,7 @@ def forms(granted: Granted) -> dict[str, Any]:
         "feature": registry.FEATURES,
         "notch": {"": registry.Notch},
         "feedback": {"": registry.Feedback},
+        "feedforward": registry.FEEDFORWARDS,
         "labels": {"": registry.Labels},
         "guard": {"": registry.Guard},
         "scenario": {"": registry.Scenario},

@@ -76,7 +76,7 @@ class Task:
     inputs: Inputs
     quantile: float
     order: int | None
-    u: Mapping[str, Any]  # limits of the controllers
+    u: Mapping[str, Any]  # limits of the controllers, and their feedforward if there is one
 
     def problem(self, members: Sequence[int] | None = None) -> Problem:
         """Return the problem of the optimiser; the objective is that of ``members`` of the set."""

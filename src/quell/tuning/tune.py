@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
+from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.feedforward import Feedforward, checked_feedforward
 from quell.parallel import one_blas_thread
 from quell.plants.labelled import signals_of
 from quell.plants.linear import LinearPlant
@@ -54,6 +57,7 @@ def tune(
     reference: Any = None,
     duration: float | None = None,
     load: float = 1.0,
+    feedforward: bool | Feedforward = False,
     delay: Any = 0.0,
     actuator_lag: float = 0.0,
     operating_point: Any = None,
@@ -102,6 +106,10 @@ def tune(
         signal for ``"tracking"`` and the limits of u, and how long it is followed [s].
     load
         step of the load at the plant's input [u-unit], without a reference.
+    feedforward
+        whether an ADRC gets the feedforward of the first plant's model, ``Feedforward.of`` with its
+        delay and friction, or a ``Feedforward`` of yours. It changes no margin, so it is not
+        searched for; PID and LQG controllers have none.
     delay, actuator_lag, operating_point
         as for ``analyse``; ``delay`` may have a value for each plant.
     uncertain
@@ -159,6 +167,10 @@ def tune(
         how |= {"compare": compare, "delay": delay, "actuator_lag": actuator_lag, "setup": setup}
         how |= {"operating_point": operating_point, "uncertain": uncertain, "b_range": b_range}
         how |= {"samples": samples, "check_samples": check_samples, "seed": seed}
+        if uncertain is None and operating_point is None:
+            late = float(np.ravel(delay)[0]) + actuator_lag
+            feedforward = _by_model(feedforward, as_list(plant)[0], late)
+        how["feedforward"] = feedforward
         how |= {"progress": progress, **limits}
         linear = partial(tune, dt=dt, rest=rest)
         return tune_by_simulation(linear, plant, scenario, objective, search or {}, how)
@@ -189,6 +201,11 @@ def tune(
     bounds = constraints or Constraints()
     inputs = _inputs(objective, reference, duration, load, plants)
     model = model_of(given, plants, bounds)
+    late = float(np.ravel(delay)[0]) + actuator_lag
+    known = as_list(plant)[0] if operating_point is None else given.linear[0]
+    forward = _by_model(feedforward, known, late)
+    if forward is not False:
+        limits["feedforward"] = forward
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task)
@@ -197,6 +214,11 @@ def tune(
         chosen = simplest(designs, objective) if structure == SIMPLEST else designs[structure]
         if chosen.controller is None:
             raise ValueError(f"structure = {structure!r}: {chosen.reason} ({task.constraints})")
+        if forward is not False and not isinstance(chosen.controller, ADRC):
+            raise ValueError(
+                f"feedforward = {feedforward!r}: structure = {structure!r} has none; take an ADRC, "
+                "such as freed or model-based, or leave it out"
+            )
         check = None
         if box is not None or b_range[0] != b_range[1]:
             report("check", 1.0)
@@ -213,6 +235,20 @@ def tune(
         noise_bound=noise_bound,
         signals=signals_of(as_list(plant)[0]),
     )
+
+
+def _by_model(
+    feedforward: bool | Feedforward, plant: Any, late: float
+) -> Literal[False] | Feedforward:
+    """Return the feedforward of a plant with a delay [s] of u besides its own, if it is wanted."""
+    given = checked_feedforward(feedforward)
+    if isinstance(given, Feedforward):
+        return given
+    if not given:
+        return False
+    found = Feedforward.of(plant)
+    late += found.delay or 0.0
+    return replace(found, delay=late) if late > 0.0 else found
 
 
 def _check_names(structure: str, compare: Sequence[str], objective: str) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from quell.analysis.loop import LoopAnalysis
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.base import Controller
 from quell.files import nonfinite_to_none, written_atomically
 from quell.parallel import one_blas_thread
@@ -128,6 +129,9 @@ class Tuned:
             lines.append(f"{name}: {quantity} {value}; " + _measures(second, rest))
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
         lines += [str(self.reference_step)]
+        forward = getattr(self.design.controller, "feedforward", False)
+        if isinstance(forward, Feedforward):
+            lines.append(f"feedforward: {forward.describe()}")
         lines += report.tradeoff_lines(self.tradeoff, self.objective)
         lines += [str(self.check)] if self.check is not None else []
         for name, each in (self.simulated_check or {}).items():
@@ -151,7 +155,8 @@ class Tuned:
     def toml(self) -> str:
         """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``.
 
-        An ADRC has the feedforward of the setup that was tuned: it is no matter of the loop.
+        An ADRC has the feedforward that ``tune`` was asked for, else that of the setup that was
+        tuned: it is no matter of the loop.
         """
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
         comment += f"active: {', '.join(self.active) or 'none'}\n{self.reference_step}"
@@ -159,7 +164,7 @@ class Tuned:
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
         designed = {key: dict(table) for key, table in self.design.tables.items()}
         before, law = self.setup.get("controller", {}), designed["controller"]
-        if law["kind"] == "adrc" and "feedforward" in before:
+        if law["kind"] == "adrc" and "feedforward" in before and "feedforward" not in law:
             law["feedforward"] = before["feedforward"]
         return toml_text({**tables, **designed}, comment)
 

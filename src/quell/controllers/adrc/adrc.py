@@ -11,6 +11,12 @@ import numpy as np
 from quell import checks
 from quell.controllers.adrc.estimate import Estimate, read_estimate
 from quell.controllers.adrc.feedback import NonlinearFeedback, checked_feedback, feedback_design
+from quell.controllers.adrc.feedforward import (
+    Feedforward,
+    checked_feedforward,
+    derivatives_used,
+    feedforward_design,
+)
 from quell.controllers.adrc.handover import (
     change_design,
     check_replacement,
@@ -52,8 +58,11 @@ class ADRC(StatefulController):
     guard
         limits the learner to the authority that it has earned, which is full without a guard.
     feedforward
-        whether to feed the reference's derivatives forward. ``simulate`` takes them from the
-        signal, ``step`` from its arguments. The ideal loop then follows the reference without lag.
+        whether to feed the reference's derivatives forward, r^(m)/b0, or a ``Feedforward``: that of
+        a model of the plant, which does not depend on b0 and which the observer knows. ``simulate``
+        takes the derivatives from the signal, ``step`` from its arguments. The ideal loop then
+        follows the reference without lag. Where b0 is not the plant's gain, as after tuning, only
+        the model's follows fast moves.
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
@@ -92,7 +101,7 @@ class ADRC(StatefulController):
         *,
         learner: Learner | None = None,
         guard: Guard | None = None,
-        feedforward: bool = False,
+        feedforward: bool | Feedforward = False,
         u_min: float = -math.inf,
         u_max: float = math.inf,
         rate_limit: RateLimit = math.inf,
@@ -114,7 +123,7 @@ class ADRC(StatefulController):
             raise ValueError(f"learner = {learner!r}: must be a learner, {example}, or None")
         if guard is not None and not isinstance(guard, Guard):
             raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
-        self.feedforward = checks.flag("feedforward", feedforward)
+        self.feedforward = checked_feedforward(feedforward)
         self.half_gain = checks.flag("half_gain", half_gain)
         self.feedback = checked_feedback(feedback)
         self.law_poles = law_poles
@@ -142,6 +151,7 @@ class ADRC(StatefulController):
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
             feedback=feedback_design(self.feedback, observer.degree, omega_c),
+            feedforward=feedforward_design(self.feedforward, observer),
             fade=math.exp(-omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
@@ -169,14 +179,16 @@ class ADRC(StatefulController):
     @property
     def derivatives(self) -> int:
         """Number of derivatives of the reference that are fed forward."""
-        return self.observer.degree if self.feedforward else 0
+        return derivatives_used(self.feedforward, self.observer.degree)
 
     @property
     def channels(self) -> Channels:
         """Name and width of each recorded channel, in order."""
         estimates = (("x_hat", self.observer.order), ("f_residual", 1), ("f_learned", 1))
+        by_model = isinstance(self.feedforward, Feedforward)
+        forward = (("u_feedforward", 1),) if by_model else ()
         guard = () if self.guard is None else GUARD_CHANNELS
-        return (*estimates, ("status", 1), *guard, ("theta", len(self.features)))
+        return (*estimates, ("status", 1), *forward, *guard, ("theta", len(self.features)))
 
     def initial_state(self) -> AdrcState:
         """Return a state before the first sample, with nothing learned."""
@@ -208,7 +220,7 @@ class ADRC(StatefulController):
         """
         if self._packed is None:
             self.prepare()
-        if derivatives or self.feedforward:
+        if derivatives or self.derivatives:
             self._set_derivatives(derivatives)
         try:
             return self._step(self._packed, r, y)
@@ -218,7 +230,7 @@ class ADRC(StatefulController):
     def _set_derivatives(self, derivatives: tuple[float, ...]) -> None:
         if len(derivatives) > self.derivatives:
             usable = f"it uses {self.derivatives} at most"
-            rule = usable if self.feedforward else "make the controller with feedforward=True"
+            rule = usable if self.derivatives else "make the controller with feedforward=True"
             given = f"step was given {len(derivatives)} derivatives of the reference"
             raise ValueError(f"{given}: {rule}")
         values = np.array(derivatives, dtype=np.float64)

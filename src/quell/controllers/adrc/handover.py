@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from quell.controllers.adrc.feedforward_law import known_share
 from quell.controllers.adrc.law import AdrcDesign, AdrcState, unlimited_control
 from quell.controllers.base import reset_loop
 from quell.guard import limit
@@ -47,9 +48,11 @@ def start_at_rest(
     begin(design.eso, state.z, state.seen, y)
     loop = state.loop[0]
     model, z, seen = design.eso, state.z, state.seen
-    call_specialised(_observe_at_rest, model, z, seen, y, u, loop.f_learned, samples)
+    known = loop.f_learned + loop.f_known
+    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
     _feed_forward(design, state, u)
-    call_specialised(_observe_at_rest, model, z, seen, y, u, loop.f_learned, samples)
+    known = loop.f_learned + loop.f_known
+    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
     loop.bumpless = 1.0
 
 
@@ -60,7 +63,7 @@ def start_in_motion(
     _start_loop(design, state, float(x[0]), u, r)
     state.seen[:] = np.append(x, f)
     _feed_forward(design, state, u)
-    state.seen[x.size] -= state.loop[0].f_learned
+    state.seen[x.size] -= state.loop[0].f_learned + state.loop[0].f_known
     state.z[:] = state_for(design.eso, x, float(state.seen[x.size]), u)
 
 
@@ -69,6 +72,7 @@ def _start_loop(design: AdrcDesign, state: AdrcState, y: float, u: float, r: flo
     loop = state.loop[0]
     loop.y, loop.r, loop.u = y, r, u
     loop.started = loop.has_reference = 1.0
+    loop.f_known = known_share(design.feedforward, r, state.reference)
 
 
 def _feed_forward(design: AdrcDesign, state: AdrcState, u: float) -> None:
@@ -121,6 +125,10 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     change = (old.b0 - new.b0) * acting
     for i in range(size):
         change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
+    # The model's share of f depends on them, too, and is not in the estimate.
+    known = known_share(new.feedforward, loop.r, state.reference)
+    change -= known - loop.f_known
+    loop.f_known = known
     state.z[size] += change
     state.seen[size] += change
     loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)

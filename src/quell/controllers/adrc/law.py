@@ -5,8 +5,11 @@
 
 (Gao, ACC 2003; paper eq. (control), which lacks the term ``a·x̂``.) Derivatives of r are zero
 unless they are given; m is the relative degree from u to y, which is the plant's order unless it
-has zeros. The feedforward ``f_L = h + s u`` is affine in u, so the loop through u is solved
-exactly, without a delay of one sample: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
+has zeros. A model's feedforward takes the place of ``r^(m)/b0`` (``feedforward.py``): the share f_m
+of f that it knows is fed to the observer beside f_L.
+
+The learner's ``f_L = h + s u`` is affine in u, so the loop through u is solved exactly, without a
+delay of one sample: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
 
 If u reaches the plant with a delay, learner, guard and observer receive the u that *acts*
 (``observers.base.acting_control``): ``f_L = h + s u_acting``. The law does not change, because f
@@ -22,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.controllers.adrc.feedback import nonlinear_part
+from quell.controllers.adrc.feedforward_law import known_share, reference_part, write_feedforward
 from quell.controllers.bad_samples import (
     control_at_rest,
     hold_last_good,
@@ -91,6 +95,7 @@ class AdrcLoop(Scalars):
 
     u: float  # applied control signal
     f_learned: float  # f_L, as the observer receives it
+    f_known: float  # f_m, what the model of the feedforward knows of f in this sample
     f_learned_shown: float  # f_L^F: the share of f_L that Δf̂ lacks at the next sample
     r: float  # last finite reference
     y: float  # last finite measurement, or the one that the observer expected
@@ -114,6 +119,7 @@ class AdrcDesign(NamedTuple):
     cancel: Vector  # a (n,)
     cancel_f: float  # 1 if f enters where u enters, else 0
     feedback: Any  # linear or nonlinear law of the errors, see ``feedback``
+    feedforward: Any  # with or without a model, see ``feedforward``
     fade: float  # factor of the offset from one sample to the next
     b0: float
     limits: Limits
@@ -130,7 +136,7 @@ class AdrcState(NamedTuple):
 
     z: Vector  # state of the observer
     seen: Vector  # estimates (x̂_1 … x̂_n, Δf̂) of the observer (N,)
-    reference: Vector  # r', …, r^(m) (m,), zero if they are not given; empty without feedforward
+    reference: Vector  # r', r'', … as used, zero if they are not given; empty without feedforward
     loop: NDArray[AdrcLoop]  # (1,)
     learner: Any
     shadow: Matrix  # lag filter of f_L (1, …)
@@ -157,15 +163,16 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         if status & _MEASUREMENT_HELD != 0:
             # The last y would look like a disturbance while the plant moves; the expected y does
             # not change the estimates.
-            y = expected_measurement(design.eso, state.z, loop.u, loop.f_learned)
+            y = expected_measurement(design.eso, state.z, loop.u, loop.f_learned + loop.f_known)
             if is_usable(y):
                 loop.y = y
-        observe(design.eso, state.z, seen, loop.y, loop.u, loop.f_learned)
+        observe(design.eso, state.z, seen, loop.y, loop.u, loop.f_learned + loop.f_known)
         f_plain = seen[seen.size - 1] + loop.f_learned_shown
         assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
             status |= trouble(design.learner, state.learner)
+    loop.f_known = known_share(design.feedforward, loop.r, state.reference)
     constant, slope = predict(design.learner, state.learner, seen, u_acting)
     output = constant + slope * u_acting
     constant, slope, was_cut = limit(
@@ -275,15 +282,11 @@ def reset_lag_filters(design: AdrcDesign, state: AdrcState) -> None:
 def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
     """Return the control signal before limits for ``f_L = constant + slope · u``."""
     seen, reference, order = state.seen, state.reference, design.law.size
-    unlimited = design.law[0] * state.loop[0].r
-    if reference.size > 0:
-        for i in range(1, reference.size):
-            unlimited += design.law[i] * reference[i - 1]
-        unlimited += reference[reference.size - 1]
+    r = state.loop[0].r
+    unlimited = reference_part(design.feedforward, design.law, r, reference)
     for i in range(order):
         unlimited += (design.cancel[i] - design.law[i]) * seen[i]
     unlimited -= design.cancel_f * (seen[order] + constant)
-    r = state.loop[0].r
     unlimited = nonlinear_part(design.feedback, design.law, seen, r, reference, unlimited)
     return unlimited / (design.b0 + design.cancel_f * slope)
 
@@ -303,8 +306,10 @@ def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
         row[i] = state.seen[i]
     row[order + 1] = state.loop[0].f_learned
     row[order + 2] = state.loop[0].status
-    written = write_channels(design.guard, state.guard, row[order + 3 :])
-    coefficients(design.learner, state.learner, row[order + 3 + written :])
+    r, reference = state.loop[0].r, state.reference
+    forward = write_feedforward(design.feedforward, r, reference, row[order + 3 :])
+    written = write_channels(design.guard, state.guard, row[order + 3 + forward :])
+    coefficients(design.learner, state.learner, row[order + 3 + forward + written :])
 
 
 @status_flags.register(AdrcDesign)

@@ -20,6 +20,7 @@ import numpy as np
 
 from quell.checks import LARGEST_SIGNAL
 from quell.controllers.adrc.feedback import LinearFeedback
+from quell.controllers.adrc.feedforward_law import ModelFeedforward
 from quell.controllers.adrc.law import AdrcDesign
 from quell.controllers.linear.form import LinearForm, linear_form
 from quell.controllers.linear.law import LinearLaw
@@ -83,6 +84,8 @@ def _of_cascade(model: CascadeModel) -> Prediction:
 def _of_adrc(design: AdrcDesign) -> LinearForm | None:
     kinds = tuple(map(type, (design.learner, design.guard, design.feedback)))
     found = prediction(without_delay(design.eso))
+    if isinstance(design.feedforward, ModelFeedforward):
+        return None  # it acts on the observer with derivatives of r, and friction is not linear
     if found is None or kinds != (NoLearnerDesign, UnguardedDesign, LinearFeedback):
         return None
     order = design.law.size

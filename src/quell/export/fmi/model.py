@@ -218,15 +218,14 @@ class Model:
             lines.append(f"const double y = {self.plant.source.name}_measure(&m->plant);")
             y = "y + m->real[AT_NOISE]"
         if self.controller:
-            source, count = self.controller.source, self.controller.derivatives
+            source = self.controller.source
             real, state = source.real, "&m->controller"
             cast = "" if real == "double" else f"({real})"
-            if count:
-                values = [f"{cast}m->real[AT_R_DERIVATIVE_{i + 1}]" for i in range(count)]
-                lines.append(f"const {real} derivatives[{count}] = {{{', '.join(values)}}};")
-                lines.append(f"{source.name}_set_derivatives({state}, derivatives);")
             y = f"{cast}({y})" if cast else y
-            lines.append(f"m->real[AT_U] = {source.name}_step({state}, {cast}m->real[AT_R], {y});")
+            given = [state, f"{cast}m->real[AT_R]", y]
+            for i in range(source.derivatives):
+                given.append(f"{cast}m->real[AT_R_DERIVATIVE_{i + 1}]")
+            lines.append(f"m->real[AT_U] = {source.name}_step({', '.join(given)});")
         if self.plant:
             w = ", &m->real[AT_W_1]" if self.plant.disturbances else ""
             name = self.plant.source.name

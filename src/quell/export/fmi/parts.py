@@ -16,6 +16,7 @@ _DESCRIPTIONS = {
     "f_hat": "estimate of the total disturbance: f_residual + f_learned",
     "f_residual": "the observer's share of it",
     "f_learned": "the learner's share of it",
+    "u_feedforward": "feedforward of the model, a part of u",
     "status": "flags of the last sample, see the enumeration in the header of the controller",
     "authority": "share of its output that the guard allows the learner",
     "error_plain": "RMS error in f of an observer without learner",
@@ -33,7 +34,6 @@ class ControllerPart:
     """A controller in C."""
 
     source: CSource
-    derivatives: int  # of the reference that it takes as inputs
     limits: tuple[float, float]  # of u
     limits_path: str  # of ``Limits`` in its parameters
     bandwidths: Bandwidths | None
@@ -49,7 +49,6 @@ class ControllerPart:
         limits = at_path(parameters, path)
         return cls(
             source,
-            controller.derivatives if "set_derivatives" in source.operations else 0,
             (limits.low, limits.high),
             path,
             bandwidths(controller),
@@ -70,7 +69,7 @@ class ControllerPart:
         described = "derivative {i} of the reference"
         return [
             Variable("r", INPUT, "reference"),
-            *several("r_derivative", self.derivatives, INPUT, described),
+            *several("r_derivative", self.source.derivatives, INPUT, described),
         ]
 
     @property

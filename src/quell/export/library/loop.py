@@ -14,6 +14,7 @@ import numpy as np
 
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.prefilters.prefilter import without_prefilters
+from quell.export.c_files import CSource
 from quell.export.library.templates import fill
 
 BLOCK = 50
@@ -82,13 +83,14 @@ class Loop:
             x[-1] = x[-1] + plant.dt * slope
 
 
-def c_code(plant: Plant, write: Callable[[Any], str], real: str, name: str) -> str:
+def c_code(plant: Plant, write: Callable[[Any], str], real: str, source: CSource) -> str:
     """Return the same loop in C, as a function that plays a block of samples."""
     gains = ", ".join(write(gain) for gain in plant.gains)
     return fill(_CODE, {
-        "REAL": real, "NAME": name, "ORDER": len(plant.gains), "GAINS": gains,
+        "REAL": real, "NAME": source.name, "ORDER": len(plant.gains), "GAINS": gains,
         "B0": write(plant.b0), "DT": write(plant.dt), "AMPLITUDE": write(plant.amplitude),
         "NOISE": write(plant.noise), "HALF": plant.samples // 4, "BLOCK": BLOCK,
+        "DERIVATIVES": f", {write(0.5)} * r" * source.derivatives,
         "MULTIPLIER": _MULTIPLIER, "INCREMENT": _INCREMENT, "ZERO": write(0.0),
     })  # fmt: skip
 
@@ -112,7 +114,7 @@ static @REAL@ play_loop(@NAME@_state *state)
         r = @AMPLITUDE@ * (real)position / (real)@HALF@;
         y = x[0] + @NOISE@ * (real)((int)(seed >> 15) - 32768);
         k++;
-        u = @NAME@_step(state, r, y);
+        u = @NAME@_step(state, r, y@DERIVATIVES@);
         slope = @B0@ * u;
         for (int i = 0; i < @ORDER@; i++)
             slope -= gains[i] * x[i];

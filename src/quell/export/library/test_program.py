@@ -22,7 +22,7 @@ and more where a learner acts in a loop."""
 # What the program does before the step in a sample of each kind; NAME is the controller's.
 _CODE = {
     Action.APPLIED: ("NAME_applied(state, now->given);",),
-    Action.TRACK: ("return NAME_track(state, now->r, now->y, now->given);",),
+    Action.TRACK: ("return NAME_track(state, now->r, now->y, now->givenDERIVATIVES);",),
     Action.HAND_OVER: ("NAME_hand_over(state);",),
     Action.LIMIT: (
         "*limited = NAME_default_parameters;",
@@ -34,30 +34,25 @@ _CODE = {
     Action.START: ("NAME_start(state, now->y, now->given, now->r);",),
     Action.LEARN: ("return play_loop(state);",),
 }
-# The derivatives of the reference belong to each step.
-_DERIVATIVES = """    for (int i = 0; i < COUNT; i++)
-        derivatives[i] = HALF * now->r;
-    NAME_set_derivatives(state, derivatives);
-"""
 
 
 def test_program(source: CSource, vectors: Vectors) -> str:
     """Return the text of ``test_NAME.c``."""
     single = source.precision == "single"
     write = Literals(single).write_real
-    derivatives = _derivatives(source.name, vectors, write(0.5))
+    # In each step the derivatives of the reference are half the reference.
+    derivatives = f", {write(0.5)} * now->r" * source.derivatives
     used = [action for action in Action if any(row.action == action for row in vectors.rows)]
     limits = Action.LIMIT in used
     cases: list[str] = []
     for action in used:
         lines = _CODE.get(action, ())
-        if action is Action.TRACK and vectors.derivatives:
-            lines = (*derivatives.splitlines(), *lines)
         if lines:
             cases.append(f"    case {action.name}:")
             cases += [f"        {line.strip()}" for line in lines]
             cases += [] if lines[-1].startswith("return") else ["        break;"]
     text = "\n".join(cases).replace("NAME", source.name).replace("PATH", vectors.limit_path)
+    text = text.replace("DERIVATIVES", derivatives)
     limit = write(vectors.limit) if limits else ""
     rows = (
         f"    {{{row.action.name}, {write(row.r)}, {write(row.y)}, {write(row.given)}, "
@@ -81,9 +76,8 @@ def test_program(source: CSource, vectors: Vectors) -> str:
         "limited_parameter": f", {parameters} *limited" if limits else "",
         "limited_variable": f"    static {parameters} limited;\n" if limits else "",
         "limited_argument": ", &limited" if limits else "",
-        "variables": _variables(source, vectors),
-        "before_step": derivatives,
-        "loop": c_code(vectors.plant, write, "real", source.name) if vectors.plant else "",
+        "derivatives": derivatives,
+        "loop": c_code(vectors.plant, write, "real", source) if vectors.plant else "",
         "samples": f"count + {blocks * (BLOCK - 1)}" if blocks else "count",
         "tolerance": repr(_TOLERANCE_LEARNING if vectors.plant else _TOLERANCE),
         "tolerance_reason": TOLERANCE_REASON.replace("\n", "\n * "),
@@ -107,16 +101,3 @@ def _expected(source: CSource, vectors: Vectors) -> Iterator[str]:
     for place, at, part in _places(source):
         size = float(np.max(np.abs(np.where(np.isfinite(row[part]), row[part], 0.0))))
         yield f'    {{"{place}", {write(row[at])}, {size!r}}},'
-
-
-def _derivatives(name: str, vectors: Vectors, half: str) -> str:
-    if not vectors.derivatives:
-        return ""
-    text = _DERIVATIVES.replace("COUNT", str(vectors.derivatives))
-    return text.replace("HALF", half).replace("NAME", name)
-
-
-def _variables(source: CSource, vectors: Vectors) -> str:
-    if not vectors.derivatives:
-        return ""
-    return f"    {source.real} derivatives[{vectors.derivatives}];\n\n"

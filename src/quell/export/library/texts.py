@@ -14,17 +14,13 @@ from quell.export.library.vectors import Vectors
 _OPERATIONS = {
     "init": ("init(s)", "once, before all others"),
     "start": ("start(s, y, u, r)", "the plant rests at y under u; long: before the timer starts"),
-    "set_derivatives": (
-        "set_derivatives(s, derivatives)",
-        "before the step, if r', r'', ... are known",
-    ),
-    "step": ("step(s, r, y)", "each sample; returns u"),
+    "step": ("step(s, r, yDERIVATIVES)", "each sample; returns u"),
     "step_counts": (
-        "step_counts(s, r, count)",
+        "step_counts(s, r, countDERIVATIVES)",
         "instead of the step, with r and y as encoder counts; without rounding of the position",
     ),
     "applied": ("applied(s, u)", "after the step, if another u was applied"),
-    "track": ("track(s, r, y, u)", "instead of the step in manual operation, under u"),
+    "track": ("track(s, r, y, uDERIVATIVES)", "instead of the step in manual operation, under u"),
     "hand_over": (
         "hand_over(s)",
         "once, before the first step after manual operation; false before the first sample",
@@ -57,6 +53,15 @@ _DOUBLE = """- `double` must have 8 bytes; where it has 4 (AVR) the file refuses
 
 """
 
+_ONE_WORD = (
+    "volatile float reference; "
+    "/* the main loop writes it; one word, so that no half of it is read */"
+)
+_FED_FORWARD = """The controller feeds PRIMES of the reference forward, so they are arguments of
+`NAME_step`. They belong to the same move as r: take all of them from one formula (`next_reference`
+below), never from differences of r. At rest they are zero.
+"""
+
 
 def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[str, str]:
     """Return the text of all files of the library by path.
@@ -72,8 +77,9 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
     """
     name, single = source.name, source.precision == "single"
     one = "1.0f" if single else "1.0"
+    given = "".join(f", r{i + 1}" for i in range(source.derivatives))
     rows = (
-        f"| `{name}_{call}` | {when} |"
+        f"| `{name}_{call.replace('DERIVATIVES', given)}` | {when} |"
         for operation, (call, when) in _OPERATIONS.items()
         if operation in source.operations
     )
@@ -90,6 +96,7 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         "one": one,
         "zero": "0.0f" if single else "0.0",
         "dt": repr(float(controller.dt)),
+        **_reference_texts(source),
         "operations": "\n".join(rows),
         "fast_math": ", and so do the compensated sums" if single else "",
         "double": "" if single else _DOUBLE,
@@ -106,4 +113,34 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         f"test_{name}.c": test_program(source, vectors),
         f"examples/{name}/{name}.ino": filled("example.ino", values),
         **{each: filled(each, values) for each in texts},
+    }
+
+
+def _reference_texts(source: CSource) -> dict[str, str]:
+    """Return the parts of the examples that make the reference of a sample."""
+    count, real = source.derivatives, source.real
+    zero = "0.0f" if source.precision == "single" else "0.0"
+    if not count:
+        return {
+            "about_reference": "",
+            "declared_reference": _ONE_WORD,
+            "defined_reference": f"static {real} reference = {zero};",
+            "next_reference": "",
+            "reference": "reference",
+            "derivatives": "",
+        }
+    primes = ", ".join("r" + "'" * (i + 1) for i in range(count))
+    about = _FED_FORWARD.replace("NAME", source.name).replace("PRIMES", primes)
+    names = f"{real} r[{count + 1}]"
+    return {
+        "about_reference": about,
+        "declared_reference": f"extern void next_reference({names}); /* r, {primes} */",
+        "defined_reference": (
+            f"/* Set r, {primes} of a sample: replace it by your move, with its derivatives. */\n"
+            f"static void next_reference({names})\n{{\n"
+            f"    for (int i = 0; i <= {count}; i++)\n        r[i] = {zero};\n}}"
+        ),
+        "next_reference": f"    {names};\n\n    next_reference(r);\n",
+        "reference": "r[0]",
+        "derivatives": "".join(f", r[{i + 1}]" for i in range(count)),
     }

@@ -70,8 +70,6 @@ class Vectors(NamedTuple):
     ----------
     rows
         the samples.
-    derivatives
-        number of derivatives of the reference; each of them is half the reference in the run.
     limit_path, limit
         field of the parameters with the upper limit of u, and its value after ``LIMIT``.
     scale
@@ -83,7 +81,6 @@ class Vectors(NamedTuple):
     """
 
     rows: tuple[Row, ...]
-    derivatives: int
     limit_path: str
     limit: Any
     scale: float
@@ -121,9 +118,8 @@ class Player:
                 reset_loop(old, self.state)
             elif action is Action.START:
                 operations.start(old, self.state, _samples(self.described), y_, given_, r_)
-            if self.derivatives and action is not Action.LEARN:
-                half = np.full(self.derivatives, real(0.5) * r_, dtype=type(real(0.0)))
-                set_reference_derivatives(self.design, self.state, half)
+            if action is not Action.LEARN:
+                self._set_derivatives(r_)
             if action is Action.LEARN:
                 u = self._block()
             elif action is Action.TRACK:
@@ -139,9 +135,17 @@ class Player:
         assert self.loop is not None
         u: Any = 0.0
         for _ in range(BLOCK):
-            u = control(self.design, self.state, *self.loop.measure())
+            r, y = self.loop.measure()
+            self._set_derivatives(r)
+            u = control(self.design, self.state, r, y)
             self.loop.advance(u)
         return u
+
+    def _set_derivatives(self, r: Any) -> None:
+        """Set each derivative of the reference to half the reference."""
+        if self.derivatives:
+            half = np.full(self.derivatives, self.real(0.5) * r, dtype=type(self.real(0.0)))
+            set_reference_derivatives(self.design, self.state, half)
 
     def limit_at(self, path: str, high: Any) -> None:
         """Set the parameters of ``LIMIT``: the upper limit at ``path`` is ``high``."""
@@ -206,7 +210,7 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
     limit = at_path(player.limited, path).high if path else math.inf
     row = np.zeros(sum(width for _, width in controller.channels), dtype=type(player.real(0.0)))
     write_row(player.design, player.state, row)
-    return Vectors(tuple(player.rows), player.derivatives, path, limit, scale, row, plant)
+    return Vectors(tuple(player.rows), path, limit, scale, row, plant)
 
 
 def _play_limited(player: Player, path: str, signals: _Signals) -> None:

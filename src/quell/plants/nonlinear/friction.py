@@ -107,6 +107,11 @@ class FrictionPlant(Described):
         """Number of states."""
         return len(self.den) - 1
 
+    @property
+    def signed_force(self) -> float:
+        """F with the sign of the gain: friction acts against the motion that u causes [u-unit]."""
+        return math.copysign(self.force, self.num[0] / self.den[0])
+
     def sampled(self, dt: float, interpret: bool = False) -> FrictionModel:
         """Return the parameters for a sample time ``dt`` [s]."""
         n, lead = self.order, float(self.den[0])
@@ -114,8 +119,7 @@ class FrictionPlant(Described):
         A[:, 0] -= np.asarray(self.den[1:], dtype=np.float64) / lead
         B = np.zeros(n)
         B[n - len(self.num) :] = np.asarray(self.num, dtype=np.float64) / lead
-        # Friction acts against the motion that u causes, whichever sign the gain has.
-        force = math.copysign(self.force, self.num[0] / lead)
+        force = self.signed_force
         speed = A[0] if n > 1 else np.ones(1)
         at_rest = A - force / self.width * np.outer(B, speed)
         fastest = float(np.max(np.abs(np.linalg.eigvals(at_rest))))

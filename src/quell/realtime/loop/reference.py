@@ -11,6 +11,7 @@ from quell import checks
 from quell.kernels.sized import Buffer
 from quell.records.sample_times import in_steps
 from quell.signals import Signal, as_signal
+from quell.signals.samples import check_derivative
 from quell.simulation.scenario import Scenario
 from quell.types import Matrix, Vector
 
@@ -52,6 +53,7 @@ def reference_samples(
     t = np.arange(math.floor(in_steps(scenario.duration, dt)) + 1) * dt
     signals = [scenario.seeded_signals(len(scenario.disturbances))[0]]
     for _ in range(derivatives):
+        check_derivative(signals[-1])
         signals.append(signals[-1].derivative())
     columns = np.column_stack([signal(t) for signal in signals])
     finite = np.isfinite(columns).all(axis=1)

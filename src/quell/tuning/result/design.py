@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.base import Controller
 from quell.files import nonfinite_to_none
 from quell.tuning.constraints import Constraints
@@ -73,13 +74,17 @@ def impossible(name: str, reason: str) -> Design:
 def design_of(
     name: str, problem: Problem, solution: Solution, constraints: Constraints, u: Mapping[str, Any]
 ) -> Design:
-    """Return the design of a solution; ``u`` are the limits of the controller."""
+    """Return the design of a solution; ``u`` are limits and feedforward of the controller."""
     structure, values = solution.structure, solution.values
     measures, active = measured(problem, solution, constraints)
     k_i = float(structure.integral_gain(values[None, :])[0])
     size = math.exp(solution.cost)
     tables = structure.tables(values)
-    tables["controller"] |= {name: limit for name, limit in u.items() if limit is not None}
+    if tables["controller"]["kind"] != "adrc":
+        u = {key: each for key, each in u.items() if key != "feedforward"}
+    for key, each in u.items():
+        if each is not None:
+            tables["controller"][key] = each.table() if isinstance(each, Feedforward) else each
     return Design(
         name=name,
         controller=structure.controller(values, **u),

@@ -11,7 +11,7 @@ static const unsigned long sample_time = (unsigned long)(1e6 * @NAME@_SAMPLE_TIM
 
 static const @real@ y_per_count = @one@; /* sensor: units of y */
 static const @real@ counts_per_u = @one@; /* drive */
-static @real@ reference = @zero@;
+@defined_reference@
 
 void setup()
 {
@@ -25,8 +25,8 @@ void loop()
         return;
     next_sample += sample_time;
 
-    const @real@ y = y_per_count * (@real@)analogRead(A0);
-    const @real@ u = @name@_step(&controller, reference, y);
+@next_reference@    const @real@ y = y_per_count * (@real@)analogRead(A0);
+    const @real@ u = @name@_step(&controller, @reference@, y@derivatives@);
     const int counts = constrain((int)(counts_per_u * u), 0, 255);
 
     analogWrite(9, counts);

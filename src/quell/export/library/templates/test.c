@@ -61,12 +61,12 @@ static double in_ulps(real found, real right, double size)
 @loop@
 static real play(@name@_state *state@limited_parameter@, const sample *now)
 {
-@variables@    switch (now->action) {
+    switch (now->action) {
 @cases@
     default:
         break;
     }
-@before_step@    return @name@_step(state, now->r, now->y);
+    return @name@_step(state, now->r, now->y@derivatives@);
 }
 
 int main(int argc, char **argv)

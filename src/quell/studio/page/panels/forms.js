@@ -112,6 +112,7 @@ export class Forms {
   entry(entry, path, value) {
     const name = NAMES[entry.key] ?? entry.key.replaceAll("_", " ");
     if (entry.group === "signal") return this.signal(entry, path, name, value);
+    if (entry.group === "feedforward") return this.feedforward(entry, path, name, value);
     if (entry.group) return this.inner(entry, path, name, value);
     if (entry.list_of) return this.list(entry, path, name, value);
     if (entry.type === "true or false") return this.flag(entry, path, name, value);
@@ -130,6 +131,24 @@ export class Forms {
       box.append(field("Use", on));
     }
     if (value != null) box.append(...this.table(entry.group, value, path));
+    return box;
+  }
+
+  // None, the reference's own derivatives over b0, or a table of a model.
+  feedforward(entry, path, name, value) {
+    const box = element("div", "inner");
+    const kinds = ["none", "reference", ...Object.keys(this.groups.feedforward)];
+    const kind = value === true ? "reference" : value ? (value.kind ?? value) : "none";
+    const choice = select(kinds, kind, path + "!", name);
+    choice.onchange = () => {
+      const fresh = choice.value === "none" ? undefined : choice.value === "reference" ? true
+        : this.fresh("feedforward", choice.value);
+      this.change(path, fresh, true);
+    };
+    box.append(field(name, choice, entry.about));
+    if (value && value !== true) {
+      box.append(...this.table("feedforward", value, path).slice(1).filter((part) => part.className !== "about"));
+    }
     return box;
   }
 
