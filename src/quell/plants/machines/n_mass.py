@@ -40,9 +40,9 @@ from quell.quantities import Signals
 from quell.types import Matrix, Vector
 
 # A sub-step turns the fastest mode by at most so many radians: the period of a coupling in its play
-# is then right to 1e-3.
-_TURN = 0.1
-# Most sub-steps of a sample: the fastest mode then has 160 periods in it, which no loop can control.
+# is then right to 3e-4.
+_TURN = 0.05
+# Most sub-steps of a sample: the fastest mode then has 80 periods in it.
 _MOST_SUBSTEPS = 10_000
 
 
