@@ -99,6 +99,18 @@ class Tuned:
         return tuple(report.active_text(each, plants) for each in self.design.active)
 
     @property
+    def left_out(self) -> str:
+        """What of the plant is not in the model of a model-based observer; empty if nothing is."""
+        solution = self.design.solution
+        reduced = getattr(solution.structure, "reduced", None) if solution is not None else None
+        if reduced is None or not str(reduced):
+            return ""
+        return (
+            f"the {reduced} of the plant: not in the observer's model of order {reduced.order}, "
+            "belongs to f; all measures count it"
+        )
+
+    @property
     def costs(self) -> list[str]:
         """Costs of the chosen structure against the best one, PI and PID, as sentences."""
         return report.costs(self.design, self.designs, self.objective)
@@ -113,6 +125,7 @@ class Tuned:
         for row in report.rows(self.designs, self.objective):
             name, value, *rest = row
             lines.append(f"{name}: {report.quantity(self.objective)} {value}; " + _measures(rest))
+        lines += [self.left_out] if self.left_out else []
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
         lines += report.tradeoff_lines(self.tradeoff, self.objective)
         lines += [str(self.check)] if self.check is not None else []
@@ -141,6 +154,7 @@ class Tuned:
         """
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
         comment += f"active: {', '.join(self.active) or 'none'}"
+        comment += f"\n{self.left_out}" if self.left_out else ""
         replaced = ("observer", "controller")
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
         designed = {key: dict(table) for key, table in self.design.tables.items()}

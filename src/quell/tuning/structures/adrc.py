@@ -10,6 +10,7 @@ long as the loop with its own nominal plant is stable; ``equivalent.py`` finds t
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from quell.analysis.frequency_response import Complex
 from quell.controllers.adrc.adrc import ADRC
 from quell.lti.canonical import Canonical, canonical
+from quell.lti.reduction import Reduced, without_far_zeros
 from quell.observers.eso import ESO
 from quell.tuning.structures import sampled_adrc
 from quell.tuning.structures.base import Model, Parameter
@@ -67,8 +69,16 @@ class AdrcStructure:
 
     gain_power = -1
 
-    def __init__(self, model: Model, name: str, order: int, form: Form) -> None:
-        self.name, self.model, self.form = name, model, form
+    def __init__(
+        self, model: Model, name: str, order: int, form: Form, reduced: Reduced | None = None
+    ) -> None:
+        self.name, self.form = name, form
+        # The design model of a form with a model; all else is about the plant itself.
+        self.reduced = reduced
+        if reduced is not None and str(reduced):
+            own = canonical(reduced.plant)
+            model = model._replace(plant=reduced.plant, degree=own.degree, b=abs(own.b))
+        self.model = model
         # With s^(n+1) A + b0 B = p_law p_observer the poles of 1/A are as fast as the loop's. With
         # a model, D s A + b0 N B has A less the model's own poles: it may have a slow one.
         self.may_swing = form.based
@@ -275,6 +285,7 @@ class AdrcStructure:
             "poles": observer,
         }
         if self.form.based:
+            options |= {"far": math.inf}
             eso = ESO.model_based(self.model.plant, omega_o, dt, b0=b0, **options)
         else:
             eso = ESO.model_free(self.order, b0, omega_o, dt, **options)
@@ -288,6 +299,11 @@ class AdrcStructure:
         if not self.form.based:
             observer["order"] = self.order
         observer |= {"b0": b0, "omega_o": omega_o}
+        if self.reduced is not None and str(self.reduced):
+            num, den = (np.asarray(part).tolist() for part in self.model.plant)
+            observer["plant"] = {"kind": "linear", "num": num, "den": den}
+        elif self.form.based and without_far_zeros(self.model.plant, omega_o).zeros.size:
+            observer["far"] = math.inf
         if poles is not None:
             observer["poles"] = _listed(poles)
         if self.form.reduced:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from quell import checks
+from quell.lti.reduction import design_models
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
 from quell.tuning.structures.lqg import LqgStructure
@@ -30,16 +31,21 @@ STRUCTURES = (*_ADRC, *_PID, LQG)
 
 
 def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
-    """Return the orders to search: of a free ADRC 1 and 2, unless the plant or user says one."""
-    if name in _PID or name == LQG or _ADRC[name].based:
+    """Return the orders to search: of a free ADRC 1 and 2, unless the plant or user says one.
+
+    With a model they are the numbers of the models for a design, the plant itself first.
+    """
+    if name in _PID or name == LQG:
         return (0,)
+    if _ADRC[name].based:
+        return tuple(range(len(design_models(model.plant))))
     if order is not None:
         return (checks.whole("order", order, 1, 8),)
     return (1,) if model.degree == 1 and model.delay == 0.0 else (1, 2)
 
 
 def make_structure(name: str, model: Model, order: int = 0) -> Structure:
-    """Return a structure for a loop; ``order`` is that of an ADRC without model.
+    """Return a structure for a loop; ``order`` is one of ``orders_of``.
 
     Raises
     ------
@@ -53,5 +59,8 @@ def make_structure(name: str, model: Model, order: int = 0) -> Structure:
     if name == LQG:
         return LqgStructure(model)
     form = _ADRC[name]
-    label = name if form.based else f"{name} of order {order}"
-    return AdrcStructure(model, label, order, form)
+    if not form.based:
+        return AdrcStructure(model, f"{name} of order {order}", order, form)
+    chosen = design_models(model.plant)[order]
+    label = f"{name} of order {chosen.order}" if str(chosen) else name
+    return AdrcStructure(model, label, 0, form, chosen)
