@@ -14,6 +14,7 @@ total disturbance; margins have to be those of the whole plant.
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,7 +113,7 @@ def design_models(plant: Any) -> tuple[Reduced, ...]:
     resonant = np.sort(
         np.abs(poles[(poles.imag > 0.0) & (-poles.real < _RESONANT * np.abs(poles))])
     )
-    for upper, lower in zip(sizes[:-1], sizes[1:], strict=True):
+    for upper, lower in itertools.pairwise(sizes):
         if upper < _GAP * lower or (resonant.size and lower < (1.0 - 1e-9) * resonant[0]):
             continue
         cut = float(np.sqrt(upper * lower))

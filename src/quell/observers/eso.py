@@ -168,9 +168,10 @@ class ESO:
             if near.zeros.size:
                 whole, found = found, canonical(near.plant)
                 b0 = None if b0 is None else b0 * found.b / whole.b
+                gain = found.b if b0 is None else b0
                 warn(
                     f"the {near} of the plant is not in the observer's model: it is far beyond "
-                    f"omega_o = {omega_o!r} rad/s and belongs to f; b0 is {b0 or found.b:.4g}, from "
+                    f"omega_o = {omega_o!r} rad/s and belongs to f; b0 is {gain:.4g}, from "
                     f"u to derivative {found.degree} of y; analyse(plant, controller) counts it in "
                     "the margins (far=math.inf keeps it)"
                 )

@@ -75,7 +75,8 @@ def tune(
     dt
         sample time [s].
     structure
-        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own.
+        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own,
+        ``"p-pi-notch"`` the cascade of servo drives with a notch for each resonance.
     order
         order of an ADRC without model; 1 and 2 are tried by default.
     objective
@@ -103,7 +104,8 @@ def tune(
     seed
         of the samples.
     setup
-        tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default.
+        tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default. With
+        ``feedforward = true`` in its controller a cascade feeds speed and torque forward.
     scenario
         tunes by simulation (extra ``tuning``), for saturation, friction, encoders and criteria of
         your own: a ``Scenario`` that the plants, which need not be linear, run through, or one for
@@ -169,7 +171,9 @@ def tune(
     plants = plant_set(given, dt)
     bounds = constraints or Constraints()
     inputs = _inputs(objective, reference, duration, load, plants)
-    model = model_of(given, plants, bounds)
+    law = (setup or {}).get("controller", {})
+    follows = isinstance(law, Mapping) and bool(law.get("feedforward"))
+    model = model_of(given, plants, bounds)._replace(feedforward=follows)
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task)

@@ -36,6 +36,8 @@ _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
 _OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
+# Damping of the observer's pair at a resonance of the plant, to start from.
+_RESONANCE_STARTS = (0.1, 0.4)
 # With a model there are many valleys, also with an observer far slower than a quick law: a grid of
 # bandwidths from this share of the crossover to this one of the fastest, with so many for each.
 _FROM, _TO, _COUNT = 0.03, 0.98, 9
@@ -177,7 +179,29 @@ class AdrcStructure:
             found = self.rows_of(b0, *poles)
             if found is not None:
                 rows.append(found)
+            rows += self._around_resonance(b0, *poles)
         return np.array(rows)
+
+    def _around_resonance(self, b0: float, law: Any, observer: Any) -> list[Vector]:
+        """Return the values with a pair of the observer's poles where the plant resonates.
+
+        An observer leaves a resonance where it is, and damps it. Where the law moves it, too, its
+        poles are there as well.
+        """
+        roots = np.roots(np.append(1.0, self.plant.a[::-1])) if self.form.based else np.zeros(0)
+        size = np.abs(roots)
+        resonant = size[(roots.imag > 0.0) & (-roots.real < 0.5 * size) & (size < self._fastest)]
+        resonant = resonant[resonant > 1e-6 * np.max(size, initial=0.0)]
+        found: list[Vector | None] = []
+        for omega, damping in itertools.product(resonant.tolist(), _RESONANCE_STARTS):
+            pair = omega * np.exp(1j * np.arccos(damping) * np.array([1.0, -1.0])) * -1.0
+            seen = np.concatenate([observer[2:].astype(complex), pair])
+            found.append(self.rows_of(b0, law, seen))
+            if self.degree > 2:
+                slow = omega * np.exp(1j * np.arccos(0.7) * np.array([1.0, -1.0])) * -1.0
+                moved = np.concatenate([law[2:].astype(complex), slow])
+                found.append(self.rows_of(b0, moved, seen))
+        return [row for row in found if row is not None]
 
     def grid(self) -> tuple[Matrix, float]:
         """Return pairs of bandwidths, the law's and the observer's, for structures with a model."""

@@ -7,6 +7,7 @@ from quell.lti.reduction import design_models
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
 from quell.tuning.structures.lqg import LqgStructure
+from quell.tuning.structures.p_pi import CascadeStructure
 from quell.tuning.structures.pid import FilteredPID
 
 _PID = {
@@ -25,9 +26,9 @@ _ADRC = {
     "delay": Form(knows_delay=True),
     "delay-freed": Form(knows_delay=True, freed=True),
 }
-LQG = "lqg"
-STRUCTURES = (*_ADRC, *_PID, LQG)
-"""Names of the structures: forms of ADRC by bandwidths or freed poles, PI and PID, and LQG."""
+LQG, CASCADE = "lqg", "p-pi-notch"
+STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE)
+"""Names of the structures: forms of ADRC, PI and PID, LQG, and the cascade of servo drives."""
 
 
 def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
@@ -35,7 +36,7 @@ def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
 
     With a model they are the numbers of the models for a design, the plant itself first.
     """
-    if name in _PID or name == LQG:
+    if name in _PID or name in (LQG, CASCADE):
         return (0,)
     if _ADRC[name].based:
         return tuple(range(len(design_models(model.plant))))
@@ -58,6 +59,8 @@ def make_structure(name: str, model: Model, order: int = 0) -> Structure:
         return FilteredPID(model, derivative=derivative, filtered=filtered)
     if name == LQG:
         return LqgStructure(model)
+    if name == CASCADE:
+        return CascadeStructure(model)
     form = _ADRC[name]
     if not form.based:
         return AdrcStructure(model, f"{name} of order {order}", order, form)
