@@ -36,8 +36,8 @@ _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
 _OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
-# Damping of the observer's pair at a resonance of the plant, to start from.
-_RESONANCE_STARTS = (0.1, 0.4)
+# Damping of the observer's pair at a resonance of the plant, and of the law's, to start from.
+_RESONANCE_STARTS, _MOVED = (0.1, 0.4), 0.7
 # With a model there are many valleys, also with an observer far slower than a quick law: a grid of
 # bandwidths from this share of the crossover to this one of the fastest, with so many for each.
 _FROM, _TO, _COUNT = 0.03, 0.98, 9
@@ -179,34 +179,38 @@ class AdrcStructure:
             found = self.rows_of(b0, *poles)
             if found is not None:
                 rows.append(found)
-            rows += self._around_resonance(b0, *poles)
         return np.array(rows)
 
-    def _around_resonance(self, b0: float, law: Any, observer: Any) -> list[Vector]:
-        """Return the values with a pair of the observer's poles where the plant resonates.
+    def _around_resonance(self, shape: Vector) -> list[Vector]:
+        """Return values with a pair of the observer's poles where the plant resonates.
 
-        An observer leaves a resonance where it is, and damps it. Where the law moves it, too, its
-        poles are there as well.
+        An observer leaves a resonance where it is, and damps it. Where the law moves it, too, it
+        has poles there as well.
         """
-        roots = np.roots(np.append(1.0, self.plant.a[::-1])) if self.form.based else np.zeros(0)
+        roots = np.roots(np.append(1.0, self.plant.a[::-1]))
         size = np.abs(roots)
         resonant = size[(roots.imag > 0.0) & (-roots.real < 0.5 * size) & (size < self._fastest)]
         resonant = resonant[resonant > 1e-6 * np.max(size, initial=0.0)]
-        found: list[Vector | None] = []
+        law, observer = (poles[0] for poles in self.poles(shape[None, :]))
+        b0, found = float(shape[0]), []
         for omega, damping in itertools.product(resonant.tolist(), _RESONANCE_STARTS):
-            pair = omega * np.exp(1j * np.arccos(damping) * np.array([1.0, -1.0])) * -1.0
-            seen = np.concatenate([observer[2:].astype(complex), pair])
+            seen = np.concatenate([observer[2:], _pair(omega, damping)])
             found.append(self.rows_of(b0, law, seen))
             if self.degree > 2:
-                slow = omega * np.exp(1j * np.arccos(0.7) * np.array([1.0, -1.0])) * -1.0
-                moved = np.concatenate([law[2:].astype(complex), slow])
+                moved = np.concatenate([law[2:], _pair(omega, _MOVED)])
                 found.append(self.rows_of(b0, moved, seen))
         return [row for row in found if row is not None]
 
     def grid(self) -> tuple[Matrix, float]:
-        """Return pairs of bandwidths, the law's and the observer's, for structures with a model."""
-        if not self.form.based or self.form.freed:
+        """Return pairs of bandwidths, the law's and the observer's, for structures with a model.
+
+        With freed poles they are those around the plant's resonances, without a spacing.
+        """
+        if not self.form.based:
             return np.zeros((0, len(self.parameters))), 0.0
+        if self.form.freed:
+            around = [row for shape in self.shapes() for row in self._around_resonance(shape)]
+            return np.array(around).reshape(-1, len(self.parameters)), 0.0
         low = max(_FROM * self.model.omega, self.parameters[1].low)
         each = np.geomspace(min(low, 0.1 * self._fastest), _TO * self._fastest, _COUNT)
         rows = np.array([[self.model.b, *pair] for pair in itertools.product(each, each)])
@@ -342,6 +346,12 @@ class AdrcStructure:
         if self.form.half_law:
             controller["half_gain"] = True
         return {"observer": observer, "controller": controller}
+
+
+def _pair(omega: float, damping: float) -> NDArray[np.complex128]:
+    """Return two conjugate poles."""
+    root = 1j * np.sqrt(1.0 - damping**2)
+    return np.array([-omega * (damping - root), -omega * (damping + root)])
 
 
 def _pattern(poles: NDArray[np.complex128]) -> tuple[Any, ...]:
