@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,13 +25,15 @@ from quell.types import Matrix, Vector
 # A pair of poles with less damping is a resonance; notches lie below this share of half the
 # sampling rate. Drives have two to four filters; a third resonance is hardly ever below the limit.
 _RESONANT, _BELOW, _MOST = 0.5, 0.95, 2
-# Bounds of depth and width of a notch, and of its place in units of the resonance.
-_DEPTH, _WIDTH, _PLACE = (0.01, 0.999), (0.05, 6.0), (0.2, 5.0)
+# Bounds of depth and width of a notch, and of its place in units of the resonance. Beside a notch
+# that is deeper, |T| has peaks that are narrower than the grid of frequencies (2 % above the bound
+# on two masses without damping).
+_DEPTH, _WIDTH, _PLACE = (0.1, 0.999), (0.05, 6.0), (0.2, 5.0)
 # Bounds of times in units of the time of one radian at the plant's phase crossover.
 _TIMES = (1e-4, 1e4)
 # Values to start from: K_v and T_f in units of that radian, T_n K_v, depth and width of notches.
-_KV_STARTS, _TN_STARTS, _TF_STARTS = (0.01, 0.03, 0.1, 0.3, 1.0), (0.5, 2.0, 8.0), (0.01, 0.3)
-_NOTCH_STARTS = ((0.9, 0.3), (0.1, 0.5), (0.1, 2.0))
+_KV_STARTS, _TN_STARTS, _TF_STARTS = (0.01, 0.03, 0.1, 0.3, 1.0), (0.5, 2.0, 8.0), (0.01, 0.3, 2.8)
+_NOTCH_STARTS = ((0.9, 0.3), (0.12, 0.5), (0.15, 2.0), (0.4, 1.5))
 
 
 class CascadeStructure:
@@ -62,19 +65,26 @@ class CascadeStructure:
             )
 
     def shapes(self) -> Matrix:
-        """Return gains and times in wide ranges, with notches from none to wide ones."""
-        unit, rows = 1.0 / self.model.omega, []
-        notches = _NOTCH_STARTS if self._centres else _NOTCH_STARTS[:1]
-        for kv, tn, tf, shape in itertools.product(_KV_STARTS, _TN_STARTS, _TF_STARTS, notches):
-            row = [1.0, kv / unit, tn * unit / kv, max(tf * unit, 1.05 * self._shortest)]
-            for omega in self._centres:
-                row += [omega / math.tau, *shape]
-            rows.append(row)
-        return np.array(rows)
+        """Return gains and times in wide ranges, with the same notch at all resonances."""
+        return self._rows([[shape] * len(self._centres) for shape in _NOTCH_STARTS])
 
     def grid(self) -> tuple[Matrix, float]:
-        """Return none."""
-        return np.zeros((0, len(self.parameters))), 0.0
+        """Return the same with notches from none to wide ones in all combinations."""
+        if not self._centres:
+            return np.zeros((0, len(self.parameters))), 0.0
+        return self._rows(itertools.product(_NOTCH_STARTS, repeat=len(self._centres))), 0.0
+
+    def _rows(self, notches: Iterable[Sequence[tuple[float, float]]]) -> Matrix:
+        """Return values with the depth and width of the notch at each resonance."""
+        unit, rows = 1.0 / self.model.omega, []
+        for shapes in notches:
+            filters: list[float] = []
+            for omega, shape in zip(self._centres, shapes, strict=True):
+                filters += [omega / math.tau, *shape]
+            for kv, tn, tf in itertools.product(_KV_STARTS, _TN_STARTS, _TF_STARTS):
+                times = [kv / unit, tn * unit / kv, max(tf * unit, 1.05 * self._shortest)]
+                rows.append([1.0, *times, *filters])
+        return np.array(rows)
 
     def beside(self, values: Vector) -> Matrix:
         """Return none."""
