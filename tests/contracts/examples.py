@@ -28,6 +28,7 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
     "linear": {"num": [1.5], "den": [1.0, 1.0]},
     "delayed": {"plant": _LAG, "delay": 0.02, "dt": 0.01},
     "encoded": {"plant": _LAG, "counts": 16_000},
+    "n-mass": {"inertias": [1.0, 0.5, 2.0], "stiffnesses": [3.0, 2.0], "sensor": 3},
 }
 
 
@@ -46,6 +47,9 @@ PLANTS: dict[str, Any] = {
     "delayed, by part of a sample": ql.plants.delayed(_LAG, delay=0.0125, dt=0.01),
     "torsional, late": ql.plants.torsional(late=2),
     "torsional, not rounded": ql.plants.torsional(dac_bits=None, counts=None),
+    "n-mass, play": ql.plants.n_mass(
+        [1.0, 0.5, 2.0], [3.0, 2.0], [0.01, 0.02], play=[0.1, 0.0], loads=[1, 3]
+    ),
     "CubicSpringPlant": ql.plants.lagged_two_mass_spring(k_cubic=0.3),
     "LinearPlant": ql.plants.LinearPlant(
         [[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]

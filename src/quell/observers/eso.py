@@ -12,6 +12,7 @@ import numpy as np
 from quell import checks
 from quell.described import text
 from quell.lti.canonical import Canonical, canonical, format_roots
+from quell.lti.reduction import without_far_zeros
 from quell.observers.cascade import cascade_model, level_bandwidths
 from quell.observers.delay import delayed_model, without_delay
 from quell.observers.design import design_model
@@ -19,6 +20,7 @@ from quell.observers.kalman_gains import kalman_gain
 from quell.observers.nonlinear import NonlinearModel, nonlinear_model
 from quell.observers.response import scaled_response, total_time_constant
 from quell.types import Vector
+from quell.warn import warn
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +127,7 @@ class ESO:
         half_gain: bool = False,
         delay: float = 0.0,
         poles: Sequence[float | tuple[float, float]] | None = None,
+        far: float = 10.0,
     ) -> ESO:
         """Design an ESO from a model of the plant (paper eq. (mbplant)), which may have zeros.
 
@@ -146,13 +149,34 @@ class ESO:
             is what a learner needs; the state is found no faster than the zeros are. By default all
             N poles lie at ``exp(−omega_o dt)``: state and constant f are found fast, but f̂
             exaggerates changes (docs/design).
+        far
+            zeros from u that are beyond 3 times the fastest pole and beyond ``far`` times omega_o
+            are not in the observer's model, and a warning names them: the gain to the derivative
+            that they make u move is tiny, and no loop can be built on it. They belong to f, and
+            ``analyse`` with the plant as given counts them in the margins. The states of the model
+            are then y and its derivatives, and a given ``b0`` is scaled as the model's own is.
+            Infinite, or with ``keep_zeros``: all zeros are in the model.
 
         Raises
         ------
         ValueError
             as for ``canonical``, for more than 8 states, and if a zero at s = 0 hides a constant f.
         """
+        far = checks.positive("far", far) if far != math.inf else far
         found = canonical(plant, E)
+        keep_zeros = checks.flag("keep_zeros", keep_zeros)
+        if found.matched and found.zeros.size and far < math.inf and not keep_zeros:
+            near = without_far_zeros(plant, far * checks.positive("omega_o", omega_o, "rad/s"))
+            if near.zeros.size:
+                whole, found = found, canonical(near.plant)
+                b0 = None if b0 is None else b0 * found.b / whole.b
+                gain = found.b if b0 is None else b0
+                warn(
+                    f"the {near} of the plant is not in the observer's model: it is far beyond "
+                    f"omega_o = {omega_o!r} rad/s and belongs to f; b0 is {gain:.4g}, from "
+                    f"u to derivative {found.degree} of y; analyse(plant, controller) counts it in "
+                    "the margins (far=math.inf keeps it)"
+                )
         checks.whole("order of the plant", found.a.size, 1, 8)
         if found.matched and np.any(found.zeros == 0.0):
             raise ValueError(
@@ -160,7 +184,6 @@ class ESO:
                 "constant f does not show in y and can not be estimated; measure another output"
             )
         b0 = found.b if b0 is None else b0
-        keep_zeros = checks.flag("keep_zeros", keep_zeros)
         return cls._design(found, b0, omega_o, dt, form, half_gain, keep_zeros, delay, poles)
 
     @classmethod

@@ -14,15 +14,16 @@ from quell.plants.linear import LinearPlant
 from quell.plants.linearise import linearised
 from quell.plants.machines.cubic_spring import CubicSpringPlant, lagged_two_mass_spring
 from quell.plants.machines.dc_motor import DcMotor, dc_motor
+from quell.plants.machines.n_mass import NMassPlant, n_mass
 from quell.plants.machines.torsional import TorsionalPlant, torsional, torsional_identified
 from quell.plants.machines.two_mass_spring import two_mass_spring
 from quell.plants.nonlinear.plant import NonlinearPlant
 from quell.suggestions import suggest_names
 
 __all__ = [
-    "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch",
-    "TorsionalPlant", "batch", "dc_motor", "delayed", "encoded", "labelled",
-    "lagged_two_mass_spring", "linearised", "signals_of", "torsional",
+    "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NMassPlant", "NonlinearPlant", "Plant",
+    "PlantBatch", "TorsionalPlant", "batch", "dc_motor", "delayed", "encoded", "labelled",
+    "lagged_two_mass_spring", "linearised", "n_mass", "signals_of", "torsional",
     "torsional_identified", "two_mass_spring",
 ]  # fmt: skip
 

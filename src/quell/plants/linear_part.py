@@ -90,8 +90,8 @@ def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any
         )
     if hasattr(plant, "linear") and hasattr(plant, "sampled"):
         raise ValueError(
-            f"plant = {plant.name!r} has dry friction, limits or an encoder, which are not linear: "
-            "analyse its linear part, plant.linear, with its delay as delay="
+            f"plant = {plant.name!r} has dry friction, limits or an encoder, or play, which "
+            "are not linear: analyse its linear part, plant.linear, with its delay as delay="
         )
     if callable(plant) and not (hasattr(plant, "sampled") or is_linear_model(plant)):
         raise ValueError(

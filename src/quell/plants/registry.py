@@ -13,6 +13,7 @@ from quell.plants.identified_file import identified
 from quell.plants.linear import LinearPlant
 from quell.plants.machines.cubic_spring import lagged_two_mass_spring
 from quell.plants.machines.dc_motor import dc_motor
+from quell.plants.machines.n_mass import n_mass
 from quell.plants.machines.torsional import torsional, torsional_identified
 from quell.plants.machines.two_mass_spring import two_mass_spring
 from quell.plants.nonlinear.python_file import python_plant
@@ -53,6 +54,7 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
     "dc-motor": dc_motor,
     "lagged-two-mass": lagged_two_mass_spring,
     "linear": linear,
+    "n-mass": n_mass,
     "delayed": delayed,
     "encoded": encoded,
     "fmu": FMU,

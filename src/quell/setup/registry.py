@@ -18,7 +18,17 @@ from quell.controllers import (
     TrackingDifferentiator,
     adrc_for_dead_time,
 )
-from quell.controllers.baselines import LQG, PID, ZV, ZVD, NotchPID, ResonanceRatio, Shaper, notch
+from quell.controllers.baselines import (
+    LQG,
+    PID,
+    PPI,
+    ZV,
+    ZVD,
+    NotchPID,
+    ResonanceRatio,
+    Shaper,
+    notch,
+)
 from quell.observers import ESO
 from quell.quantities import Signals
 from quell.realtime.loop.run import run_rig
@@ -167,6 +177,7 @@ _CONTROLLERS = (
     call_table("pid-simc", PID.simc, forwards_to=_PID),
     call_table(_DOUBLE_INTEGRATOR, PID.simc_double_integrator, forwards_to=_PID),
     call_table("notch-pid", NotchPID, forwards_to=_PID, types={"notch": Notch}),
+    call_table("p-pi", PPI, forwards_to=_LINEAR, types={"notches": list_of(Notch)}),
     call_table("lqg", LQG, forwards_to=_LINEAR, types=_PLANT, descriptions=_MODEL),
     call_table("resonance-ratio", ResonanceRatio, forwards_to=_LINEAR),
 )

@@ -38,7 +38,7 @@ _PLANTS, _MOST_PERCENT = 24, 50.0
 # weights of the measurement; and where a plant starts or is linearised.
 _EXACT = (
     *("counts", "dac_bits", "late", "order", "substeps", "max_size", "cogging", "delay"),
-    *("kind", "uncertain", "c1", "c2", "start", "operating_point"),
+    *("kind", "uncertain", "c1", "c2", "start", "operating_point", "sensor", "loads"),
 )
 
 

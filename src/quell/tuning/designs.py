@@ -59,7 +59,7 @@ _NEAR_BEST = 1.05
 # The structures, simple ones first: by what a user has to know, and by the number of parameters.
 _FROM_SIMPLE = (
     *("pi-unfiltered", "pi", "pid", "bandwidths", "reduced", "half-gain", "half-gain-law"),
-    *("freed", "delay", "delay-freed", "model-based", "model-based-freed", "lqg"),
+    *("p-pi-notch", "freed", "delay", "delay-freed", "model-based", "model-based-freed", "lqg"),
 )
 # Largest order of an ADRC that has an equivalent PI or PID controller.
 _LIKE_PID = 2

@@ -88,9 +88,9 @@ def tune(
     dt
         sample time [s].
     structure
-        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own. By
-        default, ``"simplest"``, the simplest of ``compare`` whose objective is within 5 % of the
-        best of them.
+        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own,
+        ``"p-pi-notch"`` the cascade of servo drives with a notch for each resonance. By default,
+        ``"simplest"``, the simplest of ``compare`` whose objective is within 5 % of the best.
     order
         order of an ADRC without model; 1 and 2 are tried by default.
     objective
@@ -123,7 +123,8 @@ def tune(
     seed
         of the samples.
     setup
-        tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default.
+        tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default. With
+        ``feedforward = true`` in its controller a cascade feeds speed and torque forward.
     rest
         u and y at rest, where the plant works: the scenario of ``Tuned.toml`` begins there. Of a
         nonlinear plant the operating point by default, else zero.
@@ -200,7 +201,9 @@ def tune(
     plants = plant_set(given, dt)
     bounds = constraints or Constraints()
     inputs = _inputs(objective, reference, duration, load, plants)
-    model = model_of(given, plants, bounds)
+    law = (setup or {}).get("controller", {})
+    follows = isinstance(law, Mapping) and bool(law.get("feedforward"))
+    model = model_of(given, plants, bounds)._replace(feedforward=follows)
     late = float(np.ravel(delay)[0]) + actuator_lag
     known = as_list(plant)[0] if operating_point is None else given.linear[0]
     forward = _by_model(feedforward, known, late)

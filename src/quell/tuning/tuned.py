@@ -109,6 +109,18 @@ class Tuned:
         return tuple(report.active_text(each, plants) for each in self.design.active)
 
     @property
+    def left_out(self) -> str:
+        """What of the plant is not in the model of a model-based observer; empty if nothing is."""
+        solution = self.design.solution
+        reduced = getattr(solution.structure, "reduced", None) if solution is not None else None
+        if reduced is None or not str(reduced):
+            return ""
+        return (
+            f"the {reduced} of the plant: not in the observer's model of order {reduced.order}, "
+            "belongs to f; all measures count it"
+        )
+
+    @property
     def costs(self) -> list[str]:
         """Costs of the chosen structure against the best one, PI and PID, as sentences."""
         return report.costs(self.design, self.designs, self.objective)
@@ -127,6 +139,7 @@ class Tuned:
                 report.second_quantity(self.objective),
             )
             lines.append(f"{name}: {quantity} {value}; " + _measures(second, rest))
+        lines += [self.left_out] if self.left_out else []
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
         lines += [str(self.reference_step)]
         forward = getattr(self.design.controller, "feedforward", False)
@@ -160,6 +173,7 @@ class Tuned:
         """
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
         comment += f"active: {', '.join(self.active) or 'none'}\n{self.reference_step}"
+        comment += f"\n{self.left_out}" if self.left_out else ""
         replaced = ("observer", "controller")
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
         designed = {key: dict(table) for key, table in self.design.tables.items()}

@@ -6,6 +6,7 @@ May import ``controllers`` with ``adrc``, ``linear`` and ``prefilters``, and wha
 from quell.controllers.baselines.equivalent import equivalent_pid
 from quell.controllers.baselines.lqg import LQG
 from quell.controllers.baselines.notch import Notch, NotchPID
+from quell.controllers.baselines.p_pi import PPI
 from quell.controllers.baselines.pid import PID
 from quell.controllers.baselines.resonance_ratio import ResonanceRatio
 from quell.controllers.prefilters.shaping import ZV, ZVD, Shaper
@@ -14,6 +15,7 @@ from quell.suggestions import suggest_names
 __all__ = [
     "LQG",
     "PID",
+    "PPI",
     "ZV",
     "ZVD",
     "Notch",

@@ -33,6 +33,7 @@ from quell.types import Matrix, Progress, Vector
 STRUCTURES = {
     "tuned-pid": "pid",
     "tuned-lqg": "lqg",
+    "tuned-p-pi-notch": "p-pi-notch",
     "tuned-bandwidths": "bandwidths",
     "tuned-freed": "freed",
     "tuned-mb-eso": "model-based",

@@ -38,6 +38,7 @@ from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel, quantized
 from quell.plants.labelled import labelled
 from quell.plants.linear import LinearModel, LinearPlant
+from quell.plants.machines.n_mass import chain_matrices
 from quell.quantities import Signals
 from quell.types import Vector
 
@@ -254,11 +255,7 @@ def torsional(
     step = 0.0 if bits is None else 2.0 * _RANGE / 2**bits
     counts = checks.optional(checks.whole, "counts", counts, 1)
     late = checks.whole("late", late, 0, 1000)
-    A, E = np.zeros((4, 4)), np.zeros((4, 2))
-    A[0, 2] = A[1, 3] = 1.0
-    A[2] = -k / j1, k / j1, -(c1 + d) / j1, d / j1
-    A[3] = k / j2, -k / j2, d / j2, -(c2 + d) / j2
-    E[2, 0], E[3, 1] = 1.0 / j1, 1.0 / j2
+    A, E = chain_matrices((j1, j2), (k,), (d,), (c1, c2))
     B, C = ratio * k_t * k_a * E[:, 0], [0.0, 1.0, 0.0, 0.0]
     linear = labelled(
         LinearPlant(A, B, C, E, name="torsional plant without friction"), *_SIGNALS[:3]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from quell import checks
 from quell.plants.labelled import labelled
 from quell.plants.linear import LinearPlant
+from quell.plants.machines.n_mass import chain_matrices
 from quell.quantities import Signals
 from quell.types import Matrix
 
@@ -18,13 +17,7 @@ def two_mass_matrices(m1: float, m2: float, k: float) -> tuple[Matrix, Matrix]:
     """Return A (4, 4) and the inputs (4, 2) of forces on both masses; the arguments are checked."""
     m1, m2 = checks.positive("m1", m1, "kg"), checks.positive("m2", m2, "kg")
     k = checks.positive("k", k, "N/m")
-    A = np.zeros((4, 4))
-    A[0, 2] = A[1, 3] = 1.0
-    A[2, :2] = -k / m1, k / m1
-    A[3, :2] = k / m2, -k / m2
-    E = np.zeros((4, 2))
-    E[2, 0], E[3, 1] = 1.0 / m1, 1.0 / m2
-    return A, E
+    return chain_matrices((m1, m2), (k,), (0.0,), (0.0, 0.0))
 
 
 def two_mass_spring(

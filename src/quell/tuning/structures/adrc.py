@@ -10,6 +10,7 @@ long as the loop with its own nominal plant is stable; ``equivalent.py`` finds t
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from quell.analysis.frequency_response import Complex
 from quell.controllers.adrc.adrc import ADRC
 from quell.lti.canonical import Canonical, canonical
+from quell.lti.reduction import Reduced, without_far_zeros
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
 from quell.tuning.structures import sampled_adrc
@@ -35,6 +37,8 @@ _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
 _OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
+# Damping of the observer's pair at a resonance of the plant, and of the law's, to start from.
+_RESONANCE_STARTS, _MOVED = (0.1, 0.4), 0.7
 # With a model there are many valleys, also with an observer far slower than a quick law: a grid of
 # bandwidths from this share of the crossover to this one of the fastest, with so many for each.
 _FROM, _TO, _COUNT = 0.03, 0.98, 9
@@ -68,8 +72,16 @@ class AdrcStructure:
 
     gain_power = -1
 
-    def __init__(self, model: Model, name: str, order: int, form: Form) -> None:
-        self.name, self.model, self.form = name, model, form
+    def __init__(
+        self, model: Model, name: str, order: int, form: Form, reduced: Reduced | None = None
+    ) -> None:
+        self.name, self.form = name, form
+        # The design model of a form with a model; all else is about the plant itself.
+        self.reduced = reduced
+        if reduced is not None and str(reduced):
+            own = canonical(reduced.plant)
+            model = model._replace(plant=reduced.plant, degree=own.degree, b=abs(own.b))
+        self.model = model
         self.gain_sign = model.sign
         # With s^(n+1) A + b0 B = p_law p_observer the poles of 1/A are as fast as the loop's. With
         # a model, D s A + b0 N B has A less the model's own poles: it may have a slow one.
@@ -171,10 +183,36 @@ class AdrcStructure:
                 rows.append(found)
         return np.array(rows)
 
+    def _around_resonance(self, shape: Vector) -> list[Vector]:
+        """Return values with a pair of the observer's poles where the plant resonates.
+
+        An observer leaves a resonance where it is, and damps it. Where the law moves it, too, it
+        has poles there as well.
+        """
+        roots = np.roots(np.append(1.0, self.plant.a[::-1]))
+        size = np.abs(roots)
+        resonant = size[(roots.imag > 0.0) & (-roots.real < 0.5 * size) & (size < self._fastest)]
+        resonant = resonant[resonant > 1e-6 * np.max(size, initial=0.0)]
+        law, observer = (poles[0] for poles in self.poles(shape[None, :]))
+        b0, found = float(shape[0]), []
+        for omega, damping in itertools.product(resonant.tolist(), _RESONANCE_STARTS):
+            seen = np.concatenate([observer[2:], _pair(omega, damping)])
+            found.append(self.rows_of(b0, law, seen))
+            if self.degree > 2:
+                moved = np.concatenate([law[2:], _pair(omega, _MOVED)])
+                found.append(self.rows_of(b0, moved, seen))
+        return [row for row in found if row is not None]
+
     def grid(self) -> tuple[Matrix, float]:
-        """Return pairs of bandwidths, the law's and the observer's, for structures with a model."""
-        if not self.form.based or self.form.freed:
+        """Return pairs of bandwidths, the law's and the observer's, for structures with a model.
+
+        With freed poles they are those around the plant's resonances, without a spacing.
+        """
+        if not self.form.based:
             return np.zeros((0, len(self.parameters))), 0.0
+        if self.form.freed:
+            around = [row for shape in self.shapes() for row in self._around_resonance(shape)]
+            return np.array(around).reshape(-1, len(self.parameters)), 0.0
         low = max(_FROM * self.model.omega, self.parameters[1].low)
         each = np.geomspace(min(low, 0.1 * self._fastest), _TO * self._fastest, _COUNT)
         rows = np.array([[self.model.b, *pair] for pair in itertools.product(each, each)])
@@ -277,6 +315,7 @@ class AdrcStructure:
             "poles": observer,
         }
         if self.form.based:
+            options |= {"far": math.inf}
             eso = ESO.model_based(self.model.plant, omega_o, dt, b0=b0, **options)
         else:
             eso = ESO.model_free(self.order, b0, omega_o, dt, **options)
@@ -290,10 +329,15 @@ class AdrcStructure:
         if not self.form.based:
             observer["order"] = self.order
         observer |= {"b0": b0, "omega_o": omega_o}
-        if self.form.based:  # the plant of the file may be late, or not linear
+        if self.reduced is not None and str(self.reduced):
+            num, den = (np.asarray(part).tolist() for part in self.model.plant)
+            observer["plant"] = {"kind": "linear", "num": num, "den": den}
+        elif self.form.based:  # the plant of the file may be late, or not linear
             linear = LinearPlant.of(self.model.plant)
             parts = zip("ABC", (linear.A, linear.B, linear.C), strict=True)
             observer["plant"] = {"kind": "linear"} | {key: part.tolist() for key, part in parts}
+            if without_far_zeros(self.model.plant, omega_o).zeros.size:
+                observer["far"] = math.inf
         if poles is not None:
             observer["poles"] = _listed(poles)
         if self.form.reduced:
@@ -308,6 +352,12 @@ class AdrcStructure:
         if self.form.half_law:
             controller["half_gain"] = True
         return {"observer": observer, "controller": controller}
+
+
+def _pair(omega: float, damping: float) -> NDArray[np.complex128]:
+    """Return two conjugate poles."""
+    root = 1j * np.sqrt(1.0 - damping**2)
+    return np.array([-omega * (damping - root), -omega * (damping + root)])
 
 
 def _pattern(poles: NDArray[np.complex128]) -> tuple[Any, ...]:

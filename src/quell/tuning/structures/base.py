@@ -39,6 +39,7 @@ class Model(NamedTuple):
     omega: float  # frequency at which the plant's phase lag is that of two integrators [rad/s]
     gain: float  # |P| around it
     constraints: Constraints
+    feedforward: bool = False  # whether a cascade feeds speed and torque forward
 
 
 class Structure(Protocol):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from quell import checks
+from quell.lti.reduction import design_models
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
 from quell.tuning.structures.lqg import LqgStructure
+from quell.tuning.structures.p_pi import CascadeStructure
 from quell.tuning.structures.pid import FilteredPID
 
 _PID = {
@@ -24,22 +26,27 @@ _ADRC = {
     "delay": Form(knows_delay=True),
     "delay-freed": Form(knows_delay=True, freed=True),
 }
-LQG = "lqg"
-STRUCTURES = (*_ADRC, *_PID, LQG)
-"""Names of the structures: forms of ADRC by bandwidths or freed poles, PI and PID, and LQG."""
+LQG, CASCADE = "lqg", "p-pi-notch"
+STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE)
+"""Names of the structures: forms of ADRC, PI and PID, LQG, and the cascade of servo drives."""
 
 
 def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
-    """Return the orders to search: of a free ADRC 1 and 2, unless the plant or user says one."""
-    if name in _PID or name == LQG or _ADRC[name].based:
+    """Return the orders to search: of a free ADRC 1 and 2, unless the plant or user says one.
+
+    With a model they are the numbers of the models for a design, the plant itself first.
+    """
+    if name in _PID or name in (LQG, CASCADE):
         return (0,)
+    if _ADRC[name].based:
+        return tuple(range(len(design_models(model.plant))))
     if order is not None:
         return (checks.whole("order", order, 1, 8),)
     return (1,) if model.degree == 1 and model.delay == 0.0 else (1, 2)
 
 
 def make_structure(name: str, model: Model, order: int = 0) -> Structure:
-    """Return a structure for a loop; ``order`` is that of an ADRC without model.
+    """Return a structure for a loop; ``order`` is one of ``orders_of``.
 
     Raises
     ------
@@ -52,6 +59,11 @@ def make_structure(name: str, model: Model, order: int = 0) -> Structure:
         return FilteredPID(model, derivative=derivative, filtered=filtered)
     if name == LQG:
         return LqgStructure(model)
+    if name == CASCADE:
+        return CascadeStructure(model)
     form = _ADRC[name]
-    label = name if form.based else f"{name} of order {order}"
-    return AdrcStructure(model, label, order, form)
+    if not form.based:
+        return AdrcStructure(model, f"{name} of order {order}", order, form)
+    chosen = design_models(model.plant)[order]
+    label = f"{name} of order {chosen.order}" if str(chosen) else name
+    return AdrcStructure(model, label, 0, form, chosen)

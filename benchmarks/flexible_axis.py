@@ -1,0 +1,162 @@
+"""Flexible axes: what each structure reaches, and what the resonance does to an ADRC of order 2.
+
+Chains of two and three inertias with damped couplings, encoder at the motor or at the load, ratios
+J_load/J_motor of 0.3 to 10 (the axis: J_motor = 3.2e-4 kg m², k = 180 N m/rad, c = 0.02 N m s/rad,
+4 kHz, torque a sample late; the third inertia, 0.3 J_motor, sits between on 300 N m/rad). For each
+axis the tuned cascade of servo drives (p-pi-notch, M_s and M_t at most 1.6) is the reference; the
+others are tuned with the same bounds and with the M_ks that the cascade has, so that noise costs
+the same. The figure is the integral gain over that of the cascade, k_i being that of a loop that is
+checked to be stable with the whole plant. With --free M_ks has no bound for any of them.
+
+The second table is M_s of an ADRC of order 2 with omega_o = 4 omega_c and b0 = 1/(J_m + J_l), the
+encoder at the motor.
+
+Usage: python benchmarks/flexible_axis.py [--free] [--quick] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import quell as ql
+from quell.tuning import Constraints
+
+DT = LATE = 2.5e-4  # s
+MOTOR, STIFFNESS = 3.2e-4, 180.0  # kg m², N m/rad
+BOUND = 1.6  # M_s and M_t
+REFERENCE = "p-pi-notch"
+OTHERS = ("bandwidths", "freed", "model-based", "model-based-freed")
+RATIOS = (0.3, 1.0, 3.0, 10.0)
+
+
+class Axis(NamedTuple):
+    """A case of the trial."""
+
+    inertias: int
+    sensor: str
+    ratio: float
+    damping: float
+
+    def plant(self) -> Any:
+        """Return the chain of inertias."""
+        J, k, c = [MOTOR, self.ratio * MOTOR], [STIFFNESS], self.damping
+        if self.inertias == 3:
+            J, k = [MOTOR, 0.3 * MOTOR, self.ratio * MOTOR], [300.0, STIFFNESS]
+        at = 1 if self.sensor == "motor" else len(J)
+        return ql.plants.n_mass(J, k, [c] * len(k), sensor=at)
+
+
+def axes(quick: bool) -> list[Axis]:
+    """Return the cases: sensor, number of inertias and ratio; more damping at the load."""
+    ratios = (3.0,) if quick else RATIOS
+    found = [Axis(n, s, r, 0.02) for n in (2, 3) for s in ("motor", "load") for r in ratios]
+    return found + [Axis(2, "load", ratio, 0.1) for ratio in ratios]
+
+
+def tuned(axis: Axis, free: bool, others: tuple[str, ...] = OTHERS) -> dict[str, Any]:
+    """Return k_i, M_s and M_ks of each structure, or why there is none."""
+    plant, how = axis.plant(), {"dt": DT, "delay": LATE}
+    bounds = Constraints(m_s=BOUND, m_t=BOUND, noise_over_pi=None)
+    first = ql.tune(plant, structure=REFERENCE, compare=(), constraints=bounds, **how)
+    if not free:
+        m_ks = 1.001 * first.design.measures["M_ks"]
+        bounds = Constraints(m_s=BOUND, m_t=BOUND, m_ks=m_ks)
+    found = {REFERENCE: _row(plant, first.design, 0.0)}
+    for name in others:
+        begun = time.perf_counter()
+        try:
+            design = ql.tune(plant, structure=name, compare=(), constraints=bounds, **how).design
+        except ValueError as error:
+            found[name] = {"reason": str(error)}
+            continue
+        found[name] = _row(plant, design, time.perf_counter() - begun)
+    return found
+
+
+def _row(plant: Any, design: Any, seconds: float) -> dict[str, Any]:
+    loop = ql.analysis.analyse(plant, design.controller, delay=LATE)
+    measures = {"m_s": 1.0 / loop.margins.modulus if loop.stable else None, "k_i": design.k_i}
+    rest = {key: design.measures[key] for key in ("M_ks", "iae")}
+    return {"name": design.name, "seconds": seconds} | measures | rest
+
+
+def summary(results: list[tuple[Axis, dict[str, Any]]]) -> dict[str, Any]:
+    """Return the ratios of the best structure of each axis, and of each structure."""
+    best, each = [], {name: [] for name in OTHERS}
+    for _, found in results:
+        reference = found[REFERENCE]["k_i"]
+        ratios = {
+            name: row["k_i"] / reference
+            for name, row in found.items()
+            if name != REFERENCE and row.get("m_s") is not None and row["m_s"] <= 1.002 * BOUND
+        }
+        for name, ratio in ratios.items():
+            each[name].append(ratio)
+        best.append(max(ratios.values(), default=0.0))
+    return {
+        "axes": len(results),
+        "none": sum(ratio == 0.0 for ratio in best),
+        "least": min(best),
+        "median": statistics.median(best),
+        "each": {
+            name: (len(values), min(values, default=0.0), statistics.median(values or [0.0]))
+            for name, values in each.items()
+        },
+    }
+
+
+def model_free(ratio: float, omega_c: float) -> float | None:
+    """Return M_s of an ADRC of order 2 at the motor; None if it is not stable."""
+    plant = Axis(2, "motor", ratio, 0.02).plant()
+    b0 = 1.0 / (MOTOR * (1.0 + ratio))
+    observer = ql.ESO.model_free(2, b0, 4.0 * omega_c, DT)
+    loop = ql.analysis.analyse(plant, ql.ADRC(observer, omega_c), delay=LATE)
+    return 1.0 / loop.margins.modulus if loop.stable else None
+
+
+def main() -> None:
+    """Run the trial and print its tables."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--free", action="store_true", help="no bound of M_ks")
+    parser.add_argument("--quick", action="store_true", help="the ratio 3 only")
+    parser.add_argument("--json", type=Path, help="file for all numbers")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print("ADRC of order 2 at the motor, omega_o = 4 omega_c: M_s")
+    print("J_l/J_m  " + "".join(f"omega_c = {w:<6g}" for w in (20.0, 40.0, 80.0, 160.0)))
+    for ratio in RATIOS:
+        cells = (model_free(ratio, w) for w in (20.0, 40.0, 80.0, 160.0))
+        text = "".join(f"{'unstable' if m is None else f'{m:.2f}':16s}" for m in cells)
+        print(f"{ratio:<9g}{text}")
+    results = []
+    print(f"\nk_i over that of the tuned {REFERENCE}, M_s and M_t <= {BOUND:g}", end="")
+    print(", no bound of M_ks" if options.free else ", its M_ks")
+    for axis in axes(options.quick):
+        found = tuned(axis, options.free)
+        results.append((axis, found))
+        reference = found[REFERENCE]
+        cells = [
+            f"{name} " + (f"{row['k_i'] / reference['k_i']:.2f}" if "k_i" in row else "none")
+            for name, row in found.items()
+            if name != REFERENCE
+        ]
+        at = f"{axis.inertias} inertias, {axis.sensor}, ratio {axis.ratio:g}, c {axis.damping:g}"
+        print(f"{at}: k_i {reference['k_i']:.0f}; " + ", ".join(cells), flush=True)
+    figures = summary(results)
+    print(f"best of all: least {figures['least']:.2f}, median {figures['median']:.2f}", end="")
+    print(f" of {figures['axes']} axes, none found for {figures['none']}")
+    for name, (count, least, median) in figures["each"].items():
+        print(f"  {name}: found for {count}, least {least:.2f}, median {median:.2f}")
+    if options.json is not None:
+        rows = [{**axis._asdict(), "found": found} for axis, found in results]
+        options.json.write_text(json.dumps({"axes": rows, "summary": figures}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
