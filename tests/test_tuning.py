@@ -232,6 +232,14 @@ def test_noise_and_limits_of_u_give_the_bound_of_noise() -> None:
     assert "2 % of half the range of u" in found.noise_bound
 
 
+@pytest.mark.parametrize("more", [{}, {"m_ks": 3.0}])
+def test_a_noise_without_effect_is_refused(more: dict[str, float]) -> None:
+    """It needs the limits of u, and says nothing beside M_ks."""
+    bounds = Constraints(resolution=0.01, **more)
+    with pytest.raises(ValueError, match="m_ks" if more else "u_min and u_max"):
+        ql.tune(([1.0], [1.0, 1.0]), 0.1, constraints=bounds, structure="pi", compare=())
+
+
 def test_without_a_pi_controller_of_use_the_bound_of_noise_is_that_of_a_pid_controller() -> None:
     """An integrated inertia has no PI controller, a damped one a bad one: k_i of 1e-4 for 1."""
     for den, least in (([1.0, 0.0, 0.0], 100.0), ([1.0, 3.3, 0.0], 30.0)):

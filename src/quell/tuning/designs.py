@@ -96,9 +96,20 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     with the usual filter, ``T_f = T_d/10``.
     """
     given = task.constraints
+    low, high = task.u.get("u_min"), task.u.get("u_max")
+    if given.noise and given.u_std is None:
+        if given.m_ks is not None:
+            raise ValueError(
+                f"m_ks = {given.m_ks:g}: bounds what noise does to u, so noise_std and resolution "
+                "have no effect; leave m_ks out, or them"
+            )
+        if low is None or high is None:
+            raise ValueError(
+                "noise_std, resolution: noise may use a share of the range of u; give u_min and "
+                "u_max, too, or u_std"
+            )
     if given.m_ks is not None or given.u_std is not None:
         return task, ""
-    low, high = task.u.get("u_min"), task.u.get("u_max")
     if given.noise and low is not None and high is not None:
         half = 0.5 * (float(high) - float(low))
         how = (
