@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import math
 import shutil
 import subprocess
 import tempfile
@@ -62,6 +63,7 @@ def tuned(structure: str, feedforward: bool | ql.Feedforward = True) -> ql.ADRC:
         DT,
         structure=structure,
         feedforward=feedforward,
+        constraints=ql.tuning.Constraints(resolution=math.tau / COUNTS),
         compare=(),
         **limits,
     )

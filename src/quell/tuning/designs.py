@@ -93,7 +93,7 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     Where the noise of y and the limits of u are known, the standard deviation of u is bounded by a
     share of half their range. Else M_ks is bounded by a multiple of that of the optimal PI
     controller; where a PI controller is of no use, as for an inertia, by that of a PID controller
-    with the usual filter, ``T_f = T_d/10``.
+    with the usual filter, ``T_f = T_d/10``, if it is larger.
     """
     given = task.constraints
     low, high = task.u.get("u_min"), task.u.get("u_max")
@@ -125,20 +125,21 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
         "--noise, --resolution), to have what noise may do to u"
     )
     pi = _reference(by_gain, FilteredPID(task.model, derivative=False, filtered=False))
-    pid = FilteredPID(task.model, derivative=True, filtered=False, ratio=ratio)
-    if pi is not None and task.model.degree < _INERTIA:
+    found = []
+    if pi is not None:
         size = _m_ks(task, pi)
         how = f"M_ks: {ratio:g} times that of the optimal PI controller, {size:.4g}"
-        return _bounded(task, m_ks=ratio * size), how + remedy
-    best = _reference(by_gain, pid)
-    if pi is not None and (best is None or best.cost > pi.cost - math.log(_OF_USE)):
-        size = _m_ks(task, pi)
-        how = f"M_ks: {ratio:g} times that of the optimal PI controller, {size:.4g}"
-        return _bounded(task, m_ks=ratio * size), how + remedy
-    if best is None:
+        found.append((ratio * size, how))
+    if pi is None or task.model.degree >= _INERTIA:
+        tied = FilteredPID(task.model, derivative=True, filtered=False, ratio=ratio)
+        pid = _reference(by_gain, tied)
+        if pid is not None and (pi is None or pid.cost <= pi.cost - math.log(_OF_USE)):
+            how = f"M_ks: that of the optimal PID controller with T_f = T_d/{ratio:g}"
+            found.append((_m_ks(task, pid), how))
+    if not found:
         return task, f"no bound of M_ks: no PI or PID controller meets the constraints{remedy}"
-    how = f"M_ks: that of the optimal PID controller with T_f = T_d/{ratio:g}"
-    return _bounded(task, m_ks=_m_ks(task, best)), how + remedy
+    m_ks, how = max(found)
+    return _bounded(task, m_ks=m_ks), how + remedy
 
 
 def _bounded(task: Task, **bound: float) -> Task:

@@ -100,7 +100,10 @@ class Tuned:
 
         That of the linear loop with the first plant, without the controller's feedforward.
         """
-        return reference_step(self.plants, self.controller)
+        solution = self.design.solution
+        if solution is None:
+            return reference_step(self.plants, self.controller)
+        return reference_step(self.plants, solution.structure.controller(solution.values))
 
     @property
     def active(self) -> tuple[str, ...]:
