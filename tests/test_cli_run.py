@@ -398,7 +398,7 @@ def test_the_examples_are_printed_and_can_be_used(
     (tmp_path / "short.toml").write_text(SHORT)
     assert (
         quell("run-rig", "short.toml").err
-        == "quell: short.toml: rig: missing; give a table [rig]\n"
+        == "quell: short.toml: rig: missing; give a table [rig], rig = {device = 'twin:'}\n"
     )
 
 

@@ -33,8 +33,6 @@ _EXAMPLES = {
     "plant": "plant = {kind = 'linear', num = [1.0], den = [1.0, 1.0]}",
     "rig": "rig = {device = 'twin:'}",
 }
-# Objects that tables within a table may need.
-_FOR_TABLES_INSIDE = {"controller": {"plant"}}
 
 EXAMPLES = Path(__file__).parent / "examples"
 """The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
@@ -126,7 +124,9 @@ def assembled(
         table = getattr(tables, key)
         if table is None:
             return None
-        takes = parameters_of(table.function).keys() | _FOR_TABLES_INSIDE.get(key, set())
+        takes = set(parameters_of(table.function))
+        if table.written().get("feedforward") not in (None, True, False):
+            takes.add("plant")  # the feedforward of a model
         context = {each: context[each] for each in takes & context.keys()}
         inputs = table, dt, *context, *context.values()
         return made_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
