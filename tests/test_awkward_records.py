@@ -589,7 +589,7 @@ def test_a_command_says_which_one_takes_the_file(
                 SetupError, match=f"{name}: is a record, not a setup: quell identify"
             ):
                 app([command, name], result_action="return_value")
-    with pytest.raises(SetupError, match="quell tune log.txt a controller"):
+    with pytest.raises(SetupError, match="quell tune log.txt --out tuned.toml a controller"):
         load_setup("log.txt")
     with pytest.raises(SetupError, match="photo.png: is an image .PNG., not a setup"):
         load_setup("photo.png")

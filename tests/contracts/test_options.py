@@ -49,7 +49,7 @@ WORK = {
     "identify": ("quell.identification.identify",),
     "tune": (
         "quell.tuning.tune",
-        "quell.identification.identify",
+        "quell.tuning.record_model.record_model",
         "quell.commissioning.experiment",
     ),
     "b0": ("quell.identification.identify_b0",),
