@@ -233,6 +233,13 @@ def test_an_observer_with_another_input_of_f_is_refused() -> None:
         ql.ADRC(observer, 3.0, feedforward=ql.Feedforward((1.0,)))
 
 
+def test_a_delay_of_part_of_a_sample_is_the_feedforwards_too() -> None:
+    """All of it, not only its whole samples."""
+    assert ql.Feedforward.of(ql.plants.delayed(SPRING, 1.4 * DT, DT)).delay == pytest.approx(
+        1.4 * DT
+    )
+
+
 def test_the_tuner_writes_the_feedforward_of_the_model(tmp_path: Path) -> None:
     """Into controller, summary and setup; a PID has none; no margin changes."""
     late = ql.plants.delayed(SPRING, DT, DT)

@@ -193,7 +193,7 @@ class Feedforward:
         """
         late, friction, width = 0.0, 0.0, 0.0
         while isinstance(plant, DelayedPlant | EncodedPlant):
-            late += plant.samples * plant.dt if isinstance(plant, DelayedPlant) else 0.0
+            late += plant.delay if isinstance(plant, DelayedPlant) else 0.0
             plant = plant.plant
         if isinstance(plant, FrictionPlant):
             friction, width = plant.signed_force, plant.width
