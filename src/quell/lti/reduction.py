@@ -44,7 +44,7 @@ class Reduced(NamedTuple):
         return canonical(self.plant).a.size
 
     def __str__(self) -> str:
-        """Say what is left out; empty if nothing is."""
+        """Return what is left out as text; empty if nothing is."""
         parts = []
         for name, roots in (("zero", self.zeros), ("pole", self.poles)):
             if roots.size:

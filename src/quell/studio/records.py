@@ -69,7 +69,7 @@ _IDENTIFYING = 0.85
 
 
 class Shown(NamedTuple):
-    """What a page shows of a record: the set of plants, or why there is none."""
+    """The record of a page: the set of plants, or why there is none."""
 
     plant: Any  # table of the model in a setup
     dt: float  # [s]

@@ -30,7 +30,7 @@ from quell.tuning.optimiser.requirements import bounds_of, worst_ratio
 from quell.tuning.plants import as_list
 from quell.tuning.result.design import Design, design_of
 from quell.tuning.simulated import Problem, Search, SearchRange, search
-from quell.tuning.structures.base import Structure, vector
+from quell.tuning.structures.base import Structure, named, vector
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Uncertain
 
@@ -171,9 +171,7 @@ def tune_by_simulation(
     progress = how.get("progress")
     report = None if progress is None else lambda share: progress("simulations", share)
     given = {"violation": bounds, "seed": seed, "progress": report, **options}
-    first_values = found.design.solution.values
-    names = [parameter.name for parameter in build.structure.parameters]
-    start = dict(zip(names, map(float, first_values), strict=True))
+    start = named(build.structure, found.design.solution.values)
     trials = tune_structure(build, problem, start, **given)
     best = trials.best if len(trials.objectives) == 1 else trials.front[0]
     first = trials.objectives[0]

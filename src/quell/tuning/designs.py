@@ -20,6 +20,7 @@ from quell.tuning.optimiser.requirements import Bound, bounds_of, sizes
 from quell.tuning.optimiser.search import best_solution, search
 from quell.tuning.optimiser.time_responses import Inputs, SetResponses, law_of
 from quell.tuning.result.design import Design, design_of, impossible, measured
+from quell.tuning.result.report import relative
 from quell.tuning.structures.adrc import AdrcStructure
 from quell.tuning.structures.base import Model, Structure
 from quell.tuning.structures.equivalent import equivalents
@@ -96,8 +97,10 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     with the usual filter, ``T_f = T_d/10``, if it is larger.
     """
     given = task.constraints
-    low, high = task.u.get("u_min"), task.u.get("u_max")
-    if given.noise and given.u_std is None:
+    if given.u_std is not None:
+        return task, ""
+    if given.noise:
+        low, high = task.u.get("u_min"), task.u.get("u_max")
         if given.m_ks is not None:
             raise ValueError(
                 f"m_ks = {given.m_ks:g}: bounds what noise does to u, so noise_std and resolution "
@@ -108,16 +111,13 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
                 "noise_std, resolution: noise may use a share of the range of u; give u_min and "
                 "u_max, too, or u_std"
             )
-    if given.m_ks is not None or given.u_std is not None:
-        return task, ""
-    if given.noise and low is not None and high is not None:
         half = 0.5 * (float(high) - float(low))
         how = (
             f"std(u): {100.0 * given.noise_share:g} % of half the range of u, {half:.4g}, for "
             f"noise of {given.noise:.3g} in y"
         )
         return _bounded(task, u_std=given.noise_share * half), how
-    if given.noise_over_pi is None:
+    if given.m_ks is not None or given.noise_over_pi is None:
         return task, ""
     ratio, by_gain = given.noise_over_pi, replace(task, objective="load")
     remedy = (
@@ -199,18 +199,10 @@ def simplest(designs: Mapping[str, Design], objective: str) -> Design:
     usable = {name: each for name, each in designs.items() if each.controller is not None}
     if not usable:
         return next(iter(designs.values()))
-    best = max(usable.values(), key=lambda each: -cost_by(each, objective))
-    near = cost_by(best, objective) + math.log(_NEAR_BEST)
-    good = [name for name, each in usable.items() if cost_by(each, objective) <= near]
+    first = next(iter(usable.values()))
+    best = max(usable.values(), key=lambda each: relative(each, first, objective))
+    good = [k for k, each in usable.items() if relative(best, each, objective) <= _NEAR_BEST]
     return usable[min(good, key=_FROM_SIMPLE.index)]
-
-
-def cost_by(design: Design, objective: str) -> float:
-    """Return the logarithm of what a design minimises."""
-    size = design.objective
-    if not size > 0.0:
-        return math.inf if objective == "load" else -math.inf
-    return -math.log(size) if objective == "load" else math.log(size)
 
 
 def _order(names: Sequence[str], task: Task) -> list[str]:
@@ -279,8 +271,8 @@ def _best_gain(problem: Problem, structure: Structure, known: Matrix) -> Solutio
         start = best_solution(relaxed(problem, share), structure, known)
         found = None if start is None else search(problem, structure, start.values, _ROUNDS)
         best = min((each for each in (best, found) if each is not None), key=_rank, default=None)
-    noisy = all(bound.kind != "M_ks" for bound in problem.bounds)
-    if best is None or not noisy or any(extra.name == "u_std" for extra in problem.extras):
+    names = [bound.kind for bound in problem.bounds] + [extra.name for extra in problem.extras]
+    if best is None or "M_ks" in names or "u_std" in names:
         return best
     return _from_less_noise(problem, structure, best)
 

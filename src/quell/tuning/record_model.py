@@ -1,4 +1,4 @@
-"""What a record shows: its model, those that it does not tell apart from it, plants to tune for.
+"""The model of a record, those that the record does not tell apart from it, plants to tune for.
 
 ``quell tune RECORD`` and the studio identify records in this way.
 """

@@ -113,7 +113,7 @@ class Tuned:
 
     @property
     def left_out(self) -> str:
-        """What of the plant is not in the model of a model-based observer; empty if nothing is."""
+        """The part of the plant that is not in the observer's model as text; empty if all is."""
         solution = self.design.solution
         reduced = getattr(solution.structure, "reduced", None) if solution is not None else None
         if reduced is None or not str(reduced):
@@ -135,12 +135,9 @@ class Tuned:
         """Return constraints, measures, costs and trade-off in some lines."""
         lines = [f"constraints: {self.constraints}"]
         lines += [self.noise_bound] if self.noise_bound else []
-        for row in report.rows(self.designs, self.objective):
-            name, value, *rest = row
-            quantity, second = (
-                report.quantity(self.objective),
-                report.second_quantity(self.objective),
-            )
+        quantity = report.quantity(self.objective)
+        second = report.second_quantity(self.objective)
+        for name, value, *rest in report.rows(self.designs, self.objective):
             lines.append(f"{name}: {quantity} {value}; " + _measures(second, rest))
         lines += [self.left_out] if self.left_out else []
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]

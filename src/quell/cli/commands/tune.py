@@ -144,12 +144,12 @@ def tune(
     measured = rig.device is not None or (setup is not None and is_record(setup))
     if trials is not None and (measured or setup is None):
         raise ValueError(f"--trials = {trials}: needs a setup file with a scenario")
+    of_rig = {"save_record": (save_record, None)} | options_of(rig, RIG_OPTIONS)
     if not measured:
         unused = {"model_order": (model_order, None)} | options_of(read, READ_OPTIONS)
         unused |= options_of(of_model, MODEL_OPTIONS)
         refuse(unused, "goes with a record or --device, which is identified")
-        more = {"save_record": (save_record, None)} | options_of(rig, RIG_OPTIONS)
-        refuse(more, "goes with --device, an experiment at a rig")
+        refuse(of_rig, "goes with --device, an experiment at a rig")
         plant, dt, options, name = _plant(setup, num, den, dt, options, works, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
@@ -170,8 +170,7 @@ def tune(
         more |= rest_of_model(model, y_now)
     else:
         assert setup is not None
-        more_of_rig = {"save_record": (save_record, None)}
-        refuse(more_of_rig | options_of(rig, RIG_OPTIONS), "goes with --device")
+        refuse(of_rig, "goes with --device, an experiment at a rig")
         given_rest = works.rest()
         plant, dt, more, model = from_record(console, setup, asked)
         more |= given_rest or rest_of_model(model)
@@ -277,10 +276,8 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
         print_line(console, tuned.noise_bound)
     quantity = report.quantity(tuned.objective)
     headings = ("structure", quantity, report.second_quantity(tuned.objective), *_HEADINGS)
-    tight: dict[str, Any] = {
-        "padding": (0, 1, 0, 0),
-        "pad_edge": False,
-    }  # 80 columns hold all names
+    # With so little white space 80 columns hold all names.
+    tight: dict[str, Any] = {"padding": (0, 1, 0, 0), "pad_edge": False}
     rows = table("Optima under these constraints", *headings, **tight)
     reasons = []
     for label, *cells, reason in report.rows(tuned.designs, tuned.objective):

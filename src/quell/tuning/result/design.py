@@ -19,6 +19,7 @@ from quell.tuning.optimiser.objectives import scores
 from quell.tuning.optimiser.problem import Problem, Solution
 from quell.tuning.optimiser.requirements import Active, Bound, all_peaks, sizes
 from quell.tuning.optimiser.time_responses import SetResponses, load_step
+from quell.tuning.structures.base import named
 from quell.types import Vector
 
 # A constraint within this share of its limit is active.
@@ -100,9 +101,9 @@ def design_of(
 
 def _signed(solution: Solution) -> dict[str, float]:
     """Return the values by name, the gain with its sign: the search is about its size."""
-    names = [parameter.name for parameter in solution.structure.parameters]
-    values = dict(zip(names, map(float, solution.values), strict=True))
-    values[names[0]] *= solution.structure.gain_sign
+    structure = solution.structure
+    values = named(structure, solution.values)
+    values[structure.parameters[0].name] *= structure.gain_sign
     return values
 
 

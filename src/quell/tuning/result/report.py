@@ -50,17 +50,8 @@ def rows(designs: Mapping[str, Design], objective: str) -> list[tuple[str, ...]]
         numbers = (f"{m[kind]:.3f}" for kind in ("M_s", "M_t"))
         margin = duration(m["delay_margin"])
         second = design.k_i if objective == "load-iae" else m["iae"]
-        found.append(
-            (
-                design.name,
-                f"{design.objective:.4g}",
-                f"{second:.3g}",
-                *numbers,
-                f"{m['M_ks']:.4g}",
-                margin,
-                "",
-            )
-        )
+        first = (design.name, f"{design.objective:.4g}", f"{second:.3g}")
+        found.append((*first, *numbers, f"{m['M_ks']:.4g}", margin, ""))
     return found
 
 

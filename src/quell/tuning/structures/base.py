@@ -91,6 +91,12 @@ class Structure(Protocol):
         ...
 
 
+def named(structure: Structure, values: Vector) -> dict[str, float]:
+    """Return values (p,) by the names of the structure's parameters."""
+    names = [parameter.name for parameter in structure.parameters]
+    return dict(zip(names, map(float, values), strict=True))
+
+
 def vector(structure: Structure, values: Mapping[str, float]) -> Vector:
     """Return values by name in the order of the structure's parameters (p,)."""
     return np.array([values[parameter.name] for parameter in structure.parameters])
