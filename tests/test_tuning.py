@@ -240,6 +240,13 @@ def test_a_noise_without_effect_is_refused(more: dict[str, float]) -> None:
         ql.tune(([1.0], [1.0, 1.0]), 0.1, constraints=bounds, structure="pi", compare=())
 
 
+def test_limits_of_u_in_the_wrong_order_are_named() -> None:
+    """Not the bound of noise that would follow from them."""
+    how: dict[str, Any] = {"structure": "pi", "compare": (), "u_min": 1.0, "u_max": -1.0}
+    with pytest.raises(ValueError, match=r"u_min = 1\.0, u_max = -1\.0"):
+        ql.tune(([1.0], [1.0, 1.0]), 0.1, constraints=Constraints(resolution=0.01), **how)
+
+
 def test_without_a_pi_controller_of_use_the_bound_of_noise_is_that_of_a_pid_controller() -> None:
     """An integrated inertia has no PI controller, a damped one a bad one: k_i of 1e-4 for 1."""
     for den, least in (([1.0, 0.0, 0.0], 100.0), ([1.0, 3.3, 0.0], 30.0)):

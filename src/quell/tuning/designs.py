@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.extras import extras_of
@@ -100,18 +101,20 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     if given.u_std is not None:
         return task, ""
     if given.noise:
-        low, high = task.u.get("u_min"), task.u.get("u_max")
+        known = {name: value for name, value in task.u.items() if value is not None}
+        ends = known.get("u_min", -math.inf), known.get("u_max", math.inf)
+        low, high = checks.interval("u_min", ends[0], "u_max", ends[1])
         if given.m_ks is not None:
             raise ValueError(
                 f"m_ks = {given.m_ks:g}: bounds what noise does to u, so noise_std and resolution "
                 "have no effect; leave m_ks out, or them"
             )
-        if low is None or high is None:
+        if not math.isfinite(high - low):
             raise ValueError(
                 "noise_std, resolution: noise may use a share of the range of u; give u_min and "
                 "u_max, too, or u_std"
             )
-        half = 0.5 * (float(high) - float(low))
+        half = 0.5 * (high - low)
         how = (
             f"std(u): {100.0 * given.noise_share:g} % of half the range of u, {half:.4g}, for "
             f"noise of {given.noise:.3g} in y"
