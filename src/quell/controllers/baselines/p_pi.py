@@ -18,7 +18,7 @@ axis. From −y to u it is::
 
 It is sampled by Tustin's rule, with each notch where it is to be. With ``T_f = dt/2`` the speed is
 the difference of two samples over dt; the derivatives of r for the torque always are. So in single
-precision the torque has the rounding of r times J/dt², 6e-8 J |r|/dt².
+precision the torque has the rounding of r times J/dt², ``6e-8 J |r|/dt²``.
 """
 
 from __future__ import annotations
