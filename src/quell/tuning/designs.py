@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.adrc.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
@@ -109,8 +108,7 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
         return task, ""
     if given.noise:
         known = {name: value for name, value in task.limits.items() if value is not None}
-        ends = known.get("u_min", -math.inf), known.get("u_max", math.inf)
-        low, high = checks.interval("u_min", ends[0], "u_max", ends[1])
+        low, high = known.get("u_min", -math.inf), known.get("u_max", math.inf)
         if given.m_ks is not None:
             raise ValueError(
                 f"m_ks = {given.m_ks:g}: bounds what noise does to u, so noise_std and resolution "

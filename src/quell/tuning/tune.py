@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -26,10 +27,13 @@ from quell.tuning.optimiser.time_responses import Inputs, load_step
 from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set
 from quell.tuning.result.design import Design
 from quell.tuning.result.scenario import (
+    Limits,
     Rest,
     checked_rest,
+    held_sizes,
     rest_of_linear,
     rest_of_plant,
+    rest_within,
     scenario_tables,
     windows_of,
 )
@@ -198,6 +202,11 @@ def tune(
     known_rest = checked_rest(rest)
     if known_rest is None and box is None:
         known_rest = rest_of_plant(as_list(plant)[0], dt, operating_point)
+    ends = ("u_min", -math.inf), ("u_max", math.inf)
+    low, high = (end if limits.get(key) is None else limits[key] for key, end in ends)
+    u_limits = checks.interval("u_min", low, "u_max", high)
+    if setup is None or "scenario" not in setup:
+        known_rest = rest_within(LinearPlant.of(given.linear[0]), known_rest, u_limits)
     plants = plant_set(given, dt)
     bounds = constraints or Constraints()
     model = model_of(given, plants, bounds)
@@ -226,7 +235,7 @@ def tune(
         objective=objective,
         task=task,
         check=check,
-        setup=_setup(given, plants, setup, known_rest),
+        setup=_setup(given, plants, setup, known_rest, u_limits),
         noise_bound=noise_bound,
         signals=signals_of(as_list(plant)[0]),
     )
@@ -338,7 +347,11 @@ def _check(
 
 
 def _setup(
-    given: Given, plants: PlantSet, known: Mapping[str, Any] | None, rest: Rest | None
+    given: Given,
+    plants: PlantSet,
+    known: Mapping[str, Any] | None,
+    rest: Rest | None,
+    limits: Limits,
 ) -> dict[str, Any]:
     """Return the tables of a setup file: ``known``, else the first plant, a step, a load.
 
@@ -356,7 +369,8 @@ def _setup(
     if "scenario" not in tables:
         last = float(f"{load_step(plants).r.size * dt:.2g}")
         rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
-        tables |= scenario_tables(last, linear.disturbances, rest)
+        sizes = held_sizes(linear, rest, limits)
+        tables |= scenario_tables(last, linear.disturbances, rest, sizes)
     elif "metrics" not in tables:
         tables["metrics"] = windows_of(tables["scenario"])
     return tables
