@@ -342,3 +342,16 @@ def test_a_page_may_name_only_the_files_of_the_command_line(tmp_path: Path) -> N
         messages.checked(TABLES | {"plant": plant | {"source": "other.py:motor"}}, granted)
     with pytest.raises(ValueError, match="opens no files"):
         messages.checked(other)
+
+
+def test_tuning_uses_the_noise_of_y_and_keeps_the_feedforward(client: Client) -> None:
+    """The noise may use 2 % of the range of u; the controller of the form feeds its model forward."""
+    tables = TABLES | {"controller": TABLES["controller"] | {"feedforward": "model"}}
+    task = {"do": "tune", "structure": "bandwidths", "resolution": 1e-3, "setup": tables}
+    tuned = client.ask("tuned", **task)["tuned"][0]
+    assert tuned["noise_bound"].startswith("std(u): 2 % of half the range of u, 10")
+    assert tuned["step"].startswith("Step of the reference: overshoots by")
+    found = tuned["setup"]["controller"]["feedforward"]
+    assert found["coefficients"] == pytest.approx([0.0, 4.0 / 50.0, 1.0 / 50.0])
+    without = client.ask("tuned", **task | {"structure": "pid"})["tuned"][0]
+    assert "feedforward" not in without["setup"]["controller"]

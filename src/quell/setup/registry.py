@@ -162,9 +162,9 @@ LEARNERS = _call_tables(
 Notch = call_table("notch", notch.Notch.at, only=True)
 Feedback = call_table("nonlinear-feedback", NonlinearFeedback, only=True)
 _SERIES: Mapping[str, Callable[..., Any]] = {
-    "series": Feedforward,
-    "rigid": Feedforward.rigid,
     "model": Feedforward.of,
+    "rigid": Feedforward.rigid,
+    "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
 _LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True)}

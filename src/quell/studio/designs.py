@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.experiments.compare import tuned as tuned_references
 from quell.setup.loading import Setup
 from quell.simulation import simulate
@@ -25,9 +26,15 @@ from quell.studio.runs import (
     watched,
 )
 from quell.tuning import Constraints, tune
+from quell.tuning.designs import SIMPLEST
+from quell.tuning.structures.registry import FEEDING_FORWARD
+from quell.tuning.tune import COMPARED
 
 # Structures that a page may ask for, and the bounds of M_s in the trade-off. Chosen by hand.
-STRUCTURES = ("freed", "bandwidths", "model-based", "pid", "pi")
+STRUCTURES = (
+    *(SIMPLEST, "freed", "bandwidths", "model-based", "model-based-freed"),
+    *("p-pi-notch", "pid", "pi"),
+)
 _TRADEOFF = (1.2, 1.3, 1.4, 1.6, 1.8, 2.0)
 _COMPARED = {"tuned-pid": "PID", "tuned-lqg": "LQG"}
 _LIMITS = ("u_min", "u_max", "rate_limit")
@@ -51,17 +58,24 @@ def tuned_frames(
 ) -> Iterator[bytes]:
     """Yield the tuned controller's tables, and then the trade-off between M_s and load rejection.
 
-    The message has ``structure``, ``m_s``, ``m_t`` and, if noise is bounded, ``m_ks``.
+    The message has ``structure``, ``m_s``, ``m_t`` and, if noise is bounded, ``m_ks``, or the noise
+    of y: ``noise_std`` and ``resolution``. A controller that feeds forward is tuned with the
+    feedforward of the plant's model, or with its own model's.
     """
-    structure = checks.one_of("structure", message.get("structure", "freed"), STRUCTURES)
+    structure = checks.one_of("structure", message.get("structure", SIMPLEST), STRUCTURES)
     bounds = _bounds(message)
     dt = float(setup.controller.dt)
     plant, delay = record.plants(setup, message)
-    options: dict[str, Any] = {"structure": structure, "delay": delay, "compare": ()}
-    options["progress"] = stoppable(report, stale)
+    options: dict[str, Any] = {"delay": delay, "progress": stoppable(report, stale)}
     limits = _limits(setup)
-    best = tune(plant, dt, constraints=bounds, **options, **limits)
+    first: dict[str, Any] = {"structure": structure, "constraints": bounds, **limits}
+    first["compare"] = COMPARED if structure == SIMPLEST else ()
+    given = getattr(without_prefilters(setup.controller), "feedforward", False)
+    if structure in (SIMPLEST, *FEEDING_FORWARD):
+        first["feedforward"] = given
+    best = tune(plant, dt, **first, **options)
     design = best.design
+    structure = next(name for name, each in best.designs.items() if each is design)
     tables = setup.tables() | {key: dict(table) for key, table in design.tables.items()}
     if limits:
         tables["controller"] = tables["controller"] | limits
@@ -79,13 +93,15 @@ def tuned_frames(
             "k_i": design.k_i,
             "active": list(best.active),
             "constraints": str(best.constraints),
+            "noise_bound": best.noise_bound,
+            "step": _sentence(str(best.reference_step)),
             "plants": len(best.plants.plants),
         }
     )
     for at in sorted({*_TRADEOFF, bounds.m_s or _TRADEOFF[0]}):
         other = dataclasses.replace(best.constraints, m_s=at)
         try:
-            one = tune(plant, dt, constraints=other, **options)
+            one = tune(plant, dt, structure=structure, constraints=other, compare=(), **options)
         except ValueError:
             continue  # no loop satisfies these bounds: the curve has no point there
         point = {"m_s": at, "k_i": one.design.k_i, "iae": one.design.measures.get("iae")}
@@ -190,6 +206,10 @@ def varied(plant: Any, percent: float, ranges: Any, random: np.random.Generator)
     return table
 
 
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def _limits(setup: Setup) -> dict[str, Any]:
     """Return the limits of u of the setup's controller."""
     table = setup.tables().get("controller", {})
@@ -201,4 +221,9 @@ def _bounds(message: Mapping[str, Any]) -> Constraints:
     """Return the constraints that a message asks for."""
     m_ks = None if message.get("m_ks") is None else number(message, "m_ks", 1.0, 1e-9, 1e12)
     m_s, m_t = (number(message, name, 1.6, 1.05, 5.0) for name in ("m_s", "m_t"))
-    return Constraints(m_s=m_s, m_t=m_t, m_ks=m_ks)
+    noise = {
+        name: number(message, name, 0.0, 1e-15, 1e12)
+        for name in ("noise_std", "resolution")
+        if message.get(name) is not None
+    }
+    return Constraints(m_s=m_s, m_t=m_t, m_ks=m_ks, **noise)

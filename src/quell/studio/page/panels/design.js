@@ -5,7 +5,7 @@ import { home } from "../dom.js";
 import { palette } from "../plots/palette.js";
 import { labels, short } from "../plots/plots.js";
 
-const BOUNDS = [["tune-ms", "m_s"], ["tune-mt", "m_t"], ["tune-mks", "m_ks"]];
+const BOUNDS = [["tune-ms", "m_s"], ["tune-mt", "m_t"], ["tune-mks", "m_ks"], ["tune-noise", "noise_std"], ["tune-resolution", "resolution"]];
 
 export class Designs {
   // `ask(message)` sends with the present setup; `use(setup)` takes a tuned one; `pin(pin)` adds one.
@@ -61,8 +61,8 @@ export class Designs {
   tuned(header) {
     const values = Object.entries(header.values).map(([name, value]) => `${name} = ${short(value)}`);
     const active = header.active.length ? `Active: ${header.active.join(", ")}.` : "No constraint is active.";
-    const noise = header.active.some((text) => text.startsWith("M_ks"));
-    const hint = noise ? "More noise in u (a larger M_ks) would allow better load rejection. " : "";
+    const noise = header.active.some((text) => text.startsWith("M_ks") || text.startsWith("u_std"));
+    const hint = (header.noise_bound ? `${header.noise_bound}. ` : "") + (noise ? "More noise in u would allow better load rejection. " : "") + `${header.step} `;
     home("tune-result").textContent = `${header.name} for ${header.plants > 1 ? `the ${header.plants} plants of the record` : "the plant in the form"}: ${values.join(", ")}; integral gain ${short(header.k_i)}. ${active} ${hint}Computing the trade-off …`;
     this.use(header.setup);
   }
