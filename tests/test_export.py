@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import subprocess
@@ -13,12 +14,15 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers.base import control, status_flags
+from quell.export import operations
 from quell.export.library.comparison import Comparison
 from quell.export.library.templates import filled
 from quell.export.library.toolchain import stack_of
 from quell.export.library.vectors import golden_vectors
 from quell.features import Periodic, State
 from quell.kernels import dispatch
+from quell.kernels.dispatch import as_python
 from quell.types import Status
 
 from .commands import in_this_process
@@ -111,7 +115,7 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
     vectors = golden_vectors(ADRC, ("track", "start"))
     flags = Status(int(np.bitwise_or.reduce([row.status for row in vectors.rows])))
     held = Status.MEASUREMENT_HELD | Status.REFERENCE_HELD
-    assert flags == held | Status.SATURATED | Status.RATE_LIMITED
+    assert flags == held | Status.SATURATED | Status.RATE_LIMITED | Status.CONTROL_HELD
     names = [row.action.name for row in vectors.rows]
     assert set(names) == {
         "STEP",
@@ -129,6 +133,31 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
         assert vectors.rows[at].u == pytest.approx(before, rel=1e-6)
     limited = vectors.rows[names.index("LIMIT") : names.index("FREE")]
     assert max(row.u for row in limited) == vectors.limit < 3.0
+
+
+@pytest.mark.parametrize("controller", [ADRC, PID, HAN], ids=["ADRC", "PID", "prefilter"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e300])
+def test_no_function_of_the_export_takes_a_u_that_is_no_number(
+    controller: Any, value: float
+) -> None:
+    """It is ignored and flagged, and each later u is a number within the limits: as the C does, which is translated from this."""
+    design, state = controller.parameters, controller.initial_state()
+    with as_python():
+        for _ in range(3):
+            last = control(design, state, 1.0, 0.0)
+        operations.applied(design, state, value)
+        assert status_flags(design, state) & Status.CONTROL_HELD
+        if controller is not PID:
+            operations.track(design, state, 1.0, 0.0, value)
+            assert status_flags(design, state) & Status.CONTROL_HELD
+            operations.start_from(design, state, 50, value, 0.0, 1.0)
+            operations.start_from(design, state, 50, 0.0, value, 1.0)
+            assert status_flags(design, state) & Status.CONTROL_HELD
+            operations.start_from(design, state, 50, 0.0, 0.0, value)
+            assert status_flags(design, state) & Status.REFERENCE_HELD
+        later = [control(design, state, 1.0, 0.0) for _ in range(20)]
+    assert math.isfinite(last)
+    assert all(-3.0 <= u <= 3.0 for u in later)
 
 
 @needs_gcc

@@ -38,6 +38,7 @@ class Status(IntFlag):
     LEARNER_LATE = 128
     LEARNER_FAILED = 256
     POORLY_INTEGRATED = 512
+    CONTROL_HELD = 1024
 
     @property
     def message(self) -> str:
@@ -86,6 +87,10 @@ _MESSAGES = {
     Status.POORLY_INTEGRATED: (
         "The plant is integrated with too few sub-steps, its states have errors of more than 1 % "
         "in a sample: raise its substeps, or lower dt."
+    ),
+    Status.CONTROL_HELD: (
+        "The applied control signal that was given was not finite; the one before stands: check "
+        "what reads it back."
     ),
 }
 _NOTHING = "No step reported a problem."

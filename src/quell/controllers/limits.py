@@ -6,11 +6,12 @@ import math
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.kernels.dispatch import kernel
+from quell.kernels.dispatch import is_finite, kernel
 from quell.types import Status
 
 _SATURATED = int(Status.SATURATED)
 _RATE_LIMITED = int(Status.RATE_LIMITED)
+_OVERFLOWED = int(Status.OVERFLOWED)
 
 RateLimit = float | tuple[float, float]
 """Largest rate of u, in either direction; or its range (lowest, highest) [u-unit/s]."""
@@ -95,7 +96,7 @@ def apply_limits(limits: Limits, unlimited: float, before: float) -> tuple[float
     """Return the control signal that is possible after ``before``, and the status flags.
 
     The limits of magnitude are applied last: u is always within them, even if it has to change
-    faster for that.
+    faster for that, and always a number: without one it is that of rest.
     """
     status = 0
     applied = unlimited
@@ -111,4 +112,7 @@ def apply_limits(limits: Limits, unlimited: float, before: float) -> tuple[float
     elif applied < limits.low:
         applied = limits.low
         status |= _SATURATED
+    elif not is_finite(applied):
+        applied = min(max(0.0, limits.low), limits.high)
+        status |= _OVERFLOWED
     return applied, status

@@ -21,7 +21,7 @@ from quell.types import Vector
 OBSERVED_WITH_U = ("r", "y_measured", "u", "x")
 OBSERVED_WITH_F = ("r", "y_measured", "u", "x_hat", "f_residual", "f_learned")
 # Entries of a controller's status are flags below this (``types.Status``).
-_FLAGS = 1024.0
+_FLAGS = 2048.0
 
 
 class Action(NamedTuple):

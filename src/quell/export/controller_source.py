@@ -10,7 +10,6 @@ from quell.controllers.base import (
     check_controller,
     control,
     reset_loop,
-    set_applied_control,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -154,8 +153,9 @@ class _Writer:
         files.add(
             "applied",
             f"void NAME({self.state}, {real} u)",
-            "Set the control signal that was really applied since the last step.",
-            f"    {files.call(set_applied_control, *both, u)};",
+            "Set the control signal that was really applied since the last step.\n\n"
+            "One that is not finite is ignored; the status says so, until the next step.",
+            f"    {files.call(operations.applied, *both, u)};",
         )
 
     def _about_derivatives(self) -> str:
@@ -207,8 +207,9 @@ class _Writer:
             f"void NAME({self.state}, {real} y, {real} u, {real} r)",
             "Start at a plant that rests at y under u: the next step continues from u.\n\nr is the "
             "reference of the next step. What was learned is kept. The observer takes\n"
-            f"{samples} samples to settle: do not call this in an interrupt.",
-            f"    {files.call(operations.start, *files.both, count, y, u, r)};",
+            f"{samples} samples to settle: do not call this in an interrupt. If y or u is not\n"
+            "finite nothing changes but the status; an r that is not finite is y.",
+            f"    {files.call(operations.start_from, *files.both, count, y, u, r)};",
         )
 
     def _add_manual_operation(self) -> None:
@@ -218,7 +219,8 @@ class _Writer:
             "track",
             f"{real} NAME({self.state}, {real} r, {real} y, {real} u{self.arguments})",
             "Take one sample in manual operation: u is applied, unlimited, until the next sample."
-            "\n\nReturn the control signal that the controller would have applied.",
+            "\n\nReturn the control signal that the controller would have applied. A u that is not"
+            "\nfinite is the one before; the status says so.",
             *self._derivatives(),
             f"    return {files.call(operations.track, *files.both, r, y, u)};",
         )

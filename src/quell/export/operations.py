@@ -1,6 +1,7 @@
 """Operations of the exported controller besides a step, as kernels that are translated to C.
 
-Each is the method of the same name of a controller in Python.
+Each is the method of the same name of a controller in Python. Where that raises an error for a
+value that is no number, the exported function ignores the value, and the status says so.
 """
 
 from __future__ import annotations
@@ -9,10 +10,58 @@ from typing import Any
 
 from quell.controllers.adrc.handover import change_design, start_at_rest
 from quell.controllers.adrc.law import AdrcDesign, AdrcState
-from quell.controllers.base import control
+from quell.controllers.bad_samples import is_usable
+from quell.controllers.base import control, set_applied_control
 from quell.controllers.linear.linear import LinearDesign, LinearState
 from quell.controllers.prefilters.prefilter import PrefilteredDesign, PrefilteredState, settle
 from quell.kernels.dispatch import generic
+from quell.types import Status
+
+_CONTROL_HELD = int(Status.CONTROL_HELD)
+_REFERENCE_HELD = int(Status.REFERENCE_HELD)
+
+
+@generic
+def add_flag(design: Any, state: Any, flag: int) -> None:
+    """Add a flag to the status of the last sample."""
+    raise TypeError
+
+
+@add_flag.register(AdrcDesign)
+def _add_flag(design: AdrcDesign, state: AdrcState, flag: int) -> None:
+    state.loop[0].status = int(state.loop[0].status) | flag
+
+
+@add_flag.register(LinearDesign)
+def _add_flag_to_linear(design: LinearDesign, state: LinearState, flag: int) -> None:
+    state.loop[0].status = int(state.loop[0].status) | flag
+
+
+@add_flag.register(PrefilteredDesign)
+def _add_flag_inside(design: PrefilteredDesign, state: PrefilteredState, flag: int) -> None:
+    add_flag(design.controller, state.controller, flag)
+
+
+def applied(design: Any, state: Any, u: float) -> None:
+    """Set the control signal that was really applied; what is no number is ignored."""
+    if is_usable(u):
+        set_applied_control(design, state, u)
+    else:
+        add_flag(design, state, _CONTROL_HELD)
+
+
+def start_from(design: Any, state: Any, samples: int, y: float, u: float, r: float) -> None:
+    """Start at a plant that rests at y under u; nothing happens where one of them is no number.
+
+    An r that is no number is y.
+    """
+    if not (is_usable(y) and is_usable(u)):
+        add_flag(design, state, _CONTROL_HELD)
+    elif is_usable(r):
+        start(design, state, samples, y, u, r)
+    else:
+        start(design, state, samples, y, u, y)
+        add_flag(design, state, _REFERENCE_HELD)
 
 
 @generic
@@ -64,6 +113,22 @@ def _set_manual_inside(
 
 
 @generic
+def last_control(design: Any, state: Any) -> float:
+    """Return the control signal that was applied in the last sample."""
+    raise TypeError
+
+
+@last_control.register(AdrcDesign)
+def _last_control(design: AdrcDesign, state: AdrcState) -> float:
+    return state.loop[0].u
+
+
+@last_control.register(PrefilteredDesign)
+def _last_control_inside(design: PrefilteredDesign, state: PrefilteredState) -> float:
+    return last_control(design.controller, state.controller)
+
+
+@generic
 def control_of_law(design: Any, state: Any) -> float:
     """Return the control signal that the law would have applied in the last sample."""
     raise TypeError
@@ -82,11 +147,17 @@ def _control_of_inner_law(design: PrefilteredDesign, state: PrefilteredState) ->
 def track(design: Any, state: Any, r: float, y: float, u: float) -> float:
     """Take one sample in manual operation: u is applied, unlimited, until the next sample.
 
-    Return the control signal that the controller would have applied.
+    Return the control signal that the controller would have applied. A u that is no number is the
+    one before.
     """
+    given = is_usable(u)
+    if not given:
+        u = last_control(design, state)
     set_manual(design, state, True, u)
     control(design, state, r, y)
     set_manual(design, state, False, u)
+    if not given:
+        add_flag(design, state, _CONTROL_HELD)
     return control_of_law(design, state)
 
 

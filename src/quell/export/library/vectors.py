@@ -14,7 +14,6 @@ from quell.controllers.adrc.handover import samples_to_settle
 from quell.controllers.base import (
     control,
     reset_loop,
-    set_applied_control,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -108,7 +107,7 @@ class Player:
         r_, y_, given_ = real(r), real(y), real(given)
         with np.errstate(all="ignore"), as_python():
             if action is Action.APPLIED:
-                set_applied_control(old, self.state, given_)
+                operations.applied(old, self.state, given_)
             elif action is Action.HAND_OVER:
                 operations.hand_over(old, self.state)
             elif action in (Action.LIMIT, Action.FREE):
@@ -117,7 +116,8 @@ class Player:
             elif action is Action.RESET:
                 reset_loop(old, self.state)
             elif action is Action.START:
-                operations.start(old, self.state, _samples(self.described), y_, given_, r_)
+                samples = _samples(self.described)
+                operations.start_from(old, self.state, samples, y_, given_, r_)
             if action is not Action.LEARN:
                 self._set_derivatives(r_)
             if action is Action.LEARN:
@@ -186,7 +186,8 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
         player.play(Action.STEP, math.nan if i % 7 == 3 else r, y)
     for i in range(_PART):
         action = Action.APPLIED if i % 5 == 0 else Action.STEP
-        player.play(action, *signals.next(), 0.5 * float(player.rows[-1].u))
+        given = math.nan if i == _PART // 2 else 0.5 * float(player.rows[-1].u)
+        player.play(action, *signals.next(), given)
     if path:
         _play_limited(player, path, signals)
     if "track" in available:
@@ -197,6 +198,7 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
     if "start" in available and _samples(player.described) <= _LONGEST_START:
         r, y = signals.next()
         player.play(Action.START, r, y, float(np.median(player.u_of(slice(2, _FIRST)))))
+        player.play(Action.START, r, y, math.nan)  # changes nothing
         for _ in range(_PART):
             player.play(Action.STEP, *signals.next())
     plant = plant_for(player.described, signals.amplitude, player.real)
@@ -228,7 +230,8 @@ def _play_limited(player: Player, path: str, signals: _Signals) -> None:
 def _play_manual(player: Player, signals: _Signals) -> None:
     u = float(player.rows[-1].u)
     for i in range(_PART):
-        player.play(Action.TRACK, *signals.next(), u * (1.0 - 0.02 * i))
+        given = math.nan if i == _PART // 2 else u * (1.0 - 0.02 * i)
+        player.play(Action.TRACK, *signals.next(), given)
     player.play(Action.HAND_OVER, *signals.next())
     for _ in range(_PART):
         player.play(Action.STEP, *signals.next())
