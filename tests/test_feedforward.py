@@ -252,8 +252,36 @@ def test_the_tuner_writes_the_feedforward_of_the_model(tmp_path: Path) -> None:
     tuned.save(tmp_path / "tuned.toml")
     assert load(tmp_path / "tuned.toml").controller.feedforward == tuned.controller.feedforward
     assert "feedforward" not in plain.toml()
-    with pytest.raises(ValueError, match="structure = 'pi' has none"):
+    with pytest.raises(ValueError, match="feedforward: pi has none; give a structure that has"):
         ql.tune(late, DT, **how | {"structure": "pi"}, feedforward=True)
+
+
+def test_the_simplest_structure_is_one_that_can_feed_forward() -> None:
+    """Where that is asked for; PID, which is simpler, has no feedforward."""
+    how: dict[str, Any] = {"compare": ("pid", "bandwidths"), "objective": "load"}
+    lags = [1.0], [1.0, 3.0, 3.0, 1.0]
+    assert ql.tune(lags, 0.02, **how).design.name == "pid"
+    tuned = ql.tune(lags, 0.02, **how, feedforward=True)
+    assert tuned.design.name.startswith("bandwidths")
+    assert tuned.controller.feedforward == ql.Feedforward.of(lags)
+
+
+@pytest.mark.parametrize("structure", ["bandwidths", "p-pi-notch"])
+def test_tracking_is_optimised_with_the_feedforward_that_runs(structure: str) -> None:
+    """The objective is the RMS of the simulated error, for a plant that is not the model."""
+    move = ql.signals.SmoothMove(distance=1.0, duration=1.0)
+    true = [9.0], [1.0, 3.0, 0.0]
+    how: dict[str, Any] = {"objective": "tracking", "reference": move, "duration": 3.0}
+    how |= {"structure": structure, "compare": (), "dt": 5e-3}
+    model = ql.Feedforward.of(([12.0], [1.0, 3.0, 0.0]), terms=2)
+    constraints = ql.tuning.Constraints(m_ks=40.0)
+    tuned = ql.tune(true, feedforward=model, constraints=constraints, **how)
+    scenario = ql.Scenario(reference=move, duration=3.0)
+    run = ql.simulate(ql.plants.LinearPlant.of(true), tuned.controller, scenario)
+    error = float(np.sqrt(np.mean((run["r"] - run["y"]) ** 2)))
+    assert tuned.design.objective == pytest.approx(error, rel=0.02)
+    plain = ql.tune(true, constraints=constraints, **how)
+    assert tuned.design.objective < 0.5 * plain.design.objective
 
 
 SETUP = """dt = 0.001

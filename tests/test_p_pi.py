@@ -80,10 +80,9 @@ def test_arguments_out_of_range_are_refused(change: dict[str, Any], message: str
 def test_it_is_tuned_within_its_bounds_on_a_flexible_axis(sensor: int, tmp_path: Any) -> None:
     """The whole loop has the M_s asked for, and more k_i than PID, which has no notch.
 
-    The file of the result makes the same controller, with feedforward if the setup has it.
+    The file of the result makes the same controller, feedforward included.
     """
     bounds = ql.tuning.Constraints(noise_over_pi=None)
-    known = {"title": "axis", "dt": DT, "controller": {"kind": "adrc", "feedforward": True}}
     tuned = ql.tune(
         axis(sensor),
         DT,
@@ -91,7 +90,7 @@ def test_it_is_tuned_within_its_bounds_on_a_flexible_axis(sensor: int, tmp_path:
         compare=("pid",),
         delay=DT,
         constraints=bounds,
-        setup=known,
+        feedforward=True,
     )
     loop = ql.analysis.analyse(axis(sensor), tuned.controller, delay=DT)
     assert loop.stable
@@ -110,11 +109,10 @@ def test_it_is_tuned_within_its_bounds_on_a_flexible_axis(sensor: int, tmp_path:
 def test_a_plant_without_resonance_gets_no_notch() -> None:
     """It is then the plain cascade, with the friction of a motor as its feedforward."""
     motor = ([50.0], [1.0, 4.0, 0.0])
-    tuned = ql.tune(motor, 1e-3, structure="p-pi-notch", compare=())
-    controller: Any = tuned.controller
+    how: dict[str, Any] = {"structure": "p-pi-notch", "compare": ()}
+    controller: Any = ql.tune(motor, 1e-3, **how).controller
     assert controller.notches == ()
     assert controller.inertia is None
-    structure: Any = tuned.design.solution.structure  # type: ignore[union-attr]
-    found = structure.feedforward()
-    assert found["inertia"] == pytest.approx(1.0 / 50.0)
-    assert found["viscous"] == pytest.approx(4.0 / 50.0)
+    moving: Any = ql.tune(motor, 1e-3, feedforward=True, **how).controller
+    assert moving.inertia == pytest.approx(1.0 / 50.0)
+    assert moving.viscous == pytest.approx(4.0 / 50.0)

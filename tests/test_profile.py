@@ -240,7 +240,7 @@ def controller() -> Prefiltered:
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_exported_moves_are_the_same_bit_for_bit(tmp_path: Path, precision: str) -> None:
     """With targets that change during moves, a stop, a missing target, and another limit."""
-    given = controller()
+    given: Any = controller()
     if precision == "single":
         given = ql.controllers.in_single_precision(given)
     code, player = InC(c_source(given, "servo"), tmp_path), Player(given)
@@ -259,7 +259,7 @@ def test_exported_moves_are_the_same_bit_for_bit(tmp_path: Path, precision: str)
 
 def test_only_a_generator_plans_a_stop() -> None:
     """Another prefilter says so; the property is what stops the reference."""
-    given = controller()
+    given: Any = controller()
     for _ in range(30):
         given.step(1.0, 0.0)
     point = given.stopping_point

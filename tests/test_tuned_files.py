@@ -158,6 +158,56 @@ def test_an_operating_point_that_is_given_is_where_the_scenario_begins(quell: ob
         assert message in shown.err
 
 
+HEATER = ([0.7], np.polymul([142.0, 1.0], [19.0, 1.0]).tolist())
+MOTOR = ([45_000.0], [1.0, 3.3, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("plant", "dt", "limits", "expected"),
+    [
+        (HEATER, 1.0, {"u_min": 0.0, "u_max": 100.0}, (1.0, -1.0)),
+        (HEATER, 1.0, {"u_min": 0.0, "u_max": 1.0}, (0.28, -0.4)),
+        (HEATER, 1.0, {"u_min": -9.0}, (1.0, 1.0)),
+        (MOTOR, 1e-3, {"u_min": -0.5, "u_max": 0.5}, (1.0, 0.2)),
+        (DRIVE, 0.05, {"u_min": 0.5, "u_max": 4.5}, (1.0, 1.0)),
+    ],
+)
+def test_step_and_load_of_the_file_can_be_held_within_the_limits_of_u(
+    tmp_path: Path,
+    plant: tuple[list[float], list[float]],
+    dt: float,
+    limits: dict[str, float],
+    expected: tuple[float, float],
+) -> None:
+    """With 40 % each of what the limits leave at rest: of a heater at zero the load is negative, and limits beside zero have their rest in the middle."""
+    tuned = ql.tune(plant, dt, structure="bandwidths", order=2, compare=(), **limits)
+    tuned.save(tmp_path / "tuned.toml")
+    setup = load(tmp_path / "tuned.toml")
+    signals = setup.scenario.reference, setup.scenario.disturbances[0]
+    before, after = np.array([-1.0]), np.array([setup.scenario.duration])
+    sizes = tuple(float(s(after)[0] - s(before)[0]) for s in signals)
+    if "u_min" in limits and limits["u_min"] <= 0.0:
+        assert sizes == expected
+    run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    assert run["y"][-1] == pytest.approx(run["r"][-1], abs=0.02 * abs(sizes[0]))
+    least, most = limits["u_min"], limits.get("u_max", math.inf)
+    inside = run["u"][-(run["u"].size // 10) :]
+    assert np.all((least < inside) & (inside < most))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"rest": (5.0, 0.0)}, "u at rest = 5: must lie within u_min = 1 and u_max = 4"),
+        ({}, "u at rest = 0: .*give u and y at rest"),
+    ],
+)
+def test_a_rest_that_u_cannot_hold_is_refused(given: dict[str, object], message: str) -> None:
+    """Whether it is given, or zero by default for a plant that integrates."""
+    with pytest.raises(ValueError, match=message):
+        ql.tune(MOTOR, 1e-3, structure="bandwidths", compare=(), u_min=1.0, u_max=4.0, **given)
+
+
 def test_a_nonlinear_plant_is_judged_at_its_operating_point(tmp_path: Path) -> None:
     """A tank: outflow with the root of its level, a tenth of a volt to a centimetre."""
     tank = ql.plants.NonlinearPlant(

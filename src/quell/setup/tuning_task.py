@@ -13,7 +13,9 @@ from quell.setup.errors import SetupError
 from quell.setup.loading import Setup, made
 from quell.setup.toml_file import read
 from quell.setup.vary import changed
+from quell.tuning.designs import SIMPLEST
 from quell.tuning.result.scenario import late_tables, rest_of_plant
+from quell.tuning.structures.registry import FEEDING_FORWARD
 
 # What a tuning replaces. A law without effect stands in for the controller.
 _REPLACED = ("observer", "controller", "learner", "guard", "prefilter")
@@ -35,8 +37,9 @@ def tuning_task(
     """Read a setup file for ``quell.tune``; ``changes`` are values of ``[tune]`` by name.
 
     Observer, controller, learner, guard and prefilter of the file are left out: they are what is
-    tuned. The limits of u stay, and the controller's feedforward. Dry friction and limits of the
-    plant are left out, too. A tuning by simulation (``trials``) has them, and no feedforward.
+    tuned. The limits of u stay, and the tuned controller has the feedforward of a model if the
+    file's feeds forward, unless ``[tune]`` says otherwise. Dry friction and limits of the plant are
+    left out, too; a tuning by simulation (``trials``) has them.
 
     Raises
     ------
@@ -48,8 +51,13 @@ def tuning_task(
     kept = {key: value for key, value in data.items() if key not in _REPLACED}
     kept["controller"] = _NO_CONTROLLER
     table = data.get("tune", {})
-    if isinstance(table, Mapping) and changes:
-        kept["tune"] = {**table, **changes}
+    if isinstance(table, Mapping):
+        asked = {**table, **(changes or {})}
+        structure = asked.get("structure", SIMPLEST)
+        if isinstance(given, Mapping) and structure in (SIMPLEST, *FEEDING_FORWARD):
+            asked = _feedforward(given) | asked
+        if asked:
+            kept["tune"] = asked
     setup = made(name, kept, trust)
     plant, ranges = setup.needed("plant"), _ranges(setup)
     options = dict(setup.tune or {})
@@ -70,8 +78,6 @@ def tuning_task(
     if "scenario" not in data:
         with suppress(ValueError):  # of a plant without operating point, which tune refuses
             options["rest"] = rest_of_plant(plant, setup.controller.dt)
-    if isinstance(given, Mapping) and "feedforward" in given and "search" not in options:
-        options["setup"]["controller"] = {"feedforward": given["feedforward"]}
     part = linear_model
     if "search" in options:
         options["scenario"], part = setup.needed("scenario"), _whole
@@ -84,6 +90,16 @@ def tuning_task(
         return part(_with(name, kept, values, trust).plant)
 
     return TuningTask(make, setup.controller.dt, {**options, "uncertain": ranges}, setup)
+
+
+def _feedforward(controller: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the feedforward of a controller's table as an option of [tune]."""
+    if controller.get("feedforward"):
+        return {"feedforward": controller["feedforward"]}
+    if "inertia" in controller:  # of a cascade
+        model = {key: controller[key] for key in ("inertia", "viscous") if key in controller}
+        return {"feedforward": {"kind": "rigid"} | model}
+    return {}
 
 
 def _whole(plant: Any) -> Any:

@@ -49,14 +49,14 @@ class Build:
     """Builds the controllers of a structure, within its rules; ``search`` calls it."""
 
     structure: Structure
-    limits: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, values: Mapping[str, float]) -> Controller:
         """Return the controller; raise a ``ValueError`` for values against the rules."""
         row = vector(self.structure, values)
         if np.any(self.structure.rules(row[None, :]) < 0.0):
             raise ValueError(f"values {dict(values)!r}: are against the rules of the structure")
-        return self.structure.controller(row, **self.limits)
+        return self.structure.controller(row, **self.options)
 
 
 def tune_structure(
@@ -165,8 +165,8 @@ def tune_by_simulation(
     problem = Problem.of_runs(plants, scenario, objective)
     found = linear(parts, **how, objective="load")
     assert found.design.solution is not None  # ``tune`` returns no other design
-    limits = found.task.u
-    build = Build(found.design.solution.structure, limits)
+    structure = found.design.solution.structure
+    build = Build(structure, found.task.options(structure))
     bounds = LinearBounds(found.plants, found.constraints)
     progress = how.get("progress")
     report = None if progress is None else lambda share: progress("simulations", share)
@@ -219,9 +219,8 @@ def _design(found: Tuned, values: Mapping[str, float], objective: float) -> Desi
     assert solution is not None
     row = vector(solution.structure, values)
     better = Solution(solution.structure, row, 0.0, 0.0)
-    made = design_of(
-        found.design.name, found.task.problem(), better, found.constraints, found.task.u
-    )
+    options = found.task.options(solution.structure)
+    made = design_of(found.design.name, found.task.problem(), better, found.constraints, options)
     return replace(made, objective=objective)
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from quell import checks
 from quell.analysis.loop import LoopAnalysis
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.extras import extras_of
 from quell.tuning.optimiser.loops import PlantSet
@@ -78,7 +78,8 @@ class Task:
     inputs: Inputs
     quantile: float
     order: int | None
-    u: Mapping[str, Any]  # limits of the controllers, and their feedforward if there is one
+    limits: Mapping[str, Any]  # of u, for all controllers
+    feedforward: Feedforward | None = None
 
     def problem(self, members: Sequence[int] | None = None) -> Problem:
         """Return the problem of the optimiser; the objective is that of ``members`` of the set."""
@@ -87,6 +88,11 @@ class Task:
         cost = cost_of(self.objective, for_cost, self.quantile)
         extras = extras_of(self.constraints, over)
         return Problem(self.plants, bounds_of(self.constraints), extras, self.objective, cost)
+
+    def options(self, structure: Structure) -> dict[str, Any]:
+        """Return limits and feedforward of the structure's controllers."""
+        given = self.feedforward
+        return {**self.limits, **({} if given is None else structure.feedforward(given))}
 
 
 def with_noise_bound(task: Task) -> tuple[Task, str]:
@@ -101,9 +107,8 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     if given.u_std is not None:
         return task, ""
     if given.noise:
-        known = {name: value for name, value in task.u.items() if value is not None}
-        ends = known.get("u_min", -math.inf), known.get("u_max", math.inf)
-        low, high = checks.interval("u_min", ends[0], "u_max", ends[1])
+        known = {name: value for name, value in task.limits.items() if value is not None}
+        low, high = known.get("u_min", -math.inf), known.get("u_max", math.inf)
         if given.m_ks is not None:
             raise ValueError(
                 f"m_ks = {given.m_ks:g}: bounds what noise does to u, so noise_std and resolution "
@@ -189,7 +194,7 @@ def tuned_designs(
         elif not best.feasible:
             designs[name] = impossible(name, contradiction(problem, best, task.constraints))
         else:
-            made = (problem, best, task.constraints, task.u)
+            made = (problem, best, task.constraints, task.options(best.structure))
             designs[name] = design_of(best.structure.name, *made)
     return {name: designs[name] for name in names}
 

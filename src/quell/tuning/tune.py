@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
-from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.feedforward import Feedforward, checked_feedforward
 from quell.parallel import one_blas_thread
 from quell.plants.labelled import signals_of
 from quell.plants.linear import LinearPlant
+from quell.signals.base import Signal
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import SIMPLEST, Task, simplest, tuned_designs, with_noise_bound
@@ -26,18 +27,21 @@ from quell.tuning.optimiser.time_responses import Inputs, load_step
 from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set
 from quell.tuning.result.design import Design
 from quell.tuning.result.scenario import (
+    Limits,
     Rest,
     checked_rest,
+    held_sizes,
     rest_of_linear,
     rest_of_plant,
+    rest_within,
     scenario_tables,
     windows_of,
 )
 from quell.tuning.result.setup_file import plant_table
-from quell.tuning.structures.registry import STRUCTURES
+from quell.tuning.structures.registry import FEEDING_FORWARD, STRUCTURES
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Check, Uncertain, checked
-from quell.types import Progress
+from quell.types import Progress, Vector
 
 COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "freed", "model-based")
 """The structures that a result is compared with by default."""
@@ -107,9 +111,10 @@ def tune(
     load
         step of the load at the plant's input [u-unit], without a reference.
     feedforward
-        whether an ADRC gets the feedforward of the first plant's model, ``Feedforward.of`` with its
-        delay and friction, or a ``Feedforward`` of yours. It changes no margin, so it is not
-        searched for; PID and LQG controllers have none.
+        whether the controller gets the feedforward of the first plant's model, ``Feedforward.of``
+        with its delay and friction, or a ``Feedforward`` of yours. It changes no margin, so only
+        ``"tracking"`` has to do with it. The cascade uses inertia and viscous friction; PID and LQG
+        controllers have none, so ``"simplest"`` is one of the others.
     delay, actuator_lag, operating_point
         as for ``analyse``; ``delay`` may have a value for each plant.
     uncertain
@@ -123,8 +128,7 @@ def tune(
     seed
         of the samples.
     setup
-        tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default. With
-        ``feedforward = true`` in its controller a cascade feeds speed and torque forward.
+        tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default.
     rest
         u and y at rest, where the plant works: the scenario of ``Tuned.toml`` begins there. Of a
         nonlinear plant the operating point by default, else zero.
@@ -170,7 +174,7 @@ def tune(
         how |= {"samples": samples, "check_samples": check_samples, "seed": seed}
         if uncertain is None and operating_point is None:
             late = float(np.ravel(delay)[0]) + actuator_lag
-            feedforward = _by_model(feedforward, as_list(plant)[0], late)
+            feedforward = _by_model(feedforward, as_list(plant)[0], late) or False
         how["feedforward"] = feedforward
         how |= {"progress": progress, **limits}
         linear = partial(tune, dt=dt, rest=rest)
@@ -198,30 +202,27 @@ def tune(
     known_rest = checked_rest(rest)
     if known_rest is None and box is None:
         known_rest = rest_of_plant(as_list(plant)[0], dt, operating_point)
+    ends = ("u_min", -math.inf), ("u_max", math.inf)
+    low, high = (end if limits.get(key) is None else limits[key] for key, end in ends)
+    u_limits = checks.interval("u_min", low, "u_max", high)
+    if setup is None or "scenario" not in setup:
+        known_rest = rest_within(LinearPlant.of(given.linear[0]), known_rest, u_limits)
     plants = plant_set(given, dt)
     bounds = constraints or Constraints()
-    inputs = _inputs(objective, reference, duration, load, plants)
-    law = (setup or {}).get("controller", {})
-    follows = isinstance(law, Mapping) and bool(law.get("feedforward"))
-    model = model_of(given, plants, bounds)._replace(feedforward=follows)
+    model = model_of(given, plants, bounds)
     late = float(np.ravel(delay)[0]) + actuator_lag
     known = as_list(plant)[0] if operating_point is None else given.linear[0]
     forward = _by_model(feedforward, known, late)
-    if forward is not False:
-        limits["feedforward"] = forward
-    task = Task(plants, model, bounds, objective, inputs, quantile, order, limits)
+    names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
+    if forward is not None:
+        asked = names if structure == SIMPLEST else [structure]
+        _check_feedforward(asked)
+    inputs = _inputs(objective, reference, duration, load, plants, forward)
+    task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task)
-        names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
         designs = tuned_designs(list(dict.fromkeys(names)), task, report)
-        chosen = simplest(designs, objective) if structure == SIMPLEST else designs[structure]
-        if chosen.controller is None:
-            raise ValueError(f"structure = {structure!r}: {chosen.reason} ({task.constraints})")
-        if forward is not False and not isinstance(chosen.controller, ADRC):
-            raise ValueError(
-                f"feedforward = {feedforward!r}: structure = {structure!r} has none; take an ADRC, "
-                "such as freed or model-based, or leave it out"
-            )
+        chosen = _chosen(designs, structure, task)
         check = None
         if box is not None or b_range[0] != b_range[1]:
             report("check", 1.0)
@@ -234,21 +235,32 @@ def tune(
         objective=objective,
         task=task,
         check=check,
-        setup=_setup(given, plants, setup, known_rest),
+        setup=_setup(given, plants, setup, known_rest, u_limits),
         noise_bound=noise_bound,
         signals=signals_of(as_list(plant)[0]),
     )
 
 
-def _by_model(
-    feedforward: bool | Feedforward, plant: Any, late: float
-) -> Literal[False] | Feedforward:
+def _chosen(designs: Mapping[str, Design], structure: str, task: Task) -> Design:
+    """Return the design of the structure, or the simplest one that can do what is asked."""
+    if structure == SIMPLEST:
+        able = STRUCTURES if task.feedforward is None else FEEDING_FORWARD
+        usable = {name: each for name, each in designs.items() if name in able}
+        found = simplest(usable, task.objective)
+    else:
+        found = designs[structure]
+    if found.controller is None:
+        raise ValueError(f"structure = {structure!r}: {found.reason} ({task.constraints})")
+    return found
+
+
+def _by_model(feedforward: bool | Feedforward, plant: Any, late: float) -> Feedforward | None:
     """Return the feedforward of a plant with a delay [s] of u besides its own, if it is wanted."""
     given = checked_feedforward(feedforward)
     if isinstance(given, Feedforward):
         return given
     if not given:
-        return False
+        return None
     found = Feedforward.of(plant)
     late += found.delay or 0.0
     return replace(found, delay=late) if late > 0.0 else found
@@ -261,20 +273,42 @@ def _check_names(structure: str, compare: Sequence[str], objective: str) -> None
     checks.one_of("objective", objective, OBJECTIVES)
 
 
+def _check_feedforward(names: Sequence[str]) -> None:
+    """Raise an error unless one of the structures has a feedforward."""
+    if not set(names) & set(FEEDING_FORWARD):
+        raise ValueError(
+            f"feedforward: {', '.join(names)} has none; give a structure that has, as freed, "
+            "model-based or p-pi-notch, or feedforward = false"
+        )
+
+
 def _inputs(
-    objective: str, reference: Any, duration: float | None, load: float, plants: PlantSet
+    objective: str,
+    reference: Any,
+    duration: float | None,
+    load: float,
+    plants: PlantSet,
+    feedforward: Feedforward | None,
 ) -> Inputs:
-    """Return the reference, or without one the step of the load."""
+    """Return the reference and its feedforward, or without one the step of the load."""
     if objective == "tracking" and reference is None:
         raise ValueError("reference = None: objective = 'tracking' needs a signal to follow")
     last = checks.optional(checks.positive, "duration", duration, "s")
     step = load_step(plants, checks.finite("load", load), last)
     if reference is None:
         return step
-    t = np.arange(step.r.size) * plants.dt
+    t: Vector = np.arange(step.r.size, dtype=np.float64) * plants.dt
     if not callable(reference):
         raise ValueError(f"reference = {reference!r}: must be a signal, as quell.signals.Step()")
-    return Inputs(np.asarray(reference(t), dtype=np.float64), np.zeros(t.size))
+    r, none = np.asarray(reference(t), dtype=np.float64), np.zeros(t.size)
+    if feedforward is None:
+        return Inputs(r, none)
+    if not isinstance(reference, Signal):
+        raise ValueError(
+            f"reference = {reference!r}: must be a signal of quell.signals, whose derivatives the "
+            "feedforward uses"
+        )
+    return Inputs(r, none, feedforward.linear_part(reference, t, plants.dt))
 
 
 def _analysis(given: Given, plants: PlantSet, design: Design) -> LoopAnalysis:
@@ -313,7 +347,11 @@ def _check(
 
 
 def _setup(
-    given: Given, plants: PlantSet, known: Mapping[str, Any] | None, rest: Rest | None
+    given: Given,
+    plants: PlantSet,
+    known: Mapping[str, Any] | None,
+    rest: Rest | None,
+    limits: Limits,
 ) -> dict[str, Any]:
     """Return the tables of a setup file: ``known``, else the first plant, a step, a load.
 
@@ -331,7 +369,8 @@ def _setup(
     if "scenario" not in tables:
         last = float(f"{load_step(plants).r.size * dt:.2g}")
         rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
-        tables |= scenario_tables(last, linear.disturbances, rest)
+        sizes = held_sizes(linear, rest, limits)
+        tables |= scenario_tables(last, linear.disturbances, rest, sizes)
     elif "metrics" not in tables:
         tables["metrics"] = windows_of(tables["scenario"])
     return tables

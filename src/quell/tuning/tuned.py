@@ -166,21 +166,13 @@ class Tuned:
         return draw(*drawn, given_axes(axes, ax))
 
     def toml(self) -> str:
-        """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``.
-
-        An ADRC has the feedforward that ``tune`` was asked for, else that of the setup that was
-        tuned: it is no matter of the loop.
-        """
+        """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``."""
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
         comment += f"active: {', '.join(self.active) or 'none'}\n{self.reference_step}"
         comment += f"\n{self.left_out}" if self.left_out else ""
         replaced = ("observer", "controller")
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
-        designed = {key: dict(table) for key, table in self.design.tables.items()}
-        before, law = self.setup.get("controller", {}), designed["controller"]
-        if law["kind"] == "adrc" and "feedforward" in before and "feedforward" not in law:
-            law["feedforward"] = before["feedforward"]
-        return toml_text({**tables, **designed}, comment)
+        return toml_text({**tables, **self.design.tables}, comment)
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""

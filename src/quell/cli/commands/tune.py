@@ -61,6 +61,7 @@ def tune(
     m_ks: float | None = None,
     noise: float | None = None,
     resolution: float | None = None,
+    feedforward: bool | None = None,
     trials: WholeOrNone = None,
     out: Path | None = None,
     save_record: Path | None = None,
@@ -112,6 +113,8 @@ def tune(
         Standard deviation of the noise of y in each sample [y-unit].
     resolution
         Step to which y is rounded [y-unit]: 360/2^16 degrees of a 16-bit encoder.
+    feedforward
+        Feed the reference forward by the model of the plant; with a setup as its controller does.
     trials
         Of a setup: tune on by simulation in its scenario, with this many candidates and all that
         is not linear in the plant; --objective is then a metric, as iae, which is the default.
@@ -131,6 +134,7 @@ def tune(
         "order": order,
         "objective": objective,
         "delay": delay,
+        "feedforward": feedforward,
         "trials": trials,
     }
     named |= {"m_s": m_s, "m_t": m_t, "m_ks": m_ks}

@@ -51,6 +51,7 @@ from quell.plants.delay import DelayedPlant
 from quell.plants.encoder import EncodedPlant
 from quell.plants.linear_part import linear_model
 from quell.plants.nonlinear.friction import FrictionPlant
+from quell.signals.base import Signal
 from quell.types import Vector
 
 # The highest derivative of the reference: a move knows no more with sense, and the numbers of an
@@ -212,6 +213,21 @@ class Feedforward:
         """The highest derivative of the reference that is used."""
         highest = min(len(self.coefficients), _MOST)
         return highest if self.derivatives is None else self.derivatives
+
+    def linear_part(self, reference: Signal, t: Vector, dt: float) -> Vector:
+        """Return u_ff without friction and constant at times (k,) [s], of a sampled controller.
+
+        The derivatives of the reference give it at the time when u acts, half a sample and
+        ``delay`` later.
+        """
+        series = np.zeros(self.order + 1)
+        given = np.asarray(self.coefficients, dtype=np.float64)[: series.size]
+        series[: given.size] = given
+        total = np.zeros(t.shape)
+        for coefficient in shifted(series, (self.delay or 0.0) + 0.5 * dt).tolist():
+            total += coefficient * reference(t)
+            reference = reference.derivative()
+        return total
 
     def describe(self) -> str:
         """Return u_ff as a formula."""

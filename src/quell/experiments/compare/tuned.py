@@ -181,7 +181,7 @@ def _tuned_pid(given: Given, task: Task, progress: Progress) -> Design:
     structure = make_structure("pid", task.model)
     assert found.solution is not None
     row = found.solution.values
-    return replace(found, controller=structure.controller(row, **task.u))
+    return replace(found, controller=structure.controller(row, **task.limits))
 
 
 def shaped(plant: Any, controller: Controller, delay: float = 0.0) -> Controller:

@@ -33,10 +33,22 @@ _DIVERGED = 1e100
 
 
 class Inputs(NamedTuple):
-    """Inputs of a loop: the reference and the load at the plant's input, sample by sample."""
+    """Inputs of a loop: the reference and the load at the plant's input, sample by sample.
+
+    With the feedforward of a model the loop is that of the errors ``y − r`` and ``u − u_ff``
+    (``controllers/adrc/feedforward.py``): the law sees ``y − r`` with a reference of zero, and the
+    plant has u_ff besides what the law gives.
+    """
 
     r: Vector  # (k,) [y-unit]
     d: Vector  # (k,) [u-unit]
+    u_ff: Vector | None = None  # (k,) [u-unit]
+
+    def of_loop(self) -> tuple[tuple[str, Vector], ...]:
+        """Return the inputs of the linear loop by their names in ``closed_loop``."""
+        if self.u_ff is None:
+            return ("r", self.r), ("d", self.d)
+        return ("n", -self.r), ("d", self.d + self.u_ff)
 
 
 def law_of(controller: Controller) -> LinearLaw:
@@ -108,7 +120,9 @@ def response(plant: SampledPlant, law: LinearLaw, inputs: Inputs, target: str = 
     """Return y or u (k,) of a loop from rest; infinite for an unstable one that overflows."""
     size = inputs.r.size
     total = np.zeros(size)
-    for source, given in (("r", inputs.r), ("d", inputs.d)):
+    if target == "u" and inputs.u_ff is not None:
+        total += inputs.u_ff
+    for source, given in inputs.of_loop():
         if np.any(given):
             pulse = _pulse(closed_loop(plant, law, source, target), size)
             if not np.max(np.abs(pulse)) < _DIVERGED:

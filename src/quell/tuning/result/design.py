@@ -73,22 +73,24 @@ def impossible(name: str, reason: str) -> Design:
 
 
 def design_of(
-    name: str, problem: Problem, solution: Solution, constraints: Constraints, u: Mapping[str, Any]
+    name: str,
+    problem: Problem,
+    solution: Solution,
+    constraints: Constraints,
+    options: Mapping[str, Any],
 ) -> Design:
-    """Return the design of a solution; ``u`` are limits and feedforward of the controller."""
+    """Return the design of a solution; ``options`` are those of the structure's controllers."""
     structure, values = solution.structure, solution.values
     measures, active = measured(problem, solution, constraints)
     k_i = float(structure.integral_gain(values[None, :])[0])
     size = math.exp(solution.cost)
     tables = structure.tables(values)
-    if tables["controller"]["kind"] != "adrc":
-        u = {key: each for key, each in u.items() if key != "feedforward"}
-    for key, each in u.items():
+    for key, each in options.items():
         if each is not None:
             tables["controller"][key] = each.table() if isinstance(each, Feedforward) else each
     return Design(
         name=name,
-        controller=structure.controller(values, **u),
+        controller=structure.controller(values, **options),
         values=_signed(solution),
         objective=k_i if problem.objective == "load" else size,
         k_i=k_i,

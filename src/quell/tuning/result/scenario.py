@@ -15,8 +15,18 @@ from quell.plants.linear import LinearPlant
 from quell.plants.linear_part import operating_point_of
 from quell.plants.nonlinear.plant import NonlinearPlant, checked_point
 
+# A step and a load take at most this share each of what u has left at rest, as both act in the end.
+_SHARE = 0.4
+# A solution of A x + B u = −E w, C x = r within this share of its right side is one.
+_SOLVED = 1e-6
+# Smaller parts of a solution are rounding.
+_ROUNDING = 1e-12
 # Names of the times at which signals begin, in their tables.
 _TIMES = ("at", "start")
+
+
+Limits = tuple[float, float]
+"""u_min and u_max of the controller [u-unit], infinite where it has none."""
 
 
 class Rest(NamedTuple):
@@ -63,12 +73,64 @@ def rest_of_linear(linear: LinearPlant, rest: Rest) -> Rest:
     matrix = np.block([[linear.A, linear.E], [linear.C, np.zeros((1, m))]])
     right = np.append(-linear.B[:, 0] * rest.u, rest.y)
     found = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    found[np.abs(found) < _ROUNDING * np.max(np.abs(found), initial=0.0)] = 0.0
     return rest._replace(x0=tuple(found[:n].tolist()), w=tuple(found[n:].tolist()))
 
 
-def scenario_tables(last: float, disturbances: int, rest: Rest | None) -> dict[str, Any]:
+def rest_within(linear: LinearPlant, rest: Rest | None, limits: Limits) -> Rest | None:
+    """Return an operating point within the limits of u: the given one, else zero or their middle.
+
+    Raises ``ValueError`` for limits within which there is no such point.
+    """
+    low, high = limits
+    at = 0.0 if rest is None else rest.u
+    if low <= at <= high:
+        return rest
+    within = f"must lie within u_min = {low:g} and u_max = {high:g}"
+    if rest is not None:
+        raise ValueError(f"u at rest = {at:g}: {within}; no controller can hold the plant there")
+    middle = 0.5 * (low + high)
+    if not np.isfinite(middle) or np.linalg.matrix_rank(linear.A) < linear.order:
+        raise ValueError(
+            f"u at rest = 0: {within}; give u and y at rest: rest = (u, y), or --u-rest and "
+            "--y-rest"
+        )
+    y = -float((linear.C @ np.linalg.solve(linear.A, linear.B))[0, 0]) * middle
+    return Rest(middle, y)
+
+
+def held_sizes(linear: LinearPlant, rest: Rest | None, limits: Limits) -> tuple[float, float]:
+    """Return the sizes of a step of r [y-unit] and of the first load that u can hold, of 1 at most.
+
+    At rest the step needs u with ``A x + B u = 0``, ``C x = 1``, the load ``A x + B u = −E``,
+    ``C x = 0``; each gets 40 % of what the limits leave. A size is negative where u has more room
+    on the other side, as that of a load on a heater at zero.
+    """
+    at = 0.0 if rest is None else rest.u
+    low, high = limits
+    n = linear.order
+    matrix = np.block([[linear.A, linear.B], [linear.C, np.zeros((1, 1))]])
+    rights = [np.append(np.zeros(n), 1.0)]
+    rights += [np.append(-linear.E[:, 0], 0.0)] if linear.disturbances else []
+    sizes = []
+    for right in rights:
+        found = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        solved = np.linalg.norm(matrix @ found - right) <= _SOLVED * np.linalg.norm(right)
+        u = float(found[-1]) if solved else 0.0
+        # How large a positive and a negative one may be.
+        ends = (high - at, low - at) if u > 0.0 else (low - at, high - at)
+        most = [1.0 if u == 0.0 else min(1.0, abs(_SHARE * end / u)) for end in ends]
+        size = most[0] if most[0] >= most[1] else -most[1]
+        sizes.append(float(f"{size:.2g}"))
+    return sizes[0], sizes[-1]
+
+
+def scenario_tables(
+    last: float, disturbances: int, rest: Rest | None, sizes: tuple[float, float] = (1.0, 1.0)
+) -> dict[str, Any]:
     """Return ``scenario`` and ``metrics``: a step, and later a load if there is an input for it.
 
+    ``sizes`` are those of the step and the load.
     A loop at an operating point has half of ``last`` [s] to come to rest: the controller starts
     from u = 0.
     """
@@ -80,15 +142,19 @@ def scenario_tables(last: float, disturbances: int, rest: Rest | None) -> dict[s
         constant = [*rest.w, *[0.0] * (disturbances - len(rest.w))]
     at, load_at, end = (float(f"{time:.6g}") for time in (at, at + half, at + last))
     begins: Mapping[str, Any] = {"at": at} if at else {}
-    reference: Any = {**step, **begins}
+    reference: Any = {**step, **begins, **_size(sizes[0])}
     scenario: dict[str, Any] = {"duration": end, "reference": [y, reference] if y else reference}
     if rest is not None and rest.x0:
         scenario["x0"] = list(rest.x0)
     if disturbances:
-        load: Any = {**step, "at": load_at}
+        load: Any = {**step, "at": load_at, **_size(sizes[1])}
         first = [constant[0], load] if constant[0] else load
         scenario["disturbances"] = [first, *constant[1:]]
     return {"scenario": scenario, "metrics": _windows([at, load_at] if disturbances else [at])}
+
+
+def _size(size: float) -> dict[str, float]:
+    return {} if size == 1.0 else {"height": size}
 
 
 def windows_of(scenario: Mapping[str, Any]) -> list[dict[str, float]]:

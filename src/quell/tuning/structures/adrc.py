@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from quell.analysis.frequency_response import Complex
 from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.lti.canonical import Canonical, canonical
 from quell.lti.reduction import Reduced, without_far_zeros
 from quell.observers.eso import ESO
@@ -304,22 +305,26 @@ class AdrcStructure:
         omega_c, omega_o = (float(np.exp(np.mean(np.log(np.abs(p))))) for p in (law, observer))
         return omega_c, omega_o, _pattern(law / omega_c), _pattern(observer / omega_o)
 
-    def controller(self, values: Vector, **limits: Any) -> ADRC:
+    def controller(self, values: Vector, **options: Any) -> ADRC:
         """Return the controller."""
         omega_c, omega_o, law, observer = self._patterns(values)
         b0, dt = self.model.sign * float(values[0]), self.model.dt
-        options: dict[str, Any] = {
+        form: dict[str, Any] = {
             "form": "reduced" if self.form.reduced else "current",
             "half_gain": self.form.half_observer,
             "delay": self._delay * dt,
             "poles": observer,
         }
         if self.form.based:
-            options |= {"far": math.inf}
-            eso = ESO.model_based(self.model.plant, omega_o, dt, b0=b0, **options)
+            form |= {"far": math.inf}
+            eso = ESO.model_based(self.model.plant, omega_o, dt, b0=b0, **form)
         else:
-            eso = ESO.model_free(self.order, b0, omega_o, dt, **options)
-        return ADRC(eso, omega_c, half_gain=self.form.half_law, law_poles=law, **limits)
+            eso = ESO.model_free(self.order, b0, omega_o, dt, **form)
+        return ADRC(eso, omega_c, half_gain=self.form.half_law, law_poles=law, **options)
+
+    def feedforward(self, of_model: Feedforward) -> dict[str, Any]:
+        """Return the feedforward as it is."""
+        return {"feedforward": of_model}
 
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
         """Return the tables of observer and controller."""

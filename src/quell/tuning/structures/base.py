@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from quell.analysis.frequency_response import Complex
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.base import Controller
 from quell.tuning.constraints import Constraints
 from quell.types import Matrix, Vector
@@ -39,7 +40,6 @@ class Model(NamedTuple):
     omega: float  # frequency at which the plant's phase lag is that of two integrators [rad/s]
     gain: float  # |P| around it
     constraints: Constraints
-    feedforward: bool = False  # whether a cascade feeds speed and torque forward
 
 
 class Structure(Protocol):
@@ -82,8 +82,12 @@ class Structure(Protocol):
         """Return further constraints (m, k), which must not be negative."""
         ...
 
-    def controller(self, values: Vector, **limits: Any) -> Controller:
-        """Return the controller with values (p,); ``limits`` as for ``ADRC``."""
+    def controller(self, values: Vector, **options: Any) -> Controller:
+        """Return the controller with values (p,); ``options``: limits of u, ``feedforward``."""
+        ...
+
+    def feedforward(self, of_model: Feedforward) -> dict[str, Any]:
+        """Return the options of ``controller`` for a feedforward; none where it has no such."""
         ...
 
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:

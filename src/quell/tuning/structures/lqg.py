@@ -16,6 +16,7 @@ import numpy as np
 from quell.analysis.frequency_response import Complex, Response
 from quell.analysis.pure_delays import eigenvalues
 from quell.analysis.subsystems import law_matrix
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.baselines.lqg import LQG
 from quell.lti.system import System
 from quell.plants.linear import LinearPlant
@@ -117,6 +118,10 @@ class LqgStructure:
         factor, omega_c, omega_o = map(float, values)
         plant = LinearPlant(self.plant.A, factor * self.plant.B, self.plant.C)
         return LQG(plant, omega_c, omega_o, self.model.dt, **limits)
+
+    def feedforward(self, of_model: Feedforward) -> dict[str, Any]:
+        """Return none: the observer's state does not follow a reference."""
+        return {}
 
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
         """Return the table of the controller, with its own model of the plant."""

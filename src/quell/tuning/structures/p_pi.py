@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from quell.analysis.frequency_response import Complex
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.baselines.notch import Notch
 from quell.controllers.baselines.p_pi import PPI
-from quell.lti.canonical import canonical
 from quell.plants.linear import LinearPlant
 from quell.tuning.structures.base import Model, Parameter
 from quell.types import Matrix, Vector
@@ -117,34 +117,24 @@ class CascadeStructure:
         """Return nothing: the bounds of the parameters say all."""
         return np.zeros((values.shape[0], 0))
 
-    def feedforward(self) -> dict[str, float]:
-        """Return inertia and viscous friction of the plant at low frequencies.
-
-        ``1/P(s) = c_0 + c_1 s + c_2 s² + …``; c_2 is the inertia, c_1 the friction.
-        """
-        plant = canonical(self.model.plant)
-        den = np.append(plant.a, [1.0, 0.0, 0.0])
-        num = np.append(plant.b * np.real(np.atleast_1d(np.poly(plant.zeros)))[::-1], [0.0, 0.0])
-        series: list[float] = []
-        for i in range(3):
-            known = sum(series[j] * num[i - j] for j in range(i))
-            series.append(float((den[i] - known) / num[0]))
-        return {"inertia": series[2], "viscous": series[1]}
+    def feedforward(self, of_model: Feedforward) -> dict[str, Any]:
+        """Return the inertia and the viscous friction: of ``r''`` and ``r'``; it has no more."""
+        _, viscous, inertia = np.append(of_model.coefficients, [0.0, 0.0])[:3].tolist()
+        return {"inertia": inertia, "viscous": viscous}
 
     def _arguments(self, values: Vector) -> dict[str, Any]:
         kp, kv, tn, tf = map(float, values[:4])
-        arguments: dict[str, Any] = {"kv": kv, "kp": self.model.sign * kp, "tn": tn, "tf": tf}
-        return arguments | (self.feedforward() if self.model.feedforward else {})
+        return {"kv": kv, "kp": self.model.sign * kp, "tn": tn, "tf": tf}
 
     def _notches(self, values: Vector) -> list[dict[str, float]]:
         rows = values[4:].reshape(-1, 3).tolist()
         return [{"omega": math.tau * f, "depth": d, "width": w} for f, d, w in rows]
 
-    def controller(self, values: Vector, **limits: Any) -> PPI:
+    def controller(self, values: Vector, **options: Any) -> PPI:
         """Return the controller."""
         notches = [Notch.at(**each) for each in self._notches(values)]
         name = "P-PI + notch" if notches else "P-PI"
-        arguments = self._arguments(values) | {"name": name} | limits
+        arguments = self._arguments(values) | {"name": name} | options
         return PPI(dt=self.model.dt, notches=notches, **arguments)
 
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from quell.analysis.frequency_response import Complex
+from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.baselines.pid import PID
 from quell.tuning.structures.base import Model, Parameter
 from quell.types import Matrix, Vector
@@ -148,6 +149,10 @@ class FilteredPID:
         """Return the PID controller."""
         name = "PID" if self.derivative else "PI"
         return PID(**self._arguments(values), dt=self.model.dt, name=name, **limits)
+
+    def feedforward(self, of_model: Feedforward) -> dict[str, Any]:
+        """Return none: a PID controller has no model."""
+        return {}
 
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
         """Return the table of the controller."""

@@ -29,6 +29,8 @@ _ADRC = {
 LQG, CASCADE = "lqg", "p-pi-notch"
 STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE)
 """Names of the structures: forms of ADRC, PI and PID, LQG, and the cascade of servo drives."""
+FEEDING_FORWARD = (*_ADRC, CASCADE)
+"""Names of those with the feedforward of a model."""
 
 
 def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
