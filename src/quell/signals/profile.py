@@ -169,7 +169,8 @@ def _plan_peak(
         jerk, first, held, last = change_of_speed(v_1, a_1, 0.0, a_max, j_max)
         rest = way_of(v_1, a_1, jerk, first, held, last)
         excess = way + more + rest - distance
-        if abs(excess) <= epsilon * (abs(way) + abs(more) + abs(rest)):
+        # Rounding of the ways, whose terms are of both signs, is some units of their last digits.
+        if abs(excess) <= 8.0 * epsilon * (abs(way) + abs(more) + abs(rest)):
             break
         # J ∂f/∂a of the stop
         slope = j_max * first * (0.5 * a_1 / j_max + last + held)
@@ -181,7 +182,7 @@ def _plan_peak(
             low = s
         before = step
         step = excess / slope if slope > 0.0 else high - low
-        if abs(step) <= epsilon * s:
+        if abs(step) <= 2.0 * epsilon * s or high - low <= 2.0 * epsilon * high:
             break
         if not low < s - step < high or abs(step) > 0.5 * abs(before):
             step = s - 0.5 * (low + high)
