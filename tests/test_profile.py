@@ -284,3 +284,14 @@ def test_settled_at_a_value_it_rests_there() -> None:
     run = Moving()
     settle(run.design, run.memory, 0.3)
     assert run.step(0.3).tolist() == [0.3, 0.0, 0.0, 0.0]
+
+
+def test_the_library_says_what_r_is_and_how_to_stop(tmp_path: Path) -> None:
+    """In header, description and sketch; the interrupt hands over a target, without derivatives."""
+    ql.export.c(controller(), tmp_path, name="servo")
+    header, text = (tmp_path / name for name in ("src/servo.h", "README.md"))
+    assert "r is the target of a move" in header.read_text()
+    assert "double servo_stopping_point(const servo_state *state);" in header.read_text()
+    assert "call\n`servo_stopping_point` once" in text.read_text()
+    assert "servo_step(&state, reference, y);" in text.read_text()
+    assert "/* target of the moves */" in (tmp_path / "examples/servo/servo.ino").read_text()

@@ -211,6 +211,10 @@ class ProfileGenerator:
     Limits that become lower while the axis moves (``NAME_retune`` of exported code) act at once: a
     speed above its limit is reduced first; an acceleration above its limit is not raised.
 
+    It is for targets that stand still for some samples. One that moves in each sample is followed,
+    too, within the limits, but with a jerk that alternates, which feedforward passes on to u: take
+    a ``ReferenceModel`` for it, or the derivatives of its formula.
+
     Examples
     --------
     >>> profile = ProfileGenerator(v_max=2.0, a_max=10.0, j_max=100.0)
