@@ -62,6 +62,10 @@ def cases() -> list[Case]:
     limits = {"u_min": -10.0, "u_max": 10.0}
     observer = ql.ESO.model_free(order=2, b0=5.0, omega_o=50.0, dt=1e-3)
     mf = ql.ADRC(observer, omega_c=10.0, **limits)
+    # The reference of the runs gives a new target in each sample: each step plans a move.
+    moves = "MF-ESO, order 2, feedforward, moves"
+    fed = ql.ADRC(observer, omega_c=10.0, feedforward=ql.Feedforward.of(DRIVE), **limits)
+    moving = ql.controllers.Prefiltered(fed, ql.controllers.ProfileGenerator(2.0, 20.0, 500.0))
     pid = ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits)
     learners = ql.learners
     guarded = law(learners.Kalman(), ql.Guard())
@@ -73,6 +77,8 @@ def cases() -> list[Case]:
         Case("PID", m4, "single", DRIVE, pid),
         Case("MF-ESO, order 2", m4, "single", DRIVE, mf, small),
         Case("MF-ESO, order 2", m7, "double", DRIVE, mf),
+        Case(moves, m4, "single", DRIVE, moving),
+        Case(moves, m7, "double", DRIVE, moving),
         Case("MF-ESO, order 4", m4, "single", two_mass, law()),
         Case(l_eso, m4, "single", two_mass, guarded, large),
         Case(l_eso, m7, "single", two_mass, guarded),

@@ -1,8 +1,9 @@
 """A controller that was tuned in Python runs on an emulated Cortex-M, compared with the simulation.
 
-It is exported to C, joined with the device of the serial line, and compiled for two boards with the
-C compiler for ARM. The emulator runs it; quell sends the reference over its serial line and records
-the telemetry. The plant is simulated on the target, too.
+It has the feedforward of the drive's model, and plans moves within limits of speed, acceleration
+and jerk to the targets that it gets. It is exported to C, joined with the device of the serial
+line, and compiled for two boards with the C compiler for ARM. The emulator runs it; quell sends the
+targets over its serial line and records the telemetry. The plant is simulated on the target, too.
 """
 
 import sys
@@ -13,15 +14,18 @@ import numpy as np
 from target import emulator
 
 import quell as ql
+from quell.controllers import Prefiltered, ProfileGenerator
 from quell.realtime import open_device, record_target
 
 DT = 1e-3
 DRIVE = ql.plants.LinearPlant(A=[[0.0, 1.0], [0.0, -0.6]], B=[0.0, 5.0], C=[1.0, 0.0])
-REFERENCE = ql.signals.SmoothMove(distance=0.2, duration=0.3, start=0.05)
+# The second target comes while the drive moves to the first one.
+REFERENCE = ql.signals.Step(0.3, at=0.05) - ql.signals.Step(0.1, at=0.2)
+LIMITS = {"v_max": 2.0, "a_max": 20.0, "j_max": 500.0}
 LOAD_AT, LOAD, DURATION = 0.4, -3.0, 0.8
 
 
-def on_target(board: emulator.Board, controller: ql.ADRC, precision: str) -> ql.Trajectory:
+def on_target(board: emulator.Board, controller: Prefiltered, precision: str) -> ql.Trajectory:
     """Run the exported controller on a board; return its telemetry."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -46,8 +50,9 @@ if tool := emulator.missing_tool():
     sys.exit()
 
 constraints = ql.tuning.Constraints(m_ks=500.0)
-tuned = ql.tune(DRIVE, DT, compare=(), constraints=constraints, u_min=-10.0, u_max=10.0)
-controller = tuned.controller
+how = {"feedforward": True, "compare": (), "constraints": constraints}
+tuned = ql.tune(DRIVE, DT, u_min=-10.0, u_max=10.0, **how)
+controller = Prefiltered(tuned.controller, ProfileGenerator(**LIMITS))
 print(tuned.summary().splitlines()[1])
 load = ql.signals.Step(height=LOAD, at=LOAD_AT)
 scenario = ql.Scenario(reference=REFERENCE, disturbances=(load,), duration=DURATION)
@@ -55,7 +60,7 @@ simulated = ql.simulate(DRIVE, controller, scenario, interpret=True)
 for name, precision in (("Cortex-M4F", "single"), ("Cortex-M7", "double")):
     run = on_target(emulator.BOARDS[name], controller, precision)
     print(f"{name} in {precision} precision, {len(run)} samples, y = {run['y'][-1]:.6f} at the end")
-    for channel in ("y", "u", "f_residual"):
+    for channel in ("y", "u", "r_shaped", "u_feedforward", "f_residual"):
         largest, apart = np.max(np.abs(simulated[channel])), run[channel] - simulated[channel]
         print(
             f"    {channel}: differs from the simulation by {np.max(np.abs(apart)) / largest:.1e}"

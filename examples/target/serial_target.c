@@ -1,7 +1,8 @@
 /* A controller of quell on the target, with telemetry over a serial line.
  *
  * It joins ../serial_device.c, which has frames and sessions, with an exported controller, "servo",
- * and an exported plant, "plant", in place of a drive. Commands are references; every tick sends y as
+ * and an exported plant, "plant", in place of a drive. Commands are the targets of moves, which the
+ * controller plans; every tick sends y as
  * the measurement and the rest as telemetry, in the order of the names that the loop gives to
  * quell.realtime.record_target.
  *
@@ -43,12 +44,14 @@ static void send_telemetry(double u)
     uint32_t channel = 0;
     quell_telemetry(channel++, r);
     quell_telemetry(channel++, u);
-    /* the channels of the controller in Python, in its order */
+    /* the channels of the controller in Python, in its order: those of one with moves and feedforward */
+    quell_telemetry(channel++, estimate.r_shaped);
     for (size_t i = 0; i < sizeof estimate.x_hat / sizeof estimate.x_hat[0]; i++)
         quell_telemetry(channel++, estimate.x_hat[i]);
     quell_telemetry(channel++, estimate.f_residual);
     quell_telemetry(channel++, estimate.f_learned);
     quell_telemetry(channel++, estimate.status);
+    quell_telemetry(channel++, estimate.u_feedforward);
 }
 
 double board_measure(void)

@@ -63,6 +63,9 @@ CONTROLLERS: dict[str, Any] = {
         ql.ADRC(ESO, 1.5, feedforward=ql.Feedforward((0.3, 0.1, 0.7), 0.2, 0.5, -0.1), **LIMITS),
         room.ReferenceModel(3.0, order=3),
     ),
+    "Prefiltered, moves": room.Prefiltered(
+        ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.ProfileGenerator(0.5, 2.0, 5.0)
+    ),
     "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
 }
 PLANTS = {"ResonanceRatio": ql.plants.two_mass_spring()}

@@ -21,6 +21,7 @@ from quell.controllers.linear.law import LinearLaw
 from quell.controllers.linear.linear import LinearController
 from quell.controllers.prefilters.differentiator import TrackingDifferentiator
 from quell.controllers.prefilters.prefilter import Prefilter, Prefiltered
+from quell.controllers.prefilters.profile import ProfileGenerator
 from quell.controllers.prefilters.reference_model import ReferenceModel
 from quell.controllers.single import in_single_precision
 from quell.suggestions import suggest_names
@@ -36,6 +37,7 @@ __all__ = [
     "NonlinearFeedback",
     "Prefilter",
     "Prefiltered",
+    "ProfileGenerator",
     "ReferenceModel",
     "TrackingDifferentiator",
     "adrc_for_dead_time",

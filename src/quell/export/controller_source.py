@@ -14,7 +14,11 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.prefilters.prefilter import Prefiltered, without_prefilters
+from quell.controllers.prefilters.prefilter import (
+    Prefiltered,
+    stopping_point,
+    without_prefilters,
+)
 from quell.export import operations
 from quell.export.c_files import CFiles, CSource, translated
 from quell.export.counts import check_counts
@@ -103,6 +107,8 @@ class _Writer:
         self.real = self.files.real
         self.state = f"{name}_state *state"
         has_own = isinstance(self.described, Prefiltered)  # derivatives, from its prefilter
+        design = self.described.parameters
+        self.moves = has_own and type(design.prefilter) in stopping_point.implementations
         self.derivatives = 0 if has_own else int(getattr(self.described, "derivatives", 0))
         # They are arguments of each step: whoever forgets them gets an error of the compiler.
         self.names = [f"r{i + 1}" for i in range(self.derivatives)]
@@ -120,6 +126,8 @@ class _Writer:
             self._add_manual_operation()
         self._add_retune()
         self._add_reset()
+        if self.moves:
+            self._add_stop()
         channels = tuple((name, width) for name, width in self.controller.channels if width)
         self._add_estimate(channels)
         kind, precision = type(self.described).__name__, "float" if self.files.single else "double"
@@ -145,8 +153,9 @@ class _Writer:
             "step",
             f"{real} NAME({self.state}, {real} r, {real} y{self.arguments})",
             "Take one sample: return the control signal u for reference r and measurement y.\n\n"
-            f"{self._about_derivatives()}A value that is not finite is replaced; the status says\n"
-            "so. The controller assumes that u is applied until the next sample.",
+            f"{self._about_target()}{self._about_derivatives()}"
+            "A value that is not finite is replaced; the status says so. The controller assumes\n"
+            "that u is applied until the next sample.",
             *self._derivatives(),
             f"    return {files.call(control, *both, r, y)};",
         )
@@ -156,6 +165,15 @@ class _Writer:
             "Set the control signal that was really applied since the last step.\n\n"
             "One that is not finite is ignored; the status says so, until the next step.",
             f"    {files.call(operations.applied, *both, u)};",
+        )
+
+    def _about_target(self) -> str:
+        """Return the sentence on the reference of a controller that plans moves."""
+        if not self.moves:
+            return ""
+        return (
+            "r is the target of a move within the limits of speed, acceleration and jerk in\n"
+            "parameters->prefilter; it may change in any sample, also during a move.\n"
         )
 
     def _about_derivatives(self) -> str:
@@ -258,6 +276,15 @@ class _Writer:
             f"int NAME(const {self.state})",
             f"Return the flags of the last sample, see enum {self.name}_flag.",
             f"    return {files.call(status_flags, *files.both)};",
+        )
+
+    def _add_stop(self) -> None:
+        files = self.files
+        files.add(
+            "stopping_point",
+            f"{self.real} NAME(const {self.state})",
+            "Return where the move can stop soonest: it does if this is r of the next steps.",
+            f"    return {files.call(operations.stop_of_move, *files.both)};",
         )
 
     def _add_estimate(self, channels: Channels) -> None:

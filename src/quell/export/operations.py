@@ -13,7 +13,12 @@ from quell.controllers.adrc.law import AdrcDesign, AdrcState
 from quell.controllers.bad_samples import is_usable
 from quell.controllers.base import control, set_applied_control
 from quell.controllers.linear.linear import LinearDesign, LinearState
-from quell.controllers.prefilters.prefilter import PrefilteredDesign, PrefilteredState, settle
+from quell.controllers.prefilters.prefilter import (
+    PrefilteredDesign,
+    PrefilteredState,
+    settle,
+    stopping_point,
+)
 from quell.kernels.dispatch import generic
 from quell.types import Status
 
@@ -197,6 +202,11 @@ def _move_origin(design: AdrcDesign, state: AdrcState, distance: float) -> None:
     state.seen[0] -= distance
     loop.y -= distance
     loop.r -= distance
+
+
+def stop_of_move(design: PrefilteredDesign, state: PrefilteredState) -> float:
+    """Return where the reference comes to rest soonest: as r of a step it stops there."""
+    return stopping_point(design.prefilter, state.prefilter)
 
 
 @generic

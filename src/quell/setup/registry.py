@@ -14,6 +14,7 @@ from quell.controllers import (
     Feedforward,
     LinearController,
     NonlinearFeedback,
+    ProfileGenerator,
     ReferenceModel,
     TrackingDifferentiator,
     adrc_for_dead_time,
@@ -184,7 +185,7 @@ _CONTROLLERS = (
 CONTROLLERS = {table.kind_name: table for table in _CONTROLLERS}
 PREFILTERS = _call_tables(
     {"reference-model": ReferenceModel, "tracking-differentiator": TrackingDifferentiator}
-    | {"zv": ZV, "zvd": ZVD, "shaper": Shaper}
+    | {"profile-generator": ProfileGenerator, "zv": ZV, "zvd": ZVD, "shaper": Shaper}
 )
 Observer, Learner, Prefilter = one_of(OBSERVERS), one_of(LEARNERS), one_of(PREFILTERS)
 Controller = one_of(CONTROLLERS, default="adrc")

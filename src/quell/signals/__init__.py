@@ -7,7 +7,7 @@ add, subtract and scale::
     reference   = Sinusoid(amplitude=1.0, omega=1.0).until(110.0, then=Step(at=110.0))
     disturbance = 0.5 * Step(at=2.0) + BandLimitedNoise(power=1e-6, sample_time=0.01)
 
-May import ``types`` and ``checks``.
+May import ``types``, ``checks`` and ``kernels``.
 """
 
 from __future__ import annotations

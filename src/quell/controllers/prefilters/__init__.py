@@ -1,4 +1,4 @@
-"""Prefilters of the reference: reference models, tracking differentiator, input shaping.
+"""Prefilters of the reference: reference models, moves within limits, input shaping and others.
 
-May import ``controllers`` (base files, ``adrc``), ``lti`` and ``kernels``.
+May import ``controllers`` (base files, ``adrc``), ``lti``, ``signals`` and ``kernels``.
 """

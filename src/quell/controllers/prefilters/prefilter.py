@@ -3,7 +3,7 @@
 ``prefilter`` and ``settle`` are registered for the type of a prefilter's parameters. A prefilter
 that provides derivatives of the shaped reference has an attribute ``derivatives``, their number,
 and registers ``write_derivatives``. One that would take long to return from an absurd reference
-registers ``restart_if_astray``.
+registers ``restart_if_astray``. One that can stop registers ``stopping_point``.
 """
 
 from __future__ import annotations
@@ -68,6 +68,12 @@ def write_derivatives(design: Any, memory: Any, derivatives: Vector) -> None:
 @generic_with_default
 def restart_if_astray(design: Any, memory: Any, r: float, y: float) -> None:
     """Start again from rest at ``y`` if the shaped reference is no transition from y to r."""
+
+
+@generic
+def stopping_point(design: Any, memory: Any) -> float:
+    """Return where the shaped reference comes to rest soonest, for a prefilter with limits."""
+    raise TypeError
 
 
 class PrefilteredDesign(NamedTuple):
@@ -227,6 +233,19 @@ class Prefiltered(Wrapper):
         """Take one sample and return the change of the control signal, see ``ADRC.increment``."""
         before = float(self._adrc._state.loop[0].u)
         return self.step(r, y) - before
+
+    @property
+    def stopping_point(self) -> float:
+        """Where the shaped reference can come to rest soonest [y-unit]: as r of a step it stops.
+
+        Raises ``ValueError`` for a prefilter without limits that plan a stop.
+        """
+        design = self.parameters.prefilter
+        if type(design) not in stopping_point.implementations:
+            raise ValueError(
+                f"prefilter = {type(self.prefilter).__name__}: plans no stop; take ProfileGenerator"
+            )
+        return float(stopping_point(design, self._state.prefilter))
 
     def _take_parameters(self) -> None:
         """Use the parameters that the controller has now."""

@@ -27,6 +27,10 @@ _OPERATIONS = {
     ),
     "retune": ("retune(s, &parameters)", "between two samples: other parameters, without a jump"),
     "reset": ("reset(s)", "from rest at the next sample; what was learned is kept"),
+    "stopping_point": (
+        "stopping_point(s)",
+        "after the step: where the move can stop soonest; as r of the next steps it stops there",
+    ),
     "status": ("status(s)", "after the step: flags, see the enum in the header"),
     "get_estimate": ("get_estimate(s)", "after the step: what the controller knows, for telemetry"),
 }
@@ -60,6 +64,15 @@ _ONE_WORD = (
 _FED_FORWARD = """The controller feeds PRIMES of the reference forward, so they are arguments of
 `NAME_step`. They belong to the same move as r: take all of them from one formula (`next_reference`
 below), never from differences of r. At rest they are zero.
+"""
+_MOVES = """`r` is a target: the controller moves its reference there within limits of speed,
+acceleration and jerk, as quickly as they allow; a law with feedforward has the derivatives of the
+move. A new target may come in any sample, also during a move. `r_shaped` of `NAME_get_estimate` is
+the reference; it equals `r` when the move has ended. To stop as soon as the limits allow, call
+`NAME_stopping_point` once and hand its number over as `r` from the next step on. Other limits act
+at once, by `NAME_retune`: `prefilter.v_max`, `prefilter.a_max` and `prefilter.j_max` of the
+parameters, all above zero.
+
 """
 
 
@@ -121,10 +134,12 @@ def _reference_texts(source: CSource) -> dict[str, str]:
     count, real = source.derivatives, source.real
     zero = "0.0f" if source.precision == "single" else "0.0"
     if not count:
+        moves = "stopping_point" in source.operations
+        target = " /* target of the moves */" if moves else ""
         return {
-            "about_reference": "",
+            "about_reference": _MOVES.replace("NAME", source.name) if moves else "",
             "declared_reference": _ONE_WORD,
-            "defined_reference": f"static {real} reference = {zero};",
+            "defined_reference": f"static {real} reference = {zero};{target}",
             "next_reference": "",
             "reference": "reference",
             "derivatives": "",
