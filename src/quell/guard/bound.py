@@ -63,7 +63,7 @@ def bounds_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[
     """Return the least and the largest e_L; ``removed`` is R."""
     sample = memory.sample[0]
     if sample.authority == 0.0:
-        closing = _closing(guard, memory)
+        closing = _closing(guard, memory) if sample.taking_back > 0.0 else 0.0
         return closing, closing
     left = newest_share(guard, memory)
     proven = min(max(removed / _PROVEN, 0.0), 1.0)

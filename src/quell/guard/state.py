@@ -22,9 +22,10 @@ class GuardDesign(NamedTuple):
     lag: Any  # lag filter of the observer
     forget: float  # dt/T
     earn: float  # dt/T_C
-    stages: Size  # n: order of ℓ
+    stages: Size  # r: order of ℓ, the relative degree
     respond: float  # share by which each of its stages follows in a sample
-    closing: float  # the same of ℓ e_L, stage by stage, without authority
+    closing: float  # the same of ℓ e_L, stage by stage, while corrections are taken back
+    taking_back: float  # samples without authority in which they are; 0 where ℓ is not the loop's
     forget_account: float  # dt/(300 lags)
     forget_match: float  # 10 dt/T
     rise: float  # share by which P and e follow a larger |q| in a sample
@@ -74,6 +75,7 @@ class GuardSample(Scalars):
     reason: float  # a Reason
     samples: float  # number of samples so far
     unsettled: float  # samples until q is right again
+    taking_back: float  # samples in which corrections are still taken back
 
 
 class GuardMemory(NamedTuple):
