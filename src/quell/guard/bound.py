@@ -54,7 +54,9 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     sample.outside = min(sample.outside + max(more, 0.0), sample.peak)
     grown = min(grown, sample.peak, _OWN_GROWTH * sample.outside)
     if learner_acts and grown > size:
-        sample.credit -= _GROWTH_COST * (grown - size) / size
+        cost = _GROWTH_COST * (grown - size) / size
+        sample.credit -= cost
+        sample.credit_at_y -= cost
     sample.typical_error = max(grown, tiny(guard))
 
 

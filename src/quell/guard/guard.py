@@ -148,7 +148,7 @@ class Guard:
         """Return the state before the first sample, without authority."""
         fed = lag_memory(parameters.fed_lag, 0 if parameters.invertible else 1)
         filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
-        effects = np.zeros((2, parameters.stages))
+        effects = np.zeros((3, parameters.stages))
         memory = GuardMemory(*filters, effects, GuardAverages.zeros(), GuardSample.zeros())
         withdraw_authority(memory)
         return memory
