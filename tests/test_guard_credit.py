@@ -304,7 +304,7 @@ def test_a_learner_that_adds_to_slow_errors_is_hardly_heard_however_well_it_expl
 
 
 def test_a_learner_is_heard_in_noise_that_y_hardly_shows(rng: np.random.Generator) -> None:
-    """f has noise of a measurement, differentiated n times; q is noise, ℓ q is the load, which the learner knows, and C_y alone gives it authority."""
+    """The disturbance has noise of a measurement, differentiated; q is noise, ℓ q is the load, which the learner knows, and C_y alone gives it authority."""
     design = ql.Guard().design(OBSERVER)
     memory = ql.Guard().memory(design)
     load = np.sin(0.6 * 5e-3 * np.arange(30_000))

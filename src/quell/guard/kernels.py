@@ -40,16 +40,16 @@ raise slowly:
     p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
     β = min( clip(2 max(C, C_y), 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
 
-q is an n-th derivative of y, and mostly noise where y has some. C_y is such a credit at y, of ℓ q and
-ℓ p̄ in place of q and p̄ (ℓ: account, below), without the eight times: ℓ q changes so slowly that a
-close match over 1.5 lags is no evidence. y shows late what q shows at once, so C_y pays what
+q is an n-th derivative of y, and mostly noise where y has some. C_y is such a credit at y, of ℓ q
+and ℓ p̄ in place of q and p̄ (ℓ: account, below), without the eight times: ℓ q changes so slowly
+that a close match over 1.5 lags is no evidence. y shows late what q shows at once, so C_y pays what
 C pays while ε > 1, that is, while the learner adds to q. Both pay for growth of e, and both are −1
 while R < −0.01.
 
-C and C_y start at −1. A learner that explains q nearly completely earns up to eight times as much: 1 + 7
-clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below); a jump of f
-is seen in q for two lags only. S, the mean share of p² in p² + q² over T, scales down an output
-that is larger than what it explains.
+C and C_y start at −1. For C, a learner that explains q nearly completely earns up to eight times as
+much: 1 + 7 clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below);
+a jump of f is seen in q for two lags only. S, the mean share of p² in p² + q² over T, scales down
+an output that is larger than what it explains.
 
 **Account.** Credit is soon forgotten: a learner can earn it in twenty lags and spend it in ten,
 again and again. And y is q through n integrations: a learner that explains quick changes of f and
