@@ -224,7 +224,7 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
     memory = ql.Guard().memory(design)
     stages, rate = design.stages, 1.5 / observer.lag_time
     memory.effects[CORRECTED] = 1.0
-    memory.sample[0].typical_error = 1e6
+    memory.sample[0].typical_error, memory.sample[0].taking_back = 1e6, design.taking_back
     start, f_shown, samples = memory.effects[CORRECTED].copy(), 0.0, 10_000 * order
     moved, shadow = np.zeros(samples), np.zeros((1, order + 1))
     for k in range(samples):
@@ -242,7 +242,10 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
     np.testing.assert_allclose(moved[::500], expected, atol=0.02 * np.max(np.abs(expected)))
     assert abs(moved[-1]) < 0.03 or order == 1
     memory.effects[CORRECTED], memory.sample[0].typical_error = 1.0, 0.01
+    memory.sample[0].taking_back = 1.0
     assert bounds(design, memory) == pytest.approx((-0.012, -0.012))
+    memory.sample[0].taking_back = 0.0
+    assert bounds(design, memory) == (0.0, 0.0)
 
 
 def test_what_was_done_is_taken_back_without_swinging_where_the_bound_is_small() -> None:
@@ -250,7 +253,7 @@ def test_what_was_done_is_taken_back_without_swinging_where_the_bound_is_small()
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=20.0, dt=5e-3)
     design = ql.Guard().design(observer, np.array([1.0, 4.0, 6.0, 4.0]))  # omega_c = 1
     memory = ql.Guard().memory(design)
-    memory.sample[0].typical_error = 0.5
+    memory.sample[0].typical_error, memory.sample[0].taking_back = 0.5, 6000.0
     memory.effects[CORRECTED] = start = 0.15
     moved = []
     for _ in range(6000):
@@ -335,3 +338,18 @@ def test_mistakes_are_named(make: object, message: str) -> None:
     """Argument, value, rule."""
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_the_loop_s_response_has_as_many_poles_as_the_relative_degree() -> None:
+    """ω_c is that of the law, whose gains beyond it are zero, and the geometric mean of other poles; there is nothing to take back where the plant has zeros."""
+    plant = ([1.0, 30.0, 900.0], [1.0, 2.0, 40.0, 10.0, 0.0])
+    zeros = ql.ESO.model_based(plant, 40.0, 1e-3)
+    chain = ql.ESO.model_free(2, 1.0, 40.0, 1e-3)
+    for observer, takes_back in ((zeros, False), (chain, True)):
+        for options, omega_c in (({}, 5.0), ({"half_gain": True}, 5.0 / math.sqrt(2.0))):
+            learner = ql.learners.Kalman()
+            loop = ql.ADRC(observer, 5.0, learner=learner, guard=ql.Guard(), **options)
+            design = loop.parameters.guard
+            assert design.stages == 2
+            assert design.respond == pytest.approx(-math.expm1(-omega_c * 1e-3))
+            assert (design.taking_back > 0.0) == takes_back

@@ -169,7 +169,7 @@ def test_who_has_added_a_hundredth_to_the_squared_error_begins_anew_and_may_with
 
 
 def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
-    """M, S, C, J, A, P, o, c_L and e by the module's equations, with outliers and small samples."""
+    """M, S, C, C_y, J, A, P, o, c_L and e by the module's equations, with outliers and small samples."""
     guard = ql.Guard(time=0.4)
     design, memory = guard.design(OBSERVER), guard.memory(guard.design(OBSERVER))
     forget, lag = -math.expm1(-5e-3 / 0.4), 5 / 10.0
@@ -177,7 +177,8 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
     left, s, credit, peak, e, own, f_shown = 0.0, 0.5, -1.0, 0.0, 0.0, 0.0, 0.0
     shadow, square, spared, outside = np.zeros((1, 5)), 0.0, 0, 0.0
     # Without the gains of a law, y is taken to respond as f̂ does, within four lags.
-    respond, stages, missed, gained = -math.expm1(-5e-3 / lag), np.zeros((2, 4)), 0.0, 0.0
+    respond, stages, missed, gained = -math.expm1(-5e-3 / lag), np.zeros((3, 4)), 0.0, 0.0
+    at_y, seen, paid = -1.0, 0.0, 0
     begun_anew, late, account = 0, 0.0, 5e-3 / (300.0 * lag)
     newest, match, quick = np.zeros(2), -math.expm1(-5e-3 / 0.04), 0
     disturbance, said = np.zeros((1, 5)), 0.0
@@ -200,7 +201,8 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         more = rise * (large - most_own - outside)
         outside = min(outside + max(more, 0.0), peak)
         e = min(e, peak, 2.5 * outside)
-        credit -= 0.35 * (e / before - 1.0) if acts and e > before else 0.0
+        cost = 0.35 * (e / before - 1.0) if acts and e > before else 0.0
+        credit, at_y = credit - cost, at_y - cost
         more = forget * ((q - p) ** 2 - left)
         left += more if (k + 1) * forget < 1.0 else min(more, rise * left)
         s += forget * min(1.0, (q * q + p * p) / (0.4 * peak) ** 2) * (p * p / (q * q + p * p) - s)
@@ -212,20 +214,29 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         matching = max(1.0 - newest[1] / newest[0] / 0.35, 0.0)
         quick += earned > 0.0 and matching > 0.0
         earned *= 1.0 + 7.0 * matching if earned > 0.0 else 1.0
-        credit = np.clip(credit + 5e-3 / (0.4 * 2.0 / 3.0) * max(earned, -3.0), -1.0, 1.0)
+        earn = 5e-3 / (0.4 * 2.0 / 3.0)
+        credit = np.clip(credit + earn * max(earned, -3.0), -1.0, 1.0)
         for i in range(4):
             stages[0, i] += respond * (q - stages[0, i])
-            q = stages[0, i]
+            stages[2, i] += respond * (bounded - stages[2, i])
+            q, bounded = stages[0, i], stages[2, i]
+        more = forget * (q * q - seen)
+        seen += more if (k + 1) * forget < 1.0 else min(more, rise * seen)
+        earned_at_y = (2.0 * q * bounded - bounded**2) / max(q * q, 4.0 * seen)
+        at_y = np.clip(at_y + earn * max(earned_at_y, -3.0), -1.0, 1.0)
+        if newest[1] > newest[0] and earned < 0.0:
+            at_y, paid = max(at_y + earn * max(earned, -3.0), -1.0), paid + 1
         more, is_new = account * (q * q - missed), (k + 1) * forget < 1.0
         if is_new or more <= rise * missed:
             gained += account * (2.0 * q * late - 1.5 * late**2 - gained)
         missed += more if is_new else min(more, rise * missed)
         missed = min(missed, 1e4 * square)
         gained = min(max(gained, -0.02 * missed), missed)
-        credit = -1.0 if gained < -0.01 * missed else credit
+        credit, at_y = (-1.0, -1.0) if gained < -0.01 * missed else (credit, at_y)
         begun_anew += gained < -0.01 * missed
         if k % 100 == 99:
             credit = memory.sample[0].credit = 1.0
+            at_y = memory.sample[0].credit_at_y = 0.5
         if k == 700:
             gained = memory.averages[0].gained = -0.015 * missed
         sample, averages = memory.sample[0], memory.averages[0]
@@ -233,6 +244,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
             [sample.peak, sample.typical_error, sample.credit], [peak, e, credit], rtol=1e-9
         )
         np.testing.assert_allclose([averages.missed, averages.gained], [missed, gained], rtol=1e-6)
+        assert sample.credit_at_y == pytest.approx(at_y, rel=1e-6, abs=1e-9)
         assert averages.loudness == pytest.approx(s, rel=1e-9)
         assert averages.square == pytest.approx(square, rel=1e-9)
         assert averages.square_left == pytest.approx(left, rel=1e-9)
@@ -249,6 +261,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         f_shown = lag_push(design.lag, shadow, 0, f_learned)
     assert spared > 5, "the learner's own share never counted: the test says nothing"
     assert begun_anew > 5, "the account never ran out: the test says nothing"
+    assert paid > 5, "nothing was added to q: the test says nothing"
     assert quick > 5, "nothing was ever explained: the test says nothing"
 
 
@@ -288,3 +301,16 @@ def test_a_learner_that_adds_to_slow_errors_is_hardly_heard_however_well_it_expl
         memory = guard.memory(design)
         authority = np.mean(feed(design, memory, quick + load, quick + sign * load)[2_500:])
         assert authority > 0.99 if heard else authority < 0.05
+
+
+def test_a_learner_is_heard_in_noise_that_y_hardly_shows(rng: np.random.Generator) -> None:
+    """The disturbance has noise of a measurement, differentiated; q is noise, ℓ q is the load, which the learner knows, and C_y alone gives it authority."""
+    design = ql.Guard().design(OBSERVER)
+    memory = ql.Guard().memory(design)
+    load = np.sin(0.6 * 5e-3 * np.arange(30_000))
+    # In q more than the load, in ℓ q little.
+    pushes = 1000.0 * rng.normal(size=30_001)
+    authority = feed(design, memory, load + np.diff(pushes), load)
+    assert memory.sample[0].credit < 0.0
+    assert memory.sample[0].credit_at_y > 0.5
+    assert np.mean(authority) > 0.7

@@ -54,7 +54,9 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     sample.outside = min(sample.outside + max(more, 0.0), sample.peak)
     grown = min(grown, sample.peak, _OWN_GROWTH * sample.outside)
     if learner_acts and grown > size:
-        sample.credit -= _GROWTH_COST * (grown - size) / size
+        cost = _GROWTH_COST * (grown - size) / size
+        sample.credit -= cost
+        sample.credit_at_y -= cost
     sample.typical_error = max(grown, tiny(guard))
 
 
@@ -63,7 +65,7 @@ def bounds_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[
     """Return the least and the largest e_L; ``removed`` is R."""
     sample = memory.sample[0]
     if sample.authority == 0.0:
-        closing = _closing(guard, memory)
+        closing = _closing(guard, memory) if sample.taking_back > 0.0 else 0.0
         return closing, closing
     left = newest_share(guard, memory)
     proven = min(max(removed / _PROVEN, 0.0), 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from quell.guard.reason import Reason
-from quell.guard.state import MISSED, GuardDesign, GuardMemory, tiny
+from quell.guard.state import EXPLAINED, MISSED, GuardDesign, GuardMemory, tiny
 from quell.kernels.dispatch import kernel
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
@@ -57,12 +57,28 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
     averages.newest_left += rate * (left - averages.newest_left)
     most = guard.usual_bound * sample.typical_error
     bounded = min(max(p, -most), most)
+    share = newest_share(guard, memory)
     earned = _earned(q, bounded, averages.square, tiny(guard))
     if earned > 0.0:
-        matching = max(1.0 - newest_share(guard, memory) / _MATCHING, 0.0)
-        earned *= 1.0 + (_QUICK - 1.0) * matching
+        earned *= 1.0 + (_QUICK - 1.0) * max(1.0 - share / _MATCHING, 0.0)
     sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
-    _keep_account(guard, memory, respond(guard, memory, MISSED, q), is_new)
+    missed = respond(guard, memory, MISSED, q)
+    _earn_at_y(guard, memory, missed, respond(guard, memory, EXPLAINED, bounded), is_new)
+    if share > 1.0:
+        # The learner adds to q: what y shows late, q shows at once.
+        sample.credit_at_y = max(sample.credit_at_y + guard.earn * min(earned, 0.0), -1.0)
+    _keep_account(guard, memory, missed, is_new)
+
+
+@kernel
+def _earn_at_y(
+    guard: GuardDesign, memory: GuardMemory, missed: float, explained: float, is_new: bool
+) -> None:
+    """Update the credit C_y with ℓ q and ℓ p̄: as C, but noise of y has little weight in it."""
+    averages, sample = memory.averages[0], memory.sample[0]
+    averages.seen = _mean_square(guard, averages.seen, missed * missed, guard.forget, is_new)
+    earned = _earned(missed, explained, averages.seen, tiny(guard))
+    sample.credit_at_y = min(max(sample.credit_at_y + guard.earn * earned, -1.0), 1.0)
 
 
 @kernel
@@ -79,7 +95,7 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new
     gain = averages.gained + (0.0 if is_burst else rate * (gain - averages.gained))
     averages.gained = min(max(gain, -_LARGEST_DEBT * allowed), averages.missed)
     if averages.gained < -allowed:
-        memory.sample[0].credit = -1.0
+        memory.sample[0].credit = memory.sample[0].credit_at_y = -1.0
 
 
 @kernel
@@ -137,7 +153,7 @@ def _is_own_doing(guard: GuardDesign, memory: GuardMemory) -> bool:
 def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[float, int]:
     """Return β and the reason for it; ``removed`` is R."""
     loudness, sample = memory.averages[0].loudness, memory.sample[0]
-    earned = min(sample.credit / _FULL_CREDIT, 1.0 + removed / _LOAN)
+    earned = min(max(sample.credit, sample.credit_at_y) / _FULL_CREDIT, 1.0 + removed / _LOAN)
     if earned <= 0.0:
         return 0.0, _UNPROVEN
     if _is_own_doing(guard, memory):
@@ -151,5 +167,5 @@ def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tup
 @kernel
 def withdraw_authority(memory: GuardMemory) -> None:
     """Set the credit of a learner that has yet to prove itself, and the loudness of one like f."""
-    memory.sample[0].credit = -1.0
+    memory.sample[0].credit = memory.sample[0].credit_at_y = -1.0
     memory.averages[0].loudness = 0.5

@@ -45,6 +45,8 @@ _MATCH_TIME = 0.1
 _USUAL_BOUND = 1.2
 # After a learner has lost its authority, what it has done to y is taken back in this time.
 _CLOSING_LAGS = 2.0 / 3.0
+# It is taken back for at most so long: from then on a learner without authority moves nothing.
+_TAKING_BACK_LAGS = 10.0
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
 
@@ -109,17 +111,19 @@ class Guard:
             """Return the share of its distance that a first-order lag covers in a sample."""
             return -math.expm1(-dt / (lags * lag_time))
 
-        # The law's gains are those of its poles; without a law y is taken to be as slow as f̂.
-        order = observer.order if law is None else len(law)
-        omega_c = 1.0 / lag_time if law is None else float(law[0]) ** (1.0 / order)
+        # y responds to f with the law's poles, as many as the relative degree: of a plant with
+        # zeros the other gains are zero. Without a law y is taken to be as slow as f̂.
+        degree = observer.degree
+        omega_c = 1.0 / lag_time if law is None else float(law[0]) ** (1.0 / degree)
         lag, invertible = lag_of(observer), is_invertible(observer)
         return GuardDesign(
             lag=lag,
             forget=-math.expm1(-dt / time),
             earn=dt / (_CREDIT_TIME * time),
-            stages=order,
+            stages=degree,
             respond=-math.expm1(-omega_c * dt),
             closing=share(_CLOSING_LAGS),
+            taking_back=_TAKING_BACK_LAGS * lag_time / dt if degree == observer.order else 0.0,
             forget_account=dt / (_ACCOUNT_LAGS * lag_time),
             forget_match=-math.expm1(-dt / (_MATCH_TIME * time)),
             rise=share(_RISE_LAGS),
@@ -144,7 +148,7 @@ class Guard:
         """Return the state before the first sample, without authority."""
         fed = lag_memory(parameters.fed_lag, 0 if parameters.invertible else 1)
         filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
-        effects = np.zeros((2, parameters.stages))
+        effects = np.zeros((3, parameters.stages))
         memory = GuardMemory(*filters, effects, GuardAverages.zeros(), GuardSample.zeros())
         withdraw_authority(memory)
         return memory

@@ -31,24 +31,31 @@ whether the motion goes on: with M, the mean of q² (below), and M_left, that of
     β = 0  from  M > (2 o)² and M_left > 0.05 (2 o)²  on, until  M < (1.3 o)²
 
 Without authority λ is that of one lag, so o soon follows |q| if the error was not the learner's; if
-it was, M decays. Only for n ≤ 3: of higher order, what a gap in e_L does to y is worse.
+it was, M decays. Only for r ≤ 3: of higher order, what a gap in e_L does to y is worse.
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
 raise slowly:
 
     p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
-    β = min( clip(2 C, 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
+    β = min( clip(2 max(C, C_y), 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
 
-C starts at −1. A learner that explains q nearly completely earns up to eight times as much: 1 + 7
-clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below); a jump of f
-is seen in q for two lags only. S, the mean share of p² in p² + q² over T, scales down an output
-that is larger than what it explains.
+q is an n-th derivative of y, and mostly noise where y has some. C_y is such a credit at y, of ℓ q
+and ℓ p̄ in place of q and p̄ (ℓ: account, below), without the eight times: ℓ q changes so slowly
+that a close match over 1.5 lags is no evidence. y shows late what q shows at once, so C_y pays what
+C pays while ε > 1, that is, while the learner adds to q. Both pay for growth of e, and both are −1
+while R < −0.01.
+
+C and C_y start at −1. For C, a learner that explains q nearly completely earns up to eight times as
+much: 1 + 7 clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below);
+a jump of f is seen in q for two lags only. S, the mean share of p² in p² + q² over T, scales down
+an output that is larger than what it explains.
 
 **Account.** Credit is soon forgotten: a learner can earn it in twenty lags and spend it in ten,
 again and again. And y is q through n integrations: a learner that explains quick changes of f and
 adds to slow ones earns credit and harms y. So an account over 300 lags compares what its
-corrections did to y with what was missed there, with ``ℓ = (ω_c/(s + ω_c))^n``, as y responds to f:
+corrections did to y with what was missed there, with ``ℓ = (ω_c/(s + ω_c))^r``, as y responds to f.
+r is the relative degree of the plant, n where it has no zeros, and ω_c^r the first gain of the law:
 
     J ← J + ((ℓ q)² − J) dt/300 lags,
     A ← clip( A + (2 ℓq d − 1.5 d² − A) dt/300 lags,  −0.02 J, J )
@@ -92,14 +99,15 @@ what is constant in e_L. At β = 1 it comes nearer by 0.05/30 lags at least, so 
 The constant part of f_L is free. A target that is more than 1000 e from β̄g approaches it by e in
 1000 lags, so that rounding errors stay small.
 
-**Without authority** what earlier corrections have done to y is taken back. With the stages x_i of
-ℓ e_L, x_1 the first,
+**Without authority** what earlier corrections have done to y is taken back, for ten lags at most;
+from then on e_L = 0. With the stages x_i of ℓ e_L, x_1 the first,
 
-    e_L = clip( −Σ_i C(n, i) (r − 1)^i x_i, ±κ_0 e ),        r ω_c = 1.5/lag
+    e_L = clip( −Σ_i C(n, i) (a − 1)^i x_i, ±κ_0 e ),        a ω_c = 1.5/lag
 
-places the n poles of ℓ e_L, which are at −ω_c, at −r ω_c, so that it decays within some lags. Where
-that asks for more than 4 κ_0 e, r is smaller: a chain of four lags that is pushed to and fro with
-all of κ_0 e swings for a hundred lags. A learner that never had authority has e_L = 0.
+places the n poles of ℓ e_L, which are at −ω_c, at −a ω_c, so that it decays within some lags. Where
+that asks for more than 4 κ_0 e, a is smaller: a chain of four lags that is pushed to and fro with
+all of κ_0 e swings for a hundred lags. A plant with zeros responds to e_L otherwise, in ways that ℓ
+does not have: nothing is taken back there. A learner that never had authority has e_L = 0.
 
 For observers with which that recursion is unstable (``correction.is_invertible``), F is here the
 filter of a chain of integrators with the same omega_o; for them nothing is certified.
@@ -257,6 +265,7 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
     decay = guard.own_decay if sample.authority > 0.0 else 1.0 - guard.within_lag
     sample.own_peak = max(abs(correction), decay * sample.own_peak)
     if sample.authority > 0.0:
+        sample.taking_back = guard.taking_back
         more = guard.leak * (f_learned - sample.target)
         sample.target = carried_sum(guard, memory, TARGET, sample.target, more)
         distance = sample.share * sample.output - sample.target
@@ -264,6 +273,7 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
             step = copysign(guard.home * sample.typical_error, distance)
             sample.target = carried_sum(guard, memory, TARGET, sample.target, step)
     else:
+        sample.taking_back = max(sample.taking_back - 1.0, 0.0)
         sample.target = f_learned
         clear_carry(memory, TARGET)
 
@@ -286,7 +296,7 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     for i in range(memory.shown.size):
         memory.shown[i] = 0.0
     sample.output = sample.target = sample.unsettled = 0.0
-    sample.own_peak = sample.late_effect = 0.0
+    sample.own_peak = sample.late_effect = sample.taking_back = 0.0
     # The next output has none before it: it is a constant.
     sample.share = -abs(sample.share)
 

@@ -22,9 +22,10 @@ class GuardDesign(NamedTuple):
     lag: Any  # lag filter of the observer
     forget: float  # dt/T
     earn: float  # dt/T_C
-    stages: Size  # n: order of ℓ
+    stages: Size  # r: order of ℓ, the relative degree
     respond: float  # share by which each of its stages follows in a sample
-    closing: float  # the same of ℓ e_L, stage by stage, without authority
+    closing: float  # the same of ℓ e_L, stage by stage, while corrections are taken back
+    taking_back: float  # samples without authority in which they are; 0 where ℓ is not the loop's
     forget_account: float  # dt/(300 lags)
     forget_match: float  # 10 dt/T
     rise: float  # share by which P and e follow a larger |q| in a sample
@@ -55,12 +56,14 @@ class GuardAverages(Scalars):
     gained: float  # A
     newest_error: float  # mean of q² over T/10 [(y-unit/s^n)²]
     newest_left: float  # the same of (q − p)²
+    seen: float  # mean of (ℓ q)² over T, as M
 
 
 class GuardSample(Scalars):
     """Values of the newest sample."""
 
     credit: float  # C
+    credit_at_y: float  # C_y
     authority: float  # β
     share: float  # β̄: β, smoothed; negative if there is no output of a sample before
     peak: float  # P [y-unit/s^n]
@@ -74,6 +77,7 @@ class GuardSample(Scalars):
     reason: float  # a Reason
     samples: float  # number of samples so far
     unsettled: float  # samples until q is right again
+    taking_back: float  # samples in which corrections are still taken back
 
 
 class GuardMemory(NamedTuple):
@@ -83,7 +87,7 @@ class GuardMemory(NamedTuple):
     fed: Matrix  # lag filter of f_L (1, …), if it is not that of the observer, else (0, …)
     # Their outputs f_plain^F, g^F, p and f_L^F (4,); in single precision carries, too (7,).
     shown: Vector
-    effects: Matrix  # ℓ q and ℓ e_L, stage by stage (2, n) [y-unit/s^n]
+    effects: Matrix  # ℓ q, ℓ e_L and ℓ p̄, stage by stage (3, r) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
 
@@ -91,7 +95,7 @@ class GuardMemory(NamedTuple):
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.shown.
 F_PLAIN, G, V, F_L = range(4)
 # Rows of GuardMemory.effects.
-MISSED, CORRECTED = range(2)
+MISSED, CORRECTED, EXPLAINED = range(3)
 # Carries of sums in single precision, the last entries of GuardMemory.shown there.
 TARGET, SHARE, PEAK = 4, 5, 6
 CARRIES = 3

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.markup import escape
 
-from quell.cli.options import OUTPUTS, Outputs, Whole
+from quell.cli.options import OUTPUTS, Outputs, Whole, WholeOrNone
 from quell.cli.output import (
     Console,
     check_outputs,
@@ -19,6 +19,9 @@ from quell.cli.output import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from quell.experiments.stress.axes import AxesResult
     from quell.experiments.stress.general.result import Bar, GeneralResult
     from quell.experiments.stress.study import Result
 
@@ -32,15 +35,20 @@ _GENERAL_HEADINGS = (
     *("RMS\n50 %", "\n99 %", "\nmost"),
     *("window\n99 %", "\nmost", "peak\n99 %", "\nmost", "worse\nby 5%"),
 )
+_AXES_HEADINGS = (
+    *("observer", "loops", "lost"),
+    *("RMS\n50 %", "\nmost", "late\n50 %", "\nmost"),
+    *("over unguarded\n50 %", "late\n50 %"),
+)
 
 
 def stress(
     *,
-    runs: Whole = 600,
+    runs: WholeOrNone = None,
     honest: Whole = 100,
     seed: Whole = 0,
     guard: bool = True,
-    loops: Literal["two-mass", "all"] = "two-mass",
+    loops: Literal["two-mass", "all", "axes"] = "two-mass",
     outputs: Outputs = OUTPUTS,
 ) -> None:
     """Test the guard: hostile learners and an honest one in random loops, each beside plain MF-ESO.
@@ -48,7 +56,7 @@ def stress(
     Parameters
     ----------
     runs
-        How many runs with hostile learners, all kinds in turn.
+        How many runs with hostile learners, all kinds in turn; 600 by default, and none on axes.
     honest
         How many runs with the honest learner.
     seed
@@ -56,15 +64,20 @@ def stress(
     guard
         With the guard, or without it, for comparison.
     loops
-        The loops: two masses on a spring, all alike; or all kinds of plants, orders, references and
-        loads, with named cases and the bars that a guard has to meet. For these, seeds below 10000
+        The loops: two masses on a spring, all alike; all kinds of plants, orders, references and
+        loads, with named cases and the bars that a guard has to meet; or flexible axes with honest
+        learners only, in means over four draws of the noise. For the last two, seeds below 10000
         are for tuning, and seeds from 1000000 on for judging: look at each of them once.
     """
     from rich.progress import TextColumn, TimeRemainingColumn
 
-    from quell.experiments.stress import figures, study
+    from quell.experiments.stress import axes, figures, study
     from quell.experiments.stress.general import study as general
     from quell.guard import Guard
+
+    if loops == "axes" and runs:
+        raise ValueError(f"runs = {runs}: the trial on axes has no hostile learners; leave it out")
+    hostile = 600 if runs is None else runs
 
     outputs = check_outputs(outputs, ["stress"])
     console = Console()
@@ -73,9 +86,14 @@ def stress(
     columns = (TextColumn("{task.percentage:>3.0f} %"), TimeRemainingColumn())
     with progress_bar(console, first, *columns) as report:
         used, progress = Guard() if guard else None, partial(report, "simulating")
-        trial: Any = study if loops == "two-mass" else general
-        result = trial.run(runs, honest, seed, guard=used, progress=progress)
-    (_print if loops == "two-mass" else _print_general)(console, result, guard)
+        result: Any
+        if loops == "axes":
+            result = axes.run(honest, seed, guard=used, progress=progress)
+        else:
+            trial: Any = study if loops == "two-mass" else general
+            result = trial.run(hostile, honest, seed, guard=used, progress=progress)
+    printed: dict[str, Any] = {"two-mass": _print, "all": _print_general, "axes": _print_axes}
+    printed[loops](console, result, guard)
     paths = figures.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
     write_results(console, result.to_json(), outputs, paths)
 
@@ -138,11 +156,7 @@ def _print_general(console: Console, result: GeneralResult, guarded: bool) -> No
         worse = number(found["worse"], ".3f")
         rows.add_row(escape(label), str(found["runs"]), lost, *cells, worse)
     console.print(rows)
-    bars = table("Bars", "over", "measure", "figure", "bar", "met", "other\nnoise", left=2)
-    for bar in result.bars():
-        cells = [_figure(bar), f"{bar.bar:g}", yes_or_no(bar.met), number(bar.other_noise, ".4g")]
-        bars.add_row(escape(bar.over), escape(bar.measure), *cells)
-    console.print(bars)
+    _print_bars(console, result.bars())
     why = result.left_out
     console.print(
         "Other noise: MF-ESO itself, with another draw of the same noise, over MF-ESO: what chance "
@@ -150,4 +164,37 @@ def _print_general(console: Console, result: GeneralResult, guarded: bool) -> No
         f"Not counted: {why['low_margin']} runs with a lower margin, {why['plain_lost']} in which "
         f"MF-ESO is lost, {why['fragile']} in which it hardly holds within the limits of u; "
         f"{why['lost']} of these are lost.\n"
+    )
+
+
+def _print_bars(console: Console, found: Sequence[Bar]) -> None:
+    bars = table("Bars", "over", "measure", "figure", "bar", "met", "other\nnoise", left=2)
+    for bar in found:
+        cells = [_figure(bar), f"{bar.bar:g}", yes_or_no(bar.met), number(bar.other_noise, ".4g")]
+        bars.add_row(escape(bar.over), escape(bar.measure), *cells)
+    console.print(bars)
+
+
+def _print_axes(console: Console, result: AxesResult, guarded: bool) -> None:
+    from quell.experiments.stress.axes.trial import DRAWS, summary
+
+    how = "with guard" if guarded else "WITHOUT guard"
+    title = f"RMS error over that without learner on the same flexible axis, {how}"
+    rows = table(title, *_AXES_HEADINGS, padding=(0, 1, 0, 0), pad_edge=False)
+    names = dict.fromkeys(o.structure for o in result.outcomes)
+    groups = {name: [o for o in result.outcomes if o.structure == name] for name in names}
+    for label, outcomes in {**groups, "all": result.outcomes}.items():
+        if label == "all":
+            rows.add_section()
+        found = summary(outcomes)
+        keys = [(name, key) for name in ("rms", "late") for key in ("median", "max")]
+        keys += [(f"{name}_over_unguarded", "median") for name in ("rms", "late")]
+        lost = f"[red]{found['lost']}[/]" if found["lost"] else "0"
+        cells = [number(found[name][key], ".3f") for name, key in keys]
+        rows.add_row(escape(label), str(found["loops"]), lost, *cells)
+    console.print(rows)
+    _print_bars(console, result.bars())
+    console.print(
+        f"Means over {DRAWS} draws of the noise. Other noise: the loop without learner with other "
+        "draws, over that loop.\n"
     )

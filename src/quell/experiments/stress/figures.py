@@ -11,28 +11,38 @@ from typing import Any
 import numpy as np
 
 from quell.experiments.common.figures import save_figures
+from quell.experiments.stress.axes import AxesResult
 from quell.experiments.stress.general.result import GeneralResult
 from quell.experiments.stress.general.trial import HONEST as HONEST_LEARNERS
 from quell.experiments.stress.study import HONEST, Result
 from quell.records.plotting import grid_of_axes, new_figure
 
 _PANELS = {"ratio": "whole run", "load_ratio": "60 s of load"}
+_AXES_PANELS = {"rms": "whole time of load", "late": "its second half"}
 _GENERAL_PANELS = {"rms": "whole run", "window": "worst window", "peak": "largest error"}
 
 
-def draw(result: Result | GeneralResult, ax: Any = None) -> Any:
+def draw(result: Result | GeneralResult | AxesResult, ax: Any = None) -> Any:
     """Draw for each kind of learner the share of runs whose ratio is below x; return the axes.
+
+    For the trial on flexible axes it is each kind of observer.
 
     Parameters
     ----------
     result
-        of ``run``, or of the trial in general loops.
+        of ``run``, or of the trial in general loops or on flexible axes.
     ax
         axes to draw into, two, or three for general loops; those of a new figure by default.
     """
     if isinstance(result, Result):
         groups: Mapping[str, Sequence[Any]] = {kind: result.of(kind) for kind in result.kinds}
         return _draw(groups, _PANELS, "RMS error over that of MF-ESO", (HONEST,), ax)
+    if isinstance(result, AxesResult):
+        names = dict.fromkeys(o.structure for o in result.outcomes)
+        found = {
+            name: [o.guarded for o in result.outcomes if o.structure == name] for name in names
+        }
+        return _draw(found, _AXES_PANELS, "RMS error over that without learner", (), ax)
     groups = result.grouped(result.healthy, "kind")
     return _draw(groups, _GENERAL_PANELS, "over that of MF-ESO", HONEST_LEARNERS, ax)
 
@@ -64,7 +74,9 @@ def _draw(
 
 
 def save(
-    result: Result | GeneralResult, folder: str | os.PathLike[str], overwrite: bool = False
+    result: Result | GeneralResult | AxesResult,
+    folder: str | os.PathLike[str],
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write the figure into ``folder``, created if missing; return the paths."""
     return save_figures({"stress": partial(draw, result)}, folder, overwrite=overwrite)

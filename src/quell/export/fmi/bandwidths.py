@@ -2,7 +2,7 @@
 
 *omega_c*: ``k_i = w_i omega_c^(m−i+1)`` with the binomial coefficients, or those of a pattern of
 poles, as w (``controllers/adrc/law.py``), and the factor ``exp(−omega_c dt)`` of the offset after a
-bumpless transfer. A guard takes the gains for poles at ``ω_g = k_1^(1/n)``, and has the parameter
+bumpless transfer. A guard takes the m gains for poles at ``ω_g = k_1^(1/m)``, and has the parameter
 ``respond = 1 − exp(−ω_g dt)`` (``guard/guard.py``).
 
 *omega_o*: Ackermann's formula (``observers/placement.py``) with N equal poles ``1 − ω``,
@@ -45,7 +45,7 @@ class Bandwidths(NamedTuple):
     dt: float
     omega_c: float
     weights: Vector | None  # w (m,)
-    guard: int | None  # n of its ω_g
+    guard: int | None  # m of its ω_g
     omega_o: float
     coefficients: Matrix | None  # of ω^k in L (N, N + 1)
 
@@ -74,8 +74,8 @@ def _learns(controller: ADRC) -> bool:
 
 
 def _guard_order(controller: ADRC) -> int | None:
-    design = controller.parameters
-    return int(design.law.size) if isinstance(design.guard, GuardDesign) else None
+    has_guard = isinstance(controller.parameters.guard, GuardDesign)
+    return controller.observer.degree if has_guard else None
 
 
 def _weights(controller: ADRC, guard: int | None) -> Vector | None:

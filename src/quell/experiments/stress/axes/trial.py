@@ -1,0 +1,192 @@
+"""The trial on flexible axes: honest learners beside no learner, in means over draws of the noise.
+
+The error is y, as the reference is zero. Measures are the RMS errors from the start of the load on,
+and of the second half of that time (*late*), each the mean over ``DRAWS`` draws of the noise, which
+are the same with and without learner. *Chance* is the loop without learner and other draws of the
+noise, over the loop without learner.
+
+Every loop has ``Harmonic()`` or ``Kalman()`` in turn. A run is *lost* if it diverges or leaves
+|y| = 100 rad where the loop without learner does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell.experiments.common.scores import quantiles
+from quell.experiments.stress.axes import loops
+from quell.experiments.stress.axes.loops import Axis, draw_axis
+from quell.experiments.stress.general.result import Bar
+from quell.experiments.stress.general.trial import HONEST
+from quell.experiments.stress.study import check_numbers
+from quell.files import nonfinite_to_none
+from quell.guard import Guard
+from quell.learners import Learner
+from quell.parallel import in_parallel
+from quell.simulation.simulate import simulate
+
+DRAWS = 4
+"""Draws of the noise over which the errors of a loop are averaged."""
+_LIMIT = 100.0  # |y| beyond which a run counts as lost [rad]
+_WORST_LISTED = 10
+
+
+class AxisErrors(NamedTuple):
+    """RMS errors, means over the draws of the noise; infinite if one of the runs is lost."""
+
+    rms: float  #: from the start of the load on
+    late: float  #: of the second half of that time
+
+    def over(self, other: AxisErrors) -> AxisErrors:
+        """Return the ratios to those of another loop."""
+        return AxisErrors(*(a / b for a, b in zip(self, other, strict=True)))
+
+
+@dataclass(frozen=True)
+class AxisOutcome:
+    """The ratios of one loop."""
+
+    learner: str
+    loop: str
+    structure: str
+    sensor: str
+    guarded: AxisErrors  #: over no learner
+    unguarded: AxisErrors  #: over no learner
+    chance: AxisErrors  #: no learner with other draws of the noise, over no learner
+
+    @property
+    def lost(self) -> bool:
+        """Whether the guarded loop is lost."""
+        return math.isinf(self.guarded.rms)
+
+    @property
+    def over_unguarded(self) -> AxisErrors:
+        """The guarded loop over the unguarded one; zero where that is lost."""
+        return self.guarded.over(self.unguarded)
+
+
+@dataclass(frozen=True)
+class AxesResult:
+    """All loops of the trial."""
+
+    settings: dict[str, Any]
+    outcomes: Sequence[AxisOutcome]
+
+    def bars(self) -> list[Bar]:
+        """Return the figures that have a bar."""
+        found, chance = summary(self.outcomes), _chance(self.outcomes)
+        if not self.outcomes:
+            return []
+        over_none = "guarded over no learner, largest"
+        over_unguarded = "guarded over unguarded, median"
+        rows = [
+            Bar("all", "lost", found["lost"], 0.0),
+            Bar("RMS", over_none, found["rms"]["max"], 1.02, chance["rms"]["max"]),
+            Bar("late", over_none, found["late"]["max"], 1.02, chance["late"]["max"]),
+        ]
+        for name in ("rms", "late"):
+            median = found[f"{name}_over_unguarded"]["median"]
+            rows.append(Bar("RMS" if name == "rms" else name, over_unguarded, median, 1.15))
+        return rows
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dictionaries and lists for ``json.dump``."""
+        worst = sorted(self.outcomes, key=lambda o: -o.guarded.rms)[:_WORST_LISTED]
+        names = dict.fromkeys(o.structure for o in self.outcomes)
+        return {
+            "settings": self.settings,
+            "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
+            "all": summary(self.outcomes),
+            "chance": _chance(self.outcomes),
+            "structures": {
+                name: summary([o for o in self.outcomes if o.structure == name]) for name in names
+            },
+            "worst": [_to_json(outcome) for outcome in worst],
+        }
+
+
+def summary(outcomes: Sequence[AxisOutcome]) -> dict[str, Any]:
+    """Return counts, and quantiles of the ratios; None for those of no numbers."""
+    found: dict[str, Any] = {"loops": len(outcomes), "lost": sum(o.lost for o in outcomes)}
+    for name in AxisErrors._fields:
+        found[name] = quantiles(getattr(o.guarded, name) for o in outcomes)
+        over_unguarded = (getattr(o.over_unguarded, name) for o in outcomes)
+        found[f"{name}_over_unguarded"] = quantiles(over_unguarded)
+    return found
+
+
+def _chance(outcomes: Sequence[AxisOutcome]) -> dict[str, Any]:
+    return {
+        name: quantiles(getattr(o.chance, name) for o in outcomes) for name in AxisErrors._fields
+    }
+
+
+def _to_json(outcome: AxisOutcome) -> dict[str, Any]:
+    found = asdict(outcome)
+    for name in ("guarded", "unguarded", "chance"):
+        found[name] = nonfinite_to_none(getattr(outcome, name)._asdict())
+    return found
+
+
+def run(
+    count: int,
+    seed: int,
+    *,
+    guard: Guard | None,
+    progress: Callable[[float], None] | None = None,
+) -> AxesResult:
+    """Run the trial in ``count`` loops, with the guard or without (None).
+
+    Seeds below 10 000 are for tuning, from 1 000 000 on for judging. ``progress`` is called with
+    the finished share.
+    """
+    check_numbers(0, count, seed)
+    jobs = [partial(run_one, seed, i, guard) for i in range(count)]
+    settings = {
+        "honest": count,
+        "seed": seed,
+        "guard": None if guard is None else asdict(guard),
+        "learners": {name: repr(learner) for name, learner in HONEST.items()},
+        "loops": loops.__doc__,
+        "ratios": __doc__,
+    }
+    return AxesResult(settings, in_parallel(jobs, progress))
+
+
+def run_one(seed: int, index: int, guard: Guard | None) -> AxisOutcome:
+    """Run the loop with this number."""
+    axis = draw_axis(np.random.default_rng([seed, index]))
+    kind = list(HONEST)[index % len(HONEST)]
+    plain = errors(axis, None, None)
+    unguarded = errors(axis, HONEST[kind], None).over(plain)
+    guarded = unguarded
+    if guard is not None:
+        guarded = errors(axis, HONEST[kind], guard).over(plain)
+    return AxisOutcome(
+        learner=kind,
+        loop=axis.describe(),
+        structure=axis.structure,
+        sensor=axis.sensor,
+        guarded=guarded,
+        unguarded=unguarded,
+        chance=errors(axis, None, None, first=DRAWS).over(plain),
+    )
+
+
+def errors(axis: Axis, learner: Learner | None, guard: Guard | None, first: int = 0) -> AxisErrors:
+    """Return the errors of a loop, over draws of the noise from number ``first`` on."""
+    controller, found = axis.controller(learner, guard), []
+    for draw in range(first, first + DRAWS):
+        run = simulate(axis.plant, controller, axis.scenario(draw), limit=_LIMIT)
+        if run.diverged:
+            return AxisErrors(math.inf, math.inf)
+        square = run["y"][run.t >= axis.load_at] ** 2
+        late = square[square.size // 2 :]
+        found.append([math.sqrt(np.mean(square)), math.sqrt(np.mean(late))])
+    return AxisErrors(*np.mean(found, axis=0).tolist())
