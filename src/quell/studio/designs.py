@@ -28,7 +28,6 @@ from quell.studio.runs import (
 from quell.tuning import Constraints, tune
 from quell.tuning.designs import SIMPLEST
 from quell.tuning.structures.registry import FEEDING_FORWARD
-from quell.tuning.tune import COMPARED
 
 # Structures that a page may ask for, and the bounds of M_s in the trade-off. Chosen by hand.
 STRUCTURES = (
@@ -69,7 +68,7 @@ def tuned_frames(
     options: dict[str, Any] = {"delay": delay, "progress": stoppable(report, stale)}
     limits = _limits(setup)
     first: dict[str, Any] = {"structure": structure, "constraints": bounds, **limits}
-    first["compare"] = COMPARED if structure == SIMPLEST else ()
+    first["compare"] = None if structure == SIMPLEST else ()
     given = getattr(without_prefilters(setup.controller), "feedforward", False)
     if structure in (SIMPLEST, *FEEDING_FORWARD):
         first["feedforward"] = given

@@ -38,13 +38,14 @@ from quell.tuning.result.scenario import (
     windows_of,
 )
 from quell.tuning.result.setup_file import plant_table
-from quell.tuning.structures.registry import FEEDING_FORWARD, STRUCTURES
+from quell.tuning.structures.p_pi import resonances
+from quell.tuning.structures.registry import CASCADE, FEEDING_FORWARD, STRUCTURES
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Check, Uncertain, checked
 from quell.types import Progress, Vector
 
 COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "freed", "model-based")
-"""The structures that a result is compared with by default."""
+"""The structures that a result is compared with by default; and the cascade at a resonance."""
 # Names of the limits of a controller.
 _LIMITS = ("u_min", "u_max", "rate_limit")
 
@@ -57,7 +58,7 @@ def tune(
     order: int | None = None,
     objective: Any = "load-iae",
     constraints: Constraints | None = None,
-    compare: Sequence[str] = COMPARED,
+    compare: Sequence[str] | None = None,
     reference: Any = None,
     duration: float | None = None,
     load: float = 1.0,
@@ -105,7 +106,8 @@ def tune(
         the bounds; by default M_s = M_t = 1.6, and one for what noise does to u, which follows from
         the noise of y and the limits of u where they are given (``Constraints``).
     compare
-        names of other structures.
+        names of other structures; by default ``COMPARED``, and ``"p-pi-notch"`` for a plant with a
+        resonance. An empty list for none.
     reference, duration
         signal for ``"tracking"`` and the limits of u, and how long it is followed [s].
     load
@@ -213,6 +215,8 @@ def tune(
     late = float(np.ravel(delay)[0]) + actuator_lag
     known = as_list(plant)[0] if operating_point is None else given.linear[0]
     forward = _by_model(feedforward, known, late)
+    if compare is None:
+        compare = (*COMPARED, CASCADE) if resonances(model) else COMPARED
     names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
     if forward is not None:
         asked = names if structure == SIMPLEST else [structure]
@@ -266,9 +270,9 @@ def _by_model(feedforward: bool | Feedforward, plant: Any, late: float) -> Feedf
     return replace(found, delay=late) if late > 0.0 else found
 
 
-def _check_names(structure: str, compare: Sequence[str], objective: str) -> None:
+def _check_names(structure: str, compare: Sequence[str] | None, objective: str) -> None:
     checks.one_of("structure", structure, (SIMPLEST, *STRUCTURES))
-    for name in compare:
+    for name in compare or ():
         checks.one_of("compare", name, STRUCTURES)
     checks.one_of("objective", objective, OBJECTIVES)
 

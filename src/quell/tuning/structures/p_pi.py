@@ -50,7 +50,7 @@ class CascadeStructure:
         self._shortest = dt / model.constraints.omega_o_dt
         K = unit / model.gain
         top = _BELOW * math.pi / dt
-        self._centres = [w for w in _resonances(model) if w < top][:_MOST]
+        self._centres = [w for w in resonances(model) if w < top][:_MOST]
         self.parameters: tuple[Parameter, ...] = (
             Parameter("K_p", "u-unit/(y-unit/s)", 1e-8 * K, 1e8 * K),
             Parameter("K_v", "1/s", _TIMES[0] / unit, _TIMES[1] / unit),
@@ -144,8 +144,11 @@ class CascadeStructure:
         return {"controller": table | ({"notches": notches} if notches else {})}
 
 
-def _resonances(model: Model) -> list[float]:
-    """Return the frequencies of the plant's resonances, the lowest first [rad/s]."""
+def resonances(model: Model) -> list[float]:
+    """Return the frequencies of the plant's resonances, the lowest first [rad/s].
+
+    They are pairs of poles with a damping below 0.5.
+    """
     if model.plant is None:
         return []
     poles = np.linalg.eigvals(LinearPlant.of(model.plant).A)
