@@ -58,9 +58,12 @@ class Response:
     def __call__(self, omega: Any, dt: float) -> Complex:
         """Return the response (k,) at the frequencies ``omega`` (k,) [rad/s].
 
-        Raises ``ValueError`` at the frequency of a pole.
+        A complex frequency −j s gives the transfer function at s. Raises ``ValueError`` at the
+        frequency of a pole.
         """
-        omega = np.atleast_1d(np.asarray(omega, dtype=np.float64))
+        omega = np.atleast_1d(np.asarray(omega))
+        if omega.dtype != np.complex128:
+            omega = omega.astype(np.float64)
         count = math.ceil(omega.size * (self._system.N.size + self._steps.size) / _BLOCK)
         if count < 2:
             return self._block(omega, dt)

@@ -38,6 +38,10 @@ class Constraints:
         share of half the range of u that noise may use, as a standard deviation.
     delay_margin
         least additional dead time at which the loop becomes unstable [s].
+    damping
+        least damping of the closed loop's poles, ``−Re s/|s|``; 0.4 overshoots by 25 % alone. Poles
+        of a dead time, with a half period below it, do not count, and a flexible mode of the plant
+        keeps half of its own damping (``optimiser/damping.py``).
     u_max
         largest ``|u|`` in the responses of the objective's scenario [u-unit].
     rate_max
@@ -67,6 +71,7 @@ class Constraints:
     resolution: float | None = None
     noise_share: float = 0.02
     delay_margin: float | None = None
+    damping: float | None = 0.4
     u_max: float | None = None
     rate_max: float | None = None
     noise_over_pi: float | None = 10.0
@@ -77,6 +82,12 @@ class Constraints:
             checks.optional(checks.positive, name, getattr(self, name))
         for name in ("rate_max", "noise_over_pi", "resolution"):
             checks.optional(checks.positive, name, getattr(self, name))
+        damping = checks.optional(checks.positive, "damping", self.damping)
+        if damping is not None and damping >= 1.0:
+            raise ValueError(
+                f"damping = {self.damping!r}: must be below 1, the damping of real poles (0.4 lets "
+                "a pair overshoot by 25 %, 0.7 by 5 %)"
+            )
         checks.positive("noise_share", self.noise_share)
         checks.positive("omega_o_dt", self.omega_o_dt)
         for name in ("m_s", "m_t"):
@@ -107,6 +118,7 @@ class Constraints:
             ("M_ks ≤ {:g}", self.m_ks),
             ("std(u) ≤ {:.4g}" + f" for noise of {self.noise:.3g} in y", self.u_std),
             ("delay margin ≥ {:g} s", self.delay_margin),
+            ("damping ≥ {:g}", self.damping),
             ("|u| ≤ {:g}", self.u_max),
             ("|u'| ≤ {:g}/s", self.rate_max),
             ("|p| dt ≤ {:g} for poles of observers and filters", self.omega_o_dt),

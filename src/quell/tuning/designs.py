@@ -15,10 +15,10 @@ from quell.controllers.adrc.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.extras import extras_of
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.objectives import cost_of, load_cost, scores
+from quell.tuning.optimiser.objectives import cost_of, scores
 from quell.tuning.optimiser.problem import Extra, Problem, Solution
-from quell.tuning.optimiser.requirements import Bound, bounds_of, sizes
-from quell.tuning.optimiser.search import best_solution, search
+from quell.tuning.optimiser.requirements import KINDS, Bound, bounds_of, worst_ratio
+from quell.tuning.optimiser.search import FEW, best_solution, merit, search, solution_at
 from quell.tuning.optimiser.time_responses import Inputs, SetResponses, law_of
 from quell.tuning.result.design import Design, design_of, impossible, measured
 from quell.tuning.result.report import relative
@@ -36,8 +36,9 @@ _NEARBY_ROUNDS = 6
 _OTHER_LIMITS = (0.85, 1.2, 2.0)
 # Rounds of a search over time, from the optimum for the integral gain.
 _ROUNDS = 15
-# Shares of the M_ks of an optimum without a bound of noise, with which the search starts again.
-_LESS_NOISE = (0.3, 0.1)
+# Shares of what an optimum has, as bounds with which the search starts again, the least excess of a
+# peak over one that is shared, and the share of a limit from which on it is reached.
+_TIGHTER, _LEAST_PEAK, _REACHED = (0.4, 0.15), 0.1, 0.995
 # Plants of a set that its worst case over time is first taken from, how much worse another one must
 # be to come in, and how often: chosen by hand.
 _MEMBERS, _WORSE, _EXCHANGES = 2, 1.005, 4
@@ -87,7 +88,8 @@ class Task:
         for_cost = over if members is None else SetResponses(self.plants, self.inputs, members)
         cost = cost_of(self.objective, for_cost, self.quantile)
         extras = extras_of(self.constraints, over)
-        return Problem(self.plants, bounds_of(self.constraints), extras, self.objective, cost)
+        bounds, damping = bounds_of(self.constraints), self.constraints.damping
+        return Problem(self.plants, bounds, extras, self.objective, cost, damping)
 
     def options(self, structure: Structure) -> dict[str, Any]:
         """Return limits and feedforward of the structure's controllers."""
@@ -124,7 +126,7 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
             f"std(u): {100.0 * given.noise_share:g} % of half the range of u, {half:.4g}, for "
             f"noise of {given.noise:.3g} in y"
         )
-        return _bounded(task, u_std=given.noise_share * half), how
+        return _with(task, u_std=given.noise_share * half), how
     if given.m_ks is not None or given.noise_over_pi is None:
         return task, ""
     ratio, by_gain = given.noise_over_pi, replace(task, objective="load")
@@ -147,11 +149,12 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     if not found:
         return task, f"no bound of M_ks: no PI or PID controller meets the constraints{remedy}"
     m_ks, how = max(found)
-    return _bounded(task, m_ks=m_ks), how + remedy
+    return _with(task, m_ks=m_ks), how + remedy
 
 
-def _bounded(task: Task, **bound: float) -> Task:
-    constraints = replace(task.constraints, **bound)
+def _with(task: Task, **bounds: Any) -> Task:
+    """Return the task with other bounds."""
+    constraints = replace(task.constraints, **bounds)
     model = task.model._replace(constraints=constraints)
     return replace(task, constraints=constraints, model=model)
 
@@ -241,18 +244,20 @@ def _solutions(name: str, task: Task, solved: Mapping[str, Sequence[Solution]]) 
 def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     """Return the best solution.
 
-    What is about responses over time is slow: it comes in at the optimum for the integral gain. The
-    worst case of a set is that of few plants: those that are the worst at the optima so far.
+    What is about responses over time is slow: it comes in at optima for the integral gain, the best
+    one of them and of ``known``. The worst case of a set is that of few plants: those that are the
+    worst at the optima so far.
     """
     problem = task.problem()
-    slow = [extra for extra in problem.extras if extra.over_time]
-    if problem.objective == "load" and not slow:
-        return _best_gain(problem, structure, known)
-    quick = tuple(extra for extra in problem.extras if not extra.over_time)
-    by_gain = replace(problem, objective="load", cost=load_cost, extras=quick)
-    best = _best_gain(by_gain, structure, known)
-    if best is None:
+    quick = replace(_with(task, u_max=None, rate_max=None), objective="load")
+    ends = _best_gains(quick, structure, known)
+    if not ends or (problem.objective == "load" and not _is_slow(problem)):
+        return min(ends, key=_rank, default=None)
+    tried = [solution_at(problem, structure, row) for row in (*(e.values for e in ends), *known)]
+    starts = sorted((each for each in tried if each is not None), key=_merit)
+    if not starts:
         return None
+    best = starts[0]
     if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
         return search(problem, structure, best.values, _ROUNDS)
     over, members = SetResponses(task.plants, task.inputs), list[int]()
@@ -270,8 +275,17 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     return replace(best, cost=cost)
 
 
-def _best_gain(problem: Problem, structure: Structure, known: Matrix) -> Solution | None:
-    """Return the best solution for the integral gain; if in need, from optima of other limits."""
+def _is_slow(problem: Problem) -> bool:
+    return any(extra.over_time for extra in problem.extras)
+
+
+def _merit(solution: Solution) -> float:
+    return merit(solution.cost, solution.violation)
+
+
+def _best_gains(task: Task, structure: Structure, known: Matrix) -> list[Solution]:
+    """Return optima for the integral gain; if in need, from optima of other limits."""
+    problem = task.problem()
     best = best_solution(problem, structure, known)
     for share in _OTHER_LIMITS:
         if best is not None and best.feasible:
@@ -279,31 +293,47 @@ def _best_gain(problem: Problem, structure: Structure, known: Matrix) -> Solutio
         start = best_solution(relaxed(problem, share), structure, known)
         found = None if start is None else search(problem, structure, start.values, _ROUNDS)
         best = min((each for each in (best, found) if each is not None), key=_rank, default=None)
-    names = [bound.kind for bound in problem.bounds] + [extra.name for extra in problem.extras]
-    if best is None or "M_ks" in names or "u_std" in names:
-        return best
-    return _from_less_noise(problem, structure, best)
+    if best is None or len(structure.parameters) <= FEW:
+        return [] if best is None else [best]
+    return [best, *_from_tighter(task, structure, best)]
 
 
-def _from_less_noise(problem: Problem, structure: Structure, best: Solution) -> Solution:
-    """Return the best solution of a problem without a bound of noise, also from those with one.
+def _from_tighter(task: Task, structure: Structure, best: Solution) -> list[Solution]:
+    """Return optima that are reached from those of tighter bounds.
 
-    Without it the search may end where a fast filter costs robustness, at less than what a bound
-    of M_ks leads to.
+    The fewer bounds there are, the more valleys there are, and the search may end in one with a
+    fast filter, say, that costs robustness, at less than what a further bound leads to. So where a
+    bound is missing, or not reached, the search also goes by optima with that bound at shares of
+    what the optimum has.
     """
-    plants = problem.plants
-    C = structure.response(best.values[None, :], plants.omega)[0]
-    largest = float(np.max(sizes("M_ks", plants.P, C)))
-    ends, start = [best], best
-    for share in _LESS_NOISE:
-        bounded = replace(problem, bounds=(*problem.bounds, Bound("M_ks", share * largest)))
-        near = search(bounded, structure, start.values, _ROUNDS)
+    problem, start, ends = task.problem(), best.values, []
+    for share in _TIGHTER:
+        tight = _tightened(task, structure, best, share).problem()
+        near = search(tight, structure, start, _NEARBY_ROUNDS, roughly=True)
         if near is None:
             break
-        start = near
-        found = search(problem, structure, near.values, _ROUNDS)
+        start = near.values
+        found = search(problem, structure, start, _ROUNDS, roughly=True)
         ends += [] if found is None else [found]
-    return min(ends, key=_rank)
+    return ends
+
+
+def _tightened(task: Task, structure: Structure, best: Solution, share: float) -> Task:
+    """Return the task with bounds that the solution does not reach at a share of what it has."""
+    given, bounds = task.constraints, dict[str, float]()
+    C = structure.response(best.values[None, :], task.plants.omega)
+    for name, kind in KINDS.items():
+        size, limit = (
+            float(worst_ratio((Bound(kind, 1.0),), task.plants, C)[0]),
+            getattr(given, name),
+        )
+        is_reached = limit is not None and size >= _REACHED * limit
+        if is_reached or (name == "m_ks" and given.u_std is not None):
+            continue
+        bounds[name] = share * size
+        if name != "m_ks":  # no loop has a peak of 1
+            bounds[name] = 1.0 + share * max(size - 1.0, _LEAST_PEAK)
+    return _with(task, **bounds)
 
 
 def _is_stable(plants: PlantSet, solution: Solution) -> bool:
@@ -355,9 +385,10 @@ def contradiction(problem: Problem, solution: Solution, constraints: Constraints
             high, found = middle, nearer
         else:
             low = middle
-    _, active = measured(relaxed(problem, high), found, constraints)
+    _, active, _ = measured(relaxed(problem, high), found, constraints)
     given = {bound.kind: bound.limit for bound in problem.bounds}
     given |= {extra.name: extra.limit for extra in problem.extras}
+    given |= {} if problem.damping is None else {"damping": problem.damping}
     # Bounds of parameters, as |p| dt, are not relaxed.
     limits = {each.name: given.get(each.name, each.limit) for each in active}
     reached = ", ".join(f"{name} {limit:.4g}" for name, limit in limits.items())
@@ -374,7 +405,9 @@ def relaxed(problem: Problem, factor: float) -> Problem:
         extra._replace(limit=factor * extra.limit, ratio=partial(_share, extra, factor))
         for extra in problem.extras
     )
-    return replace(problem, bounds=bounds, extras=extras)
+    damping = None if problem.damping is None else 1.0 - factor * (1.0 - problem.damping)
+    damping = None if damping is None or damping <= 0.0 else damping
+    return replace(problem, bounds=bounds, extras=extras, damping=damping)
 
 
 def _share(extra: Extra, factor: float, structure: Structure, values: Matrix) -> Vector:
@@ -386,6 +419,7 @@ def tradeoff(task: Task, design: Design) -> list[tuple[str, float, float]]:
     assert design.solution is not None
     found = []
     fields = {"M_s": "m_s", "M_t": "m_t", "M_ks": "m_ks", "delay margin": "delay_margin"}
+    # ``damping`` is a field of the same name.
     for active in design.active:
         field = fields.get(active.name, active.name)
         if getattr(task.constraints, field, None) is None:

@@ -13,9 +13,10 @@ import numpy as np
 from quell import checks
 from quell.sweeping.shares import share_interval
 from quell.sweeping.values import latin_hypercube
+from quell.tuning.optimiser.damping import beside_poles, closed_loop_poles, counted
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.problem import Problem, Solution
-from quell.tuning.optimiser.requirements import all_peaks, grid_sizes
+from quell.tuning.optimiser.requirements import all_peaks
 from quell.types import Matrix, Vector
 
 # With more parameters, the corners of their box are not all in the set.
@@ -128,16 +129,16 @@ def checked(
 ) -> Check:
     """Return how a solution does on fresh plants; ``values`` (k, parameters) belong to them."""
     structure, row = solution.structure, solution.values[None, :]
-    C = structure.response(row, plants.omega)
 
     def controller(omega: Vector) -> Any:
         return structure.response(row, omega)[0]
 
-    unstable = plants.unstable_loops(C, structure.unstable_poles(row))[0] > 0.5
+    poles = closed_loop_poles(plants, structure, solution.values)
+    unstable = np.array([bool(np.any(s.real >= 0.0)) for s in poles])
     ratio = np.zeros(len(plants.plants))
     worst = {}
-    on_grid = grid_sizes(problem.bounds, plants, C[0])
-    peaks = all_peaks(problem.bounds, plants, controller, on_grid, 0.5)
+    beside = beside_poles(plants, poles)
+    peaks = all_peaks(problem.bounds, plants, controller, beside, 0.5)
     for number, (kind, limit) in enumerate(problem.bounds):
         own = np.zeros(ratio.size)
         for of_bound, peak in peaks:
@@ -146,6 +147,10 @@ def checked(
         if not np.all(unstable):
             worst[kind] = float(np.max(own[~unstable])) * limit
         ratio = np.maximum(ratio, own)
+    if problem.damping is not None:
+        for pole in counted(plants, poles, problem.damping):
+            share = (1.0 - pole.damping) / (1.0 - pole.least)
+            ratio[pole.plant] = max(ratio[pole.plant], share)
     ratio[unstable] = np.inf
     bad = ratio > 1.0 + _TOLERANCE
     at = int(np.argmax(ratio)) % values.shape[0]

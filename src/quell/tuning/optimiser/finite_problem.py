@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.analysis.frequency_response import Complex
+from quell.tuning.optimiser.damping import Followed
 from quell.tuning.optimiser.problem import Problem
 from quell.tuning.optimiser.requirements import Points, slacks, slopes_of_slacks
 from quell.tuning.structures.base import Structure
@@ -29,6 +30,7 @@ class _Values(NamedTuple):
     C: Complex  # at the points' frequencies (m, ω)
     extras: Matrix  # slack of the constraints that are no bounds over frequency (m, e)
     rules: Matrix  # (m, r)
+    damping: Matrix  # slack of the poles that are followed (m, d)
     cost: Vector  # (m,)
 
     def with_more(self, others: _Values) -> _Values:
@@ -39,8 +41,16 @@ class _Values(NamedTuple):
 class FiniteProblem:
     """Cost and constraints at points, as functions of the logarithms x (p,) of the parameters."""
 
-    def __init__(self, problem: Problem, structure: Structure, points: Points, x: Vector) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        structure: Structure,
+        points: Points,
+        followed: Followed,
+        x: Vector,
+    ) -> None:
         self._problem, self._structure, self._points = problem, structure, points
+        self._followed = followed
         # No step, then one along each parameter.
         self._steps = _DIFFERENCE * np.eye(x.size + 1, x.size, -1)
         self._x, self._values = x.tobytes(), self._values_at(x + self._steps)
@@ -53,7 +63,8 @@ class FiniteProblem:
     def constraints(self, x: Vector) -> Vector:
         """Return the constraints (k,), which must not be negative."""
         found = self._at(x)
-        return np.concatenate([slacks(self._points, found.C[0]), found.extras[0], found.rules[0]])
+        rest = found.extras[0], found.rules[0], found.damping[0]
+        return np.concatenate([slacks(self._points, found.C[0]), *rest])
 
     def slope_of_cost(self, x: Vector) -> Vector:
         """Return the derivatives of the cost (p,)."""
@@ -78,9 +89,9 @@ class FiniteProblem:
             left = self._steps[len(found.cost) :]
             if left.size:
                 found = self._values = found.with_more(self._values_at(x + left))
-            C, extras, rules, cost = ((each[1:] - each[0]) / _DIFFERENCE for each in found)
+            C, extras, rules, damping, cost = ((each[1:] - each[0]) / _DIFFERENCE for each in found)
             bounds = slopes_of_slacks(self._points, found.C[0], C)
-            self._slopes = cost, np.vstack([bounds, extras.T, rules.T])
+            self._slopes = cost, np.vstack([bounds, extras.T, rules.T, damping.T])
         return self._slopes
 
     def _values_at(self, x: Matrix) -> _Values:
@@ -90,5 +101,6 @@ class FiniteProblem:
             structure.response(values, self._points.omega),
             1.0 - np.reshape(ratios, (len(ratios), len(values))).T,
             structure.rules(values),
+            self._followed.slacks(structure, values),
             self._problem.cost(structure, values),
         )

@@ -10,9 +10,17 @@ from functools import cached_property
 import numpy as np
 
 from quell.analysis.frequency_response import Complex
+from quell.tuning.optimiser.damping import (
+    Followed,
+    Pole,
+    beside_poles,
+    closed_loop_poles,
+    counted,
+    slack_of,
+)
 from quell.tuning.optimiser.loops import Peak
 from quell.tuning.optimiser.problem import Problem
-from quell.tuning.optimiser.requirements import Points, all_peaks, grid_sizes, points_of
+from quell.tuning.optimiser.requirements import Points, all_peaks, points_of, sizes
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
 
@@ -35,7 +43,28 @@ class Iterate:
     @cached_property
     def _sizes(self) -> list[Matrix]:
         """|S|, |T| or |C S| (J, G) for each bound."""
-        return grid_sizes(self._problem.bounds, self._problem.plants, self._response[0])
+        P, C = self._problem.plants.P, self._response[0]
+        return [sizes(kind, P, C) for kind, _ in self._problem.bounds]
+
+    @cached_property
+    def _poles(self) -> list[Complex]:
+        """All poles of the loop with each plant, where the search needs them; else none."""
+        problem = self._problem
+        if problem.damping is None and not problem.plants.resonant:
+            return []
+        return closed_loop_poles(problem.plants, self._structure, self._values[0])
+
+    @cached_property
+    def counted(self) -> list[Pole]:
+        """The poles whose damping is bounded."""
+        if self._problem.damping is None:
+            return []
+        return counted(self._problem.plants, self._poles, self._problem.damping)
+
+    @property
+    def followed(self) -> Followed:
+        """The poles near their bound or beyond it, as functions of the parameters."""
+        return Followed(self._problem.plants, self.counted)
 
     @cached_property
     def peaks(self) -> list[tuple[int, Peak]]:
@@ -44,11 +73,15 @@ class Iterate:
         def controller(omega: Vector) -> Complex:
             return self._structure.response(self._values, omega)[0]
 
-        return all_peaks(self._problem.bounds, self._problem.plants, controller, self._sizes, _PEAK)
+        plants = self._problem.plants
+        beside = beside_poles(plants, self._poles)
+        return all_peaks(self._problem.bounds, plants, controller, beside, _PEAK)
 
     @cached_property
     def stable(self) -> bool:
         """Whether the loops with all plants are stable."""
+        if self._poles:
+            return all(bool(np.all(s.real < 0.0)) for s in self._poles)
         poles = self._structure.unstable_poles(self._values)
         return bool(np.all(self._problem.plants.unstable_loops(self._response, poles) < 0.5))
 
@@ -64,6 +97,7 @@ class Iterate:
         extras = self._problem.extras
         ratios += [float(each.ratio(self._structure, self._values)[0]) for each in extras]
         ratios += (1.0 - self._structure.rules(self._values)[0]).tolist()
+        ratios += [1.0 - slack_of(pole.damping, pole.least) for pole in self.counted]
         return max(max([ratio - 1.0 for ratio in ratios], default=0.0), 0.0)
 
     def points(self, least: float, more: list[tuple[int, Peak]]) -> Points:

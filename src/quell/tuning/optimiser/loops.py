@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ _LEAST_BOTTOM = 3.0
 # the grid has an even part with so many radians between points, up to where the plant's gain has
 # fallen to this share of that at the crossover. Beyond, the loop's gain is too small for peaks.
 _POINTS_PER_DECADE, _TURN, _FALLEN = 24, 0.5, 0.02
+# Poles with less damping have peaks beside them that may lie between points of the grid.
+_NARROW = 0.1
 # Half the sampling rate itself is a pole of Tustin's rule.
 _BELOW_HALF = 1.0 - 1e-6
 # Points between the neighbours of a maximum, and how often they are placed anew: an interval of
@@ -88,6 +91,12 @@ class PlantSet:
         P: Complex = found * self.factors[members]
         return P
 
+    @cached_property
+    def resonant(self) -> bool:
+        """Whether a plant has poles with so little damping that peaks beside them are narrow."""
+        found = [self.s_poles(plant) for plant in self.plants]
+        return any(np.any((s.imag > 0.0) & (-s.real < _NARROW * s.imag)) for s in found)
+
     def scaled(self) -> list[SampledPlant]:
         """Return the plants with the factors of their gain."""
         return [
@@ -95,7 +104,8 @@ class PlantSet:
             for plant, factor in zip(self.plants, self.factors.tolist(), strict=True)
         ]
 
-    def _s_poles(self, plant: SampledPlant) -> Complex:
+    def s_poles(self, plant: SampledPlant) -> Complex:
+        """Return the poles of a plant of the set [rad/s], but for those at z = 0."""
         poles = in_s_plane(self._poles[id(plant)], self.dt)
         kept: Complex = poles[np.isfinite(poles)]
         return kept
@@ -103,7 +113,7 @@ class PlantSet:
     def _crossover(self) -> float:
         top = math.pi / self.dt
         first = self.plants[0]
-        sizes = np.abs(self._s_poles(first))
+        sizes = np.abs(self.s_poles(first))
         sizes = sizes[(sizes > 1e-7 * top) & (sizes < top)]
         low = 1e-2 * float(np.min(sizes, initial=1e-2 * top))
         omega = np.geomspace(low, top * _BELOW_HALF, 600)
@@ -120,12 +130,12 @@ class PlantSet:
         bottom = min(_BOTTOM * self.crossover, 0.01 * top)
         count = math.ceil(_POINTS_PER_DECADE * math.log10(top / bottom)) + 1
         parts = [np.geomspace(bottom, top, count)]
-        longest = max(_dead_samples(plant) for plant in self.plants) * self.dt
+        longest = max(dead_samples(plant) for plant in self.plants) * self.dt
         if longest > 0.0:
             end = self._end_of_peaks(top)
             parts.append(np.arange(1.0, end * longest / _TURN) * (_TURN / longest))
         for plant in self.plants:
-            poles = self._s_poles(plant)
+            poles = self.s_poles(plant)
             poles = poles[poles.imag > 0.0]
             resonant = poles[-poles.real < 0.5 * poles.imag]
             if resonant.size:
@@ -224,7 +234,7 @@ def peaks(
     return found
 
 
-def _dead_samples(plant: SampledPlant) -> int:
+def dead_samples(plant: SampledPlant) -> int:
     """Return the number of samples that a plant's control signal waits."""
     return int(np.count_nonzero(np.diag(plant.N) == -1.0))
 

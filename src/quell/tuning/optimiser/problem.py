@@ -35,6 +35,7 @@ class Problem:
     extras: tuple[Extra, ...]
     objective: str  # its name
     cost: Callable[[Structure, Matrix], Vector]  # values (m, p) → cost (m,), its logarithm
+    damping: float | None = None  # least damping of the closed loop's poles
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import Peak, PlantSet, peaks
 from quell.types import Matrix, Vector
 
-_KINDS = {"m_s": "M_s", "m_t": "M_t", "m_ks": "M_ks"}
+KINDS = {"m_s": "M_s", "m_t": "M_t", "m_ks": "M_ks"}
 
 
 class Bound(NamedTuple):
@@ -61,7 +61,7 @@ class Active(NamedTuple):
 
 def bounds_of(constraints: Constraints) -> tuple[Bound, ...]:
     """Return the bounds over frequency."""
-    found = [(text, getattr(constraints, name)) for name, text in _KINDS.items()]
+    found = [(text, getattr(constraints, name)) for name, text in KINDS.items()]
     return tuple(Bound(text, float(value)) for text, value in found if value is not None)
 
 
@@ -140,21 +140,17 @@ def slopes_of_slacks(points: Points, C: Complex, dC: NDArray[np.complex128]) -> 
     return found
 
 
-def grid_sizes(bounds: tuple[Bound, ...], plants: PlantSet, C: Complex) -> list[Matrix]:
-    """Return |S|, |T| or |C S| (J, G) for each bound, for a controller C (G,) on the grid."""
-    return [sizes(kind, plants.P, C) for kind, _ in bounds]
-
-
 def all_peaks(
     bounds: tuple[Bound, ...],
     plants: PlantSet,
     controller: Callable[[Vector], Complex],
-    on_grid: list[Matrix],
+    beside: Vector,
     least: float,
 ) -> list[tuple[int, Peak]]:
     """Return the refined maxima with a ratio above ``least``, each with the number of its bound.
 
-    ``controller`` is a function from frequencies to C_y (k,); ``on_grid`` are its ``grid_sizes``.
+    ``controller`` is a function from frequencies to C_y (k,). Maxima are bracketed by the grid and
+    by the frequencies ``beside``, between which narrow ones may be.
     """
     count = len(plants.plants)
 
@@ -167,7 +163,13 @@ def all_peaks(
             found[own] = sizes(kind, P[own], C[own]) / limit
         return found
 
-    limits = [limit for _, limit in bounds]
-    values = np.vstack([size / limit for size, limit in zip(on_grid, limits, strict=True)])
-    found = peaks(ratios, plants.omega, values, least)
+    C = controller(plants.omega)
+    omega, P = plants.omega, plants.P
+    if beside.size:
+        omega = np.concatenate([omega, beside])
+        order = np.argsort(omega)
+        P = np.hstack([P, plants.responses(beside)])[:, order]
+        C, omega = np.append(C, controller(beside))[order], omega[order]
+    values = np.vstack([sizes(kind, P, C) / limit for kind, limit in bounds])
+    found = peaks(ratios, omega, values, least)
     return [(peak.plant // count, peak._replace(plant=peak.plant % count)) for peak in found]

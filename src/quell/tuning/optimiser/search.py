@@ -11,6 +11,7 @@ principle, and at the end by the closed loop's poles.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from quell.tuning.optimiser.finite_problem import FiniteProblem
 from quell.tuning.optimiser.iterate import Iterate
 from quell.tuning.optimiser.loops import Peak
 from quell.tuning.optimiser.problem import Problem, Solution, limits
-from quell.tuning.optimiser.requirements import Points
 from quell.tuning.optimiser.starts import starts
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
@@ -46,7 +46,7 @@ _EXCESS = 20.0
 # are flat: a share of 1e-4 of the objective is 1 to 2 % of the parameters. With few parameters,
 # which are worth to be known, the search goes on.
 _SETTLED, _TOLERANCE = 1e-4, 1e-7
-_FEW, _SETTLED_OF_FEW, _TOLERANCE_OF_FEW = 3, 1e-7, 1e-12
+FEW, _SETTLED_OF_FEW, _TOLERANCE_OF_FEW = 3, 1e-7, 1e-12
 
 
 def best_solution(
@@ -55,10 +55,45 @@ def best_solution(
     """Return the best solution from several starts; None if no start is stable.
 
     All of them take some rounds, the best go on until they settle, the winner until its parameters
-    do. ``more`` (k, p) are values to start from besides those of the structure.
+    do. ``more`` (k, p) are values to start from besides those of the structure. A bound of damping
+    comes in where they have settled, because the poles of many loops are slow to find.
     """
     if more is None:
         more = np.zeros((0, len(structure.parameters)))
+    best = min(_ends(replace(problem, damping=None), structure, more), key=_rank, default=None)
+    if best is not None and problem.damping is not None:
+        best = _damped(problem, structure, best, more)
+    if best is None or not _is_precise(problem, structure):
+        return best
+    end = search(problem, structure, best.values, _ROUNDS)
+    return best if end is None or (best.feasible and not end.feasible) else end
+
+
+def _damped(problem: Problem, structure: Structure, best: Solution, more: Matrix) -> Solution:
+    """Return the best solution with a bound of damping, from one without.
+
+    Where that rings the search goes on from there, and from the best of ``more``.
+    """
+    now = solution_at(problem, structure, best.values)
+    if now is not None and now.feasible:
+        return now
+    found = [each for row in more if (each := solution_at(problem, structure, row)) is not None]
+    near = sorted(found, key=lambda each: merit(each.cost, each.violation))[:1]
+    ends = [search(problem, structure, each.values, _ROUNDS, True) for each in (best, *near)]
+    kept = [each for each in (now, *ends) if each is not None]
+    return min(kept, key=_rank, default=best)
+
+
+def solution_at(problem: Problem, structure: Structure, values: Vector) -> Solution | None:
+    """Return the solution that values (p,) are as they are; None if a loop is unstable."""
+    here = Iterate(problem, structure, np.log(np.clip(values, *limits(structure))))
+    if not here.stable:
+        return None
+    return Solution(structure, np.exp(here.x), here.cost, here.violation)
+
+
+def _ends(problem: Problem, structure: Structure, more: Matrix) -> list[Solution]:
+    """Return where the searches from the best starts end."""
     found = []
     first = starts(problem, structure, np.vstack([structure.shapes(), more]), _STARTS)
     grid, spacing = structure.grid()
@@ -67,9 +102,9 @@ def best_solution(
         solution = search(problem, structure, start, _FIRST_ROUNDS, roughly=True)
         if solution is not None:
             found.append(solution)
-    found.sort(key=lambda solution: _merit(solution.cost, solution.violation))
+    found.sort(key=lambda solution: merit(solution.cost, solution.violation))
     ends: list[Solution] = []
-    few = len(structure.parameters) <= _FEW
+    few = len(structure.parameters) <= FEW
     for solution in found:
         if len(ends) >= _FINALISTS and (few or not _agree(ends)):
             break
@@ -82,11 +117,7 @@ def best_solution(
         for start in starts(problem, structure, structure.beside(best.values), _BESIDE):
             end = search(problem, structure, start, _ROUNDS, roughly=True)
             ends += [] if end is None else [end]
-        best = min(ends, key=_rank)
-    if best is None or not _is_precise(problem, structure):
-        return best
-    end = search(problem, structure, best.values, _ROUNDS)
-    return best if end is None or (best.feasible and not end.feasible) else end
+    return ends
 
 
 def _agree(ends: list[Solution]) -> bool:
@@ -97,7 +128,7 @@ def _agree(ends: list[Solution]) -> bool:
 
 def _is_precise(problem: Problem, structure: Structure) -> bool:
     """Return whether the search goes on until the parameters settle; it is quick for k_i."""
-    return len(structure.parameters) <= _FEW and problem.objective == "load"
+    return len(structure.parameters) <= FEW and problem.objective == "load"
 
 
 def _rank(solution: Solution) -> tuple[float, float]:
@@ -105,7 +136,7 @@ def _rank(solution: Solution) -> tuple[float, float]:
     return 0.0 if solution.feasible else solution.violation, solution.cost
 
 
-def _merit(cost: float, violation: float) -> float:
+def merit(cost: float, violation: float) -> float:
     """Return the cost of a point that may exceed limits; less is better."""
     return cost + _EXCESS * violation
 
@@ -125,8 +156,7 @@ def search(
     settled = _SETTLED_OF_FEW if few else _SETTLED
     allowed = _SETTLED_OF_FEW if few else _VIOLATION
     for i in range(rounds):
-        merit = _merit(now.cost, now.violation)
-        if best is None or merit < _merit(best.cost, best.violation):
+        if best is None or merit(now.cost, now.violation) < merit(best.cost, best.violation):
             best = now
         if i == rounds - 1 or (now.violation <= allowed and abs(last - now.cost) < settled):
             break
@@ -135,7 +165,8 @@ def search(
         points = now.points(_NEAR if i < _EARLY_ROUNDS else _NEARER, extra_points)
         bounds = list(zip(np.maximum(low, now.x - box), np.minimum(high, now.x + box), strict=True))
         tolerance = _TOLERANCE_OF_FEW if few else _TOLERANCE
-        x = _quadratic_programming(problem, structure, now.x, points, bounds, tolerance)
+        near = FiniteProblem(problem, structure, points, now.followed, now.x)
+        x = _quadratic_programming(near, now.x, bounds, tolerance)
         after = None if x is None else Iterate(problem, structure, x)
         if after is None or not after.stable:
             box *= _SHRINK
@@ -149,17 +180,11 @@ def search(
 
 
 def _quadratic_programming(
-    problem: Problem,
-    structure: Structure,
-    x: Vector,
-    points: Points,
-    bounds: list[Any],
-    tolerance: float,
+    near: FiniteProblem, x: Vector, bounds: list[Any], tolerance: float
 ) -> Vector | None:
     from scipy.optimize import minimize
 
     try:
-        near = FiniteProblem(problem, structure, points, x)
         found = minimize(
             near.cost,
             x,

@@ -13,6 +13,14 @@ from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.base import Controller
 from quell.files import nonfinite_to_none
 from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser.damping import (
+    USUAL_DAMPING,
+    Pole,
+    beside_poles,
+    closed_loop_poles,
+    counted,
+    slack_of,
+)
 from quell.tuning.optimiser.extras import delay_margin, noise_gain
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import scores
@@ -33,7 +41,8 @@ class Design:
 
     ``measures`` has ``M_s``, ``M_t``, ``M_ks`` [u-unit/y-unit], ``noise_gain`` (RMS of u for white
     noise of RMS 1 in y), ``delay_margin`` [s], ``iae`` (integral of ``|y|`` after a unit step of
-    the load): the worst over all plants.
+    the load), ``damping`` (the least of the loop's poles, but for modes of the plant): the worst
+    over all plants.
     """
 
     name: str  #: name of the structure, with its order
@@ -48,6 +57,8 @@ class Design:
     tables: Mapping[str, Mapping[str, Any]]  #: tables of a setup file for the controller
     solution: Solution | None = None  #: what the optimiser found
     reason: str = ""  #: why there is no controller; empty otherwise
+    #: the least damped of the poles that count, and that of the plant's own modes
+    least_damped: tuple[Pole, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers and texts for a JSON file; infinite numbers become None."""
@@ -59,6 +70,15 @@ class Design:
                 "k_i": self.k_i,
                 "measures": dict(self.measures),
                 "active": [active._asdict() for active in self.active],
+                "least_damped": [
+                    {
+                        "damping": pole.damping,
+                        "omega": abs(pole.s),
+                        "plant": pole.plant,
+                        "own": pole.own,
+                    }
+                    for pole in self.least_damped
+                ],
                 "tables": {key: dict(table) for key, table in self.tables.items()},
                 "reason": self.reason,
             }
@@ -81,7 +101,7 @@ def design_of(
 ) -> Design:
     """Return the design of a solution; ``options`` are those of the structure's controllers."""
     structure, values = solution.structure, solution.values
-    measures, active = measured(problem, solution, constraints)
+    measures, active, least = measured(problem, solution, constraints)
     k_i = float(structure.integral_gain(values[None, :])[0])
     size = math.exp(solution.cost)
     tables = structure.tables(values)
@@ -98,6 +118,7 @@ def design_of(
         active=active,
         tables=tables,
         solution=solution,
+        least_damped=least,
     )
 
 
@@ -111,10 +132,12 @@ def _signed(solution: Solution) -> dict[str, float]:
 
 def measured(
     problem: Problem, solution: Solution, constraints: Constraints
-) -> tuple[dict[str, float], tuple[Active, ...]]:
-    """Return the measures and the active constraints."""
+) -> tuple[dict[str, float], tuple[Active, ...], tuple[Pole, ...]]:
+    """Return the measures, the active constraints, and the least damped poles."""
     plants, structure, values = problem.plants, solution.structure, solution.values[None, :]
     C = structure.response(values, plants.omega)
+    poles = closed_loop_poles(plants, structure, solution.values)
+    beside = beside_poles(plants, poles)
 
     def controller(omega: Vector) -> Any:
         return structure.response(values, omega)[0]
@@ -124,7 +147,7 @@ def measured(
     for kind in _KINDS:
         grid = sizes(kind, plants.P, C[0])
         largest = float(np.max(grid))
-        found = all_peaks((Bound(kind, 1.0),), plants, controller, [grid], 0.9 * largest)
+        found = all_peaks((Bound(kind, 1.0),), plants, controller, beside, 0.9 * largest)
         at = max(found, key=lambda entry: entry[1].value)[1]
         measures[kind] = at.value
         if kind in bounds and at.value >= (1.0 - _ACTIVE) * bounds[kind]:
@@ -138,12 +161,24 @@ def measured(
         if ratio >= 1.0 - _ACTIVE:
             value = extra.limit / ratio if extra.name == "delay margin" else extra.limit * ratio
             active.append(Active(extra.name, value, extra.limit, math.nan, 0))
+    least = _least_damped(counted(plants, poles, problem.damping or USUAL_DAMPING))
+    measures["damping"] = min((pole.damping for pole in least if not pole.own), default=1.0)
+    for pole in least if problem.damping is not None else ():
+        if slack_of(pole.damping, pole.least) <= _ACTIVE:
+            name = "damping of the plant's mode" if pole.own else "damping"
+            active.append(Active(name, pole.damping, pole.least, abs(pole.s), pole.plant))
     limit, fastest = constraints.omega_o_dt, _fastest(solution, constraints, plants)
     if np.any(structure.rules(values)[0] < _ACTIVE):  # the faster real pole of a pair
         fastest = limit
     if fastest >= (1.0 - _ACTIVE) * limit:
         active.append(Active("|p| dt", min(fastest, limit), limit, math.nan, 0))
-    return measures, tuple(active)
+    return measures, tuple(active), least
+
+
+def _least_damped(poles: list[Pole]) -> tuple[Pole, ...]:
+    """Return the least damped pole, and that of the plant's modes, where there are any."""
+    groups = ([pole for pole in poles if pole.own == own] for own in (False, True))
+    return tuple(min(group, key=lambda pole: pole.damping) for group in groups if group)
 
 
 def _fastest(solution: Solution, constraints: Constraints, plants: PlantSet) -> float:

@@ -97,6 +97,10 @@ class AdrcStructure:
         self._chain = sampled_adrc.sampled_chain(self.plant, model.dt)
         self._delay = round(model.delay / model.dt) if form.knows_delay else 0
         self._fastest = model.constraints.omega_o_dt / model.dt
+        self._damping = dict(_DAMPING)
+        if model.constraints.damping is not None and not _resonates(model):
+            low, high = _DAMPING["o"]
+            self._damping["o"] = (max(low, model.constraints.damping), high)
         self._observed = self.order + (0 if form.reduced else 1)
         unit = model.gain * model.omega**self.degree
         self.parameters = (
@@ -112,7 +116,7 @@ class AdrcStructure:
         found = []
         for i in range(count // 2):
             found.append(Parameter(f"omega_{which}{i + 1}", "rad/s", *bounds))
-            found.append(Parameter(f"damping_{which}{i + 1}", "", *_DAMPING[which]))
+            found.append(Parameter(f"damping_{which}{i + 1}", "", *self._damping[which]))
         if count % 2:
             found.append(Parameter(f"pole_{which}", "rad/s", *bounds))
         return found
@@ -357,6 +361,15 @@ class AdrcStructure:
         if self.form.half_law:
             controller["half_gain"] = True
         return {"observer": observer, "controller": controller}
+
+
+def _resonates(model: Model) -> bool:
+    """Return whether the plant has a mode with less damping than the bound."""
+    poles = np.linalg.eigvals(LinearPlant.of(model.plant).A)
+    size = np.abs(poles)
+    # Integrators of a chain are pairs near zero, to rounding.
+    flexible = (poles.imag > 0.0) & (size > 1e-6 * np.max(size, initial=0.0))
+    return bool(np.any(flexible & (-poles.real < (model.constraints.damping or 0.0) * size)))
 
 
 def _pair(omega: float, damping: float) -> NDArray[np.complex128]:

@@ -67,7 +67,10 @@ class Structure(Protocol):
         ...
 
     def response(self, values: Matrix, omega: Vector) -> Complex:
-        """Return C_y (m, k), from −y to u, for values (m, p) at frequencies (k,) [rad/s]."""
+        """Return C_y (m, k), from −y to u, for values (m, p) at frequencies (k,) [rad/s].
+
+        A complex frequency −j s gives the transfer function at s.
+        """
         ...
 
     def integral_gain(self, values: Matrix) -> Vector:

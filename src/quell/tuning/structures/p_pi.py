@@ -25,10 +25,9 @@ from quell.types import Matrix, Vector
 # A pair of poles with less damping is a resonance; notches lie below this share of half the
 # sampling rate. Drives have two to four filters; a third resonance is hardly ever below the limit.
 _RESONANT, _BELOW, _MOST = 0.5, 0.95, 2
-# Bounds of depth and width of a notch, and of its place in units of the resonance. Beside a notch
-# that is deeper, |T| has peaks that are narrower than the grid of frequencies (2 % above the bound
-# on two masses without damping).
-_DEPTH, _WIDTH, _PLACE = (0.1, 0.999), (0.05, 6.0), (0.2, 5.0)
+# Bounds of depth and width of a notch, and of its place in units of the resonance: drives have
+# notches of −40 dB at most.
+_DEPTH, _WIDTH, _PLACE = (0.01, 0.999), (0.05, 6.0), (0.2, 5.0)
 # Bounds of times in units of the time of one radian at the plant's phase crossover.
 _TIMES = (1e-4, 1e4)
 # Values to start from: K_v and T_f in units of that radian, T_n K_v, depth and width of notches.
