@@ -93,7 +93,7 @@ def main() -> None:
     for seed in range(arguments.first, arguments.first + arguments.plants):
         num, den, m_s = drawn_plant(seed)
         given.clear()
-        bounds, began = Constraints(m_s=m_s, m_t=None), time.process_time()
+        bounds, began = Constraints(m_s=m_s, m_t=None, damping=None), time.process_time()
         options: dict[str, Any] = {"structure": "model-based", "constraints": bounds, "compare": ()}
         options["objective"] = "load"
         try:

@@ -98,11 +98,11 @@ def trial(plant: tuple[str, list[float], list[float], float], m_s: float) -> dic
     name, num, den, delay = plant
     dt = sample_time(num, den, delay)
     began = time.process_time()
-    free = Constraints(m_s=m_s, m_t=None, noise_over_pi=None)
+    free = Constraints(m_s=m_s, m_t=None, noise_over_pi=None, damping=None)
     how = {"objective": "load", "delay": delay}
     pi = ql.tune((num, den), dt, structure="pi-unfiltered", constraints=free, compare=(), **how)
     m_ks = pi.design.measures["M_ks"]
-    bounds = Constraints(m_s=m_s, m_t=None, m_ks=m_ks)
+    bounds = Constraints(m_s=m_s, m_t=None, m_ks=m_ks, damping=None)
     tuned = ql.tune((num, den), dt, structure="freed", constraints=bounds, compare=NAMES, **how)
     row: dict[str, object] = {"plant": name, "m_s": m_s, "m_ks": m_ks, "k_i": pi.design.k_i}
     for key, design in tuned.designs.items():

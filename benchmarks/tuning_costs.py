@@ -29,11 +29,11 @@ def costs(plant: tuple[str, list[float], list[float], float]) -> list[str]:
     """Return ``k_i (1/IAE)`` of each structure over those of the optimal PI controller."""
     _, num, den, delay = plant
     dt = sample_time(num, den, delay)
-    free = Constraints(m_s=1.4, m_t=None, noise_over_pi=None)
+    free = Constraints(m_s=1.4, m_t=None, noise_over_pi=None, damping=None)
     how = {"delay": delay, "objective": "load"}
     pi = ql.tune((num, den), dt, structure="pi-unfiltered", constraints=free, compare=(), **how)
     unit = pi.design
-    bounds = Constraints(m_s=1.4, m_t=None, m_ks=NOISE * unit.measures["M_ks"])
+    bounds = Constraints(m_s=1.4, m_t=None, m_ks=NOISE * unit.measures["M_ks"], damping=None)
     tuned = ql.tune((num, den), dt, structure="freed", constraints=bounds, compare=NAMES, **how)
     found = []
     for name in NAMES:

@@ -24,6 +24,7 @@ from quell.lti.system import System
 from quell.plants.linear import LinearPlant
 from quell.plants.linear_part import linear_model
 from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser.damping import counted
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.problem import Solution
 from quell.tuning.optimiser.requirements import bounds_of, worst_ratio
@@ -111,22 +112,27 @@ class LinearBounds:
     plants
         the linear plants, sampled.
     constraints
-        the bounds of M_s, M_t and M_ks.
+        the bounds of M_s, M_t, M_ks and damping.
     """
 
     def __init__(self, plants: PlantSet, constraints: Constraints) -> None:
         self._plants, self._bounds = plants, bounds_of(constraints)
+        self._damping = constraints.damping
 
     def __call__(self, controller: Controller) -> float:
         """Return zero or less if all bounds hold; infinity for an unstable loop."""
         law, plants = linear_law(controller), self._plants
-        if not all(LoopAnalysis(plant, law, plants.dt).stable for plant in plants.scaled()):
+        loops = [LoopAnalysis(plant, law, plants.dt) for plant in plants.scaled()]
+        if not all(loop.stable for loop in loops):
             return math.inf
         input_y = law.B_y + law.B_u * law.D_y
         C_y = Response(System(law_matrix(law), input_y, -law.C, -law.D_y))
-        ratio = worst_ratio(self._bounds, plants, C_y(plants.omega, plants.dt)[None, :])
+        ratio = float(worst_ratio(self._bounds, plants, C_y(plants.omega, plants.dt)[None, :])[0])
+        if self._damping is not None:
+            poles = counted(plants, [loop.s_poles for loop in loops], self._damping)
+            ratio = max([ratio, *(pole.ratio for pole in poles)])
         # The start is within 0.1 % of its bounds, and so may be what follows.
-        return math.log(float(ratio[0])) - _SLACK
+        return math.log(ratio) - _SLACK
 
 
 def tune_by_simulation(

@@ -112,6 +112,11 @@ class Tuned:
         return tuple(report.active_text(each, plants) for each in self.design.active)
 
     @property
+    def damping(self) -> str:
+        """The least damped pole of the loop, and the plant's own modes in it, as a line."""
+        return report.damping_line(self.design, self.constraints.damping)
+
+    @property
     def left_out(self) -> str:
         """The part of the plant that is not in the observer's model as text; empty if all is."""
         solution = self.design.solution
@@ -141,7 +146,7 @@ class Tuned:
             lines.append(f"{name}: {quantity} {value}; " + _measures(second, rest))
         lines += [self.left_out] if self.left_out else []
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
-        lines += [str(self.reference_step)]
+        lines += [self.damping, str(self.reference_step)]
         forward = getattr(self.design.controller, "feedforward", False)
         if isinstance(forward, Feedforward):
             lines.append(f"feedforward: {forward.describe()}")
@@ -194,6 +199,7 @@ class Tuned:
                 "design": self.design.to_json(),
                 "designs": {name: each.to_json() for name, each in self.designs.items()},
                 "costs": self.costs,
+                "damping": self.damping,
                 "reference_step": {
                     "overshoot": self.reference_step.overshoot,
                     "settling": self.reference_step.settling,

@@ -149,8 +149,7 @@ def checked(
         ratio = np.maximum(ratio, own)
     if problem.damping is not None:
         for pole in counted(plants, poles, problem.damping):
-            share = (1.0 - pole.damping) / (1.0 - pole.least)
-            ratio[pole.plant] = max(ratio[pole.plant], share)
+            ratio[pole.plant] = max(ratio[pole.plant], pole.ratio)
     ratio[unstable] = np.inf
     bad = ratio > 1.0 + _TOLERANCE
     at = int(np.argmax(ratio)) % values.shape[0]

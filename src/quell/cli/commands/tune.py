@@ -292,6 +292,7 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
         print_line(console, line)
     for line in report.tradeoff_lines(tuned.tradeoff, tuned.objective):
         print_line(console, f"with {line}")
+    print_line(console, tuned.damping)
     print_line(console, str(tuned.reference_step))
     if tuned.check is not None:
         print_line(console, str(tuned.check))

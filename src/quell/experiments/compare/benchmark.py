@@ -111,7 +111,8 @@ def tuned_controllers(
     plant = two_mass_spring()
     ours = sensitivities(plant, controller("mf-eso", dt))
     assert ours is not None
-    bounds = Constraints(m_s=ours.m_s, m_t=ours.m_t, m_ks=ours.m_ks, omega_o_dt=_POLES_DT)
+    measured = {"m_s": ours.m_s, "m_t": ours.m_t, "m_ks": ours.m_ks}
+    bounds = Constraints(**measured, damping=None, omega_o_dt=_POLES_DT)
     limits = {"u_min": -u_max, "u_max": u_max}
     return tuned(plant, dt, names, bounds, order=4, limits=limits, progress=progress)
 

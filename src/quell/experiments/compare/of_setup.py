@@ -116,12 +116,13 @@ def _constraints(
 ) -> Constraints:
     if None not in bounds or not own.stable:
         given = dict(zip(("m_s", "m_t", "m_ks"), bounds, strict=True))
-        return Constraints(**{name: value for name, value in given.items() if value is not None})
+        given = {name: value for name, value in given.items() if value is not None}
+        return Constraints(**given, damping=None)
     found = of_loop(own)
     pairs = zip(bounds, (found.m_s, found.m_t, found.m_ks), strict=True)
     m_s, m_t, m_ks = (other if bound is None else bound for bound, other in pairs)
     # Every loop has an M_s above 1, but |T| may be 1 at its largest.
-    return Constraints(m_s=m_s, m_t=max(m_t, _LEAST_M_T), m_ks=m_ks)
+    return Constraints(m_s=m_s, m_t=max(m_t, _LEAST_M_T), m_ks=m_ks, damping=None)
 
 
 def _limits(controller: Any) -> dict[str, Any]:

@@ -70,6 +70,11 @@ class Pole(NamedTuple):
         """``−Re s/|s|``."""
         return -self.s.real / abs(self.s)
 
+    @property
+    def ratio(self) -> float:
+        """``(1 − ζ)/(1 − ζ_least)``: a value over its limit, as that of other constraints."""
+        return (1.0 - self.damping) / (1.0 - self.least)
+
 
 def closed_loop_poles(plants: PlantSet, structure: Structure, values: Vector) -> list[Complex]:
     """Return all poles of the loops of each plant with the controller of values (p,) [rad/s]."""
@@ -147,7 +152,7 @@ class Followed:
         self._P = plants.responses_of(self._omega, members) if kept else np.zeros(0, dtype=complex)
 
     def slacks(self, structure: Structure, values: Matrix) -> Matrix:
-        """Return ``(ζ − ζ_least)/(1 − ζ_least)`` (m, k) of controllers with values (m, p)."""
+        """Return one less the ratios (m, k), of controllers with values (m, p)."""
         count = self._s.size
         if count == 0:
             return np.zeros((values.shape[0], 0))
@@ -158,13 +163,8 @@ class Followed:
         second = (after - 2.0 * at + before) / self._h**2
         with np.errstate(divide="ignore", invalid="ignore"):
             s = self._s - 2.0 * at * first / (2.0 * first**2 - at * second)
-            slack = slack_of(_damping(s), self._least)
+            slack = (_damping(s) - self._least) / (1.0 - self._least)
         return np.nan_to_num(slack, nan=-1.0, posinf=-1.0, neginf=-1.0)
-
-
-def slack_of(damping: Any, least: Any) -> Any:
-    """Return ``(ζ − ζ_least)/(1 − ζ_least)``: one for a real pole, negative beyond the bound."""
-    return (damping - least) / (1.0 - least)
 
 
 def _modes(plant: SampledPlant, poles: Complex, damping: float, dt: float) -> tuple[Complex, int]:

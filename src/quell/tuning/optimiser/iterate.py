@@ -16,7 +16,6 @@ from quell.tuning.optimiser.damping import (
     beside_poles,
     closed_loop_poles,
     counted,
-    slack_of,
 )
 from quell.tuning.optimiser.loops import Peak
 from quell.tuning.optimiser.problem import Problem
@@ -97,7 +96,7 @@ class Iterate:
         extras = self._problem.extras
         ratios += [float(each.ratio(self._structure, self._values)[0]) for each in extras]
         ratios += (1.0 - self._structure.rules(self._values)[0]).tolist()
-        ratios += [1.0 - slack_of(pole.damping, pole.least) for pole in self.counted]
+        ratios += [pole.ratio for pole in self.counted]
         return max(max([ratio - 1.0 for ratio in ratios], default=0.0), 0.0)
 
     def points(self, least: float, more: list[tuple[int, Peak]]) -> Points:

@@ -19,7 +19,6 @@ from quell.tuning.optimiser.damping import (
     beside_poles,
     closed_loop_poles,
     counted,
-    slack_of,
 )
 from quell.tuning.optimiser.extras import delay_margin, noise_gain
 from quell.tuning.optimiser.loops import PlantSet
@@ -164,7 +163,7 @@ def measured(
     least = _least_damped(counted(plants, poles, problem.damping or USUAL_DAMPING))
     measures["damping"] = min((pole.damping for pole in least if not pole.own), default=1.0)
     for pole in least if problem.damping is not None else ():
-        if slack_of(pole.damping, pole.least) <= _ACTIVE:
+        if pole.ratio >= 1.0 - _ACTIVE:
             name = "damping of the plant's mode" if pole.own else "damping"
             active.append(Active(name, pole.damping, pole.least, abs(pole.s), pole.plant))
     limit, fastest = constraints.omega_o_dt, _fastest(solution, constraints, plants)

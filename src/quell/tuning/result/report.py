@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from quell.analysis.loop import duration
+from quell.tuning.optimiser.damping import USUAL_DAMPING
 from quell.tuning.optimiser.requirements import Active
 from quell.tuning.result.design import Design
 
@@ -85,6 +86,18 @@ def costs(chosen: Design, designs: Mapping[str, Design], objective: str) -> list
                 f"{100.0 * (1.0 - share):.3g} %"
             )
     return lines
+
+
+def damping_line(design: Design, bound: float | None) -> str:
+    """Return the damping of the loop's poles, and of the plant's own modes in it."""
+    parts = []
+    for pole in design.least_damped:
+        which = "mode of the plant" if pole.own else "least damped pole of the loop"
+        parts.append(f"{which}: damping {pole.damping:.3g} at {abs(pole.s):.3g} rad/s")
+    line = "; ".join(parts) or "no pole of the loop oscillates, but for those of a dead time"
+    if bound is None and design.measures["damping"] < USUAL_DAMPING:
+        return f"NOT damped: {line}: no plant has it; bound it by Constraints(damping=)"
+    return line
 
 
 def tradeoff_lines(tradeoff: Sequence[tuple[str, float, float]], objective: str) -> list[str]:
