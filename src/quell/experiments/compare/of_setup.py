@@ -115,12 +115,12 @@ def _constraints(
     bounds: tuple[float | None, float | None, float | None], own: LoopAnalysis
 ) -> Constraints:
     if None not in bounds or not own.stable:
-        given = dict(zip(("m_s", "m_t", "m_ks"), bounds, strict=True))
-        given = {name: value for name, value in given.items() if value is not None}
+        pairs = zip(("m_s", "m_t", "m_ks"), bounds, strict=True)
+        given: dict[str, Any] = {name: value for name, value in pairs if value is not None}
         return Constraints(**given, damping=None)
     found = of_loop(own)
-    pairs = zip(bounds, (found.m_s, found.m_t, found.m_ks), strict=True)
-    m_s, m_t, m_ks = (other if bound is None else bound for bound, other in pairs)
+    both = zip(bounds, (found.m_s, found.m_t, found.m_ks), strict=True)
+    m_s, m_t, m_ks = (other if bound is None else bound for bound, other in both)
     # Every loop has an M_s above 1, but |T| may be 1 at its largest.
     return Constraints(m_s=m_s, m_t=max(m_t, _LEAST_M_T), m_ks=m_ks, damping=None)
 
