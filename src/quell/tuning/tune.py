@@ -98,8 +98,9 @@ def tune(
         integral gain, the least integral of y, whose optima may ring, as y of both signs counts
         for nothing; ``"tracking"``: least RMS of ``r − y``.
     constraints
-        the bounds; by default M_s = M_t = 1.6, and one for what noise does to u, which follows from
-        the noise of y and the limits of u where they are given (``Constraints``).
+        the bounds; by default M_s = M_t = 1.6, a damping of 0.4, and one for what noise does to u,
+        which follows from the noise of y and the limits of u where they are given
+        (``Constraints``).
     compare
         names of other structures.
     reference, duration
