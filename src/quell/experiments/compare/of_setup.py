@@ -115,9 +115,9 @@ def _constraints(
     bounds: tuple[float | None, float | None, float | None], own: LoopAnalysis
 ) -> Constraints:
     if None not in bounds or not own.stable:
-        given = dict(zip(("m_s", "m_t", "m_ks"), bounds, strict=True))
-        given = {name: value for name, value in given.items() if value is not None}
-        return Constraints(**given, damping=None)
+        given = zip(("m_s", "m_t", "m_ks"), bounds, strict=True)
+        kept: dict[str, Any] = {name: value for name, value in given if value is not None}
+        return Constraints(**kept, damping=None)
     found = of_loop(own)
     pairs = zip(bounds, (found.m_s, found.m_t, found.m_ks), strict=True)
     m_s, m_t, m_ks = (other if bound is None else bound for bound, other in pairs)
