@@ -19,7 +19,14 @@ from quell.plants.labelled import signals_of
 from quell.plants.linear import LinearPlant
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints
-from quell.tuning.designs import SIMPLEST, Task, simplest, tuned_designs, with_noise_bound
+from quell.tuning.designs import (
+    SIMPLEST,
+    Task,
+    simplest,
+    tuned_designs,
+    with_noise_bound,
+    without_damping,
+)
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import OBJECTIVES
 from quell.tuning.optimiser.time_responses import Inputs, load_step
@@ -223,6 +230,8 @@ def tune(
                 f"feedforward = {feedforward!r}: structure = {structure!r} has none; take an ADRC, "
                 "such as freed or model-based, or leave it out"
             )
+        if chosen.undamped:
+            task = without_damping(task)
         check = None
         if box is not None or b_range[0] != b_range[1]:
             report("check", 1.0)
