@@ -6,12 +6,13 @@ J_load/J_motor of 0.3 to 10 (the axis: J_motor = 3.2e-4 kg m², k = 180 N m/rad,
 axis the tuned cascade of servo drives (p-pi-notch, M_s and M_t at most 1.6) is the reference; the
 others are tuned with the same bounds and with the M_ks that the cascade has, so that noise costs
 the same. The figure is the integral gain over that of the cascade, k_i being that of a loop that is
-checked to be stable with the whole plant. With --free M_ks has no bound for any of them.
+checked to be stable with the whole plant. With --free M_ks has no bound for any of them, with
+--ringing the damping of poles has none.
 
 The second table is M_s of an ADRC of order 2 with omega_o = 4 omega_c and b0 = 1/(J_m + J_l), the
 encoder at the motor.
 
-Usage: python benchmarks/flexible_axis.py [--free] [--quick] [--json FILE]
+Usage: python benchmarks/flexible_axis.py [--free] [--ringing] [--quick] [--json FILE]
 """
 
 from __future__ import annotations
@@ -59,14 +60,17 @@ def axes(quick: bool) -> list[Axis]:
     return found + [Axis(2, "load", ratio, 0.1) for ratio in ratios]
 
 
-def tuned(axis: Axis, free: bool, others: tuple[str, ...] = OTHERS) -> dict[str, Any]:
+def tuned(
+    axis: Axis, free: bool, others: tuple[str, ...] = OTHERS, damping: float | None = 0.4
+) -> dict[str, Any]:
     """Return k_i, M_s and M_ks of each structure, or why there is none."""
     plant, how = axis.plant(), {"dt": DT, "delay": LATE}
-    bounds = Constraints(m_s=BOUND, m_t=BOUND, noise_over_pi=None)
+    given = {"m_s": BOUND, "m_t": BOUND, "damping": damping}
+    bounds = Constraints(**given, noise_over_pi=None)
     first = ql.tune(plant, structure=REFERENCE, compare=(), constraints=bounds, **how)
     if not free:
         m_ks = 1.001 * first.design.measures["M_ks"]
-        bounds = Constraints(m_s=BOUND, m_t=BOUND, m_ks=m_ks)
+        bounds = Constraints(**given, m_ks=m_ks)
     found = {REFERENCE: _row(plant, first.design, 0.0)}
     for name in others:
         begun = time.perf_counter()
@@ -124,6 +128,7 @@ def main() -> None:
     """Run the trial and print its tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--free", action="store_true", help="no bound of M_ks")
+    parser.add_argument("--ringing", action="store_true", help="no bound of damping")
     parser.add_argument("--quick", action="store_true", help="the ratio 3 only")
     parser.add_argument("--json", type=Path, help="file for all numbers")
     options = parser.parse_args()
@@ -138,7 +143,7 @@ def main() -> None:
     print(f"\nk_i over that of the tuned {REFERENCE}, M_s and M_t <= {BOUND:g}", end="")
     print(", no bound of M_ks" if options.free else ", its M_ks")
     for axis in axes(options.quick):
-        found = tuned(axis, options.free)
+        found = tuned(axis, options.free, damping=None if options.ringing else 0.4)
         results.append((axis, found))
         reference = found[REFERENCE]
         cells = [

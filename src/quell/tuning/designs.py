@@ -159,11 +159,23 @@ def _with(task: Task, **bounds: Any) -> Task:
     return replace(task, constraints=constraints, model=model)
 
 
+def without_damping(task: Task) -> Task:
+    """Return the task without the bound of damping."""
+    return _with(task, damping=None)
+
+
+def _any_feasible(solutions: Sequence[Solution]) -> bool:
+    return any(each.feasible for each in solutions)
+
+
 def _reference(task: Task, structure: FilteredPID) -> Solution | None:
     """Return the controller of a reference with the largest integral gain, if there is any."""
     best = _best(task, structure, _known_starts(structure, {}))
-    usable = best is not None and best.feasible and _is_stable(task.plants, best)
-    return best if usable else None
+    if best is not None and best.feasible and _is_stable(task.plants, best):
+        return best
+    if task.constraints.damping is None:
+        return None
+    return _reference(without_damping(task), structure)
 
 
 def _m_ks(task: Task, solution: Solution) -> float:
@@ -183,7 +195,11 @@ def tuned_designs(
         progress(name, i / len(order))
         known = {key: solved[key] for key in _GIVES_STARTS.get(name, ()) if key in solved}
         try:
-            solved[name] = _solutions(name, task, known)
+            solved[name], kept = _solutions(name, task, known), task
+            if task.constraints.damping is not None and not _any_feasible(solved[name]):
+                ringing = _solutions(name, without_damping(task), known)
+                if _any_feasible(ringing):
+                    solved[name], kept = ringing, without_damping(task)
         except ValueError as error:
             designs[name] = impossible(name, str(error))
             continue
@@ -197,19 +213,22 @@ def tuned_designs(
         elif not best.feasible:
             designs[name] = impossible(name, contradiction(problem, best, task.constraints))
         else:
-            made = (problem, best, task.constraints, task.options(best.structure))
-            designs[name] = design_of(best.structure.name, *made)
+            made = (kept.problem(), best, kept.constraints, kept.options(best.structure))
+            found = design_of(best.structure.name, *made)
+            designs[name] = replace(found, undamped=kept is not task)
     return {name: designs[name] for name in names}
 
 
 def simplest(designs: Mapping[str, Design], objective: str) -> Design:
     """Return the simplest design whose objective is within 5 % of the best of all.
 
-    Without any controller it is one that says why.
+    One that keeps the bound of damping comes before all that do not. Without any controller it is
+    one that says why.
     """
     usable = {name: each for name, each in designs.items() if each.controller is not None}
     if not usable:
         return next(iter(designs.values()))
+    usable = {name: each for name, each in usable.items() if not each.undamped} or usable
     first = next(iter(usable.values()))
     best = max(usable.values(), key=lambda each: relative(each, first, objective))
     good = [k for k, each in usable.items() if relative(best, each, objective) <= _NEAR_BEST]

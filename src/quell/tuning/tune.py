@@ -20,7 +20,14 @@ from quell.plants.linear import LinearPlant
 from quell.signals.base import Signal
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints
-from quell.tuning.designs import SIMPLEST, Task, simplest, tuned_designs, with_noise_bound
+from quell.tuning.designs import (
+    SIMPLEST,
+    Task,
+    simplest,
+    tuned_designs,
+    with_noise_bound,
+    without_damping,
+)
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import OBJECTIVES
 from quell.tuning.optimiser.time_responses import Inputs, load_step
@@ -103,8 +110,9 @@ def tune(
         integral gain, the least integral of y, whose optima may ring, as y of both signs counts
         for nothing; ``"tracking"``: least RMS of ``r − y``.
     constraints
-        the bounds; by default M_s = M_t = 1.6, and one for what noise does to u, which follows from
-        the noise of y and the limits of u where they are given (``Constraints``).
+        the bounds; by default M_s = M_t = 1.6, a damping of 0.4, and one for what noise does to u,
+        which follows from the noise of y and the limits of u where they are given
+        (``Constraints``).
     compare
         names of other structures; by default ``COMPARED``, and ``"p-pi-notch"`` for a plant with a
         resonance. An empty list for none.
@@ -227,6 +235,8 @@ def tune(
         task, noise_bound = with_noise_bound(task)
         designs = tuned_designs(list(dict.fromkeys(names)), task, report)
         chosen = _chosen(designs, structure, task)
+        if chosen.undamped:
+            task = without_damping(task)
         check = None
         if box is not None or b_range[0] != b_range[1]:
             report("check", 1.0)

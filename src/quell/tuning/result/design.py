@@ -58,6 +58,7 @@ class Design:
     reason: str = ""  #: why there is no controller; empty otherwise
     #: the least damped of the poles that count, and that of the plant's own modes
     least_damped: tuple[Pole, ...] = ()
+    undamped: bool = False  #: whether it keeps the other constraints, but not that of damping
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers and texts for a JSON file; infinite numbers become None."""
@@ -79,6 +80,7 @@ class Design:
                     for pole in self.least_damped
                 ],
                 "tables": {key: dict(table) for key, table in self.tables.items()},
+                "undamped": self.undamped,
                 "reason": self.reason,
             }
         )

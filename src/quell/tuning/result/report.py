@@ -95,6 +95,9 @@ def damping_line(design: Design, bound: float | None) -> str:
         which = "mode of the plant" if pole.own else "least damped pole of the loop"
         parts.append(f"{which}: damping {pole.damping:.3g} at {abs(pole.s):.3g} rad/s")
     line = "; ".join(parts) or "no pole of the loop oscillates, but for those of a dead time"
+    if design.undamped:
+        remedy = "take another structure, or looser bounds"
+        return f"NOT damped: {line}: with the bound of damping no controller was found; {remedy}"
     if bound is None and design.measures["damping"] < USUAL_DAMPING:
         return f"NOT damped: {line}: no plant has it; bound it by Constraints(damping=)"
     return line
