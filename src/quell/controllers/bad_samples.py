@@ -62,9 +62,3 @@ def hold_last_good(loop: Any, r: float, y: float) -> int:
         if loop.has_reference == 0.0:
             loop.r = loop.y
     return status
-
-
-@kernel
-def control_at_rest(limits: Limits) -> float:
-    """Return u before the first finite measurement: zero, or the limit nearest to it."""
-    return min(max(0.0, limits.low), limits.high)

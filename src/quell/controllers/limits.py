@@ -92,6 +92,12 @@ def largest_wish(limits: Limits) -> float:
 
 
 @kernel
+def control_at_rest(limits: Limits) -> float:
+    """Return u where nothing gives one: zero, or the limit nearest to it."""
+    return min(max(0.0, limits.low), limits.high)
+
+
+@kernel
 def apply_limits(limits: Limits, unlimited: float, before: float) -> tuple[float, int]:
     """Return the control signal that is possible after ``before``, and the status flags.
 
@@ -113,6 +119,6 @@ def apply_limits(limits: Limits, unlimited: float, before: float) -> tuple[float
         applied = limits.low
         status |= _SATURATED
     elif not is_finite(applied):
-        applied = min(max(0.0, limits.low), limits.high)
+        applied = control_at_rest(limits)
         status |= _OVERFLOWED
     return applied, status

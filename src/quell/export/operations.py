@@ -99,7 +99,7 @@ def _start_prefiltered(
 
 @generic
 def set_manual(design: Any, state: Any, manual: bool, u: float) -> None:
-    """Begin manual operation, in which u is applied, or end it."""
+    """Begin manual operation, or end it. A u that is no number is the one before."""
     raise TypeError
 
 
@@ -107,7 +107,7 @@ def set_manual(design: Any, state: Any, manual: bool, u: float) -> None:
 def _set_manual(design: AdrcDesign, state: AdrcState, manual: bool, u: float) -> None:
     loop = state.loop[0]
     loop.manual = 1.0 if manual else 0.0
-    loop.u_manual = u
+    loop.u_manual = u if is_usable(u) else loop.u
 
 
 @set_manual.register(PrefilteredDesign)
@@ -115,22 +115,6 @@ def _set_manual_inside(
     design: PrefilteredDesign, state: PrefilteredState, manual: bool, u: float
 ) -> None:
     set_manual(design.controller, state.controller, manual, u)
-
-
-@generic
-def last_control(design: Any, state: Any) -> float:
-    """Return the control signal that was applied in the last sample."""
-    raise TypeError
-
-
-@last_control.register(AdrcDesign)
-def _last_control(design: AdrcDesign, state: AdrcState) -> float:
-    return state.loop[0].u
-
-
-@last_control.register(PrefilteredDesign)
-def _last_control_inside(design: PrefilteredDesign, state: PrefilteredState) -> float:
-    return last_control(design.controller, state.controller)
 
 
 @generic
@@ -155,13 +139,10 @@ def track(design: Any, state: Any, r: float, y: float, u: float) -> float:
     Return the control signal that the controller would have applied. A u that is no number is the
     one before.
     """
-    given = is_usable(u)
-    if not given:
-        u = last_control(design, state)
     set_manual(design, state, True, u)
     control(design, state, r, y)
     set_manual(design, state, False, u)
-    if not given:
+    if not is_usable(u):
         add_flag(design, state, _CONTROL_HELD)
     return control_of_law(design, state)
 

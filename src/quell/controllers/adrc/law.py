@@ -26,12 +26,7 @@ from numpy.typing import NDArray
 
 from quell.controllers.adrc.feedback import nonlinear_part
 from quell.controllers.adrc.feedforward_law import known_share, reference_part, write_feedforward
-from quell.controllers.bad_samples import (
-    control_at_rest,
-    hold_last_good,
-    is_usable,
-    is_usable_control,
-)
+from quell.controllers.bad_samples import hold_last_good, is_usable, is_usable_control
 from quell.controllers.base import (
     bumpless_transfer,
     control,
@@ -41,7 +36,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.limits import Limits, apply_limits, largest_magnitude
+from quell.controllers.limits import Limits, apply_limits, control_at_rest, largest_magnitude
 from quell.guard import (
     assess,
     confine,

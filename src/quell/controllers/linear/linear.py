@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.bad_samples import control_at_rest, hold_last_good, is_usable_control
+from quell.controllers.bad_samples import hold_last_good, is_usable_control
 from quell.controllers.base import control, reset_loop, set_applied_control, status_flags, write_row
 from quell.controllers.limits import (
     Limits,
     RateLimit,
     apply_limits,
     checked_limits,
+    control_at_rest,
     largest_wish,
 )
 from quell.controllers.linear.law import LinearLaw, advance_law, checked_law, rest_state
