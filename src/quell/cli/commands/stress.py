@@ -181,9 +181,7 @@ def _print_axes(console: Console, result: AxesResult, guarded: bool) -> None:
     how = "with guard" if guarded else "WITHOUT guard"
     title = f"RMS error over that without learner on the same flexible axis, {how}"
     rows = table(title, *_AXES_HEADINGS, padding=(0, 1, 0, 0), pad_edge=False)
-    names = dict.fromkeys(o.structure for o in result.outcomes)
-    groups = {name: [o for o in result.outcomes if o.structure == name] for name in names}
-    for label, outcomes in {**groups, "all": result.outcomes}.items():
+    for label, outcomes in {**result.by_structure, "all": result.outcomes}.items():
         if label == "all":
             rows.add_section()
         found = summary(outcomes)

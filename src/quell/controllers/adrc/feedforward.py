@@ -214,17 +214,21 @@ class Feedforward:
         highest = min(len(self.coefficients), _MOST)
         return highest if self.derivatives is None else self.derivatives
 
+    def series(self, highest: int) -> Vector:
+        """Return c_0, c_1, … up to a power (highest + 1,), zero where there are no more."""
+        found = np.zeros(highest + 1)
+        given = np.asarray(self.coefficients, dtype=np.float64)[: found.size]
+        found[: given.size] = given
+        return found
+
     def linear_part(self, reference: Signal, t: Vector, dt: float) -> Vector:
         """Return u_ff without friction and constant at times (k,) [s], of a sampled controller.
 
         The derivatives of the reference give it at the time when u acts, half a sample and
         ``delay`` later.
         """
-        series = np.zeros(self.order + 1)
-        given = np.asarray(self.coefficients, dtype=np.float64)[: series.size]
-        series[: given.size] = given
-        total = np.zeros(t.shape)
-        for coefficient in shifted(series, (self.delay or 0.0) + 0.5 * dt).tolist():
+        total, lead = np.zeros(t.shape), (self.delay or 0.0) + 0.5 * dt
+        for coefficient in shifted(self.series(self.order), lead).tolist():
             total += coefficient * reference(t)
             reference = reference.derivative()
         return total
@@ -265,9 +269,7 @@ class Feedforward:
         known = model.samples * observer.dt if isinstance(model, DelayedModel) else 0.0
         half = 0.5 * observer.dt
         lead = (known if self.delay is None else self.delay) + half
-        own = np.zeros(m + 1)
-        given = np.asarray(self.coefficients, dtype=np.float64)[: m + 1]
-        own[: given.size] = given
+        own = self.series(m)
         inverse = inverse_series(plant, m)
         wish = np.zeros(m + 1)
         wish[degree] = 1.0

@@ -38,10 +38,7 @@ def draw(result: Result | GeneralResult | AxesResult, ax: Any = None) -> Any:
         groups: Mapping[str, Sequence[Any]] = {kind: result.of(kind) for kind in result.kinds}
         return _draw(groups, _PANELS, "RMS error over that of MF-ESO", (HONEST,), ax)
     if isinstance(result, AxesResult):
-        names = dict.fromkeys(o.structure for o in result.outcomes)
-        found = {
-            name: [o.guarded for o in result.outcomes if o.structure == name] for name in names
-        }
+        found = {name: [o.guarded for o in each] for name, each in result.by_structure.items()}
         return _draw(found, _AXES_PANELS, "RMS error over that without learner", (), ax)
     groups = result.grouped(result.healthy, "kind")
     return _draw(groups, _GENERAL_PANELS, "over that of MF-ESO", HONEST_LEARNERS, ax)

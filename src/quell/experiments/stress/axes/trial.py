@@ -78,6 +78,14 @@ class AxesResult:
     settings: dict[str, Any]
     outcomes: Sequence[AxisOutcome]
 
+    @property
+    def by_structure(self) -> dict[str, list[AxisOutcome]]:
+        """The loops of each kind of observer."""
+        found: dict[str, list[AxisOutcome]] = {}
+        for outcome in self.outcomes:
+            found.setdefault(outcome.structure, []).append(outcome)
+        return found
+
     def bars(self) -> list[Bar]:
         """Return the figures that have a bar."""
         found, chance = summary(self.outcomes), _chance(self.outcomes)
@@ -98,15 +106,12 @@ class AxesResult:
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists for ``json.dump``."""
         worst = sorted(self.outcomes, key=lambda o: -o.guarded.rms)[:_WORST_LISTED]
-        names = dict.fromkeys(o.structure for o in self.outcomes)
         return {
             "settings": self.settings,
             "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
             "all": summary(self.outcomes),
             "chance": _chance(self.outcomes),
-            "structures": {
-                name: summary([o for o in self.outcomes if o.structure == name]) for name in names
-            },
+            "structures": {name: summary(each) for name, each in self.by_structure.items()},
             "worst": [_to_json(outcome) for outcome in worst],
         }
 
