@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.adrc.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
@@ -97,6 +98,13 @@ class Task:
         return {**self.limits, **({} if given is None else structure.feedforward(given))}
 
 
+def range_of_u(limits: Mapping[str, Any]) -> tuple[float, float]:
+    """Return u_min and u_max [u-unit], infinite where there is none."""
+    known = {name: value for name, value in limits.items() if value is not None}
+    ends = known.get("u_min", -math.inf), known.get("u_max", math.inf)
+    return checks.interval("u_min", ends[0], "u_max", ends[1])
+
+
 def with_noise_bound(task: Task) -> tuple[Task, str]:
     """Return the task with a bound for what noise does to u, and how it came.
 
@@ -109,8 +117,7 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     if given.u_std is not None:
         return task, ""
     if given.noise:
-        known = {name: value for name, value in task.limits.items() if value is not None}
-        low, high = known.get("u_min", -math.inf), known.get("u_max", math.inf)
+        low, high = range_of_u(task.limits)
         if given.m_ks is not None:
             raise ValueError(
                 f"m_ks = {given.m_ks:g}: bounds what noise does to u, so noise_std and resolution "
@@ -270,13 +277,13 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     problem = task.problem()
     quick = replace(_with(task, u_max=None, rate_max=None), objective="load")
     ends = _best_gains(quick, structure, known)
-    if not ends or (problem.objective == "load" and not _is_slow(problem)):
+    is_slow = any(extra.over_time for extra in problem.extras)
+    if not ends or (problem.objective == "load" and not is_slow):
         return min(ends, key=_rank, default=None)
     tried = [solution_at(problem, structure, row) for row in (*(e.values for e in ends), *known)]
-    starts = sorted((each for each in tried if each is not None), key=_merit)
-    if not starts:
+    best = min((each for each in tried if each is not None), key=merit, default=None)
+    if best is None:
         return None
-    best = starts[0]
     if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
         return search(problem, structure, best.values, _ROUNDS)
     over, members = SetResponses(task.plants, task.inputs), list[int]()
@@ -292,14 +299,6 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
         best = found
     cost = float(problem.cost(structure, best.values[None, :])[0])
     return replace(best, cost=cost)
-
-
-def _is_slow(problem: Problem) -> bool:
-    return any(extra.over_time for extra in problem.extras)
-
-
-def _merit(solution: Solution) -> float:
-    return merit(solution.cost, solution.violation)
 
 
 def _best_gains(task: Task, structure: Structure, known: Matrix) -> list[Solution]:
@@ -342,10 +341,8 @@ def _tightened(task: Task, structure: Structure, best: Solution, share: float) -
     given, bounds = task.constraints, dict[str, float]()
     C = structure.response(best.values[None, :], task.plants.omega)
     for name, kind in KINDS.items():
-        size, limit = (
-            float(worst_ratio((Bound(kind, 1.0),), task.plants, C)[0]),
-            getattr(given, name),
-        )
+        size = float(worst_ratio((Bound(kind, 1.0),), task.plants, C)[0])
+        limit = getattr(given, name)
         is_reached = limit is not None and size >= _REACHED * limit
         if is_reached or (name == "m_ks" and given.u_std is not None):
             continue

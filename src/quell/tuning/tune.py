@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,6 +22,7 @@ from quell.tuning.constraints import Constraints
 from quell.tuning.designs import (
     SIMPLEST,
     Task,
+    range_of_u,
     simplest,
     tuned_designs,
     with_noise_bound,
@@ -45,7 +45,7 @@ from quell.tuning.result.scenario import (
     windows_of,
 )
 from quell.tuning.result.setup_file import plant_table
-from quell.tuning.structures.p_pi import resonances
+from quell.tuning.structures.base import resonances
 from quell.tuning.structures.registry import CASCADE, FEEDING_FORWARD, STRUCTURES
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Check, Uncertain, checked
@@ -212,9 +212,7 @@ def tune(
     known_rest = checked_rest(rest)
     if known_rest is None and box is None:
         known_rest = rest_of_plant(as_list(plant)[0], dt, operating_point)
-    ends = ("u_min", -math.inf), ("u_max", math.inf)
-    low, high = (end if limits.get(key) is None else limits[key] for key, end in ends)
-    u_limits = checks.interval("u_min", low, "u_max", high)
+    u_limits = range_of_u(limits)
     if setup is None or "scenario" not in setup:
         known_rest = rest_within(LinearPlant.of(given.linear[0]), known_rest, u_limits)
     plants = plant_set(given, dt)
@@ -227,8 +225,7 @@ def tune(
         compare = (*COMPARED, CASCADE) if resonances(model) else COMPARED
     names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
     if forward is not None:
-        asked = names if structure == SIMPLEST else [structure]
-        _check_feedforward(asked)
+        _check_feedforward(names if structure == SIMPLEST else [structure])
     inputs = _inputs(objective, reference, duration, load, plants, forward)
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
     with one_blas_thread():

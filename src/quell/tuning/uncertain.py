@@ -138,7 +138,8 @@ def checked(
     ratio = np.zeros(len(plants.plants))
     worst = {}
     beside = beside_poles(plants, poles)
-    peaks = all_peaks(problem.bounds, plants, controller, beside, 0.5)
+    C = controller(plants.omega)
+    peaks = all_peaks(problem.bounds, plants, controller, C, beside, 0.5)
     for number, (kind, limit) in enumerate(problem.bounds):
         own = np.zeros(ratio.size)
         for of_bound, peak in peaks:

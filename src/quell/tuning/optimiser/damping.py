@@ -32,7 +32,7 @@ from quell.analysis.frequency_response import Complex, in_s_plane
 from quell.analysis.pure_delays import eigenvalues
 from quell.analysis.subsystems import closed_loop_matrix, law_matrix
 from quell.plants.sampled import SampledPlant
-from quell.tuning.optimiser.loops import PlantSet, dead_samples
+from quell.tuning.optimiser.loops import NARROW, PlantSet, dead_samples
 from quell.tuning.optimiser.time_responses import law_of
 from quell.tuning.structures.base import Structure
 from quell.types import DesignWarning, Matrix, Vector
@@ -48,9 +48,8 @@ _NEAR, _KEPT = 2.0, 0.5
 _PAIRS = 2  # of the loop for one of the plant
 # Poles with a smaller imaginary part, in units of their size, are real, to rounding.
 _REAL = 1e-6
-# Poles with less damping have peaks that the grid of frequencies may miss, which is looked at so
-# many half widths beside them.
-_NARROW, _BESIDE = 0.1, np.array([-3.0, -1.0, 0.0, 1.0, 3.0])
+# Narrow peaks are looked for so many half widths beside a pole.
+_BESIDE = np.array([-3.0, -1.0, 0.0, 1.0, 3.0])
 # The search follows poles with less than this damping, or than what they must have by this factor.
 _FOLLOWED, _FOLLOWED_BEYOND = 0.75, 1.5
 # Step of the derivatives of g by differences, in units of |s|.
@@ -126,7 +125,7 @@ def beside_poles(plants: PlantSet, poles: list[Complex]) -> Vector:
     if not poles:
         return np.zeros(0)
     s = np.concatenate([_upper(each) for each in poles])
-    s = s[np.abs(_damping(s)) < _NARROW]
+    s = s[np.abs(_damping(s)) < NARROW]
     width = np.maximum(np.abs(s.real), 1e-7 * s.imag)
     near = np.ravel(s.imag[:, None] + width[:, None] * _BESIDE)
     near = near[(near > plants.omega[0]) & (near < plants.omega[-1])]

@@ -74,7 +74,8 @@ class Iterate:
 
         plants = self._problem.plants
         beside = beside_poles(plants, self._poles)
-        return all_peaks(self._problem.bounds, plants, controller, beside, _PEAK)
+        C = self._response[0]
+        return all_peaks(self._problem.bounds, plants, controller, C, beside, _PEAK)
 
     @cached_property
     def stable(self) -> bool:

@@ -30,8 +30,8 @@ _LEAST_BOTTOM = 3.0
 # the grid has an even part with so many radians between points, up to where the plant's gain has
 # fallen to this share of that at the crossover. Beyond, the loop's gain is too small for peaks.
 _POINTS_PER_DECADE, _TURN, _FALLEN = 24, 0.5, 0.02
-# Poles with less damping have peaks beside them that may lie between points of the grid.
-_NARROW = 0.1
+NARROW = 0.1
+"""Poles with less damping have peaks beside them that may lie between points of the grid."""
 # Half the sampling rate itself is a pole of Tustin's rule.
 _BELOW_HALF = 1.0 - 1e-6
 # Points between the neighbours of a maximum, and how often they are placed anew: an interval of
@@ -95,7 +95,7 @@ class PlantSet:
     def resonant(self) -> bool:
         """Whether a plant has poles with so little damping that peaks beside them are narrow."""
         found = [self.s_poles(plant) for plant in self.plants]
-        return any(np.any((s.imag > 0.0) & (-s.real < _NARROW * s.imag)) for s in found)
+        return any(np.any((s.imag > 0.0) & (-s.real < NARROW * s.imag)) for s in found)
 
     def scaled(self) -> list[SampledPlant]:
         """Return the plants with the factors of their gain."""

@@ -144,13 +144,15 @@ def all_peaks(
     bounds: tuple[Bound, ...],
     plants: PlantSet,
     controller: Callable[[Vector], Complex],
+    C: Complex,
     beside: Vector,
     least: float,
 ) -> list[tuple[int, Peak]]:
     """Return the refined maxima with a ratio above ``least``, each with the number of its bound.
 
-    ``controller`` is a function from frequencies to C_y (k,). Maxima are bracketed by the grid and
-    by the frequencies ``beside``, between which narrow ones may be.
+    ``controller`` is a function from frequencies to C_y (k,), and C (G,) are its values on the
+    grid. Maxima are bracketed by the grid and by the frequencies ``beside``, between which narrow
+    ones may be.
     """
     count = len(plants.plants)
 
@@ -163,7 +165,6 @@ def all_peaks(
             found[own] = sizes(kind, P[own], C[own]) / limit
         return found
 
-    C = controller(plants.omega)
     omega, P = plants.omega, plants.P
     if beside.size:
         omega = np.concatenate([omega, beside])

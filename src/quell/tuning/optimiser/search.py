@@ -78,7 +78,7 @@ def _damped(problem: Problem, structure: Structure, best: Solution, more: Matrix
     if now is not None and now.feasible:
         return now
     found = [each for row in more if (each := solution_at(problem, structure, row)) is not None]
-    near = sorted(found, key=lambda each: merit(each.cost, each.violation))[:1]
+    near = sorted(found, key=merit)[:1]
     ends = [search(problem, structure, each.values, _ROUNDS, True) for each in (best, *near)]
     kept = [each for each in (now, *ends) if each is not None]
     return min(kept, key=_rank, default=best)
@@ -102,7 +102,7 @@ def _ends(problem: Problem, structure: Structure, more: Matrix) -> list[Solution
         solution = search(problem, structure, start, _FIRST_ROUNDS, roughly=True)
         if solution is not None:
             found.append(solution)
-    found.sort(key=lambda solution: merit(solution.cost, solution.violation))
+    found.sort(key=merit)
     ends: list[Solution] = []
     few = len(structure.parameters) <= FEW
     for solution in found:
@@ -136,9 +136,9 @@ def _rank(solution: Solution) -> tuple[float, float]:
     return 0.0 if solution.feasible else solution.violation, solution.cost
 
 
-def merit(cost: float, violation: float) -> float:
+def merit(point: Solution | Iterate) -> float:
     """Return the cost of a point that may exceed limits; less is better."""
-    return cost + _EXCESS * violation
+    return point.cost + _EXCESS * point.violation
 
 
 def search(
@@ -156,7 +156,7 @@ def search(
     settled = _SETTLED_OF_FEW if few else _SETTLED
     allowed = _SETTLED_OF_FEW if few else _VIOLATION
     for i in range(rounds):
-        if best is None or merit(now.cost, now.violation) < merit(best.cost, best.violation):
+        if best is None or merit(now) < merit(best):
             best = now
         if i == rounds - 1 or (now.violation <= allowed and abs(last - now.cost) < settled):
             break

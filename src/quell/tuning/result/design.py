@@ -148,7 +148,8 @@ def measured(
     for kind in _KINDS:
         grid = sizes(kind, plants.P, C[0])
         largest = float(np.max(grid))
-        found = all_peaks((Bound(kind, 1.0),), plants, controller, beside, 0.9 * largest)
+        bound = (Bound(kind, 1.0),)
+        found = all_peaks(bound, plants, controller, C[0], beside, 0.9 * largest)
         at = max(found, key=lambda entry: entry[1].value)[1]
         measures[kind] = at.value
         if kind in bounds and at.value >= (1.0 - _ACTIVE) * bounds[kind]:

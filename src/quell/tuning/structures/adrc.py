@@ -25,7 +25,7 @@ from quell.lti.reduction import Reduced, without_far_zeros
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
 from quell.tuning.structures import sampled_adrc
-from quell.tuning.structures.base import Model, Parameter
+from quell.tuning.structures.base import Model, Parameter, resonances
 from quell.types import Matrix, Vector
 
 # Bounds of a pole in units of the plant's phase crossover, and of the damping of a pair. The law's
@@ -98,9 +98,10 @@ class AdrcStructure:
         self._delay = round(model.delay / model.dt) if form.knows_delay else 0
         self._fastest = model.constraints.omega_o_dt / model.dt
         self._damping = dict(_DAMPING)
-        if model.constraints.damping is not None and not _resonates(model):
+        least = model.constraints.damping
+        if least is not None and not resonances(model, least):
             low, high = _DAMPING["o"]
-            self._damping["o"] = (max(low, model.constraints.damping), high)
+            self._damping["o"] = (max(low, least), high)
         self._observed = self.order + (0 if form.reduced else 1)
         unit = model.gain * model.omega**self.degree
         self.parameters = (
@@ -361,15 +362,6 @@ class AdrcStructure:
         if self.form.half_law:
             controller["half_gain"] = True
         return {"observer": observer, "controller": controller}
-
-
-def _resonates(model: Model) -> bool:
-    """Return whether the plant has a mode with less damping than the bound."""
-    poles = np.linalg.eigvals(LinearPlant.of(model.plant).A)
-    size = np.abs(poles)
-    # Integrators of a chain are pairs near zero, to rounding.
-    flexible = (poles.imag > 0.0) & (size > 1e-6 * np.max(size, initial=0.0))
-    return bool(np.any(flexible & (-poles.real < (model.constraints.damping or 0.0) * size)))
 
 
 def _pair(omega: float, damping: float) -> NDArray[np.complex128]:

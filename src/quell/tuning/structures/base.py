@@ -15,8 +15,12 @@ import numpy as np
 from quell.analysis.frequency_response import Complex
 from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.base import Controller
+from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
 from quell.types import Matrix, Vector
+
+RESONANT = 0.5
+"""A pair of poles with less damping is a resonance."""
 
 
 class Parameter(NamedTuple):
@@ -96,6 +100,21 @@ class Structure(Protocol):
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
         """Return the tables of a setup file that describe the controller."""
         ...
+
+
+def resonances(model: Model, damping: float = RESONANT) -> list[float]:
+    """Return the frequencies of the plant's pairs of poles with less damping [rad/s].
+
+    The lowest is the first. A plant of which no model is known has none.
+    """
+    if model.plant is None:
+        return []
+    poles = np.linalg.eigvals(LinearPlant.of(model.plant).A)
+    size = np.abs(poles)
+    found = size[(poles.imag > 0.0) & (-poles.real < damping * size)]
+    # Integrators of a chain are pairs near zero, to rounding.
+    kept = found[found > 1e-6 * np.max(size, initial=0.0)]
+    return sorted(kept.tolist())
 
 
 def named(structure: Structure, values: Vector) -> dict[str, float]:

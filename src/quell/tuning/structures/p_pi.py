@@ -18,13 +18,12 @@ from quell.analysis.frequency_response import Complex
 from quell.controllers.adrc.feedforward import Feedforward
 from quell.controllers.baselines.notch import Notch
 from quell.controllers.baselines.p_pi import PPI
-from quell.plants.linear import LinearPlant
-from quell.tuning.structures.base import Model, Parameter
+from quell.tuning.structures.base import Model, Parameter, resonances
 from quell.types import Matrix, Vector
 
-# A pair of poles with less damping is a resonance; notches lie below this share of half the
-# sampling rate. Drives have two to four filters; a third resonance is hardly ever below the limit.
-_RESONANT, _BELOW, _MOST = 0.5, 0.95, 2
+# Notches lie below this share of half the sampling rate. Drives have two to four filters; a third
+# resonance is hardly ever below the limit.
+_BELOW, _MOST = 0.95, 2
 # Bounds of depth and width of a notch, and of its place in units of the resonance: drives have
 # notches of −40 dB at most.
 _DEPTH, _WIDTH, _PLACE = (0.01, 0.999), (0.05, 6.0), (0.2, 5.0)
@@ -118,7 +117,7 @@ class CascadeStructure:
 
     def feedforward(self, of_model: Feedforward) -> dict[str, Any]:
         """Return the inertia and the viscous friction: of ``r''`` and ``r'``; it has no more."""
-        _, viscous, inertia = np.append(of_model.coefficients, [0.0, 0.0])[:3].tolist()
+        _, viscous, inertia = of_model.series(2).tolist()
         return {"inertia": inertia, "viscous": viscous}
 
     def _arguments(self, values: Vector) -> dict[str, Any]:
@@ -141,18 +140,3 @@ class CascadeStructure:
         table = {"kind": "p-pi"} | self._arguments(values)
         notches = self._notches(values)
         return {"controller": table | ({"notches": notches} if notches else {})}
-
-
-def resonances(model: Model) -> list[float]:
-    """Return the frequencies of the plant's resonances, the lowest first [rad/s].
-
-    They are pairs of poles with a damping below 0.5.
-    """
-    if model.plant is None:
-        return []
-    poles = np.linalg.eigvals(LinearPlant.of(model.plant).A)
-    size = np.abs(poles)
-    found = size[(poles.imag > 0.0) & (-poles.real < _RESONANT * size)]
-    # Integrators of a chain are pairs near zero, to rounding.
-    kept = found[found > 1e-6 * np.max(size, initial=0.0)]
-    return sorted(kept.tolist())
