@@ -117,6 +117,18 @@ def test_limits_of_u_reach_the_file_by_every_route(
     assert (setup.controller.limits.low, setup.controller.limits.high) == (0.5, 4.5)
 
 
+def test_the_noise_of_a_record_bounds_what_noise_does_to_u(quell: object, tmp_path: Path) -> None:
+    """Its white part: 1e-4 of y was drawn; half the range of u is 2, of which it may use 2 %."""
+    record(tmp_path / "record.csv")
+    command = ("tune", "record.csv", "--model-order", "2", "--u-min", "0.5", "--u-max", "4.5", *FEW)
+    shown: Shown = quell(*command, "--json", "tuned.json")  # type: ignore[operator]
+    assert shown.code == 0, shown.err
+    line = next(line for line in shown.out.splitlines() if line.startswith("std(u)"))
+    noise = float(line.split("noise of ")[1].split()[0])
+    assert noise == pytest.approx(1e-4, rel=0.05)
+    assert "2 % of half the range of u, 2," in line
+
+
 def test_the_scenario_begins_at_the_operating_point_of_the_record(
     quell: object, tmp_path: Path
 ) -> None:
@@ -168,7 +180,7 @@ MOTOR = ([45_000.0], [1.0, 3.3, 0.0])
         (HEATER, 1.0, {"u_min": 0.0, "u_max": 100.0}, (1.0, -1.0)),
         (HEATER, 1.0, {"u_min": 0.0, "u_max": 1.0}, (0.28, -0.4)),
         (HEATER, 1.0, {"u_min": -9.0}, (1.0, 1.0)),
-        (MOTOR, 1e-3, {"u_min": -0.5, "u_max": 0.5}, (1.0, 0.2)),
+        (MOTOR, 1e-3, {"u_min": -0.5, "u_max": 0.5}, (None, 0.2)),
         (DRIVE, 0.05, {"u_min": 0.5, "u_max": 4.5}, (1.0, 1.0)),
     ],
 )
@@ -177,9 +189,9 @@ def test_step_and_load_of_the_file_can_be_held_within_the_limits_of_u(
     plant: tuple[list[float], list[float]],
     dt: float,
     limits: dict[str, float],
-    expected: tuple[float, float],
+    expected: tuple[float | None, float],
 ) -> None:
-    """With 40 % each of what the limits leave at rest: of a heater at zero the load is negative, and limits beside zero have their rest in the middle."""
+    """With 40 % each of what the limits leave at rest: of a heater at zero the load is negative, and limits beside zero have their rest in the middle. A step that needs no u at rest, as a motor's, just reaches a limit on the way."""
     tuned = ql.tune(plant, dt, structure="bandwidths", order=2, compare=(), **limits)
     tuned.save(tmp_path / "tuned.toml")
     setup = load(tmp_path / "tuned.toml")
@@ -187,8 +199,11 @@ def test_step_and_load_of_the_file_can_be_held_within_the_limits_of_u(
     before, after = np.array([-1.0]), np.array([setup.scenario.duration])
     sizes = tuple(float(s(after)[0] - s(before)[0]) for s in signals)
     if "u_min" in limits and limits["u_min"] <= 0.0:
-        assert sizes == expected
+        assert sizes == (expected[0] or sizes[0], expected[1])
     run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    if expected[0] is None:
+        during = run.window(0.0, 0.5 * setup.scenario.duration)
+        assert np.max(np.abs(run["u"][during])) == pytest.approx(limits["u_max"], rel=0.06)
     assert run["y"][-1] == pytest.approx(run["r"][-1], abs=0.02 * abs(sizes[0]))
     least, most = limits["u_min"], limits.get("u_max", math.inf)
     inside = run["u"][-(run["u"].size // 10) :]

@@ -232,6 +232,37 @@ def test_noise_and_limits_of_u_give_the_bound_of_noise() -> None:
     assert "2 % of half the range of u" in found.noise_bound
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_the_resolution_of_a_plants_encoder_is_known(late: bool) -> None:
+    """Counts and y of a turn, as 360 degrees, give the same design as the resolution; also behind a delay."""
+    motor, limits = ql.plants.LinearPlant.of(([45_000.0], [1.0, 3.3, 0.0])), {"u_max": 0.5}
+    seen = ql.plants.encoded(motor, 2**16, turn=360.0)
+    how: dict[str, Any] = {"structure": "pid", "compare": (), "u_min": -0.5, **limits}
+    found = ql.tune(ql.plants.delayed(seen, 2e-3, 1e-3) if late else seen, 1e-3, **how)
+    bounds = Constraints(resolution=360.0 / 2**16)
+    given = ql.tune(motor, 1e-3, constraints=bounds, delay=2e-3 if late else 0.0, **how)
+    assert found.design.values == given.design.values
+    assert found.noise_bound == given.noise_bound
+
+
+def test_an_encoder_does_not_replace_a_bound_that_is_given() -> None:
+    """M_ks bounds what noise does to u, and without limits of u the noise bounds nothing."""
+    seen = ql.plants.encoded(ql.plants.LinearPlant.of(([1.0], [1.0, 1.0, 1.0])), 4096)
+    how: dict[str, Any] = {"structure": "pi", "compare": ()}
+    bounds = Constraints(m_ks=3.0)
+    found = ql.tune(seen, 0.1, constraints=bounds, u_min=-1.0, u_max=1.0, **how)
+    assert (found.constraints.u_std, found.constraints.m_ks) == (None, 3.0)
+    assert ql.tune(seen, 0.1, **how).constraints.u_std is None
+
+
+def test_a_feedforward_that_the_cascade_does_not_use_is_refused() -> None:
+    """It has inertia and viscous friction, and no Coulomb friction, gravity or delay."""
+    motor, how = ([45_000.0], [1.0, 3.3, 0.0]), {"structure": "p-pi-notch", "compare": ()}
+    given = ql.Feedforward.rigid(2e-5, coulomb=0.01, delay=1e-3)
+    with pytest.raises(ValueError, match="coulomb, delay would have no effect"):
+        ql.tune(motor, 1e-3, feedforward=given, **how)
+
+
 @pytest.mark.parametrize("more", [{}, {"m_ks": 3.0}])
 def test_a_noise_without_effect_is_refused(more: dict[str, float]) -> None:
     """It needs the limits of u, and says nothing beside M_ks."""

@@ -13,6 +13,7 @@ from quell.identification import plots
 from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.model.roots import WITHIN_95, Root
 from quell.identification.search.at_rest import SURE
+from quell.identification.search.output_error import noise_model
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
 from quell.plants.labelled import labelled
@@ -87,6 +88,18 @@ class Identified:
         """Gain ``lim s^q G(s)`` at s = 0, with q integrators [y-unit/u-unit/s^q]."""
         constant = self.den[self.den.size - 1 - self.integrators]
         return float(self.num[-1] / constant) if constant else math.inf
+
+    @cached_property
+    def noise_std(self) -> float:
+        """Standard deviation of the part of y that its past does not tell [y-unit].
+
+        The model's error is ``e = w/C(q)`` with white w, and this is the deviation of w: noise of y
+        and its rounding in each sample. What a slow load adds to y from one sample to the next is
+        in it, too, so it is an upper limit.
+        """
+        error = (self.y - self.simulated)[: self.held_from]
+        _, variance = noise_model(error - np.mean(error))
+        return math.sqrt(variance)
 
     @property
     def records(self) -> tuple[Any, Any]:

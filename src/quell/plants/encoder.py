@@ -1,7 +1,8 @@
 """A plant whose output is quantized by an encoder with a finite number of counts a turn.
 
-``y = q floor(y_plant/q + 1/2)`` with ``q = 2π/counts``. The counter is zeroed half-way between two
-edges, so its error is at most q/2 in both directions. Only the output is quantized, not the state.
+``y = q floor(y_plant/q + 1/2)`` with ``q = turn/counts``. The counter is zeroed half-way between
+two edges, so its error is at most q/2 in both directions. Only the output is quantized, not the
+state.
 """
 
 from __future__ import annotations
@@ -63,18 +64,19 @@ def _check_run(plant: EncodedPlantModel, scratch: Vector) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EncodedPlant(PlantWrapper):
-    """A plant whose output [rad] is read by an encoder of ``counts`` a turn.
+    """A plant whose output is read by an encoder of ``counts`` a turn.
 
     Make it with ``encoded``.
     """
 
     plant: Plant
     counts: int
+    turn: float = math.tau  #: y of one turn [y-unit]
 
     @property
     def resolution(self) -> float:
-        """Angle of one count [rad]."""
-        return math.tau / self.counts
+        """Step of y that one count is [y-unit]."""
+        return self.turn / self.counts
 
     @property
     def name(self) -> str:
@@ -86,8 +88,8 @@ class EncodedPlant(PlantWrapper):
         return EncodedPlantModel(self.plant.sampled(dt, interpret), self.resolution)
 
 
-def encoded(plant: Plant, counts: int) -> EncodedPlant:
-    """Return a plant whose output y, an angle [rad], is read by an encoder.
+def encoded(plant: Plant, counts: int, turn: float = math.tau) -> EncodedPlant:
+    """Return a plant whose output y, an angle or a position, is read by an encoder.
 
     Parameters
     ----------
@@ -95,11 +97,14 @@ def encoded(plant: Plant, counts: int) -> EncodedPlant:
         any plant.
     counts
         counts of the encoder a turn, with all four edges of its two channels.
+    turn
+        y of one turn [y-unit]: 2π rad by default, 360 for degrees, the pitch of a screw [mm].
 
     Raises
     ------
     ValueError
-        if ``counts`` is no whole number above zero, or ``plant`` is not a plant.
+        if ``counts`` is no whole number above zero, ``turn`` is not positive, or ``plant`` is not a
+        plant.
 
     Examples
     --------
@@ -109,4 +114,5 @@ def encoded(plant: Plant, counts: int) -> EncodedPlant:
     0.0003927
     """
     check_plant(plant)
-    return EncodedPlant(plant, checks.whole("counts", counts, 1))
+    counts = checks.whole("counts", counts, 1)
+    return EncodedPlant(plant, counts, checks.positive("turn", turn, "y-unit"))

@@ -13,7 +13,9 @@ from quell.setup.errors import SetupError
 from quell.setup.loading import Setup, made
 from quell.setup.toml_file import read
 from quell.setup.vary import changed
-from quell.tuning.designs import SIMPLEST
+from quell.tuning.constraints import Constraints
+from quell.tuning.designs import SIMPLEST, range_of_u
+from quell.tuning.plants import with_known_noise
 from quell.tuning.result.scenario import late_tables, rest_of_plant
 from quell.tuning.structures.registry import FEEDING_FORWARD
 
@@ -32,9 +34,14 @@ class TuningTask(NamedTuple):
 
 
 def tuning_task(
-    path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None, trust: bool = False
+    path: str | os.PathLike[str],
+    changes: Mapping[str, Any] | None = None,
+    trust: bool = False,
+    limits: Mapping[str, float] | None = None,
 ) -> TuningTask:
     """Read a setup file for ``quell.tune``; ``changes`` are values of ``[tune]`` by name.
+
+    ``limits`` are limits of u that replace those of the file's controller.
 
     Observer, controller, learner, guard and prefilter of the file are left out: they are what is
     tuned. The limits of u stay, and the tuned controller has the feedforward of a model if the
@@ -62,8 +69,11 @@ def tuning_task(
     plant, ranges = setup.needed("plant"), _ranges(setup)
     options = dict(setup.tune or {})
     if isinstance(given, Mapping):
-        limits = ("u_min", "u_max", "rate_limit")
-        options = {key: given[key] for key in limits if key in given} | options
+        names = ("u_min", "u_max", "rate_limit")
+        options = {key: given[key] for key in names if key in given} | options
+    options |= limits or {}
+    bounds, u_limits = options.get("constraints") or Constraints(), range_of_u(options)
+    options["constraints"] = with_known_noise(bounds, plant, u_limits)
     options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
     delay = options.get("delay", 0.0)
     if isinstance(delay, float) and delay > 0.0:  # the plant of the tuned file has it, too

@@ -67,6 +67,7 @@ def tuned_frames(
     plant, delay = record.plants(setup, message)
     options: dict[str, Any] = {"delay": delay, "progress": stoppable(report, stale)}
     limits = _limits(setup)
+    bounds = record.with_noise(bounds, limits, setup, message)
     first: dict[str, Any] = {"structure": structure, "constraints": bounds, **limits}
     first["compare"] = None if structure == SIMPLEST else ()
     given = getattr(without_prefilters(setup.controller), "feedforward", False)

@@ -31,7 +31,9 @@ from quell.studio.runs import (
     linear_of,
     stoppable,
 )
-from quell.tuning import Tuned, tune
+from quell.tuning import Constraints, Tuned, tune
+from quell.tuning.designs import range_of_u
+from quell.tuning.plants import with_known_noise
 from quell.tuning.record_model import RecordModel, record_model
 
 MOST_FILE = 8 * 2**20
@@ -76,6 +78,7 @@ class Shown(NamedTuple):
     plants: list[Any]
     delays: list[float]  # [s]
     refusal: str  # why nothing is tuned for the record; empty if it is
+    model: Any  # what the record shows
 
 
 class PageRecord:
@@ -132,10 +135,30 @@ class PageRecord:
                 f"NOT: no plant to tune for: {self.shown.refusal}; change the fields and identify "
                 "again, or close the record to tune for the plant in the form"
             )
-        same = message["setup"].get("plant") == self.shown.plant
-        if same and float(setup.controller.dt) == self.shown.dt:
+        if self._is_of_record(setup, message):
             return self.shown.plants, self.shown.delays
         return linear_of(setup)
+
+    def with_noise(
+        self,
+        bounds: Constraints,
+        limits: Mapping[str, Any],
+        setup: Setup,
+        message: Mapping[str, Any],
+    ) -> Constraints:
+        """Return the constraints with the noise of y that the record or the encoder tells of."""
+        shown = self.shown
+        of_record = shown is not None and self._is_of_record(setup, message)
+        plant = shown.model if shown is not None and of_record else setup.plant
+        return with_known_noise(bounds, plant, range_of_u(limits))
+
+    def _is_of_record(self, setup: Setup, message: Mapping[str, Any]) -> bool:
+        """Whether the page shows a record, and the setup has its plant and its sample time."""
+        shown = self.shown
+        if message.get("record") is not True or shown is None:
+            return False
+        same = message["setup"].get("plant") == shown.plant
+        return same and float(setup.controller.dt) == shown.dt
 
 
 def read_file(content: bytes, name: str, options: Mapping[str, Any]) -> tuple[Measured, list[str]]:
@@ -204,7 +227,7 @@ def record_frames(
     found = record_model(read, **model, progress=identifying)
     table = _plant_table(found)
     plants, delays, refusal, first = _first_design(found, tuning)
-    record.shown = Shown(table, read.dt, plants, delays, refusal)
+    record.shown = Shown(table, read.dt, plants, delays, refusal, found.model)
     lines = [for_page(line) for line in found.lines]
     header = {
         "kind": "record",

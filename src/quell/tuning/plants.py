@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +12,7 @@ import numpy as np
 from quell import checks
 from quell.lti.canonical import canonical
 from quell.plants.batch import PlantBatch
+from quell.plants.delay import DelayedPlant
 from quell.plants.linear_part import linear_part
 from quell.plants.sampled import SampledPlant, sampled_plant
 from quell.tuning.constraints import Constraints
@@ -46,6 +49,23 @@ def as_list(plant: Any) -> list[Any]:
         if not any(isinstance(entry, inner) for entry in plant):
             return plant
     return [plant]
+
+
+def with_known_noise(given: Constraints, plant: Any, limits: tuple[float, float]) -> Constraints:
+    """Return the constraints with the noise of y that a plant tells of, if nothing bounds it yet.
+
+    A plant with an encoder tells of its resolution, the model of a record of ``noise_std``. Either
+    is of use between finite ``limits`` of u [u-unit], a share of which noise may take.
+    """
+    bounded = given.noise or given.m_ks or given.u_std or given.noise_over_pi is None
+    if bounded or not math.isfinite(limits[1] - limits[0]):
+        return given
+    while isinstance(plant, DelayedPlant):
+        plant = plant.plant
+    std, step = (getattr(plant, name, None) or 0.0 for name in ("noise_std", "resolution"))
+    if std > 0.0:  # rounding is part of it
+        return replace(given, noise_std=std)
+    return replace(given, resolution=step) if step > 0.0 else given
 
 
 def given_plants(

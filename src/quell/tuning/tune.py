@@ -31,8 +31,16 @@ from quell.tuning.designs import (
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import OBJECTIVES
 from quell.tuning.optimiser.time_responses import Inputs, load_step
-from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set
+from quell.tuning.plants import (
+    Given,
+    as_list,
+    given_plants,
+    model_of,
+    plant_set,
+    with_known_noise,
+)
 from quell.tuning.result.design import Design
+from quell.tuning.result.reference_step import peak_of_u
 from quell.tuning.result.scenario import (
     Limits,
     Rest,
@@ -112,7 +120,7 @@ def tune(
     constraints
         the bounds; by default M_s = M_t = 1.6, a damping of 0.4, and one for what noise does to u,
         which follows from the noise of y and the limits of u where they are given
-        (``Constraints``).
+        (``Constraints``); the resolution of a plant's encoder is known.
     compare
         names of other structures; by default ``COMPARED``, and ``"p-pi-notch"`` for a plant with a
         resonance. An empty list for none.
@@ -177,6 +185,9 @@ def tune(
     >>> round(tuned.design.values["K"], 2), round(tuned.design.values["T_i"], 2)
     (0.63, 1.96)
     """
+    u_limits = range_of_u(limits)
+    if uncertain is None:
+        constraints = with_known_noise(constraints or Constraints(), as_list(plant)[0], u_limits)
     if scenario is not None or not isinstance(objective, str) or objective not in OBJECTIVES:
         how: dict[str, Any] = {"structure": structure, "order": order, "constraints": constraints}
         how |= {"compare": compare, "delay": delay, "actuator_lag": actuator_lag, "setup": setup}
@@ -212,7 +223,6 @@ def tune(
     known_rest = checked_rest(rest)
     if known_rest is None and box is None:
         known_rest = rest_of_plant(as_list(plant)[0], dt, operating_point)
-    u_limits = range_of_u(limits)
     if setup is None or "scenario" not in setup:
         known_rest = rest_within(LinearPlant.of(given.linear[0]), known_rest, u_limits)
     plants = plant_set(given, dt)
@@ -225,7 +235,7 @@ def tune(
         compare = (*COMPARED, CASCADE) if resonances(model) else COMPARED
     names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
     if forward is not None:
-        _check_feedforward(names if structure == SIMPLEST else [structure])
+        _check_feedforward(names if structure == SIMPLEST else [structure], feedforward)
     inputs = _inputs(objective, reference, duration, load, plants, forward)
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
     with one_blas_thread():
@@ -246,7 +256,7 @@ def tune(
         objective=objective,
         task=task,
         check=check,
-        setup=_setup(given, plants, setup, known_rest, u_limits),
+        setup=_setup(given, plants, setup, known_rest, u_limits, chosen),
         noise_bound=noise_bound,
         signals=signals_of(as_list(plant)[0]),
     )
@@ -284,13 +294,25 @@ def _check_names(structure: str, compare: Sequence[str] | None, objective: str) 
     checks.one_of("objective", objective, OBJECTIVES)
 
 
-def _check_feedforward(names: Sequence[str]) -> None:
-    """Raise an error unless one of the structures has a feedforward."""
+def _check_feedforward(names: Sequence[str], given: bool | Feedforward) -> None:
+    """Raise an error unless one of the structures has all of the feedforward that is given."""
     if not set(names) & set(FEEDING_FORWARD):
         raise ValueError(
             f"feedforward: {', '.join(names)} has none; give a structure that has, as freed, "
             "model-based or p-pi-notch, or feedforward = false"
         )
+    if list(names) == [CASCADE] and isinstance(given, Feedforward):
+        used, extra = (1, 2), ("coulomb", "constant", "delay", "derivatives")
+        unused = [name for name in extra if getattr(given, name)]
+        unused += [
+            f"coefficients[{i}]" for i, c in enumerate(given.coefficients) if c and i not in used
+        ]
+        if unused:
+            raise ValueError(
+                f"feedforward: {', '.join(unused)} would have no effect: structure = {CASCADE!r} "
+                "feeds inertia and viscous friction forward; leave them out, or give freed or "
+                "model-based"
+            )
 
 
 def _inputs(
@@ -363,6 +385,7 @@ def _setup(
     known: Mapping[str, Any] | None,
     rest: Rest | None,
     limits: Limits,
+    design: Design,
 ) -> dict[str, Any]:
     """Return the tables of a setup file: ``known``, else the first plant, a step, a load.
 
@@ -380,7 +403,9 @@ def _setup(
     if "scenario" not in tables:
         last = float(f"{load_step(plants).r.size * dt:.2g}")
         rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
-        sizes = held_sizes(linear, rest, limits)
+        assert design.solution is not None
+        unlimited = design.solution.structure.controller(design.solution.values)
+        sizes = held_sizes(linear, rest, limits, peak_of_u(plants, unlimited))
         tables |= scenario_tables(last, linear.disturbances, rest, sizes)
     elif "metrics" not in tables:
         tables["metrics"] = windows_of(tables["scenario"])

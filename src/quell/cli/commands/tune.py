@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from quell.commissioning import Verification
     from quell.tuning import Tuned
 
-_BOUNDS = ("m_s", "m_t", "m_ks", "noise_std", "resolution")
+_BOUNDS = ("m_s", "m_t", "m_ks", "damping", "noise_std", "resolution")
 _HEADINGS = ("M_s", "M_t", "M_ks", "delay\nmargin")
 
 
@@ -59,6 +59,7 @@ def tune(
     m_s: float | None = None,
     m_t: float | None = None,
     m_ks: float | None = None,
+    damping: float | None = None,
     noise: float | None = None,
     resolution: float | None = None,
     feedforward: bool | None = None,
@@ -107,10 +108,13 @@ def tune(
     m_t
         Largest complementary sensitivity; 1.6 by default.
     m_ks
-        Largest gain from y to u. By default noise may use 2 % of the range of u if --noise or
-        --resolution and --u-min, --u-max are given, else it follows from a PI or PID controller.
+        Largest gain from y to u. By default noise may use 2 % of the range of u if --u-min, --u-max
+        and the noise of y are known, else it follows from a PI or PID controller.
+    damping
+        Least damping of the closed loop's poles; 0.4 by default.
     noise
-        Standard deviation of the noise of y in each sample [y-unit].
+        Standard deviation of the noise of y in each sample [y-unit]; that of a record, and the
+        resolution of a plant's encoder, are known.
     resolution
         Step to which y is rounded [y-unit]: 360/2^16 degrees of a 16-bit encoder.
     feedforward
@@ -128,6 +132,8 @@ def tune(
     """
     from quell.commissioning.records import is_record
     from quell.files import check_writable
+    from quell.tuning.designs import range_of_u
+    from quell.tuning.plants import with_known_noise
 
     named: dict[str, Any] = {
         "structure": structure,
@@ -137,7 +143,7 @@ def tune(
         "feedforward": feedforward,
         "trials": trials,
     }
-    named |= {"m_s": m_s, "m_t": m_t, "m_ks": m_ks}
+    named |= {"m_s": m_s, "m_t": m_t, "m_ks": m_ks, "damping": damping}
     named |= {"noise_std": noise, "resolution": resolution}
     options = {name: value for name, value in named.items() if value is not None}
     files = [file for file in (out, save_record) if file is not None]
@@ -178,6 +184,7 @@ def tune(
         given_rest = works.rest()
         plant, dt, more, model = from_record(console, setup, asked)
         more |= given_rest or rest_of_model(model)
+    options["constraints"] = with_known_noise(options["constraints"], model, range_of_u(options))
     tuned = replace(_tuned(console, plant, dt, options | more), signals=model.signals)
     _print(console, tuned, rig.device or str(setup))
     step = None
@@ -250,8 +257,8 @@ def _plant(
             raise ValueError("setup: goes without --num, --den and --dt, which are in the file")
         rest = {"u_rest": (works.u_rest, None), "y_rest": (works.y_rest, None)}
         refuse(rest, "is the operating_point of [plant], and scenario.x0, in a setup")
-        task = tuning_task(setup, options, trust)
-        return task.plant, task.dt, task.options | works.limits(), task.setup.title
+        task = tuning_task(setup, options, trust, works.limits())
+        return task.plant, task.dt, task.options, task.setup.title
     if not num or not den or dt is None:
         raise ValueError(
             "setup: missing; must be a TOML file, or give --num 1 --den 1,3,3,1 --dt 0.01"

@@ -72,6 +72,14 @@ def reference_step(plants: PlantSet, controller: Controller) -> ReferenceStep:
     return ReferenceStep(overshoot, settling, *best)
 
 
+def peak_of_u(plants: PlantSet, controller: Controller) -> float:
+    """Return the largest ``|u|`` after a unit step of r [u-unit/y-unit], without limits of u."""
+    size = load_step(plants).r.size
+    one, none = np.ones(size), np.zeros(size)
+    u = response(plants.scaled()[0], law_of(controller), Inputs(one, none), "u")
+    return float(np.max(np.abs(u)))
+
+
 def _behind(model: ReferenceModel, pulse: Vector, dt: float) -> Vector:
     """Return the response to a step through a prefilter (k,)."""
     # All its poles are at the same place: r_f is the step through that many equal lags.

@@ -99,12 +99,16 @@ def rest_within(linear: LinearPlant, rest: Rest | None, limits: Limits) -> Rest 
     return Rest(middle, y)
 
 
-def held_sizes(linear: LinearPlant, rest: Rest | None, limits: Limits) -> tuple[float, float]:
+def held_sizes(
+    linear: LinearPlant, rest: Rest | None, limits: Limits, peak: float
+) -> tuple[float, float]:
     """Return the sizes of a step of r [y-unit] and of the first load that u can hold, of 1 at most.
 
     At rest the step needs u with ``A x + B u = 0``, ``C x = 1``, the load ``A x + B u = −E``,
-    ``C x = 0``; each gets 40 % of what the limits leave. A size is negative where u has more room
-    on the other side, as that of a load on a heater at zero.
+    ``C x = 0``; each gets 40 % of what the limits leave. A step that needs no u at rest, as that of
+    an axis, keeps the largest ``|u|`` on the way within the limits, which is ``peak`` after a step
+    of 1 without limits [u-unit/y-unit]. A size is negative where u has more room on the other side,
+    as that of a load on a heater at zero.
     """
     at = 0.0 if rest is None else rest.u
     low, high = limits
@@ -112,7 +116,7 @@ def held_sizes(linear: LinearPlant, rest: Rest | None, limits: Limits) -> tuple[
     matrix = np.block([[linear.A, linear.B], [linear.C, np.zeros((1, 1))]])
     rights = [np.append(np.zeros(n), 1.0)]
     rights += [np.append(-linear.E[:, 0], 0.0)] if linear.disturbances else []
-    sizes = []
+    sizes: list[float] = []
     for right in rights:
         found = np.linalg.lstsq(matrix, right, rcond=None)[0]
         solved = np.linalg.norm(matrix @ found - right) <= _SOLVED * np.linalg.norm(right)
@@ -121,6 +125,8 @@ def held_sizes(linear: LinearPlant, rest: Rest | None, limits: Limits) -> tuple[
         ends = (high - at, low - at) if u > 0.0 else (low - at, high - at)
         most = [1.0 if u == 0.0 else min(1.0, abs(_SHARE * end / u)) for end in ends]
         size = most[0] if most[0] >= most[1] else -most[1]
+        if not sizes and u == 0.0 and peak > 0.0:
+            size = min(1.0, min(high - at, at - low) / peak)
         sizes.append(float(f"{size:.2g}"))
     return sizes[0], sizes[-1]
 
