@@ -107,7 +107,7 @@ CASES: dict[str, dict[str, Case]] = {
     "tune": {
         "SETUP": (_PLANT, _OF_SETUP), "--num": (_PLANT, (*_PLANT, "--num", "3")), "--den": (_PLANT, (*_PLANT, "--den", "1,2")), "--dt": (_PLANT, (*_PLANT, "--dt", "0.06")),
         "--delay": ("--delay", "0.1"), "--structure": ("--structure", "pid"), "--order": ("--order", "1"), "--objective": ("--objective", "load"),
-        "--m-s": ("--m-s", "1.7"), "--m-t": ("--m-t", "1.7"), "--m-ks": ("--m-ks", "9"), "--noise": ("--noise", "0.01"), "--resolution": ("--resolution", "0.01"), "--feedforward": ("--feedforward",), "--trials": ("--trials", "3"), "--out": ("--out", "taken.json"), "--save-record": ("--save-record", "new.csv"),
+        "--m-s": ("--m-s", "1.7"), "--m-t": ("--m-t", "1.7"), "--m-ks": ("--m-ks", "9"), "--damping": ("--damping", "0.7"), "--noise": ("--noise", "0.01"), "--resolution": ("--resolution", "0.01"), "--feedforward": ("--feedforward",), "--trials": ("--trials", "3"), "--out": ("--out", "taken.json"), "--save-record": ("--save-record", "new.csv"),
         "--model-order": (_RECORD, (*_RECORD, "--model-order", "2")), "--u-min": ("--u-min=-3",), "--u-max": ("--u-max", "3"),
         "--u-rest": ("--u-rest", "1"), "--y-rest": (_PLANT, (*_PLANT, "--u-rest", "1", "--y-rest", "2")), "--device": (_OF_SETUP, _TWIN),
         **{f"--{name}": (_RECORD, (*_RECORD, f"--{name}", *value)) for name, value in {
