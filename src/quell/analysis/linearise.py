@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.frozen_learner import Frozen, copy_state, frozen
+from quell.analysis.adapting_learner import Adapting, adaptation_memory, adapting
+from quell.analysis.frozen_learner import Frozen, copy_state
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.feedforward_law import without_forces
 from quell.controllers.base import Controller, control
@@ -54,11 +55,14 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
         return given
     if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
-    learner = at if isinstance(at, Frozen) else frozen(controller, at)
+    learner = at if isinstance(at, Frozen | Adapting) else adapting(controller, at)
     design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
     forward = without_forces(design.feedforward)
     design, nothing = design._replace(limits=NO_LIMITS, feedforward=forward), np.zeros(0)
-    nothing_learned, unguarded = NoLearnerMemory(nothing), UnguardedMemory(nothing)
+    nothing_learned: Any = NoLearnerMemory(nothing)
+    if isinstance(learner, Adapting):
+        nothing_learned = adaptation_memory(learner)
+    unguarded = UnguardedMemory(nothing)
     state = controller.initial_state()._replace(learner=nothing_learned, guard=unguarded)
     control(design, state, 0.0, 0.0)
     measured = _measured(_Sample(design, state))
