@@ -3,6 +3,7 @@
 May import ``simulation``, ``records``, ``controllers`` and what they import.
 """
 
+from quell.analysis.adapting_learner import Adapting, adapting
 from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify
 from quell.analysis.frozen_learner import Frozen, frozen
@@ -22,11 +23,13 @@ from quell.controllers.design_checks import Finding
 from quell.suggestions import suggest_names
 
 __all__ = [
+    "Adapting",
     "Certificate",
     "Finding",
     "Frozen",
     "LoopAnalysis",
     "Margins",
+    "adapting",
     "advise",
     "analyse",
     "certify",

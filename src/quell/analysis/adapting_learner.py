@@ -11,8 +11,8 @@ What goes on adapting is the bias d, and the amplitudes of oscillators at ω_j: 
 the learner is linear, and a part of the loop. ^F is the observer's own lag (``learners/lag.py``),
 H_j its response at ω_j to the sinusoid of the last sample, and c_j turns with the oscillator, which
 makes the law the same in each sample. So the bias is an integrator, and each oscillator is a
-resonance: a loop with a bias has two integrators, and its margins are those of such a loop (METHOD:
-docs/theory, "What the bias is").
+resonance: a loop with a bias has two integrators, and its margins are those of such a loop (docs/theory, "Margins with
+a learner").
 
 The gains γ and Γ are steady ones. Those of a Kalman filter follow from its Riccati equation for the
 features that move at rest, the constant 1 and the sinusoids, in units of the density of the noise,
@@ -50,7 +50,7 @@ from quell.learners.base import (
 )
 from quell.learners.gradient.batch_gradient import BatchDesign
 from quell.learners.kalman.kernels import KalmanDesign
-from quell.learners.lag import NO_LAG, lag_memory, lag_push
+from quell.learners.lag import lag_memory, lag_push
 from quell.learners.online.learner import OnlineDesign
 from quell.learners.regression.kernels import LinearDesign
 from quell.types import Matrix, Vector
@@ -190,7 +190,9 @@ def adapting(controller: Controller, run: Any = None, t: float | None = None) ->
     authority = 1.0 if state is None else float(controller.read(state).authority)
     found = adaptation_of(design, memory)
     lag: Any = getattr(design, "lag", controller.parameters.lag)
-    seen = lag_response(lag, found.omega * controller.dt) * np.exp(-1j * found.omega * controller.dt)
+    seen = lag_response(lag, found.omega * controller.dt) * np.exp(
+        -1j * found.omega * controller.dt
+    )
     return Adapting(
         known=known,
         authority=authority,
@@ -260,7 +262,9 @@ def _of_kalman(design: KalmanDesign, omega: Vector) -> Adaptation:
     for k in range(steps):
         turned = np.exp(1j * angular * dt * k)
         shown = shift * turned
-        phi = np.append(np.ones(int(design.bias)), np.column_stack([shown.imag, shown.real]).ravel())
+        phi = np.append(
+            np.ones(int(design.bias)), np.column_stack([shown.imag, shown.real]).ravel()
+        )
         of_phi = P @ phi
         spread = float(phi @ of_phi)
         gain = of_phi / max(spread + 1.0 / dt, spread / (design.fastest * dt))

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.analysis.adapting_learner import Adapting, adapting
+from quell.analysis.frozen_learner import Frozen
 from quell.analysis.loop import LoopAnalysis, analyse, durations
 from quell.analysis.pure_delays import eigenvalues
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
 from quell.controllers.design_checks import Finding, known_samples, sampling_findings
+from quell.learners.base import NoLearner
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
 from quell.plants.linear_part import linear_part
@@ -21,6 +24,11 @@ from quell.plants.linear_part import linear_part
 _NOISE = 0.05
 # Between loops of four integrators with omega_o = 10 omega_c, 0.41, and with 3 omega_c, 0.24.
 _LEAST_MODULUS = 0.3
+# M_s that a learner may cause by its adaptation: a modulus margin of 0.4, beyond which a loop rings.
+# Up to the second number times M_s without the learner it is not the learner's doing.
+_LEARNED_M_S, _RAISED = 2.5, 1.1
+# Steps of the bisection for the bandwidth that keeps it.
+_BISECTIONS = 12
 # Factor between b and b0 from which on b0 is blamed for too little margin. Chosen by hand: a factor
 # of 2 takes a chain of four integrators with omega_o = 10 omega_c from 0.41 to 0.08 or less.
 _WRONG_GAIN = 1.3
@@ -49,7 +57,7 @@ def advise(
 ) -> list[Finding]:
     """Return the weak points of a design, each with its number, the limit, and what to do.
 
-    They are in the order sampling, bandwidth, margin, lag, noise. Times within one message have the
+    They are in the order sampling, bandwidth, margin, learner, lag, noise. Times within one message have the
     same unit. Raises ``ValueError`` as ``analyse`` does, and without a plant for a controller that
     assumes none.
 
@@ -70,7 +78,8 @@ def advise(
         that the observer assumes. If none is stated, a loop that a delay of one sample makes
         unstable is a finding.
     at
-        instant at which the learner is frozen; see ``analyse``.
+        instant at which the learner is looked at; see ``analyse``. By default its adaptation is
+        judged with full authority of a guard.
     operating_point
         state and control signal (x, u) about which a nonlinear plant is linearised.
     """
@@ -93,6 +102,7 @@ def advise(
             lost = _unstable(loop, "with this plant", _remedy(loop, controller, found))
         return [*found, lost]
     found += _judge_margin(loop, controller, found)
+    found += _judge_learner(plant, controller, known_delay, options)
     if actuator_lag > 0.0 or delay > 0.0:
         lags: dict[str, Any] = {"delay": known_delay + delay, "actuator_lag": actuator_lag}
         late = analyse(plant, controller, **lags, **options)
@@ -210,6 +220,44 @@ def _judge_margin(
         f"{_remedy(loop, controller, found)}"
     )
     return [Finding("margin", margins.modulus, _LEAST_MODULUS, message)]
+
+
+def _judge_learner(
+    plant: Any, controller: Controller, delay: float, options: dict[str, Any]
+) -> list[Finding]:
+    """Judge what a learner's adaptation takes of the modulus margin."""
+    if not isinstance(controller, ADRC) or isinstance(controller.learner, NoLearner):
+        return []
+    at = options["at"]
+    learner = at if isinstance(at, Frozen | Adapting) else adapting(controller, at)
+    if isinstance(learner, Frozen) or not (learner.level > 0.0 or learner.omega.size):
+        return []
+    if at is None:
+        learner = learner._replace(authority=1.0)
+
+    def m_s(part: Any) -> float:
+        loop = analyse(plant, controller, delay=delay, **{**options, "at": part})
+        return 1.0 / loop.margins.modulus if loop.stable else math.inf
+
+    none = m_s(learner.known._replace(gain=0.0 * learner.known.gain, before=0.0, slope=0.0))
+    value, limit = m_s(learner), max(_LEARNED_M_S, _RAISED * none)
+    if value <= limit:
+        return []
+    message = f"the learner's adaptation raises M_s from {none:.3g} to {value:.3g}: "
+    if learner.level > 0.0 and m_s(learner._replace(level=0.0)) <= limit:
+        low, high = 0.0, 1.0
+        for _ in range(_BISECTIONS):
+            share = 0.5 * (low + high)
+            kept = m_s(learner._replace(level=share * learner.level)) <= limit
+            low, high = (share, high) if kept else (low, share)
+        bandwidth = low * learner.level / controller.dt
+        message += (
+            f"its bias is an integrator beside the observer's; with bias_bandwidth = "
+            f"{bandwidth:.3g} rad/s M_s is {limit:.3g}"
+        )
+    else:
+        message += "take fewer oscillators, lower frequencies, or a lower pair_bandwidth"
+    return [Finding("learner", value, limit, message)]
 
 
 def _judge_lag(

@@ -35,9 +35,9 @@ _SAME = 1e-9
 
 
 def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
-    """Return the linear law of a controller, its learner frozen.
+    """Return the linear law of a controller, its learner as it adapts at rest.
 
-    It equals the controller without limits, except for a constant feedforward of the learner, and
+    It equals the controller without limits, except for what the learner learns in motion, and
     except for a first sample with y ≠ 0, at which an ADRC takes the measurement as its state.
     Raises ``ValueError`` for a controller without a linear law, or with one that changes from
     sample to sample.
@@ -47,8 +47,8 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     controller
         an ``ADRC``, or a linear controller, whose own law is returned.
     at
-        instant at which the learner is frozen: a ``Frozen``, a run or a state of the controller
-        (its end); by default the present state.
+        instant at which the learner is looked at: an ``Adapting`` or a ``Frozen``, a run or a state
+        of the controller (its end); by default the present state.
     """
     if hasattr(controller, "law"):
         given: LinearLaw = controller.law

@@ -19,8 +19,10 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.analysis.adapting_learner import is_known
 from quell.analysis.certificate import Certificate, certify
 from quell.analysis.frequency_response import Complex, Response, frequencies, in_s_plane
+from quell.analysis.frozen_learner import Frozen
 from quell.analysis.linearise import linear_law
 from quell.analysis.margins import Margins, least, margins
 from quell.analysis.pure_delays import eigenvalues
@@ -47,7 +49,10 @@ def analyse(
     actuator_lag: float = 0.0,
     operating_point: Any = None,
 ) -> LoopAnalysis:
-    """Analyse the loop of a linear plant and a controller, unlimited and with a frozen learner.
+    """Analyse the loop of a linear plant and a controller, unlimited, with a learner at rest.
+
+    What a learner knows of the plant is a feedback, and its bias and oscillators go on adapting:
+    the loop contains both, linearised about rest (``adapting_learner.py``).
 
     Raises ``ValueError`` for a nonlinear plant without operating point, a plant with direct
     feedthrough, a controller without a linear law, a delay of more than 200 samples.
@@ -61,9 +66,10 @@ def analyse(
     controller
         an ``ADRC`` or a linear controller; a prefilter in front of it is left out.
     at
-        instant at which its learner is frozen: a ``Frozen`` from ``frozen(controller, run, t)``, or
-        a run or state of the controller (its end); by default the present state, which for a new
-        controller has learned nothing.
+        instant at which its learner is looked at: a run or state of the controller (its end), or
+        an ``Adapting`` from ``adapting(controller, run, t)``; by default the present state, which
+        for a new controller has learned nothing. A ``Frozen`` from ``frozen`` in its place is a
+        learner that no longer learns.
     delay
         additional dead time of the loop [s].
     actuator_lag
@@ -86,7 +92,13 @@ def analyse(
     if _is_guarded(controller):
         how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
         certificate = partial(certify, plant, controller, operating_point=operating_point, **how)
-    return LoopAnalysis(sampled, linear_law(controller, at), dt, b_over_b0, certificate)
+    law, note = linear_law(controller, at), ""
+    if isinstance(controller, ADRC) and not isinstance(at, Frozen):
+        design = controller.parameters.learner
+        if not is_known(design):
+            name = type(controller.learner).__name__
+            note = f"NOT in these margins: how {name} adapts; measure it (docs/analysis)"
+    return LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note)
 
 
 class LoopAnalysis:
@@ -113,9 +125,10 @@ class LoopAnalysis:
         dt: float,
         b_over_b0: float | None = None,
         certify: Callable[[], Certificate] | None = None,
+        note: str = "",
     ) -> None:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
-        self._certify = certify
+        self._certify, self._note = certify, note
         self._N = law_matrix(law)
         names = ("P", "C_r", "C_y")
         self._open = {name: Response(subsystem(plant, law, name)) for name in names}
@@ -141,7 +154,9 @@ class LoopAnalysis:
             f"or phase ±{m.disk_phase:.1f}°, or some of both\n"
             f"stable for {what} from {low:.3g} to {high:.3g}{unit}\n"
             f"white noise of 1 in y makes u move by {noise:.3g} RMS, "
-            f"at most by a factor of {peak:.3g} at one frequency" + self._certificate_lines()
+            f"at most by a factor of {peak:.3g} at one frequency"
+            + (f"\n{self._note}" if self._note else "")
+            + self._certificate_lines()
         )
 
     @cached_property

@@ -144,7 +144,7 @@ def plot_gang_of_four(
 def plot_margins_over_time(
     times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, *, ax: Any = None, **style: Any
 ) -> list[Axes]:
-    """Plot the margins of the loop with its learner frozen at each instant; return the axes.
+    """Plot the margins of the loop with its learner as it was at each instant; return the axes.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def plot_margins_over_time(
         for another number of loops than instants, or of axes.
     """
     axes = _plot_margins(checks.vector("times", times), loops, given_axes(axes, ax), style)
-    axes[-1].set_xlabel("learner frozen at [s]")
+    axes[-1].set_xlabel("learner as it was at [s]")
     return axes
 
 

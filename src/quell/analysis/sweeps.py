@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from quell import checks
-from quell.analysis.frozen_learner import frozen
+from quell.analysis.adapting_learner import adapting
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.controllers.base import Controller
 from quell.records.trajectory import Trajectory
@@ -17,10 +17,11 @@ from quell.simulation import Scenario, simulate
 def loops_over_time(
     plant: Any, controller: Controller, run: Any, times: Any, **options: Any
 ) -> list[LoopAnalysis]:
-    """Analyse the loop with its learner frozen at several instants.
+    """Analyse the loop with its learner as it was at several instants.
 
-    Each is the loop that would follow if nothing more were learned. That all of them are stable
-    does not prove that the loop with a learner that learns is stable (docs/analysis). Raises
+    Each is the loop that would follow if the plant came to rest there (``analyse``). That all of
+    them are stable does not prove that the loop with a learner that learns is stable
+    (docs/analysis). Raises
     ``ValueError`` as ``frozen`` and ``analyse`` do, for a time outside of the run, and for a
     scenario in which the loop diverges before it.
 
@@ -39,7 +40,7 @@ def loops_over_time(
     instants = checks.vector("times", times).tolist()
     if isinstance(run, Trajectory):
         return [
-            analyse(plant, controller, at=frozen(controller, run, t), **options) for t in instants
+            analyse(plant, controller, at=adapting(controller, run, t), **options) for t in instants
         ]
     if not isinstance(run, Scenario):
         raise ValueError(f"run = {run!r}: must be a Trajectory or a Scenario")

@@ -35,7 +35,7 @@ _ROUNDING = 1.0 + 1e-9
 class Finding(NamedTuple):
     """A weak point of a design."""
 
-    subject: str  # ``"sampling"``, ``"noise"``, ``"lag"``, ``"margin"`` or ``"stability"``
+    subject: str  #: "sampling", "bandwidth", "margin", "learner", "lag", "noise" or "stability"
     value: float
     limit: float
     message: str  # the weak point, with both numbers, and what to do
