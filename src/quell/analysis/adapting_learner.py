@@ -11,17 +11,17 @@ What goes on adapting is the bias d, and the amplitudes of oscillators at ω_j: 
 the learner is linear, and a part of the loop. ^F is the observer's own lag (``learners/lag.py``),
 H_j its response at ω_j to the sinusoid of the last sample, and c_j turns with the oscillator, which
 makes the law the same in each sample. So the bias is an integrator, and each oscillator is a
-resonance: a loop with a bias has two integrators, and its margins are those of such a loop (docs/theory, "Margins with
-a learner").
+resonance: a loop with a bias has two integrators, and its margins are those of such a loop
+(docs/theory, "What the bias is").
 
 The gains γ and Γ are steady ones. Those of a Kalman filter follow from its Riccati equation for the
 features that move at rest, the constant 1 and the sinusoids, in units of the density of the noise,
 
     P ← P − P φ (P φ)ᵀ/(φ·P φ + 1/dt) + Q dt,        gain = P φ/max(φ·P φ + 1/dt, φ·P φ/(λ_m dt))
 
-so they depend on the bandwidths of the design alone, for the bias γ ≈ λ dt. The other learners with a
-bias have γ = λ dt. Algorithm 1 learns from Δf̂ alone, the sum of the last ``batch`` samples: ``d ← d
-+ α Σ Δf̂``.
+so they depend on the bandwidths of the design alone, for the bias γ ≈ λ dt. The other learners with
+a bias have γ = λ dt. Algorithm 1 learns from Δf̂ alone, the sum of the last ``batch`` samples: ``d ←
+d + α Σ Δf̂``.
 
 Frequencies that are still being adapted, a guard's changes of authority, and what is learned in
 motion are not in it.
@@ -226,7 +226,7 @@ def adaptation_of(design: Any, memory: Any) -> Adaptation:
 
 def is_known(design: Any) -> bool:
     """Whether the adaptation of a learner's parameters is known here."""
-    kinds = (KalmanDesign, LinearDesign, OnlineDesign, BatchDesign, NoLearnerDesign)
+    kinds = (KalmanDesign, LinearDesign, OnlineDesign, BatchDesign, NoLearnerDesign, Frozen)
     return isinstance(design, kinds)
 
 
