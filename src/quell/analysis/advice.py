@@ -24,8 +24,8 @@ from quell.plants.linear_part import linear_part
 _NOISE = 0.05
 # Between loops of four integrators with omega_o = 10 omega_c, 0.41, and with 3 omega_c, 0.24.
 _LEAST_MODULUS = 0.3
-# M_s that a learner may cause by its adaptation, a modulus margin of 0.4: beyond it a loop rings. Up
-# to the second number times M_s without the learner it is not the learner's doing.
+# M_s that a learner may cause by its adaptation, a modulus margin of 0.4: beyond it a loop rings.
+# Up to the second number times M_s without the learner it is not the learner's doing.
 _LEARNED_M_S, _RAISED = 2.5, 1.1
 # Steps of the bisection for the bandwidth that keeps it.
 _BISECTIONS = 12
@@ -58,8 +58,8 @@ def advise(
     """Return the weak points of a design, each with its number, the limit, and what to do.
 
     They are in the order sampling, bandwidth, margin, learner, lag, noise. Times within one message
-    have the same unit. Raises ``ValueError`` as ``analyse`` does, and without a plant for a controller that
-    assumes none.
+    have the same unit. Raises ``ValueError`` as ``analyse`` does, and without a plant for a
+    controller that assumes none.
 
     Parameters
     ----------

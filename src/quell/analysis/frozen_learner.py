@@ -9,6 +9,9 @@ other learner (a network, a Gaussian process, polynomials) it holds for small mo
 central differences of its own ``predict``. The constant, and autonomous features (oscillators), are
 a feedforward: they move the loop but do not close it, so no margin depends on them.
 
+A learner with a gate of noise (``learners/noise_gate.py``) is taken in motion, with the gate open:
+within the noise its feedback of a signal is cut, and the loop is as without it.
+
 A guard multiplies all of it by the learner's authority β. When it clips the output
 (``Reason.OUT_OF_BOUNDS``), the true feedback is smaller than the one computed here.
 """
@@ -131,6 +134,8 @@ def _from_state(controller: ADRC, state: Any) -> Frozen:
             "period, so it has no gain at an instant; analyse the loop without it"
         )
     learner, memory = controller.parameters.learner, copy_state(state.learner)
+    if hasattr(memory, "gate"):
+        memory.gate.variance[:] = np.inf  # all signals move
     known = controller.read(state)
     seen, u = np.append(known.x, known.f_residual), known.u
     sizes = _signal_sizes(controller, memory, seen, u)

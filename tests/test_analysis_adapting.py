@@ -1,0 +1,123 @@
+"""Margins of loops whose learner goes on adapting."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell import analysis
+from quell.learners import BatchGradient, Harmonic, Kalman, Repetitive
+
+from .analysed_loops import PLANT, adrc, chain
+
+DT, OMEGA_C = 0.01, 2.0
+# Its first disturbance acts as u does.
+LOADED = ql.plants.LinearPlant(PLANT.A, PLANT.B, PLANT.C, PLANT.B)
+
+
+def controller(learner: Any) -> ql.ADRC:
+    """Return an ADRC for ``LOADED``."""
+    observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=12.0, dt=DT)
+    return ql.ADRC(observer, omega_c=OMEGA_C, learner=learner)
+
+
+def run(learner: Any, omega: float, size: float) -> ql.Trajectory:
+    """Return a run with a sinusoid of u from 40 s on, after training and rest."""
+    t = DT * np.arange(8001)
+    r = np.where(t < 20.0, np.sin(t) + np.sin(2.7 * t), 0.0)
+    d = np.where(t >= 40.0, size * np.sin(omega * (t - 40.0)), 0.0)
+    if isinstance(learner, Harmonic):  # else its oscillator follows the small sinusoid
+        d += np.sin(t)
+    signals = ql.signals.Samples(t, r), ql.signals.Samples(t, d)
+    noise = ql.signals.BandLimitedNoise(power=1e-12, sample_time=DT)
+    scenario = ql.Scenario(signals[0], disturbances=(signals[1],), noise=noise, duration=80.0)
+    return ql.simulate(LOADED, controller(learner), scenario)
+
+
+@pytest.mark.parametrize("make", [Kalman, Harmonic, lambda: BatchGradient(rate=3e-4)])
+def test_the_sensitivity_is_that_of_the_running_loop(make: Any) -> None:
+    """``|u/d|`` of a small sinusoid that is added to u after training, at the peak and beside it; the frozen learner's is another one."""
+    trained = run(make(), 1.0, 0.0)
+    loop = analysis.analyse(LOADED, controller(make()), at=trained)
+    still = analysis.frozen(controller(make()), trained)
+    frozen = analysis.analyse(LOADED, controller(make()), at=still)
+    peak = loop.margins.modulus_omega
+    for omega in (0.7 * peak, peak):
+        size = 1e-4
+        one, other = (run(make(), omega, sign * size) for sign in (1.0, -1.0))
+        late = one.t >= 80.0 - 2.0 * np.pi / omega * int(20.0 * omega / (2.0 * np.pi))
+        turned = np.exp(-1j * omega * (one.t[late] - 40.0))
+        d = size * np.sin(omega * (one.t[late] - 40.0))
+        u = 0.5 * (one["u"] - other["u"])[late]
+        measured = abs(1.0 + np.mean(u * turned) / np.mean(d * turned))
+        assert abs(loop.response("S", np.array([omega]))[0]) == pytest.approx(measured, rel=0.02)
+    assert loop.margins.modulus < frozen.margins.modulus
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_a_bias_is_an_integrator_beside_the_observers(order: int) -> None:
+    """The loop has two of them: S falls with the square of the frequency; without a bias with the frequency."""
+    slopes = []
+    for learner in (Kalman(state=False), ql.learners.NoLearner()):
+        loop = analysis.analyse(chain(order), adrc(order, learner=learner))
+        low, high = np.abs(loop.response("S", np.array([1e-4, 1e-3])))
+        slopes.append(np.log10(high / low))
+    assert slopes == pytest.approx([2.0, 1.0], abs=1e-2)
+
+
+def test_an_oscillator_is_a_resonance() -> None:
+    """Nothing of a load at its frequency is left, without a bias a constant load leaves as much as without learner."""
+    learner = Harmonic(bias=False, omegas=(0.7,))
+    loop = analysis.analyse(chain(2), adrc(2, learner=learner))
+    S = np.abs(loop.response("S", np.array([0.7 * 0.9, 0.7 * (1.0 + 1e-7), 0.7 * 1.1])))
+    assert S[1] < 1e-5 * min(S[0], S[2])
+
+
+@pytest.mark.parametrize("bandwidth", [0.1, 3.0, 12.0])
+def test_the_steady_gain_of_the_bias_follows_its_bandwidth(bandwidth: float) -> None:
+    """It is the root of the scalar Riccati equation, ``P² = Q dt (P + 1/dt)``, about λ dt."""
+    learner = controller(Kalman(bias_bandwidth=bandwidth))
+    Q = bandwidth**2 * DT
+    P = 0.5 * (Q + np.sqrt(Q**2 + 4.0 * Q / DT))
+    assert analysis.adapting(learner).level == pytest.approx(P / (P + 1.0 / DT), rel=1e-4)
+
+
+def test_a_guard_without_authority_leaves_the_loop_of_the_observer() -> None:
+    """A new guarded learner has none yet."""
+    observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=12.0, dt=DT)
+    guarded = ql.ADRC(observer, omega_c=OMEGA_C, learner=Kalman(), guard=ql.Guard())
+    plain = analysis.analyse(LOADED, ql.ADRC(observer, omega_c=OMEGA_C))
+    assert analysis.analyse(LOADED, guarded).margins.modulus == plain.margins.modulus
+
+
+def test_a_learner_whose_adaptation_is_not_known_is_named() -> None:
+    """A line begins with NOT; a frozen one is what was asked for."""
+    repetitive = controller(Repetitive(period=1.0))
+    assert "NOT in these margins: how Repetitive adapts" in repr(
+        analysis.analyse(LOADED, repetitive)
+    )
+    still = analysis.frozen(repetitive)
+    assert "NOT" not in repr(analysis.analyse(LOADED, repetitive, at=still))
+
+
+def test_advise_tells_what_a_bias_takes_of_the_margin() -> None:
+    """With the bandwidth that it names M_s is at its limit; below the limit nothing is said."""
+    plant = ql.plants.two_mass_spring()
+    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-3)
+
+    def found(learner: Any) -> list[analysis.Finding]:
+        every = analysis.advise(ql.ADRC(observer, omega_c=1.0, learner=learner), plant)
+        return [each for each in every if each.subject == "learner"]
+
+    (finding,) = found(Kalman())
+    assert finding.value == pytest.approx(4.03, abs=0.01)
+    named = float(finding.message.split("bias_bandwidth = ")[1].split()[0])
+    slow = ql.ADRC(observer, omega_c=1.0, learner=Kalman(bias_bandwidth=named))
+    assert 1.0 / analysis.analyse(plant, slow).margins.modulus == pytest.approx(
+        finding.limit, rel=2e-3
+    )
+    assert found(Kalman(bias_bandwidth=0.9 * named)) == []
+    assert found(ql.learners.NoLearner()) == []
