@@ -38,7 +38,7 @@ def test_help_and_version_answer(quell: Callable[..., Shown]) -> None:
 def test_the_study_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
-    """Tables, JSON in its fixed form, figures as PNG and SVG; without a terminal."""
+    """Tables, JSON in its fixed form, figures as PNG, SVG and PDF; without a terminal."""
     places = ("--json", "out.json", "--figures", "pictures")
     shown = quell("reproduce", "two-mass", "--dt", "0.01", *places)
     assert shown.code == 0, shown.err
@@ -63,7 +63,7 @@ def test_the_study_is_printed_written_and_drawn(
     assert result["settings"]["dt"] == 0.01
     names = {"position", "control", "learning", "algorithm-1"}
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
-        f"{n}.{s}" for n in names for s in ("png", "svg")
+        f"{n}.{s}" for n in names for s in ("png", "svg", "pdf")
     }
 
 
@@ -81,7 +81,7 @@ def test_the_torsional_experiment_has_a_longest_sample_time(quell: Callable[...,
 def test_the_guards_trial_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
-    """A table a line a kind, JSON, and a figure as PNG and SVG; without a terminal.
+    """A table a line a kind, JSON, and a figure as PNG, SVG and PDF; without a terminal.
 
     The turncoat of this seed is compiled in the guard's own tests.
     """
@@ -106,7 +106,11 @@ def test_the_guards_trial_is_printed_written_and_drawn(
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["settings"]["seed"] == 6
     assert result["adversarial"]["unstable_where_plain_is_stable"] == 0
-    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"stress.png", "stress.svg"}
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
+        "stress.png",
+        "stress.svg",
+        "stress.pdf",
+    }
     wrong = quell("stress", "--runs", "-3")
     assert wrong.code == 2
     assert wrong.err.strip() == "quell: runs = -3: must be a whole number from 0 to 1000000"
@@ -216,12 +220,14 @@ def test_two_outputs_have_two_files(quell: Callable[..., Shown], tmp_path: Path)
     assert "out': must be a file for one output, is for two" in shown.err
 
 
-def test_a_figure_is_written_as_png_and_svg(tmp_path: Path) -> None:
-    """With all that is in it; commands in these tests write theirs without the axes."""
+def test_a_figure_is_written_as_png_svg_and_pdf(tmp_path: Path) -> None:
+    """With all that is in it, TrueType fonts in the PDF, and the same bytes each time; commands in these tests write theirs without the axes."""
     figure = plt.figure()
     figure.subplots().plot([0.0, 1.0], [0.0, 1.0], gid="the-line")
-    png, svg = save_figure(figure, tmp_path / "pictures", "step")
-    assert (png.name, svg.name) == ("step.png", "step.svg")
+    png, svg, pdf = save_figure(figure, tmp_path / "pictures", "step")
+    assert (png.name, svg.name, pdf.name) == ("step.png", "step.svg", "step.pdf")
+    assert b"/Type /Font /Subtype /Type0" in pdf.read_bytes()
+    assert b"CreationDate" not in pdf.read_bytes()
     assert plt.imread(png).min() == 0.0
     assert "the-line" in svg.read_text(encoding="utf-8")
 

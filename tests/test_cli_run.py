@@ -66,7 +66,11 @@ def test_a_setup_is_simulated_printed_written_drawn_and_saved(
     ]
     assert result["metrics"][1]["rms"] == run.metrics(8.0)["rms"]
     assert result["setup"]["observer"]["omega_o"] == 10.0
-    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"short.png", "short.svg"}
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {
+        "short.png",
+        "short.svg",
+        "short.pdf",
+    }
 
 
 @pytest.mark.parametrize(
@@ -258,7 +262,7 @@ def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_pat
     assert result["tally"]["cycles"] > 40
     assert set(result["timing"]["lateness"]) == {"p50", "p99", "p99.9", "max"}
     assert {path.name for path in (tmp_path / "pictures").iterdir()} == {
-        f"{n}.{s}" for n in ("rig", "timing") for s in ("png", "svg")
+        f"{n}.{s}" for n in ("rig", "timing") for s in ("png", "svg", "pdf")
     }
     run = ql.Trajectory.load(tmp_path / "run.nc")
     assert run.ended == pytest.approx(0.3)

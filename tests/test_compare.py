@@ -175,7 +175,7 @@ def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
 def test_the_comparison_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
-    """A table a line a controller, JSON, a figure as PNG and SVG; a mistake is one line, and nothing is written."""
+    """A table a line a controller, JSON, a figure as PNG, SVG and PDF; a mistake is one line, and nothing is written."""
     where = ("--json", "out.json", "--figures", "p")
     benchmark = ("--dt", "0.01", "--k", "1.2", "--u-max", "1")
     shown = quell("compare", *benchmark, "--controllers", "lqg, pid", *where)
@@ -193,7 +193,11 @@ def test_the_comparison_is_printed_written_and_drawn(
         "u_max": 1.0,
     }
     assert list(result["controllers"]) == ["lqg", "pid"]
-    assert {p.name for p in (tmp_path / "p").iterdir()} == {"compare.png", "compare.svg"}
+    assert {p.name for p in (tmp_path / "p").iterdir()} == {
+        "compare.png",
+        "compare.svg",
+        "compare.pdf",
+    }
     wrong = quell("compare", "--controllers", "lqg,nonsense", "--json", "other.json")
     assert wrong.code == 2
     assert wrong.err.startswith("quell: controllers: 'nonsense' must be one of mf-eso")

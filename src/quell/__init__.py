@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from quell.observers.eso import ESO
     from quell.records import metrics
     from quell.records.batch_trajectory import BatchTrajectory
+    from quell.records.style import style
     from quell.records.trajectory import Trajectory
     from quell.simulation.scenario import Scenario
     from quell.simulation.simulate import simulate
@@ -75,6 +76,7 @@ _HOME = {
     "identify": "quell.identification.identify",
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation.simulate",
+    "style": "quell.records.style",
     "sweep": "quell.sweeping.sweep",
     "tune": "quell.tuning.tune",
 }
@@ -85,7 +87,7 @@ __all__ = [
     "Reason", "Scenario", "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical",
     "controllers", "envs", "experiments", "export", "features", "identification", "identify",
     "learners", "metrics", "observers", "omega_c_for", "plants", "realtime", "setup", "signals",
-    "simulate", "sweep", "sweeping", "tune", "tuning",
+    "simulate", "style", "sweep", "sweeping", "tune", "tuning",
 ]  # fmt: skip
 
 

@@ -50,9 +50,9 @@ def manual() -> ql.controllers.LinearController:
     return ql.controllers.LinearController(law, DT)
 
 
-def built(b: float) -> Any:
+def built(b: float, omega_o: float) -> Any:
     """Return the parts of a run of the sweep."""
-    return ql.plants.LinearPlant([[-1.0]], [b], [1.0]), adrc(), ql.Scenario(1.0, 1.0)
+    return ql.plants.LinearPlant([[-1.0]], [b], [1.0]), adrc(omega_o), ql.Scenario(1.0, 1.0)
 
 
 def studies() -> dict[str, Case]:
@@ -83,7 +83,7 @@ def studies() -> dict[str, Case]:
         return acc_figures._spread(rates, ax)
 
     found = {"stress": Case(lambda ax=None: stress.draw(trial_of_guard, ax=ax), 2)}
-    for name, axes in (("position", 3), ("control", 3), ("learning", 3), ("algorithm-1", 2)):
+    for name, axes in (("position", 3), ("control", 12), ("learning", 3), ("algorithm-1", 2)):
         found[name] = Case(lambda ax=None, n=name: two_mass_spring.draw(two, n, ax=ax), axes)
     for name, axes in (("position", 3), ("control", 2), ("learning", 2)):
         name = f"torsional-{name}"
@@ -102,7 +102,10 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     batch = ql.simulate(LAG, adrc(), [scenario] * 2)
     loop = analysis.analyse(LAG, adrc())
     swept = sweep(
-        built, {"b": [0.8, 1.2]}, folder=tmp_path_factory.mktemp("sweep") / "s", metrics=["iae"]
+        built,
+        {"b": [0.8, 1.2], "omega_o": [3.0, 5.0]},
+        folder=tmp_path_factory.mktemp("sweep") / "s",
+        metrics=["iae"],
     )
     tuned = ql.tune(LAG, DT, structure="pi", compare=())
     rng = np.random.default_rng(0)
@@ -125,6 +128,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         "Identified": Case(model.plot, 7),
         "Verification": Case(step.plot, 2),
         "Sweep": Case(lambda ax=None: swept.plot("b", ax=ax), 2),
+        "Sweep in lines": Case(lambda ax=None: swept.plot("b", by="omega_o", ax=ax), 2),
         "Histogram": Case(histogram.plot, 1),
         "Timing": Case(Timing(histogram, histogram).plot, 1),
         "compare": Case(lambda ax=None: compare.draw(compared, ax=ax), 2),
@@ -162,7 +166,7 @@ def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str
         assert all(each.has_data() for each in given), name
         if count > 1:
             with pytest.raises(ValueError, match="axes"):
-                draw(ax=plt.figure().subplots(1, 1 if name == "Sweep" else count + 3))
+                draw(ax=plt.figure().subplots(1, 1 if name.startswith("Sweep") else count + 3))
     plt.close("all")
 
 
@@ -209,3 +213,18 @@ def test_no_function_that_draws_is_forgotten(cases: dict[str, Case]) -> None:
         found |= {f"{file} {name}" for name in _DRAWS.findall(text)}
     assert found == {*_PUBLIC, *_INSIDE}
     assert set(_PUBLIC.values()) <= set(cases)
+
+
+def test_the_style_for_papers_fits_a_column_and_embeds_truetype() -> None:
+    """3.5 or 7.16 inches; without it matplotlib's own width."""
+    for columns, width in ((1, 3.5), (2, 7.16)):
+        with plt.rc_context(ql.style(columns)):
+            figure = plt.figure()
+            figure.subplots().set_xlabel("time [s]")
+            written = io.BytesIO()
+            figure.savefig(written, format="pdf")
+        assert figure.get_figwidth() == width
+        assert b"/Subtype /Type3" not in written.getvalue()
+    with pytest.raises(ValueError, match="columns"):
+        ql.style(3)
+    plt.close("all")

@@ -70,7 +70,7 @@ class Outputs:
     json
         Write all results and settings to this file, for programs.
     figures
-        Put the figures into this folder, as PNG and SVG; by default into quell-figures, or
+        Put the figures into this folder, as PNG, SVG and PDF; by default into quell-figures, or
         quell-figures-2 and so on if that exists.
     """
 
@@ -89,7 +89,7 @@ class RunOutputs(Outputs):
     json
         Write metrics, events and settings to this file, for programs.
     figures
-        Put the figures into this folder, as PNG and SVG; by default into quell-figures, or
+        Put the figures into this folder, as PNG, SVG and PDF; by default into quell-figures, or
         quell-figures-2 and so on if that exists.
     save
         Write the whole record to this file, which `Trajectory.load` reads.

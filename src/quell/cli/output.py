@@ -161,7 +161,7 @@ def write_results(
     if figures:
         names = sorted({path.stem for path in figures})
         noun = "Figures" if len(names) > 1 else "Figure"
-        print_line(console, f"{noun}: {', '.join(names)} (PNG and SVG) in {outputs.figures}/")
+        print_line(console, f"{noun}: {', '.join(names)} (PNG, SVG, PDF) in {outputs.figures}/")
     if outputs.json is not None:
         write_json(outputs.json, results, outputs.overwrite)
         print_line(console, f"Results: {outputs.json}")

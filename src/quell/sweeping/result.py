@@ -145,7 +145,9 @@ class Sweep:
         unit = self.signals.unit(self.store.measures[measure].get("units", "1"))
         return measure if unit == "1" else f"{measure} [{unit}]"
 
-    def plot(self, parameter: str, figure: Any = None, *, ax: Any = None) -> Any:
+    def plot(
+        self, parameter: str, figure: Any = None, *, by: str | None = None, ax: Any = None
+    ) -> Any:
         """Draw failure rate and quantiles of each measure over a parameter; return the axes.
 
         The quantiles are those of runs that did not diverge.
@@ -156,8 +158,16 @@ class Sweep:
             name of the parameter.
         figure
             a matplotlib figure; a new one by default.
+        by
+            name of another parameter: a line for each of its values or, of many, for each third
+            of them.
         ax
             axes to draw into: one for the failures, then one for each measure.
+
+        Raises
+        ------
+        ValueError
+            for an unknown parameter, and for ``by`` the same one.
         """
         from quell.sweeping.figures import groups_of, plot_over
 
@@ -165,5 +175,14 @@ class Sweep:
         measures = {}
         for name in self.store.measures:
             measures[self.label(name)] = np.where(self.complete, self.dataset[name].values, np.nan)
-        groups = groups_of(values, texts, self.done)
-        return plot_over(parameter, groups, self.failed, measures, figure, ax)
+        if by is None:
+            lines = {"": groups_of(values, texts, self.done)}
+        elif by == parameter:
+            raise ValueError(f"by = {by!r}: must be another parameter than the one of the axis")
+        else:
+            others = groups_of(self.parameter(by).values, self.store.labels[by], self.done, most=3)
+            lines = {
+                label: groups_of(values, texts, np.isin(np.arange(self.done.size), members))
+                for label, members in zip(others.labels(by), others.members, strict=True)
+            }
+        return plot_over(parameter, lines, self.failed, measures, figure, ax)

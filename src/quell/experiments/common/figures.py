@@ -1,4 +1,4 @@
-"""Figures as files: PNG and SVG, each written completely or not at all."""
+"""Figures as files: PNG, SVG and PDF, each written completely or not at all."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ STYLES: dict[str, dict[str, Any]] = {
 """Line styles of the paper's three controllers, in all figures."""
 ESTIMATES = {"f_hat": "estimate", "f_learned": "learned", "f_residual": "residual"}
 """Channels of the estimates of f, with their names in legends."""
+# Formats of a figure, and what leaves the time out of a file.
+_SUFFIXES = ("png", "svg", "pdf")
+_UNDATED: dict[str, dict[str, Any]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 PAPER_STYLE = {"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}
 """Settings of matplotlib for the figures of the paper's experiments."""
 
@@ -61,13 +64,13 @@ def make_folder(folder: str | os.PathLike[str]) -> Path:
 
 def figure_files(folder: str | os.PathLike[str], names: Iterable[str]) -> list[Path]:
     """Return the files of figures with these names."""
-    return [Path(folder) / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
+    return [Path(folder) / f"{name}.{suffix}" for name in names for suffix in _SUFFIXES]
 
 
 def save_figure(
     figure: Any, folder: str | os.PathLike[str], name: str, overwrite: bool = False
 ) -> list[Path]:
-    """Write a figure, or that of some axes, as PNG and SVG, close it, and return the paths."""
+    """Write a figure, or that of some axes, as PNG, SVG and PDF, close it, and return the paths."""
     import matplotlib
 
     if not hasattr(figure, "savefig"):
@@ -76,11 +79,11 @@ def save_figure(
         written = figure_files(make_folder(folder), [name])
         for path in written:
             check_free(path, overwrite)
-        with matplotlib.rc_context({"svg.hashsalt": "quell"}):
+        # The same figure gives the same files. Fonts of a PDF are TrueType, as journals ask for.
+        with matplotlib.rc_context({"svg.hashsalt": "quell", "pdf.fonttype": 42}):
             for path in written:
                 with written_atomically(path, overwrite) as part:
-                    about = {"Date": None} if path.suffix == ".svg" else None
-                    figure.savefig(part, dpi=130, metadata=about)
+                    figure.savefig(part, dpi=130, metadata=_UNDATED.get(path.suffix))
     finally:
         pyplot = sys.modules.get("matplotlib.pyplot")
         if pyplot is not None:  # it would keep its figures until the program ends
@@ -95,7 +98,7 @@ def save_figures(
     style: Any = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Draw figures and write each as PNG and SVG; return the paths.
+    """Draw figures and write each as PNG, SVG and PDF; return the paths.
 
     ``drawings`` has a function that returns a figure or its axes for each name of a file, ``style``
     settings of matplotlib. Nothing is drawn if a file exists, unless ``overwrite`` allows to

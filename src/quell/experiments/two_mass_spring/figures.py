@@ -57,8 +57,8 @@ def draw(result: Result, name: str, ax: Any = None) -> Any:
     result
         of ``run``.
     name
-        ``"position"`` or ``"control"`` with three axes (whole run, two zooms), ``"learning"`` with
-        three, ``"algorithm-1"`` with two.
+        ``"position"`` with three axes (whole run, two zooms), ``"control"`` with three for each of
+        the four controllers, ``"learning"`` with three, ``"algorithm-1"`` with two.
     ax
         axes to draw into; those of a new figure by default.
 
@@ -68,6 +68,29 @@ def draw(result: Result, name: str, ax: Any = None) -> Any:
         for another name or number of axes.
     """
     return _DRAWINGS[checks.one_of("name", name, NAMES)](result, ax)
+
+
+def _control(result: Result, ax: Any) -> Any:
+    """Draw u of each controller of equal bandwidth: a row for each, whole and in the two zooms.
+
+    In one plot the noise of one controller would hide the others.
+    """
+    names, spans = [*_STYLES], ((_FROM, END), *_ZOOMS)
+    shared = {"sharex": "col", "sharey": "col", "width_ratios": (2.0, 1.0, 1.0)}
+    axes = grid_of_axes(ax, partial(wide_figure, 7.0), len(names), 3, **shared)
+    for row, name in zip(axes, names, strict=True):
+        run = result.runs[name]
+        for one, (start, stop) in zip(row, spans, strict=True):
+            part = run.window(start, stop)
+            if part.stop > part.start:
+                draw_line(one, run.t[part], run["u"][part], color="black", linewidth=0.7)
+            one.set_xlim(start, stop)
+        row[0].set_ylabel(f"{legend_label(name, run)}\nu [N]")
+    for one, (start, stop) in zip(axes[0], spans, strict=True):
+        one.set_title(f"{start:g} s to {stop:g} s", fontsize="medium")
+    for one in axes[-1]:
+        one.set_xlabel("time [s]")
+    return axes.ravel()
 
 
 def _comparison(channel: str, label: str, result: Result, ax: Any) -> Any:
@@ -91,7 +114,7 @@ def _comparison(channel: str, label: str, result: Result, ax: Any) -> Any:
         f"{label.split(' [')[0]}, from {_FROM:g} s: step at {STEP_AT:g} s, "
         f"force on m2 from {FORCE_AT:g} s"
     )
-    whole.legend(ncols=2, loc="upper left" if channel == "u" else "lower left", fontsize="small")
+    whole.legend(ncols=2, loc="lower left", fontsize="small")
     for start, stop in _ZOOMS:
         whole.axvspan(start, stop, color="0.9", zorder=0)
     for place in ("step", "force"):
@@ -166,7 +189,7 @@ def _algorithm_1(result: Result, ax: Any) -> Any:
 
 _DRAWINGS: Mapping[str, Callable[[Result, Any], Any]] = {
     "position": partial(_comparison, "y", "position of m2 [m]"),
-    "control": partial(_comparison, "u", "control force [N]"),
+    "control": _control,
     "learning": _learning,
     "algorithm-1": _algorithm_1,
 }
