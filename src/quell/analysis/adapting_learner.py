@@ -276,11 +276,13 @@ def _of_kalman(design: KalmanDesign, omega: Vector) -> Adaptation:
             pairs = gain[int(design.bias) :].reshape(-1, 2)
             # The oscillator has turned by one sample when its error is seen.
             drive += (pairs[:, 1] - 1j * pairs[:, 0]) * turned * np.exp(1j * angular * dt)
-    drive /= counted
+    # Two oscillators at one frequency, as at a limit, are one: their difference shows nowhere.
+    different, at_frequency = np.unique(angular, return_inverse=True)
+    drive = np.array([np.sum(drive[at_frequency == j]) for j in range(different.size)]) / counted
     return Adaptation(
         level=level / counted,
         window=1,
         compensated=True,
-        omega=angular,
+        omega=different,
         drive=np.column_stack([drive.real, drive.imag]),
     )
