@@ -58,8 +58,8 @@ from quell.types import Matrix, Vector
 # The Riccati equation is followed for so many times the slowest adaptation, and at most so many
 # samples; then gains are averaged over the last part of it, some turns of each oscillator.
 _SETTLING, _MOST_SAMPLES, _AVERAGED = 12.0, 200_000, 0.25
-# The chain of lag filters follows a constant to rounding after so many of the observer's lags.
-_FILLED = 40.0
+# Frequencies that differ by less than this share are one: apart they would turn once in a million.
+_EQUAL = 1e-6
 
 
 class Adaptation(NamedTuple):
@@ -277,8 +277,11 @@ def _of_kalman(design: KalmanDesign, omega: Vector) -> Adaptation:
             # The oscillator has turned by one sample when its error is seen.
             drive += (pairs[:, 1] - 1j * pairs[:, 0]) * turned * np.exp(1j * angular * dt)
     # Two oscillators at one frequency, as at a limit, are one: their difference shows nowhere.
-    different, at_frequency = np.unique(angular, return_inverse=True)
-    drive = np.array([np.sum(drive[at_frequency == j]) for j in range(different.size)]) / counted
+    order = np.argsort(angular)
+    apart = np.diff(angular[order]) > _EQUAL * angular[order][1:]
+    firsts = np.flatnonzero(np.append(True, apart))[: angular.size]
+    different = angular[order][firsts]
+    drive = np.add.reduceat(drive[order], firsts) / counted if angular.size else drive
     return Adaptation(
         level=level / counted,
         window=1,
