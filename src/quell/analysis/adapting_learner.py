@@ -281,11 +281,11 @@ def _of_kalman(design: KalmanDesign, omega: Vector) -> Adaptation:
     apart = np.diff(angular[order]) > _EQUAL * angular[order][1:]
     firsts = np.flatnonzero(np.append(True, apart))[: angular.size]
     different = angular[order][firsts]
-    drive = np.add.reduceat(drive[order], firsts) / counted if angular.size else drive
+    merged = np.add.reduceat(drive[order], firsts) / counted if angular.size else drive
     return Adaptation(
         level=level / counted,
         window=1,
         compensated=True,
         omega=different,
-        drive=np.column_stack([drive.real, drive.imag]),
+        drive=np.column_stack([merged.real, merged.imag]),
     )
