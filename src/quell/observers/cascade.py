@@ -15,6 +15,12 @@ of the levels before, and corrects as the current form does::
     ξ_i⁻ = Φ ξ_i + Γ_u u + Γ_f (f_L + Σ_{j<i} ξ_j,N)
     ξ_i  = ξ_i⁻ + L_i (ξ_{i−1},1 − ξ_i⁻,1),      ξ_0,1 = y
 
+With m extended states f and its derivatives are known from the levels before: over a sample f is not
+held, but moves as the model says, with ``Γ_j`` the response of x to the j-th derivative of f, the
+columns n + 1 + j of Φ in its first n rows::
+
+    ξ_i⁻ = Φ ξ_i + Γ_u u + Γ_f (f_L + Σ_{l<i} ξ_l,n+1) + Σ_{j=1}^{m−1} Γ_j Σ_{l<i} ξ_l,n+1+j
+
 The poles of level i lie at ``exp(−omega_i dt)``, because no level feeds back to one before it.
 """
 
@@ -26,18 +32,21 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.kernels.dispatch import kernel
+from quell.kernels.sized import Size
 from quell.observers.base import begin, observe, predict_state
 from quell.observers.linear import EsoModel
 from quell.types import Matrix, Vector
 
 
 class CascadeModel(NamedTuple):
-    """Parameters of p levels with N = n + 1 states each; the state of the first level is first."""
+    """Parameters of p levels with N = n + m states each; the state of the first level is first."""
 
     transition: Matrix  # Φ (N, N)
     input: Vector  # Γ_u (N,)
     feed: Vector  # Γ_f (N,)
     gains: Matrix  # L_i (p, N)
+    derivatives: Size  # m − 1, of f in the state
 
     @property
     def states(self) -> int:
@@ -45,26 +54,53 @@ class CascadeModel(NamedTuple):
         return int(self.gains.size)
 
 
+@kernel
+def add_known_motion(
+    transition: Matrix, predicted: Vector, at_f: int, rate: float, second: float
+) -> None:
+    """Add to the predicted x what known derivatives of f move it by within a sample."""
+    if at_f + 1 < predicted.size:
+        for i in range(at_f):
+            predicted[i] += transition[i, at_f + 1] * rate
+    if at_f + 2 < predicted.size:
+        for i in range(at_f):
+            predicted[i] += transition[i, at_f + 2] * second
+
+
+@kernel
+def add_levels(z: Vector, estimate: Vector, at_f: int, levels: int, stride: int) -> None:
+    """Set f and its derivatives in ``estimate`` to their sums over the levels in ``z``."""
+    for i in range(at_f, estimate.size):
+        total = 0.0
+        for level in range(levels):
+            total += z[level * stride + i]
+        estimate[i] = total
+
+
 @observe.register(CascadeModel)
 def _observe(
     model: CascadeModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
 ) -> None:
     levels, size = model.gains.shape
-    target, f_known, f_estimate = y, f_learned, 0.0
+    at_f = size - 1 - model.derivatives
+    target, f_known, rate_known, second_known = y, f_learned, 0.0, 0.0
     for level in range(levels):
         state = z[level * size : (level + 1) * size]
-        f_before = state[size - 1]
+        f_before = state[at_f]
+        rate_before = state[at_f + 1] if model.derivatives > 0 else 0.0
+        second_before = state[at_f + 2] if model.derivatives > 1 else 0.0
         predict_state(model, state, estimate, u, f_known)
+        add_known_motion(model.transition, estimate, at_f, rate_known, second_known)
         error = target - estimate[0]
         for i in range(size):
             state[i] = estimate[i] + model.gains[level, i] * error
         target = state[0]
         f_known += f_before
-        f_estimate += state[size - 1]
-        if level == levels - 1:
-            for i in range(size):
-                estimate[i] = state[i]
-    estimate[size - 1] = f_estimate
+        rate_known += rate_before
+        second_known += second_before
+    for i in range(size):
+        estimate[i] = z[(levels - 1) * size + i]
+    add_levels(z, estimate, at_f, levels, size)
 
 
 @begin.register(CascadeModel)
@@ -85,8 +121,11 @@ def level_bandwidths(omega_o: float, levels: int, ratio: float) -> list[float]:
     return [omega_o / ratio ** (p - 1 - i) for i in range(p)]
 
 
-def cascade_model(levels: Sequence[EsoModel]) -> CascadeModel:
-    """Return the cascade of ``levels``, which differ only in their gain; the first one reads y."""
+def cascade_model(levels: Sequence[EsoModel], derivatives: int = 0) -> CascadeModel:
+    """Return the cascade of ``levels``, which differ only in their gain; the first one reads y.
+
+    ``derivatives`` is the number m − 1 of derivatives of f in their states.
+    """
     first = levels[0]
     gains = np.array([level.gain for level in levels])
-    return CascadeModel(first.transition, first.input, first.feed, gains)
+    return CascadeModel(first.transition, first.input, first.feed, gains, derivatives)
