@@ -5,23 +5,19 @@ only one that reads y. Each further level is faster, uses the estimates of f of 
 it, and follows the output of the level before instead of y::
 
     ξ_1' = A ξ_1 + B (b0 u + f_L) + l_1 (y − ξ_1,1)
-    ξ_i' = A ξ_i + B (b0 u + f_L + Σ_{j<i} ξ_j,N) + l_i (ξ_{i−1},1 − ξ_i,1)          i = 2 … p
-    x̂ = (ξ_p,1 … ξ_p,n),     Δf̂ = Σ_j ξ_j,N
+    ξ_i' = A ξ_i + B (b0 u + f_L + Σ_{j<i} ξ_j,n+1) + l_i (ξ_{i−1},1 − ξ_i,1)        i = 2 … p
+    x̂ = (ξ_p,1 … ξ_p,n),     Δf̂ = Σ_j ξ_j,n+1
 
 with bandwidths ``omega_1 < omega_2 = α omega_1 < … < omega_p``. Noise reaches the fast levels only
 through the slow ones. Here each level is sampled exactly, with zero-order hold on u, f_L and the f
 of the levels before, and corrects as the current form does::
 
-    ξ_i⁻ = Φ ξ_i + Γ_u u + Γ_f (f_L + Σ_{j<i} ξ_j,N)
+    ξ_i⁻ = Φ ξ_i + Γ_u u + Γ_f (f_L + Σ_{j<i} ξ_j,n+1)
     ξ_i  = ξ_i⁻ + L_i (ξ_{i−1},1 − ξ_i⁻,1),      ξ_0,1 = y
 
-With m extended states f and its derivatives are known from the levels before: over a sample f is not
-held, but moves as the model says, with ``Γ_j`` the response of x to the j-th derivative of f, the
-columns n + 1 + j of Φ in its first n rows::
-
-    ξ_i⁻ = Φ ξ_i + Γ_u u + Γ_f (f_L + Σ_{l<i} ξ_l,n+1) + Σ_{j=1}^{m−1} Γ_j Σ_{l<i} ξ_l,n+1+j
-
-The poles of level i lie at ``exp(−omega_i dt)``, because no level feeds back to one before it.
+With m extended states ``ξ_i,n+1`` is f, and f', … follow; f of the levels before is held over a
+sample as f is in each level's own model, so nothing else changes. The poles of level i lie at
+``exp(−omega_i dt)``, because no level feeds back to one before it.
 """
 
 from __future__ import annotations
@@ -46,25 +42,12 @@ class CascadeModel(NamedTuple):
     input: Vector  # Γ_u (N,)
     feed: Vector  # Γ_f (N,)
     gains: Matrix  # L_i (p, N)
-    derivatives: Size  # m − 1, of f in the state
+    at_f: Size  # n, the place of f in a level's state
 
     @property
     def states(self) -> int:
         """Length of the running state."""
         return int(self.gains.size)
-
-
-@kernel
-def add_known_motion(
-    transition: Matrix, predicted: Vector, at_f: int, rate: float, second: float
-) -> None:
-    """Add to the predicted x what known derivatives of f move it by within a sample."""
-    if at_f + 1 < predicted.size:
-        for i in range(at_f):
-            predicted[i] += transition[i, at_f + 1] * rate
-    if at_f + 2 < predicted.size:
-        for i in range(at_f):
-            predicted[i] += transition[i, at_f + 2] * second
 
 
 @kernel
@@ -82,25 +65,19 @@ def _observe(
     model: CascadeModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
 ) -> None:
     levels, size = model.gains.shape
-    at_f = size - 1 - model.derivatives
-    target, f_known, rate_known, second_known = y, f_learned, 0.0, 0.0
+    target, f_known = y, f_learned
     for level in range(levels):
         state = z[level * size : (level + 1) * size]
-        f_before = state[at_f]
-        rate_before = state[at_f + 1] if model.derivatives > 0 else 0.0
-        second_before = state[at_f + 2] if model.derivatives > 1 else 0.0
+        f_before = state[model.at_f]
         predict_state(model, state, estimate, u, f_known)
-        add_known_motion(model.transition, estimate, at_f, rate_known, second_known)
         error = target - estimate[0]
         for i in range(size):
             state[i] = estimate[i] + model.gains[level, i] * error
         target = state[0]
         f_known += f_before
-        rate_known += rate_before
-        second_known += second_before
-    for i in range(size):
+    for i in range(model.at_f):
         estimate[i] = z[(levels - 1) * size + i]
-    add_levels(z, estimate, at_f, levels, size)
+    add_levels(z, estimate, model.at_f, levels, size)
 
 
 @begin.register(CascadeModel)
@@ -121,11 +98,8 @@ def level_bandwidths(omega_o: float, levels: int, ratio: float) -> list[float]:
     return [omega_o / ratio ** (p - 1 - i) for i in range(p)]
 
 
-def cascade_model(levels: Sequence[EsoModel], derivatives: int = 0) -> CascadeModel:
-    """Return the cascade of ``levels``, which differ only in their gain; the first one reads y.
-
-    ``derivatives`` is the number m − 1 of derivatives of f in their states.
-    """
+def cascade_model(levels: Sequence[EsoModel], order: int) -> CascadeModel:
+    """Return the cascade of ``levels``, which differ only in their gain; the first one reads y."""
     first = levels[0]
     gains = np.array([level.gain for level in levels])
-    return CascadeModel(first.transition, first.input, first.feed, gains, derivatives)
+    return CascadeModel(first.transition, first.input, first.feed, gains, order)

@@ -32,7 +32,7 @@ from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Flag, Size
 from quell.kernels.sums import add_with_carry
 from quell.observers.base import begin, expected_measurement, observe
-from quell.observers.cascade import CascadeModel, add_known_motion, add_levels
+from quell.observers.cascade import CascadeModel, add_levels
 from quell.observers.delay import DelayedModel
 from quell.observers.linear import EsoModel
 from quell.observers.nonlinear import NonlinearModel, is_lost, nonlinear_correction
@@ -80,7 +80,7 @@ class DeltaCascadeModel(NamedTuple):
     input: Vector  # Γ_u (N,)
     feed: Vector  # Γ_f (N,)
     gains: Matrix  # L_i (p, N)
-    derivatives: Size  # m − 1, of f in the state
+    at_f: Size  # n, the place of f in a level's state
     chain: Flag  # whether Φ − I is zero up to its diagonal
 
     @property
@@ -133,25 +133,19 @@ def _observe_by_levels(
     model: DeltaCascadeModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
 ) -> None:
     levels, size = model.gains.shape
-    at_f = size - 1 - model.derivatives
-    target, f_known, rate_known, second_known = y, f_learned, 0.0, 0.0
+    target, f_known = y, f_learned
     for level in range(levels):
         state = z[2 * level * size : 2 * (level + 1) * size]
-        f_before = state[at_f]
-        rate_before = state[at_f + 1] if model.derivatives > 0 else 0.0
-        second_before = state[at_f + 2] if model.derivatives > 1 else 0.0
+        f_before = state[model.at_f]
         predict_increments(model, state, estimate, u, f_known)
-        add_known_motion(model.difference, estimate, at_f, rate_known, second_known)
         error = (target - state[0]) - estimate[0]
         for i in range(size):
             add_with_carry(state, size, i, estimate[i] + model.gains[level, i] * error)
         target = state[0]
         f_known += f_before
-        rate_known += rate_before
-        second_known += second_before
-    for i in range(size):
+    for i in range(model.at_f):
         estimate[i] = z[2 * (levels - 1) * size + i]
-    add_levels(z, estimate, at_f, levels, 2 * size)
+    add_levels(z, estimate, model.at_f, levels, 2 * size)
 
 
 @expected_measurement.register(DeltaModel)

@@ -8,7 +8,7 @@ For a plant with zeros, the observable canonical form ``z' = Ā z + B̄ u + Ē (
 ``lti/canonical.py`` replaces the first two. It is sampled exactly with zero-order hold.
 
 A *generalised* observer has m extended states, ``z = (x̂_1 … x̂_n, Δf̂, Δf̂', …)``, and its model of
-f is a polynomial of degree m − 1 (Miklosovic, Radke & Gao, ACC 2006, eq. 4; Godbole, Kolhe & Talole,
+f is a polynomial of degree m − 1 (Miklosovic, Radke & Gao, ACC 2006; Godbole, Kolhe & Talole,
 *IEEE Trans. Control Systems Technology* 21, 2013)::
 
     (Δf^(j))' = Δf^(j+1)   for j = 0 … m − 2,        (Δf^(m−1))' = 0
@@ -18,7 +18,13 @@ With all N = n + m poles at −omega_o and a chain of integrators ``l_i = C(N, i
     f̂/f = Σ_{i=n+1}^{N} C(N, i) omega_o^i s^(N−i) / (s + omega_o)^N,
     1 − f̂/f = s^m Σ_{i=0}^{n} C(N, i) omega_o^i s^(n−i) / (s + omega_o)^N
 
-so f̂ follows a polynomial of degree m − 1 without error, with m = 1 a constant.
+so f̂ follows a polynomial of degree m − 1 without error, with m = 1 a constant. Sampled, f is such a
+polynomial from sample to sample and held in between, as u is: ``f⁺ = f + dt f' + dt²/2 f''``, and
+only f itself moves x. So a held u cancels it exactly, and the feedback has m poles at z = 1: the
+error of y goes to zero for every load that is a polynomial of degree m − 1, whatever the plant and
+the sample time. If f moved x within the sample as a ramp, the law ``u = (u_0 − f̂)/b0`` would leave
+an error of ``f' dt/(2 k_1)``, and the feedback would have one pole there. A known delay τ of u leaves
+``f' τ/k_1``, because the law cancels the f of now.
 
 All eigenvalues of ``(I − L C) Φ`` lie at ``exp(−omega_o dt)`` (the bandwidth parametrisation of
 Gao, ACC 2003, in the z-plane as in Miklosovic, Radke & Gao, ACC 2006), or at ``exp(p_i omega_o
@@ -45,7 +51,7 @@ from quell.lti.discretize import zero_order_hold
 from quell.lti.pole_pattern import pole_pattern
 from quell.observers.linear import EsoModel
 from quell.observers.placement import place_poles, sampled_zeros
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 FORMS = ("current", "predictor", "reduced")
 # In the coordinates of the design useful gains are at most O(1); far above, rounding decides where
@@ -116,13 +122,15 @@ def _sampled_design(
     size = n + m
     power = np.append(np.arange(n), q + np.arange(m))
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-        A = np.diag(np.ones(size - 1), 1)
-        A[n - 1, :n] -= plant.a * dt ** (n - np.arange(n))
-        A[:n, n] = plant.E * dt ** (np.arange(n) + 1.0 - q)
-        inputs = np.zeros((size, 2))
-        inputs[:n, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
-        inputs[:, 1] = A[:, n]
+        A = np.diag(np.ones(n), 1)
+        A[-2, :-1] -= plant.a * dt ** (n - np.arange(n))
+        A[:-1, -1] = plant.E * dt ** (np.arange(n) + 1.0 - q)
+        inputs = np.zeros((n + 1, 2))
+        inputs[:-1, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
+        inputs[:, 1] = A[:, -1]
         phi, (difference, gammas) = zero_order_hold(A, [A, inputs], 1.0)
+        phi = with_motion_of_f(phi, m, 1.0)
+        difference, gammas = with_motion_of_f(difference, m), with_rates(gammas, m)
         step = omega_o * dt
         gain = np.full(size, np.nan)
         if np.all(np.isfinite(phi)):
@@ -152,6 +160,29 @@ def _sampled_design(
         gain=gain / scale,
         predictor=form == "predictor",
     )
+
+
+def with_motion_of_f(matrix: Matrix, m: int, diagonal: float = 0.0) -> Matrix:
+    """Return Φ, or Φ − I without ``diagonal``, of N = n + m states from that of n + 1.
+
+    In units of the sample time f moves from sample to sample by ``f^(i) ← Σ_{j≥i} f^(j)/(j − i)!``,
+    and is held in between.
+    """
+    if m == 1:
+        return matrix
+    n = matrix.shape[0] - 1
+    found = np.zeros((n + m, n + m))
+    found[: n + 1, : n + 1] = matrix
+    for i in range(m):
+        found[n + i, n + i] = diagonal
+        for j in range(i + 1, m):
+            found[n + i, n + j] = 1.0 / math.factorial(j - i)
+    return found
+
+
+def with_rates(inputs: Matrix, m: int) -> Matrix:
+    """Return the inputs' columns of N = n + m states from those of n + 1: none moves f', …."""
+    return np.vstack([inputs, np.zeros((m - 1, inputs.shape[1]))]) if m > 1 else inputs
 
 
 def continuous_gain(a: Vector, omega_o: float, disturbance_order: int = 1) -> Vector:

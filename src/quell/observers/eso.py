@@ -232,7 +232,7 @@ class ESO:
         levels_of = partial(cls.model_free, order, b0, dt=dt, disturbance_order=m)
         bandwidths = level_bandwidths(last.omega_o, levels, ratio)
         models = [levels_of(omega_o=omega).model for omega in bandwidths]
-        return last._with_model(cascade_model(models, last.disturbance_order - 1), delay)
+        return last._with_model(cascade_model(models, last.order), delay)
 
     @classmethod
     def nonlinear(

@@ -1,8 +1,9 @@
 """The steady-state Kalman gain of the extended state observer, from variances.
 
 White noise is assumed to drive the extended model: ``f^(m) = w`` with the density ``drift`` and m
-extended states, ``x_n' = … + f + v`` with the density ``jitter``. y is measured with noise of the variance ``noise``
-in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23, 1978)::
+extended states, ``x_n' = … + f + v`` with the density ``jitter``. y is measured with noise of the
+variance ``noise`` in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23,
+1978)::
 
     Q  = ∫_0^dt exp(A s) G exp(Aᵀ s) ds
     P⁻ = Φ (P⁻ − P⁻ Cᵀ (C P⁻ Cᵀ + R)⁻¹ C P⁻) Φᵀ + Q,      L = P⁻ Cᵀ / (C P⁻ Cᵀ + R)
@@ -25,8 +26,9 @@ def kalman_gain(
 ) -> tuple[Vector, float]:
     """Return L (N,) and the geometric mean of ``|ln z_i|/dt`` over the poles [rad/s].
 
-    L is in the coordinates of ``A`` (N, N), whose states from n + 1 on, n the ``order``, are f, f', …. The equation is solved in the
-    time unit of the Butterworth pattern, where the entries of Φ, Q and P have similar sizes.
+    L is in the coordinates of ``A`` (N, N), whose states from n + 1 on, with n the ``order``, are f
+    and its derivatives. The equation is solved in the time unit of the Butterworth pattern, where
+    the entries of Φ, Q and P have similar sizes.
     """
     from scipy.linalg import solve_discrete_are
 
@@ -51,6 +53,7 @@ def kalman_gain(
     drive[order - 1, order - 1] = jitter / density * (scale[order - 1] / omega) ** 2
     step = omega * dt
     phi, _ = zero_order_hold(scaled, [], step)
+    phi[:order, order + 1 :] = 0.0  # f is held within a sample, as in ``design.py``
     C, R = np.eye(1, size), np.array([[1.0 / step]])
     try:
         with np.errstate(invalid="ignore"):  # what overflows is found below

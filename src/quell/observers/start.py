@@ -13,10 +13,10 @@ from quell.types import Vector
 
 
 def state_for(model: Any, x: Vector, f: Vector, u: float) -> Vector:
-    """Return the running state whose estimates are ``x`` (n,) and ``f`` (m,), after a constant ``u``.
+    """Return the running state whose estimates are ``x`` (n,) and ``f`` (m,), after a constant u.
 
-    ``f`` is f with its derivatives. All levels of a cascade have the same x, and the first one has
-    f; the others estimate what the levels before them miss.
+    ``f`` is f with its derivatives; missing ones are zero. All levels of a cascade have the same x,
+    and the first one has f; the others estimate what the levels before them miss.
     """
     if isinstance(model, DelayedModel):
         inner = state_for(model.inner, x, f, u)

@@ -52,6 +52,7 @@ _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
     "freed": ("pi", "pid", "bandwidths"),
     "delay-freed": ("pi", "pid", "bandwidths", "delay"),
     "model-based-freed": ("model-based",),
+    "freed-2": ("bandwidths-2",),
 }
 # A PI controller is of use as a reference for noise unless a PID controller with filter has so many
 # times its integral gain; chosen by hand. Plants below this relative degree are not in doubt.
@@ -63,7 +64,8 @@ _NEAR_BEST = 1.05
 # The structures, simple ones first: by what a user has to know, and by the number of parameters.
 _FROM_SIMPLE = (
     *("pi-unfiltered", "pi", "pid", "bandwidths", "reduced", "half-gain", "half-gain-law"),
-    *("p-pi-notch", "freed", "delay", "delay-freed", "model-based", "model-based-freed", "lqg"),
+    *("p-pi-notch", "bandwidths-2", "bandwidths-3", "freed", "freed-2", "delay", "delay-freed"),
+    *("model-based", "model-based-2", "model-based-freed", "lqg"),
 )
 # Largest order of an ADRC that has an equivalent PI or PID controller.
 _LIKE_PID = 2
@@ -261,6 +263,11 @@ def _solutions(name: str, task: Task, solved: Mapping[str, Sequence[Solution]]) 
     found = []
     for order in orders_of(name, task.model, task.order):
         structure = make_structure(name, task.model, order)
+        if task.objective == "load" and structure.integrators > 1:
+            raise ValueError(
+                f"k_i is infinite with {structure.integrators} integrators: after a step of the "
+                "load the integral of y is zero for any gains; use objective='load-iae'"
+            )
         best = _best(task, structure, _known_starts(structure, solved))
         if best is not None and _is_stable(task.plants, best):
             found.append(best)

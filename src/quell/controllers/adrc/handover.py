@@ -120,8 +120,8 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     if loop.started == 0.0:
         return
     before = unlimited_control(old, state, loop.constant, loop.slope)
-    # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a. Its
-    # derivatives, if the observer has them, stay: how u moves from now on is not known.
+    # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
+    # Its derivatives, if the observer has them, stay: how u moves from now on is not known.
     acting = acting_control(old.eso, state.z, float(loop.u))
     change = (old.b0 - new.b0) * acting
     for i in range(size):

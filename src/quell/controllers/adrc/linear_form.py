@@ -61,17 +61,14 @@ def _of_eso(model: EsoModel) -> Prediction:
 @prediction.register
 def _of_cascade(model: CascadeModel) -> Prediction:
     levels, size = model.gains.shape
-    states, n = levels * size, size - 1 - model.derivatives
+    states, n = levels * size, model.at_f
     F, J, H = np.zeros((states, states)), np.eye(states), np.zeros(states)
     error, error_e = np.zeros(states), 1.0  # of a level, from z⁻ and from e
     for level in range(levels):
         own = slice(level * size, (level + 1) * size)
         F[own, own] = model.transition
         for before in range(level):
-            known = before * size + n
-            F[own, known] = model.feed
-            moved = slice(known + 1, (before + 1) * size)
-            F[level * size : level * size + n, moved] = model.transition[:n, n + 1 :]
+            F[own, before * size + n] = model.feed
         J[own] += np.outer(model.gains[level], error)
         H[own] = model.gains[level] * error_e
         error, error_e = J[level * size].copy(), H[level * size]  # less the next level's z⁻_1

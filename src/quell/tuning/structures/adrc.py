@@ -59,6 +59,7 @@ class Form:
     half_law: bool = False
     based: bool = False
     knows_delay: bool = False
+    extended: int = 1  # number of extended states, and of integrators
 
 
 class _Designed(NamedTuple):
@@ -86,7 +87,8 @@ class AdrcStructure:
         self.gain_sign = model.sign
         # With s^(n+1) A + b0 B = p_law p_observer the poles of 1/A are as fast as the loop's. With
         # a model, D s A + b0 N B has A less the model's own poles: it may have a slow one.
-        self.may_swing = form.based
+        self.may_swing = form.based and form.extended == 1
+        self.integrators = form.extended
         self.plant: Canonical = (
             canonical(model.plant) if form.based else canonical((np.zeros(order), 1.0))
         )
@@ -94,7 +96,7 @@ class AdrcStructure:
             raise ValueError("the plant has zeros outside of the left half plane, which it inverts")
         self.order, self.degree = self.plant.a.size, self.plant.degree
         self._last: tuple[bytes, Any] = b"", None
-        self._chain = sampled_adrc.sampled_chain(self.plant, model.dt)
+        self._chain = sampled_adrc.sampled_chain(self.plant, model.dt, form.extended)
         self._delay = round(model.delay / model.dt) if form.knows_delay else 0
         self._fastest = model.constraints.omega_o_dt / model.dt
         self._damping = dict(_DAMPING)
@@ -102,7 +104,7 @@ class AdrcStructure:
         if least is not None and not resonances(model, least):
             low, high = _DAMPING["o"]
             self._damping["o"] = (max(low, least), high)
-        self._observed = self.order + (0 if form.reduced else 1)
+        self._observed = self.order + form.extended - form.reduced
         unit = model.gain * model.omega**self.degree
         self.parameters = (
             Parameter("b0", f"y-unit/u-unit/s^{self.degree}", 1e-10 * unit, 1e10 * unit),
@@ -158,8 +160,9 @@ class AdrcStructure:
 
     def from_other(self, other: AdrcStructure, values: Vector) -> Vector | None:
         """Return the values with the poles of another form of the same order, if there are any."""
-        same = (other.degree, other.order, other.form.based)
-        if other is self or same != (self.degree, self.order, self.form.based):
+        same = (other.degree, other.order, other.form.based, other.form.extended)
+        own = (self.degree, self.order, self.form.based, self.form.extended)
+        if other is self or same != own:
             return None
         law, observer = (poles[0] for poles in other.poles(values[None, :]))
         if not self.form.freed:
@@ -319,6 +322,7 @@ class AdrcStructure:
             "half_gain": self.form.half_observer,
             "delay": self._delay * dt,
             "poles": observer,
+            "disturbance_order": self.form.extended,
         }
         if self.form.based:
             form |= {"far": math.inf}
@@ -354,6 +358,8 @@ class AdrcStructure:
             observer["form"] = "reduced"
         if self.form.half_observer:
             observer["half_gain"] = True
+        if self.form.extended > 1:
+            observer["disturbance_order"] = self.form.extended
         if self._delay:
             observer["delay"] = self._delay * self.model.dt
         controller: dict[str, Any] = {"kind": "adrc", "omega_c": omega_c}
