@@ -23,8 +23,8 @@ polynomial from sample to sample and held in between, as u is: ``f⁺ = f + dt f
 only f itself moves x. So a held u cancels it exactly, and the feedback has m poles at z = 1: the
 error of y goes to zero for every load that is a polynomial of degree m − 1, whatever the plant and
 the sample time. If f moved x within the sample as a ramp, the law ``u = (u_0 − f̂)/b0`` would leave
-an error of ``f' dt/(2 k_1)``, and the feedback would have one pole there. A known delay τ of u leaves
-``f' τ/k_1``, because the law cancels the f of now.
+an error of ``f' dt/(2 k_1)``, and the feedback would have one pole there. A known delay τ of u
+leaves ``f' τ/k_1``, because the law cancels the f of now.
 
 All eigenvalues of ``(I − L C) Φ`` lie at ``exp(−omega_o dt)`` (the bandwidth parametrisation of
 Gao, ACC 2003, in the z-plane as in Miklosovic, Radke & Gao, ACC 2006), or at ``exp(p_i omega_o

@@ -20,6 +20,7 @@ from quell.tuning.optimiser.objectives import cost_of, scores
 from quell.tuning.optimiser.problem import Extra, Problem, Solution
 from quell.tuning.optimiser.requirements import KINDS, Bound, bounds_of, worst_ratio
 from quell.tuning.optimiser.search import FEW, best_solution, merit, search, solution_at
+from quell.tuning.optimiser.starts import starts
 from quell.tuning.optimiser.time_responses import Inputs, SetResponses, law_of
 from quell.tuning.result.design import Design, design_of, impossible, measured
 from quell.tuning.result.report import relative
@@ -45,6 +46,9 @@ _TIGHTER, _LEAST_PEAK, _REACHED = (0.4, 0.15), 0.1, 0.995
 _MEMBERS, _WORSE, _EXCHANGES = 2, 1.005, 4
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
 _RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0, 100.0, 1e3, 1e4, 1e5), 6
+# Starts of a search over time with several integrators: the ISE, which leads to them, has other
+# valleys than the IAE. Chosen by hand.
+_VALLEYS = 4
 # Structures whose optima stand for starts of another one. They are always tuned before it, so that
 # a result does not depend on what it is compared with.
 _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
@@ -287,12 +291,18 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     is_slow = any(extra.over_time for extra in problem.extras)
     if not ends or (problem.objective == "load" and not is_slow):
         return min(ends, key=_rank, default=None)
-    tried = [solution_at(problem, structure, row) for row in (*(e.values for e in ends), *known)]
-    best = min((each for each in tried if each is not None), key=merit, default=None)
-    if best is None:
+    rows, count = [*(end.values for end in ends), *known], 1
+    if structure.integrators > 1:
+        rows += [*starts(quick.problem(), structure, structure.shapes(), _VALLEYS)]
+        count = _VALLEYS
+    tried = [solution_at(problem, structure, row) for row in rows]
+    first = sorted((each for each in tried if each is not None), key=merit)[:count]
+    if not first:
         return None
+    best = first[0]
     if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
-        return search(problem, structure, best.values, _ROUNDS)
+        found = (search(problem, structure, each.values, _ROUNDS) for each in first)
+        return min((each for each in found if each is not None), key=_rank, default=None)
     over, members = SetResponses(task.plants, task.inputs), list[int]()
     for _ in range(_EXCHANGES):
         each = scores(task.objective, structure, best.values, over)

@@ -38,6 +38,8 @@ _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
 _OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
+# With more extended states one slower than the law is often the best under bounds of M_s.
+_SLOW_OBSERVER = 0.1
 # Damping of the observer's pair at a resonance of the plant, and of the law's, to start from.
 _RESONANCE_STARTS, _MOVED = (0.1, 0.4), 0.7
 # With a model there are many valleys, also with an observer far slower than a quick law: a grid of
@@ -178,7 +180,8 @@ class AdrcStructure:
         """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
         omega, rows = self.model.omega, []
         b0 = self.model.b if self.degree == self.model.degree else 1.0
-        for law, ratio in itertools.product(_LAW_STARTS, _OBSERVER_STARTS):
+        ratios = _OBSERVER_STARTS if self.form.extended == 1 else (_SLOW_OBSERVER, *_OBSERVER_STARTS)
+        for law, ratio in itertools.product(_LAW_STARTS, ratios):
             pair = (law * omega, law * ratio * omega)
             if max(pair) > 0.999 * self._fastest:
                 pair = (min(pair[0], 0.9 * self._fastest), 0.99 * self._fastest)
