@@ -21,7 +21,7 @@ _A = (
     (0, 0, 1, 0),
     (0, 0, 0, 1),
     (0, 0, -2, 0),
-)  # y, y', y'', y''' of 1/(s^4 + 2 s^2)
+)  # of 1/(s^4 + 2 s^2)
 _TERMS = 14
 Rational = list[list[Fraction]]
 
@@ -110,12 +110,12 @@ def controller(based: bool, m: int, omega_o: float, omega_c: float = 1.0) -> tup
 
 
 def sampled_plant() -> tuple[Any, Any]:
-    """Return Φ (4, 4) and the columns for u and for the force on m2 (4, 2); y is the first state."""
+    """Return Φ (4, 4) of (y, y', x1 − x2, x1' − x2'), and the columns for u and the force on m2."""
     dt = Fraction(1, 1000)
     A = [[Fraction(value) * dt for value in [*row, 0, 0]] for row in _A] + [[Fraction(0)] * 6] * 2
-    A[3][4] = dt  # m1 m2 y'''' + k (m1 + m2) y'' = k u + (m1 s² + k) w
-    A[1][5], A[3][5] = dt, -dt  # y'' = w + …, y'''' = w + w'' − 2 y'' …
-    whole = np.array([row for row in exponential(A)[:4]], dtype=float)
+    A[3][4] = dt
+    A[1][5], A[3][5] = dt, -dt  # the third state is the spring's x1 − x2: y'' = x1 − x2 + w
+    whole = np.array(exponential(A)[:4], dtype=float)
     return whole[:, :4], whole[:, 4:]
 
 
