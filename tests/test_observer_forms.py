@@ -42,7 +42,9 @@ def run_observer(
 
 def poles(observer: ESO) -> np.ndarray:
     """Return the eigenvalues of the observer's own update."""
-    return np.linalg.eigvals(response(observer.model, observer.estimates, observer.order).transition)
+    return np.linalg.eigvals(
+        response(observer.model, observer.estimates, observer.order).transition
+    )
 
 
 def records(rng: np.random.Generator, samples: int = 800) -> tuple[np.ndarray, np.ndarray]:
