@@ -301,14 +301,13 @@ def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
         row[i] = state.seen[i]
     row[order + 1] = state.loop[0].f_learned
     row[order + 2] = state.loop[0].status
-    at = order + 3
+    after = state.seen.size + 2
     for i in range(order + 1, state.seen.size):
-        row[at] = state.seen[i]
-        at += 1
+        row[i + 2] = state.seen[i]
     r, reference = state.loop[0].r, state.reference
-    at += write_feedforward(design.feedforward, r, reference, row[at:])
-    at += write_channels(design.guard, state.guard, row[at:])
-    coefficients(design.learner, state.learner, row[at:])
+    forward = write_feedforward(design.feedforward, r, reference, row[after:])
+    written = write_channels(design.guard, state.guard, row[after + forward :])
+    coefficients(design.learner, state.learner, row[after + forward + written :])
 
 
 @status_flags.register(AdrcDesign)
