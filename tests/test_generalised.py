@@ -12,6 +12,7 @@ import pytest
 import quell as ql
 from quell.analysis import analyse, certify
 from quell.controllers import in_single_precision
+from quell.experiments.compare import sensitivities
 from quell.export import c_source
 from quell.observers import continuous_gain
 from quell.observers.response import f_learned_response, response
@@ -318,6 +319,29 @@ def test_a_setup_file_has_it_and_is_the_same_after_saving(tmp_path: Path, m: int
     again.write_text(toml_text(setup.tables()))
     assert repr(ql.setup.load(again).controller) == repr(setup.controller)
     assert ("disturbance_order=" in repr(setup.controller)) == (m > 1)
+
+
+def test_a_comparison_has_no_k_i_with_two_integrators() -> None:
+    """It is infinite, as after a step of the load the integral of y is zero; in a file for programs it is None."""
+    plant = ([B0], [1.0, 0.3, 2.0])
+    k_i = [sensitivities(plant, ql.ADRC(chain(m), OMEGA_C)).k_i for m in (1, 2, 3)]
+    loop = analyse(plant, ql.ADRC(chain(1), OMEGA_C))
+    assert k_i[0] == pytest.approx(1e-4 / abs(loop.response("PS", [1e-4])[0]), rel=1e-3)
+    assert k_i[1:] == [math.inf, math.inf]
+
+
+@pytest.mark.parametrize(("structure", "extended"), [("bandwidths-2", 2), ("freed-2", 2)])
+def test_a_tuned_file_has_its_states_and_its_k_i_is_infinite(structure: str, extended: int) -> None:
+    """The loop keeps its bounds; the controller of the file is the tuned one."""
+    plant, bounds = ([1.0], [1.0, 1.0]), ql.tuning.Constraints(m_s=1.7, m_ks=10.0)
+    tuned = ql.tune(plant, 0.02, structure=structure, order=1, constraints=bounds, compare=())
+    assert tuned.controller.observer.disturbance_order == extended
+    assert tuned.design.k_i == math.inf
+    assert tuned.design.to_json()["k_i"] is None
+    assert tuned.design.measures["M_s"] <= 1.7 * 1.001
+    assert tuned.design.tables["observer"]["disturbance_order"] == extended
+    y = errors(plant, tuned.controller, 1, 60.0)
+    assert abs(y[-1]) < 1e-6 * np.max(np.abs(y))
 
 
 @needs_gcc

@@ -180,7 +180,9 @@ class AdrcStructure:
         """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
         omega, rows = self.model.omega, []
         b0 = self.model.b if self.degree == self.model.degree else 1.0
-        ratios = _OBSERVER_STARTS if self.form.extended == 1 else (_SLOW_OBSERVER, *_OBSERVER_STARTS)
+        ratios = (
+            _OBSERVER_STARTS if self.form.extended == 1 else (_SLOW_OBSERVER, *_OBSERVER_STARTS)
+        )
         for law, ratio in itertools.product(_LAW_STARTS, ratios):
             pair = (law * omega, law * ratio * omega)
             if max(pair) > 0.999 * self._fastest:
