@@ -38,7 +38,8 @@ def response(model: Any, estimates: int, at_f: int) -> Response:
         observe(model, z, estimate, *one[m:].tolist())
         state[:, i], estimated[:, i] = z, estimate
     parts = state[:, :m], state[:, m:], estimated[:, :m], estimated[:, m:]
-    return Response(*(part.copy() for part in parts), at_f)
+    transition, given, output, feedthrough = (part.copy() for part in parts)
+    return Response(transition, given, output, feedthrough, at_f)
 
 
 def f_learned_response(found: Response) -> tuple[Matrix, Vector, Vector, float]:

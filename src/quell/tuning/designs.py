@@ -301,8 +301,8 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
         return None
     best = first[0]
     if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
-        found = (search(problem, structure, each.values, _ROUNDS) for each in first)
-        return min((each for each in found if each is not None), key=_rank, default=None)
+        ends = [end for e in first if (end := search(problem, structure, e.values, _ROUNDS))]
+        return min(ends, key=_rank, default=None)
     over, members = SetResponses(task.plants, task.inputs), list[int]()
     for _ in range(_EXCHANGES):
         each = scores(task.objective, structure, best.values, over)

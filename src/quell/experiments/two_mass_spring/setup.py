@@ -113,10 +113,10 @@ def controller(
 ) -> ADRC:
     """Return one controller; ``bandwidth`` multiplies ``omega_o``."""
     omega_o = bandwidth * settings.omega_o
-    how = {"dt": settings.dt, "disturbance_order": disturbance_order}
-    observer = ESO.model_free(4, 1.0, omega_o, **how)
+    dt, m = settings.dt, disturbance_order
+    observer = ESO.model_free(4, 1.0, omega_o, dt, disturbance_order=m)
     if model:
-        observer = ESO.model_based(two_mass_spring(), omega_o, **how)
+        observer = ESO.model_based(two_mass_spring(), omega_o, dt, disturbance_order=m)
     return ADRC(observer, settings.omega_c, learner=learner)
 
 

@@ -239,7 +239,7 @@ def unstable_poles(found: Designs) -> Vector:
     """
     base, closing = found.base, found.closing
     if found.delay == 0:
-        shifted = np.linalg.eigvals(-(base + closing))
+        shifted: Any = np.linalg.eigvals(-(base + closing))
         if found.extended > 1:
             # Rounding moves an e-fold pole by its e-th root: the integrators are those next to 1.
             near = np.argsort(np.abs(shifted), axis=1)
