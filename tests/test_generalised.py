@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from quell.experiments.compare import sensitivities
 from quell.export import c_source
 from quell.observers import continuous_gain
 from quell.observers.response import f_learned_response, response
+from quell.studio.forms import forms
+from quell.studio.messages import Granted
 from quell.tuning.result.setup_file import toml_text
 
 from .in_c import InC, needs_gcc
@@ -319,6 +322,15 @@ def test_a_setup_file_has_it_and_is_the_same_after_saving(tmp_path: Path, m: int
     again.write_text(toml_text(setup.tables()))
     assert repr(ql.setup.load(again).controller) == repr(setup.controller)
     assert ("disturbance_order=" in repr(setup.controller)) == (m > 1)
+
+
+def test_the_form_of_the_studio_has_a_field_for_it() -> None:
+    """Of every kind of observer, with its default; the page shows it with its range."""
+    for about in forms(Granted((), trust=True))["observer"].values():
+        (field,) = (key for key in about["keys"] if key["key"] == "disturbance_order")
+        assert (field["type"], field["default"], field["needed"]) == ("whole number", 1, False)
+    page = resources.files("quell.studio") / "page/panels/forms.js"
+    assert "RANGES = { disturbance_order: [1, 3] }" in page.read_text(encoding="utf-8")
 
 
 def test_a_comparison_has_no_k_i_with_two_integrators() -> None:

@@ -122,7 +122,7 @@ def _chain(observer: ESO) -> Lag:
 
     With ``M = (I − L C) Φ`` and ``g = (I − L C) Γ_f``, the chain is ``s = V v`` with ``V_1 =
     g/(1−β)`` and ``V_{j+1} = (M − βI) V_j/(1−β)``, which ends after N by Cayley-Hamilton; ``c_j =
-    −(V_j)_{n+1}``.
+    −(V_j)_{n+1}``, in predictor form ``−(Φ V_j)_{n+1}`` for the next sample.
     """
     model, at_f = without_delay(observer.model), observer.order
     size = observer.estimates
@@ -134,9 +134,13 @@ def _chain(observer: ESO) -> Lag:
     rise = -np.expm1(-observer.omega_o * observer.dt)
     shifted = transition - np.eye(size) + rise * np.eye(size)
     column = correct @ (model.feed * scale) / rise
+    # In predictor form f̂ is the f that is predicted from these states: f itself, or f + dt f' + ….
+    row = np.eye(size)[at_f]
+    if model.predictor and observer.disturbance_order > 1:
+        row = model.transition[at_f] * scale[at_f] / scale
     taps = np.empty(size)
     for j in range(size):
-        taps[j] = -column[at_f] / scale[at_f]
+        taps[j] = -(row @ column) / scale[at_f]
         column = shifted @ column / rise
     return Lag(observer.pole, rise, taps, model.predictor)
 
