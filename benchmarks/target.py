@@ -62,6 +62,8 @@ def cases() -> list[Case]:
     limits = {"u_min": -10.0, "u_max": 10.0}
     observer = ql.ESO.model_free(order=2, b0=5.0, omega_o=50.0, dt=1e-3)
     mf = ql.ADRC(observer, omega_c=10.0, **limits)
+    ramps = ql.ESO.model_free(2, b0=5.0, omega_o=50.0, dt=1e-3, disturbance_order=2)
+    mf_2 = ql.ADRC(ramps, omega_c=10.0, **limits)
     # The reference of the runs gives a new target in each sample: each step plans a move.
     moves = "MF-ESO, order 2, feedforward, moves"
     fed = ql.ADRC(observer, omega_c=10.0, feedforward=ql.Feedforward.of(DRIVE), **limits)
@@ -77,6 +79,7 @@ def cases() -> list[Case]:
         Case("PID", m4, "single", DRIVE, pid),
         Case("MF-ESO, order 2", m4, "single", DRIVE, mf, small),
         Case("MF-ESO, order 2", m7, "double", DRIVE, mf),
+        Case("MF-ESO, order 2, f and f'", m4, "single", DRIVE, mf_2),
         Case(moves, m4, "single", DRIVE, moving),
         Case(moves, m7, "double", DRIVE, moving),
         Case("MF-ESO, order 4", m4, "single", two_mass, law()),

@@ -80,6 +80,8 @@ BY_MODEL = ql.ADRC(
     feedforward=ql.Feedforward((0.3, 0.1, 0.7), coulomb=0.2, coulomb_speed=0.5, constant=-0.1),
     **LIMITS,
 )
+RAMPS = ql.ADRC(ql.ESO.model_free(2, 1.5, 12.0, DT, disturbance_order=2), 1.5, **LIMITS)
+PARABOLAS = ql.ADRC(ql.ESO.cascade(2, 1.5, 12.0, DT, disturbance_order=3), 1.5, **LIMITS)
 NONLINEAR = ql.ADRC(ql.ESO.nonlinear(2, 1.5, 12.0, DT, delta=0.05), 1.5)
 
 
@@ -96,6 +98,8 @@ NONLINEAR = ql.ADRC(ql.ESO.nonlinear(2, 1.5, 12.0, DT, delta=0.05), 1.5)
         pytest.param(RLS, "single", id="RLS, single"),
         pytest.param(MOVING, "double", id="feedforward"),
         pytest.param(MOVING, "single", id="feedforward, learner and guard, single"),
+        pytest.param(RAMPS, "single", id="two extended states, single"),
+        pytest.param(PARABOLAS, "double", id="cascade of three extended states"),
         pytest.param(BY_MODEL, "double", id="feedforward by a model"),
         pytest.param(BY_MODEL, "single", id="feedforward by a model, single"),
     ],

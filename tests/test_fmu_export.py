@@ -217,6 +217,13 @@ def test_parameters_are_checked_when_they_act(made: Maker) -> None:
         (lambda omega: ql.ESO.model_free(3, 2.0, omega, 0.01, form="predictor"), (5.0, 80.0)),
         (lambda omega: ql.ESO.model_based(ql.plants.two_mass_spring(), omega, 1e-3), (5.0, 40.0)),
         (lambda omega: ql.ESO.model_based(([1.0, 3.0], [1.0, 2.0, 5.0]), omega, 1e-3), (5.0, 40.0)),
+        (lambda omega: ql.ESO.model_free(2, 2.0, omega, 0.01, disturbance_order=3), (5.0, 40.0)),
+        (
+            lambda omega: ql.ESO.model_based(
+                ([1.0, 3.0], [1.0, 2.0, 5.0]), omega, 1e-3, disturbance_order=2
+            ),
+            (5.0, 40.0),
+        ),
     ],
 )
 def test_the_observer_gain_is_a_polynomial(

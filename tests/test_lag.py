@@ -13,6 +13,8 @@ from quell.observers.base import begin, observe
 from quell.observers.design import FORMS
 from quell.observers.eso import ESO
 
+from .contracts.examples import EXTENDED
+
 LINEAR = {
     "current": ESO.model_free(3, 2.0, 15.0, 2e-3),
     "predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, form="predictor"),
@@ -38,27 +40,49 @@ LINEAR = {
     dt=st.sampled_from([1e-3, 1e-2]),
     form=st.sampled_from(["current", "predictor"]),
     model=st.booleans(),
+    m=st.integers(1, 3),
     seed=st.integers(0, 100),
 )
 def test_the_lag_filter_is_the_observers_own_shadow(
-    order: int, dt: float, form: str, model: bool, seed: int
+    order: int, dt: float, form: str, model: bool, m: int, seed: int
 ) -> None:
     """Against the definition: the full observer, fed y = 0 and the input through Γ_f, for five hundred samples."""
     rng = np.random.default_rng(seed)
+    order = min(order, 9 - m)
     observer = (
-        ESO.model_based((rng.normal(size=order), 1.0), omega_o=10.0, dt=dt, form=form)
+        ESO.model_based((rng.normal(size=order), 1.0), 10.0, dt, form=form, disturbance_order=m)
         if model
-        else ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=dt, form=form)
+        else ESO.model_free(order, 1.0, 10.0, dt, form=form, disturbance_order=m)
     )
-    lag, size = lag_of(observer), order + 1
+    lag, size = lag_of(observer), order + m
     inputs = rng.normal(size=500)
     z, seen, chain = np.zeros(size), np.zeros(size), np.zeros((1, size))
     shadow, quick = np.zeros(500), np.zeros(500)
     for k in range(1, 500):
         observe(observer.model, z, seen, 0.0, 0.0, inputs[k - 1])
-        shadow[k] = -seen[-1]
+        shadow[k] = -seen[order]
         quick[k] = lag_push(lag, chain, 0, inputs[k - 1])
     np.testing.assert_allclose(quick, shadow, atol=1e-7 * max(np.max(np.abs(shadow)), 1e-3))
+
+
+@pytest.mark.parametrize("name", [name for name in EXTENDED if "nonlinear" not in name])
+def test_the_lag_filter_of_an_observer_with_more_extended_states_is_its_shadow(
+    name: str, rng: np.random.Generator
+) -> None:
+    """Of every form: what f̂ lacks when f_L is fed forward, from the same y and u."""
+    observer = EXTENDED[name]
+    lag, n = lag_of(observer), observer.order
+    memory = lag_memory(lag, 1)
+    y, u, f_learned = (np.cumsum(rng.normal(size=600)) * 1e-2 for _ in range(3))
+    z, plain = np.zeros((2, observer.states))
+    seen, alone = np.zeros((2, observer.estimates))
+    missed, shown = np.zeros((2, y.size))
+    for k in range(1, y.size):
+        observe(observer.model, z, seen, y[k], u[k], f_learned[k])
+        observe(observer.model, plain, alone, y[k], u[k], 0.0)
+        shown[k] = lag_push(lag, memory, 0, f_learned[k])
+        missed[k] = alone[n] - seen[n]
+    np.testing.assert_allclose(shown, missed, atol=1e-8 * np.max(np.abs(missed)))
 
 
 @pytest.mark.parametrize("order", range(1, 9))

@@ -361,7 +361,7 @@ def test_a_zero_keeps_a_pole_only_if_it_is_stable_and_slower_than_omega_o(
     """All other poles of the observer lie at ``exp(−omega_o dt)``."""
     plant = (np.poly(zeros), np.poly([-1.0, -0.3, 0.5, 0.0]))
     observer = ESO.model_based(plant, omega_o=20.0, dt=2e-3, keep_zeros=True)
-    found = scaled_response(observer.model, observer.units).transition
+    found = scaled_response(observer.model, observer.units, observer.order).transition
     rates = [-20.0] * (5 - len(kept)) + kept
     # About z = 1, in the time unit 1/omega_o: a multiple pole is not found by eigenvalues.
     wanted = np.poly(np.expm1(2e-3 * np.array(rates)) / 0.04)

@@ -42,7 +42,9 @@ def run_observer(
 
 def poles(observer: ESO) -> np.ndarray:
     """Return the eigenvalues of the observer's own update."""
-    return np.linalg.eigvals(response(observer.model, observer.order + 1).transition)
+    return np.linalg.eigvals(
+        response(observer.model, observer.estimates, observer.order).transition
+    )
 
 
 def records(rng: np.random.Generator, samples: int = 800) -> tuple[np.ndarray, np.ndarray]:
@@ -415,7 +417,7 @@ FORMS = {
 def test_noise_gains_are_what_noise_does(name: str, rng: np.random.Generator) -> None:
     """White noise in y of a hundred observers, for a thousand samples from their steady state on, to 10 % in variance."""
     observer = FORMS[name]
-    found = response(observer.model, 3)
+    found = response(observer.model, 3, 2)
     seen, state = [], np.zeros((observer.states, 100))
     for y in rng.normal(size=(1200, 100)):
         seen.append(found.output @ state + found.feedthrough[:, :1] * y)
@@ -441,7 +443,7 @@ def test_states_for_given_estimates_show_them(name: str) -> None:
     """After a sample with the expected y they are the estimates that the model moves."""
     observer = FORMS[name]
     x, f, u = np.array([0.3, -0.8]), 1.7, 0.6
-    z, seen = state_for(observer.model, x, f, u), np.zeros(3)
+    z, seen = state_for(observer.model, x, np.array([f]), u), np.zeros(3)
     assert z.shape == (observer.states,)
     y = 0.3 - 0.8 * DT + 0.5 * DT**2 * (1.5 * u + f)
     assert expected_measurement(observer.model, z, u, 0.0) == pytest.approx(y, rel=1e-12)
@@ -475,7 +477,7 @@ def test_the_response_of_an_observer_is_its_update_as_matrices(
 ) -> None:
     """Inputs are y, u and f_L, estimates x̂ and Δf̂, whatever the state."""
     observer = FORMS[name]
-    found = response(observer.model, 3)
+    found = response(observer.model, 3, 2)
     z, inputs, seen = rng.normal(size=observer.states), rng.normal(size=3), np.zeros(3)
     after = z.copy()
     observe(observer.model, after, seen, *inputs)
@@ -496,7 +498,7 @@ SUMMED = {name: observer for name, observer in FORMS.items() if not observer.has
 def test_noise_gains_are_those_of_the_lyapunov_equation(name: str) -> None:
     """``P = M P Mᵀ + g gᵀ`` and ``diag (C P Cᵀ + d dᵀ)``, where no formula is known."""
     observer = SUMMED[name]
-    found = response(observer.model, 3)
+    found = response(observer.model, 3, 2)
     g, d = found.input[:, :1], found.feedthrough[:, :1]
     P = solve_discrete_lyapunov(found.transition, g @ g.T)
     expected = np.diag(found.output @ P @ found.output.T + d @ d.T)

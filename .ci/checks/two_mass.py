@@ -12,6 +12,8 @@ names = [
     "L-ESO (Algorithm 1)",
     "MF-ESO (3x bandwidth)",
     "MB-ESO (3x bandwidth)",
+    "MF-ESO m = 2",
+    "MB-ESO m = 2",
 ]
 keys = {"overshoot", "settling_time", "disturbance_peak", "disturbance_rms", "control_variation"}
 assert list(result["controllers"]) == names, list(result["controllers"])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections import ChainMap
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,3 +160,30 @@ OBSERVERS: dict[str, ESO] = {
     "nonlinear": ESO.nonlinear(2, 1.5, 12.0, 0.01, delta=0.05),
     "delay": ESO.model_free(2, 1.5, 12.0, 0.01, delay=0.02),
 }
+
+
+def extended(m: int) -> dict[str, ESO]:
+    """Every form with m extended states; a test finds a form without an example."""
+    chain, more = partial(ESO.model_free, 2, 1.5, 12.0, 0.01), {"disturbance_order": m}
+    plant = ([2.0, 0.3, 1.0, 0.5], 1.5)
+    zero = ([1.5, 6.0], [1.0, 0.5, 2.0, 1.0])
+    drift = 3e-2 * 12.0 ** (2 * m - 2)
+    return {f"{name}, m = {m}": observer for name, observer in {
+        **{f"model_free, form={form}": chain(form=form, **more) for form in FORMS},
+        "model_free, half_gain": chain(half_gain=True, **more),
+        "model_free, delay": chain(delay=0.02, **more),
+        "model_free, poles": chain(poles=[(-0.8, 0.6), *[-1.0] * m], **more),
+        **{
+            f"model_based, form={form}": ESO.model_based(plant, 12.0, 0.01, form=form, **more)
+            for form in FORMS
+        },
+        "model_based": ESO.model_based(zero, 12.0, 0.01, **more),
+        "model_based, keep_zeros": ESO.model_based(zero, 12.0, 0.01, keep_zeros=True, **more),
+        "cascade": ESO.cascade(2, 1.5, 12.0, 0.01, **more),
+        "nonlinear": ESO.nonlinear(2, 1.5, 12.0, 0.01, delta=0.05, **more),
+        "kalman": ESO.kalman(2, 1.5, 0.01, noise_variance=1e-6, drift=drift, **more),
+    }.items()}  # fmt: skip
+
+
+EXTENDED = extended(2) | extended(3)
+OBSERVERS |= EXTENDED

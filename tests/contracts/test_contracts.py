@@ -30,11 +30,20 @@ from quell.learners.base import adapt, coefficients, commit, forget, predict, re
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.observers.delay import without_delay
+from quell.observers.design import FORMS
 from quell.plants import registry
 from quell.plants.base import advance, begin_run, measure
 from quell.simulation.driver import run_block
 
-from .examples import CHAIN, FROM_FILES, LEARNERS, OBSERVERS, PLANTS, PYTHON_LEARNERS
+from .examples import (
+    CHAIN,
+    EXTENDED,
+    FROM_FILES,
+    LEARNERS,
+    OBSERVERS,
+    PLANTS,
+    PYTHON_LEARNERS,
+)
 
 SCENARIO = ql.Scenario(
     reference=ql.signals.Sinusoid(omega=1.5),
@@ -148,14 +157,15 @@ def test_a_plant_changes_nothing_but_its_state(name: str, rng: np.random.Generat
 
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state(name: str) -> None:
-    """On its own model: state and f are found, parameters stay."""
+    """On its own model: state and f are found, parameters stay; with more extended states also its derivatives."""
     observer = OBSERVERS[name]
-    size, model = observer.order + 1, observer.model
+    size, model = observer.estimates, observer.model
     before = copy.deepcopy(model)
     extended = without_delay(model)
     f, u = 0.7, 0.4
     truth = np.zeros(size)
-    truth[-1] = f
+    truth[observer.order] = f
+    truth[observer.order + 1 :] = (0.3, -0.05)[: observer.disturbance_order - 1]
     z, seen = np.zeros(observer.states), np.zeros(size)
     begin(model, z, seen, 0.0)
     for _ in range(1500):
@@ -190,7 +200,10 @@ def estimate(
 TO_COMPILE = [
     name
     for name in OBSERVERS
-    if "order 2" not in name
+    if (
+        ("order 2" not in name and name not in EXTENDED)
+        or name in ("cascade, m = 3", "kalman, m = 2")
+    )
     and not ("order 4" in name if "current" in name else "order 1," in name or "order 8" in name)
 ]
 
@@ -204,11 +217,11 @@ def test_an_observer_estimates_the_same_again_and_interpreted(
     observer = OBSERVERS[name]
     y, u = 0.01 * rng.normal(size=(2, 300)).cumsum(axis=1)
     # A nonlinear observer has no lag filter; any will do.
-    lag = lag_of(OBSERVERS["half gain" if name == "nonlinear" else name])
+    lag = lag_of(OBSERVERS["half gain" if "nonlinear" in name else name])
 
     def estimates(entry: Any) -> Any:
-        z, sample = np.zeros(observer.states), Sample(np.zeros(observer.order + 1))
-        found = np.zeros((y.size, 4 + observer.order))
+        z, sample = np.zeros(observer.states), Sample(np.zeros(observer.estimates))
+        found = np.zeros((y.size, 3 + observer.estimates))
         entry(observer.model, z, sample, lag, lag_memory(lag, 1), y, u, found)
         return found
 
@@ -264,6 +277,39 @@ def test_a_learner_changes_only_its_memory(name: str, rng: np.random.Generator) 
     assert np.all(np.isfinite(first))
     for label, array in _named_arrays(memory).items():
         np.testing.assert_array_equal(array, frozen[label], err_msg=label)
+
+
+def test_every_observer_form_has_examples_with_more_extended_states() -> None:
+    """All that make an ``ESO``, all forms, and all options of ``model_free`` and ``model_based``."""
+    makers = {maker for maker, _ in inspect.getmembers(ql.ESO, inspect.ismethod) if maker[0] != "_"}
+    for m in (2, 3):
+        names = [name.removesuffix(f", m = {m}") for name in EXTENDED if name.endswith(str(m))]
+        assert makers == {name.partition(",")[0] for name in names}
+        shown = {name.partition(", ")[2].partition("=")[0] for name in names} - {""}
+        options = set(inspect.signature(ql.ESO.model_based).parameters)
+        assert shown == options - {
+            *("plant", "omega_o", "dt", "b0", "E", "far", "disturbance_order")
+        }
+        forms = {name.partition("form=")[2] for name in names} - {""}
+        assert forms == set(FORMS)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_does_not_see_the_derivatives_of_f(name: str, rng: np.random.Generator) -> None:
+    """With f', … behind f among the estimates it learns and says the same, whatever they are."""
+    learner = LEARNERS[name]
+    design = learner.design(OBSERVERS["model-free, order 2, current"], 1.0)
+    memories = [learner.memory(design) for _ in range(2)]
+    said: list[list[Any]] = [[], []]
+    for _ in range(200):
+        seen = rng.normal(size=3)
+        for memory, shown, out in zip(
+            memories, (seen, np.append(seen, (1e3, -1e4))), said, strict=True
+        ):
+            adapt(design, memory, shown, seen[0] + 1e-6, 0.3, seen[2])
+            out.append(predict(design, memory, shown, 0.2))
+            commit(design, memory, shown, 0.3, 0.1)
+    assert said[0] == said[1]
 
 
 @pytest.mark.parametrize("name", LEARNERS)

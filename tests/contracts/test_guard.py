@@ -20,6 +20,8 @@ from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.design import FORMS
 from quell.plants import delayed, n_mass
 
+from .examples import EXTENDED
+
 J_MOTOR, J_LOAD, STIFFNESS, FRICTION = 3.2e-4, 3.2e-4, 0.51, 1e-3  # zeros at the motor: 40 rad/s
 TORQUE, LAGS = 0.05, 60.0
 HEALTHY = 0.3  # modulus margin of a loop without learner
@@ -124,13 +126,21 @@ def test_every_observer_form_is_among_them() -> None:
     }
     assert makers - {"nonlinear"} == {name.partition(",")[0] for name in OBSERVERS}
     options = set(inspect.signature(ql.ESO.model_based).parameters)
-    options -= {"plant", "omega_o", "dt", "b0", "delay", "far"}  # numbers
+    options -= {"plant", "omega_o", "dt", "b0", "delay", "far", "disturbance_order"}  # numbers
     shown = {name.partition(", ")[2].partition("=")[0] for name in OBSERVERS} - {""}
     assert options == shown
     assert set(FORMS) == {"current", "predictor", "reduced"}
     nonlinear = ql.ESO.nonlinear(2, 1.0, 20.0, 1e-3, delta=0.1)
     with pytest.raises(ValueError, match="observer is nonlinear"):
         ql.Guard().design(nonlinear)
+
+
+@pytest.mark.parametrize("name", EXTENDED)
+def test_a_guard_refuses_every_observer_with_more_extended_states(name: str) -> None:
+    """And says why: a ramp of f_L moves nothing, and would have to leak away."""
+    if "nonlinear" not in name:
+        with pytest.raises(ValueError, match=r"a (ramp|parabola) of f_L moves nothing.*=1, or no"):
+            ql.ADRC(EXTENDED[name], 1.0, learner=Adversary(MULTIPLE, size=1.0), guard=ql.Guard())
 
 
 def healthy_loop(name: str, plant: Plant, wrong: float) -> tuple[Loop, ql.ADRC] | None:

@@ -74,6 +74,7 @@ def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_band
         (study.MB, 0.0000, 12.18, 0.219, 100.0),
         (study.MF3, 0.0000, 14.2, 0.0505, 10_382.0),
         (study.L, 0.0000, 11.99, 0.042, 103.0),
+        (study.MF_2, 0.00075, 11.9, 0.0355, 116.0),
     ],
 )
 def test_the_reference_figures_are_met(

@@ -63,7 +63,7 @@ def _predict(
     learner: Frozen, memory: NoLearnerMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
     constant = learner.before * u_before
-    for i in range(seen.size):
+    for i in range(learner.gain.size):
         constant += learner.gain[i] * seen[i]
     return constant, learner.slope
 

@@ -41,14 +41,14 @@ def observer_error(controller: Controller, run: Trajectory) -> Vector:
             f"run has every = {run.every!r}: all samples must be recorded, with finite y_measured"
         )
     observer = controller.observer
-    estimates = observer.order + 1
-    plain = response(observer.model, estimates)
-    M, g, c, d = f_learned_response(response(without_delay(observer.model), estimates))
-    z = state_for(observer.model, np.append(y[0], np.zeros(observer.order - 1)), 0.0, 0.0)
+    n, estimates = observer.order, observer.estimates
+    plain = response(observer.model, estimates, n)
+    M, g, c, d = f_learned_response(response(without_delay(observer.model), estimates, n))
+    z = state_for(observer.model, np.append(y[0], np.zeros(n - 1)), np.zeros(1), 0.0)
     lag, shown, q = np.zeros(M.shape[0]), 0.0, np.zeros(y.size)
     for k in range(1, y.size):
         given = np.array([y[k], u[k - 1], 0.0])
-        f_plain = float(plain.output[-1] @ z + plain.feedthrough[-1] @ given)
+        f_plain = float(plain.output[n] @ z + plain.feedthrough[n] @ given)
         z = plain.transition @ z + plain.input @ given
         q[k] = f_plain - shown
         shown = float(c @ lag + d * f_plain)

@@ -132,8 +132,10 @@ def _bounds(loop: Loops, action: Action, x_limit: Any) -> dict[str, Any]:
         raise ValueError(f"x_limit has {x.size} entries: must be a number, or one for each state")
     if isinstance(loop.controller, ADRC):
         observer = loop.controller.observer
-        rates = limit * observer.omega_o ** np.arange(observer.order + 1.0)
-        f = max(float(rates[-1]), action.reach)
+        rates = limit * observer.omega_o ** np.arange(observer.estimates + 0.0)
+        n = observer.order
+        f = max(float(rates[n]), action.reach)
         found |= dict.fromkeys(("f_residual", "f_learned", "error_plain", "error_learned"), f)
-        found |= {"x_hat": rates[:-1], "authority": 1.0, "status": _FLAGS, "reason": _FLAGS}
+        found |= {"x_hat": rates[:n], "f_derivatives": rates[n + 1 :]}
+        found |= {"authority": 1.0, "status": _FLAGS, "reason": _FLAGS}
     return found

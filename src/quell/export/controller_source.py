@@ -37,6 +37,7 @@ _CHANNELS = {
     "x_hat": "y and its derivatives",
     "f_residual": "the observer's share of f",
     "f_learned": "the learner's share of f",
+    "f_derivatives": "derivatives of the observer's share of f",
     "u_feedforward": "feedforward of the model, a part of u",
     "status": "flags of the last sample",
     "authority": "share of its output that the guard allows the learner",

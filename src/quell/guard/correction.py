@@ -49,7 +49,8 @@ class CorrectionGains(NamedTuple):
 def correction_gains(plant: SampledPlant, observer: ESO, law: Vector) -> CorrectionGains:
     """Return Γ and Γ_y of the loop of a sampled plant.
 
-    Raises ``ValueError`` for an unstable loop, or a nonlinear observer.
+    Raises ``ValueError`` for an unstable loop, a nonlinear observer, or one that models more of f
+    than a constant.
 
     Parameters
     ----------
@@ -60,11 +61,26 @@ def correction_gains(plant: SampledPlant, observer: ESO, law: Vector) -> Correct
     law
         gains k of the law (n,).
     """
+    check_one_state_of_f(observer)
     path = state_path(observer, law)
     to_error, to_output = plain_loop(plant, observer, law)
     _check_stable(to_error, "the loop without learner")
     _check_stable(path, "the observer's answer to a correction")
     return CorrectionGains(peak_gain(path.then(to_error)), peak_gain(path.then(to_output)))
+
+
+def check_one_state_of_f(observer: ESO) -> None:
+    """Raise a ``ValueError`` for an observer whose model of f is more than a constant."""
+    m = observer.disturbance_order
+    if m > 1:
+        free = "a ramp" if m == 2 else "a parabola"
+        raise ValueError(
+            f"guard with disturbance_order = {m}: a guard bounds the correction e_L = f_L − f_L^F, "
+            "what the observer does not take back through f, and lets the part of f_L that moves "
+            f"nothing leak away; with this observer {free} of f_L moves nothing, grows without "
+            "bound, and would have to leak away, too, which no guard does; use an observer with "
+            "disturbance_order=1, or no guard"
+        )
 
 
 def _check_stable(system: System, what: str) -> None:
@@ -91,9 +107,9 @@ def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System,
             f"observer has {observer.states} states with its delay: must have at most "
             f"{_MOST_STATES}; take a longer dt"
         )
-    estimates = observer.order + 1
-    whole = response(observer.model, estimates)
-    M, g, c, d = f_learned_response(response(without_delay(observer.model), estimates))
+    n, estimates = observer.order, observer.estimates
+    whole = response(observer.model, estimates, n)
+    M, g, c, d = f_learned_response(response(without_delay(observer.model), estimates, n))
     # The state: plant, observer, u before, lag filter of f_plain, and its output f_plain^F.
     sizes = (plant.B.size, whole.transition.shape[0], 1, M.shape[0], 1)
     edges = [0, *np.cumsum(sizes).tolist()]
@@ -103,8 +119,8 @@ def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System,
     seen = np.outer(whole.feedthrough[:, 0], y)
     seen[:, z] += whole.output
     seen[:, before] += whole.feedthrough[:, 1:2]
-    f_plain = seen[-1]
-    u = np.append(observer.cancel - law, -observer.cancel_f) @ seen / observer.b0
+    f_plain = seen[n]
+    u = np.append(observer.cancel - law, -observer.cancel_f) @ seen[: n + 1] / observer.b0
     N, B = -np.eye(edges[-1]), np.zeros(edges[-1])
     N[x, x] = plant.N
     N[x] += np.outer(plant.B, u)
@@ -127,7 +143,7 @@ def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System,
 def state_path(observer: ESO, law: Vector) -> System:
     """Return the path from e_L to w."""
     size = observer.order + 1
-    found = scaled_response(observer.model, observer.units)
+    found = scaled_response(observer.model, observer.units, observer.order)
     m = found.transition.shape[0]
     # The state: the shadow, and the estimates that it causes, of which the last is −f_L^F.
     A, B = np.zeros((m + size, m + size)), np.zeros(m + size)

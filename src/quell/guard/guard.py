@@ -11,7 +11,7 @@ import numpy as np
 import quell.guard.kernels  # noqa: F401  (registers the functions for ``GuardDesign``)
 from quell import checks
 from quell.guard.certified import certified_bound
-from quell.guard.correction import is_invertible
+from quell.guard.correction import check_one_state_of_f, is_invertible
 from quell.guard.credit import withdraw_authority
 from quell.guard.state import GuardAverages, GuardDesign, GuardMemory, GuardSample
 from quell.learners.lag import lag_memory, lag_of
@@ -55,7 +55,9 @@ _SETTLING_LAGS = 3.0
 class Guard:
     """Limits a learner to the authority that it has earned: ``ADRC(…, learner=…, guard=Guard())``.
 
-    ``kernels.py`` has the equations. They do not depend on the units of y and u.
+    ``kernels.py`` has the equations. They do not depend on the units of y and u. The observer must
+    have one extended state, ``disturbance_order=1``: of a learner's output that moves nothing the
+    guard lets a constant leak away, and an observer with f' lets it be a ramp.
 
     Parameters
     ----------
@@ -95,8 +97,10 @@ class Guard:
         Raises
         ------
         ValueError
-            for a loop of ``certified_for`` that is unstable without learner, or without gains.
+            for a loop of ``certified_for`` that is unstable without learner, or without gains;
+            for an observer with ``disturbance_order`` above 1.
         """
+        check_one_state_of_f(observer)
         bound = float(self.bound)
         if self.certified_for is not None:
             if law is None:

@@ -49,7 +49,7 @@ class Learner(Protocol):
 def adapt(
     learner: Any, memory: Any, seen: Vector, y: float, u_before: float, f_plain: float
 ) -> None:
-    """Learn from the observer's estimates ``seen = (x̂_1 … x̂_n, Δf̂)``.
+    """Learn from the observer's estimates ``seen = (x̂_1 … x̂_n, Δf̂, Δf̂', …)``.
 
     They follow from the measurement ``y`` and from the u applied before it. An ESO without a
     learner would have estimated ``f_plain = Δf̂ + f_L^F`` (``lag.py``).

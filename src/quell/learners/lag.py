@@ -3,7 +3,7 @@
 The ESO is linear. An input φ that enters where f does and that its measurement does not show causes
 the error
 
-    s⁺ = (I − L C)(Φ s + Γ_f φ),        φ^F = −s_N
+    s⁺ = (I − L C)(Φ s + Γ_f φ),        φ^F = −s_{n+1}
 
 so ``Δf̂ = (f − f_L)^F`` exactly, except for noise and for changes of f between samples, and
 ``Δf̂ + f_L^F ≈ θ·φ^F`` is a regression without lag bias. All poles of this filter are at
@@ -25,7 +25,13 @@ from quell.kernels.dispatch import generic, kernel
 from quell.kernels.sized import Flag
 from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
-from quell.observers.response import f_lag, f_learned_response, response, scaled_response
+from quell.observers.response import (
+    Response,
+    f_lag,
+    f_learned_response,
+    response,
+    scaled_response,
+)
 from quell.types import Matrix, Vector
 
 # Duration of the start in units of the observer's lag: its initial error decays to 0.1 % in it.
@@ -33,7 +39,7 @@ STARTUP_LAGS = 2.0
 
 
 class Lag(NamedTuple):
-    """The lag filter of an observer with all poles in one place, N = n + 1 states per input."""
+    """The lag filter of an observer with all poles in one place, N = n + m states per input."""
 
     pole: float  # β
     rise: float  # 1 − β, without cancellation
@@ -91,8 +97,12 @@ def lag_of(observer: ESO) -> Lag | DenseLag:
     """
     if observer.has_one_pole:
         return _chain(observer)
-    M, g, c, d = f_learned_response(response(without_delay(observer.model), observer.order + 1))
+    M, g, c, d = f_learned_response(_response(observer))
     return DenseLag(M, g.copy(), c, d)
+
+
+def _response(observer: ESO) -> Response:
+    return response(without_delay(observer.model), observer.estimates, observer.order)
 
 
 def group_delay(observer: ESO) -> float:
@@ -101,7 +111,7 @@ def group_delay(observer: ESO) -> float:
     The j-th lag of the chain delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
     """
     if not observer.has_one_pole:
-        return f_lag(scaled_response(observer.model, observer.units))
+        return f_lag(scaled_response(observer.model, observer.units, observer.order))
     lag = _chain(observer)
     stage = np.arange(lag.taps.size)
     return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + float(lag.predictor)
@@ -112,10 +122,10 @@ def _chain(observer: ESO) -> Lag:
 
     With ``M = (I − L C) Φ`` and ``g = (I − L C) Γ_f``, the chain is ``s = V v`` with ``V_1 =
     g/(1−β)`` and ``V_{j+1} = (M − βI) V_j/(1−β)``, which ends after N by Cayley-Hamilton; ``c_j =
-    −(V_j)_N``.
+    −(V_j)_{n+1}``, in predictor form ``−(Φ V_j)_{n+1}`` for the next sample.
     """
-    model = without_delay(observer.model)
-    size = observer.order + 1
+    model, at_f = without_delay(observer.model), observer.order
+    size = observer.estimates
     # In the coordinates x_i dt^(i−1) all entries are O(1).
     scale = observer.dt ** np.arange(size)
     correct = np.eye(size)
@@ -124,9 +134,13 @@ def _chain(observer: ESO) -> Lag:
     rise = -np.expm1(-observer.omega_o * observer.dt)
     shifted = transition - np.eye(size) + rise * np.eye(size)
     column = correct @ (model.feed * scale) / rise
+    # In predictor form f̂ is the f that is predicted from these states: f itself, or f + dt f' + ….
+    row = np.eye(size)[at_f]
+    if model.predictor and observer.disturbance_order > 1:
+        row = model.transition[at_f] * scale[at_f] / scale
     taps = np.empty(size)
     for j in range(size):
-        taps[j] = -column[-1] / scale[-1]
+        taps[j] = -(row @ column) / scale[at_f]
         column = shifted @ column / rise
     return Lag(observer.pole, rise, taps, model.predictor)
 

@@ -56,7 +56,7 @@ class NoiseGateMemory(NamedTuple):
 
 
 def relative_noise(observer: ESO) -> Vector:
-    """Return the variances of noise in the estimates (N,), in units of that of ``y − x̂_1``.
+    """Return the variances of noise in x̂ and f̂ (n + 1,), in units of that of ``y − x̂_1``.
 
     Raises ``ValueError`` for an observer of reduced form: its x̂_1 is y, so y − x̂_1 does not show
     the noise.

@@ -2,9 +2,10 @@
 
 An observer is an ``ESO``. Its ``model`` is a NamedTuple of parameters with ``states``, the length
 of the running state ``z``. Entry n of ``z`` is a summand of the estimated f, so a controller may
-shift the estimate there. A new kind of model registers ``observe``. It registers ``begin`` if its
-``z`` does not start with the estimates, ``expected_measurement`` if it lacks ``transition``,
-``input`` and ``feed`` for the first entries of ``z``, and ``acting_control`` if u is delayed.
+shift the estimate there; with m extended states f', … follow. A new kind of model registers
+``observe``. It registers ``begin`` if its ``z`` does not start with the estimates,
+``expected_measurement`` if it lacks ``transition``, ``input`` and ``feed`` for the first entries of
+``z``, and ``acting_control`` if u is delayed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from quell.types import Vector
 
 @generic
 def observe(model: Any, z: Vector, estimate: Vector, y: float, u: float, f_learned: float) -> None:
-    """Advance the state ``z`` by a sample and write ``x̂_1 … x̂_n, Δf̂`` into ``estimate`` (n + 1,).
+    """Advance the state ``z`` by a sample; write ``x̂_1 … x̂_n, Δf̂, Δf̂', …`` into ``estimate`` (N,).
 
     ``u`` is the control signal that was applied, ``f_learned`` the share of f that was fed
     forward, over the sample that ends with the measurement ``y``.

@@ -29,10 +29,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.kernels.dispatch import kernel
-from quell.kernels.sized import Flag
+from quell.kernels.sized import Flag, Size
 from quell.kernels.sums import add_with_carry
 from quell.observers.base import begin, expected_measurement, observe
-from quell.observers.cascade import CascadeModel
+from quell.observers.cascade import CascadeModel, add_levels
 from quell.observers.delay import DelayedModel
 from quell.observers.linear import EsoModel
 from quell.observers.nonlinear import NonlinearModel, is_lost, nonlinear_correction
@@ -40,7 +40,7 @@ from quell.types import Matrix, Vector
 
 
 class DeltaModel(NamedTuple):
-    """Parameters of the linear observer for order n, with N = n + 1 states and N carries."""
+    """Parameters of the linear observer for order n, with N = n + m states and N carries."""
 
     difference: Matrix  # Φ − I (N, N)
     input: Vector  # Γ_u (N,)
@@ -56,7 +56,7 @@ class DeltaModel(NamedTuple):
 
 
 class DeltaNonlinearModel(NamedTuple):
-    """Parameters of the nonlinear observer, with N = n + 1 states and N carries."""
+    """Parameters of the nonlinear observer, with N = n + m states and N carries."""
 
     difference: Matrix  # Φ − I (N, N)
     input: Vector  # Γ_u (N,)
@@ -74,12 +74,13 @@ class DeltaNonlinearModel(NamedTuple):
 
 
 class DeltaCascadeModel(NamedTuple):
-    """Parameters of p levels, each with N = n + 1 states and N carries."""
+    """Parameters of p levels, each with N = n + m states and N carries."""
 
     difference: Matrix  # Φ − I (N, N)
     input: Vector  # Γ_u (N,)
     feed: Vector  # Γ_f (N,)
     gains: Matrix  # L_i (p, N)
+    at_f: Size  # n, the place of f in a level's state
     chain: Flag  # whether Φ − I is zero up to its diagonal
 
     @property
@@ -132,21 +133,19 @@ def _observe_by_levels(
     model: DeltaCascadeModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
 ) -> None:
     levels, size = model.gains.shape
-    target, f_known, f_estimate = y, f_learned, 0.0
+    target, f_known = y, f_learned
     for level in range(levels):
         state = z[2 * level * size : 2 * (level + 1) * size]
-        f_before = state[size - 1]
+        f_before = state[model.at_f]
         predict_increments(model, state, estimate, u, f_known)
         error = (target - state[0]) - estimate[0]
         for i in range(size):
             add_with_carry(state, size, i, estimate[i] + model.gains[level, i] * error)
         target = state[0]
         f_known += f_before
-        f_estimate += state[size - 1]
-        if level == levels - 1:
-            for i in range(size):
-                estimate[i] = state[i]
-    estimate[size - 1] = f_estimate
+    for i in range(model.at_f):
+        estimate[i] = z[2 * (levels - 1) * size + i]
+    add_levels(z, estimate, model.at_f, levels, 2 * size)
 
 
 @expected_measurement.register(DeltaModel)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from quell.lti.canonical import Canonical, canonical, format_roots
 from quell.lti.reduction import without_far_zeros
 from quell.observers.cascade import cascade_model, level_bandwidths
 from quell.observers.delay import delayed_model, without_delay
-from quell.observers.design import design_model
+from quell.observers.design import checked_disturbance_order, design_model
 from quell.observers.kalman_gains import kalman_gain
 from quell.observers.nonlinear import NonlinearModel, nonlinear_model
 from quell.observers.response import scaled_response, total_time_constant
@@ -49,6 +50,8 @@ class ESO:
         full order and gain. Poles kept at zeros do not count, because f does not excite them.
     poles
         the pattern of poles in units of omega_o, or None for one pole.
+    disturbance_order : int
+        number m of extended states: f̂ follows a polynomial of degree m − 1 without error.
 
     Examples
     --------
@@ -65,6 +68,7 @@ class ESO:
     model: Any
     has_one_pole: bool = True
     poles: Any = None
+    disturbance_order: int = 1
 
     @classmethod
     def model_free(
@@ -78,6 +82,7 @@ class ESO:
         half_gain: bool = False,
         delay: float = 0.0,
         poles: Sequence[float | tuple[float, float]] | None = None,
+        disturbance_order: int = 1,
     ) -> ESO:
         """Design an ESO from the order and nominal gain of the plant only (paper eq. (mfplant)).
 
@@ -103,7 +108,13 @@ class ESO:
             one of a delay with a part of a sample, whose effect is then in f̂.
         poles
             poles in units of omega_o, instead of all at −1: negative numbers, and pairs (real,
-            imaginary) for two conjugate ones; order + 1 in all, or order for the reduced form.
+            imaginary) for two conjugate ones; order + disturbance_order in all, or one less for
+            the reduced form.
+        disturbance_order
+            number m of extended states f, f', …, 1 to 3: the observer's model of f is a polynomial
+            of degree m − 1 in time. With 2 a ramp of f is rejected without error, with 3 a
+            parabola, and slow loads better; the loop comes closer to −1 at the same omega_o
+            (docs/forms). A ``Guard`` needs 1.
 
         Raises
         ------
@@ -111,7 +122,8 @@ class ESO:
             naming the argument, its value and the rule.
         """
         chain = canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0))
-        return cls._design(chain, b0, omega_o, dt, form, half_gain, False, delay, poles)
+        m = disturbance_order
+        return cls._design(chain, b0, omega_o, dt, form, half_gain, False, delay, poles, m)
 
     @classmethod
     def model_based(
@@ -128,6 +140,7 @@ class ESO:
         delay: float = 0.0,
         poles: Sequence[float | tuple[float, float]] | None = None,
         far: float = 10.0,
+        disturbance_order: int = 1,
     ) -> ESO:
         """Design an ESO from a model of the plant (paper eq. (mbplant)), which may have zeros.
 
@@ -139,7 +152,7 @@ class ESO:
         plant, E
             a linear plant, ``control.StateSpace``, ``control.TransferFunction``, matrices,
             coefficients; see ``canonical``.
-        omega_o, dt, form, half_gain, delay, poles
+        omega_o, dt, form, half_gain, delay, poles, disturbance_order
             as for ``model_free``.
         b0
             nominal control gain, from u to y^(relative degree); the model's own by default.
@@ -184,7 +197,8 @@ class ESO:
                 "constant f does not show in y and can not be estimated; measure another output"
             )
         b0 = found.b if b0 is None else b0
-        return cls._design(found, b0, omega_o, dt, form, half_gain, keep_zeros, delay, poles)
+        options = form, half_gain, keep_zeros, delay, poles, disturbance_order
+        return cls._design(found, b0, omega_o, dt, *options)
 
     @classmethod
     def cascade(
@@ -197,12 +211,13 @@ class ESO:
         levels: int = 2,
         ratio: float = 2.0,
         delay: float = 0.0,
+        disturbance_order: int = 1,
     ) -> ESO:
         """Design a cascade of model-free observers (``cascade.py``): less noise in u.
 
         Parameters
         ----------
-        order, b0, dt, delay
+        order, b0, dt, delay, disturbance_order
             as for ``model_free``.
         omega_o
             bandwidth of the last level, the fastest [rad/s].
@@ -212,10 +227,12 @@ class ESO:
             ratio α > 1 of the bandwidths of successive levels; the first level has
             ``omega_o / α^(p−1)``.
         """
-        last = cls.model_free(order, b0, omega_o, dt)
+        m = disturbance_order
+        last = cls.model_free(order, b0, omega_o, dt, disturbance_order=m)
+        levels_of = partial(cls.model_free, order, b0, dt=dt, disturbance_order=m)
         bandwidths = level_bandwidths(last.omega_o, levels, ratio)
-        models = [cls.model_free(order, b0, omega, dt).model for omega in bandwidths]
-        return last._with_model(cascade_model(models), delay)
+        models = [levels_of(omega_o=omega).model for omega in bandwidths]
+        return last._with_model(cascade_model(models, last.order), delay)
 
     @classmethod
     def nonlinear(
@@ -228,6 +245,7 @@ class ESO:
         delta: float,
         alpha: Any = None,
         delay: float = 0.0,
+        disturbance_order: int = 1,
     ) -> ESO:
         """Design Han's nonlinear observer (``nonlinear.py``).
 
@@ -236,14 +254,14 @@ class ESO:
 
         Parameters
         ----------
-        order, b0, omega_o, dt, delay
+        order, b0, omega_o, dt, delay, disturbance_order
             as for ``model_free``.
         delta
             largest error for which it is linear, δ [y-unit].
         alpha
-            the powers α (n + 1,) beyond δ, above 0 and at most 1; by default Han's 1, 1/2, 1/4, …
+            the powers α (n + m,) beyond δ, above 0 and at most 1; by default Han's 1, 1/2, 1/4, …
         """
-        linear = cls.model_free(order, b0, omega_o, dt)
+        linear = cls.model_free(order, b0, omega_o, dt, disturbance_order=disturbance_order)
         return linear._with_model(nonlinear_model(linear.model, delta, alpha), delay)
 
     @classmethod
@@ -258,6 +276,7 @@ class ESO:
         jitter: float = 0.0,
         form: str = "current",
         delay: float = 0.0,
+        disturbance_order: int = 1,
     ) -> ESO:
         """Design a model-free ESO with the steady-state Kalman gain (``kalman_gains.py``).
 
@@ -266,13 +285,14 @@ class ESO:
 
         Parameters
         ----------
-        order, b0, dt, delay
+        order, b0, dt, delay, disturbance_order
             as for ``model_free``.
         noise_variance
             variance of the measurement's noise in each sample [y-unit²].
         drift
             density of the white noise whose integral f is [(y-unit/s^n)²/s]: in the time T, f
-            drifts by ``√(drift T)``.
+            drifts by ``√(drift T)``. With m extended states it drives the m-th derivative of f
+            [(y-unit/s^(n+m−1))²/s].
         jitter
             density of white noise in f itself [(y-unit/s^n)² s].
         form
@@ -283,8 +303,10 @@ class ESO:
         drift, jitter = checks.positive("drift", drift), checks.non_negative("jitter", jitter)
         dt = checks.positive("dt", dt, "s")
         checks.one_of("form", form, ("current", "predictor"))
-        gain, omega_o = kalman_gain(np.diag(np.ones(n), 1), dt, noise, drift, jitter)
-        observer = cls.model_free(n, b0, omega_o, dt, form=form)
+        m = checked_disturbance_order(disturbance_order)
+        chain = np.diag(np.ones(n + m - 1), 1)
+        gain, omega_o = kalman_gain(chain, n, dt, noise, drift, jitter)
+        observer = cls.model_free(n, b0, omega_o, dt, form=form, disturbance_order=m)
         return observer._with_model(observer.model._replace(gain=gain), delay)
 
     @classmethod
@@ -299,15 +321,17 @@ class ESO:
         keep_zeros: bool,
         delay: float,
         poles: Any,
+        disturbance_order: int,
     ) -> ESO:
         reason = "it is the gain from u to the first derivative of y that u moves"
         b0 = checks.nonzero("b0", b0, reason)
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         options: dict[str, Any] = {"half_gain": half_gain, "keep_zeros": keep_zeros}
+        m = options["disturbance_order"] = checked_disturbance_order(disturbance_order)
         model = design_model(plant, b0, omega_o, dt, form=form, poles=poles, **options)
         has_one_pole = form != "reduced" and not half_gain and poles is None
         model = delayed_model(model, delay, dt)
-        return cls(plant, b0, omega_o, dt, form, model, has_one_pole, poles)
+        return cls(plant, b0, omega_o, dt, form, model, has_one_pole, poles, m)
 
     def _with_model(self, model: Any, delay: float) -> ESO:
         model = delayed_model(model, delay, self.dt)
@@ -317,6 +341,8 @@ class ESO:
         inner = without_delay(self.model)
         kind = type(inner).__name__.removesuffix("Model")
         more = "" if self.poles is None else f", poles={text(self.poles)}"
+        if self.disturbance_order > 1:
+            more += f", disturbance_order={self.disturbance_order}"
         if inner is not self.model:
             more += f", delay={self.model.samples * self.dt:g}"
         return (
@@ -334,8 +360,13 @@ class ESO:
 
     @property
     def order(self) -> int:
-        """Order n of the plant; the observer has n + 1 states."""
+        """Order n of the plant; the observer has n + ``disturbance_order`` states."""
         return int(self.plant.a.size)
+
+    @property
+    def estimates(self) -> int:
+        """Number N of estimates: x̂ (n,), f̂ and the ``disturbance_order`` − 1 derivatives of it."""
+        return self.order + self.disturbance_order
 
     @property
     def degree(self) -> int:
@@ -371,11 +402,12 @@ class ESO:
         """``Σ 1/|p_i|`` over the poles [s]: ``N/omega_o`` if they lie in one place.
 
         At high sampling rates it is the lag of the estimate behind a slowly varying f. (The lag of
-        a cascade is shorter.)
+        a cascade is shorter; with further extended states there is none, and it is the observer's
+        memory.)
         """
         if self.has_one_pole or isinstance(without_delay(self.model), NonlinearModel):
-            return (self.order + 1) / self.omega_o
-        return self.dt * total_time_constant(scaled_response(self.model, self.units))
+            return self.estimates / self.omega_o
+        return self.dt * total_time_constant(scaled_response(self.model, self.units, self.order))
 
     @property
     def pole(self) -> float:
@@ -384,8 +416,9 @@ class ESO:
 
     @property
     def units(self) -> Vector:
-        """Units (N,) of the states and f in the time unit 1/omega_o: ``omega_o^(i−1)``."""
-        return self.omega_o ** np.append(np.arange(float(self.order)), self.f_degree)
+        """Units (N,) of the estimates in the time unit 1/omega_o: ``omega_o^(i−1)``."""
+        of_f = self.f_degree + np.arange(self.disturbance_order)
+        return self.omega_o ** np.append(np.arange(float(self.order)), of_f)
 
     def states_of(self, x_hat: Any) -> Vector:
         """Return estimates in the states of the plant the observer was designed for: ``S⁻¹ x̂``.

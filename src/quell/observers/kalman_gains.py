@@ -1,8 +1,9 @@
 """The steady-state Kalman gain of the extended state observer, from variances.
 
-White noise is assumed to drive the extended model: ``f' = w`` with the density ``drift``,
-``x_n' = … + f + v`` with the density ``jitter``. y is measured with noise of the variance ``noise``
-in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23, 1978)::
+White noise is assumed to drive the extended model: ``f^(m) = w`` with the density ``drift`` and m
+extended states, ``x_n' = … + f + v`` with the density ``jitter``. y is measured with noise of the
+variance ``noise`` in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23,
+1978)::
 
     Q  = ∫_0^dt exp(A s) G exp(Aᵀ s) ds
     P⁻ = Φ (P⁻ − P⁻ Cᵀ (C P⁻ Cᵀ + R)⁻¹ C P⁻) Φᵀ + Q,      L = P⁻ Cᵀ / (C P⁻ Cᵀ + R)
@@ -21,22 +22,23 @@ from quell.types import Matrix, Vector
 
 
 def kalman_gain(
-    A: Matrix, dt: float, noise: float, drift: float, jitter: float
+    A: Matrix, order: int, dt: float, noise: float, drift: float, jitter: float
 ) -> tuple[Vector, float]:
     """Return L (N,) and the geometric mean of ``|ln z_i|/dt`` over the poles [rad/s].
 
-    L is in the coordinates of ``A`` (N, N), whose last state is f. The equation is solved in the
-    time unit of the Butterworth pattern, where the entries of Φ, Q and P have similar sizes.
+    L is in the coordinates of ``A`` (N, N), whose states from n + 1 on, with n the ``order``, are f
+    and its derivatives. The equation is solved in the time unit of the Butterworth pattern, where
+    the entries of Φ, Q and P have similar sizes.
     """
     from scipy.linalg import solve_discrete_are
 
     size = A.shape[0]
     # With drift alone q/(r dt) is the bandwidth to the power 2N, with jitter alone to the power
-    # 2n. Take the faster one.
+    # 2n, n being the order. Take the faster one.
     density = noise * dt
     with np.errstate(all="ignore"):
         by_drift, by_jitter = np.float64(drift) / density, np.float64(jitter) / density
-        omega = float(max(by_drift ** (0.5 / size), by_jitter ** (0.5 / (size - 1))))
+        omega = float(max(by_drift ** (0.5 / size), by_jitter ** (0.5 / order)))
     refusal = ValueError(
         f"noise_variance = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with "
         f"dt = {dt!r} s: no steady-state gain is found; they ask for about {omega:.3g} rad/s, "
@@ -48,9 +50,10 @@ def kalman_gain(
     scaled = A * scale[:, None] / scale[None, :] / omega
     drive = np.zeros((size, size))
     drive[-1, -1] = drift / density * (scale[-1] / omega) ** 2
-    drive[-2, -2] = jitter / density * (scale[-2] / omega) ** 2
+    drive[order - 1, order - 1] = jitter / density * (scale[order - 1] / omega) ** 2
     step = omega * dt
     phi, _ = zero_order_hold(scaled, [], step)
+    phi[:order, order + 1 :] = 0.0  # f is held within a sample, as in ``design.py``
     C, R = np.eye(1, size), np.array([[1.0 / step]])
     try:
         with np.errstate(invalid="ignore"):  # what overflows is found below

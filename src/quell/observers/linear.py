@@ -19,7 +19,7 @@ from quell.types import Matrix, Vector
 
 
 class EsoModel(NamedTuple):
-    """Parameters of the update for order n, with N = n + 1 states."""
+    """Parameters of the update for order n, with N = n + m states."""
 
     transition: Matrix  # Φ (N, N)
     input: Vector  # Γ_u (N,)

@@ -13,7 +13,7 @@ from quell.types import Vector
 
 
 def noise_gains(observer: ESO) -> Vector:
-    """Return the variance (N,) of each estimate that white noise of unit variance in y causes.
+    """Return the variance (n + 1,) that white noise of unit variance in y causes in x̂ and f̂.
 
     If all poles lie in one place, the formula of a model-free observer is used. In continuous time
     ``x̂_i = Σ_{k=i}^{N} C(N, k) ω_o^k s^(N−k+i−1) / (s + ω_o)^N · y``, and sampled white noise has
@@ -21,10 +21,11 @@ def noise_gains(observer: ESO) -> Vector:
     ω_o = 1. This is accurate for small ``omega_o dt``. With other poles, or if f enters before the
     last integrator, the variance is summed sample by sample instead.
     """
-    size = observer.order + 1
+    kept = observer.order + 1
     if observer.f_degree < observer.order or not observer.has_one_pole:
         return _summed_noise_gains(observer)
-    return observer.dt * observer.omega_o ** (2.0 * np.arange(size) + 1.0) * _unit_noise_gains(size)
+    unit = _unit_noise_gains(observer.estimates)[:kept]
+    return observer.dt * observer.omega_o ** (2.0 * np.arange(kept) + 1.0) * unit
 
 
 @cache
@@ -43,7 +44,7 @@ def _unit_noise_gains(size: int) -> Vector:
 
 def _summed_noise_gains(observer: ESO) -> Vector:
     """Return the diagonal of ``C P Cᵀ + d dᵀ``, ``P = Σ M^k g gᵀ M^kᵀ``, by doubling."""
-    found = scaled_response(observer.model, observer.units)
+    found = scaled_response(observer.model, observer.units, observer.order)
     gain, feedthrough, transition = found.input[:, 0], found.feedthrough[:, 0], found.transition
     total = np.outer(gain, gain)
     for _ in range(64):
@@ -52,4 +53,4 @@ def _summed_noise_gains(observer: ESO) -> Vector:
         if np.max(np.abs(transition)) < 1e-12:
             break
     variances: Vector = np.einsum("ij,jk,ik->i", found.output, total, found.output)
-    return variances + feedthrough**2
+    return (variances + feedthrough**2)[: observer.order + 1]

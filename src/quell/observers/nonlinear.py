@@ -39,7 +39,7 @@ _INVERSE_SLOPE, _LARGEST = 12.0, 40.0  # powers of two
 
 
 class NonlinearModel(NamedTuple):
-    """Parameters of the nonlinear observer, with N = n + 1 states."""
+    """Parameters of the nonlinear observer, with N = n + m states."""
 
     transition: Matrix  # Φ (N, N)
     input: Vector  # Γ_u (N,)

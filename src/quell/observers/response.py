@@ -15,16 +15,17 @@ from quell.types import Matrix, Vector
 class Response(NamedTuple):
     """The update ``z⁺ = M z + G (y, u, f_L)`` and the estimates ``C z + D (y, u, f_L)``.
 
-    There are m states and N = n + 1 estimates, ``x̂_1 … x̂_n, Δf̂``.
+    There are m states and N estimates, ``x̂_1 … x̂_n, Δf̂`` and its derivatives, if there are any.
     """
 
     transition: Matrix  #: M (m, m)
     input: Matrix  #: G (m, 3)
     output: Matrix  #: C (N, m)
     feedthrough: Matrix  #: D (N, 3)
+    at_f: int  #: n, the place of Δf̂ among the estimates
 
 
-def response(model: Any, estimates: int) -> Response:
+def response(model: Any, estimates: int, at_f: int) -> Response:
     """Return the matrices of the update of a linear observer's ``model``, for N ``estimates``."""
     if isinstance(without_delay(model), NonlinearModel):
         raise ValueError(
@@ -37,21 +38,22 @@ def response(model: Any, estimates: int) -> Response:
         observe(model, z, estimate, *one[m:].tolist())
         state[:, i], estimated[:, i] = z, estimate
     parts = state[:, :m], state[:, m:], estimated[:, :m], estimated[:, m:]
-    return Response(*(part.copy() for part in parts))
+    transition, given, output, feedthrough = (part.copy() for part in parts)
+    return Response(transition, given, output, feedthrough, at_f)
 
 
 def f_learned_response(found: Response) -> tuple[Matrix, Vector, Vector, float]:
     """Return ``(M, g, c, d)`` of ``s⁺ = M s + g f_L``, ``−Δf̂ = c·s + d f_L``, for y = u = 0."""
-    feedthrough = float(found.feedthrough[-1, 2])
-    return found.transition, found.input[:, 2], -found.output[-1], -feedthrough
+    feedthrough = float(found.feedthrough[found.at_f, 2])
+    return found.transition, found.input[:, 2], -found.output[found.at_f], -feedthrough
 
 
-def scaled_response(model: Any, units: Vector) -> Response:
+def scaled_response(model: Any, units: Vector, at_f: int) -> Response:
     """Return the response without the delay of u, with the states divided by ``units`` (N,).
 
     ``ESO.units`` makes the poles O(1) in the time unit ``1/omega_o``. The estimates keep theirs.
     """
-    found = response(without_delay(model), units.size)
+    found = response(without_delay(model), units.size, at_f)
     units = np.resize(units, found.transition.shape[0])
     return found._replace(
         transition=found.transition * units[None, :] / units[:, None],

@@ -8,7 +8,7 @@ from quell.quantities import UNKNOWN, Signals
 from quell.types import Channels
 
 # Channels that are vectors even if their width is one.
-_VECTORS = ("w", "x", "x_hat", "theta")
+_VECTORS = ("w", "x", "x_hat", "f_derivatives", "theta")
 # Description and unit.
 _DESCRIPTIONS = {
     "r": ("reference", "y-unit"),
@@ -21,6 +21,7 @@ _DESCRIPTIONS = {
     "x": ("state of the plant", "state-unit"),
     "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),
     "f_residual": ("residual total disturbance estimated by the observer", "y-unit/s^n"),
+    "f_derivatives": ("estimated derivatives of f, from the first on", "y-unit/s^(n+i)"),
     "u_feedforward": ("feedforward of the model", "u-unit"),
     "f_learned": ("total disturbance fed forward by the learner", "y-unit/s^n"),
     "f_hat": ("estimated total disturbance", "y-unit/s^n"),

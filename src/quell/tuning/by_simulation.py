@@ -32,6 +32,7 @@ from quell.tuning.plants import as_list
 from quell.tuning.result.design import Design, design_of
 from quell.tuning.simulated import Problem, Search, SearchRange, search
 from quell.tuning.structures.base import Structure, named, vector
+from quell.tuning.structures.registry import SEVERAL_INTEGRATORS
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Uncertain
 
@@ -169,7 +170,8 @@ def tune_by_simulation(
     plants = as_list(plant) if box is None else box.plants(box.design_set(count, seed))
     plants = [LinearPlant.of(p) if is_linear_model(p) else p for p in plants]
     problem = Problem.of_runs(plants, scenario, objective)
-    found = linear(parts, **how, objective="load")
+    linear_objective = "load-iae" if how["structure"] in SEVERAL_INTEGRATORS else "load"
+    found = linear(parts, **how, objective=linear_objective)
     assert found.design.solution is not None  # ``tune`` returns no other design
     structure = found.design.solution.structure
     build = Build(structure, found.task.options(structure))

@@ -20,6 +20,7 @@ from quell.tuning.optimiser.objectives import cost_of, scores
 from quell.tuning.optimiser.problem import Extra, Problem, Solution
 from quell.tuning.optimiser.requirements import KINDS, Bound, bounds_of, worst_ratio
 from quell.tuning.optimiser.search import FEW, best_solution, merit, search, solution_at
+from quell.tuning.optimiser.starts import starts
 from quell.tuning.optimiser.time_responses import Inputs, SetResponses, law_of
 from quell.tuning.result.design import Design, design_of, impossible, measured
 from quell.tuning.result.report import relative
@@ -45,6 +46,9 @@ _TIGHTER, _LEAST_PEAK, _REACHED = (0.4, 0.15), 0.1, 0.995
 _MEMBERS, _WORSE, _EXCHANGES = 2, 1.005, 4
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
 _RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0, 100.0, 1e3, 1e4, 1e5), 6
+# Starts of a search over time with several integrators: the ISE, which leads to them, has other
+# valleys than the IAE. Chosen by hand.
+_VALLEYS = 4
 # Structures whose optima stand for starts of another one. They are always tuned before it, so that
 # a result does not depend on what it is compared with.
 _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
@@ -52,6 +56,7 @@ _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
     "freed": ("pi", "pid", "bandwidths"),
     "delay-freed": ("pi", "pid", "bandwidths", "delay"),
     "model-based-freed": ("model-based",),
+    "freed-2": ("bandwidths-2",),
 }
 # A PI controller is of use as a reference for noise unless a PID controller with filter has so many
 # times its integral gain; chosen by hand. Plants below this relative degree are not in doubt.
@@ -63,7 +68,8 @@ _NEAR_BEST = 1.05
 # The structures, simple ones first: by what a user has to know, and by the number of parameters.
 _FROM_SIMPLE = (
     *("pi-unfiltered", "pi", "pid", "bandwidths", "reduced", "half-gain", "half-gain-law"),
-    *("p-pi-notch", "freed", "delay", "delay-freed", "model-based", "model-based-freed", "lqg"),
+    *("p-pi-notch", "bandwidths-2", "bandwidths-3", "freed", "freed-2", "delay", "delay-freed"),
+    *("model-based", "model-based-2", "model-based-freed", "lqg"),
 )
 # Largest order of an ADRC that has an equivalent PI or PID controller.
 _LIKE_PID = 2
@@ -261,6 +267,11 @@ def _solutions(name: str, task: Task, solved: Mapping[str, Sequence[Solution]]) 
     found = []
     for order in orders_of(name, task.model, task.order):
         structure = make_structure(name, task.model, order)
+        if task.objective == "load" and structure.integrators > 1:
+            raise ValueError(
+                f"k_i is infinite with {structure.integrators} integrators: after a step of the "
+                "load the integral of y is zero for any gains; use objective='load-iae'"
+            )
         best = _best(task, structure, _known_starts(structure, solved))
         if best is not None and _is_stable(task.plants, best):
             found.append(best)
@@ -280,12 +291,18 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     is_slow = any(extra.over_time for extra in problem.extras)
     if not ends or (problem.objective == "load" and not is_slow):
         return min(ends, key=_rank, default=None)
-    tried = [solution_at(problem, structure, row) for row in (*(e.values for e in ends), *known)]
-    best = min((each for each in tried if each is not None), key=merit, default=None)
-    if best is None:
+    rows, count = [*(end.values for end in ends), *known], 1
+    if structure.integrators > 1:
+        rows += [*starts(quick.problem(), structure, structure.shapes(), _VALLEYS)]
+        count = _VALLEYS
+    tried = [solution_at(problem, structure, row) for row in rows]
+    first = sorted((each for each in tried if each is not None), key=merit)[:count]
+    if not first:
         return None
+    best = first[0]
     if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
-        return search(problem, structure, best.values, _ROUNDS)
+        ends = [end for e in first if (end := search(problem, structure, e.values, _ROUNDS))]
+        return min(ends, key=_rank, default=None)
     over, members = SetResponses(task.plants, task.inputs), list[int]()
     for _ in range(_EXCHANGES):
         each = scores(task.objective, structure, best.values, over)

@@ -8,6 +8,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from quell.cli.output import Console, table
+from quell.files import nonfinite_to_none
 
 if TYPE_CHECKING:
     from quell.experiments.compare import Benchmark, Comparison, Entry
@@ -38,7 +39,7 @@ def as_json(
     for name, scores in results["controllers"].items():
         scores["stable"] = stable[name]
         if gains[name] is not None:
-            scores |= asdict(gains[name])
+            scores |= nonfinite_to_none(asdict(gains[name]))  # k_i with two integrators
         if name in entries:
             scores |= {"structure": entries[name].structure, "values": dict(entries[name].values)}
     if bounds is not None:

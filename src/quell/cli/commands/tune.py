@@ -96,8 +96,9 @@ def tune(
         Dead time of the plant [s].
     structure
         bandwidths, freed, half-gain, half-gain-law, reduced, model-based, model-based-freed,
-        delay, delay-freed, pi, pi-unfiltered, pid, p-pi-notch or lqg; by default simplest: the
-        simplest whose objective is within 5 % of the best.
+        delay, delay-freed, bandwidths-2, bandwidths-3, freed-2, model-based-2, pi, pi-unfiltered,
+        pid, p-pi-notch or lqg; by default simplest: the simplest whose objective is within 5 % of
+        the best.
     order
         Order of an ADRC without model; 1 and 2 are tried by default.
     objective

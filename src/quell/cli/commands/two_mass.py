@@ -40,6 +40,8 @@ def two_mass(
 ) -> None:
     """Run the two-mass-spring study: MF-ESO, MB-ESO and L-ESO, with every claim judged.
 
+    Two rows are not in the paper: observers that estimate f and f', without a learner.
+
     Parameters
     ----------
     dt
@@ -86,6 +88,8 @@ def _print_claims(console: Console, result: Result) -> None:
 
 
 def _print_scores(console: Console, result: Result) -> None:
+    from quell.experiments.two_mass_spring.setup import TWO_STATES
+
     settings = result.settings
     reset = "with" if settings.reset else "without"
     about = f"dt = {settings.dt:g} s, seed {settings.seed}, omega_o = {settings.omega_o:g} rad/s"
@@ -96,7 +100,8 @@ def _print_scores(console: Console, result: Result) -> None:
     console.print(scores)
     console.print(
         "Overshoot, settling (±0.2 %) and variation: step, 110–150 s. Peak and RMS of y − 1: force "
-        "on m2, 170–250 s. –: not settled, or diverged before.\n"
+        "on m2, 170–250 s. –: not settled, or diverged before. m = 2: observers without learner "
+        f"that estimate f and f', at {TWO_STATES:g} omega_o.\n"
     )
     print_diverged(console, result.runs)
 

@@ -188,14 +188,16 @@ class ADRC(StatefulController):
         by_model = isinstance(self.feedforward, Feedforward)
         forward = (("u_feedforward", 1),) if by_model else ()
         guard = () if self.guard is None else GUARD_CHANNELS
-        return (*estimates, ("status", 1), *forward, *guard, ("theta", len(self.features)))
+        rates = self.observer.disturbance_order - 1
+        of_f = (("f_derivatives", rates),) if rates else ()
+        return (*estimates, ("status", 1), *of_f, *forward, *guard, ("theta", len(self.features)))
 
     def initial_state(self) -> AdrcState:
         """Return a state before the first sample, with nothing learned."""
         design, guard = self.parameters, UnguardedMemory(np.zeros(0))
         return AdrcState(
             z=np.zeros(self.observer.states),
-            seen=np.zeros(self.observer.order + 1),
+            seen=np.zeros(self.observer.estimates),
             reference=np.zeros(self.derivatives),
             loop=AdrcLoop.zeros(),
             learner=self.learner.memory(design.learner),
@@ -258,7 +260,7 @@ class ADRC(StatefulController):
         signals = map(number, (y, u, goal))
         start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), *signals)
 
-    def start_at(self, x: Any, f: float = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
+    def start_at(self, x: Any, f: Any = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
         """Start with given estimates, for a plant in motion; what was learned is kept.
 
         They are those of the sample before the next ``step``, which takes u for the control signal
@@ -270,16 +272,22 @@ class ADRC(StatefulController):
         x
             estimates x̂ (n,), y and its derivatives; see ``observer.states_of`` if there are zeros.
         f
-            total disturbance [y-unit/s^n].
+            total disturbance [y-unit/s^n]; for an observer with more extended states also a list
+            of f, f', … [y-unit/s^(n+j)], the missing ones zero.
         u
             control signal applied until the next step [u-unit]; a delayed one has the same past.
         r
             reference until the next one that is finite [y-unit]; ``x[0]`` by default.
         """
         estimates = checks.vector("x", x, self.observer.order)
-        f, u = checks.finite("f", f), checks.signal("u", u)
+        u = checks.signal("u", u)
+        most = self.observer.disturbance_order
+        given = checks.vector("f", checks.finite("f", f) if np.ndim(f) == 0 else f)
+        if given.size > most:
+            raise ValueError(f"f = {f!r}: the observer estimates {most} of f, f', …: give as many")
+        of_f = np.append(given, np.zeros(most - given.size))
         goal = float(estimates[0]) if r is None else checks.signal("r", r)
-        start_in_motion(self.parameters, self._state, estimates, f, u, goal)
+        start_in_motion(self.parameters, self._state, estimates, of_f, u, goal)
 
     def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
         """Take one sample in manual operation: ``u`` is applied, unlimited, until the next sample.

@@ -38,6 +38,8 @@ class Estimate(NamedTuple):
     """The same for the learner with full authority."""
     reason: Reason = Reason.TRUSTED
     """Reason for the authority."""
+    f_derivatives: Vector = np.zeros(0)
+    """(m − 1,): derivatives of Δf̂, of an observer with m extended states [y-unit/s^(n+j)]."""
 
 
 def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...]) -> Estimate:
@@ -60,4 +62,5 @@ def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...
         u=float(state.loop[0].u),
         status=Status(int(state.loop[0].status)),
         **guarded,
+        f_derivatives=state.seen[order + 1 :].copy(),
     )

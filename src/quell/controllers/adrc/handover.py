@@ -57,14 +57,14 @@ def start_at_rest(
 
 
 def start_in_motion(
-    design: AdrcDesign, state: AdrcState, x: Vector, f: float, u: float, r: float
+    design: AdrcDesign, state: AdrcState, x: Vector, f: Vector, u: float, r: float
 ) -> None:
-    """Set the state to the estimates ``x`` (n,) and ``f`` under u, with the reference r."""
+    """Set the state to the estimates ``x`` (n,) and ``f`` (m,) under u, with the reference r."""
     _start_loop(design, state, float(x[0]), u, r)
     state.seen[:] = np.append(x, f)
     _feed_forward(design, state, u)
     state.seen[x.size] -= state.loop[0].f_learned + state.loop[0].f_known
-    state.z[:] = state_for(design.eso, x, float(state.seen[x.size]), u)
+    state.z[:] = state_for(design.eso, x, state.seen[x.size :], u)
 
 
 def _start_loop(design: AdrcDesign, state: AdrcState, y: float, u: float, r: float) -> None:
@@ -88,7 +88,7 @@ def samples_to_settle(observer: ESO) -> int:
     """Return after how many samples an observer has forgotten its initial state."""
     samples = _TIME_CONSTANTS * observer.lag_time / observer.dt
     if not isinstance(without_delay(observer.model), NonlinearModel):
-        transition = scaled_response(observer.model, observer.units).transition
+        transition = scaled_response(observer.model, observer.units, observer.order).transition
         slowest = float(np.max(np.abs(np.linalg.eigvals(transition))))
         if 0.0 < slowest < 1.0:
             samples = max(samples, _TIME_CONSTANTS / -math.log(slowest))
@@ -121,6 +121,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
         return
     before = unlimited_control(old, state, loop.constant, loop.slope)
     # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
+    # Its derivatives, if the observer has them, stay: how u moves from now on is not known.
     acting = acting_control(old.eso, state.z, float(loop.u))
     change = (old.b0 - new.b0) * acting
     for i in range(size):
@@ -138,7 +139,8 @@ def check_replacement(old: ESO, new: Any, learns: bool) -> None:
     """Check that ``new`` can replace ``old`` in a running controller; ``learns`` with a learner."""
     if not isinstance(new, ESO):
         raise ValueError(f"observer = {new!r}: must be an ESO")
-    for name in ("order", "degree", "f_degree", "dt", "form", "states"):
+    names = ("order", "disturbance_order", "degree", "f_degree", "dt", "form", "states")
+    for name in names:
         if getattr(new, name) != getattr(old, name):
             rule = f"the present one {getattr(old, name)!r}: must be the same"
             raise ValueError(f"observer has {name} = {getattr(new, name)!r}, {rule}")

@@ -107,7 +107,7 @@ class AdrcLoop(Scalars):
 
 
 class AdrcDesign(NamedTuple):
-    """Parameters of the controller, for a plant of order n; N = n + 1."""
+    """Parameters of the controller, for a plant of order n and an observer of m extended states."""
 
     eso: Any  # parameters of the observer, see ``observers.base``
     law: Vector  # k (n,); zero from the relative degree on
@@ -130,7 +130,7 @@ class AdrcState(NamedTuple):
     """State of the controller."""
 
     z: Vector  # state of the observer
-    seen: Vector  # estimates (x̂_1 … x̂_n, Δf̂) of the observer (N,)
+    seen: Vector  # estimates (x̂_1 … x̂_n, Δf̂, Δf̂', …) of the observer (n + m,)
     reference: Vector  # r', r'', … as used, zero if they are not given; empty without feedforward
     loop: NDArray[AdrcLoop]  # (1,)
     learner: Any
@@ -162,7 +162,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             if is_usable(y):
                 loop.y = y
         observe(design.eso, state.z, seen, loop.y, loop.u, loop.f_learned + loop.f_known)
-        f_plain = seen[seen.size - 1] + loop.f_learned_shown
+        f_plain = seen[design.law.size] + loop.f_learned_shown
         assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
@@ -216,7 +216,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         lost = has_escaped(watch, output, excessive) or has_lost_range(
             watch, design.window, loop.y, f_plain, output, excessive, limited
         )
-        if design.forgets and does_harm(watch, design.window, seen[seen.size - 1], f_plain):
+        if design.forgets and does_harm(watch, design.window, seen[design.law.size], f_plain):
             lost = True
         if lost:
             status |= _OVERFLOWED
@@ -301,10 +301,13 @@ def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
         row[i] = state.seen[i]
     row[order + 1] = state.loop[0].f_learned
     row[order + 2] = state.loop[0].status
+    after = state.seen.size + 2
+    for i in range(order + 1, state.seen.size):
+        row[i + 2] = state.seen[i]
     r, reference = state.loop[0].r, state.reference
-    forward = write_feedforward(design.feedforward, r, reference, row[order + 3 :])
-    written = write_channels(design.guard, state.guard, row[order + 3 + forward :])
-    coefficients(design.learner, state.learner, row[order + 3 + forward + written :])
+    forward = write_feedforward(design.feedforward, r, reference, row[after:])
+    written = write_channels(design.guard, state.guard, row[after + forward :])
+    coefficients(design.learner, state.learner, row[after + forward + written :])
 
 
 @status_flags.register(AdrcDesign)

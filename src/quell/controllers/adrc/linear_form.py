@@ -61,21 +61,22 @@ def _of_eso(model: EsoModel) -> Prediction:
 @prediction.register
 def _of_cascade(model: CascadeModel) -> Prediction:
     levels, size = model.gains.shape
-    states = levels * size
+    states, n = levels * size, model.at_f
     F, J, H = np.zeros((states, states)), np.eye(states), np.zeros(states)
     error, error_e = np.zeros(states), 1.0  # of a level, from z⁻ and from e
     for level in range(levels):
         own = slice(level * size, (level + 1) * size)
         F[own, own] = model.transition
         for before in range(level):
-            F[own, (before + 1) * size - 1] = model.feed
+            F[own, before * size + n] = model.feed
         J[own] += np.outer(model.gains[level], error)
         H[own] = model.gains[level] * error_e
         error, error_e = J[level * size].copy(), H[level * size]  # less the next level's z⁻_1
         error[(level + 1) * size % states] -= 1.0
     last = np.zeros((size, states))
     last[:, states - size :] = np.eye(size)
-    last[-1, size - 1 :: size] = 1.0  # Δf̂ is the sum over the levels
+    for i in range(n, size):
+        last[i, i::size] = 1.0  # Δf̂ and its derivatives are sums over the levels
     start = np.tile(np.eye(size)[0], levels)
     return Prediction(F, np.tile(model.input, levels), J, H, last @ J, last @ H, start)
 
@@ -89,7 +90,8 @@ def _of_adrc(design: AdrcDesign) -> LinearForm | None:
     if found is None or kinds != (NoLearnerDesign, UnguardedDesign, LinearFeedback):
         return None
     order = design.law.size
-    gains = np.append(design.cancel - design.law, -design.cancel_f) / design.b0
+    gains = np.zeros(found.D.size)
+    gains[: order + 1] = np.append(design.cancel - design.law, -design.cancel_f) / design.b0
     law = LinearLaw(
         A=found.F @ found.J,
         B_r=np.zeros(found.H.size),
@@ -101,6 +103,7 @@ def _of_adrc(design: AdrcDesign) -> LinearForm | None:
     )
     degree = np.count_nonzero(design.law)
     estimates = np.column_stack([found.T, found.D])
+    rates = {"f_derivatives": estimates[order + 1 :]} if order + 1 < found.D.size else {}
     return LinearForm(
         law=law,
         predicts=1.0,
@@ -111,7 +114,8 @@ def _of_adrc(design: AdrcDesign) -> LinearForm | None:
         largest_wish=LARGEST_SIGNAL,
         channels={
             "x_hat": estimates[:order],
-            "f_residual": estimates[order:],
+            "f_residual": estimates[order : order + 1],
             "f_learned": np.zeros((1, estimates.shape[1])),
-        },
+        }
+        | rates,
     )

@@ -80,6 +80,11 @@ def _check_linear(controller: Any) -> None:
             f"controller is of order {observer.order}: must be of order 1 (PI) or 2 (PID); an ADRC "
             "of order n has n zeros from y, a PID controller two at most"
         )
+    if observer.disturbance_order > 1:
+        raise ValueError(
+            f"observer has disturbance_order = {observer.disturbance_order}: its feedback has so "
+            "many integrators, and that of a PID controller has one; use disturbance_order = 1"
+        )
     design = (observer.order, observer.b0, observer.omega_o, observer.dt)
     usual = ESO.model_free(*design, form=observer.form).model
     if (

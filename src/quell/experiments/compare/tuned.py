@@ -61,7 +61,7 @@ class Sensitivities:
     m_s: float  #: largest ``|S|``
     m_t: float  #: largest ``|T|``
     m_ks: float  #: largest gain from y to u [u-unit/y-unit]
-    k_i: float  #: u per integral of y, for a constant load [u-unit/(y-unit s)]
+    k_i: float  #: u per integral of y, for a constant load; infinite with two integrators
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,14 @@ def of_loop(loop: LoopAnalysis) -> Sensitivities:
 
     smallest, _ = least(inverse, loop.omega, inverse(loop.omega))
     low = _LOW * float(np.min(np.abs(loop.s_poles)))
-    load = abs(complex(loop.response("PS", [low])[0]))
+    k_i, lower = (
+        omega / abs(complex(loop.response("PS", [omega])[0])) for omega in (low, 0.5 * low)
+    )
     return Sensitivities(
         m_s=1.0 / loop.margins.modulus,
         m_t=1.0 / smallest,
         m_ks=loop.noise_to_control_peak,
-        k_i=low / load,
+        k_i=math.inf if lower > 1.5 * k_i else k_i,  # twice as large with two integrators
     )
 
 

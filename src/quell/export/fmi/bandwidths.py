@@ -104,9 +104,9 @@ def gain_coefficients(observer: ESO) -> Matrix | None:
     model, n = observer.model, observer.plant.a.size
     if type(model) is not EsoModel or not observer.has_one_pole:
         return None
-    size = n + 1
-    # In the coordinates x_i dt^(i−1) and f dt^q of the design all entries are O(1).
-    scale = observer.dt ** np.append(np.arange(n), observer.plant.f_degree)
+    size, m = observer.estimates, observer.disturbance_order
+    # In the coordinates x_i dt^(i−1) and f^(j) dt^(q+j) of the design all entries are O(1).
+    scale = observer.dt ** np.append(np.arange(n), observer.plant.f_degree + np.arange(m))
     difference = model.transition * scale[:, None] / scale[None, :] - np.eye(size)
     rows = np.empty((size, size))
     rows[0] = difference[0]

@@ -16,6 +16,7 @@ _DESCRIPTIONS = {
     "f_hat": "estimate of the total disturbance: f_residual + f_learned",
     "f_residual": "the observer's share of it",
     "f_learned": "the learner's share of it",
+    "f_derivatives": "derivative of the observer's share of it",
     "u_feedforward": "feedforward of the model, a part of u",
     "status": "flags of the last sample, see the enumeration in the header of the controller",
     "authority": "share of its output that the guard allows the learner",
@@ -83,7 +84,7 @@ class ControllerPart:
                     Variable(f"theta[{i + 1}]", OUTPUT, f"{text} for {feature}", held=True)
                     for i, feature in enumerate(self.features)
                 ]
-            elif width == 1 and name != "x_hat":
+            elif width == 1 and name not in ("x_hat", "f_derivatives"):
                 found.append(Variable(name, OUTPUT, text, held=True, whole=name in WHOLE))
             else:
                 found += several(name, width, OUTPUT, f"{text}, {{i}}", held=True)

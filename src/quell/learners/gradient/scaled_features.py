@@ -76,7 +76,7 @@ def _adapt(
         return
     _rescale(learner, memory, seen, u_before, f_plain)
     _write(learner, memory, seen, u_before)
-    residual = seen[seen.size - 1] / memory.scale[memory.scale.size - 1]
+    residual = seen[memory.scaled.size] / memory.scale[memory.scale.size - 1]
     take_step(memory.buffers, residual, learner.rate)
 
 

@@ -104,7 +104,7 @@ def frequency_search(
 ) -> FrequencySearch:
     """Return a search for the frequencies of oscillators, with n ``states`` as given signals."""
     # In units of the observer's bandwidth, whatever its tuning: N over its lag.
-    spacing = max(round(2.0 * observer.lag_time / ((observer.order + 1) * observer.dt)), 1)
+    spacing = max(round(2.0 * observer.lag_time / (observer.estimates * observer.dt)), 1)
     step = spacing * observer.dt
     low, high = oscillators.low * step, oscillators.high * step
     lines = np.geomspace(low, high, _LINES) * oscillators.orders[0]

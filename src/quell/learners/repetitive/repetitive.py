@@ -109,14 +109,14 @@ class Repetitive:
 
 
 def correction_weights(observer: ESO, lag: Any) -> Vector:
-    """Return the weights of ``(1 + ω²/ω_e²)^m`` (2m + 1,) with m = (N − 1)//2, ω_e = N/lag.
+    """Return the weights of ``(1 + ω²/ω_e²)^k`` (2k + 1,) with k = n//2, ω_e = N/lag.
 
     They are scaled so that ``|F|²`` times their response is one at most.
     """
-    size = observer.order + 1
-    share = (size / observer.lag_time * observer.dt) ** -2
+    power = observer.order // 2
+    share = (observer.estimates / observer.lag_time * observer.dt) ** -2
     weights = np.ones(1)
-    for _ in range((size - 1) // 2):
+    for _ in range(power):
         weights = np.convolve(weights, (-share, 1.0 + 2.0 * share, -share))
     # The response of F has decayed after ten lags, that of twice as many samples shows its peak.
     count = 2 ** math.ceil(math.log2(20.0 * observer.lag_time / observer.dt + 16.0))
@@ -124,6 +124,6 @@ def correction_weights(observer: ESO, lag: Any) -> Vector:
     for i in range(count // 2):
         pulse[i] = lag_push(lag, memory, 0, 1.0 if i == 0 else 0.0)
     angle = np.linspace(0.0, math.pi, count // 2 + 1)
-    sharpened = (1.0 + share * (2.0 - 2.0 * np.cos(angle))) ** ((size - 1) // 2)
+    sharpened = (1.0 + share * (2.0 - 2.0 * np.cos(angle))) ** power
     found: Vector = weights / np.max(sharpened * np.abs(np.fft.rfft(pulse)) ** 2)
     return found

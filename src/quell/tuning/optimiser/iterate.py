@@ -82,8 +82,8 @@ class Iterate:
         """Whether the loops with all plants are stable."""
         if self._poles:
             return all(bool(np.all(s.real < 0.0)) for s in self._poles)
-        poles = self._structure.unstable_poles(self._values)
-        return bool(np.all(self._problem.plants.unstable_loops(self._response, poles) < 0.5))
+        poles, count = self._structure.unstable_poles(self._values), self._structure.integrators
+        return bool(np.all(self._problem.plants.unstable_loops(self._response, poles, count) < 0.5))
 
     @cached_property
     def cost(self) -> float:

@@ -164,7 +164,7 @@ class PlantSet:
 
     # ---- loops
 
-    def unstable_loops(self, C: Complex, controller: Vector) -> Matrix:
+    def unstable_loops(self, C: Complex, controller: Vector, at_one: int = 1) -> Matrix:
         """Return the number (m, J) of unstable closed-loop poles, by the argument principle.
 
         ``1 + L`` is the closed loop's polynomial over the open loop's. Over the upper half circle
@@ -175,7 +175,7 @@ class PlantSet:
         Parameters
         ----------
         C
-            responses (m, G) of controllers with one pole at z = 1, on the grid.
+            responses (m, G) of controllers with ``at_one`` poles at z = 1, on the grid.
         controller
             their numbers of unstable poles (m,).
         """
@@ -189,7 +189,7 @@ class PlantSet:
             at = at[(at >= 0) & (at < steps.shape[1])]
             across = np.remainder(steps[:, at] + np.pi, 2.0 * np.pi) - np.pi
             turns -= np.count_nonzero(across > 0.0, axis=1)
-            expected = unstable + controller + 0.5 * (integrators + 1.0)
+            expected = unstable + controller + 0.5 * (integrators + at_one)
             count[:, j] = np.round(expected - np.sum(steps, axis=1) / np.pi - 2.0 * turns)
             # A loop whose crossover lies below the grid: its slow poles do not show.
             count[np.abs(self.P[j, 0] * C[:, 0]) < _LEAST_BOTTOM, j] = np.inf

@@ -2,6 +2,8 @@
 
 * ``load``: ``1/k_i``, the integral of y after a unit step of the load at the plant's input (IE;
   Åström & Hägglund, *Advanced PID Control*, ISA 2006, eq. 4.35). It is the same for all plants.
+  With more than one integrator k_i is infinite, and the search for starts has the integral of y²
+  (ISE) after that step in its place, ``1/π ∫ |P S/ω|² dω`` by Parseval's theorem.
 * ``load-iae``: the integral of ``|y|`` after that step, from the exact response.
 * ``tracking``: the RMS of ``r − y`` along a given reference.
 
@@ -11,9 +13,12 @@ Of several plants, the last two take the largest value, or a quantile of them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
+from quell.analysis.frequency_response import Complex
+from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.time_responses import SetResponses
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
@@ -27,10 +32,22 @@ Cost = Callable[[Structure, Matrix], Vector]
 _WORST = 200.0
 
 
-def load_cost(structure: Structure, values: Matrix) -> Vector:
-    """Return ``−log k_i`` (m,)."""
+def load_cost(structure: Structure, values: Matrix, plants: PlantSet) -> Vector:
+    """Return ``−log k_i`` (m,); with more integrators the logarithm of the root of the ISE."""
+    if structure.integrators > 1:
+        return _log_root_ise(plants, structure.response(values, plants.omega))
     with np.errstate(divide="ignore", invalid="ignore"):
         cost = -np.log(structure.integral_gain(values))
+    return np.where(np.isfinite(cost), cost, _WORST)
+
+
+def _log_root_ise(plants: PlantSet, C: Complex) -> Vector:
+    worst, omega = np.zeros(C.shape[0]), plants.omega
+    for P in plants.P:
+        density = np.abs(P / (1.0 + P * C)) ** 2 / omega  # over log ω
+        worst = np.maximum(worst, np.trapezoid(density, np.log(omega), axis=1) / np.pi)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cost: Vector = 0.5 * np.log(worst)
     return np.where(np.isfinite(cost), cost, _WORST)
 
 
@@ -45,7 +62,7 @@ def scores(objective: str, structure: Structure, values: Vector, over: SetRespon
 def cost_of(objective: str, over: SetResponses, quantile: float) -> Cost:
     """Return the function from a structure and values (m, p) to costs (m,)."""
     if objective == "load":
-        return load_cost
+        return partial(load_cost, plants=over.plants)
 
     def cost(structure: Structure, values: Matrix) -> Vector:
         found = np.empty(values.shape[0])

@@ -50,7 +50,7 @@ class Design:
     #: what was optimised: k_i for load rejection [u-unit/(y-unit s)], which is to be large; else
     #: the integral of ``|y|`` or the RMS of r − y, which are to be small
     objective: float
-    k_i: float  #: integral gain [u-unit/(y-unit s)]
+    k_i: float  #: integral gain [u-unit/(y-unit s)]; infinite with more than one integrator
     measures: Mapping[str, float]
     active: tuple[Active, ...]  #: the constraints at their limits
     tables: Mapping[str, Mapping[str, Any]]  #: tables of a setup file for the controller
@@ -103,7 +103,7 @@ def design_of(
     """Return the design of a solution; ``options`` are those of the structure's controllers."""
     structure, values = solution.structure, solution.values
     measures, active, least = measured(problem, solution, constraints)
-    k_i = float(structure.integral_gain(values[None, :])[0])
+    k_i = math.inf if structure.integrators > 1 else float(structure.integral_gain(values[None])[0])
     size = math.exp(solution.cost)
     tables = structure.tables(values)
     for key, each in options.items():

@@ -38,6 +38,8 @@ _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
 _OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
+# With more extended states one slower than the law is often the best under bounds of M_s.
+_SLOW_OBSERVER = 0.1
 # Damping of the observer's pair at a resonance of the plant, and of the law's, to start from.
 _RESONANCE_STARTS, _MOVED = (0.1, 0.4), 0.7
 # With a model there are many valleys, also with an observer far slower than a quick law: a grid of
@@ -59,6 +61,7 @@ class Form:
     half_law: bool = False
     based: bool = False
     knows_delay: bool = False
+    extended: int = 1  # number of extended states, and of integrators
 
 
 class _Designed(NamedTuple):
@@ -86,7 +89,8 @@ class AdrcStructure:
         self.gain_sign = model.sign
         # With s^(n+1) A + b0 B = p_law p_observer the poles of 1/A are as fast as the loop's. With
         # a model, D s A + b0 N B has A less the model's own poles: it may have a slow one.
-        self.may_swing = form.based
+        self.may_swing = form.based and form.extended == 1
+        self.integrators = form.extended
         self.plant: Canonical = (
             canonical(model.plant) if form.based else canonical((np.zeros(order), 1.0))
         )
@@ -94,7 +98,7 @@ class AdrcStructure:
             raise ValueError("the plant has zeros outside of the left half plane, which it inverts")
         self.order, self.degree = self.plant.a.size, self.plant.degree
         self._last: tuple[bytes, Any] = b"", None
-        self._chain = sampled_adrc.sampled_chain(self.plant, model.dt)
+        self._chain = sampled_adrc.sampled_chain(self.plant, model.dt, form.extended)
         self._delay = round(model.delay / model.dt) if form.knows_delay else 0
         self._fastest = model.constraints.omega_o_dt / model.dt
         self._damping = dict(_DAMPING)
@@ -102,7 +106,7 @@ class AdrcStructure:
         if least is not None and not resonances(model, least):
             low, high = _DAMPING["o"]
             self._damping["o"] = (max(low, least), high)
-        self._observed = self.order + (0 if form.reduced else 1)
+        self._observed = self.order + form.extended - form.reduced
         unit = model.gain * model.omega**self.degree
         self.parameters = (
             Parameter("b0", f"y-unit/u-unit/s^{self.degree}", 1e-10 * unit, 1e10 * unit),
@@ -158,8 +162,9 @@ class AdrcStructure:
 
     def from_other(self, other: AdrcStructure, values: Vector) -> Vector | None:
         """Return the values with the poles of another form of the same order, if there are any."""
-        same = (other.degree, other.order, other.form.based)
-        if other is self or same != (self.degree, self.order, self.form.based):
+        same = (other.degree, other.order, other.form.based, other.form.extended)
+        own = (self.degree, self.order, self.form.based, self.form.extended)
+        if other is self or same != own:
             return None
         law, observer = (poles[0] for poles in other.poles(values[None, :]))
         if not self.form.freed:
@@ -175,7 +180,10 @@ class AdrcStructure:
         """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
         omega, rows = self.model.omega, []
         b0 = self.model.b if self.degree == self.model.degree else 1.0
-        for law, ratio in itertools.product(_LAW_STARTS, _OBSERVER_STARTS):
+        ratios = (
+            _OBSERVER_STARTS if self.form.extended == 1 else (_SLOW_OBSERVER, *_OBSERVER_STARTS)
+        )
+        for law, ratio in itertools.product(_LAW_STARTS, ratios):
             pair = (law * omega, law * ratio * omega)
             if max(pair) > 0.999 * self._fastest:
                 pair = (min(pair[0], 0.9 * self._fastest), 0.99 * self._fastest)
@@ -319,6 +327,7 @@ class AdrcStructure:
             "half_gain": self.form.half_observer,
             "delay": self._delay * dt,
             "poles": observer,
+            "disturbance_order": self.form.extended,
         }
         if self.form.based:
             form |= {"far": math.inf}
@@ -354,6 +363,8 @@ class AdrcStructure:
             observer["form"] = "reduced"
         if self.form.half_observer:
             observer["half_gain"] = True
+        if self.form.extended > 1:
+            observer["disturbance_order"] = self.form.extended
         if self._delay:
             observer["delay"] = self._delay * self.model.dt
         controller: dict[str, Any] = {"kind": "adrc", "omega_c": omega_c}

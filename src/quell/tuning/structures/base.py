@@ -53,6 +53,7 @@ class Structure(Protocol):
     parameters: tuple[Parameter, ...]
     gain_sign: float  # sign of the first parameter where it is printed, +1 or −1
     gain_power: int  # 1 if C_y is proportional to the first parameter, −1 if to its inverse
+    integrators: int  # number of poles of C_y at z = 1
     may_swing: bool  # whether a second slow pole can make k_i large, so that this must be bounded
 
     def shapes(self) -> Matrix:
@@ -78,7 +79,7 @@ class Structure(Protocol):
         ...
 
     def integral_gain(self, values: Matrix) -> Vector:
-        """Return the integral gains k_i (m,) [u-unit/(y-unit s)]."""
+        """Return the integral gains k_i (m,) [u-unit/(y-unit s)]; infinite with two integrators."""
         ...
 
     def unstable_poles(self, values: Matrix) -> Vector:

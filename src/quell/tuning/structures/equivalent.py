@@ -38,7 +38,8 @@ def equivalents(pid: FilteredPID, values: Vector, adrc: AdrcStructure, most: int
     """
     rows: list[tuple[float, Vector]] = []
     order = 2 if pid.derivative else 1
-    usable = adrc.form.freed and not adrc.form.based and not adrc.form.reduced
+    form = adrc.form
+    usable = form.freed and not form.based and not form.reduced and form.extended == 1
     if not usable or adrc.order != order or not pid.filtered:
         return np.zeros((0, len(adrc.parameters)))
     kp, ki, kd, f1, f2 = (float(part[0]) for part in pid.parts(values[None, :]))

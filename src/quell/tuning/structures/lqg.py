@@ -50,6 +50,7 @@ class LqgStructure:
     name = "lqg"
     gain_sign = 1.0  # a factor of the plant's own gain
     gain_power = -1
+    integrators = 1
     may_swing = False
 
     def __init__(self, model: Model) -> None:

@@ -39,6 +39,7 @@ class CascadeStructure:
 
     name = "p-pi-notch"
     gain_power = 1
+    integrators = 1
     may_swing = False
 
     def __init__(self, model: Model) -> None:

@@ -36,6 +36,7 @@ class FilteredPID:
     """
 
     gain_power = 1
+    integrators = 1
     may_swing = False
 
     def __init__(

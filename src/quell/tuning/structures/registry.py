@@ -25,10 +25,16 @@ _ADRC = {
     "model-based-freed": Form(based=True, freed=True),
     "delay": Form(knows_delay=True),
     "delay-freed": Form(knows_delay=True, freed=True),
+    "bandwidths-2": Form(extended=2),
+    "bandwidths-3": Form(extended=3),
+    "freed-2": Form(freed=True, extended=2),
+    "model-based-2": Form(based=True, extended=2),
 }
 LQG, CASCADE = "lqg", "p-pi-notch"
 STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE)
 """Names of the structures: forms of ADRC, PI and PID, LQG, and the cascade of servo drives."""
+SEVERAL_INTEGRATORS = tuple(name for name, form in _ADRC.items() if form.extended > 1)
+"""Names of those with more than one integrator, whose k_i is infinite."""
 FEEDING_FORWARD = (*_ADRC, CASCADE)
 """Names of those with the feedforward of a model."""
 

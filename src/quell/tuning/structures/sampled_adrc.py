@@ -15,8 +15,15 @@ the roots ``1 − z_i`` and O the observability matrix: it is linear in the coef
 
 C_y has a pole at z = 1. With v and w the right and left null vectors of that matrix M at ζ = 0, its
 residue is ``K v · w L / (w M'(0) v)``, from which the integral gain follows. All is in coordinates
-``x_i/ω^(i−1)``, ``f/ω^q`` with ω the geometric mean of the observer's poles; then C_y is
+``x_i/ω^(i−1)``, ``f^(j)/ω^(q+j)`` with ω the geometric mean of the observer's poles; then C_y is
 ``ω^r/b0`` times a function of the poles alone.
+
+With e extended states the pole at z = 1 has the multiplicity e, the integral gain is infinite, and
+at low frequencies M is singular to rounding. There C_y is found from the innovation, with
+A = Δ − Γ K. The states x of it do not depend on f, because u cancels it where it enters, and f is a
+chain of its own, so that its powers of 1/ζ are exact::
+
+    (ζ I − A) W = (I + A) L,        C_y = K (W + L) / (1 + c W)
 """
 
 from __future__ import annotations
@@ -31,6 +38,7 @@ from numpy.typing import NDArray
 from quell.analysis.frequency_response import Complex
 from quell.lti.canonical import Canonical
 from quell.lti.discretize import zero_order_hold
+from quell.observers.design import with_motion_of_f, with_rates
 from quell.types import Matrix, Vector
 
 Stack = NDArray[np.float64]
@@ -40,20 +48,20 @@ _OUTSIDE = 1e-7
 
 
 class SampledChain(NamedTuple):
-    """The extended model of a plant, sampled in the coordinates ``x_i dt^(i−1)``, ``f dt^q``."""
+    """The extended model of a plant, sampled in ``x_i dt^(i−1)``, ``f^(j) dt^(q+j)``."""
 
     difference: Matrix  # Φ − I (N, N)
     input: Vector  # Γ for b0 = 1 and u in units of dt^−r (N,)
     placing: Matrix  # Δ^j O⁻¹ e_N in row N − j (N + 1, N)
-    power: Vector  # 0 … n − 1, q
+    power: Vector  # 0 … n − 1, q, q + 1, …
     cancel: Vector  # (n,)
     cancel_f: float
     degree: int
     dt: float
 
 
-def sampled_chain(plant: Canonical, dt: float) -> SampledChain:
-    """Sample the extended model of ``plant`` as ``observers/design`` does."""
+def sampled_chain(plant: Canonical, dt: float, extended: int = 1) -> SampledChain:
+    """Sample the model of ``plant`` with extended states as ``observers/design`` does."""
     n, q = plant.a.size, plant.f_degree
     A = np.diag(np.ones(n), 1)
     A[-2, :-1] -= plant.a * dt ** (n - np.arange(n))
@@ -61,8 +69,9 @@ def sampled_chain(plant: Canonical, dt: float) -> SampledChain:
     column = np.zeros((n + 1, 1))
     column[:-1, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
     _, (difference, gamma) = zero_order_hold(A, [A, column], 1.0)
+    difference, gamma = with_motion_of_f(difference, extended), with_rates(gamma, extended)
     cancel = plant.a if plant.degree == n else -np.eye(n)[plant.degree]
-    power = np.append(np.arange(float(n)), float(q))
+    power = np.append(np.arange(float(n)), q + np.arange(float(extended)))
     matched = 1.0 if plant.matched else 0.0
     return SampledChain(
         difference, gamma[:, 0], _placing(difference), power, cancel, matched, plant.degree, dt
@@ -90,12 +99,16 @@ class Designs:
     factor: Vector  # ω^r (m,); C_y = factor / b0 times the response of these
     base: Stack  # L c − (I − L c) Δ (m, N, N)
     closing: Stack  # (I − L c) Γ K (m, N, N)
+    inner: Stack  # A = Δ − Γ K (m, N, N)
     delay: int
     dt: float
+    extended: int  # e, number of extended states
 
     @cached_property
     def integral_gain(self) -> Vector:
         """``k_i b0 / ω^r`` (m,)."""
+        if self.extended > 1:
+            return np.full(self.gain.shape[0], np.inf)
         left, _, right = np.linalg.svd(self.base + self.closing)
         v, w = right[:, -1, :], left[:, :, -1]
         slope = np.eye(v.shape[1]) - self.delay * self.closing
@@ -117,6 +130,8 @@ def designs(
 ) -> Designs:
     """Return designs with law gains k (m, r) and observer poles (m, N), or (m, N − 1) if reduced.
 
+    With more than one extended state there must be no delay.
+
     ``kept`` are the numbers of those to return: not by itself, because in a product of matrices a
     single row has other rounding. ``delay`` is the known delay of u [samples].
     """
@@ -136,8 +151,9 @@ def designs(
         gain *= 0.5
     K = np.zeros((kept.size, size))
     K[:, : law.shape[1]] = law
-    K[:, :-1] -= chain.cancel
-    K[:, -1] = chain.cancel_f
+    n = chain.cancel.size
+    K[:, :n] -= chain.cancel
+    K[:, n] = chain.cancel_f
     K *= omega[:, None] ** (power - chain.degree)
     correct = np.empty((kept.size, size, size))  # I − L c
     correct[:] = np.eye(size)
@@ -147,7 +163,9 @@ def designs(
     difference = chain.difference * step[:, None, None] ** (power - power[:, None])
     base = -(correct @ difference)
     base[:, :, 0] += gain
-    return Designs(gain, K, omega**chain.degree, base, closing, delay, chain.dt)
+    inner = difference - column[:, :, None] * K[:, None, :]
+    factor = omega**chain.degree
+    return Designs(gain, K, factor, base, closing, inner, delay, chain.dt, size - n)
 
 
 def coefficients(roots: NDArray[np.complex128]) -> Matrix:
@@ -167,10 +185,30 @@ def monic(roots: NDArray[np.complex128]) -> Matrix:
 
 def feedback(found: Designs, omega: Vector) -> Complex:
     """Return ``C_y b0 / ω^r`` (m, k) at frequencies (k,) [rad/s]."""
+    if found.extended > 1:
+        return _feedback_by_innovation(found, omega)
     matrix, z = _matrices(found, omega)
     solved = np.linalg.solve(matrix, found.gain[:, None, :, None])[..., 0]
     product: Complex = np.einsum("mkn,mn->mk", solved, found.law) * z
     return product
+
+
+def _feedback_by_innovation(found: Designs, omega: Vector) -> Complex:
+    zeta, A = np.expm1(1j * omega * found.dt), found.inner
+    count, size = found.gain.shape
+    n = size - found.extended
+    given = found.gain + np.einsum("mij,mj->mi", A, found.gain)  # (I + A) L
+    given[:, :n] = found.gain[:, :n] + np.einsum("mij,mj->mi", A[:, :n, :n], found.gain[:, :n])
+    W = np.empty((count, omega.size, size), dtype=complex)
+    for i in range(size - 1, n - 1, -1):
+        later = np.einsum("mj,mkj->mk", A[:, i, i + 1 :], W[:, :, i + 1 :])
+        W[:, :, i] = (given[:, i, None] + later) / zeta
+    matrix = zeta[:, None, None] * np.eye(n) - A[:, None, :n, :n]
+    given_x = np.broadcast_to(given[:, None, :n, None], (count, omega.size, n, 1))
+    W[:, :, :n] = np.linalg.solve(matrix, given_x)[..., 0]
+    corrected = np.einsum("mki,mi->mk", W + found.gain[:, None, :], found.law)
+    response: Complex = corrected / (1.0 + W[:, :, 0])
+    return response
 
 
 def _matrices(found: Designs, omega: Vector) -> tuple[Complex, Complex]:
@@ -201,7 +239,11 @@ def unstable_poles(found: Designs) -> Vector:
     """
     base, closing = found.base, found.closing
     if found.delay == 0:
-        shifted = np.linalg.eigvals(-(base + closing))
+        shifted: Any = np.linalg.eigvals(-(base + closing))
+        if found.extended > 1:
+            # Rounding moves an e-fold pole by its e-th root: the integrators are those next to 1.
+            near = np.argsort(np.abs(shifted), axis=1)
+            shifted = np.take_along_axis(shifted, near[:, found.extended :], axis=1)
         outside = np.abs(1.0 + shifted) > 1.0 + _OUTSIDE
         return np.sum(outside, axis=1).astype(np.float64)
     top, size = np.pi / found.dt, base.shape[1]

@@ -10,8 +10,11 @@ const TITLES = {
 const NAMES = {
   omega_c: "ω_c [rad/s]", omega_o: "ω_o [rad/s]", u_min: "u_min", u_max: "u_max",
   disturbances: "disturbance", at: "at [s]", duration: "duration [s]", delay: "delay [s]",
-  signals: "names and units",
+  signals: "names and units", disturbance_order: "extended states of f",
 };
+// Keys with a field of their own even if the setup lacks them, and ranges of whole numbers.
+const SHOWN = ["disturbance_order"];
+const RANGES = { disturbance_order: [1, 3] };
 const OPTIONAL = ["observer", "learner", "guard", "prefilter"];
 const OPEN = ["plant", "observer", "controller"];
 const POLYNOMIALS = ["num", "den"];
@@ -96,7 +99,7 @@ export class Forms {
     const rest = [];
     for (const entry of about.keys) {
       const found = this.entry(entry, `${path}.${entry.key}`, given[entry.key]);
-      const shown = entry.needed || (given[entry.key] !== undefined && entry.group !== "labels");
+      const shown = entry.needed || SHOWN.includes(entry.key) || (given[entry.key] !== undefined && entry.group !== "labels");
       (shown ? parts : rest).push(found);
     }
     if (rest.length) {
@@ -249,6 +252,7 @@ export class Forms {
   number(entry, path, name, slides = entry.type === "number") {
     const box = input("number", path, name);
     box.step = entry.type === WHOLE ? "1" : "any";
+    if (RANGES[entry.key]) [box.min, box.max] = RANGES[entry.key];
     box.showValue = (now) => {
       box.value = now ?? (Number.isFinite(entry.default) ? entry.default : "");
       if (now == null && entry.default === undefined) box.placeholder = "auto";

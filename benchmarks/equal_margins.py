@@ -1,0 +1,197 @@
+"""What learning gives at equal margins: late errors with M_s and M_ks the same for all.
+
+    python benchmarks/equal_margins.py [--m-ks 100] [--json file] [--figure file]
+
+The plant is an axis with viscous friction, ``y'' = −2 y' + 100 (u + w)``, sampled at 500 Hz. Linear
+controllers are tuned for the least IAE after a step of the load with M_s ≤ 2 and M_ks ≤ the
+argument. Learners stand on the ADRC of free poles, tuned with the M_s that leaves M_s ≤ 2 with the
+learner's adaptation (``analyse``), and the same M_ks. The loads are
+
+- a sinusoid of 3 rad/s, and two of 2 and 5.3 rad/s, which no controller knows;
+- cogging, ``0.3 sin(20 y)``, and a hardening spring, ``−0.3 y³``, in a slow motion;
+- steps at random times, and coloured noise with a correlation time of 0.5 s.
+
+The error is that of y, less what the same loop does in the same motion without the load, in RMS
+over the last fifth of 300 s; the noise of y is the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+import quell as ql
+from quell.analysis import LoopAnalysis, analyse
+from quell.features import Bias, Periodic, Polynomial, State
+from quell.learners import RLS, Harmonic, Kalman
+from quell.tuning import Constraints
+
+DT, LAST, M_S = 2e-3, 300.0, 2.0
+AXIS = ql.plants.LinearPlant.of(([100.0], [1.0, 2.0, 0.0]))
+LINEAR = ("pid", "lqg", "bandwidths", "freed")
+# With a learner M_s may exceed the bound by this share.
+TOLERANCE = 0.01
+LEARNERS: dict[str, Callable[[], Any]] = {
+    "Kalman()": Kalman,
+    "Kalman, bias of 1 rad/s": lambda: Kalman(bias_bandwidth=1.0),
+    "Harmonic(count=2, bias=False)": lambda: Harmonic(
+        count=2, bias=False, bias_bandwidth=10.0, pair_bandwidth=10.0
+    ),
+    "RLS(Periodic)": lambda: RLS(
+        Periodic(period=0.1 * np.pi, orders=(1,)) + Bias(), bias_bandwidth=0.0
+    ),
+    "RLS(Polynomial)": lambda: RLS(State() + Polynomial(3, states=(1,)), bias_bandwidth=0.0),
+}
+
+
+def cogging(t: float, x: Any, u: float, w: Any) -> tuple[float, float]:
+    """Return the derivatives of position and speed with cogging."""
+    return x[1], -2.0 * x[1] + 100.0 * (u + w[0] + 0.3 * np.sin(20.0 * x[0]))
+
+
+def spring(t: float, x: Any, u: float, w: Any) -> tuple[float, float]:
+    """Return the derivatives of position and speed with a hardening spring."""
+    return x[1], -2.0 * x[1] + 100.0 * (u + w[0] - 0.3 * x[0] ** 3)
+
+
+def plants() -> dict[str, Any]:
+    """Return the plant of each load, with an input w beside u."""
+    loaded = ql.plants.LinearPlant(AXIS.A, AXIS.B, AXIS.C, AXIS.B)
+    found: dict[str, Any] = dict.fromkeys(("sinusoid", "two sinusoids", "steps", "noise"), loaded)
+    for name, rate in (("cogging", cogging), ("spring", spring)):
+        found[name] = ql.plants.NonlinearPlant(rate, order=2, disturbances=1)
+    return found
+
+
+def signals(t: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the reference and the load of each case."""
+    rng, none = np.random.default_rng(5), np.zeros(t.size)
+    steps, at, value = none.copy(), 0, 1.0
+    while at < t.size:
+        length = int(rng.uniform(1.0, 5.0) / DT)
+        steps[at : at + length] = value
+        at, value = at + length, -value
+    pole = np.exp(-DT / 0.5)
+    noise = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.normal(size=t.size))
+    motion = np.sin(0.5 * t) + 0.3 * np.sin(0.23 * t)
+    return {
+        "sinusoid": (none, np.sin(3.0 * t)),
+        "two sinusoids": (none, np.sin(2.0 * t) + 0.7 * np.sin(5.3 * t)),
+        "cogging": (motion, none),
+        "spring": (motion, none),
+        "steps": (none, steps),
+        "noise": (none, noise),
+    }
+
+
+def late_error(plant: Any, controller: Any, t: Any, r: Any, w: Any) -> tuple[float, Any]:
+    """Return the RMS error over the last fifth, and the run."""
+    scenario = ql.Scenario(
+        reference=ql.signals.Samples(t, r, hold="spline"),
+        disturbances=(ql.signals.Samples(t, w),),
+        noise=ql.signals.BandLimitedNoise(power=1e-12 * DT, sample_time=DT),
+        duration=float(t[-1]),
+    )
+    run = ql.simulate(plant, controller, scenario)
+    if run.diverged:
+        return np.inf, run
+    y = run["y"].copy()
+    if np.any(r):
+        y -= ql.simulate(plants()["steps"], controller_without_learner(controller), scenario)["y"]
+    late = y[-t.size // 5 :]
+    return float(np.sqrt(np.mean(late**2))), run
+
+
+def controller_without_learner(controller: Any) -> Any:
+    """Return the controller with what is linear of it."""
+    if not isinstance(controller, ql.ADRC):
+        return controller
+    return ql.ADRC(controller.observer, omega_c=controller.omega_c, feedforward=FEEDFORWARD)
+
+
+FEEDFORWARD = ql.Feedforward.of(AXIS)
+
+
+def peaks(loop: LoopAnalysis) -> tuple[float, float]:
+    """Return M_s and M_ks; infinite for an unstable loop."""
+    if not loop.stable:
+        return np.inf, np.inf
+    return 1.0 / loop.margins.modulus, loop.noise_to_control_peak
+
+
+def tuned(structure: str, m_s: float, m_ks: float) -> Any:
+    """Return the controller of a structure with the least IAE within the bounds."""
+    bounds = Constraints(m_s=m_s, m_t=None, m_ks=m_ks, damping=0.3)
+    order = {"order": 2} if structure in ("bandwidths", "freed") else {}
+    return ql.tune(
+        AXIS, DT, structure=structure, compare=(), constraints=bounds, **order
+    ).controller
+
+
+def with_learner(base: Any, make: Callable[[], Any]) -> ql.ADRC:
+    """Return the ADRC with a learner and the feedforward of the axis."""
+    return ql.ADRC(base.observer, omega_c=base.omega_c, learner=make(), feedforward=FEEDFORWARD)
+
+
+def main() -> None:
+    """Print a row for each controller, and the ratio of the best learner to the best linear one."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--m-ks", type=float, default=100.0)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    warnings.simplefilter("ignore")
+    t = DT * np.arange(round(LAST / DT) + 1)
+    cases, parts = signals(t), plants()
+    rows: dict[str, dict[str, Any]] = {}
+    for structure in LINEAR:
+        controller = tuned(structure, M_S, given.m_ks)
+        m_s, m_ks = peaks(analyse(AXIS, controller))
+        if isinstance(controller, ql.ADRC):
+            controller = controller_without_learner(controller)
+        errors = {
+            name: late_error(parts[name], controller, t, *case)[0] for name, case in cases.items()
+        }
+        if not isinstance(controller, ql.ADRC):  # without feedforward its motion is another one
+            errors |= {"cogging": np.nan, "spring": np.nan}
+        rows[structure] = {"m_s": m_s, "m_ks": m_ks, **errors}
+        show(structure, rows[structure])
+    # The bound of M_ks that is left with the learner is found together with that of M_s.
+    bases = {m: tuned("freed", m, 0.97 * given.m_ks) for m in (2.0, 1.9, 1.8, 1.7, 1.6, 1.5, 1.4)}
+    for label, make in LEARNERS.items():
+        row: dict[str, Any] = {"m_s": 0.0, "m_ks": 0.0}
+        for name, case in cases.items():
+            row[name] = np.nan
+            for base in bases.values():
+                controller = with_learner(base, make)
+                error, run = late_error(parts[name], controller, t, *case)
+                m_s, m_ks = peaks(analyse(AXIS, with_learner(base, make), at=run))
+                if m_s <= M_S * (1.0 + TOLERANCE) and m_ks <= given.m_ks * (1.0 + TOLERANCE):
+                    row[name] = error
+                    row["m_s"], row["m_ks"] = max(row["m_s"], m_s), max(row["m_ks"], m_ks)
+                    break
+        rows[label] = row
+        show(label, row)
+    for name in cases:
+        linear = np.nanmin([rows[structure][name] for structure in LINEAR])
+        learned = {label: linear / rows[label][name] for label in LEARNERS}
+        best = max(learned, key=lambda label: np.nan_to_num(learned[label]))
+        print(f"{name:14} {best}: {learned[best]:.3g} times as good as the best linear controller")
+    if given.json is not None:
+        given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+
+
+def show(label: str, row: dict[str, Any]) -> None:
+    """Print a row."""
+    cells = "  ".join(f"{name} {row[name]:.1e}" for name in row if not name.startswith("m_"))
+    print(f"{label:30} M_s {row['m_s']:.2f} M_ks {row['m_ks']:5.1f}  {cells}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
