@@ -42,7 +42,7 @@ LEARNERS: dict[str, Callable[[], Any]] = {
     "Kalman()": Kalman,
     "Kalman, bias of 1 rad/s": lambda: Kalman(bias_bandwidth=1.0),
     "Harmonic(count=2, bias=False)": lambda: Harmonic(
-        count=2, bias=False, bias_bandwidth=10.0, pair_bandwidth=10.0
+        count=2, bias=False, bias_bandwidth=10.0, pair_bandwidth=10.0, limits=(0.5, 15.0)
     ),
     "RLS(Periodic)": lambda: RLS(
         Periodic(period=0.1 * np.pi, orders=(1,)) + Bias(), bias_bandwidth=0.0

@@ -200,7 +200,7 @@ def test_the_default_is_as_good_as_the_best_structure_that_was_tried(by_default:
 def test_the_default_does_not_ring(by_default: ql.Tuned) -> None:
     """All poles of its closed loop have a damping of 0.4 or more, as those of the plant have."""
     z = np.asarray(by_default.analysis.poles, dtype=complex)
-    poles = np.log(z) / DT
+    poles = np.log(z[z != 0.0]) / DT  # those at zero are gone after a sample
     slow = poles[np.abs(poles) < 0.5 * np.pi / DT]
     assert np.min(-slow.real / np.abs(slow)) > 0.4
 

@@ -116,7 +116,7 @@ def _adapt(
     f_plain: float,
 ) -> None:
     pairs, errors = memory.pairs, memory.errors
-    error = seen[seen.size - 1]
+    error = seen[learner.known.gain.size - 1]
     if learner.compensated:
         error = f_plain - memory.known[0] - memory.level[0]
         for j in range(learner.omega.size):
@@ -142,7 +142,7 @@ def _predict(
     for j in range(learner.omega.size):
         total += memory.pairs[j, 0]
     constant = learner.authority * total + learner.known.before * u_before
-    for i in range(seen.size):
+    for i in range(learner.known.gain.size):
         constant += learner.known.gain[i] * seen[i]
     return constant, learner.known.slope
 
