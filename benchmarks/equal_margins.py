@@ -35,7 +35,8 @@ from quell.tuning import Constraints
 
 DT, LAST, M_S = 2e-3, 300.0, 2.0
 AXIS = ql.plants.LinearPlant.of(([100.0], [1.0, 2.0, 0.0]))
-LINEAR = ("pid", "lqg", "bandwidths", "freed")
+LINEAR = ("pid", "lqg", "model-based", "bandwidths", "bandwidths-2", "bandwidths-3", "freed")
+LINEAR += ("freed-2",)
 # With a learner M_s may exceed the bound by this share.
 TOLERANCE = 0.01
 LEARNERS: dict[str, Callable[[], Any]] = {
@@ -129,15 +130,17 @@ def peaks(loop: LoopAnalysis) -> tuple[float, float]:
 def tuned(structure: str, m_s: float, m_ks: float) -> Any:
     """Return the controller of a structure with the least IAE within the bounds."""
     bounds = Constraints(m_s=m_s, m_t=None, m_ks=m_ks, damping=0.3)
-    order = {"order": 2} if structure in ("bandwidths", "freed") else {}
+    order = {"order": 2} if structure.startswith(("bandwidths", "freed")) else {}
     return ql.tune(
         AXIS, DT, structure=structure, compare=(), constraints=bounds, **order
     ).controller
 
 
-def with_learner(base: Any, make: Callable[[], Any]) -> ql.ADRC:
+def with_learner(base: Any, make: Callable[[], Any], guard: Any = None) -> ql.ADRC:
     """Return the ADRC with a learner and the feedforward of the axis."""
-    return ql.ADRC(base.observer, omega_c=base.omega_c, learner=make(), feedforward=FEEDFORWARD)
+    return ql.ADRC(
+        base.observer, omega_c=base.omega_c, learner=make(), guard=guard, feedforward=FEEDFORWARD
+    )
 
 
 def main() -> None:
@@ -151,7 +154,11 @@ def main() -> None:
     cases, parts = signals(t), plants()
     rows: dict[str, dict[str, Any]] = {}
     for structure in LINEAR:
-        controller = tuned(structure, M_S, given.m_ks)
+        try:
+            controller = tuned(structure, M_S, given.m_ks)
+        except ValueError as error:
+            print(f"{structure}: {error}")
+            continue
         m_s, m_ks = peaks(analyse(AXIS, controller))
         if isinstance(controller, ql.ADRC):
             controller = controller_without_learner(controller)
@@ -166,8 +173,9 @@ def main() -> None:
     bases = {m: tuned("freed", m, 0.97 * given.m_ks) for m in (2.0, 1.9, 1.8, 1.7, 1.6, 1.5, 1.4)}
     for label, make in LEARNERS.items():
         row: dict[str, Any] = {"m_s": 0.0, "m_ks": 0.0}
+        guarded = dict(row)
         for name, case in cases.items():
-            row[name] = np.nan
+            row[name] = guarded[name] = np.nan
             for base in bases.values():
                 controller = with_learner(base, make)
                 error, run = late_error(parts[name], controller, t, *case)
@@ -175,12 +183,22 @@ def main() -> None:
                 if m_s <= M_S * (1.0 + TOLERANCE) and m_ks <= given.m_ks * (1.0 + TOLERANCE):
                     row[name] = error
                     row["m_s"], row["m_ks"] = max(row["m_s"], m_s), max(row["m_ks"], m_ks)
+                    safe = with_learner(base, make, ql.Guard())
+                    guarded[name], _ = late_error(parts[name], safe, t, *case)
                     break
-        rows[label] = row
+        rows[label], rows[f"{label}, guarded"] = (
+            row,
+            guarded
+            | {
+                "m_s": row["m_s"],
+                "m_ks": row["m_ks"],
+            },
+        )
         show(label, row)
+        show("  guarded", rows[f"{label}, guarded"])
     for name in cases:
-        linear = np.nanmin([rows[structure][name] for structure in LINEAR])
-        learned = {label: linear / rows[label][name] for label in LEARNERS}
+        linear = np.nanmin([rows[structure][name] for structure in LINEAR if structure in rows])
+        learned = {label: linear / row[name] for label, row in rows.items() if label not in LINEAR}
         best = max(learned, key=lambda label: np.nan_to_num(learned[label]))
         print(f"{name:14} {best}: {learned[best]:.3g} times as good as the best linear controller")
     if given.json is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import OUTPUTS, Outputs, Whole
@@ -27,6 +27,8 @@ _COLUMNS = (
     Column("disturbance_peak", "peak\n[m]", 1.0, ".4f"),
     Column("disturbance_rms", "RMS\n[m]", 1.0, ".4f"),
     Column("control_variation", "variation\n[N]", 1.0, ".1f"),
+    Column("m_s", "M_s", 1.0, ".2f"),
+    Column("m_ks", "M_ks\n[N/m]", 1.0, ".0f"),
 )
 
 
@@ -94,14 +96,17 @@ def _print_scores(console: Console, result: Result) -> None:
     reset = "with" if settings.reset else "without"
     about = f"dt = {settings.dt:g} s, seed {settings.seed}, omega_o = {settings.omega_o:g} rad/s"
     headings = ("controller", *(column.heading for column in _COLUMNS))
-    scores = table(f"All controllers ({about}, {reset} reset)", *headings)
+    # With so little white space 80 columns hold all names.
+    tight: dict[str, Any] = {"padding": (0, 1, 0, 0), "pad_edge": False}
+    scores = table(f"All controllers ({about}, {reset} reset)", *headings, **tight)
     for name, score in result.scores.items():
         scores.add_row(name, *(column.cell(score) for column in _COLUMNS))
     console.print(scores)
     console.print(
         "Overshoot, settling (±0.2 %) and variation: step, 110–150 s. Peak and RMS of y − 1: force "
-        "on m2, 170–250 s. –: not settled, or diverged before. m = 2: observers without learner "
-        f"that estimate f and f', at {TWO_STATES:g} omega_o.\n"
+        "on m2, 170–250 s. M_s and M_ks at the end, with the learner's adaptation. –: not settled, "
+        "diverged before, or not stable at rest. m = 2: observers without learner that estimate f "
+        f"and f', at {TWO_STATES:g} omega_o.\n"
     )
     print_diverged(console, result.runs)
 

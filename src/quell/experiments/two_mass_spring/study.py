@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from quell.analysis.loop import analyse
+from quell.controllers.adrc.adrc import ADRC
 from quell.experiments.common.claims import Claim, ratio
 from quell.experiments.common.scores import Scores, ended_early
 from quell.experiments.two_mass_spring.gradient_range import Trial, stable_up_to, trials
@@ -83,11 +85,23 @@ def run(settings: Settings, progress: Progress | None = None) -> Result:
     jobs = [partial(simulate, plant, each, paper) for each in controllers(settings).values()]
     done = in_parallel(jobs, partial(progress, "simulating"))
     runs = dict(zip(NAMES, done, strict=True))
-    scores = {name: score(run) for name, run in runs.items()}
+    laws = controllers(settings)
+    scores = {name: score(run) | _margins(laws[name], run) for name, run in runs.items()}
     needed = {name: _bandwidth_for(settings, name == MB, scores, progress) for name in (MF, MB)}
     variations = _batch_variations(settings)
     claims = tuple(_claims(runs, scores, needed, variations))
     return Result(settings, runs, scores, claims, trials(settings, progress))
+
+
+def _margins(law: ADRC, run: Trajectory) -> Scores:
+    """Return M_s and M_ks [N/m] of the loop at the end of a run, its learner's adaptation included.
+
+    None for a run that diverged, and for a loop that is not stable at rest.
+    """
+    loop = None if run.diverged else analyse(two_mass_spring(), law, at=run)
+    if loop is None or not loop.stable:
+        return {"m_s": None, "m_ks": None}
+    return {"m_s": 1.0 / loop.margins.modulus, "m_ks": loop.noise_to_control_peak}
 
 
 def _bandwidth_for(
