@@ -14,8 +14,8 @@ _FULL_CREDIT = 0.5
 _LOUDEST = 1.2
 # A single sample costs at most this many times what a perfect one earns.
 _WORST_SAMPLE = 3.0
-# Below this ε a sample earns more, at ε = 0 so many times as much: a learner that explains all of a
-# disturbance has authority after some lags in which the disturbance is seen.
+# Below this ε a sample earns more, and β̄ follows β more quickly, at ε = 0 so many times: a learner
+# that explains all of a disturbance is heard after some lags in which the disturbance is seen.
 _MATCHING, _QUICK = 0.35, 8.0
 # M counts so many times: a sinusoid then earns half of what the best sample earns.
 _MEAN_SQUARES = 4.0
@@ -57,14 +57,13 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
     averages.newest_left += rate * (left - averages.newest_left)
     most = guard.usual_bound * sample.typical_error
     bounded = min(max(p, -most), most)
-    share = newest_share(guard, memory)
     earned = _earned(q, bounded, averages.square, tiny(guard))
     if earned > 0.0:
-        earned *= 1.0 + (_QUICK - 1.0) * max(1.0 - share / _MATCHING, 0.0)
+        earned *= quickness(guard, memory)
     sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
     missed = respond(guard, memory, MISSED, q)
     _earn_at_y(guard, memory, missed, respond(guard, memory, EXPLAINED, bounded), is_new)
-    if share > 1.0:
+    if newest_share(guard, memory) > 1.0:
         # The learner adds to q: what y shows late, q shows at once.
         sample.credit_at_y = max(sample.credit_at_y + guard.earn * min(earned, 0.0), -1.0)
     _keep_account(guard, memory, missed, is_new)
@@ -90,7 +89,7 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new
     averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
     averages.missed = min(averages.missed, _MOST_PAST * averages.square)
     gain = (2.0 * missed - _OWN_SQUARES * own) * own
-    allowed = _LOAN * averages.missed
+    allowed = _LOAN * max(averages.missed, averages.seen)
     # What a learner did in a burst says nothing, as J does not follow it.
     gain = averages.gained + (0.0 if is_burst else rate * (gain - averages.gained))
     averages.gained = min(max(gain, -_LARGEST_DEBT * allowed), averages.missed)
@@ -131,10 +130,18 @@ def newest_share(guard: GuardDesign, memory: GuardMemory) -> float:
 
 
 @kernel
+def quickness(guard: GuardDesign, memory: GuardMemory) -> float:
+    """Return how many times as quickly a learner is heard that closely matches q at present."""
+    return 1.0 + (_QUICK - 1.0) * max(1.0 - newest_share(guard, memory) / _MATCHING, 0.0)
+
+
+@kernel
 def removed_share(guard: GuardDesign, memory: GuardMemory) -> float:
     """Return R."""
     averages = memory.averages[0]
-    return averages.gained / max(averages.missed, tiny(guard))
+    # J follows a load that begins only after ten lags: harm is compared with M_y until then.
+    past = averages.missed if averages.gained > 0.0 else max(averages.missed, averages.seen)
+    return averages.gained / max(past, tiny(guard))
 
 
 @kernel

@@ -70,7 +70,8 @@ an absurd measurement is forgotten.
 Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
 removed; the factor is for plants on which a correction acts more strongly than on the observer's
 model. While R < −0.01 the credit is −1: whoever has added one percent to the squared error begins
-anew.
+anew. J follows a load that begins only after some ten lags, so a negative A is compared with M_y,
+the mean of (ℓ q)² over T, where that is larger.
 
 **Width.** The bound b is κ_0 e for a learner with R ≥ 0.3, and less for one that has removed less;
 κ_0 = 1.2, or κ if that is less. After a jump of f, (1 − F) f is twice what q shows of it, and b
@@ -95,7 +96,9 @@ and what the bound took is made up for while the target is still near:
     f_L = f_L^F + e_L,        target ← target + dt/(7 lags) (f_L − target)
 
 β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
-what is constant in e_L. At β = 1 it comes nearer by 0.05/30 lags at least, so that it reaches 1.
+what is constant in e_L. It follows as many times as quickly as a sample earns more, up to eight: a
+learner that explains nearly all of q is not what moves its β. At β = 1 it comes nearer by 0.05/30
+lags at least, so that it reaches 1.
 The constant part of f_L is free. A target that is more than 1000 e from β̄g approaches it by e in
 1000 lags, so that rounding errors stay small.
 
@@ -132,6 +135,7 @@ from quell.guard.bound import bounds_of, update_bound
 from quell.guard.credit import (
     authority_of,
     judge,
+    quickness,
     removed_share,
     respond,
     withdraw_authority,
@@ -224,7 +228,7 @@ def _limit(
     authority, sample.reason = authority_of(guard, memory, removed)
     sample.authority = authority
     missing = authority - sample.share
-    more = guard.smooth * missing
+    more = guard.smooth * quickness(guard, memory) * missing
     if authority >= 1.0:
         more = min(max(more, guard.smooth * _LAST_SHARE), missing)
     sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
