@@ -12,15 +12,9 @@ from quell.kernels.dispatch import kernel
 _FULL_CREDIT = 0.5
 # Largest energy of p in units of that of q: p of a good learner is at most a little too large.
 _LOUDEST = 1.2
-# A single sample costs at most this many times what a perfect one earns.
-_WORST_SAMPLE = 3.0
 # Below this ε a sample earns more, and β̄ follows β more quickly, at ε = 0 so many times: a learner
 # that explains all of a disturbance is heard after some lags in which the disturbance is seen.
 _MATCHING, _QUICK = 0.35, 8.0
-# M counts so many times: a sinusoid then earns half of what the best sample earns.
-_MEAN_SQUARES = 4.0
-# Samples below this share of P count less for S, because q at rest is noise.
-_NOISE = 0.4
 # Factor of (ℓ e_L)² in the account: the plant's gain may be so many times b0.
 _OWN_SQUARES = 1.5
 # Share by which a learner may make the squared error larger, and least R, as a multiple of it: R
@@ -28,14 +22,7 @@ _OWN_SQUARES = 1.5
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
 # Largest J in units of M: an absurd past counts for little.
 _MOST_PAST = 1e4
-# RMS of q in units of o from which it may be the learner's own doing, and until which authority is
-# withheld; the share of the square of the first that such a learner leaves at least.
-_OWN_DOING, _GONE, _LEFT = 2.0, 1.3, 0.05
-# Of higher order, withholding authority moves y more than what it ends.
-_HIGHEST_ORDER = 3
-
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
-_WITHHELD = int(Reason.WITHHELD)
 
 
 @kernel
@@ -43,16 +30,11 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
     """Update averages, credit and account with q and p, of which one is not zero."""
     averages, sample = memory.averages[0], memory.sample[0]
     qq, pp = q * q, p * p
-    energy = qq + pp
     is_new = sample.samples * guard.forget < 1.0
     averages.square = _mean_square(guard, averages.square, qq, guard.forget, is_new)
     left, rate = (q - p) * (q - p), guard.forget_match
     averages.square_left = _mean_square(guard, averages.square_left, left, guard.forget, is_new)
-    averages.loudness += (
-        guard.forget
-        * min(energy / (_NOISE * sample.peak) ** 2, 1.0)
-        * (pp / energy - averages.loudness)
-    )
+    averages.loudness += guard.forget * (pp / (qq + pp) - averages.loudness)
     averages.newest_error += rate * (qq - averages.newest_error)
     averages.newest_left += rate * (left - averages.newest_left)
     most = guard.usual_bound * sample.typical_error
@@ -118,8 +100,7 @@ def _mean_square(
 @kernel
 def _earned(q: float, p: float, mean_square: float, least: float) -> float:
     """Return what a sample earns in which q − p is left of q."""
-    earned = (2.0 * q - p) * p / max(q * q, _MEAN_SQUARES * mean_square, least)
-    return max(earned, -_WORST_SAMPLE)
+    return (2.0 * q - p) * p / max(q * q, mean_square, least)
 
 
 @kernel
@@ -145,26 +126,12 @@ def removed_share(guard: GuardDesign, memory: GuardMemory) -> float:
 
 
 @kernel
-def _is_own_doing(guard: GuardDesign, memory: GuardMemory) -> bool:
-    """Return whether q is so large beside o that learner and loop may keep it up together."""
-    averages, sample = memory.averages[0], memory.sample[0]
-    if guard.stages > _HIGHEST_ORDER:
-        return False
-    if sample.authority > 0.0:
-        own_doing = (_OWN_DOING * sample.outside) ** 2
-        return averages.square > own_doing and averages.square_left > _LEFT * own_doing
-    return averages.square > (_GONE * sample.outside) ** 2
-
-
-@kernel
 def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[float, int]:
     """Return β and the reason for it; ``removed`` is R."""
     loudness, sample = memory.averages[0].loudness, memory.sample[0]
     earned = min(max(sample.credit, sample.credit_at_y) / _FULL_CREDIT, 1.0 + removed / _LOAN)
     if earned <= 0.0:
         return 0.0, _UNPROVEN
-    if _is_own_doing(guard, memory):
-        return 0.0, _WITHHELD
     scaled = _LOUDEST * (1.0 - loudness) / max(loudness, tiny(guard))
     if scaled < min(earned, 1.0):
         return scaled, _TOO_LOUD
