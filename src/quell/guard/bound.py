@@ -8,10 +8,6 @@ from quell.kernels.dispatch import kernel
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
 # judges them as a set on other seeds (docs/theory).
-# Credit that e costs when it grows by a factor of 2.7 while the learner acts. In the five lags that
-# this takes at least, a learner that explains a sinusoidal load earns a quarter, and up to two if
-# it explains all of it.
-_GROWTH_COST = 0.35
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
 # The bound becomes wider with R, wholly at the first, and where ε is below the second, wholly at
@@ -36,15 +32,10 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     more = guard.rise * (error - peak) if error > peak else -guard.decay * peak
     peak = carried_sum(guard, memory, PEAK, peak, more)
     sample.peak = max(peak, tiny(guard))
-    learner_acts = sample.authority > 0.0
     more = max(guard.rise * (error - size), 0.0)
-    grown = size + (min(more, guard.growth * size) if learner_acts else more)
-    grown = min(grown, sample.peak)
-    if learner_acts and grown > size:
-        cost = _GROWTH_COST * (grown - size) / size
-        sample.credit -= cost
-        sample.credit_at_y -= cost
-    sample.typical_error = max(grown, tiny(guard))
+    if sample.authority > 0.0:
+        more = min(more, guard.growth * size)
+    sample.typical_error = max(min(size + more, sample.peak), tiny(guard))
 
 
 @kernel

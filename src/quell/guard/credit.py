@@ -12,6 +12,8 @@ from quell.kernels.dispatch import kernel
 _FULL_CREDIT = 0.5
 # Largest energy of p in units of that of q: p of a good learner is at most a little too large.
 _LOUDEST = 1.2
+# A single sample costs at most this many times what a perfect one earns.
+_WORST_SAMPLE = 3.0
 # Below this ε a sample earns more, and β̄ follows β more quickly, at ε = 0 so many times: a learner
 # that explains all of a disturbance is heard after some lags in which the disturbance is seen.
 _MATCHING, _QUICK = 0.35, 8.0
@@ -20,8 +22,6 @@ _OWN_SQUARES = 1.5
 # Share by which a learner may make the squared error larger, and least R, as a multiple of it: R
 # comes back from there within 200 lags.
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
-# Largest J in units of M: an absurd past counts for little.
-_MOST_PAST = 1e4
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
 
 
@@ -69,7 +69,6 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new
     own, rate = memory.sample[0].late_effect, guard.forget_account
     is_burst = not is_new and rate * (square - averages.missed) > guard.rise * averages.missed
     averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
-    averages.missed = min(averages.missed, _MOST_PAST * averages.square)
     gain = (2.0 * missed - _OWN_SQUARES * own) * own
     allowed = _LOAN * max(averages.missed, averages.seen)
     # What a learner did in a burst says nothing, as J does not follow it.
@@ -100,7 +99,7 @@ def _mean_square(
 @kernel
 def _earned(q: float, p: float, mean_square: float, least: float) -> float:
     """Return what a sample earns in which q − p is left of q."""
-    return (2.0 * q - p) * p / max(q * q, mean_square, least)
+    return max((2.0 * q - p) * p / max(q * q, mean_square, least), -_WORST_SAMPLE)
 
 
 @kernel

@@ -10,14 +10,9 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 
     q = F (f − f^F) = f_plain − f_plain^F,        p = F v,        v = g − g^F
 
-**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. e rises to |q| as P
-does; while the learner acts it grows by a factor of 2.7 in five lags at most, which costs credit:
-
-    e ≤ P,        C ← C − 0.35 Δe/e
-
-So a learner that causes what it then explains does not raise e again and again. And credit that was
-earned with small errors does not suffice for large ones: a learner that explains them as well earns
-more than the growth of e costs.
+**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. ``e ≤ P`` rises to |q|
+as P does; while the learner acts it grows by a factor of 2.7 in five lags at most. So a learner that
+causes what it then explains does not raise e at once.
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
@@ -29,8 +24,7 @@ raise slowly:
 q is an n-th derivative of y, and mostly noise where y has some. C_y is such a credit at y, of ℓ q
 and ℓ p̄ in place of q and p̄ (ℓ: account, below), without the eight times: ℓ q changes so slowly
 that a close match over 1.5 lags is no evidence. y shows late what q shows at once, so C_y pays what
-C pays while ε > 1, that is, while the learner adds to q. Both pay for growth of e, and both are −1
-while R < −0.01.
+C pays while ε > 1, that is, while the learner adds to q. Both are −1 while R < −0.01.
 
 C and C_y start at −1. For C, a learner that explains q nearly completely earns up to eight times as
 much: 1 + 7 clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below);
@@ -50,8 +44,7 @@ q is a lag of the observer late, so d is ``ℓ e_L`` through a first-order lag o
 ``ℓ e_L`` of now, right corrections of disturbances with a period below some nine lags would count
 as harm.
 
-J follows a burst no more quickly than M does, and A does not follow it; J is at most 10⁴ M, so that
-an absurd measurement is forgotten.
+J follows a burst no more quickly than M does, and A does not follow it.
 
 Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
 removed; the factor is for plants on which a correction acts more strongly than on the observer's
