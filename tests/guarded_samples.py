@@ -19,7 +19,7 @@ def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
     design = ql.Guard().design(observer)
     memory = ql.Guard().memory(design)
     memory.sample[0].credit = memory.sample[0].share = 1.0
-    memory.sample[0].typical_error = memory.sample[0].peak = e
+    memory.sample[0].typical_error = memory.sample[0].peak = memory.sample[0].outside = e
     memory.averages[0].missed, memory.averages[0].gained = e**2, 0.5 * e**2
     return design, memory
 

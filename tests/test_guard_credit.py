@@ -71,6 +71,44 @@ def test_the_authority_is_what_a_learner_has_earned(
     assert memory.sample[0].reason == reason
 
 
+@pytest.mark.parametrize(
+    ("square", "left", "before", "authority"),
+    [
+        (4.1, 0.21, 1.0, 0.0),
+        (3.9, 0.21, 1.0, 1.0),  # q is not large beside o
+        (4.1, 0.19, 1.0, 1.0),  # the learner explains nearly all of q
+        (1.7, 0.0, 0.0, 0.0),  # withheld until q is small, whatever the learner says
+        (1.68, 0.0, 0.0, 1.0),
+    ],
+)
+@pytest.mark.parametrize("o", [1.0, 1e-3])
+def test_authority_is_withheld_while_q_may_be_the_learner_s_own_doing(
+    square: float, left: float, before: float, authority: float, o: float
+) -> None:
+    """From M > (2 o)² and M_left > 0.05 (2 o)² on, until M < (1.3 o)²; not for n = 4."""
+    for order in (1, 3, 4):
+        guard, observer = ql.Guard(), ql.ESO.model_free(order, b0=1.0, omega_o=10.0, dt=5e-3)
+        design = guard.design(observer)
+        memory = guard.memory(design)
+        sample, averages = memory.sample[0], memory.averages[0]
+        sample.credit, sample.authority, sample.outside = 1.0, before, o
+        averages.square, averages.square_left = square * o**2, left * o**2
+        averages.missed, averages.gained = 1.0, 0.5
+        limit(design, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
+        assert sample.authority == (1.0 if order == 4 else authority)
+        assert (sample.reason == ql.Reason.WITHHELD) == (sample.authority == 0.0)
+        assert sample.credit == 1.0
+
+
+def test_without_authority_the_guard_soon_forgets_what_the_learner_did() -> None:
+    """c_L decays within ten lags, and within one where the learner is not heard."""
+    design, memory = trusted()
+    for authority, lags in ((1.0, 10.0), (0.0, 1.0)):
+        memory.sample[0].own_peak, memory.sample[0].authority = 1.0, authority
+        record_output(design, memory, 0.0)
+        assert memory.sample[0].own_peak == pytest.approx(math.exp(-5e-3 / (lags * 0.5)))
+
+
 def test_a_learner_that_turns_is_seen_within_five_lags() -> None:
     """With g = f nothing of q is left; with g = −f from then on, more than twice q."""
     design, memory = trusted()
@@ -132,13 +170,13 @@ def test_what_a_learner_does_to_a_load_that_begins_is_compared_with_that_load() 
 
 
 def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
-    """M, S, C, C_y, J, A, P and e by the module's equations, with outliers and small samples."""
+    """M, S, C, C_y, J, A, P, o, c_L and e by the module's equations, with outliers and small samples."""
     guard = ql.Guard(time=0.4)
     design, memory = guard.design(OBSERVER), guard.memory(guard.design(OBSERVER))
     forget, lag = -math.expm1(-5e-3 / 0.4), 5 / 10.0
     rise, decay, growth = (-math.expm1(-5e-3 / (lags * lag)) for lags in (0.7, 200.0, 5.0))
     left, s, credit, peak, e, f_shown = 0.0, 0.5, -1.0, 0.0, 0.0, 0.0
-    shadow, square = np.zeros((1, 5)), 0.0
+    shadow, square, outside, own = np.zeros((1, 5)), 0.0, 0.0, 0.0
     # Without the gains of a law, y is taken to respond as f̂ does, within four lags.
     respond, stages, missed, gained = -math.expm1(-5e-3 / lag), np.zeros((3, 4)), 0.0, 0.0
     at_y, seen, paid = -1.0, 0.0, 0
@@ -160,6 +198,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         if more > 0.0:
             e += min(more, growth * e) if acts else more
         e = min(e, peak)
+        outside = min(outside + max(rise * (large - 1.5 * own - outside), 0.0), peak)
         more = forget * ((q - p) ** 2 - left)
         left += more if (k + 1) * forget < 1.0 else min(more, rise * left)
         s += forget * (p * p / (q * q + p * p) - s)
@@ -198,7 +237,9 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
             gained = memory.averages[0].gained = -0.015 * max(missed, seen)
         sample, averages = memory.sample[0], memory.averages[0]
         np.testing.assert_allclose(
-            [sample.peak, sample.typical_error, sample.credit], [peak, e, credit], rtol=1e-9
+            [sample.peak, sample.typical_error, sample.outside, sample.credit],
+            [peak, e, outside, credit],
+            rtol=1e-9,
         )
         np.testing.assert_allclose([averages.missed, averages.gained], [missed, gained], rtol=1e-6)
         assert sample.credit_at_y == pytest.approx(at_y, rel=1e-6, abs=1e-9)
@@ -211,7 +252,10 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
             stages[1, i] += respond * (value - stages[1, i])
             value = stages[1, i]
         late += -math.expm1(-5e-3 / lag) * (value - late)
+        remembered = 10.0 if sample.authority > 0.0 else 1.0
+        own = max(abs(f_learned - f_shown), math.exp(-5e-3 / (remembered * lag)) * own)
         record_output(design, memory, f_learned)
+        assert sample.own_peak == pytest.approx(own, rel=1e-9)
         f_shown = lag_push(design.lag, shadow, 0, f_learned)
     assert begun_anew > 5, "the account never ran out: the test says nothing"
     assert paid > 5, "nothing was added to q: the test says nothing"

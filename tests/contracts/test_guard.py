@@ -195,7 +195,7 @@ def test_without_authority_nothing_acts_after_ten_lags(name: str, sensor: str) -
     for k in range(6 * ten_lags):
         trusted = k < 2 * ten_lags
         sample.credit, sample.typical_error = (1.0, 1.0) if trusted else (-1.0, 1.0)
-        sample.peak = 1.0
+        sample.peak = sample.outside = 1.0
         f_learned, _, _ = limit(design, memory, 1.0, shown, rng.normal(), 0.0, 0.0)
         if not trusted and k > 3 * ten_lags:
             assert f_learned == memory.shown[F_L]

@@ -10,6 +10,8 @@ from quell.kernels.dispatch import kernel
 # judges them as a set on other seeds (docs/theory).
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
+# c_L counts so many times for o: less would let motion that learner and loop make together raise o.
+_OWN = 1.5
 # The bound becomes wider with R, wholly at the first, and where ε is below the second, wholly at
 # half of it.
 _WIDE, _CLOSE = 0.1, 0.8
@@ -23,7 +25,7 @@ _MOST_ASKED, _SLOWER, _TRIES = 4.0, 0.85, 16
 
 @kernel
 def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
-    """Update P and e with |q|."""
+    """Update P, o and e with |q|."""
     sample = memory.sample[0]
     peak, size = sample.peak, sample.typical_error
     # After T an outlier counts for 5 P at most: one bad measurement must not open all bounds.
@@ -36,6 +38,8 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     if sample.authority > 0.0:
         more = min(more, guard.growth * size)
     sample.typical_error = max(min(size + more, sample.peak), tiny(guard))
+    more = guard.rise * (error - _OWN * sample.own_peak - sample.outside)
+    sample.outside = min(sample.outside + max(more, 0.0), sample.peak)
 
 
 @kernel

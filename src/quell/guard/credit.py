@@ -22,7 +22,14 @@ _OWN_SQUARES = 1.5
 # Share by which a learner may make the squared error larger, and least R, as a multiple of it: R
 # comes back from there within 200 lags.
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
+# RMS of q in units of o from which it may be the learner's own doing, and until which authority is
+# withheld; the share of the square of the first that such a learner leaves at least.
+_OWN_DOING, _GONE, _LEFT = 2.0, 1.3, 0.05
+# Of higher order, authority that is withheld, or comes quickly, moves y too much.
+HIGHEST_ORDER = 3
+
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
+_WITHHELD = int(Reason.WITHHELD)
 
 
 @kernel
@@ -125,12 +132,26 @@ def removed_share(guard: GuardDesign, memory: GuardMemory) -> float:
 
 
 @kernel
+def _is_own_doing(guard: GuardDesign, memory: GuardMemory) -> bool:
+    """Return whether q is so large beside o that learner and loop may keep it up together."""
+    averages, sample = memory.averages[0], memory.sample[0]
+    if guard.stages > HIGHEST_ORDER:
+        return False
+    if sample.authority > 0.0:
+        own_doing = (_OWN_DOING * sample.outside) ** 2
+        return averages.square > own_doing and averages.square_left > _LEFT * own_doing
+    return averages.square > (_GONE * sample.outside) ** 2
+
+
+@kernel
 def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[float, int]:
     """Return β and the reason for it; ``removed`` is R."""
     loudness, sample = memory.averages[0].loudness, memory.sample[0]
     earned = min(max(sample.credit, sample.credit_at_y) / _FULL_CREDIT, 1.0 + removed / _LOAN)
     if earned <= 0.0:
         return 0.0, _UNPROVEN
+    if _is_own_doing(guard, memory):
+        return 0.0, _WITHHELD
     scaled = _LOUDEST * (1.0 - loudness) / max(loudness, tiny(guard))
     if scaled < min(earned, 1.0):
         return scaled, _TOO_LOUD

@@ -28,6 +28,8 @@ _CREDIT_TIME = 2.0 / 3.0
 _RISE_LAGS, _DECAY_LAGS = 0.7, 200.0
 # e grows by a factor of 2.7 in this time while the learner acts.
 _GROWTH_LAGS = 5.0
+# Memory of c_L, the learner's newest largest correction.
+_OWN_LAGS = 10.0
 # β̄ follows β over this time.
 _SMOOTHING_LAGS = 30.0
 # The target returns to f_L over this time, where the bound keeps them apart.
@@ -129,6 +131,7 @@ class Guard:
             growth=share(_GROWTH_LAGS),
             bound=bound,
             usual_bound=min(bound, _USUAL_BOUND),
+            own_decay=1.0 - share(_OWN_LAGS),
             within_lag=share(1.0),
             smooth=share(_SMOOTHING_LAGS),
             leak=share(_LEAK_LAGS),

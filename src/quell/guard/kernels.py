@@ -10,9 +10,21 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 
     q = F (f − f^F) = f_plain − f_plain^F,        p = F v,        v = g − g^F
 
-**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. ``e ≤ P`` rises to |q|
-as P does; while the learner acts it grows by a factor of 2.7 in five lags at most. So a learner that
-causes what it then explains does not raise e at once.
+**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. ``e ≤ P`` rises to
+|q| as P does; while the learner acts it grows by a factor of 2.7 in five lags at most. So a learner
+that causes what it then explains does not raise e at once.
+
+**Withheld.** Friction lets learner and loop keep each other moving: the learner explains much of a
+motion that would not be there without it. o ≤ P, the error that is certainly not the learner's,
+rises to |q| − 1.5 c_L as P rises to |q|, with the largest recent correction ``c_L ← max(|e_L|,
+λ c_L)``. Authority is withheld where q is large beside o, to see whether the motion goes on: with
+M, the mean of q² (below), and M_left, that of (q − p)²,
+
+    β = 0  from  M > (2 o)² and M_left > 0.05 (2 o)²  on, until  M < (1.3 o)²
+
+λ is that of ten lags, without authority that of one, so that o soon follows |q| if the error was
+not the learner's; if it was, M decays. Only for r ≤ 3: of higher order, what a gap in e_L does to y
+is worse.
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
@@ -72,8 +84,8 @@ and what the bound took is made up for while the target is still near:
     f_L = f_L^F + e_L,        target ← target + dt/(7 lags) (f_L − target)
 
 β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
-what is constant in e_L. It follows as many times as quickly as a sample earns more, up to eight: a
-learner that explains nearly all of q is not what moves its β.
+what is constant in e_L. For r ≤ 3 it follows as many times as quickly as a sample earns more, up to
+eight: a learner that explains nearly all of q is not what moves its β.
 The constant part of f_L is free. A target that is more than 1000 e from β̄g approaches it by e in
 1000 lags, so that rounding errors stay small.
 
@@ -108,6 +120,7 @@ from quell.guard.base import (
 )
 from quell.guard.bound import bounds_of, update_bound
 from quell.guard.credit import (
+    HIGHEST_ORDER,
     authority_of,
     judge,
     quickness,
@@ -200,7 +213,8 @@ def _limit(
     removed = removed_share(guard, memory)
     authority, sample.reason = authority_of(guard, memory, removed)
     sample.authority = authority
-    more = guard.smooth * quickness(guard, memory) * (authority - sample.share)
+    quick = quickness(guard, memory) if guard.stages <= HIGHEST_ORDER else 1.0
+    more = quick * guard.smooth * (authority - sample.share)
     sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
     if is_single(guard.forget):
         step = sample.share * (output - before)
@@ -235,6 +249,8 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
         shown[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
     effect = respond(guard, memory, CORRECTED, correction)
     sample.late_effect += guard.within_lag * (effect - sample.late_effect)
+    decay = guard.own_decay if sample.authority > 0.0 else 1.0 - guard.within_lag
+    sample.own_peak = max(abs(correction), decay * sample.own_peak)
     if sample.authority > 0.0:
         sample.taking_back = guard.taking_back
         more = guard.leak * (f_learned - sample.target)
@@ -267,7 +283,7 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     for i in range(memory.shown.size):
         memory.shown[i] = 0.0
     sample.output = sample.target = sample.unsettled = 0.0
-    sample.late_effect = sample.taking_back = 0.0
+    sample.own_peak = sample.late_effect = sample.taking_back = 0.0
     # The next output has none before it: it is a constant.
     sample.share = -abs(sample.share)
 

@@ -33,6 +33,7 @@ class GuardDesign(NamedTuple):
     growth: float  # largest share by which e grows in a sample while the learner acts
     bound: float  # κ
     usual_bound: float  # κ_0: κ of a learner that leaves a good part of the error
+    own_decay: float  # λ
     within_lag: float  # share by which d follows ℓ e_L in a sample, with one lag as time constant
     smooth: float  # share by which β̄ follows β in a sample
     leak: float  # share of its distance to f_L that the target loses in a sample
@@ -66,6 +67,8 @@ class GuardSample(Scalars):
     share: float  # β̄: β, smoothed; negative if there is no output of a sample before
     peak: float  # P [y-unit/s^n]
     typical_error: float  # e [y-unit/s^n]
+    outside: float  # o [y-unit/s^n]
+    own_peak: float  # c_L [y-unit/s^n]
     late_effect: float  # d: ℓ e_L, as late as q [y-unit/s^n]
     output: float  # g [y-unit/s^n]
     target: float  # target of f_L [y-unit/s^n]

@@ -24,6 +24,7 @@ _ESTIMATES = {"f_hat": "estimate of f", "f_learned": "learned share", "f_residua
 _MARKED = (
     Reason.TOO_LOUD,
     Reason.OUT_OF_BOUNDS,
+    Reason.WITHHELD,
     Reason.EXPLODED,
     Reason.NOT_FINITE,
 )
