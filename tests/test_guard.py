@@ -246,6 +246,7 @@ def test_a_guard_with_kappa_of_the_usual_bound_has_no_wider_one() -> None:
     assert ql.Guard(bound=5.0).design(observer).usual_bound == 1.2
     design, memory = trusted()
     for bound, expected in ((1.2, 1.2), (0.5, 0.5), (2.0, 2.0)):
+        memory.averages[0].newest_left = 0.0
         narrower = design._replace(bound=bound, usual_bound=min(bound, 1.2))
         limit(narrower, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
         assert bounds(narrower, memory)[1] == pytest.approx(expected)
@@ -271,7 +272,7 @@ def test_a_guard_that_starts_again_is_a_new_one(rng: np.random.Generator) -> Non
 
 
 def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() -> None:
-    """After a NaN it is unheard for at least half as long as at the start, though it is right; what it did is undone."""
+    """After a NaN it is unheard for T_C/8, the least time in which credit is earned, though it is right; what it did is undone."""
     design = ql.Guard(time=2.0).design(OBSERVER)
     memory = ql.Guard(time=2.0).memory(design)
     chain, shown, f_shown, heard = np.zeros((2, 5)), 0.0, 0.0, []
@@ -294,7 +295,8 @@ def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() 
         f_shown = lag_push(design.lag, chain, 1, kept)
     again = heard[3001:].index(True)
     assert heard[2999]
-    assert 0.5 < again / heard.index(True) < 4.0
+    least = round(2.0 / 3.0 * 2.0 / 8.0 / OBSERVER.dt)
+    assert least <= again < 4.0 * heard.index(True)
 
 
 @pytest.mark.parametrize(

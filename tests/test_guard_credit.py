@@ -289,14 +289,14 @@ def test_a_learner_that_adds_to_slow_errors_is_hardly_heard_however_well_it_expl
     """
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=2e-2)
     gains = ql.ADRC(observer, omega_c=1.0).parameters.law
-    guard = ql.Guard(time=2.0)
+    guard = ql.Guard()
     t = observer.dt * np.arange(5_000)
     quick, load = np.sin(3.0 * t), 5.0 * np.sin(0.1 * t)
     for sign, heard in ((1.0, True), (-1.0, False)):
         design = guard.design(observer, gains)
         memory = guard.memory(design)
         authority = np.mean(feed(design, memory, quick + load, quick + sign * load)[2_500:])
-        assert authority > 0.99 if heard else authority < 0.05
+        assert authority > 0.99 if heard else authority < 0.1
 
 
 def test_a_learner_is_heard_in_noise_that_y_hardly_shows(rng: np.random.Generator) -> None:
