@@ -70,6 +70,16 @@ def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None
             )
 
 
+def test_full_authority_is_reached_and_not_only_approached() -> None:
+    """β̄ moves by 0.05/30 lags at least while β is 1: a learner that is right loses nothing in the end."""
+    design, memory = trusted()
+    memory.sample[0].share = 0.95
+    for _ in range(round(1.01 * 30.0 * 0.5 / 5e-3)):
+        limit(design, memory, 1.0, 0.0, 0.5, 0.0, 0.0)
+        memory.sample[0].target = 0.5
+    assert memory.sample[0].share == 1.0
+
+
 def test_the_authority_follows_a_close_match_eight_times_as_quickly() -> None:
     """β̄ comes nearer to β over 30 lags where the learner leaves 0.35 of q² or more, over 30/8 where it leaves nothing; not for n = 4."""
     cases = ((2, 0.0, 8.0), (2, 0.175, 4.5), (2, 0.35, 1.0), (2, 2.0, 1.0), (4, 0.0, 1.0))

@@ -85,7 +85,8 @@ and what the bound took is made up for while the target is still near:
 
 β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
 what is constant in e_L. For r ≤ 3 it follows as many times as quickly as a sample earns more, up to
-eight: a learner that explains nearly all of q is not what moves its β.
+eight: a learner that explains nearly all of q is not what moves its β. At β = 1 it comes nearer by
+0.05/30 lags at least, so that it reaches 1.
 The constant part of f_L is free. A target that is more than 1000 e from β̄g approaches it by e in
 1000 lags, so that rounding errors stay small.
 
@@ -151,6 +152,8 @@ from quell.types import Vector
 
 # An output that is so many times larger than f is cut off.
 _CUT_OFF = 100.0
+# With full authority β̄ comes nearer to 1 as if at least so much were missing, and so reaches it.
+_LAST_SHARE = 0.05
 # The target approaches β̄g only from a distance of so many e on: where it is does not matter, but
 # rounding must not.
 _FAR = 1000.0
@@ -214,7 +217,10 @@ def _limit(
     authority, sample.reason = authority_of(guard, memory, removed)
     sample.authority = authority
     quick = quickness(guard, memory) if guard.stages <= HIGHEST_ORDER else 1.0
-    more = quick * guard.smooth * (authority - sample.share)
+    missing = authority - sample.share
+    more = quick * guard.smooth * missing
+    if authority >= 1.0:
+        more = min(max(more, guard.smooth * _LAST_SHARE), missing)
     sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
     if is_single(guard.forget):
         step = sample.share * (output - before)
