@@ -21,6 +21,8 @@ def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
     memory.sample[0].credit = memory.sample[0].share = 1.0
     memory.sample[0].typical_error = memory.sample[0].peak = memory.sample[0].outside = e
     memory.averages[0].missed, memory.averages[0].gained = e**2, 0.5 * e**2
+    # At present it explains as much as it adds: neither a wider bound nor a narrower one.
+    memory.averages[0].newest_error = memory.averages[0].newest_left = e**2
     return design, memory
 
 

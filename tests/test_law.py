@@ -135,14 +135,14 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     state.loop[0].offset = 1.0
     guard = state.guard.sample[0]
     assert guard.output != 0.0
-    guard.target = guard.own_peak = 0.5
+    guard.target = guard.late_effect = 0.5
     theta, authority, share = state.learner.theta.copy(), guard.authority, guard.share
     reset_loop(design, state)
     assert not np.any(state.loop.view(float))
     filters = (state.guard.chain, state.guard.shown, state.guard.effects, state.learner.chain)
     for each in (state.shadow, *filters):
         assert not np.any(each)
-    assert (guard.output, guard.target, guard.own_peak, guard.late_effect) == (0.0,) * 4
+    assert (guard.output, guard.target, guard.late_effect) == (0.0,) * 3
     assert guard.share == -share
     assert guard.authority == authority
     np.testing.assert_array_equal(state.learner.theta, theta)

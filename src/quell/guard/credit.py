@@ -14,25 +14,19 @@ _FULL_CREDIT = 0.5
 _LOUDEST = 1.2
 # A single sample costs at most this many times what a perfect one earns.
 _WORST_SAMPLE = 3.0
-# Below this ε a sample earns more, at ε = 0 so many times as much: a learner that explains all of a
-# disturbance has authority after some lags in which the disturbance is seen.
+# Below this ε a sample earns more, and β̄ follows β more quickly, at ε = 0 so many times: a learner
+# that explains all of a disturbance is heard after some lags in which the disturbance is seen.
 _MATCHING, _QUICK = 0.35, 8.0
-# M counts so many times: a sinusoid then earns half of what the best sample earns.
-_MEAN_SQUARES = 4.0
-# Samples below this share of P count less for S, because q at rest is noise.
-_NOISE = 0.4
 # Factor of (ℓ e_L)² in the account: the plant's gain may be so many times b0.
 _OWN_SQUARES = 1.5
 # Share by which a learner may make the squared error larger, and least R, as a multiple of it: R
 # comes back from there within 200 lags.
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
-# Largest J in units of M: an absurd past counts for little.
-_MOST_PAST = 1e4
 # RMS of q in units of o from which it may be the learner's own doing, and until which authority is
 # withheld; the share of the square of the first that such a learner leaves at least.
 _OWN_DOING, _GONE, _LEFT = 2.0, 1.3, 0.05
-# Of higher order, withholding authority moves y more than what it ends.
-_HIGHEST_ORDER = 3
+# Of higher order, authority that is withheld, or comes quickly, moves y too much.
+HIGHEST_ORDER = 3
 
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
 _WITHHELD = int(Reason.WITHHELD)
@@ -43,28 +37,22 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
     """Update averages, credit and account with q and p, of which one is not zero."""
     averages, sample = memory.averages[0], memory.sample[0]
     qq, pp = q * q, p * p
-    energy = qq + pp
     is_new = sample.samples * guard.forget < 1.0
     averages.square = _mean_square(guard, averages.square, qq, guard.forget, is_new)
     left, rate = (q - p) * (q - p), guard.forget_match
     averages.square_left = _mean_square(guard, averages.square_left, left, guard.forget, is_new)
-    averages.loudness += (
-        guard.forget
-        * min(energy / (_NOISE * sample.peak) ** 2, 1.0)
-        * (pp / energy - averages.loudness)
-    )
+    averages.loudness += guard.forget * (pp / (qq + pp) - averages.loudness)
     averages.newest_error += rate * (qq - averages.newest_error)
     averages.newest_left += rate * (left - averages.newest_left)
     most = guard.usual_bound * sample.typical_error
     bounded = min(max(p, -most), most)
-    share = newest_share(guard, memory)
     earned = _earned(q, bounded, averages.square, tiny(guard))
     if earned > 0.0:
-        earned *= 1.0 + (_QUICK - 1.0) * max(1.0 - share / _MATCHING, 0.0)
+        earned *= quickness(guard, memory)
     sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
     missed = respond(guard, memory, MISSED, q)
     _earn_at_y(guard, memory, missed, respond(guard, memory, EXPLAINED, bounded), is_new)
-    if share > 1.0:
+    if newest_share(guard, memory) > 1.0:
         # The learner adds to q: what y shows late, q shows at once.
         sample.credit_at_y = max(sample.credit_at_y + guard.earn * min(earned, 0.0), -1.0)
     _keep_account(guard, memory, missed, is_new)
@@ -88,9 +76,8 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new
     own, rate = memory.sample[0].late_effect, guard.forget_account
     is_burst = not is_new and rate * (square - averages.missed) > guard.rise * averages.missed
     averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
-    averages.missed = min(averages.missed, _MOST_PAST * averages.square)
     gain = (2.0 * missed - _OWN_SQUARES * own) * own
-    allowed = _LOAN * averages.missed
+    allowed = _LOAN * max(averages.missed, averages.seen)
     # What a learner did in a burst says nothing, as J does not follow it.
     gain = averages.gained + (0.0 if is_burst else rate * (gain - averages.gained))
     averages.gained = min(max(gain, -_LARGEST_DEBT * allowed), averages.missed)
@@ -119,8 +106,7 @@ def _mean_square(
 @kernel
 def _earned(q: float, p: float, mean_square: float, least: float) -> float:
     """Return what a sample earns in which q − p is left of q."""
-    earned = (2.0 * q - p) * p / max(q * q, _MEAN_SQUARES * mean_square, least)
-    return max(earned, -_WORST_SAMPLE)
+    return max((2.0 * q - p) * p / max(q * q, mean_square, least), -_WORST_SAMPLE)
 
 
 @kernel
@@ -131,17 +117,25 @@ def newest_share(guard: GuardDesign, memory: GuardMemory) -> float:
 
 
 @kernel
+def quickness(guard: GuardDesign, memory: GuardMemory) -> float:
+    """Return how many times as quickly a learner is heard that closely matches q at present."""
+    return 1.0 + (_QUICK - 1.0) * max(1.0 - newest_share(guard, memory) / _MATCHING, 0.0)
+
+
+@kernel
 def removed_share(guard: GuardDesign, memory: GuardMemory) -> float:
     """Return R."""
     averages = memory.averages[0]
-    return averages.gained / max(averages.missed, tiny(guard))
+    # J follows a load that begins only after ten lags: harm is compared with M_y until then.
+    past = averages.missed if averages.gained > 0.0 else max(averages.missed, averages.seen)
+    return averages.gained / max(past, tiny(guard))
 
 
 @kernel
 def _is_own_doing(guard: GuardDesign, memory: GuardMemory) -> bool:
     """Return whether q is so large beside o that learner and loop may keep it up together."""
     averages, sample = memory.averages[0], memory.sample[0]
-    if guard.stages > _HIGHEST_ORDER:
+    if guard.stages > HIGHEST_ORDER:
         return False
     if sample.authority > 0.0:
         own_doing = (_OWN_DOING * sample.outside) ** 2

@@ -22,14 +22,14 @@ from quell.types import Vector
 # other seeds (docs/theory). Times are in lags N/omega_o of the observer.
 # T of the averages:
 _AVERAGING_LAGS = 15.0
-# T_C/T: a perfect learner on a sinusoidal load has full authority after about 30 lags.
+# T_C/T: a learner that explains a part of a sinusoidal load has full authority after 25 lags.
 _CREDIT_TIME = 2.0 / 3.0
 # P follows a growing |q| within this many lags, and decays over this many.
 _RISE_LAGS, _DECAY_LAGS = 0.7, 200.0
 # e grows by a factor of 2.7 in this time while the learner acts.
 _GROWTH_LAGS = 5.0
-# γ, and the memory of c_L: the learner's own share of q.
-_OWN_SHARE, _OWN_LAGS = 0.2, 10.0
+# Memory of c_L, the learner's newest largest correction.
+_OWN_LAGS = 10.0
 # β̄ follows β over this time.
 _SMOOTHING_LAGS = 30.0
 # The target returns to f_L over this time, where the bound keeps them apart.
@@ -64,7 +64,7 @@ class Guard:
     bound
         largest correction of the plain observer's estimate, in units of that estimate's error e: κ.
         Only a learner that explains nearly all of the error has it. The others have 1.2, or κ if
-        that is less, and 0.84 until they have removed a good part of the error (``kernels.py``).
+        that is less (``kernels.py``).
         After a jump of the disturbance a perfect learner needs more than 2.
     time
         time T [s] over which a learner is judged; by default 15 lags ``(n + 1)/omega_o`` of the
@@ -135,7 +135,6 @@ class Guard:
             growth=share(_GROWTH_LAGS),
             bound=bound,
             usual_bound=min(bound, _USUAL_BOUND),
-            own=_OWN_SHARE,
             own_decay=1.0 - share(_OWN_LAGS),
             within_lag=share(1.0),
             smooth=share(_SMOOTHING_LAGS),

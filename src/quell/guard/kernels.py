@@ -10,41 +10,33 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 
     q = F (f − f^F) = f_plain − f_plain^F,        p = F v,        v = g − g^F
 
-**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. The learner's own
-share of q is at most Γ times its largest recent correction, so e counts only what exceeds γ times
-that; and while the learner acts, e grows by a factor of 2.7 in five lags at most (METHOD 8), which
-costs credit:
-
-    c_L ← max(|e_L|, λ c_L),        e → |q| − γ c_L  where that is larger,        e ≤ min(P, 2.5 o)
-    C ← C − 0.35 Δe/e
-
-o ≤ P, the error that is certainly not the learner's, rises to |q| − 5 c_L as P rises to |q|, and to
-|q| − 1.5 c_L while |q| rises so quickly that it is 1.25 P: what learner and loop build up together
-grows more slowly. So a learner that causes what it then explains does not raise e again and again.
-And credit that was earned with small errors does not suffice for large ones: a learner that
-explains them as well earns more than the growth of e costs.
+**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. ``e ≤ P`` rises to
+|q| as P does; while the learner acts it grows by a factor of 2.7 in five lags at most. So a learner
+that causes what it then explains does not raise e at once.
 
 **Withheld.** Friction lets learner and loop keep each other moving: the learner explains much of a
-motion that would not be there without it. Then q is large beside o. Authority is withheld to see
-whether the motion goes on: with M, the mean of q² (below), and M_left, that of (q − p)²,
+motion that would not be there without it. o ≤ P, the error that is certainly not the learner's,
+rises to |q| − 1.5 c_L as P rises to |q|, with the largest recent correction ``c_L ← max(|e_L|,
+λ c_L)``. Authority is withheld where q is large beside o, to see whether the motion goes on: with
+M, the mean of q² (below), and M_left, that of (q − p)²,
 
     β = 0  from  M > (2 o)² and M_left > 0.05 (2 o)²  on, until  M < (1.3 o)²
 
-Without authority λ is that of one lag, so o soon follows |q| if the error was not the learner's; if
-it was, M decays. Only for r ≤ 3: of higher order, what a gap in e_L does to y is worse.
+λ is that of ten lags, without authority that of one, so that o soon follows |q| if the error was
+not the learner's; if it was, M decays. Only for r ≤ 3: of higher order, what a gap in e_L does to y
+is worse.
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
 raise slowly:
 
-    p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
+    p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², M), −1, 1 )
     β = min( clip(2 max(C, C_y), 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
 
 q is an n-th derivative of y, and mostly noise where y has some. C_y is such a credit at y, of ℓ q
 and ℓ p̄ in place of q and p̄ (ℓ: account, below), without the eight times: ℓ q changes so slowly
 that a close match over 1.5 lags is no evidence. y shows late what q shows at once, so C_y pays what
-C pays while ε > 1, that is, while the learner adds to q. Both pay for growth of e, and both are −1
-while R < −0.01.
+C pays while ε > 1, that is, while the learner adds to q. Both are −1 while R < −0.01.
 
 C and C_y start at −1. For C, a learner that explains q nearly completely earns up to eight times as
 much: 1 + 7 clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below);
@@ -64,24 +56,21 @@ q is a lag of the observer late, so d is ``ℓ e_L`` through a first-order lag o
 ``ℓ e_L`` of now, right corrections of disturbances with a period below some nine lags would count
 as harm.
 
-J follows a burst no more quickly than M does, and A does not follow it; J is at most 10⁴ M, so that
-an absurd measurement is forgotten.
+J follows a burst no more quickly than M does, and A does not follow it.
 
 Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
 removed; the factor is for plants on which a correction acts more strongly than on the observer's
 model. While R < −0.01 the credit is −1: whoever has added one percent to the squared error begins
-anew.
+anew. J follows a load that begins only after some ten lags, so a negative A is compared with M_y,
+the mean of (ℓ q)² over T, where that is larger.
 
-**Width.** The bound b is κ_0 e for a learner with R ≥ 0.3, and less for one that has removed less;
-κ_0 = 1.2, or κ if that is less. After a jump of f, (1 − F) f is twice what q shows of it, and b
-clips what would be right. So b is wider, up to κe, for a learner with R > 0.05 whose p is close to
-q, but not wider than what it has shown before (V, the peak of |v|, which decays as P), nor than a
-multiple of the error that is not its own:
+**Width.** The bound b is κ_0 e; κ_0 = 1.2, or κ if that is less. After a jump of f, (1 − F) f is
+twice what q shows of it, and b clips what would be right. So b is wider, up to κe, for a learner
+with R > 0 whose p is close to q:
 
-    b_0 = κ_0 e (ρ + (1 − ρ) clip(R/0.3, 0, 1)),        ρ = 0.7
     ε = mean (q − p)² / mean q²  over T/10, 1.5 lags
-    w = clip((R − 0.05)/0.1, 0, 1) clip(2 − 2.5 ε, 0, 1)
-    b = b_0 + w max(min(κe, 1.2 V, 4 o) − b_0, 0)
+    w = clip(R/0.1, 0, 1) clip(2 − 2.5 ε, 0, 1)
+    b = (κ_0 + w (κ − κ_0)) e
 
 A learner with ε > 1 adds to the error. From ε = 1.5 on it has less of b on the side to which its
 corrections have moved y, the sign of ℓe_L; on the other side it has b, to take them back:
@@ -95,7 +84,9 @@ and what the bound took is made up for while the target is still near:
     f_L = f_L^F + e_L,        target ← target + dt/(7 lags) (f_L − target)
 
 β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
-what is constant in e_L. At β = 1 it comes nearer by 0.05/30 lags at least, so that it reaches 1.
+what is constant in e_L. For r ≤ 3 it follows as many times as quickly as a sample earns more, up to
+eight: a learner that explains nearly all of q is not what moves its β. At β = 1 it comes nearer by
+0.05/30 lags at least, so that it reaches 1.
 The constant part of f_L is free. A target that is more than 1000 e from β̄g approaches it by e in
 1000 lags, so that rounding errors stay small.
 
@@ -130,8 +121,10 @@ from quell.guard.base import (
 )
 from quell.guard.bound import bounds_of, update_bound
 from quell.guard.credit import (
+    HIGHEST_ORDER,
     authority_of,
     judge,
+    quickness,
     removed_share,
     respond,
     withdraw_authority,
@@ -223,8 +216,9 @@ def _limit(
     removed = removed_share(guard, memory)
     authority, sample.reason = authority_of(guard, memory, removed)
     sample.authority = authority
+    quick = quickness(guard, memory) if guard.stages <= HIGHEST_ORDER else 1.0
     missing = authority - sample.share
-    more = guard.smooth * missing
+    more = quick * guard.smooth * missing
     if authority >= 1.0:
         more = min(max(more, guard.smooth * _LAST_SHARE), missing)
     sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
@@ -254,7 +248,6 @@ def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float
 def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
     shown, sample = memory.shown, memory.sample[0]
     v = sample.output - shown[G]
-    sample.largest_output = max(abs(v), (1.0 - guard.decay) * sample.largest_output)
     shown[G] = lag_push(guard.lag, memory.chain, G, sample.output)
     shown[V] = lag_push(guard.lag, memory.chain, V, v)
     correction = f_learned - shown[F_L]

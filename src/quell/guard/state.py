@@ -33,7 +33,6 @@ class GuardDesign(NamedTuple):
     growth: float  # largest share by which e grows in a sample while the learner acts
     bound: float  # κ
     usual_bound: float  # κ_0: κ of a learner that leaves a good part of the error
-    own: float  # γ
     own_decay: float  # λ
     within_lag: float  # share by which d follows ℓ e_L in a sample, with one lag as time constant
     smooth: float  # share by which β̄ follows β in a sample
@@ -71,7 +70,6 @@ class GuardSample(Scalars):
     outside: float  # o [y-unit/s^n]
     own_peak: float  # c_L [y-unit/s^n]
     late_effect: float  # d: ℓ e_L, as late as q [y-unit/s^n]
-    largest_output: float  # V: peak of |g − g^F| [y-unit/s^n]
     output: float  # g [y-unit/s^n]
     target: float  # target of f_L [y-unit/s^n]
     reason: float  # a Reason
