@@ -16,8 +16,8 @@ FOLDER = "proof"
 PROPERTIES = "properties.csv"
 """The file with all that Frama-C has looked at."""
 
-# Level 1 of 11 keeps some paths through a function apart: 0 leaves alarms, 2 takes longer and proves
-# no more. Results that are infinite or no number are no alarm by themselves.
+# Level 1 of 11 keeps some paths through a function apart: 0 leaves alarms, 2 takes longer and
+# proves no more. Results that are infinite or no number are no alarm by themselves.
 _OPTIONS = ("-eva", "-eva-precision", "1", "-warn-special-float", "none", "-machdep", "gcc_x86_64")
 
 # Arguments of the functions, each call with other numbers.
@@ -122,7 +122,7 @@ def _program(controller: Any, source: CSource, path: str) -> str:
     ]
     return "\n".join([
         f"/* All that a program can do with {name}: every function, in any order, for ever, with",
-        " * any numbers, also infinities and NaN. Each read of a volatile variable is another one. */",
+        " * any numbers, also infinities and NaN. Each read of a volatile variable is another. */",
         f'#include "{name}_contract.h"',
         "",
         f"static volatile {real} any_real;",

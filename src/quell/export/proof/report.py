@@ -33,8 +33,9 @@ _OPEN = """An open property need not be an error: the analysis computes with set
 than can happen. Somebody must look at it before anybody relies on the proof.
 
 """
-_LIMITS = """It is at least the lower and at
-  most the upper limit of u in the parameters in use, also after these have changed."""
+_LIMITS = """
+  It is at least the lower and at most the upper limit of u in the parameters in use, also after
+  these have changed."""
 _ENDS = "Each counts an integer to an end that does not change meanwhile, so it ends."
 
 
@@ -116,9 +117,9 @@ class Proof:
         found, promising = self.findings, self.promising
         return _filled("results.md", {
             "name": self.name,
-            "head": "What is proved" if self.proved else "What is claimed, without the open properties",
+            "head": "What is proved" if self.proved else "What holds but for the open properties",
             "functions": " or ".join(f"`{self.name}_{each}`" for each in promising),
-            "limits": _LIMITS if self.promised > len(promising) else "There are no limits of u.",
+            "limits": _LIMITS if self.promised > len(promising) else " There are no limits of u.",
             "loops": self._loops(),
             "called": ", ".join(f"`{each}`" for each in sorted(self.structure.library)) or "none",
             "version": found.version,
@@ -129,9 +130,11 @@ class Proof:
     def _loops(self) -> str:
         passes = self.structure.passes.get(f"{self.name}_step")
         if passes is not None:
-            return f"{_ENDS} A step has {passes} passes of loops at most."
+            return f"{_ENDS}\n  A step has {passes} passes of loops at most."
         places = "".join(f"\n  - line {each}" for each in self.structure.by_data)
-        return f"{_ENDS} NOT counted: the passes of a step, as these ends depend on data:{places}"
+        return (
+            f"{_ENDS}\n  NOT counted: the passes of a step, as these ends depend on data:{places}"
+        )
 
 
 def _filled(name: str, values: dict[str, str]) -> str:
