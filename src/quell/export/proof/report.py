@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from importlib import resources
@@ -57,6 +58,8 @@ class Proof:
         number of promises in the contract.
     promising
         the functions that return u.
+    digest
+        SHA-256 of header and source, one after the other: the proof is for these files alone.
     """
 
     folder: Path
@@ -65,6 +68,7 @@ class Proof:
     structure: Structure
     promised: int
     promising: tuple[str, ...]
+    digest: str
 
     @property
     def proved(self) -> bool:
@@ -108,6 +112,7 @@ class Proof:
         return _filled("REPORT.md", {
             "name": self.name,
             "summary": self.summary,
+            "digest": self.digest,
             "results": "" if self.findings.failure else self._results(),
             "open": f"## What is open\n\n{lines}\n{_OPEN}" if lines else "",
             "library": ", ".join(f"`{each}`" for each in library) or "none",
@@ -161,10 +166,11 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST) -> Proof:
     """
     contract = (folder / FOLDER / f"{source.name}_contract.h").read_text(encoding="utf-8")
     found = frama_c(folder, source.name, longest)
-    text = (folder / "src" / f"{source.name}.c").read_text(encoding="utf-8")
+    header, code = ((folder / "src" / f"{source.name}{end}").read_bytes() for end in (".h", ".c"))
+    read, digest = structure(code.decode("utf-8")), hashlib.sha256(header + code).hexdigest()
     promising = tuple(each for each in RETURN_U if each in source.operations)
     promised = contract.count("ensures ")
-    proof = Proof(folder, source.name, found, structure(text), promised, promising)
+    proof = Proof(folder, source.name, found, read, promised, promising, digest)
     with written_atomically(folder / FOLDER / REPORT, overwrite=True) as part:
         part.write_text(proof.text, encoding="utf-8")
     return proof
