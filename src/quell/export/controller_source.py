@@ -289,9 +289,10 @@ class _Writer:
 
     def _add_estimate(self, channels: Channels) -> None:
         files, name, real = self.files, self.name, self.real
+        write = files.program.literals.write_real
         total = sum(width for _, width in channels)
         row = Value(Array((total,), Number.REAL), "row", root="row", mutable=True)
-        lines = [f"    {real} row[{total}];", f"    {name}_estimate estimate;"]
+        lines = [f"    {real} row[{total}] = {{{write(0.0)}}};", f"    {name}_estimate estimate;"]
         lines.append(f"    {files.call(write_row, *files.both, row)};")
         at = 0
         for channel, width in channels:

@@ -23,6 +23,13 @@ from quell.plants.base import Plant
 from quell.simulation.scenario import Scenario
 
 
+# Targets that CMake, or a program for which it writes, has of its own.
+_CMAKE_TARGETS = frozenset(
+    "all all_build clean edit_cache help install list_install_components package package_source "
+    "rebuild_cache run_tests test uninstall zero_check".split()
+)
+
+
 @dataclass(frozen=True)
 class Exported:
     """A controller that was exported to C."""
@@ -94,7 +101,7 @@ def c(
     Raises
     ------
     ValueError
-        for a name that C, C++ or their headers use; a folder with files; a controller with parts in
+        for a name that C, C++, their headers or CMake use; a folder with files; a controller with parts in
         Python (``TranslationError``); parameters out of the range of single precision; and single
         precision that differs too much, or is not compared, without ``accept``; and a proof of a
         controller that calls functions in C. Nothing is written then.
@@ -111,7 +118,9 @@ def c(
     ['servo.h', 'servo.c', 'test_servo.c']
     """
     check_controller(controller)
-    checked_name(name)
+    if checked_name(name).lower() in _CMAKE_TARGETS:
+        rule = "is a target of CMake itself, so CMakeLists.txt can't have it; choose another name"
+        raise ValueError(f"name = {name!r}: {rule}")
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
     check_folder(folder, checks.flag("overwrite", overwrite))
     checks.flag("accept", accept)
