@@ -22,12 +22,9 @@ from quell.files import check_folder, write_folder
 from quell.plants.base import Plant
 from quell.simulation.scenario import Scenario
 
-
 # Targets that CMake, or a program for which it writes, has of its own.
-_CMAKE_TARGETS = frozenset(
-    "all all_build clean edit_cache help install list_install_components package package_source "
-    "rebuild_cache run_tests test uninstall zero_check".split()
-)
+_CMAKE_TARGETS = """all all_build clean edit_cache help install list_install_components package
+    package_source rebuild_cache run_tests test uninstall zero_check"""
 
 
 @dataclass(frozen=True)
@@ -101,10 +98,10 @@ def c(
     Raises
     ------
     ValueError
-        for a name that C, C++, their headers or CMake use; a folder with files; a controller with parts in
-        Python (``TranslationError``); parameters out of the range of single precision; and single
-        precision that differs too much, or is not compared, without ``accept``; and a proof of a
-        controller that calls functions in C. Nothing is written then.
+        for a name that C, C++, their headers or CMake use; a folder with files; a controller with
+        parts in Python (``TranslationError``); parameters out of the range of single precision;
+        single precision that differs too much, or is not compared, without ``accept``; and a proof
+        of a controller that calls functions in C. Nothing is written then.
 
     Examples
     --------
@@ -118,7 +115,7 @@ def c(
     ['servo.h', 'servo.c', 'test_servo.c']
     """
     check_controller(controller)
-    if checked_name(name).lower() in _CMAKE_TARGETS:
+    if checked_name(name).lower() in _CMAKE_TARGETS.split():
         rule = "is a target of CMake itself, so CMakeLists.txt can't have it; choose another name"
         raise ValueError(f"name = {name!r}: {rule}")
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
