@@ -213,13 +213,23 @@ double a_step(a_state *state, double r)
 
 def test_the_passes_of_loops_are_counted() -> None:
     """4 of a loop, each with 4 at most of the next, each with 3 of a function's; and 4 of one to a smaller end."""
-    found = structure(LOOPS)
+    found = structure(LOOPS, "a_step")
     assert found.problems == []
     assert found.passes == {"inner": 3, "a_step": 4 + 16 + 48 + 4}
     assert found.library == {"fabs", "minimum_int", "truncated"}
-    open_end = structure(LOOPS.replace("minimum_int(truncated(r), 7)", "truncated(r)"))
+    open_end = structure(LOOPS.replace("minimum_int(truncated(r), 7)", "truncated(r)"), "a_step")
     assert open_end.passes["a_step"] is None
     assert [each.partition(":")[0] for each in open_end.by_data] == ["19"]
+
+
+def test_an_argument_that_the_call_tells_is_counted() -> None:
+    """A function whose loop ends at its argument has as many passes as each call gives it."""
+    text = LOOPS.replace("inner(double a)", "inner(double a, int count)").replace(
+        "ROWS; i++", "count; i++"
+    )
+    found = structure(text.replace("inner(r)", "inner(r, i + 2)"), "a_step")
+    assert found.passes["inner"] is None
+    assert found.passes["a_step"] == 4 + 16 + 16 * 5 + 4
 
 
 @pytest.mark.parametrize(
@@ -235,5 +245,5 @@ def test_the_passes_of_loops_are_counted() -> None:
 )
 def test_code_that_is_not_as_claimed_is_named(old: str, new: str, problem: str) -> None:
     """Recursion, other loops, a loop whose end moves, memory that is allocated."""
-    found = structure(LOOPS.replace(old, new))
+    found = structure(LOOPS.replace(old, new), "a_step")
     assert any(problem in each for each in found.problems), found.problems

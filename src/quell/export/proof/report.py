@@ -135,7 +135,9 @@ class Proof:
     def _loops(self) -> str:
         passes = self.structure.passes.get(f"{self.name}_step")
         if passes is not None:
-            return f"{_ENDS}\n  A step has {passes} passes of loops at most."
+            start = self.structure.passes.get(f"{self.name}_start")
+            more = "" if start is None else f", `{self.name}_start` {start}"
+            return f"{_ENDS}\n  A step has {passes} passes of loops at most{more}."
         places = "".join(f"\n  - line {each}" for each in self.structure.by_data)
         return (
             f"{_ENDS}\n  NOT counted: the passes of a step, as these ends depend on data:{places}"
@@ -167,7 +169,10 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST) -> Proof:
     contract = (folder / FOLDER / f"{source.name}_contract.h").read_text(encoding="utf-8")
     found = frama_c(folder, source.name, longest)
     header, code = ((folder / "src" / f"{source.name}{end}").read_bytes() for end in (".h", ".c"))
-    read, digest = structure(code.decode("utf-8")), hashlib.sha256(header + code).hexdigest()
+    read, digest = (
+        structure(code.decode("utf-8"), f"{source.name}_step"),
+        hashlib.sha256(header + code).hexdigest(),
+    )
     promising = tuple(each for each in RETURN_U if each in source.operations)
     promised = contract.count("ensures ")
     proof = Proof(folder, source.name, found, read, promised, promising, digest)

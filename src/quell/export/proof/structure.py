@@ -5,8 +5,9 @@ over a range of integers. That is read here from the text and not taken from the
 it is checked for the file that is delivered.
 
 The number of passes is an upper bound for a call: that of all loops, in all branches, each with the
-most passes that its ends allow. Ends are constants, variables of the loops around, and sums and
-products of them, or the smaller of such a number and another one.
+most passes that its ends allow. Ends are constants, variables of the loops around, arguments whose
+range the call tells, sums and products of them, and the smaller of
+such a number and another one.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ _LOOP = re.compile(
 _CALL = re.compile(r"(?<![\w.>])([A-Za-z_]\w*)\(")
 
 
+Interval = tuple[int | None, int | None]
+
+
 @dataclass
 class Structure:
     """What was read from the text.
@@ -35,7 +39,7 @@ class Structure:
     passes
         the most passes of loops in a call of each function; None where they depend on data.
     by_data
-        places ``line: header`` of loops whose passes depend on data.
+        places ``line: header`` of loops in a step whose passes depend on data.
     problems
         what is not as claimed.
     """
@@ -46,75 +50,132 @@ class Structure:
     problems: list[str] = field(default_factory=list)
 
 
-def structure(source: str) -> Structure:
-    """Read the text of a C file."""
+def structure(source: str, step: str) -> Structure:
+    """Read the text of a C file, whose function of each sample is ``step``."""
     text = re.sub(r"/\*.*?\*/", lambda found: re.sub(r"[^\n]", " ", found[0]), source, flags=re.S)
     found = Structure()
-    constants = {
-        name: int(value)
-        for name, value in re.findall(r"^static const int (\w+) = (-?\d+);", text, re.M)
-    }
-    functions = list(_FUNCTION.finditer(text))
-    every = {each[1] for each in functions}
-    for each in functions:
-        name, body = each[1], each[3]
-        called = set(_CALL.findall(body)) - _KEYWORDS
-        for other in sorted(called & every - set(found.passes)):
-            found.problems.append(
-                f"{name} calls {other}, which is defined later: recursion is possible"
-            )
-        found.library |= called - every
+    constants = re.findall(r"^static const int (\w+) = (-?\d+);", text, re.M)
+    counter = _Counter(found, {name: (int(value), int(value)) for name, value in constants})
+    for each in _FUNCTION.finditer(text):
         line = text.count("\n", 0, each.start(3)) + 1
-        found.passes[name] = _passes(name, body, line, constants, found)
+        names = tuple(re.findall(r"(\w+)(?:\[\w*\])*(?:,|$)", " ".join(each[2].split())))
+        counter.functions[each[1]] = _Function(each[1], names, each[3], line)
+    seen: set[str] = set()
+    for name, function in counter.functions.items():
+        called = set(_CALL.findall(function.body)) - _KEYWORDS
+        for other in sorted(called & set(counter.functions) - seen):
+            rule = "which is defined later: recursion is possible"
+            found.problems.append(f"{name} calls {other}, {rule}")
+        seen.add(name)
+        found.library |= called - set(counter.functions)
+        found.problems += function.problems()
     allocating = found.library & {"malloc", "calloc", "realloc", "alloca", "free"}
     found.problems += [f"{each} is called" for each in sorted(allocating)]
+    if not found.problems:
+        for name in (step, *counter.functions):
+            found.passes[name] = counter.passes(name, ())
+            if name == step and not found.by_data:
+                found.by_data = list(counter.by_data)
     return found
 
 
-def _passes(
-    function: str, body: str, line: int, constants: dict[str, int], found: Structure
-) -> int | None:
-    """Return the most passes of loops in a call of a function."""
-    for word in re.findall(r"\b(?:while|do|goto)\b", body):
-        found.problems.append(f"{function} has '{word}'")
-    loops = list(_LOOP.finditer(body))
-    if len(loops) != len(re.findall(r"\bfor\b", body)):
-        found.problems.append(f"{function} has a loop that is no range of integers")
-    spans = [(loop.start(), loop.end(), _end_of(body, loop.end())) for loop in loops]
-    most: list[int | None] = []  # passes of each loop, for a pass of the one around it
-    ranges: list[dict[str, tuple[int, int]]] = []  # of the variables in each loop
-    for i, loop in enumerate(loops):
-        around = [k for k in range(i) if spans[k][0] < loop.start() < spans[k][2]]
-        known = {name: (value, value) for name, value in constants.items()}
-        for k in around:
-            known |= ranges[k]
-        inside = body[loop.end() : spans[i][2]]
-        at = line + body.count("\n", 0, loop.start())
-        for name in {loop[1], loop[3]} - {None}:
-            if re.search(
-                rf"(?<![\w.>])(?:{name} ?(?:[-+*/]?=[^=]|\+\+|--)|(?:\+\+|--){name}\b)", inside
-            ):
-                found.problems.append(f"{function} changes {name} in its loop, line {at}")
-        first, last = _range(loop[2], known), _range(loop[4] or loop[6], known)
-        step = 1 if loop[7] == "++" else -1 if loop[7] == "--" else int(loop[8])
-        most.append(_count(first, last, step, loop[5]))
-        ranges.append(_values(loop[1], first, last, loop[5]))
-        if most[-1] is None:
-            found.by_data.append(f"{at}: {loop[0].removesuffix(' {')}")
-    total: int | None = 0
-    for i, own in enumerate(most):
-        total = _sum(total, _times(own, _product(most, spans, spans[i][0])))
-    for call in _CALL.finditer(body):
-        inner = found.passes.get(call[1])
-        if call[1] in found.passes and inner != 0:
-            total = _sum(total, _times(inner, _product(most, spans, call.start())))
-    return total
+class _Function:
+    """A function of the file, with its loops and what they span."""
+
+    def __init__(self, name: str, parameters: tuple[str, ...], body: str, line: int) -> None:
+        self.name, self.parameters, self.body = name, parameters, body
+        self.loops = list(_LOOP.finditer(body))
+        self.spans = [(loop.end(), _end_of(body, loop.end())) for loop in self.loops]
+        self.lines = [line + body.count("\n", 0, loop.start()) for loop in self.loops]
+
+    def problems(self) -> list[str]:
+        """Return what is no loop over a range of integers with an end that stays."""
+        found = [
+            f"{self.name} has '{word}'" for word in re.findall(r"\b(?:while|do|goto)\b", self.body)
+        ]
+        if len(self.loops) != len(re.findall(r"\bfor\b", self.body)):
+            found.append(f"{self.name} has a loop that is no range of integers")
+        for loop, (begin, end), line in zip(self.loops, self.spans, self.lines, strict=True):
+            names = {loop[1], *re.findall(r"(?<![\w.>])[A-Za-z_]\w*(?!\w*\()", loop[3] or loop[6])}
+            for name in sorted(names):
+                change = rf"(?<![\w.>])(?:{name} ?(?:[-+*/]?=[^=]|\+\+|--)|(?:\+\+|--){name}\b)"
+                if re.search(change, self.body[begin:end]):
+                    found.append(f"{self.name} changes {name} in its loop, line {line}")
+            if "->" in (loop[3] or loop[6]):
+                found.append(f"{self.name} has a loop whose end may change, line {line}")
+        return found
 
 
-def _product(most: list[int | None], spans: list[tuple[int, int, int]], at: int) -> int | None:
+class _Counter:
+    """The passes of functions for known ranges of their arguments."""
+
+    def __init__(self, found: Structure, constants: dict[str, tuple[int, int]]) -> None:
+        self.found, self.constants = found, constants
+        self.functions: dict[str, _Function] = {}
+        self.by_data: list[str] = []
+        self._known: dict[tuple[str, tuple[Interval, ...]], int | None] = {}
+
+    def passes(self, name: str, arguments: tuple[Interval, ...]) -> int | None:
+        """Return the most passes of loops in a call of a function."""
+        key = name, arguments
+        if key not in self._known:
+            self._known[key] = self._count(self.functions[name], arguments)
+        return self._known[key]
+
+    def _count(self, function: _Function, arguments: tuple[Interval, ...]) -> int | None:
+        given = dict(zip(function.parameters, arguments, strict=False))
+        fixed = {name: (low, high) for name, (low, high) in given.items()
+                 if low is not None and high is not None}  # fmt: skip
+        most: list[int | None] = []
+        ranges: list[dict[str, tuple[int, int]]] = []
+
+        def known(at: int) -> dict[str, tuple[int, int]]:
+            names = {**self.constants, **fixed}
+            for values, (begin, end) in zip(ranges, function.spans, strict=False):
+                names |= values if begin <= at < end else {}
+            return names
+
+        for loop, line in zip(function.loops, function.lines, strict=True):
+            names = known(loop.start())
+            first, last = _range(loop[2], names), _range(loop[4] or loop[6], names)
+            step = {"++": 1, "--": -1}.get(loop[7]) or int(loop[8])
+            most.append(_count(first, last, step, loop[5]))
+            ranges.append(_values(loop[1], first, last, loop[5]))
+            place = f"{line}: {loop[0].removesuffix(' {')}"
+            if most[-1] is None and place not in self.by_data:
+                self.by_data.append(place)
+        total: int | None = 0
+        for own, loop in zip(most, function.loops, strict=True):
+            total = _sum(total, _times(own, _product(most, function.spans, loop.start())))
+        for call in _CALL.finditer(function.body):
+            if call[1] in self.functions:
+                parts = _arguments(function.body, call.end())
+                values = tuple(_range(part, known(call.start())) for part in parts)
+                inner = self.passes(call[1], values)
+                if inner != 0:
+                    times = _product(most, function.spans, call.start())
+                    total = _sum(total, _times(inner, times))
+        return total
+
+
+def _arguments(body: str, begin: int) -> list[str]:
+    """Return the arguments of a call, which begin after its parenthesis."""
+    found, depth = [""], 0
+    for sign in body[begin:]:
+        depth += {"(": 1, "[": 1, ")": -1, "]": -1}.get(sign, 0)
+        if depth < 0:
+            break
+        if sign == "," and depth == 0:
+            found.append("")
+        else:
+            found[-1] += sign
+    return found
+
+
+def _product(most: list[int | None], spans: list[tuple[int, int]], at: int) -> int | None:
     """Return how often a place is reached: the product of the passes of the loops around it."""
     product: int | None = 1
-    for passes, (_, begin, end) in zip(most, spans, strict=True):
+    for passes, (begin, end) in zip(most, spans, strict=True):
         if begin <= at < end:
             product = _times(product, passes)
     return product
@@ -135,9 +196,6 @@ def _sum(one: int | None, other: int | None) -> int | None:
 
 def _times(one: int | None, other: int | None) -> int | None:
     return None if one is None or other is None else one * other
-
-
-Interval = tuple[int | None, int | None]
 
 
 def _count(first: Interval, last: Interval, step: int, sign: str) -> int | None:
