@@ -60,6 +60,8 @@ def structure(source: str, step: str) -> Structure:
         line = text.count("\n", 0, each.start(3)) + 1
         names = tuple(re.findall(r"(\w+)(?:\[\w*\])*(?:,|$)", " ".join(each[2].split())))
         counter.functions[each[1]] = _Function(each[1], names, each[3], line)
+    if step not in counter.functions:
+        found.problems.append(f"there is no function {step}")
     seen: set[str] = set()
     for name, function in counter.functions.items():
         called = set(_CALL.findall(function.body)) - _KEYWORDS
