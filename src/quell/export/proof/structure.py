@@ -74,10 +74,10 @@ def structure(source: str, step: str) -> Structure:
     allocating = found.library & {"malloc", "calloc", "realloc", "alloca", "free"}
     found.problems += [f"{each} is called" for each in sorted(allocating)]
     if not found.problems:
-        for name in (step, *counter.functions):
+        found.passes[step] = counter.passes(step, ())
+        found.by_data = list(counter.by_data)
+        for name in counter.functions:
             found.passes[name] = counter.passes(name, ())
-            if name == step and not found.by_data:
-                found.by_data = list(counter.by_data)
     return found
 
 
