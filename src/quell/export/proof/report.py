@@ -28,7 +28,7 @@ _MEANINGS = {
     "is_nan_or_infinite": "a number that is not finite may be converted to an integer",
     "division_by_zero": "an integer may be divided by zero",
     "shift": "a shift may have a count out of range",
-    "precondition": "a function of the C library may get an argument out of its domain",
+    "precondition": "a function may be called with an argument that it does not allow",
 }
 _OPEN = """An open property need not be an error: the analysis computes with sets that contain more
 than can happen. Somebody must look at it before anybody relies on the proof.
