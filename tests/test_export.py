@@ -268,6 +268,8 @@ def test_the_folder_has_all_files_and_no_placeholder(tmp_path: Path) -> None:
         ("class", "is a keyword of C or C++"),
         ("Math", "Math.h would hide the standard header"),
         ("x" * 64, "63 characters"),
+        ("test", "is a target of CMake itself"),
+        ("Install", "is a target of CMake itself"),
     ],
 )
 def test_a_name_that_c_can_not_use_is_refused(tmp_path: Path, name: str, rule: str) -> None:

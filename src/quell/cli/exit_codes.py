@@ -19,6 +19,7 @@ class ExitCode(IntEnum):
     ERROR = 2
     ENDED_BY_SAFETY = 3
     DIVERGED = 4
+    NOT_PROVED = 5
     INTERRUPTED = 130
     TERMINATED = 143
 
@@ -42,6 +43,10 @@ _MEANINGS = {
     ExitCode.DIVERGED: (
         "quell run, compare, reproduce two-mass and torsional: a simulated run diverged; all "
         "results were written"
+    ),
+    ExitCode.NOT_PROVED: (
+        "quell export --prove: something is not proved, or there is no Frama-C; all files were "
+        "written"
     ),
     ExitCode.INTERRUPTED: "stopped by Ctrl-C; quell run-rig ramps u to zero before",
     ExitCode.TERMINATED: "stopped by SIGTERM",

@@ -118,7 +118,7 @@ def apply_limits(limits: Limits, unlimited: float, before: float) -> tuple[float
     elif applied < limits.low:
         applied = limits.low
         status |= _SATURATED
-    elif not is_finite(applied):
+    if not is_finite(applied):
         applied = control_at_rest(limits)
         status |= _OVERFLOWED
     return applied, status

@@ -290,16 +290,20 @@ class _Writer:
 
     def _add_estimate(self, channels: Channels) -> None:
         files, name, real = self.files, self.name, self.real
+        write = files.program.literals.write_real
         total = sum(width for _, width in channels)
         row = Value(Array((total,), Number.REAL), "row", root="row", mutable=True)
-        lines = [f"    {real} row[{total}];", f"    {name}_estimate estimate;"]
+        lines = [f"    {real} row[{total}] = {{{write(0.0)}}};", f"    {name}_estimate estimate;"]
         lines.append(f"    {files.call(write_row, *files.both, row)};")
         at = 0
         for channel, width in channels:
-            cast = "(int)" if channel in _WHOLE else ""
+            whole = channel in _WHOLE
             for i in range(width):
                 place = f"[{i}]" if width > 1 else ""
-                lines.append(f"    estimate.{channel}{place} = {cast}row[{at}];")
+                number = f"row[{at}]"
+                if whole:
+                    number = f"{files.program.calls.helper('truncated')}({number})"
+                lines.append(f"    estimate.{channel}{place} = {number};")
                 at += 1
         if _has_f(channels):
             lines.append("    estimate.f = estimate.f_residual + estimate.f_learned;")

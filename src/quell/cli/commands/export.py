@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from quell.cli.exit_codes import ExitCode
 from quell.cli.options import Overwrite, Switch, Trust, refuse
 from quell.cli.output import Console, print_line
 
@@ -23,6 +25,7 @@ def export(
     what: Literal["controller", "plant", "loop"] = "controller",
     resolution: float | None = None,
     accept: Switch = False,
+    prove: Switch = False,
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -51,14 +54,18 @@ def export(
         as integers.
     accept
         Write in single precision even if it differs too much, or can't be compared.
+    prove
+        Write the folder proof beside the C code, and prove with Frama-C that no behaviour is
+        undefined and u is always a number within its limits. What is not proved is printed, and the
+        exit code is not 0.
     """
     from quell.export import c
     from quell.setup import load
 
     if to == "fmu":
-        if precision != "double" or accept or resolution is not None:
+        if precision != "double" or accept or prove or resolution is not None:
             rule = "are for --to c; an FMU is in double"
-            raise ValueError(f"--precision, --resolution and --accept: {rule}")
+            raise ValueError(f"--precision, --resolution, --accept and --prove: {rule}")
         _to_fmu(load(setup, trust), what, out, name or "", overwrite)
         return
     if what != "controller":
@@ -78,9 +85,12 @@ def export(
         scenario=given.scenario,
         resolution=resolution,
         accept=accept,
+        proof=prove,
         overwrite=overwrite,
     )
     _print(given.title, exported)
+    if exported.proof is not None and not exported.proof.proved:
+        sys.exit(ExitCode.NOT_PROVED)
 
 
 def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> None:
@@ -106,6 +116,11 @@ def _print(title: str, exported: Exported) -> None:
         for line in _differences(exported.comparison):
             print_line(console, line)
     print_line(console, _sizes(exported))
+    if exported.proof is not None:
+        print_line(console, exported.proof.summary)
+        for line in exported.proof.open:
+            print_line(console, f"NOT proved: {line}")
+        print_line(console, f"Report: {folder}/proof/REPORT.md; again: {folder}/proof/prove.sh")
     print_line(console, f"Test: {folder}/test_{name}.c; how to use it: {folder}/README.md")
 
 

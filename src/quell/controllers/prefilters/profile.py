@@ -121,7 +121,7 @@ def _advance(design: ProfileDesign, memory: ProfileMemory) -> None:
     loop.p, loop.v, loop.a, loop.jerk = _motion(memory, part, t, p, v, a)
     if loop.samples >= _MOST_SAMPLES:
         loop.p_begin, loop.v_begin, loop.a_begin = loop.p, loop.v, loop.a
-        memory.times[int(part)] -= t
+        memory.times[min(int(part), memory.times.size - 1)] -= t
         loop.offset = loop.samples = 0.0
 
 

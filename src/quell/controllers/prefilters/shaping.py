@@ -49,9 +49,8 @@ class ShaperMemory(NamedTuple):
 
 @prefilter.register(ShaperDesign)
 def _prefilter(design: ShaperDesign, memory: ShaperMemory, r: float) -> float:
-    at = int(memory.at[0]) + 1
-    if at >= design.length:
-        at = 0
+    at = int(memory.at[0])
+    at = at + 1 if at < memory.past.size - 1 else 0
     memory.at[0] = at
     memory.past[at] = r
     total = 0.0

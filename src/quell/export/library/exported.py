@@ -16,10 +16,15 @@ from quell.export.library.comparison import Comparison, compared
 from quell.export.library.texts import library_files
 from quell.export.library.toolchain import Sizes, measured_sizes
 from quell.export.library.vectors import golden_vectors
+from quell.export.proof import Proof, proof_files, prove
 from quell.export.translate.naming import checked_name
 from quell.files import check_folder, write_folder
 from quell.plants.base import Plant
 from quell.simulation.scenario import Scenario
+
+# Targets that CMake, or a program for which it writes, has of its own.
+_CMAKE_TARGETS = """all all_build clean edit_cache help install list_install_components package
+    package_source rebuild_cache run_tests test uninstall zero_check"""
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,7 @@ class Exported:
     files: tuple[Path, ...]  #: all files in it
     source: CSource  #: texts of header and source
     comparison: Comparison | None  #: single to double precision, if they were compared
+    proof: Proof | None = None  #: what was proved, if it was asked for
 
     def sizes(self) -> Sizes:
         """Return the bytes of code, state and stack, as gcc tells: for ARM if it can.
@@ -53,6 +59,7 @@ def c(
     scenario: Scenario | None = None,
     resolution: float | None = None,
     accept: bool = False,
+    proof: bool = False,
     overwrite: bool = False,
 ) -> Exported:
     """Write a controller as a library in C99, translated from the kernels that simulate it.
@@ -80,16 +87,21 @@ def c(
         and computes with differences to the last count. For an ADRC without model of the position.
     accept
         write in single precision even if nothing is compared, or the difference is too large.
+    proof
+        also write the folder ``proof``, and prove with Frama-C, where it is installed, that no
+        behaviour of the code is undefined and that u is always a number within its limits. It takes
+        seconds for an observer of order 2, minutes with a learner; ``Exported.proof`` and
+        ``proof/REPORT.md`` have the result.
     overwrite
         whether files of the same names in the folder may be replaced.
 
     Raises
     ------
     ValueError
-        for a name that C, C++ or their headers use; a folder with files; a controller with parts in
-        Python (``TranslationError``); parameters out of the range of single precision; and single
-        precision that differs too much, or is not compared, without ``accept``. Nothing is written
-        then.
+        for a name that C, C++, their headers or CMake use; a folder with files; a controller with
+        parts in Python (``TranslationError``); parameters out of the range of single precision;
+        single precision that differs too much, or is not compared, without ``accept``; and a proof
+        of a controller that calls functions in C. Nothing is written then.
 
     Examples
     --------
@@ -103,10 +115,13 @@ def c(
     ['servo.h', 'servo.c', 'test_servo.c']
     """
     check_controller(controller)
-    checked_name(name)
+    if checked_name(name).lower() in _CMAKE_TARGETS.split():
+        rule = "is a target of CMake itself, so CMakeLists.txt can't have it; choose another name"
+        raise ValueError(f"name = {name!r}: {rule}")
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
     check_folder(folder, checks.flag("overwrite", overwrite))
     checks.flag("accept", accept)
+    checks.flag("proof", proof)
     single = single or isinstance(controller, SinglePrecision)
     shown = in_single_precision(controller) if single else controller
     source = c_source(shown, name, resolution=resolution)
@@ -115,9 +130,11 @@ def c(
         comparison = compared(plant, controller, scenario)
     if single and not accept:
         _check_comparison(comparison, controller)
+    proving = proof_files(shown, source) if proof else {}
     vectors = golden_vectors(shown, source.operations)
-    files = write_folder(folder, library_files(shown, source, vectors), overwrite)
-    return Exported(Path(folder), files, source, comparison)
+    files = write_folder(folder, library_files(shown, source, vectors) | proving, overwrite)
+    done = prove(Path(folder), source) if proof else None
+    return Exported(Path(folder), files, source, comparison, done)
 
 
 def _check_comparison(comparison: Comparison | None, controller: Any) -> None:

@@ -12,6 +12,7 @@ from quell.export.translate.expressions import Expressions
 from quell.export.translate.interfaces import Translation
 from quell.export.translate.naming import identifier
 from quell.export.translate.values import (
+    AND,
     ATOM,
     EQUAL,
     NOTHING,
@@ -152,7 +153,7 @@ class Calls:
         if function is is_finite:
             if arguments[0].is_constant:
                 return body.constant(math.isfinite(arguments[0].constant))
-            return self._call(Number.BOOL, self.helper("is_finite"), body.real(arguments[0]))
+            return self._is_finite(body.real(arguments[0]))
         if function in (function_pointers.call, function_pointers.evaluate):
             returns = function is function_pointers.evaluate
             return self._user_function(body, node, arguments, returns)
@@ -165,6 +166,20 @@ class Calls:
         implementation, declaration = self._resolve(body, node, function, arguments)
         found = self.program.function(implementation, arguments, declaration, names)
         return found.call(body, arguments)
+
+    def _is_finite(self, value: Value) -> Value:
+        """Return the test whether a real number is finite.
+
+        Of a variable it compares the variable itself: a program that analyses the C code then knows
+        its range where the test holds, which it can't conclude from the result of a function. Not
+        all of them conclude from an order that a number is one: ``x == x`` says it.
+        """
+        x = value.code
+        if not x.isidentifier():
+            return self._call(Number.BOOL, self.helper("is_finite"), value)
+        largest = "FLT_MAX" if self.program.literals.single else "DBL_MAX"
+        code = f"{x} == {x} && {x} >= -{largest} && {x} <= {largest}"
+        return Value(Number.BOOL, code, AND)
 
     def _clear(self, body: Expressions, record: Value) -> Value:
         """Return the call that sets all numbers of a record to zero."""

@@ -97,14 +97,14 @@ def _resolved(memory: SearchMemory) -> float:
 def _adopt(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
     """Set the oscillators to the frequencies of the fit that are certain."""
     loop, fit, adopted = memory.loop[0], memory.fit, memory.adopted
-    result = NOTHING
+    result, taken = NOTHING, memory.taken
     for i in range(omega.size):
-        memory.taken[i] = 0.0
+        taken[i] = 0.0
     for j in range(int(loop.found)):
         if not _is_resolved(loop, fit, j):
             continue
-        i = _oscillator_for(search, memory, omega, fit.omega[j])
-        memory.taken[i] = 1.0
+        i = _oscillator_for(search, memory, omega, taken, fit.omega[j])
+        taken[i] = 1.0
         is_new = abs(omega[i] * search.step - fit.omega[j]) * loop.window > _DOUBT
         if is_new or adopted[i] == 0.0 or fit.deviation[j] < _WORSE * adopted[i]:
             omega[i] = fit.omega[j] / search.step
@@ -115,9 +115,9 @@ def _adopt(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
 
 @kernel
 def _oscillator_for(
-    search: FrequencySearch, memory: SearchMemory, omega: Vector, frequency: float
+    search: FrequencySearch, memory: SearchMemory, omega: Vector, taken: Vector, frequency: float
 ) -> int:
-    """Return the oscillator that follows a frequency of the fit [rad/entry].
+    """Return the oscillator that is not taken and follows a frequency of the fit [rad/entry].
 
     It is the one that has this frequency already, as far as the window resolves, or else one that
     has none from a fit, or else the nearest. The fit may find the frequencies in another order than
@@ -125,7 +125,7 @@ def _oscillator_for(
     """
     nearest, free, least = -1, -1, 0.0
     for i in range(omega.size):
-        if memory.taken[i] > 0.0:
+        if taken[i] > 0.0:
             continue
         if memory.adopted[i] == 0.0:
             free = i if free < 0 else free

@@ -98,11 +98,12 @@ def _adapt(
     absurd = _ABSURD_SINGLE if is_single(loop.level) else _ABSURD
     if loop.samples <= learner.startup or not abs(f_plain) < absurd:
         return
-    memory.past[int(loop.phase)] = f_plain
+    now = _place(memory)
+    memory.past[now] = f_plain
     if loop.has_begun == 0.0:
         # What Δf̂ did not show at the start is taken to be like what it shows first.
         loop.has_begun = 1.0
-        for k in range(int(loop.phase)):
+        for k in range(now):
             memory.past[k] = f_plain
 
 
@@ -111,7 +112,7 @@ def _predict(
     learner: RepetitiveDesign, memory: RepetitiveMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
     loop = memory.loop[0]
-    return memory.table[int(loop.phase)] - loop.level, 0.0
+    return memory.table[_place(memory)] - loop.level, 0.0
 
 
 @commit.register(RepetitiveDesign)
@@ -133,6 +134,12 @@ def _commit(
     if loop.phase == size:
         loop.phase = loop.row = loop.crossed = 0.0
         reset_lag(memory.filters)
+
+
+@kernel
+def _place(memory: RepetitiveMemory) -> int:
+    """Return the phase as a place in the tables; it is one of theirs whatever the state has."""
+    return min(int(memory.loop[0].phase), memory.past.size - 1)
 
 
 @kernel

@@ -1,0 +1,77 @@
+"""Proofs of exported controllers: which are proved, what is open, how long it takes.
+
+    python benchmarks/proofs.py [--only TEXT] [--precision double] [--results FILE]
+
+Every row of ``exported.py`` is exported in double and in single precision with ``proof=True`` and
+proved by Frama-C (docs/target). All rows take hours of a core: ``--results`` names a file to which
+each row is added when it is ready, and whose rows are not run again. ``--part I/N`` takes each N-th
+row from the I-th on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+from exported import cases, earlier_rows
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell.export import TranslationError
+
+HEADS = ("controller", "precision", "proved", "alarms", "time [s]", "passes of a step")
+
+
+def row_of(name: str, controller: Any, precision: str) -> list[str]:
+    """Return a row of the table."""
+    with tempfile.TemporaryDirectory() as place:
+        try:
+            folder = Path(place) / "c"
+            done = ql.export.c(
+                controller, folder, name="servo", precision=precision, accept=True, proof=True
+            )
+        except TranslationError as error:
+            return [name, precision, "refused", "", "", str(error)[:60]]
+    proof = done.proof
+    assert proof is not None
+    passes = proof.structure.passes.get("servo_step")
+    first = f": {proof.open[0][:100]}" if proof.open else ""
+    cells = ["yes" if proof.proved else f"NOT{first}", f"{len(proof.alarms)}"]
+    seconds = f"{proof.findings.seconds:.0f}"
+    return [name, precision, *cells, seconds, "by data" if passes is None else f"{passes}"]
+
+
+def main() -> None:
+    """Prove the rows."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--only", default="", help="controllers whose name has this text")
+    parser.add_argument("--precision", choices=("double", "single"), help="one precision only")
+    parser.add_argument("--part", default="1/1", help="I/N: each N-th row from the I-th on")
+    parser.add_argument("--results", type=Path, help="file of rows that are ready")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    console = Console(width=160)
+    table, known = Table(*HEADS), earlier_rows(options.results)
+    precisions = [options.precision] if options.precision else ["double", "single"]
+    first, step = map(int, options.part.split("/"))
+    rows = [(name, each, precision) for name, each in cases() for precision in precisions
+            if options.only in name]  # fmt: skip
+    for name, controller, precision in rows[first - 1 :: step]:
+        cells = known.get((name, precision))
+        if cells is None:
+            cells = row_of(name, controller, precision)
+            if options.results:
+                with options.results.open("a", encoding="utf-8") as file:
+                    print(json.dumps(cells), file=file)
+        console.print(" | ".join(cells), highlight=False)
+        table.add_row(*cells)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""``ql.export.c(..., proof=True)`` and ``quell export --prove``: what is proved of exported C code."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import quell as ql
+from quell.export.library.exported import Exported
+from quell.export.proof import prove
+from quell.export.proof.frama_c import read_findings
+from quell.export.proof.structure import structure
+from quell.features import Custom
+
+from .commands import in_this_process
+from .setups import TWO_MASS
+
+needs_frama_c = pytest.mark.skipif(
+    shutil.which("frama-c") is None,
+    reason="frama-c (apt-get install frama-c-base), which proves exported code, is missing",
+)
+LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
+OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
+ADRC = ql.ADRC(OBSERVER, 1.5, **LIMITS)
+PID = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=0.01, **LIMITS)
+
+
+def exported(folder: Path, controller: Any = ADRC, **options: Any) -> Exported:
+    """Export a controller as ``servo`` with a proof."""
+    return ql.export.c(controller, folder / "out", name="servo", accept=True, proof=True, **options)
+
+
+@needs_frama_c
+@pytest.mark.parametrize(
+    ("controller", "options"),
+    [
+        pytest.param(ADRC, {}, id="ADRC"),
+        pytest.param(ADRC, {"precision": "single"}, id="ADRC, single"),
+        pytest.param(ADRC, {"resolution": 1e-4}, id="ADRC, counts"),
+        pytest.param(ql.ADRC(OBSERVER, 1.5), {}, id="without limits"),
+        pytest.param(PID, {}, id="PID"),
+        pytest.param(ql.controllers.Prefiltered(PID, ql.baselines.ZV(3.0)), {}, id="shaper, with a ring"),
+    ],
+)  # fmt: skip
+def test_a_controller_is_proved(tmp_path: Path, controller: Any, options: dict[str, Any]) -> None:
+    """Without an alarm, with all promises of the contract; the report names the files it is for."""
+    done = exported(tmp_path, controller, **options)
+    proof = done.proof
+    assert proof is not None
+    assert proof.proved, proof.text
+    assert (proof.alarms, proof.findings.promises) == ((), proof.promised)
+    report = (done.folder / "proof/REPORT.md").read_text()
+    assert report == proof.text
+    assert "Proved: no undefined behaviour" in report
+    assert "NOT" not in report
+    files = [(done.folder / "src" / name).read_bytes() for name in ("servo.h", "servo.c")]
+    assert hashlib.sha256(b"".join(files)).hexdigest() in report
+
+
+MUTANTS = [
+    pytest.param("        applied = limits->high;\n", "", "servo_step", id="no upper limit"),
+    pytest.param("applied == applied && ", "", "servo_step", id="no test for NaN"),
+    pytest.param("        applied = control_at_rest(limits);\n", "", "servo_step", id="NaN stays"),
+    pytest.param("applied < limits->low", "applied > limits->low", "servo_step", id="wrong sign"),
+    pytest.param("estimate.x_hat[1] = row[1];", "estimate.x_hat[1] = row[9];", "servo_get_estimate", id="index"),
+    pytest.param("for (int i = 0; i < 2; i++) {", "for (int i = 0; i < 40; i++) {", "", id="too many passes"),
+    pytest.param("    observe(&design->eso, state->z", "    state->z[(int)r] = r;\n    observe(&design->eso, state->z", "", id="NaN as an index"),
+]  # fmt: skip
+
+
+@needs_frama_c
+@pytest.mark.parametrize(("old", "new", "function"), MUTANTS)
+def test_the_proof_fails_for_a_wrong_controller(
+    tmp_path: Path, old: str, new: str, function: str
+) -> None:
+    """A limit, a test for NaN or an index is changed: an alarm names file and line, and the report what it means."""
+    done = exported(tmp_path)
+    code = done.folder / "src/servo.c"
+    assert old in code.read_text()
+    code.write_text(code.read_text().replace(old, new))
+    proof = prove(done.folder, done.source)
+    assert not proof.proved
+    assert proof.alarms
+    assert any(function in alarm.function for alarm in proof.alarms)
+    report = (done.folder / "proof/REPORT.md").read_text()
+    assert all(f"NOT proved: {alarm.place}" in report for alarm in proof.alarms)
+    assert "# Proof of servo\n\nNOT proved" in report
+
+
+@needs_frama_c
+def test_the_script_comes_to_the_same_result(tmp_path: Path) -> None:
+    """It ends with 0 if all is proved; with 1 if something is not, which it prints, or if the code does not compile."""
+    done = exported(tmp_path, PID)
+    code, script = done.folder / "src/servo.c", done.folder / "proof/prove.sh"
+    text = code.read_text()
+    for old, new, status, shown in (
+        ("", "", 0, "proved: no undefined behaviour"),
+        ("        applied = limits->high;\n", "", 1, "servo_step: postcondition: Unknown"),
+        ("#include <math.h>", "int x = ;", 1, "NOT proved: Frama-C ended without a result"),
+    ):
+        code.write_text(text.replace(old, new))
+        ran = subprocess.run(["sh", script], capture_output=True, text=True, check=False)
+        assert (ran.returncode, shown in ran.stdout) == (status, True), ran.stdout
+
+
+@needs_frama_c
+def test_an_analysis_that_does_not_end_proves_nothing(tmp_path: Path) -> None:
+    """After the time that it has, or with code that is no C, the report says NOT."""
+    done = exported(tmp_path)
+    assert "did not end in 0.01 s" in prove(done.folder, done.source, longest=0.01).summary
+    (done.folder / "src/servo.c").write_text("int x = ;\n")
+    proof = prove(done.folder, done.source)
+    assert (proof.proved, proof.summary.startswith("NOT proved: frama-c ended")) == (False, True)
+
+
+def test_without_frama_c_nothing_is_proved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All files are written; command and report say NOT and how to install it; the exit code is 5."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", "")
+    Path("setup.toml").write_text(TWO_MASS)
+    arguments = ("export", "setup.toml", "--out", "out", "--name", "servo")
+    assert in_this_process(arguments, monkeypatch, capsys).code == 0
+    assert not Path("out/proof").exists()
+    shown = in_this_process((*arguments, "--prove", "--overwrite"), monkeypatch, capsys)
+    assert shown.code == 5
+    assert "NOT proved: there is no frama-c here" in shown.out
+    assert "apt-get install frama-c-base" in Path("out/proof/REPORT.md").read_text()
+    names = {path.name for path in Path("out/proof").iterdir()}
+    assert names == {"servo_contract.h", "servo_proof.c", "prove.sh", "REPORT.md"}
+    fmu = in_this_process((*arguments, "--to", "fmu", "--prove"), monkeypatch, capsys)
+    assert (fmu.code, "--prove: are for --to c" in fmu.err) == (2, True)
+
+
+def test_the_program_of_the_proof_calls_everything(tmp_path: Path) -> None:
+    """Each function of the header is in it, so the proof is for all of them."""
+    move = ql.controllers.ProfileGenerator(0.5, 2.0, 5.0)
+    moving = ql.controllers.Prefiltered(ql.ADRC(OBSERVER, 1.5, feedforward=True, **LIMITS), move)
+    for controller, resolution in ((moving, None), (ADRC, 1e-4)):
+        source = ql.export.c_source(controller, "servo", resolution=resolution)
+        text = ql.export.proof.proof_files(controller, source)["proof/servo_proof.c"]
+        assert all(f"servo_{operation}(" in text for operation in source.operations)
+
+
+def test_a_function_in_c_can_not_be_proved(tmp_path: Path) -> None:
+    """Nobody knows what it does: nothing is written."""
+    feature = Custom(lambda x, u: (x[0] * x[1],), ["product"], c_function="product")
+    learner = ql.learners.RLS(feature)
+    with pytest.raises(ValueError, match="proof = True: the controller calls product"):
+        exported(tmp_path, ql.ADRC(OBSERVER, 1.5, learner=learner, guard=ql.Guard(), **LIMITS))
+    assert not any(tmp_path.iterdir())
+
+
+HEAD = "directory\tfile\tline\tfunction\tproperty kind\tstatus\tproperty\n"
+
+
+def test_the_table_of_frama_c_is_read() -> None:
+    """What is not valid is an alarm, what a library function changes is an assumption, and each promise counts once."""
+    table = HEAD + "".join(
+        "\t".join(row) + "\n"
+        for row in (
+            ("../src", "a.c", "7", "f", "index_bound", "Unknown", "i < 3"),
+            (".", "a.h", "2", "a_step", "postcondition", "Valid", "a_number: \\is_finite(\\result)"),
+            (".", "a.h", "3", "a_step", "postcondition", "Unknown", "within_limits: low <= \\result"),
+            ("FRAMAC_SHARE/libc", "math.h", "9", "tanh", "assigns clause", "Unknown", "assigns \\nothing;"),
+            ("FRAMAC_SHARE/libc", "math.h", "9", "log2", "precondition", "Unknown", "finite_arg"),
+        )
+    )  # fmt: skip
+    log = "by the Eva analyzer:      0 errors    0 warnings\n[eva] using specification for function tanh\n"
+    found = read_findings("25.0", 1.0, log, table)
+    assert [alarm.kind for alarm in found.alarms] == [
+        "index_bound",
+        "postcondition",
+        "precondition",
+    ]
+    assert found.alarms[0].place == "a.c:7"
+    assert (found.promises, found.assumed, found.failure) == (1, ("tanh",), "")
+    failed = read_findings("25.0", 1.0, "by the Eva analyzer:      2 errors    0 warnings\n", table)
+    assert "2 errors of the Eva analyzer" in failed.failure
+
+
+LOOPS = """static const int ROWS = 3;
+
+static double inner(double a)
+{
+    for (int i = 0; i < ROWS; i++) {
+        a += 1.0;
+    }
+    return a;
+}
+
+/* for (;;) in a comment is none. */
+double a_step(a_state *state, double r)
+{
+    for (int i = 4 - 1; i > -1; i--) {
+        for (int j = 0; j < i + 1; j++) {
+            r = inner(r);
+        }
+    }
+    for (int k = 0, end = minimum_int(truncated(r), 7); k < end; k += 2) {
+        r = fabs(r);
+    }
+    return r;
+}
+"""
+
+
+def test_the_passes_of_loops_are_counted() -> None:
+    """4 of a loop, each with 4 at most of the next, each with 3 of a function's; and 4 of one to a smaller end."""
+    found = structure(LOOPS, "a_step")
+    assert found.problems == []
+    assert found.passes == {"inner": 3, "a_step": 4 + 16 + 48 + 4}
+    assert found.library == {"fabs", "minimum_int", "truncated"}
+    open_end = structure(LOOPS.replace("minimum_int(truncated(r), 7)", "truncated(r)"), "a_step")
+    assert open_end.passes["a_step"] is None
+    assert [each.partition(":")[0] for each in open_end.by_data] == ["19"]
+
+
+def test_an_argument_that_the_call_tells_is_counted() -> None:
+    """A function whose loop ends at its argument has as many passes as each call gives it."""
+    text = LOOPS.replace("inner(double a)", "inner(double a, int count)").replace(
+        "ROWS; i++", "count; i++"
+    )
+    found = structure(text.replace("inner(r)", "inner(r, i + 2)"), "a_step")
+    assert found.passes["inner"] is None
+    assert found.passes["a_step"] == 4 + 16 + 16 * 5 + 4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("a += 1.0;", "a_step(state, a);", "recursion is possible"),
+        ("a += 1.0;", "while (a < 3.0) { a += 1.0; }", "inner has 'while'"),
+        ("a += 1.0;", "i = 0;", "inner changes i in its loop, line 5"),
+        ("k += 2) {", "k += 2) {\\n        end++;", "a_step changes end"),
+        ("a += 1.0;", "a += *(double *)malloc(8);", "malloc is called"),
+        ("for (int i = 0; i < ROWS; i++)", "for (;;)", "no range of integers"),
+    ],
+)
+def test_code_that_is_not_as_claimed_is_named(old: str, new: str, problem: str) -> None:
+    """Recursion, other loops, a loop whose end moves, memory that is allocated."""
+    found = structure(LOOPS.replace(old, new), "a_step")
+    assert any(problem in each for each in found.problems), found.problems
