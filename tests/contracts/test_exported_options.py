@@ -108,7 +108,15 @@ _LINEAR = {
     "gain_interval": With((0.7, 1.4), {"u": True}),
 }  # fmt: skip
 _ESO = {"order": 2, "b0": 1.5, "omega_o": 12.0, "dt": DT}
-_ORDERS = {"order": Several((1, 3, 8)), "b0": 2.0, "omega_o": 10.0, "dt": 0.02, "delay": 0.02}
+_EXTENDED = {"disturbance_order": Several((2, 3))}
+_ORDERS = {
+    "order": Several((1, 3, 8)),
+    "b0": 2.0,
+    "omega_o": 10.0,
+    "dt": 0.02,
+    "delay": 0.02,
+    **_EXTENDED,
+}
 PARTS: dict[str, Part] = {
     # Learners.
     "Kalman": Part(ql.learners.Kalman, _learning, {}, _LINEAR),
@@ -161,10 +169,10 @@ PARTS: dict[str, Part] = {
     "ESO.model_based": Part(ql.ESO.model_based, _observing, {"plant": ([2.0, 0.3], 1.5), "omega_o": 12.0, "dt": DT}, {
         "plant": Several((PLANT, ([1.0, 2.0, 0.5], 1.5), ([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]))), "omega_o": 10.0, "dt": 0.02, "b0": 2.0,
         "E": With([0.0, 1.0], {"plant": PLANT}), "form": Several(FORMS), "keep_zeros": With(True, {"plant": ([1.5, 6.0], [1.0, 0.5, 2.0, 1.0])}),
-        "half_gain": True, "delay": 0.02, "poles": Several(([-1.0, -1.2, -1.5],)), "far": With(2.0, {"plant": ([1.5, 60.0], [1.0, 0.5, 2.0, 1.0])}),
+        "half_gain": True, "delay": 0.02, **_EXTENDED, "poles": Several(([-1.0, -1.2, -1.5],)), "far": With(2.0, {"plant": ([1.5, 60.0], [1.0, 0.5, 2.0, 1.0])}),
     }),
     "ESO.kalman": Part(ql.ESO.kalman, _observing, {"order": 2, "b0": 1.5, "dt": DT, "noise_variance": 1e-6, "drift": 0.03}, {
-        "order": Several((1, 3)), "b0": 2.0, "dt": 0.02, "noise_variance": 1e-5, "drift": 0.1, "jitter": 0.1, "form": Several(FORMS[:2]), "delay": 0.02,
+        "order": Several((1, 3)), "b0": 2.0, "dt": 0.02, "noise_variance": 1e-5, "drift": 0.1, "jitter": 0.1, "form": Several(FORMS[:2]), "delay": 0.02, **_EXTENDED,
     }),
     "ESO.cascade": Part(ql.ESO.cascade, _observing, _ESO, {**_ORDERS, "order": Several((1, 3)), "levels": 3, "ratio": 3.0}),
     "ESO.nonlinear": Part(ql.ESO.nonlinear, _observing, {**_ESO, "delta": 0.05}, {
