@@ -7,7 +7,7 @@ optimization", *Automatica* 34, 1998, whose values of two plants are here, too).
 
     (sin nθ − R) (1 + n sin² θ) + n sin θ cos θ cos nθ = 0,    K = −cos nθ/cosⁿ θ
 
-For 1/(s+1)⁴ METHOD has K = 0.438, T_i = 2.28, from a search. The optimum is K = 0.43261, T_i = 2.25357, which is
+For 1/(s+1)⁴ an independent program has K = 0.438, T_i = 2.28, from a search. The optimum is K = 0.43261, T_i = 2.25357, which is
 1.2 % off in both; the best k_i at K = 0.438 is only 0.01 % lower, with T_i = 2.282. So the pair is a point beside the
 optimum, where a search ends that knows M_s at some frequencies only: at 401 from 0.1 to 100, for example.
 """

@@ -17,7 +17,7 @@ from quell.simulation.simulate import simulate
 
 # Largest RMS difference of u that is accepted, relative to the RMS of u. Rounding acts on
 # u as noise does. One per cent of it is what a 6-bit converter adds, and does not show in y
-# (METHOD's table: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
+# (a torsional axis: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
 # unless the rounding of y itself, times omega_o^(n+1), is too much for u.
 LIMIT = 0.01
 

@@ -34,7 +34,7 @@ from quell.types import Vector
 
 Rng = np.random.Generator
 
-# Lags of the observer in a run, and least length in 1/omega_c: METHOD's guard needs 30 lags to
+# Lags of the observer in a run, and least length in 1/omega_c: the guard needs 30 lags to
 # trust, a step response 12/omega_c.
 RUN_LAGS, _LEAST_DURATION = 250.0, 40.0
 # Loops below this modulus margin are not drawn: they are hardly stable themselves.
