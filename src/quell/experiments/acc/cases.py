@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 
 from quell.analysis import analyse
-from quell.analysis.linearise import linear_law
 from quell.analysis.margins import Margins
 from quell.controllers import Controller
 from quell.experiments.acc.controllers import DT, OURS, designs
 from quell.experiments.acc.criteria import MOST_Y
-from quell.experiments.acc.stability import unstable, unstable_under
+from quell.experiments.acc.stability import law_before_learning, unstable, unstable_under
 from quell.files import nonfinite_to_none
 from quell.parallel import in_parallel
 from quell.plants import two_mass_spring
@@ -121,7 +120,7 @@ def _edge(controller: Controller, factor: float) -> float:
 
 def _parameter_bound(controller: Controller) -> float:
     """Return p, to 0.005, from the corners and middles of the box of m1, m2 and k."""
-    law = linear_law(controller)
+    law = law_before_learning(controller)
     for step in range(1, 199):
         p = 0.005 * step
         box = (1.0 - p, 1.0, 1.0 + p)

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.analysis.frozen_learner import frozen
 from quell.analysis.linearise import linear_law
 from quell.analysis.subsystems import closed_loop_matrix
 from quell.controllers import Controller
+from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.linear.law import LinearLaw
 from quell.parallel import one_blas_thread
 from quell.plants import CubicSpringPlant, LinearPlant
@@ -18,8 +20,14 @@ from quell.plants import CubicSpringPlant, LinearPlant
 def unstable(
     plants: Sequence[LinearPlant | CubicSpringPlant], controller: Controller
 ) -> NDArray[np.bool_]:
-    """Return for each plant whether its loop is unstable at rest, with nothing learned."""
-    return unstable_under(plants, linear_law(controller), controller.dt)
+    """Return for each plant whether its loop is unstable at rest, before anything is learned."""
+    return unstable_under(plants, law_before_learning(controller), controller.dt)
+
+
+def law_before_learning(controller: Controller) -> LinearLaw:
+    """Return the law of a controller whose learner knows nothing and does not learn."""
+    at = frozen(controller) if isinstance(controller, ADRC) else None
+    return linear_law(controller, at)
 
 
 def unstable_under(

@@ -41,8 +41,9 @@ class Harmonic(Kalman):
         initial frequencies [rad/s] within ``limits``, one for each sinusoid; by default ``omega_c``
         of the controller, 0.3 omega_c, 0.09 omega_c …
     limits
-        least and largest frequency [rad/s]; ``0.02 omega_c`` and ``0.5 omega_o`` by default, or the
-        largest with which the highest order is at ``omega_o``.
+        least and largest frequency [rad/s]; ``0.02 omega_c`` (of ``omega_o``, if that is smaller)
+        and ``0.5 omega_o`` by default, or the largest with which the highest order is at
+        ``omega_o``.
     orders
         multiples of each frequency that a load may contain, different whole numbers from 1, the
         strongest first: for example (1, 3, 5, 7) for a square wave. Together ``count`` and
@@ -106,13 +107,15 @@ class Harmonic(Kalman):
         ValueError
             for an initial frequency outside of the limits.
         """
-        low, high = _LOWEST * omega_c, _HIGHEST * observer.omega_o
+        # A law may be faster than the observer, as one that was tuned; loads of use are not.
+        slower = min(omega_c, observer.omega_o)
+        low, high = _LOWEST * slower, _HIGHEST * observer.omega_o
         if len(self.orders) > 1:
             high = min(high, observer.omega_o / max(self.orders))
         if self.limits is not None:
             low, high = self.limits
         if self.omegas is None:
-            start = np.clip(omega_c * _SPREAD ** np.arange(self.count), low, high)
+            start = np.clip(slower * _SPREAD ** np.arange(self.count), low, high)
         else:
             start = checks.vector("omegas", self.omegas)
         if not np.all((low <= start) & (start <= high)):
