@@ -1,6 +1,6 @@
 """What learning gives at equal margins: late errors with M_s and M_ks the same for all.
 
-    python benchmarks/equal_margins.py [--m-ks 100] [--json file] [--figure file]
+    python benchmarks/equal_margins.py [--m-ks 100] [--json FILE] [--figure FILE]
 
 The plant is an axis with viscous friction, ``y'' = −2 y' + 100 (u + w)``, sampled at 500 Hz. Linear
 controllers are tuned for the least IAE after a step of the load with M_s ≤ 2 and M_ks ≤ the
@@ -147,7 +147,8 @@ def main() -> None:
     """Print a row for each controller, and the ratio of the best learner to the best linear one."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--m-ks", type=float, default=100.0)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="file for the rows")
+    parser.add_argument("--figure", type=Path, help="file for a figure of the best of each kind")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     t = DT * np.arange(round(LAST / DT) + 1)
@@ -203,6 +204,32 @@ def main() -> None:
         print(f"{name:14} {best}: {learned[best]:.3g} times as good as the best linear controller")
     if given.json is not None:
         given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    if given.figure is not None:
+        draw(rows, [*cases], given.figure)
+
+
+def draw(rows: dict[str, dict[str, Any]], cases: list[str], path: Path) -> None:
+    """Draw the smallest error of linear controllers and of guarded learners for each load."""
+    import matplotlib.pyplot as plt
+
+    kinds = {
+        "best linear controller": [each for each in rows if each in LINEAR],
+        "best learner, guarded": [each for each in rows if each.endswith(", guarded")],
+    }
+    with plt.rc_context(ql.style(columns=2)):
+        figure, axes = plt.subplots(figsize=(7.16, 2.8))
+        for i, (label, names) in enumerate(kinds.items()):
+            sizes = [np.nanmin([rows[name][case] for name in names]) for case in cases]
+            at = np.arange(len(cases)) + 0.38 * i - 0.19
+            bars = axes.bar(at, sizes, 0.36, label=label)
+            axes.bar_label(bars, [f"{size:.1e}" for size in sizes], fontsize=6)
+        axes.axhline(1e-6, color="0.5", linestyle=":", label="noise of y")
+        axes.set_xticks(np.arange(len(cases)), cases)
+        axes.set(yscale="log", ylabel="late RMS error of y")
+        axes.grid(axis="x", visible=False)
+        axes.legend(loc="upper center", ncols=3)
+        axes.set_ylim(top=0.3)
+        figure.savefig(path, dpi=160)
 
 
 def show(label: str, row: dict[str, Any]) -> None:

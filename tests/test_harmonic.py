@@ -234,6 +234,14 @@ def test_frequencies_start_apart_and_stay_within_their_limits() -> None:
     assert (design.oscillators.low, design.oscillators.high) == (0.04, 10.0)
 
 
+def test_behind_a_law_that_is_faster_than_the_observer_slow_loads_are_found() -> None:
+    """Limits and first frequencies follow the observer then."""
+    observer = ql.ESO.model_free(2, 1.0, 20.0, 1e-2)
+    found = ql.learners.Harmonic(count=2).design(observer, 90.0).oscillators
+    assert (found.low, found.high) == (0.4, 10.0)
+    np.testing.assert_allclose(found.omega, [10.0, 6.0])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
