@@ -49,16 +49,13 @@ for file in sys.argv[1:]:
             assert (
                 abs(learned["settling_time"] - asked) <= 0.01 and learned["overshoot"] <= 0.0015
             ), (at, learned)
-    # On the linear plant the guarded learner overshoots and does not settle from all starts: most
-    # of what the guard sees there is encoder noise (docs/theory). Where that has changed, the page
-    # has to change.
-    for plant, keeps in ((friction, True), (linear, False)):
+    # On the linear plant most of what the guard sees is encoder noise: the guarded learner does not
+    # settle from all starts with all seeds (docs/torsional), so its overshoot alone is judged.
+    for plant, keys in ((friction, ("overshoot", "settling_time")), (linear, ("overshoot",))):
         free, guarded, plain = (
             plant[20.0, 90.0][name] for name in ("L-ESO", "L-ESO (guarded)", "MF-ESO")
         )
-        kept = [
-            guarded[key] is not None and guarded[key] - free[key] < 0.5 * (plain[key] - free[key])
-            for key in ("overshoot", "settling_time")
-        ]
-        assert all(kept) == keeps, (file, keeps, guarded)
+        for key in keys:
+            half = free[key] + 0.5 * (plain[key] - free[key])
+            assert guarded[key] is not None and guarded[key] < half, (file, key, guarded)
 print("L-ESO keeps what it promises at the testbed")
