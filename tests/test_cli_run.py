@@ -199,7 +199,7 @@ def test_all_exit_codes_are_in_one_table_that_help_shows(quell: Callable[..., Sh
     """Each with its meaning; commands that use one name it."""
     codes = {code.name: code.value for code in ExitCode}
     assert codes == {
-        "DONE": 0, "INTERNAL": 1, "ERROR": 2, "ENDED_BY_SAFETY": 3, "DIVERGED": 4,
+        "DONE": 0, "INTERNAL": 1, "ERROR": 2, "ENDED_BY_SAFETY": 3, "DIVERGED": 4, "NOT_PROVED": 5,
         "INTERRUPTED": 130, "TERMINATED": 143,
     }  # fmt: skip
     told = " ".join(quell("--help").out.split())

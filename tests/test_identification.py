@@ -497,6 +497,7 @@ def test_the_command_prints_writes_and_draws(quell: Callable[..., Shown], tmp_pa
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
         "identified.png",
         "identified.svg",
+        "identified.pdf",
     }
 
 
