@@ -9,6 +9,7 @@ import pytest
 
 import quell as ql
 from quell import analysis
+from quell.analysis import adapting_learner
 from quell.learners import BatchGradient, Harmonic, Kalman, Repetitive
 
 from .analysed_loops import PLANT, adrc, chain
@@ -92,7 +93,7 @@ def test_the_steady_gain_of_the_bias_follows_its_bandwidth(bandwidth: float) -> 
     learner = controller(Kalman(bias_bandwidth=bandwidth))
     Q = bandwidth**2 * DT
     P = 0.5 * (Q + np.sqrt(Q**2 + 4.0 * Q / DT))
-    assert analysis.adapting(learner).level == pytest.approx(P / (P + 1.0 / DT), rel=1e-4)
+    assert analysis.adapting(learner).rates.level == pytest.approx(P / (P + 1.0 / DT), rel=1e-4)
 
 
 def test_a_guard_without_authority_leaves_the_loop_of_the_observer() -> None:
@@ -101,6 +102,33 @@ def test_a_guard_without_authority_leaves_the_loop_of_the_observer() -> None:
     guarded = ql.ADRC(observer, omega_c=OMEGA_C, learner=Kalman(), guard=ql.Guard())
     plain = analysis.analyse(LOADED, ql.ADRC(observer, omega_c=OMEGA_C))
     assert analysis.analyse(LOADED, guarded).margins.modulus == plain.margins.modulus
+
+
+def test_the_authority_is_that_of_the_instant() -> None:
+    """Early in a run a guard has granted less of it than at the end; that multiplies the bias, too."""
+    observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=12.0, dt=DT)
+    guarded = ql.ADRC(observer, omega_c=OMEGA_C, learner=Kalman(), guard=ql.Guard())
+    scenario = ql.Scenario(ql.signals.Sinusoid(), duration=20.0)
+    recorded = ql.simulate(LOADED, guarded, scenario)
+    for t in (1.0, 20.0):
+        found = analysis.adapting(guarded, recorded, t).known
+        assert found.authority == recorded["authority"][round(t / DT)]
+    assert recorded["authority"][round(1.0 / DT)] < recorded["authority"][-1]
+
+
+def test_slow_oscillators_take_longer_steps_to_the_same_gains(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The equation is one of densities; steps a tenth as many as the samples change the gains by less than 2 %."""
+    learner = controller(Harmonic(omegas=(0.5,)))
+    fine = analysis.adapting(learner).rates
+    monkeypatch.setattr(adapting_learner, "_MOST_STEPS", 400)
+    adapting_learner._averaged_gains.cache_clear()
+    coarse = analysis.adapting(learner).rates
+    adapting_learner._averaged_gains.cache_clear()
+    assert coarse.level == pytest.approx(fine.level, rel=0.02)
+    assert not np.array_equal(coarse.drive, fine.drive)
+    np.testing.assert_allclose(coarse.drive, fine.drive, atol=0.03 * np.max(np.abs(fine.drive)))
 
 
 def test_a_learner_whose_adaptation_is_not_known_is_named() -> None:

@@ -30,13 +30,16 @@ motion are not in it.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.analysis.frozen_learner import Frozen, frozen
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
+from quell.kernels.dispatch import kernel
 from quell.kernels.functions import cos, sin
 from quell.learners.base import (
     NoLearnerDesign,
@@ -55,9 +58,9 @@ from quell.learners.online.learner import OnlineDesign
 from quell.learners.regression.kernels import LinearDesign
 from quell.types import Matrix, Vector
 
-# The Riccati equation is followed for so many times the slowest adaptation, and at most so many
-# samples; then gains are averaged over the last part of it, some turns of each oscillator.
-_SETTLING, _MOST_SAMPLES, _AVERAGED = 12.0, 200_000, 0.25
+# With oscillators the Riccati equation is followed for so many times the slowest adaptation, in at
+# most so many steps; then gains are averaged over the last part of it, some turns of each one.
+_SETTLING, _MOST_STEPS, _AVERAGED = 12.0, 200_000, 0.25
 # Frequencies that differ by less than this share are one: apart they would turn once in a million.
 _EQUAL = 1e-6
 
@@ -84,15 +87,10 @@ NOTHING = Adaptation(0.0, 1, True, np.zeros(0), np.zeros((0, 2)))
 class Adapting(NamedTuple):
     """A learner that adapts its bias and its oscillators, for a plant of order n."""
 
-    known: Frozen  # g, h and s, with the authority of a guard
-    authority: float  # β, which multiplies d and c_j, too
+    known: Frozen  # g, h and s, with the authority of a guard, which multiplies d and c_j, too
+    rates: Adaptation
     lag: Any
-    level: float
-    window: int
-    compensated: bool
     dt: float
-    omega: Vector
-    drive: Matrix
     seen: Matrix  # Re and Im of H_j e^{−i ω_j dt} (m, 2): what c_j of this sample has of the last
 
 
@@ -115,11 +113,11 @@ def _adapt(
     u_before: float,
     f_plain: float,
 ) -> None:
-    pairs, errors = memory.pairs, memory.errors
+    rates, pairs, errors = learner.rates, memory.pairs, memory.errors
     error = seen[learner.known.gain.size - 1]
-    if learner.compensated:
+    if rates.compensated:
         error = f_plain - memory.known[0] - memory.level[0]
-        for j in range(learner.omega.size):
+        for j in range(rates.omega.size):
             error -= learner.seen[j, 0] * pairs[j, 0] - learner.seen[j, 1] * pairs[j, 1]
     total = error
     for i in range(errors.size):
@@ -128,39 +126,44 @@ def _adapt(
         errors[i] = errors[i - 1]
     if errors.size > 0:
         errors[0] = error
-    memory.level[0] += learner.level * total
-    for j in range(learner.omega.size):
-        pairs[j, 0] += learner.drive[j, 0] * error
-        pairs[j, 1] += learner.drive[j, 1] * error
+    memory.level[0] += rates.level * total
+    for j in range(rates.omega.size):
+        pairs[j, 0] += rates.drive[j, 0] * error
+        pairs[j, 1] += rates.drive[j, 1] * error
+
+
+@kernel
+def _adapted(memory: AdaptingMemory) -> float:
+    """Return d + Σ Re c_j."""
+    total = memory.level[0]
+    for j in range(memory.pairs.shape[0]):
+        total += memory.pairs[j, 0]
+    return total
 
 
 @predict.register(Adapting)
 def _predict(
     learner: Adapting, memory: AdaptingMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
-    total = memory.level[0]
-    for j in range(learner.omega.size):
-        total += memory.pairs[j, 0]
-    constant = learner.authority * total + learner.known.before * u_before
-    for i in range(learner.known.gain.size):
-        constant += learner.known.gain[i] * seen[i]
-    return constant, learner.known.slope
+    known = learner.known
+    constant = known.authority * _adapted(memory) + known.before * u_before
+    for i in range(known.gain.size):
+        constant += known.gain[i] * seen[i]
+    return constant, known.slope
 
 
 @commit.register(Adapting)
 def _commit(
     learner: Adapting, memory: AdaptingMemory, seen: Vector, u: float, f_learned: float
 ) -> None:
-    total = memory.level[0]
-    for j in range(learner.omega.size):
-        total += memory.pairs[j, 0]
     # What is known of the plant is all of the output but the level and the oscillators. A guard's
     # authority is part of it: a learner estimates q, and its output is β q.
-    if learner.authority > 0.0:
-        known = (f_learned - learner.authority * total) / learner.authority
+    authority, omega = learner.known.authority, learner.rates.omega
+    if authority > 0.0:
+        known = (f_learned - authority * _adapted(memory)) / authority
         memory.known[0] = lag_push(learner.lag, memory.chain, 0, known)
-    for j in range(learner.omega.size):
-        angle = learner.omega[j] * learner.dt
+    for j in range(omega.size):
+        angle = omega[j] * learner.dt
         c, s = cos(angle), sin(angle)
         real, imaginary = memory.pairs[j, 0], memory.pairs[j, 1]
         memory.pairs[j, 0] = c * real - s * imaginary
@@ -187,29 +190,18 @@ def adapting(controller: Controller, run: Any = None, t: float | None = None) ->
     design = controller.parameters.learner
     state = controller._state if run is None else getattr(run, "final_state", run)
     memory = controller.initial_state().learner if state is None else state.learner
-    authority = 1.0 if state is None else float(controller.read(state).authority)
-    found = adaptation_of(design, memory)
+    rates = adaptation_of(design, memory)
     lag: Any = getattr(design, "lag", controller.parameters.lag)
-    seen = lag_response(lag, found.omega * controller.dt) * np.exp(
-        -1j * found.omega * controller.dt
-    )
-    return Adapting(
-        known=known,
-        authority=authority,
-        lag=lag,
-        level=found.level,
-        window=found.window,
-        compensated=found.compensated,
-        dt=float(controller.dt),
-        omega=found.omega,
-        drive=found.drive,
-        seen=np.column_stack([seen.real, seen.imag]),
-    )
+    angles = rates.omega * controller.dt
+    seen = lag_response(lag, angles) * np.exp(-1j * angles)
+    seen_parts = np.column_stack([seen.real, seen.imag])
+    return Adapting(known, rates, lag, float(controller.dt), seen_parts)
 
 
 def adaptation_memory(learner: Adapting) -> AdaptingMemory:
     """Return its state with a bias and oscillators of zero."""
-    pairs, errors = np.zeros((learner.omega.size, 2)), np.zeros(learner.window - 1)
+    rates = learner.rates
+    pairs, errors = np.zeros((rates.omega.size, 2)), np.zeros(rates.window - 1)
     return AdaptingMemory(np.zeros(1), pairs, errors, lag_memory(learner.lag, 1), np.zeros(1))
 
 
@@ -252,40 +244,61 @@ def _of_kalman(design: KalmanDesign, omega: Vector) -> Adaptation:
     walk = design.walk[at]
     if not at or not np.any(walk > 0.0):
         return NOTHING
+    if angular.size == 0:  # the scalar equation: P² = Q dt (P + 1/dt)
+        Q = float(walk[0]) * dt
+        P = 0.5 * (Q + math.sqrt(Q * (Q + 4.0 / dt)))
+        return NOTHING._replace(level=min(P / (P + 1.0 / dt), design.fastest * dt))
     shift = lag_response(design.lag, angular * dt)
-    slowest = float(np.sqrt(np.min(walk[walk > 0.0])))
-    if angular.size:
-        slowest = min(slowest, float(np.min(angular)) * slowest / design.fastest)
-    steps = min(math.ceil(_SETTLING / (slowest * dt)), _MOST_SAMPLES)
-    P, level, drive = np.zeros((len(at), len(at))), 0.0, np.zeros(angular.size, dtype=np.complex128)
-    counted = 0
-    for k in range(steps):
-        turned = np.exp(1j * angular * dt * k)
-        shown = shift * turned
-        phi = np.append(
-            np.ones(int(design.bias)), np.column_stack([shown.imag, shown.real]).ravel()
-        )
-        of_phi = P @ phi
-        spread = float(phi @ of_phi)
-        gain = of_phi / max(spread + 1.0 / dt, spread / (design.fastest * dt))
-        P -= np.outer(gain, of_phi)
-        P[np.diag_indices_from(P)] += walk * dt
-        if k >= (1.0 - _AVERAGED) * steps:
-            counted += 1
-            level += float(gain[0]) if design.bias else 0.0
-            pairs = gain[int(design.bias) :].reshape(-1, 2)
-            # The oscillator has turned by one sample when its error is seen.
-            drive += (pairs[:, 1] - 1j * pairs[:, 0]) * turned * np.exp(1j * angular * dt)
+    given = (tuple(each.tolist()) for each in (walk, angular, shift))
+    level, drive = _averaged_gains(dt, design.fastest, *given)
     # Two oscillators at one frequency, as at a limit, are one: their difference shows nowhere.
     order = np.argsort(angular)
     apart = np.diff(angular[order]) > _EQUAL * angular[order][1:]
-    firsts = np.flatnonzero(np.append(True, apart))[: angular.size]
-    different = angular[order][firsts]
-    merged = np.add.reduceat(drive[order], firsts) / counted if angular.size else drive
-    return Adaptation(
-        level=level / counted,
-        window=1,
-        compensated=True,
-        omega=different,
+    firsts = np.flatnonzero(np.append(True, apart))
+    merged = np.add.reduceat(drive[order], firsts)
+    return NOTHING._replace(
+        level=level,
+        omega=angular[order][firsts],
         drive=np.column_stack([merged.real, merged.imag]),
     )
+
+
+@lru_cache(maxsize=64)  # many instants of a run have the same
+def _averaged_gains(
+    dt: float,
+    fastest: float,
+    walk: tuple[float, ...],
+    angular: tuple[float, ...],
+    shift: tuple[complex, ...],
+) -> tuple[float, NDArray[np.complex128]]:
+    """Return γ, zero without a bias, and Γ_j (m,), averaged over turns of the oscillators.
+
+    ``walk`` has a number for the bias, if there is one, and two for each oscillator of ``angular``;
+    ``shift`` are their H_j.
+    """
+    bias, omega, H = len(walk) % 2, np.array(angular), np.array(shift)
+    slowest = math.sqrt(min(each for each in walk if each > 0.0))
+    slowest = min(slowest, min(angular) * slowest / fastest)
+    samples = math.ceil(_SETTLING / (slowest * dt))
+    # The equation is one of densities: a longer step gives the gain of as many samples.
+    stride = math.ceil(samples / _MOST_STEPS)
+    step, steps = stride * dt, math.ceil(samples / stride)
+    P, level, drive = np.zeros((len(walk), len(walk))), 0.0, np.zeros(omega.size, np.complex128)
+    last = range(math.ceil((1.0 - _AVERAGED) * steps), steps)
+    drift = np.diag(np.array(walk) * step)
+    # An oscillator has turned by one sample when its error is seen.
+    ahead = np.exp(1j * omega * dt)
+    for k in range(steps):
+        turned = np.exp(1j * omega * step * k)
+        shown = H * turned
+        phi = np.append(np.ones(bias), np.column_stack([shown.imag, shown.real]).ravel())
+        of_phi = P @ phi
+        spread = float(phi @ of_phi)
+        gain = of_phi / max(spread + 1.0 / step, spread / (fastest * step))
+        P += drift - np.outer(gain, of_phi)
+        if k in last:
+            level += float(gain[0]) if bias else 0.0
+            pairs = gain[bias:].reshape(-1, 2)
+            drive += (pairs[:, 1] - 1j * pairs[:, 0]) * turned * ahead
+    count = stride * len(last)
+    return level / count, drive / count

@@ -230,10 +230,11 @@ def _judge_learner(
         return []
     at = options["at"]
     learner = at if isinstance(at, Frozen | Adapting) else adapting(controller, at)
-    if isinstance(learner, Frozen) or not (learner.level > 0.0 or learner.omega.size):
+    if isinstance(learner, Frozen) or not learner.rates.acts:
         return []
     if at is None:
-        learner = learner._replace(authority=1.0)
+        learner = learner._replace(known=learner.known._replace(authority=1.0))
+    rates = learner.rates
 
     def m_s(part: Any) -> float:
         loop = analyse(plant, controller, delay=delay, **{**options, "at": part})
@@ -243,14 +244,17 @@ def _judge_learner(
     value, limit = m_s(learner), max(_LEARNED_M_S, _RAISED * none)
     if value <= limit:
         return []
+
+    def m_s_at(share: float) -> float:
+        return m_s(learner._replace(rates=rates._replace(level=share * rates.level)))
+
     message = f"the learner's adaptation raises M_s from {none:.3g} to {value:.3g}: "
-    if learner.level > 0.0 and m_s(learner._replace(level=0.0)) <= limit:
+    if rates.level > 0.0 and m_s_at(0.0) <= limit:
         low, high = 0.0, 1.0
         for _ in range(_BISECTIONS):
             share = 0.5 * (low + high)
-            kept = m_s(learner._replace(level=share * learner.level)) <= limit
-            low, high = (share, high) if kept else (low, share)
-        bandwidth = low * learner.level / controller.dt
+            low, high = (share, high) if m_s_at(share) <= limit else (low, share)
+        bandwidth = low * rates.level / controller.dt
         message += (
             f"its bias is an integrator beside the observer's; with bias_bandwidth = "
             f"{bandwidth:.3g} rad/s M_s is {limit:.3g}"

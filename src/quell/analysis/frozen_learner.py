@@ -51,11 +51,12 @@ _USE_STATE = "pass the scenario to loops_over_time, or the final_state of a run 
 
 
 class Frozen(NamedTuple):
-    """A learner that no longer learns, for a plant of order n, with its authority."""
+    """A learner that no longer learns, for a plant of order n; all with its authority."""
 
     gain: Vector  # g (n + 1,), for x̂_1 … x̂_n and Δf̂
     before: float  # h, for the control signal applied a sample before
     slope: float  # s, for the control signal that is about to be applied
+    authority: float = 1.0  # β, by which these are multiplied already
 
 
 @predict.register(Frozen)
@@ -168,7 +169,7 @@ def _with_authority(
     guarded = not isinstance(guard, UnguardedDesign)
     if guarded and not guard.least_slope <= slope <= guard.largest_slope:
         before, slope = before + slope, 0.0
-    return Frozen(gain, float(before), float(slope))
+    return Frozen(gain, float(before), float(slope), authority)
 
 
 def _signal_sizes(controller: ADRC, memory: Any, seen: Vector, u: float) -> Vector:
