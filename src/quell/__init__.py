@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from quell.observers.eso import ESO
     from quell.records import metrics
     from quell.records.batch_trajectory import BatchTrajectory
-    from quell.records.style import style
+    from quell.records.plotting import style
     from quell.records.trajectory import Trajectory
     from quell.simulation.scenario import Scenario
     from quell.simulation.simulate import simulate
@@ -76,7 +76,7 @@ _HOME = {
     "identify": "quell.identification.identify",
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation.simulate",
-    "style": "quell.records.style",
+    "style": "quell.records.plotting",
     "sweep": "quell.sweeping.sweep",
     "tune": "quell.tuning.tune",
 }

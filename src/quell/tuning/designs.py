@@ -371,7 +371,7 @@ def _tightened(task: Task, structure: Structure, best: Solution, share: float) -
 
 def _is_stable(plants: PlantSet, solution: Solution) -> bool:
     """Return whether the poles of all closed loops are inside of the unit circle."""
-    law = law_of(solution.structure.controller(solution.values))
+    law = law_of(solution.controller)
     return all(LoopAnalysis(plant, law, plants.dt).stable for plant in plants.scaled())
 
 

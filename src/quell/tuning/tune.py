@@ -404,8 +404,8 @@ def _setup(
         last = float(f"{load_step(plants).r.size * dt:.2g}")
         rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
         assert design.solution is not None
-        unlimited = design.solution.structure.controller(design.solution.values)
-        sizes = held_sizes(linear, rest, limits, peak_of_u(plants, unlimited))
+        peak = peak_of_u(plants, design.solution.controller)
+        sizes = held_sizes(linear, rest, limits, peak)
         tables |= scenario_tables(last, linear.disturbances, rest, sizes)
     elif "metrics" not in tables:
         tables["metrics"] = windows_of(tables["scenario"])

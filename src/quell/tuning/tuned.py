@@ -101,9 +101,8 @@ class Tuned:
         That of the linear loop with the first plant, without the controller's feedforward.
         """
         solution = self.design.solution
-        if solution is None:
-            return reference_step(self.plants, self.controller)
-        return reference_step(self.plants, solution.structure.controller(solution.values))
+        controller = self.controller if solution is None else solution.controller
+        return reference_step(self.plants, controller)
 
     @property
     def active(self) -> tuple[str, ...]:

@@ -93,8 +93,8 @@ def _control(result: Result, ax: Any) -> Any:
     return axes.ravel()
 
 
-def _comparison(channel: str, label: str, result: Result, ax: Any) -> Any:
-    """Draw one channel of the controllers of equal bandwidth: whole, and the paper's two zooms."""
+def _position(result: Result, ax: Any) -> Any:
+    """Draw y of the controllers of equal bandwidth: whole, and the paper's two zooms."""
     if ax is None:
         axes = wide_figure(6.4).subplot_mosaic([["all", "all"], ["step", "force"]])
     else:
@@ -106,13 +106,12 @@ def _comparison(channel: str, label: str, result: Result, ax: Any) -> Any:
             run, label_of_run = result.runs[name], legend_label(name, result.runs[name])
             part = run.window(start, stop)
             if part.stop > part.start:
-                draw_line(one, run.t[part], run[channel][part], label=label_of_run, **style)
+                draw_line(one, run.t[part], run["y"][part], label=label_of_run, **style)
         one.set(xlim=(start, stop), xlabel="time [s]")
     whole = axes["all"]
-    whole.set_ylabel(label)
+    whole.set_ylabel("position of m2 [m]")
     whole.set_title(
-        f"{label.split(' [')[0]}, from {_FROM:g} s: step at {STEP_AT:g} s, "
-        f"force on m2 from {FORCE_AT:g} s"
+        f"position of m2, from {_FROM:g} s: step at {STEP_AT:g} s, force on m2 from {FORCE_AT:g} s"
     )
     whole.legend(ncols=2, loc="lower left", fontsize="small")
     for start, stop in _ZOOMS:
@@ -188,7 +187,7 @@ def _algorithm_1(result: Result, ax: Any) -> Any:
 
 
 _DRAWINGS: Mapping[str, Callable[[Result, Any], Any]] = {
-    "position": partial(_comparison, "y", "position of m2 [m]"),
+    "position": _position,
     "control": _control,
     "learning": _learning,
     "algorithm-1": _algorithm_1,

@@ -82,10 +82,10 @@ def run(settings: Settings, progress: Progress | None = None) -> Result:
     """Run the study."""
     progress = progress or (lambda part, share: None)
     plant, paper = two_mass_spring(), scenario(settings)
-    jobs = [partial(simulate, plant, each, paper) for each in controllers(settings).values()]
+    laws = controllers(settings)
+    jobs = [partial(simulate, plant, each, paper) for each in laws.values()]
     done = in_parallel(jobs, partial(progress, "simulating"))
     runs = dict(zip(NAMES, done, strict=True))
-    laws = controllers(settings)
     scores = {name: score(run) | _margins(laws[name], run) for name, run in runs.items()}
     needed = {name: _bandwidth_for(settings, name == MB, scores, progress) for name in (MF, MB)}
     variations = _batch_variations(settings)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quell.controllers.base import Controller
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.requirements import Bound
 from quell.tuning.structures.base import Structure
@@ -46,6 +47,11 @@ class Solution:
     values: Vector
     cost: float
     violation: float  # the largest ratio to a bound, less one
+
+    @property
+    def controller(self) -> Controller:
+        """The linear controller, without limits of u and feedforward."""
+        return self.structure.controller(self.values)
 
     @property
     def feasible(self) -> bool:
