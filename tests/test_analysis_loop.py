@@ -194,6 +194,7 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
             lambda: analysis.frozen(adrc(2, learner=ql.learners.Kalman()), other, 30.0),
         ),
         ("a run of this controller", lambda: analysis.frozen(controller, other, 3.0)),
+        ("run = 3: must be a run", lambda: analysis.analyse(PLANT, controller, at=3)),
         ("called once a period", lambda: analysis.analyse(PLANT, outside)),
         (
             "a Trajectory or a Scenario",

@@ -26,6 +26,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.law import AdrcState
 from quell.controllers.base import Controller
 from quell.guard import UnguardedDesign
 from quell.learners.base import (
@@ -97,8 +98,10 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
         raise ValueError(f"controller = {controller!r}: must be an ADRC")
     if run is None:
         return _from_state(controller, controller._state)
-    if not isinstance(run, Trajectory):
+    if isinstance(run, AdrcState):
         return _from_state(controller, run)
+    if not isinstance(run, Trajectory):
+        raise ValueError(f"run = {run!r}: must be a run of the controller, or a state of it")
     if t is None and run.final_state is not None:
         return _from_state(controller, run.final_state)
     return _from_record(controller, run, run.ended if t is None else checks.finite("t", t))
