@@ -3,7 +3,7 @@
     python benchmarks/batch.py [--runs 1000]
 
 Random two-mass plants, 30 s at 10 ms, with an ADRC and a model-based ESO: as a batch on all cores
-and in one thread, exactly and over lanes, and as a Python loop over ``simulate``. Each time is the
+and in one thread and as a Python loop over ``simulate``. Each time is the
 best of several interleaved trials, because single times on a shared machine vary.
 """
 
@@ -37,7 +37,6 @@ def main() -> None:
     )
     plants = ql.plants.batch(ql.plants.two_mass_spring, m1=m1, m2=m2, k=k)
     result = ql.simulate(plants, controller, scenario)
-    ql.simulate(plants, controller, scenario, exact=False)  # compiles
     print(
         f"{runs} runs of {scenario.duration:g} s at {controller.dt * 1e3:g} ms, "
         f"{np.count_nonzero(result.diverged)} diverged"
@@ -47,8 +46,6 @@ def main() -> None:
         lambda: ql.plants.batch(ql.plants.two_mass_spring, m1=m1, m2=m2, k=k),
         lambda: ql.simulate(plants, controller, scenario),
         lambda: ql.simulate(plants, controller, scenario, workers=1),
-        lambda: ql.simulate(plants, controller, scenario, exact=False),
-        lambda: ql.simulate(plants, controller, scenario, exact=False, workers=1),
         lambda: [ql.simulate(plant, controller, scenario) for plant in plants],
     )
     times = np.min(
@@ -58,8 +55,6 @@ def main() -> None:
         "making the plants",
         f"batch on all {os.cpu_count()} cores",
         "batch on one core",
-        f"over lanes on all {os.cpu_count()} cores",
-        "over lanes on one core",
         "loop over simulate",
     )
     for label, time in zip(labels, times, strict=True):
@@ -67,7 +62,6 @@ def main() -> None:
             f"{label:26s} {time:7.3f} s {runs / time:9.0f} runs/s {times[-1] / time:7.1f} × "
             f"the loop"
         )
-    print(f"over lanes / exact, one core: {times[2] / times[4]:.1f} × as many runs per second")
 
 
 if __name__ == "__main__":

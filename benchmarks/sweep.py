@@ -86,10 +86,10 @@ class Memory(threading.Thread):
         return int(kilobytes.get("Pss", 0)) / 1024.0, int(kilobytes.get("Rss", 0)) / 1024.0
 
 
-def arguments(runs: int, exact: bool, noise: bool) -> dict[str, object]:
+def arguments(runs: int, noise: bool) -> dict[str, object]:
     """Return the arguments of the sweep."""
     scenario = SETUP["scenario"] | ({"noise": NOISE} if noise else {})
-    table = SETUP["sweep"] | {"draws": runs, "exact": exact}
+    table = SETUP["sweep"] | {"draws": runs}
     return sweep_of(made("sweep.toml", SETUP | {"scenario": scenario, "sweep": table}))
 
 
@@ -98,7 +98,7 @@ def timed(options: argparse.Namespace, folder: Path) -> None:
     watch = Memory()
     watch.start()
     before, began = os.times(), time.perf_counter()
-    given = arguments(options.runs, not options.lanes, options.noise)
+    given = arguments(options.runs, options.noise)
     result = sweep(**given, folder=folder, executor=options.executor, workers=options.workers)
     elapsed, after = time.perf_counter() - began, os.times()
     pss, rss = watch.pss, watch.rss
@@ -113,14 +113,13 @@ def timed(options: argparse.Namespace, folder: Path) -> None:
     for run in np.random.default_rng(0).integers(0, options.runs, 20).tolist():
         alone = result.repeat(run).metrics()
         stored = result.dataset.isel(run=run)
-        assert all(stored[name].item() == alone[name] for name in result.store.measures) or (
-            options.lanes
-        ), f"run {run} differs from the run alone"
+        same = all(stored[name].item() == alone[name] for name in result.store.measures)
+        assert same, f"run {run} differs from the run alone"
 
 
 def on_cluster(options: argparse.Namespace, folder: Path) -> None:
     """Do a sweep here and on two workers, one of which is killed, and compare all bits."""
-    given = arguments(options.runs, not options.lanes, options.noise)
+    given = arguments(options.runs, options.noise)
     local = sweep(**given, folder=folder / "here", executor="processes", workers=2)
     dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
     worker = [sys.executable, "-m", "distributed.cli.dask_worker"]
@@ -174,7 +173,6 @@ def main() -> None:
     parser.add_argument("--runs", type=int)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--executor", default="processes", choices=["processes", "threads"])
-    parser.add_argument("--lanes", action="store_true", help="exact = false")
     parser.add_argument("--noise", action="store_true")
     parser.add_argument("--cluster", action="store_true")
     parser.add_argument("--port", type=int, default=8786)

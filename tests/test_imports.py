@@ -17,7 +17,6 @@ ROWS = (
     (
         "types",
         "warn",
-        "suggestions",
         "described",
         "checks",
         "files",

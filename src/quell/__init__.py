@@ -16,8 +16,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from quell.suggestions import suggesting
-
 if TYPE_CHECKING:
     from quell import (
         analysis,
@@ -95,7 +93,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'quell' has no attribute {name!r}")
     if name in _HOME:
-        value = suggesting(getattr(importlib.import_module(_HOME[name]), name), __name__)
+        value = getattr(importlib.import_module(_HOME[name]), name)
     else:
         value = importlib.import_module(_MODULES.get(name, f"quell.{name}"))
     globals()[name] = value

@@ -14,11 +14,12 @@ from numba.core.runtime import _nrt_python, rtsys
 
 import quell as ql
 from quell import controllers as room
+from quell.analysis.linearise import linear_law
 from quell.controllers import baselines as baseline_room
 from quell.controllers.base import bumpless_transfer
-from quell.controllers.linear.form import linear_form
 from quell.controllers.stateful import named_arrays
 from quell.observers.base import expected_measurement
+from quell.tuning.optimiser.laws import law_of
 
 from .test_contracts import CHAIN, SCENARIO, check_run
 
@@ -130,27 +131,30 @@ def test_a_step_at_a_time_is_the_simulated_run_and_interpreted(name: str) -> Non
         np.testing.assert_allclose(one.state[label], array, rtol=1e-9, atol=1e-9, err_msg=label)
 
 
-# Those that are no linear law with limits: batches over lanes leave them to the exact loop (test_lanes).
+# Those that are no linear law with limits.
 NOT_LINEAR = {name for name in CONTROLLERS if name.startswith("Prefiltered") or "Han" in name}
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_a_controller_says_whether_it_is_linear(name: str) -> None:
-    """A linear law with limits has its linear form, all others have none."""
-    assert (linear_form(CONTROLLERS[name].parameters) is None) == (name in NOT_LINEAR)
+def test_the_closed_form_of_a_law_is_the_measured_one(name: str) -> None:
+    """The responses of u to pulses of r, y and u agree; what is not linear is refused."""
+    controller = CONTROLLERS[name]
+    if name in NOT_LINEAR:
+        with pytest.raises(ValueError, match="must be linear"):
+            law_of(controller)
+        return
+    derived, measured = (_pulses(law) for law in (law_of(controller), linear_law(controller)))
+    np.testing.assert_allclose(derived, measured, rtol=0.0, atol=1e-9 * np.max(np.abs(measured)))
 
 
-@pytest.mark.parametrize("name", [name for name in CONTROLLERS if name not in NOT_LINEAR])
-def test_a_batch_over_lanes_is_the_exact_one(name: str) -> None:
-    """To 1e-9 of each channel's range; the exact loop runs as Python."""
-    plant, controller = PLANTS.get(name, CHAIN), CONTROLLERS[name]
-    exact = ql.simulate(plant, controller, SCENARIO, interpret=True)
-    lanes = ql.simulate([plant] * 2, controller, SCENARIO, record="all", exact=False)
-    for channel in exact.names:
-        size = 1e-9 * np.max(np.abs(exact[channel]))
-        for run in lanes[channel]:
-            np.testing.assert_allclose(run, exact[channel], rtol=0.0, atol=size)
-    assert np.all(lanes.status == exact.status)
+def _pulses(law: Any) -> Any:
+    """Return D and C Aᵏ B of a law for r, y and u, fifty terms (51, 3)."""
+    B = np.column_stack([law.B_r, law.B_y, law.B_u])
+    terms = [np.array([law.D_r, law.D_y, 0.0])]
+    for _ in range(50):
+        terms.append(law.C @ B)
+        B = law.A @ B
+    return np.array(terms)
 
 
 def awaited(controller: Any, y: float) -> float:

@@ -20,7 +20,6 @@ from quell.analysis.plots import (
 )
 from quell.analysis.sweeps import loops_over_omega_o, loops_over_time
 from quell.controllers.design_checks import Finding
-from quell.suggestions import suggest_names
 
 __all__ = [
     "Adapting",
@@ -45,5 +44,3 @@ __all__ = [
     "plot_nyquist",
     "plot_root_locus",
 ]
-
-suggest_names(__name__, __all__)

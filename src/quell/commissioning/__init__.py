@@ -8,8 +8,5 @@ May import ``realtime``, ``tuning``, ``identification`` and what they import.
 from quell.commissioning.experiment import Experiment, experiment
 from quell.commissioning.limits import Limits
 from quell.commissioning.verification import Verification, verify
-from quell.suggestions import suggest_names
 
 __all__ = ["Experiment", "Limits", "Verification", "experiment", "verify"]
-
-suggest_names(__name__, __all__)

@@ -24,7 +24,6 @@ from quell.controllers.prefilters.prefilter import Prefilter, Prefiltered
 from quell.controllers.prefilters.profile import ProfileGenerator
 from quell.controllers.prefilters.reference_model import ReferenceModel
 from quell.controllers.single import in_single_precision
-from quell.suggestions import suggest_names
 
 __all__ = [
     "ADRC",
@@ -47,5 +46,3 @@ __all__ = [
     "omega_c_for",
     "warn_if_unwise",
 ]
-
-suggest_names(__name__, __all__)

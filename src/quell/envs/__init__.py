@@ -12,8 +12,6 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from quell.suggestions import suggesting
-
 if TYPE_CHECKING:
     from quell.envs.env import Env
     from quell.envs.policy import Policy
@@ -27,7 +25,7 @@ _HOME = {"Env": "env", "Policy": "policy", "VectorEnv": "vector"}
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'quell.envs' has no attribute {name!r}")
-    return suggesting(getattr(import_module(f"quell.envs.{_HOME[name]}"), name), __name__)
+    return getattr(import_module(f"quell.envs.{_HOME[name]}"), name)
 
 
 def register() -> None:

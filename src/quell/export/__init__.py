@@ -10,11 +10,8 @@ from quell.export.library import Comparison, Exported, NoCompilerError, Sizes, c
 from quell.export.plant_source import plant_source
 from quell.export.proof import Alarm, Proof
 from quell.export.translate.values import TranslationError
-from quell.suggestions import suggest_names
 
 __all__ = [
     "Alarm", "CSource", "Comparison", "Exported", "NoCompilerError", "Proof", "Sizes",
     "TranslationError", "c", "c_source", "fmu", "plant_source",
 ]  # fmt: skip
-
-suggest_names(__name__, __all__)

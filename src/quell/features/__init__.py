@@ -12,7 +12,6 @@ from quell.features.linear import Bias, Input, State
 from quell.features.periodic import Periodic
 from quell.features.polynomial import Polynomial
 from quell.features.radial import RBF
-from quell.suggestions import suggest_names
 
 __all__ = [
     "RBF",
@@ -27,5 +26,3 @@ __all__ = [
     "RandomFourier",
     "State",
 ]
-
-suggest_names(__name__, __all__)

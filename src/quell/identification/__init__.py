@@ -18,7 +18,6 @@ from quell.identification.input_gain import Bandwidth, InputGain, MarginError, i
 from quell.identification.model.roots import Root
 from quell.identification.result import Identified
 from quell.identification.validation import Residuals
-from quell.suggestions import suggest_names
 
 __all__ = [
     "Alternative",
@@ -42,5 +41,3 @@ __all__ = [
     "read_record",
     "simulated_plant",
 ]
-
-suggest_names(__name__, __all__)

@@ -16,7 +16,6 @@ from quell.learners.online.network import MLP
 from quell.learners.regression.nlms import NLMS
 from quell.learners.regression.rls import RLS
 from quell.learners.repetitive.repetitive import Repetitive
-from quell.suggestions import suggest_names
 
 __all__ = [
     "MLP",
@@ -39,5 +38,3 @@ __all__ = [
     "infer",
     "learn",
 ]
-
-suggest_names(__name__, __all__)

@@ -7,8 +7,5 @@ its own file with parameters and kernels, and only ``noise.py`` imports ``eso.py
 from quell.lti.canonical import Canonical, canonical
 from quell.observers.design import continuous_gain
 from quell.observers.eso import ESO
-from quell.suggestions import suggest_names
 
 __all__ = ["ESO", "Canonical", "canonical", "continuous_gain"]
-
-suggest_names(__name__, __all__)

@@ -18,7 +18,6 @@ from quell.plants.machines.n_mass import NMassPlant, n_mass
 from quell.plants.machines.torsional import TorsionalPlant, torsional, torsional_identified
 from quell.plants.machines.two_mass_spring import two_mass_spring
 from quell.plants.nonlinear.plant import NonlinearPlant
-from quell.suggestions import suggest_names
 
 __all__ = [
     "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NMassPlant", "NonlinearPlant", "Plant",
@@ -26,5 +25,3 @@ __all__ = [
     "lagged_two_mass_spring", "linearised", "n_mass", "signals_of", "torsional",
     "torsional_identified", "two_mass_spring",
 ]  # fmt: skip
-
-suggest_names(__name__, __all__)

@@ -17,8 +17,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from quell.suggestions import suggesting
-
 if TYPE_CHECKING:
     from quell.realtime.devices.base import Device
     from quell.realtime.devices.registry import open_device
@@ -60,6 +58,6 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'quell.realtime' has no attribute {name!r}")
     home = importlib.import_module(f"quell.realtime.{_HOME[name]}")
-    value = suggesting(getattr(home, name), __name__)
+    value = getattr(home, name)
     globals()[name] = value
     return value

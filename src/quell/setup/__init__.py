@@ -10,8 +10,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from quell.suggestions import suggesting
-
 if TYPE_CHECKING:
     from quell.setup.description import Description
     from quell.setup.errors import SetupError
@@ -53,6 +51,6 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'quell.setup' has no attribute {name!r}")
     home = importlib.import_module(f"quell.setup.{_HOME[name]}")
-    value = suggesting(getattr(home, name), __name__)
+    value = getattr(home, name)
     globals()[name] = value
     return value

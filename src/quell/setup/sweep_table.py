@@ -19,7 +19,6 @@ def sweep_table(
     seed: int = 0,
     metrics: Sequence[str] = ("peak_error", "iae", "control_variation"),
     limits: Mapping[str, float] | None = None,
-    exact: bool = True,
 ) -> dict[str, Any]:
     """Return the arguments of ``quell.sweep`` that a table gives.
 
@@ -43,8 +42,6 @@ def sweep_table(
         measures that are stored, in each window of `[[metrics]]`.
     limits
         largest value of some measures; a run with more fails.
-    exact
-        whether each run has the bits of the run alone.
     """
     given = _flat(parameters or {})
     if cases is not None:
@@ -57,7 +54,7 @@ def sweep_table(
         given[CASE] = tuple(cases)
     if not given and draws == 1:
         raise ValueError("parameters: missing; give a value to vary, a case, or several draws")
-    options: dict[str, Any] = {"draws": draws, "sampling": sampling, "seed": seed, "exact": exact}
+    options: dict[str, Any] = {"draws": draws, "sampling": sampling, "seed": seed}
     return {
         "parameters": given,
         "cases": cases or {},

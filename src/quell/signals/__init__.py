@@ -24,7 +24,6 @@ from quell.signals.noise import BandLimitedNoise
 from quell.signals.repeated import Repeated
 from quell.signals.samples import Samples
 from quell.signals.shapes import Chirp, Ramp, Sinusoid, SmoothMove, Step, Trapezoid
-from quell.suggestions import suggest_names
 
 __all__ = [
     "KINDS", "PRBS", "BandLimitedNoise", "Chirp", "Constant", "LimitedMove", "Multisine", "Ramp",
@@ -67,6 +66,3 @@ def make(kind: str, **parameters: Any) -> Signal:
         return cls(**parameters)
     except TypeError as error:
         raise ValueError(f"signal {kind!r}: {str(error).split('() ')[-1]}") from None
-
-
-suggest_names(__name__, __all__)

@@ -5,8 +5,5 @@ May import ``controllers``, ``plants``, ``signals``, ``records`` and what they i
 
 from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
-from quell.suggestions import suggest_names
 
 __all__ = ["Scenario", "simulate"]
-
-suggest_names(__name__, __all__)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import Controller, check_controller
@@ -20,7 +21,6 @@ from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.channels import columns_of, readable_names, signals_of_loop
 from quell.simulation.divergence import judge_integration
 from quell.simulation.driver import SIGNALS, Loop, logged_channels
-from quell.simulation.lane_batch import Outcome, run_over_lanes
 from quell.simulation.sampled_scenario import SampledScenario, Segment, segment_bounds
 from quell.simulation.scenario import Scenario, check_scenario
 from quell.types import Channels
@@ -29,6 +29,15 @@ _RECORDED = ("r", "y", "u")
 # Runs in a job: enough that threads seldom wait for the next one, few enough that progress is
 # reported often and that all threads end at about the same time. Chosen by hand.
 _RUNS_PER_JOB = 16
+
+
+class Outcome(NamedTuple):
+    """Arrays that a batch writes; the runs are the last axis but that of the samples."""
+
+    log: NDArray[np.float64]  # (rows, runs, samples)
+    lengths: NDArray[np.int64]  # recorded samples (runs,)
+    status: NDArray[np.int64]  # flags (runs,)
+    ended: NDArray[np.int64]  # last sample, or the one at which a run diverged (runs,)
 
 
 def simulate_batch(
@@ -41,7 +50,6 @@ def simulate_batch(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-    exact: bool = True,
 ) -> BatchTrajectory:
     """Run every plant, controller and scenario of a batch; see ``quell.simulate``."""
     plants, controllers, scenarios = _members(plant, controller, scenario)
@@ -58,28 +66,22 @@ def simulate_batch(
     # Channel by channel, so that a channel of all runs is contiguous in memory.
     log = np.empty((len(recorded), runs, (samples - 1) // every + 1))
     outcome = Outcome(log, *(np.zeros(runs, dtype=np.int64) for _ in range(3)))
-    left: Sequence[int] = range(runs)
-    if not (checks.flag("exact", exact) or interpret):
-        parts = plants, controllers, sampled, recorded
-        left = run_over_lanes(*parts, every, outcome, progress, workers)
-    models = _models([plants[i] for i in left], dt, interpret)
-    loops: dict[int, Loop] = {}
+    loops: list[Loop] = []
     first: dict[Any, Loop] = {}
-    for i, model in zip(left, models, strict=True):
+    for i, model in enumerate(_models(plants, dt, interpret)):
         compiled = not interpret and plants[i].compiled
         structure = (id(controllers[i]), layout_of(model)) if compiled else i
         like = first.get(structure)
-        loops[i] = Loop(plants[i], model, controllers[i], sampled[i], interpret, like)
+        loops.append(Loop(plants[i], model, controllers[i], sampled[i], interpret, like))
         first.setdefault(structure, loops[i])
-    progress = part_of(progress, runs - len(left), runs, runs)
-    if max(columns) < len(SIGNALS) and not any(x.integration.needed for x in loops.values()):
+    if max(columns) < len(SIGNALS) and not any(loop.integration.needed for loop in loops):
         width = len(SIGNALS)  # states and estimates are not used
     _run_loops(loops, columns, width, every, outcome, progress, workers)
     for i in np.flatnonzero(outcome.lengths < log.shape[2]).tolist():
         log[:, i, outcome.lengths[i] :] = np.nan
     name = plants.name if isinstance(plants, PlantBatch) else plants[0].name
-    judge_integration(name, list(loops.values()))
-    for i, loop in loops.items():
+    judge_integration(name, loops)
+    for i, loop in enumerate(loops):
         outcome.status[i], outcome.ended[i] = int(loop.result_status), loop.ended
     return BatchTrajectory(
         log=np.moveaxis(log, 0, -1),
@@ -94,12 +96,12 @@ def simulate_batch(
         parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
         features=controllers[0].features,
         signals=signals_of_loop(signals_of(plants[0]), controllers[0]),
-        final_states=tuple(loop.state for loop in loops.values()) if exact else (),
+        final_states=tuple(loop.state for loop in loops),
     )
 
 
 def _run_loops(
-    loops: Mapping[int, Loop],
+    loops: Sequence[Loop],
     columns: Sequence[int],
     width: int,
     every: int,
@@ -107,7 +109,7 @@ def _run_loops(
     progress: Callable[[float], None] | None,
     workers: int | None,
 ) -> None:
-    """Run loops, by the index of their run, and record some columns of their logs."""
+    """Run the loops of a batch and record some columns of their logs."""
     log, lengths = outcome.log, outcome.lengths
 
     def run_some(
@@ -126,10 +128,10 @@ def _run_loops(
                 log[k, i, at : at + rows] = buffer[:rows, column]
             lengths[i] += rows
 
-    counts = Counter(loop.scenario for loop in loops.values())
+    counts = Counter(loop.scenario for loop in loops)
     samples = max((scenario.samples for scenario in counts), default=0)
     for first, last in segment_bounds(samples, set().union(*(s.rest_samples for s in counts))):
-        live = [i for i, loop in loops.items() if not loop.diverged]
+        live = [i for i, loop in enumerate(loops) if not loop.diverged]
         if not live:
             break
         shared = {s: s.segment(first, last) for s, count in counts.items() if count > 1}

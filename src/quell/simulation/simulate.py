@@ -52,7 +52,6 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-    exact: bool = True,
 ) -> BatchTrajectory: ...
 def simulate(
     plant: Any,
@@ -66,7 +65,6 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-    exact: bool = True,
 ) -> Trajectory | BatchTrajectory:
     """Run a controller on a plant through a scenario, or a batch of them on all cores.
 
@@ -103,15 +101,6 @@ def simulate(
         for a batch: channels to record, ``("r", "y", "u")`` by default. A single run records all.
     workers
         for a batch: number of threads; the number of cores by default.
-    exact
-        for a batch: whether each run has the bits of the run alone. With ``False`` linear runs are
-        advanced 32 at a time, several times as fast (``quell.simulation.lanes``), and
-        ``final_states`` is empty. The channels of a stable loop are then within 1e-8 of their range
-        of the exact ones, usually within 1e-11, and within 1e-6 if limits act (docs/batch). A run
-        is linear if its plant is a ``LinearPlant``, delayed or not, and its controller an ``ADRC``
-        with a linear observer, without learner, guard or nonlinear feedback, or a linear controller
-        (PID, LQG, …). All others, and runs in which a measurement or reference is held, are exact
-        all the same.
 
     Returns
     -------
@@ -139,15 +128,11 @@ def simulate(
         several = checks.is_sequence(controller)
         controller = _in_single(controller) if several else in_single_precision(controller)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
-        options = (record_every, limit, interpret, progress, record, workers, exact)
+        options = (record_every, limit, interpret, progress, record, workers)
         return simulate_batch(plant, controller, scenario, *options)
-    for name, value, usual in (
-        ("record", record, None),
-        ("workers", workers, None),
-        ("exact", checks.flag("exact", exact), True),
-    ):
-        if value is not usual:
-            rule = "is for a batch; a single run records all channels, in this thread, exactly"
+    for name, value in (("record", record), ("workers", workers)):
+        if value is not None:
+            rule = "is for a batch; a single run records all channels, in this thread"
             raise ValueError(f"{name} = {value!r}: {rule}")
     check_plant(plant)
     check_controller(controller)

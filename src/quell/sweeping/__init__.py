@@ -3,7 +3,6 @@
 May import ``simulation``, ``records``, ``plants`` and what these import.
 """
 
-from quell.suggestions import suggest_names
 from quell.sweeping.measures import Measure
 from quell.sweeping.plan import Plan
 from quell.sweeping.result import Sweep
@@ -11,5 +10,3 @@ from quell.sweeping.sweep import sweep
 from quell.sweeping.values import Normal, Range
 
 __all__ = ["Measure", "Normal", "Plan", "Range", "Sweep", "sweep"]
-
-suggest_names(__name__, __all__)

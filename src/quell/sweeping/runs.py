@@ -26,7 +26,7 @@ ERROR = -1
 """Status of a run that could not be built, simulated or judged; its message says why."""
 
 # Memory for the records of the runs that are simulated at once [bytes]: as quick as more, and many
-# workers fit into a machine. Runs at once: all 32 lanes of several groups are full. By hand.
+# workers fit into a machine. Runs at once: enough that a batch's own cost is small. By hand.
 _RECORD_BYTES, _MOST_AT_ONCE = 8e6, 256
 # Seconds for which runs are repeated to know their time. By hand.
 _TIMING = 2.0
@@ -39,7 +39,6 @@ class Job:
     build: Callable[..., Any]  #: returns the parts of a run, see ``sweep``
     measures: Measures
     record: tuple[str, ...]  #: channels that functions of a run need
-    exact: bool
     takes_seed: bool  #: whether ``build`` gets the seed of the run; otherwise the scenario does
 
 
@@ -182,7 +181,7 @@ def _run_group(job: Job, group: Sequence[tuple[int, Parts]], outcome: Outcome) -
     """Simulate runs as one batch; if one of them makes that impossible, in halves."""
     places = [place for place, _ in group]
     plants, controllers, scenarios = zip(*(parts for _, parts in group), strict=True)
-    options: dict[str, Any] = {"record": job.record, "workers": 1, "exact": job.exact}
+    options: dict[str, Any] = {"record": job.record, "workers": 1}
     try:
         result = simulate(list(plants), list(controllers), list(scenarios), **options)
     except Exception as error:  # a plant of the user's may raise anything

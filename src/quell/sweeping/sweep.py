@@ -45,7 +45,6 @@ def sweep(
     sampling: str = "latin-hypercube",
     seed: int = 0,
     record: Sequence[str] = ("r", "y", "u"),
-    exact: bool = True,
     executor: Where = None,
     workers: int | None = None,
     runs_per_file: int | None = None,
@@ -77,8 +76,6 @@ def sweep(
         largest value of some measures, by name; a run with more fails.
     record
         channels that functions in ``metrics`` use.
-    exact
-        whether each run has the bits of the run alone, as that of ``simulate``.
     executor
         where runs are done: None for threads, ``"processes"``, ``"tcp://HOST:PORT"`` for a Dask
         cluster, or a ``concurrent.futures.Executor`` (``quell.executors.executor_on``). The results
@@ -108,7 +105,7 @@ def sweep(
     measures = as_measures(metrics)
     checked = _checked_limits(limits or {}, list(measures))
     takes_seed = _takes_seed(build, plan)
-    job = Job(build, measures, tuple(record), checks.flag("exact", exact), takes_seed)
+    job = Job(build, measures, tuple(record), takes_seed)
     checks.optional(checks.whole, "runs_per_file", runs_per_file, 1)
     if executor == "processes":
         check_sendable("build and functions in metrics", job)
@@ -131,7 +128,7 @@ def parts_of(run: int, arguments: Mapping[str, Any]) -> tuple[str, Parts]:
     plan = Plan(**{key: arguments[key] for key in ("parameters", "draws", "sampling", "seed")})
     checks.whole("run", run, 0, plan.runs - 1)
     build = arguments["build"]
-    job = Job(build, {}, (), True, _takes_seed(build, plan))
+    job = Job(build, {}, (), _takes_seed(build, plan))
     return plan.describe(run), built(job, plan.part(run, run + 1), run)
 
 
@@ -199,7 +196,6 @@ def _about(plan: Plan, job: Job, limits: Mapping[str, float]) -> dict[str, Any]:
         "metrics": describe_measures(job.measures) | functions,
         "record": list(job.record),
         "limits": dict(limits),
-        "exact": job.exact,
         "build": _identity(job.build),
     }
     return dict(json.loads(json.dumps(about)))  # as it is read again

@@ -6,7 +6,6 @@ the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` p
 and returns a ``Tuned``.
 """
 
-from quell.suggestions import suggest_names
 from quell.tuning.constraints import Constraints
 from quell.tuning.identified import identified_plants
 from quell.tuning.structures import STRUCTURES
@@ -14,5 +13,3 @@ from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 
 __all__ = ["STRUCTURES", "Constraints", "Tuned", "identified_plants", "tune"]
-
-suggest_names(__name__, __all__)

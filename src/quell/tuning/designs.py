@@ -15,13 +15,14 @@ from quell.analysis.loop import LoopAnalysis
 from quell.controllers.adrc.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.extras import extras_of
+from quell.tuning.optimiser.laws import law_of
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import cost_of, scores
 from quell.tuning.optimiser.problem import Extra, Problem, Solution
 from quell.tuning.optimiser.requirements import KINDS, Bound, bounds_of, worst_ratio
 from quell.tuning.optimiser.search import FEW, best_solution, merit, search, solution_at
 from quell.tuning.optimiser.starts import starts
-from quell.tuning.optimiser.time_responses import Inputs, SetResponses, law_of
+from quell.tuning.optimiser.time_responses import Inputs, SetResponses
 from quell.tuning.result.design import Design, design_of, impossible, measured
 from quell.tuning.result.report import relative
 from quell.tuning.structures.adrc import AdrcStructure

@@ -10,7 +10,6 @@ from quell.controllers.baselines.p_pi import PPI
 from quell.controllers.baselines.pid import PID
 from quell.controllers.baselines.resonance_ratio import ResonanceRatio
 from quell.controllers.prefilters.shaping import ZV, ZVD, Shaper
-from quell.suggestions import suggest_names
 
 __all__ = [
     "LQG",
@@ -24,5 +23,3 @@ __all__ = [
     "Shaper",
     "equivalent_pid",
 ]
-
-suggest_names(__name__, __all__)

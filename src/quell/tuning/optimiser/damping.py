@@ -32,8 +32,8 @@ from quell.analysis.frequency_response import Complex, in_s_plane
 from quell.analysis.pure_delays import eigenvalues
 from quell.analysis.subsystems import closed_loop_matrix, law_matrix
 from quell.plants.sampled import SampledPlant
+from quell.tuning.optimiser.laws import law_of
 from quell.tuning.optimiser.loops import NARROW, PlantSet, dead_samples
-from quell.tuning.optimiser.time_responses import law_of
 from quell.tuning.structures.base import Structure
 from quell.types import DesignWarning, Matrix, Vector
 

@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.analysis.subsystems import closed_loop
-from quell.controllers.base import Controller
-from quell.controllers.linear.form import linear_form
 from quell.controllers.linear.law import LinearLaw
 from quell.lti.system import System
 from quell.plants.sampled import SampledPlant
+from quell.tuning.optimiser.laws import law_of
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.structures.base import Structure
 from quell.types import DesignWarning, Vector
@@ -49,36 +48,6 @@ class Inputs(NamedTuple):
         if self.u_ff is None:
             return ("r", self.r), ("d", self.d)
         return ("n", -self.r), ("d", self.d + self.u_ff)
-
-
-def law_of(controller: Controller) -> LinearLaw:
-    """Return the law of a linear controller, driven by y and by the applied u without delay.
-
-    Raises ``ValueError`` for a controller that is not linear.
-    """
-    form = linear_form(controller.parameters)
-    if form is None:
-        raise ValueError(f"controller = {controller!r}: must be linear")
-    law = form.law
-    if form.predicts:  # the law is driven by e = y − x_1
-        first = np.eye(law.C.size)[0]
-        law = law._replace(A=law.A - np.outer(law.B_y, first), C=law.C - law.D_y * first)
-    if form.delay:
-        law = _delayed(law, form.delay)
-    return law
-
-
-def _delayed(law: LinearLaw, samples: int) -> LinearLaw:
-    """Return the law with u acting on its state ``samples`` later, as further states."""
-    m = law.C.size
-    A = np.zeros((m + samples, m + samples))
-    A[:m, :m], A[:m, -1] = law.A, law.B_u
-    A[m + 1 :, m:-1] = np.eye(samples - 1)
-    B_u = np.zeros(m + samples)
-    B_u[m] = 1.0
-    none = np.zeros(samples)
-    B_r, B_y = np.append(law.B_r, none), np.append(law.B_y, none)
-    return LinearLaw(A, B_r, B_y, B_u, np.append(law.C, none), law.D_r, law.D_y)
 
 
 def load_step(plants: PlantSet, size: float = 1.0, duration: float | None = None) -> Inputs:

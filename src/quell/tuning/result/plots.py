@@ -12,9 +12,10 @@ import numpy as np
 from quell.quantities import Signals
 from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser.laws import law_of
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.requirements import sizes
-from quell.tuning.optimiser.time_responses import Inputs, law_of, response
+from quell.tuning.optimiser.time_responses import Inputs, response
 from quell.tuning.result.design import Design
 from quell.types import Vector
 

@@ -14,8 +14,9 @@ from scipy.signal import lfilter
 
 from quell.controllers.base import Controller
 from quell.controllers.prefilters.reference_model import ReferenceModel
+from quell.tuning.optimiser.laws import law_of
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.time_responses import Inputs, law_of, load_step, response
+from quell.tuning.optimiser.time_responses import Inputs, load_step, response
 from quell.types import Vector
 
 # Overshoot from which on a prefilter is offered, and that it leaves; the band of the settling time.

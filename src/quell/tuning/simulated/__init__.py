@@ -4,7 +4,6 @@
 controller from them, and a ``Problem``. May import ``executors`` and what stands before ``tuning``.
 """
 
-from quell.suggestions import suggest_names
 from quell.tuning.simulated.problem import Checked, Objective, Problem, Sample
 from quell.tuning.simulated.result import Candidate, Search
 from quell.tuning.simulated.search import search
@@ -27,5 +26,3 @@ __all__ = [
     "Worst",
     "search",
 ]
-
-suggest_names(__name__, __all__)
