@@ -71,17 +71,6 @@ def judge_full_disk(files: list[Path], told: dict[str, Any], wrong: list[str]) -
             wrong.append(f"{path.name} has {rows} rows, and the run does not say so")
 
 
-def judge_foreign(kind: str, told: str, victim: bytes, wrong: list[str]) -> None:
-    """Check that a segment of another user, or a link, was refused and left as it was."""
-    if told not in ("ConnectionError", "ValueError"):
-        wrong.append(f"{kind}: {told or 'accepted'}")
-    if victim != VICTIM:
-        wrong.append(f"{kind}: the file behind it was changed")
-
-
-VICTIM = b"do not touch" * 10
-
-
 def judge_wire(log: np.ndarray, rig_killed: bool) -> list[str]:
     """Return the errors in the rig's log."""
     wrong: list[str] = []

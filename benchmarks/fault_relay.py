@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-import uuid
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
 
@@ -23,17 +22,15 @@ from quell.realtime.devices.registry import listen
 from quell.realtime.rig.fault_injection import Fault, FaultInjector, Relay
 from quell.realtime.wire import cobs, frames
 from quell.realtime.wire.serial_line import SerialDevice
-from quell.realtime.wire.shared_memory import SharedMemoryDevice
-from quell.realtime.wire.transport import receive, send, wait_for_frame
+from quell.realtime.wire.transport import receive, wait_for_frame
 
 PRIORITY = 40  # below that of the loop and the rig
-WIRES = ("udp", "serial", "shm")
+WIRES = ("udp", "serial")
 
 
 def rig_url(wire: str) -> str:
     """Return a URL at which a rig can listen."""
-    urls = {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}
-    return urls.get(wire, f"shm://faults-{uuid.uuid4().hex}")
+    return {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}[wire]
 
 
 def relay(url: str, faults: Sequence[Fault], seed: int) -> Any:
@@ -42,7 +39,7 @@ def relay(url: str, faults: Sequence[Fault], seed: int) -> Any:
     with real_time():
         if wire == "udp":
             return Relay(rig_url(wire), url, faults, seed)
-        return WireRelay(url, faults, seed)
+        return SerialRelay(url, faults, seed)
 
 
 @contextlib.contextmanager
@@ -69,11 +66,6 @@ def _take(transport: Any, frame: frames.Buffer, nanoseconds: int) -> int:
 
 
 @compiled
-def _put(transport: Any, frame: frames.Buffer) -> int:
-    return send(transport, frame)
-
-
-@compiled
 def _encode(coded: Any, values: Any) -> int:
     return cobs.encode(values, values.size, coded)
 
@@ -85,20 +77,11 @@ class _SerialEnd(SerialDevice):
         """Do nothing: the loop's own hello goes through."""
 
 
-class _SharedMemoryEnd(SharedMemoryDevice):
-    """The loop's end of shared memory, without a session."""
-
-    def _begin_session(self, former: int = 0) -> None:
-        """Do nothing: the loop's own hello goes through."""
-
-
-class WireRelay:
-    """A relay over a serial line or shared memory, with a thread for each direction."""
+class SerialRelay:
+    """A relay over a serial line, with a thread for each direction."""
 
     def __init__(self, rig: str, faults: Sequence[Fault], seed: int) -> None:
-        self._serial = rig.startswith("serial")
-        end = _SerialEnd if self._serial else _SharedMemoryEnd
-        self._back: Any = end(rig, 1e-3)
+        self._back: Any = _SerialEnd(rig, 1e-3)
         self._front: Any = listen(rig_url(rig.partition(":")[0]))
         self.url = self._front.url
         self._injectors = {
@@ -122,25 +105,19 @@ class WireRelay:
 
     def _carrier(self, towards: str, source: Any, target: Any) -> Callable[[], None]:
         """Return a function that carries frames in one direction, until the relay is closed."""
-        inbox, outbox = frames.buffer(), frames.buffer()
+        inbox = frames.buffer()
         coded = np.zeros(256, dtype=np.uint8)
         take, encode = specialised(_take, source, inbox, 0), specialised(_encode, coded, coded)
-        put = specialised(_put, target, outbox)
 
         def carry() -> None:
             while not self._stop:
                 while (size := take(source, inbox, 20_000_000)) >= 0:
                     data = bytes(inbox.bytes[: max(size, 0)])
                     for frame in self._injectors[towards].frames(data):
-                        if self._serial:
-                            values = np.frombuffer(frame, dtype=np.uint8)
-                            length = encode(coded, values.copy())
-                            with contextlib.suppress(OSError):  # the other end is gone
-                                os.write(target.port.fd, coded[:length].tobytes())
-                        else:
-                            fixed = frame[: frames.LENGTH].ljust(frames.LENGTH, b"\0")
-                            outbox.bytes[: frames.LENGTH] = np.frombuffer(fixed, dtype=np.uint8)
-                            put(target, outbox)
+                        values = np.frombuffer(frame, dtype=np.uint8)
+                        length = encode(coded, values.copy())
+                        with contextlib.suppress(OSError):  # the other end is gone
+                            os.write(target.port.fd, coded[:length].tobytes())
 
         return carry
 

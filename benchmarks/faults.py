@@ -1,7 +1,7 @@
 """Test of the real-time loop with random faults: on the wire, of processes, disks and clients.
 
-    python benchmarks/faults.py                # 1000 trials over three wires: about an hour
-    python benchmarks/faults.py --trials 30 --seed 7 --wires shm --json faults.json
+    python benchmarks/faults.py                # 1000 trials over both wires: about an hour
+    python benchmarks/faults.py --trials 30 --seed 7 --wires udp --json faults.json
 
 Results are written after each trial; trials that the JSON file has already are not repeated, so
 the same command goes on where it was stopped.
@@ -16,9 +16,7 @@ Each trial runs a loop in one process, a twin in another, and a relay between th
   at the end it is always zero;
 * telemetry: after a kill both files are readable and lack at most the last second; on a full disk
   they are readable, and the run goes on and says so; otherwise they are complete, whatever idle or
-  slow clients of the live port do;
-* shared memory: a segment of another user, or behind a symbolic link, is refused and not changed
-  (needs root); one that is cut off during the run ends the run safely.
+  slow clients of the live port do.
 """
 
 from __future__ import annotations
@@ -36,42 +34,36 @@ import subprocess
 import sys
 import tempfile
 import time
-import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fault_judges import DT, LIMIT, SAFETY, VICTIM, WATCHDOG, judge_foreign, judged
+from fault_judges import DT, LIMIT, SAFETY, WATCHDOG, judged
 from fault_relay import WIRES, relay, rig_url
 
 import quell as ql
 from quell.files import nonfinite_to_none, write_json
 from quell.realtime import LiveSink, open_device, run_rig
-from quell.realtime.devices.registry import listen
 from quell.realtime.loop.modes import Cause
 from quell.realtime.rig.fault_injection import KINDS, Fault
 from quell.realtime.rig.kernel import LOG
 
 SECONDS = 0.7
-SHM = Path("/dev/shm")
 DISK_KIB = 256  # size of the disk that is full
 OWN = ("stall the loop", "stall the rig", "kill the loop", "kill the rig", "interrupt the loop")
 OTHERS = ("disk full", "live clients")
-SEGMENTS = ("segment of another user", "segment behind a link", "segment cut off")
 # Ends that a busy machine causes as well.
 BY_MACHINE = (Cause.LOST, Cause.STALLED, Cause.OVERRUN, Cause.WATCHDOG, Cause.UNSETTLED)
 BY_MACHINE += (Cause.NO_MEASUREMENT,)
-MAILBOXES = ("measurements", "commands")
-NOBODY = 65534  # the user without rights
 # A request to open a WebSocket (RFC 6455, section 1.3) with Foxglove's protocol.
 UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
     b"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
 )
-TROUBLES = (*KINDS, *OWN, *OTHERS, *SEGMENTS)
+TROUBLES = (*KINDS, *OWN, *OTHERS)
 
 
 def controller() -> ql.ADRC:
@@ -154,9 +146,7 @@ def close_loop(url: str, seconds: float, telemetry: list[Any]) -> Any:
 
 def possible(kinds: Sequence[str], wire: str, disk: Path) -> list[str]:
     """Return the kinds of faults that this wire and this user allow."""
-    left_out = [] if wire == "shm" else list(SEGMENTS)
-    left_out += [] if os.path.ismount(disk) else ["disk full"]
-    left_out += [] if os.getuid() == 0 else list(SEGMENTS[:2])
+    left_out = [] if os.path.ismount(disk) else ["disk full"]
     return [kind for kind in kinds if kind not in left_out]
 
 
@@ -169,8 +159,6 @@ def trial(
     faults = [Fault(kind, towards, first, many, late)] if kind in KINDS else []
     about = {"trial": number, "wire": wire, "kind": kind, "at": first, "length": many}
     about["towards"] = towards if faults else ""
-    if kind in SEGMENTS[:2]:
-        return about | {"ended": "refused", "wrong": foreign_segment(kind, folder)}
     rig.rows()
     files, port = [folder / "run.csv", folder / "run.mcap"], None
     if kind == "disk full":
@@ -178,12 +166,10 @@ def trial(
     if kind == "live clients":
         port = free_port()
     with contextlib.ExitStack() as stack:
-        between = None
-        if kind != "segment cut off":
-            between = stack.enter_context(relay(rig.url, faults, number))
+        between = stack.enter_context(relay(rig.url, faults, number))
         pid = os.fork()
         if pid == 0:
-            in_child(folder, lambda: loop(between.url if between else rig.url, folder, files, port))
+            in_child(folder, lambda: loop(between.url, folder, files, port))
         if port is not None:
             stack.enter_context(clients(port, draw))
         killed = disturb(kind, pid, rig, between, first, many)
@@ -201,8 +187,6 @@ def trial(
         found["wrong"].append(f"the loop was ended by signal {os.WTERMSIG(status)}")
     if code is not None and kind != "kill the rig":
         found["wrong"].append(f"the rig ended with code {code}")
-    if kind == "segment cut off":
-        rig.end()
     return about | found
 
 
@@ -222,10 +206,6 @@ def disturb(kind: str, pid: int, rig: RigProcess, between: Any, first: int, many
     """Stall, kill or interrupt a process; return whether the loop was killed."""
     if kind in (*KINDS, *OTHERS):
         return False
-    if between is None:
-        time.sleep(first * DT)
-        os.truncate(SHM / f"quell-{rig.url.removeprefix('shm://')}-{random.choice(MAILBOXES)}", 0)
-        return False
     deadline = time.monotonic() + 20.0
     # Wait until ``first`` commands have passed.
     while between.passed["rig"] < first and time.monotonic() < deadline:
@@ -242,32 +222,6 @@ def disturb(kind: str, pid: int, rig: RigProcess, between: Any, first: int, many
     else:
         os.kill(whom, signal.SIGINT)
     return kind == "kill the loop"
-
-
-def foreign_segment(kind: str, folder: Path) -> list[str]:
-    """Offer mailboxes of another user, or links, to a loop and to a rig; return the errors."""
-    wrong: list[str] = []
-    url = f"shm://foreign-{uuid.uuid4().hex}"
-    paths = [SHM / f"quell-{url.removeprefix('shm://')}-{name}" for name in MAILBOXES]
-    victim = folder / "victim"
-    victim.write_bytes(VICTIM)
-    for path in paths:
-        if kind == "segment of another user":
-            path.write_bytes(bytes(96))
-            path.chmod(0o666)
-            os.chown(path, NOBODY, NOBODY)
-        else:
-            path.symlink_to(victim)
-    for work in (lambda: open_device(url, DT), lambda: listen(url)):
-        told = ""
-        try:
-            work().close()
-        except Exception as error:
-            told = type(error).__name__
-        judge_foreign(kind, told, victim.read_bytes(), wrong)
-    for path in paths:
-        path.unlink(missing_ok=True)
-    return wrong
 
 
 def free_port() -> int:

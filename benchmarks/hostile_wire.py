@@ -1,6 +1,6 @@
-"""Hostile packets, bytes and files against a rig and a loop that run a session meanwhile.
+"""Hostile packets and bytes against a rig and a loop that run a session meanwhile.
 
-    python benchmarks/hostile_wire.py                     # 10⁶ attacks: UDP, serial line, memory
+    python benchmarks/hostile_wire.py                     # 10⁶ attacks: UDP, serial line
     python benchmarks/hostile_wire.py --count 30000 --seed 7
     python benchmarks/hostile_wire.py --seconds 600       # as many as fit into this time
 
@@ -9,9 +9,7 @@ A rig and a loop exchange a frame per tick; between them an attacker sends
 * over UDP, from other addresses: random bytes, frames of the session as they are, with changed
   bits, with changed fields and a correct CRC, with absurd values, goodbyes and hellos;
 * on a serial line, in both directions: random bytes, broken packets, old frames, frames of other
-  sessions;
-* in shared memory: random bytes anywhere in the files, old contents, truncation to any length, and
-  links, pipes and files of wrong mode under the names that a rig is going to use.
+  sessions.
 
 After each tick it checks that u is within the limits, that the session is that of the loop and that
 u is a command of the loop (over UDP: the newest one, and y that of a plant beside it, bit for bit).
@@ -30,7 +28,6 @@ import struct
 import sys
 import threading
 import time
-import uuid
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -47,7 +44,6 @@ from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.rig.kernel import APPLIED
 from quell.realtime.rig.server import Rig
 from quell.realtime.wire import cobs, frames
-from quell.realtime.wire.shared_memory import SIZE, SLOT
 
 DT, LIMIT, WATCHDOG = 0.01, 5.0, 50
 PLANT = ql.plants.two_mass_spring()
@@ -229,57 +225,6 @@ def attack_serial(session: Session, ends: tuple[int, int]) -> None:
             os.write(draw.choice(ends), data)
 
 
-def attack_memory(session: Session, paths: list[Path]) -> None:
-    """Write to the files, truncate them, and plant others."""
-    draw = session.draw
-    for _ in range(AT_ONCE // 4):
-        with draw.choice(paths).open("r+b") as file:
-            kind = draw.randrange(8)
-            if kind == 0:
-                os.truncate(file.fileno(), draw.randrange(SIZE + 100))
-            elif kind < 4:
-                file.seek(draw.randrange(SIZE))
-                file.write(draw.randbytes(draw.choice((1, 8, 48))))
-            elif kind < 6:
-                other = session.number ^ draw.randrange(1, 2**32)
-                file.seek(draw.randrange(SIZE // SLOT) * SLOT)
-                file.write(struct.pack("<q", 2 * draw.randrange(2**40)) + session.forged(other))
-            else:
-                file.seek(draw.randrange(2) * SLOT)
-                file.write(struct.pack("<q", draw.choice((-1, 0, 1, 2**63 - 1, -(2**63), 6))))
-    if draw.random() < 0.1:
-        _plant(session)
-
-
-def _plant(session: Session) -> None:
-    """Plant a file: a rig must refuse it, and leave what it points to alone."""
-    name = f"hostile-{uuid.uuid4().hex}"
-    path = Path(f"/dev/shm/quell-{name}-{session.draw.choice(('commands', 'measurements'))}")
-    victim = path.with_name(f"{name}-victim")
-    victim.write_bytes(b"precious")
-    kind = session.draw.randrange(4)
-    try:
-        if kind == 0:
-            path.symlink_to(victim)
-        elif kind == 1:
-            os.link(victim, path)
-        elif kind == 2:
-            os.mkfifo(path)
-        else:
-            path.touch()
-            path.chmod(0o666)
-        try:
-            listen(f"shm://{name}").close()
-            session.wrong.append(f"a planted file was used (kind {kind})")
-        except ValueError:
-            pass
-        if victim.read_bytes() != b"precious":
-            session.wrong.append("the target of a link was changed")
-    finally:
-        for planted in Path("/dev/shm").glob(f"*{name}*"):
-            planted.unlink()
-
-
 def resources() -> tuple[int, int]:
     """Return resident memory [bytes] and the number of open files."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
@@ -288,8 +233,7 @@ def resources() -> tuple[int, int]:
 
 def attacks(wire: str, stack: ExitStack, draw: random.Random) -> Iterator[tuple[int, Session, Any]]:
     """Attack a session over one kind of wire, and yield the number of attacks after each tick."""
-    urls = {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}
-    url = urls.get(wire, f"shm://hostile-{uuid.uuid4().hex}")
+    url = {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}[wire]
     session = Session(stack, url, wire == "udp", draw)
     strangers = []
     for i in range(4):
@@ -297,10 +241,6 @@ def attacks(wire: str, stack: ExitStack, draw: random.Random) -> Iterator[tuple[
         stranger.setblocking(False)
         stranger.bind((f"127.0.0.{1 + i % 2}", 0))
         strangers.append(stranger)
-    paths = [
-        Path(f"/dev/shm/quell-{url.removeprefix('shm://')}-{kind}")
-        for kind in ("measurements", "commands")
-    ]
     balance = [0, 0]
     for number in range(1, sys.maxsize):
         if number % SESSION == 0 or session.loop.lost or session.rig.state == "tripped":
@@ -308,10 +248,8 @@ def attacks(wire: str, stack: ExitStack, draw: random.Random) -> Iterator[tuple[
         if wire == "udp":
             for i, amount in enumerate(attack_udp(session, strangers)):
                 balance[i] += amount
-        elif wire == "serial":
-            attack_serial(session, session.rig.listener._port._ends)
         else:
-            attack_memory(session, paths)
+            attack_serial(session, session.rig.listener._port._ends)
         session.tick()
         yield AT_ONCE if wire == "udp" else AT_ONCE // 4, session, tuple(balance)
 
@@ -354,7 +292,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="time in all")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    shares = {"udp": 0.8, "serial": 0.1, "shm": 0.1}
+    shares = {"udp": 0.9, "serial": 0.1}
     bad = 0
     print(
         f"{'wire':<8} {'attacks':>9} {'time':>7} {'wrong':>6} {'memory':>10} {'files':>6}  returned"

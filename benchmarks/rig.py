@@ -1,7 +1,7 @@
 """Timing of the real-time loop at 1 kHz, and the effect of the wire on the control performance.
 
     python benchmarks/rig.py                              # 60 s over UDP, on an idle machine
-    python benchmarks/rig.py --seconds 10 --wire shm --spin 0.0001
+    python benchmarks/rig.py --seconds 10 --spin 0.0001
     python benchmarks/rig.py --load 4                     # beside four programs that compute
     python benchmarks/rig.py --load 4 --wait 0.1          # the rig waits for late commands
 
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import shutil
 import subprocess
 import sys
@@ -52,9 +51,9 @@ def controller() -> ql.ADRC:
 
 
 @contextlib.contextmanager
-def rig(wire: str, priority: int, wait: float) -> Iterator[str]:
+def rig(priority: int, wait: float) -> Iterator[str]:
     """Start ``quell rig`` in its own process; yield its URL, and print its output at the end."""
-    url = "udp://127.0.0.1:0" if wire == "udp" else f"shm://quell-benchmark-{os.getpid()}"
+    url = "udp://127.0.0.1:0"
     command = [
         sys.executable,
         "-m",
@@ -145,7 +144,6 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--wire", choices=("udp", "shm"), default="udp")
     parser.add_argument("--spin", type=float, default=0.0)
     parser.add_argument("--priority", type=int, default=50)
     parser.add_argument("--load", type=int, default=0, help="programs that compute meanwhile")
@@ -156,7 +154,7 @@ def main() -> None:
     )
     with load(options.load):
         late = floor(min(options.seconds, 20.0))
-        with rig(options.wire, options.priority, options.wait) as url:
+        with rig(options.priority, options.wait) as url:
             run = over_the_wire(url, reference, options.seconds, options)
     print(run.text())
     print(
@@ -180,7 +178,7 @@ def main() -> None:
     plain = ql.simulate(delayed, controller(), ql.Scenario(reference, options.seconds))
     if run.completed:
         step = 0.5 * options.seconds
-        print(f"{'metric':<20} {'in process':>12} {'over ' + options.wire:>12} {'difference':>11}")
+        print(f"{'metric':<20} {'in process':>12} {'over udp':>12} {'difference':>11}")
         wire = run.metrics(step)
         for name, value in plain.metrics(step).items():
             difference = abs(wire[name] - value) / abs(value) if value else abs(wire[name])

@@ -7,7 +7,6 @@ import math
 import struct
 import termios
 import threading
-import uuid
 import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -25,13 +24,12 @@ from quell.realtime.rig.kernel import APPLIED
 from quell.realtime.rig.server import Rig
 from quell.realtime.wire.frames import LENGTH, RECEIVED, SENT
 from quell.realtime.wire.serial_line import SerialDevice
-from quell.realtime.wire.shared_memory import SharedMemoryDevice
 from quell.realtime.wire.transport import wait_for_frame
 from quell.realtime.wire.udp import UdpDevice
 
 DT = 0.01
 PLANT = ql.plants.two_mass_spring()
-DEVICES = {"udp": UdpDevice, "shm": SharedMemoryDevice, "serial": SerialDevice}
+DEVICES = {"udp": UdpDevice, "serial": SerialDevice}
 WIRES = tuple(DEVICES)
 TIME = 123_456_789
 """In every frame that ``packed`` makes [ns]."""
@@ -39,8 +37,7 @@ TIME = 123_456_789
 
 def url_of(wire: str) -> str:
     """Return a URL at which a rig can listen."""
-    urls = {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}
-    return urls.get(wire, f"shm://test-{uuid.uuid4().hex}")
+    return {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}[wire]
 
 
 def connect(url: str, dt: float = DT, timeout: float = 30.0) -> Any:

@@ -162,7 +162,7 @@ def test_python_runs_only_with_trust(files: Path, quell: Callable[..., Shown]) -
         ("run", "setup.toml"),
         ("tune", "setup.toml"),
         ("export", "setup.toml", "--out", "c"),
-        ("rig", "--device", "shm://no", "--plant", "mine.py:motor"),
+        ("rig", "--device", "udp://127.0.0.1:9", "--plant", "mine.py:motor"),
         ("run-rig", "setup.toml"),
     ):
         shown = quell(*arguments)

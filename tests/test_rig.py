@@ -40,12 +40,11 @@ def test_ticks_that_were_slept_over_are_caught_up(bench: Callable[..., Bench]) -
     assert np.array_equal(*positions)
 
 
-@pytest.mark.parametrize("wire", ["udp", "shm"])
 def test_a_rig_that_waits_moves_as_in_the_simulation_however_late_its_loop_is(
-    wire: str, bench: Callable[..., Bench]
+    bench: Callable[..., Bench],
 ) -> None:
     """Bit for bit; the rig ticks as fast as it can on a thread of its own."""
-    here = bench(wire, wait=30.0)
+    here = bench("udp", wait=30.0)
     device = here.open()
     twin = TwinDevice(ql.plants.delayed(PLANT, DT, DT), DT)
     thread = threading.Thread(target=lambda: here.rig.tick(60))
@@ -98,7 +97,7 @@ def test_a_session_that_never_begins_gives_way(bench: Callable[..., Bench]) -> N
 
 def test_a_rig_that_ends_says_so_at_once(bench: Callable[..., Bench]) -> None:
     """Not only when it is closed, which may take its time."""
-    here = bench("shm")
+    here = bench("udp")
     device = here.open()
     here.rig.run(5 * DT)
     device.read()
@@ -107,7 +106,7 @@ def test_a_rig_that_ends_says_so_at_once(bench: Callable[..., Bench]) -> None:
 
 def test_a_rig_with_long_ticks_need_not_be_waited_for(bench: Callable[..., Bench]) -> None:
     """To be told to stop it does not wait for the next tick."""
-    with closing(listen(url_of("shm"))) as listener, Rig(PLANT, 100.0, listener) as rig:
+    with closing(listen(url_of("udp"))) as listener, Rig(PLANT, 100.0, listener) as rig:
         rig.prepare()
         thread = threading.Thread(target=rig.run)
         thread.start()
@@ -122,7 +121,7 @@ def test_a_rig_with_long_ticks_need_not_be_waited_for(bench: Callable[..., Bench
 def test_a_rig_goes_on_without_its_log_where_the_disk_is_full() -> None:
     """And says so."""
     with (
-        closing(listen(url_of("shm"))) as listener,
+        closing(listen(url_of("udp"))) as listener,
         Rig(PLANT, DT, listener, log="/dev/full") as rig,
     ):
         notes = rig.run(10 * DT)
@@ -134,7 +133,7 @@ def test_a_rig_replaces_a_log_only_where_asked(tmp_path: Path) -> None:
     """As all outputs."""
     log = tmp_path / "log.csv"
     log.write_text("precious")
-    with closing(listen(url_of("shm"))) as listener:
+    with closing(listen(url_of("udp"))) as listener:
         with pytest.raises(ValueError, match="log.csv': the file exists; choose another name"):
             Rig(PLANT, DT, listener, log=log)
         assert log.read_text() == "precious"
@@ -146,7 +145,7 @@ def test_a_rig_does_not_hide_what_went_wrong_on_its_thread(
     bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It comes out of run."""
-    here = bench("shm")
+    here = bench("udp")
 
     def serve(most: int, paced: bool) -> None:
         if paced:
@@ -195,7 +194,7 @@ def test_a_session_starts_from_rest_or_where_the_last_one_ended(
     rest: bool, bench: Callable[..., Bench]
 ) -> None:
     """As was asked for."""
-    here = bench("shm", rest=rest)
+    here = bench("udp", rest=rest)
     device = here.open()
     here.cycle(device, law, 100)
     device.close()
@@ -213,7 +212,7 @@ def test_a_destroyed_plant_comes_back_to_rest_for_the_next_session(
     value: float, rest: bool, bench: Callable[..., Bench]
 ) -> None:
     """Not finite, or beyond any motion; a large but possible state is kept if it is to be."""
-    here = bench("shm", rest=rest, x0=[0.1, 0.0, 0.2, 0.0])
+    here = bench("udp", rest=rest, x0=[0.1, 0.0, 0.2, 0.0])
     device = here.open()
     here.rig.model.x[3] = value
     device.close()
@@ -243,6 +242,6 @@ def test_a_destroyed_plant_comes_back_to_rest_for_the_next_session(
 )
 def test_a_rig_says_what_is_wrong_with_its_settings(settings: dict[str, Any], message: str) -> None:
     """By name."""
-    listener = listen(url_of("shm"))
+    listener = listen(url_of("udp"))
     with closing(listener), pytest.raises(ValueError, match=message):
         Rig(PLANT, **{"dt": DT, "listener": listener} | settings)

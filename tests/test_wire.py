@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
-import struct
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -23,7 +21,6 @@ from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.system.clock import system_clock
 from quell.realtime.wire import device as wire_device
 from quell.realtime.wire import frames
-from quell.realtime.wire.shared_memory import SIZE
 from quell.realtime.wire.transport import (
     connect_to_sender,
     is_from_other_side,
@@ -35,7 +32,7 @@ from quell.realtime.wire.transport import (
 from quell.realtime.wire.udp import UdpDevice, UdpTransport
 
 from .benchmark_module import benchmark
-from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed, url_of
+from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed
 
 HOSTILE = Path(__file__).parents[1] / "benchmarks" / "hostile_wire.py"
 
@@ -138,12 +135,9 @@ def test_a_hello_that_is_heard_when_its_loop_has_gone_begins_nothing(
     assert here.rig.state == "idle"
 
 
-@pytest.mark.parametrize("wire", ["udp", "shm"])  # a serial line hangs up with it
-def test_the_rigs_end_is_told(
-    wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its goodbye, where it can say one."""
-    here = bench(wire)
+def test_the_rigs_end_is_told(bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its goodbye, where it can say one: a serial line hangs up with it."""
+    here = bench("udp")
     device = here.open()
     here.cycle(device, law, 2)
     here.rig.close()
@@ -157,18 +151,17 @@ def test_the_rigs_end_is_told(
         device.read()
 
 
-@pytest.mark.parametrize("url", ["udp://127.0.0.1:9", "shm://nobody"])
-def test_where_nobody_answers_it_says_what_to_start(url: str) -> None:
+def test_where_nobody_answers_it_says_what_to_start() -> None:
     """In a line."""
+    url = "udp://127.0.0.1:9"
     with pytest.raises(ConnectionError, match=f"start one with: quell rig --device {url}"):
         connect(url, DT, 0.1)
 
 
 def test_a_port_that_is_taken_is_refused(bench: Callable[..., Bench]) -> None:
-    """And a name in shared memory that another rig has."""
-    for wire in ("udp", "shm"):
-        with pytest.raises(ValueError, match=r"can't listen there|another rig has this name"):
-            listen(bench(wire).url)
+    """In a line."""
+    with pytest.raises(ValueError, match="can't listen there"):
+        listen(bench("udp").url)
 
 
 @compiled
@@ -391,18 +384,3 @@ def test_what_waited_behind_many_others_is_not_taken_for_new(bench: Callable[...
     assert device.counters["stale"] == 1
     here.rig.tick()
     assert np.isfinite(device.read())
-
-
-def test_a_rig_that_was_killed_leaves_nothing_in_the_way(bench: Callable[..., Bench]) -> None:
-    """Its mailboxes are taken over, also one that was left in the middle of a write."""
-    url = url_of("shm")
-    dead = listen(url)
-    for box in dead._boxes:
-        os.pwrite(box.file, struct.pack("<2q", 7, 7) * (SIZE // 16), 0)
-        box.close()  # as the system does
-    here = bench(url=url)
-    device = here.open()
-    here.cycle(device, law, 3)
-    assert here.rig.state == "live"
-    here.rig.close()
-    assert not list(Path("/dev/shm").glob(f"quell-{url.removeprefix('shm://')}*"))

@@ -48,7 +48,6 @@ LEFT_OUT = [
         "security",
         "serial_device",
         "serial_line",
-        "shared_memory",
         "stress",
         "telemetry",
         "torsional",

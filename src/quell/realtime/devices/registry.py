@@ -26,8 +26,6 @@ class Scheme(NamedTuple):
 # fmt: off
 SCHEMES = {
     "udp": Scheme("udp://127.0.0.1:5005", "network", "wire.udp", "UdpDevice", "UdpListener"),
-    "shm": Scheme("shm://rig", "shared memory",
-                  "wire.shared_memory", "SharedMemoryDevice", "SharedMemoryListener"),
     "serial": Scheme("serial:///dev/ttyACM0", "serial port",
                      "wire.serial_line", "SerialDevice", "SerialListener"),
     "ni": Scheme("ni://Dev1/ctr0+Dev2/ao0", "NI cards", "devices.ni.device", "ni_device"),
@@ -48,7 +46,7 @@ def open_device(device: str | Device, dt: float, trust: bool = False) -> Any:
     Parameters
     ----------
     device
-        a URL: ``udp://HOST:PORT``, ``shm://NAME``, ``serial:///dev/…``, ``ni://…``, or
+        a URL: ``udp://HOST:PORT``, ``serial:///dev/…``, ``ni://…``, or
         ``twin:PLANT`` for a plant in this process, on which u acts at once: ``twin:torsional``,
         ``twin:setup.toml``, ``twin:model.json`` and whatever else ``quell.setup.plant_given``
         takes. An object with ``read``, ``write`` and ``close`` is returned as it is.
