@@ -69,8 +69,8 @@ def settle(learner: Learner | None, guard: Guard | None, draws: range) -> Settli
             return Settling(math.inf, math.inf)
         part = run.window(*setup.STEP_WINDOW)
         scores = step_scores(run.t[part], run["y"][part], 1.0, setup.BAND)
-        time, overshoot = scores["settling_time"], scores["overshoot"]
-        found.append([math.inf if time is None else time, overshoot])
+        pair = scores["settling_time"], scores["overshoot"]
+        found.append([math.inf if value is None else value for value in pair])
     return Settling(*np.mean(found, axis=0).tolist())
 
 
