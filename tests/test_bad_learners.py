@@ -13,7 +13,8 @@ import pytest
 import quell as ql
 from quell.features.base import Features, unit, write
 from quell.guard import Reason
-from quell.learners.base import adapt, commit, predict, restart
+from quell.kernels.scalars import Scalars
+from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.online.model import infer, learn
 from quell.types import Status
 
@@ -24,6 +25,13 @@ class Memory(NamedTuple):
     """One number, in an array."""
 
     weight: Any
+
+
+class Counts(Scalars):
+    """A record of which a saved state would lose a field."""
+
+    level: float
+    samples: int
 
 
 class Lists(NamedTuple):
@@ -333,7 +341,7 @@ def learner_with(
         commit: nothing,
         restart: nothing,
         predict: lambda *all: says,
-        ql.learners.base.coefficients: theta,
+        coefficients: theta,
     }
     for function, implementation in functions.items():
         name = function.__name__  # type: ignore[attr-defined]
@@ -410,6 +418,10 @@ def learner_with(
             lambda: learner_with(memory=lambda: Memory(np.zeros(1, dtype=int))),
             "Whole.memory has weight, array of int64: .* float64",
         ),
+        (
+            lambda: learner_with(memory=lambda: Memory(Counts.zeros())),
+            "Whole.memory has weight, array of .*Counts.*: .* float64",
+        ),
     ],
 )
 def test_a_learner_that_does_not_fit_is_named(make: Any, message: str) -> None:
@@ -447,6 +459,108 @@ def test_a_learner_is_tried_on_what_a_loop_shows_it() -> None:
         "coefficients": [4],
         "restart": [],
     }
+
+
+class ShareDesign(NamedTuple):
+    """Parameters of a learner that says a share of what another says."""
+
+    share: float
+    inner: Any
+
+
+class ShareMemory(NamedTuple):
+    """The state of the other, and the number of samples."""
+
+    inner: Any
+    samples: Any
+
+
+class Share:
+    """A learner around another one."""
+
+    def __init__(self, inner: Any, share: float) -> None:
+        self.inner, self.share = inner, share
+
+    def design(self, observer: Any, omega_c: float) -> ShareDesign:
+        """Return the parameters of both."""
+        return ShareDesign(self.share, self.inner.design(observer, omega_c))
+
+    def memory(self, parameters: ShareDesign) -> ShareMemory:
+        """Return the state of both."""
+        return ShareMemory(self.inner.memory(parameters.inner), np.zeros(1))
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return the names of the other."""
+        names: tuple[str, ...] = self.inner.feature_names(order)
+        return names
+
+
+@adapt.register(ShareDesign)
+def _adapt_share(
+    learner: ShareDesign, memory: ShareMemory, seen: Any, y: float, u: float, f_plain: float
+) -> None:
+    memory.samples[0] += 1.0
+    adapt(learner.inner, memory.inner, seen, y, u, f_plain)
+
+
+@predict.register(ShareDesign)
+def _predict_share(
+    learner: ShareDesign, memory: ShareMemory, seen: Any, u: float
+) -> tuple[float, float]:
+    constant, slope = predict(learner.inner, memory.inner, seen, u)
+    return learner.share * constant, learner.share * slope
+
+
+@commit.register(ShareDesign)
+def _commit_share(
+    learner: ShareDesign, memory: ShareMemory, seen: Any, u: float, f_learned: float
+) -> None:
+    commit(learner.inner, memory.inner, seen, u, f_learned)
+
+
+@restart.register(ShareDesign)
+def _restart_share(learner: ShareDesign, memory: ShareMemory) -> None:
+    restart(learner.inner, memory.inner)
+
+
+@coefficients.register(ShareDesign)
+def _coefficients_share(learner: ShareDesign, memory: ShareMemory, theta: Any) -> None:
+    coefficients(learner.inner, memory.inner, theta)
+
+
+BUILT_IN: dict[str, Callable[[], Any]] = {
+    "Kalman": ql.learners.Kalman,
+    "Harmonic": ql.learners.Harmonic,
+    "RLS": ql.learners.RLS,
+    "Repetitive": lambda: ql.learners.Repetitive(period=2.0),
+}
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_a_learner_around_one_of_quell_is_that_learner(name: str) -> None:
+    """With all of its output the controls are those of the other to the bit; with a half they are not, and a saved state continues.
+
+    The memory contains that of the other, which has records of floats beside its arrays.
+    """
+    rng = np.random.default_rng(3)
+    y = np.cumsum(rng.standard_normal(900)) * 1e-2
+
+    def controls(learner: Any, samples: slice = slice(None), state: Any = None) -> list[float]:
+        controller = law(learner)
+        if state is not None:
+            controller.state = state
+        found = [controller.step(1.0, value) for value in y[samples]]
+        last.append(controller.state)
+        return found
+
+    last: list[Any] = []
+    alone = controls(BUILT_IN[name]())
+    assert controls(Share(BUILT_IN[name](), 1.0)) == alone
+    half = controls(Share(BUILT_IN[name](), 0.5))
+    assert half != alone
+    assert last[-1]["learner.samples"] == [899.0]  # the observer starts at the first y
+    controls(Share(BUILT_IN[name](), 0.5), slice(450))
+    assert controls(Share(BUILT_IN[name](), 0.5), slice(450, None), last[-1]) == half[450:]
 
 
 class ExplodesDesign(NamedTuple):

@@ -78,7 +78,7 @@ def test_the_authority_is_what_a_learner_has_earned(
         (3.9, 0.21, 1.0, 1.0),  # q is not large beside o
         (4.1, 0.19, 1.0, 1.0),  # the learner explains nearly all of q
         (1.7, 0.0, 0.0, 0.0),  # withheld until q is small, whatever the learner says
-        (1.68, 0.0, 0.0, 1.0),
+        (1.68, 0.0, 0.0, 1.0),  # without authority before, but not withheld
     ],
 )
 @pytest.mark.parametrize("o", [1.0, 1e-3])
@@ -98,6 +98,40 @@ def test_authority_is_withheld_while_q_may_be_the_learner_s_own_doing(
         assert sample.authority == (1.0 if order == 4 else authority)
         assert (sample.reason == ql.Reason.WITHHELD) == (sample.authority == 0.0)
         assert sample.credit == 1.0
+
+
+@pytest.mark.parametrize(
+    ("order", "goes", "own_doing"), [(2, True, True), (2, False, False), (3, True, False)]
+)
+def test_a_motion_that_went_with_the_learner_was_its_own_doing(
+    order: int, goes: bool, own_doing: bool
+) -> None:
+    """Withheld at o = 1, M falls below (1.3)²: then nothing that was earned counts. If o rises instead, or for n = 3, all of it does.
+
+    The same learner in a load that begins is heard again as soon as o has followed.
+    """
+    guard, observer = ql.Guard(), ql.ESO.model_free(order, b0=1.0, omega_o=10.0, dt=5e-3)
+    design = guard.design(observer)
+    memory = guard.memory(design)
+    sample, averages = memory.sample[0], memory.averages[0]
+    sample.credit, sample.authority, sample.outside = 1.0, 1.0, 1.0
+    averages.missed, averages.gained, averages.seen = 1.0, 0.5, 0.1
+
+    def authority(square: float, outside: float) -> float:
+        averages.square = averages.square_left = square
+        sample.outside = outside
+        limit(design, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
+        return float(sample.authority)
+
+    assert authority(4.1, 1.0) == 0.0
+    assert sample.reason == ql.Reason.WITHHELD
+    found = authority(1.68, 1.0) if goes else authority(4.1, 2.0)
+    assert found == (0.0 if own_doing else 1.0)
+    assert averages.gained == pytest.approx(-0.02 if own_doing else 0.5)
+    # What was decided is decided once: a later M is compared with an o of its own.
+    averages.gained = 0.5
+    assert authority(1.0, 1.0) == 1.0
+    assert averages.gained == 0.5
 
 
 def test_without_authority_the_guard_soon_forgets_what_the_learner_did() -> None:

@@ -149,9 +149,18 @@ def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tup
     loudness, sample = memory.averages[0].loudness, memory.sample[0]
     earned = min(max(sample.credit, sample.credit_at_y) / _FULL_CREDIT, 1.0 + removed / _LOAN)
     if earned <= 0.0:
+        sample.outside_then = 0.0
         return 0.0, _UNPROVEN
     if _is_own_doing(guard, memory):
+        if sample.outside_then == 0.0:
+            sample.outside_then = sample.outside
         return 0.0, _WITHHELD
+    then, sample.outside_then = sample.outside_then, 0.0
+    averages = memory.averages[0]
+    if guard.stages < HIGHEST_ORDER and averages.square < (_GONE * then) ** 2:
+        # The motion went with the learner: it was its own doing, whatever it explained of it.
+        averages.gained = -_LARGEST_DEBT * _LOAN * max(averages.missed, averages.seen)
+        return 0.0, _UNPROVEN
     scaled = _LOUDEST * (1.0 - loudness) / max(loudness, tiny(guard))
     if scaled < min(earned, 1.0):
         return scaled, _TOO_LOUD

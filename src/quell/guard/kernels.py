@@ -24,7 +24,9 @@ M, the mean of q² (below), and M_left, that of (q − p)²,
 
 λ is that of ten lags, without authority that of one, so that o soon follows |q| if the error was
 not the learner's; if it was, M decays. Only for r ≤ 3: of higher order, what a gap in e_L does to y
-is worse.
+is worse. How it ends is the verdict, for r ≤ 2: if M is below (1.3 o)² with the o from which
+authority was withheld, the motion went with the learner, and the account (below) is set to its
+largest debt, whatever it says that the learner explained.
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts

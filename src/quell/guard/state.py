@@ -68,6 +68,7 @@ class GuardSample(Scalars):
     peak: float  # P [y-unit/s^n]
     typical_error: float  # e [y-unit/s^n]
     outside: float  # o [y-unit/s^n]
+    outside_then: float  # o when authority was withheld, 0 while it is not [y-unit/s^n]
     own_peak: float  # c_L [y-unit/s^n]
     late_effect: float  # d: ℓ e_L, as late as q [y-unit/s^n]
     output: float  # g [y-unit/s^n]

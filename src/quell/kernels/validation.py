@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from quell.kernels.dispatch import Generic
+from quell.kernels.scalars import Scalars
 from quell.kernels.user_types import set_display_name
 from quell.types import Vector
 
@@ -66,7 +67,8 @@ def check_named_tuple(what: str, value: Any, of: str) -> None:
 def check_arrays(what: str, memory: Any, nested: bool) -> None:
     """Raise a ``ValueError`` if a field of a NamedTuple is not an array of numbers.
 
-    If ``nested``, arrays must be of floats, and NamedTuples of such arrays are allowed too.
+    If ``nested``, arrays must be of floats, or of one record of floats (``Scalars``), and
+    NamedTuples of such arrays are allowed too: a memory may contain that of a part of this package.
     """
     check_named_tuple(what, memory, "arrays")
     for name, value in zip(memory._fields, memory, strict=True):
@@ -74,12 +76,20 @@ def check_arrays(what: str, memory: Any, nested: bool) -> None:
             check_arrays(f"{what}.{name}", value, nested)
             continue
         is_array = isinstance(value, np.ndarray)
+        if nested and is_array and _is_record_of_floats(value.dtype):
+            continue
         if not is_array or value.dtype.kind not in ("f" if nested else "fiub"):
             kind = f"array of {value.dtype}" if is_array else type(value).__name__
             raise ValueError(
                 f"{what} has {name}, {kind}: all of its fields must be arrays of float64, "
                 "one number in an array (1,)"
             )
+
+
+def _is_record_of_floats(dtype: np.dtype[Any]) -> bool:
+    """Return whether it is the type of a ``Scalars`` whose fields are all floats."""
+    fields = dtype.names or ()
+    return issubclass(dtype.type, Scalars) and all(dtype[name] == np.float64 for name in fields)
 
 
 def check_number(what: str, value: Any) -> None:

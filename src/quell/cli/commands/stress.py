@@ -65,8 +65,9 @@ def stress(
         With the guard, or without it, for comparison.
     loops
         The loops: two masses on a spring, all alike; all kinds of plants, orders, references and
-        loads, with named cases and the bars that a guard has to meet; or flexible axes with honest
-        learners only, in means over four draws of the noise. For the last two, seeds below 10000
+        loads, with named cases and the bars that a guard has to meet; or flexible axes, arms with
+        two coupled joints and settling near rest, with honest learners only, in means over four
+        draws of the noise. For the last two, seeds below 10000
         are for tuning, and seeds from 1000000 on for judging: look at each of them once.
     """
     from rich.progress import TextColumn, TimeRemainingColumn
@@ -179,10 +180,10 @@ def _print_axes(console: Console, result: AxesResult, guarded: bool) -> None:
     from quell.experiments.stress.axes.trial import DRAWS, summary
 
     how = "with guard" if guarded else "WITHOUT guard"
-    title = f"RMS error over that without learner on the same flexible axis, {how}"
+    title = f"RMS error over that without learner on the same axis, {how}"
     rows = table(title, *_AXES_HEADINGS, padding=(0, 1, 0, 0), pad_edge=False)
-    for label, outcomes in {**result.by_structure, "all": result.outcomes}.items():
-        if label == "all":
+    for label, outcomes in {**result.by_structure, "all but arms": result.outcomes}.items():
+        if label == "all but arms":
             rows.add_section()
         found = summary(outcomes)
         keys = [(name, key) for name in ("rms", "late") for key in ("median", "max")]
