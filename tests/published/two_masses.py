@@ -176,7 +176,11 @@ def figures(based: bool, m: int, omega_o: float, held: bool = False) -> Figures:
     drawn = noise(count)
     step, still = np.repeat(of_r[:, None], 3, axis=1), np.zeros((of_r.size, SEEDS))
     constant = np.hstack([step, still])
-    state, y, u = np.zeros(constant.shape), np.empty((count, 3 + SEEDS)), np.empty((count, 3 + SEEDS))
+    state, y, u = (
+        np.zeros(constant.shape),
+        np.empty((count, 3 + SEEDS)),
+        np.empty((count, 3 + SEEDS)),
+    )
     for i in range(count):
         y[i], u[i] = state[0], u_row @ state
         state = whole @ state + constant
@@ -210,7 +214,9 @@ def algorithm_1() -> dict[str, Figures]:
     transition, gamma, L = sampled_observer(False, 1, 10.0)
     correct = np.eye(5) - np.outer(L, np.eye(5)[0])
     # A row for each case: x (4), z (5), u and f_L.
-    onto_z = np.hstack([np.outer(L, np.eye(4)[0]), correct @ np.column_stack([transition, gamma, gamma])])
+    onto_z = np.hstack(
+        [np.outer(L, np.eye(4)[0]), correct @ np.column_stack([transition, gamma, gamma])]
+    )
     k = np.array([math.comb(N, i) for i in range(N)] + [1], dtype=float)
     cases = [(name, load) for name in ("as printed", "without u") for load in range(3)]
     cases.append(("labelled once", 1))
@@ -222,7 +228,11 @@ def algorithm_1() -> dict[str, Figures]:
     force = np.where(t[:, None] >= 150.0, np.sin(np.array(LOADS) * (t[:, None] - 150.0)), 0.0)
     pushed = force[:, [load for _, load in cases], None] * columns[:, 1]
     seen = noise(count)[:, :1] * L
-    rows, theta, total = np.zeros((len(cases), 11)), np.zeros((len(cases), 6)), np.zeros((len(cases), 6))
+    rows, theta, total = (
+        np.zeros((len(cases), 11)),
+        np.zeros((len(cases), 6)),
+        np.zeros((len(cases), 6)),
+    )
     inputs, products = np.zeros((BATCH, len(cases), 6)), np.zeros((BATCH, len(cases), 6))
     inputs[:, :, 5], labels = 1.0, np.zeros(BATCH)
     y, u = np.empty((count, len(cases))), np.empty((count, len(cases)))
@@ -251,7 +261,9 @@ def algorithm_1() -> dict[str, Figures]:
         ("without u", [3, 4, 5], 4),
         ("labelled once", [6, 6, 6], 6),
     ):
-        scores = scored(y[reset:on, [paper]], u[reset:on, [paper]], y[round(170.0 / DT) :, of_loads])
+        scores = scored(
+            y[reset:on, [paper]], u[reset:on, [paper]], y[round(170.0 / DT) :, of_loads]
+        )
         features = own[paper] * (alpha[paper] > 0.0)
         margins = _margins(READINGS[name] * DT / BATCH, theta[paper], features)
         found[name] = Figures(*margins, *scores)

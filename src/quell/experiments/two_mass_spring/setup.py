@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from quell import checks
 from quell.analysis.loop import analyse
@@ -60,7 +61,7 @@ GRADIENT_RATE = 0.01
 GRADIENT_BATCH = 10
 """Samples in a batch of Algorithm 1: chosen by hand; the stable range does not depend on it."""
 RATE_WITHOUT_U = 1.0
-"""Its rate · batch / dt [1/s] without u among the features, where it is stable up to 3/s."""
+"""Its rate · batch / dt [1/s] without u among the features; at 3/s it still runs to the end."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ def controllers(settings: Settings) -> dict[str, ADRC]:
 def further_controllers(settings: Settings) -> dict[str, ADRC]:
     """Return those that stand in the ranges only: each needs a loop of its own to be compiled."""
     rate = RATE_WITHOUT_U * settings.dt / GRADIENT_BATCH
-    three = {"bandwidth": THREE_STATES, "disturbance_order": 3}
+    three: dict[str, Any] = {"bandwidth": THREE_STATES, "disturbance_order": 3}
     return {
         MF_3: controller(settings, **three),
         MB_3: controller(settings, **three, model=True),
