@@ -1,12 +1,13 @@
 """What learning gives at equal margins: late errors with M_s and M_ks the same for all.
 
-    python benchmarks/equal_margins.py [--plant axis] [--m-ks 100] [--json FILE] [--figure FILE]
+    python benchmarks/equal_margins.py [--plant axis] [--m-ks 100] [--base freed] [--json FILE]
+        [--figure FILE]
 
 The plant is an axis with viscous friction, ``y'' = −2 y' + 100 (u + w)``, sampled at 500 Hz, or one
 of ``MACHINES``: a hanging mass, ``y'' = −2 y' − 25 y + …``, or an axis behind a drive with a lag of
 20 ms. Linear controllers are tuned for the least IAE after a step of the load with M_s ≤ 2 and
-M_ks ≤ the argument. Learners stand on the ADRC of free poles, tuned with the M_s that leaves
-M_s ≤ 2 with the learner's adaptation (``analyse``), and the same M_ks. The loads are
+M_ks ≤ the argument. Learners stand on an ADRC, of free poles by default, tuned with the M_s that
+leaves M_s ≤ 2 with the learner's adaptation (``analyse``), and the same M_ks. The loads are
 
 - a sinusoid of 3 rad/s, and two of 2 and 5.3 rad/s, which no controller knows;
 - cogging, ``0.3 sin(20 y)``, and a hardening spring, ``−0.3 y³``, in a slow motion;
@@ -169,6 +170,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plant", choices=MACHINES, default="axis")
     parser.add_argument("--m-ks", type=float, default=100.0)
+    parser.add_argument("--base", choices=("freed", "bandwidths", "model-based"), default="freed")
     parser.add_argument("--json", type=Path, help="file for the rows")
     parser.add_argument("--figure", type=Path, help="file for a figure of the best of each kind")
     given = parser.parse_args()
@@ -195,9 +197,9 @@ def main() -> None:
     bases = {}
     for m in (2.0, 1.9, 1.8, 1.7, 1.6, 1.5, 1.4):
         try:
-            bases[m] = machine.tuned("freed", m, 0.97 * given.m_ks)
+            bases[m] = machine.tuned(given.base, m, 0.97 * given.m_ks)
         except ValueError as error:
-            print(f"freed, M_s {m}: {error}")
+            print(f"{given.base}, M_s {m}: {error}")
     for label, make in LEARNERS.items():
         row: dict[str, Any] = {"m_s": 0.0, "m_ks": 0.0}
         guarded = dict(row)
