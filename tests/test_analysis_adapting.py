@@ -25,10 +25,10 @@ def controller(learner: Any) -> ql.ADRC:
     return ql.ADRC(observer, omega_c=OMEGA_C, learner=learner)
 
 
-def run(learner: Any, omega: float, size: float) -> ql.Trajectory:
-    """Return a run with a sinusoid of u from 40 s on, after training and rest."""
+def run(learner: Any, omega: float, size: float, level: float = 0.0) -> ql.Trajectory:
+    """Return a run with a sinusoid of u from 40 s on, after training and rest at ``level``."""
     t = DT * np.arange(8001)
-    r = np.where(t < 20.0, np.sin(t) + np.sin(2.7 * t), 0.0)
+    r = np.where(t < 20.0, np.sin(t) + np.sin(2.7 * t), level)
     d = np.where(t >= 40.0, size * np.sin(omega * (t - 40.0)), 0.0)
     if isinstance(learner, Harmonic):  # else its oscillator follows the small sinusoid
         d += np.sin(t)
@@ -38,17 +38,28 @@ def run(learner: Any, omega: float, size: float) -> ql.Trajectory:
     return ql.simulate(LOADED, controller(learner), scenario)
 
 
-@pytest.mark.parametrize("make", [Kalman, Harmonic, lambda: BatchGradient(rate=3e-4)])
-def test_the_sensitivity_is_that_of_the_running_loop(make: Any) -> None:
+@pytest.mark.parametrize(
+    ("make", "level"),
+    [
+        (Kalman, 0.0),
+        (Kalman, 1.5),
+        (Harmonic, 0.0),
+        (lambda: BatchGradient(rate=3e-4), 0.0),
+        (lambda: BatchGradient(rate=3e-4, u=False), 0.0),
+        # Beside x1 = 1.5 the bias is less than a third of what adapts.
+        (lambda: BatchGradient(rate=3e-4, u=False), 1.5),
+    ],
+)
+def test_the_sensitivity_is_that_of_the_running_loop(make: Any, level: float) -> None:
     """``|u/d|`` of a small sinusoid that is added to u after training, at the peak and beside it; the frozen learner's is another one."""
-    trained = run(make(), 1.0, 0.0)
+    trained = run(make(), 1.0, 0.0, level)
     loop = analysis.analyse(LOADED, controller(make()), at=trained)
     still = analysis.frozen(controller(make()), trained)
     frozen = analysis.analyse(LOADED, controller(make()), at=still)
     peak = loop.margins.modulus_omega
     for omega in (0.7 * peak, peak):
         size = 1e-4
-        one, other = (run(make(), omega, sign * size) for sign in (1.0, -1.0))
+        one, other = (run(make(), omega, sign * size, level) for sign in (1.0, -1.0))
         late = one.t >= 80.0 - 2.0 * np.pi / omega * int(20.0 * omega / (2.0 * np.pi))
         turned = np.exp(-1j * omega * (one.t[late] - 40.0))
         d = size * np.sin(omega * (one.t[late] - 40.0))

@@ -74,6 +74,23 @@ def test_algorithm_1_predicts_and_shows_theta_by_its_features() -> None:
     assert predict(design, memory, np.array([10.0, 0.1, 9.0]), -1.0) == (2e1 + 0.3 - 5.0 + 7.0, 0.0)
     coefficients(design, memory, theta)
     np.testing.assert_array_equal(theta, memory.theta)
+    assert learner.feature_names(2) == ("x1", "x2", "u", "bias")
+
+
+def test_without_u_the_other_features_learn_as_before(rng: np.random.Generator) -> None:
+    """θ of x̂ and of the bias has the same bits, and u has no effect on the output."""
+    found = []
+    for u in (True, False):
+        learner = ql.learners.BatchGradient(rate=1e-2, batch=3, u=u)
+        design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
+        memory = learner.memory(design)
+        for row in np.random.default_rng(1).normal(size=(20, 3)):
+            adapt(design, memory, row, row[0], 0.7, row[-1])
+        found.append(memory.theta)
+    np.testing.assert_array_equal(np.delete(found[0], 2), found[1])
+    assert learner.feature_names(2) == ("x1", "x2", "bias")
+    seen = rng.normal(size=3)
+    assert predict(design, memory, seen, 3.0) == predict(design, memory, seen, -8.0)
 
 
 def test_a_position_outside_of_the_buffers_does_no_harm(rng: np.random.Generator) -> None:
@@ -130,6 +147,10 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew(rng: np.random.Gen
         (
             lambda: ql.learners.BatchGradient(batch=0),
             "batch = 0: must be a whole number of at least 1",
+        ),
+        (
+            lambda: ql.learners.BatchGradient(features=ql.features.Bias(), u=False),
+            "u = False: leave it out, as features say whether u is among them",
         ),
     ],
 )

@@ -353,6 +353,10 @@ def test_a_tuned_controller_has_its_states_and_its_k_i_is_infinite() -> None:
     assert tuned.design.tables["observer"]["disturbance_order"] == 2
     y = errors(plant, tuned.controller, 1, 60.0)
     assert abs(y[-1]) < 1e-6 * np.max(np.abs(y))
+    # One integrator rejects a step of the load better, and the report says so.
+    assert tuned.designs["bandwidths"].objective < tuned.design.objective
+    line = "NOT better with 2 integrators: bandwidths of order 2 has one, and is at least as good"
+    assert any(each.startswith(line) for each in tuned.costs), tuned.costs
 
 
 @needs_gcc

@@ -131,7 +131,7 @@ PARTS: dict[str, Part] = {
     "NLMS": Part(ql.learners.NLMS, _learning, {}, {
         **_FEATURES, "rate": 0.1, "regularisation": 0.02, **_SCALED, "gain_interval": With((0.7, 1.4), {"features": State() + Input()}),
     }),
-    "BatchGradient": Part(ql.learners.BatchGradient, _learning, {}, {**_FEATURES, "rate": 1e-5, "batch": 3}),
+    "BatchGradient": Part(ql.learners.BatchGradient, _learning, {}, {**_FEATURES, "rate": 1e-5, "batch": 3, "u": False}),
     "MLP": Part(ql.learners.MLP, _learning, {"hidden": 3}, {
         **_FEATURES, "hidden": 2, "memory_time": 20.0, "every": 2, "noise": 0.2, "seed": 1, **_SCALED,
     }),

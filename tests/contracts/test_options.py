@@ -90,7 +90,7 @@ _OF_SETUP = (*_SETUP, *_FIGURES)
 Case = tuple[str, ...] | tuple[tuple[str, ...], tuple[str, ...]]
 # For each option what is added to the command's base; or a base and a call of its own.
 CASES: dict[str, dict[str, Case]] = {
-    "reproduce two-mass": {"--dt": ("--dt", "0.002"), "--seed": ("--seed", "1"), "--omega-o": ("--omega-o", "9"), "--reset": ("--no-reset",)},
+    "reproduce two-mass": {"--dt": ("--dt", "0.002"), "--seed": ("--seed", "1"), "--omega-o": ("--omega-o", "9"), "--reset": ("--no-reset",), "--seeds": ("--seeds", "2")},
     "reproduce torsional": {"--dt": ("--dt", "0.002"), "--seed": ("--seed", "1")},
     "reproduce acc": {"--samples": ("--samples", "plants.csv"), "--count": ("--count", "4"), "--spread": ("--spread", "2"), "--seed": ("--seed", "1"), "--box": ("--box",)},
     "stress": {"--runs": ("--runs", "12"), "--honest": ("--honest", "3"), "--seed": ("--seed", "1"), "--guard": ("--no-guard",), "--loops": ("--loops", "all")},

@@ -6,6 +6,7 @@ one, the test says by how much.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -14,7 +15,9 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.experiments.two_mass_spring import ranges as ranges_of_study
 from quell.experiments.two_mass_spring import setup as study
+from quell.experiments.two_mass_spring.ranges import Range, all_controllers, range_of
 
 pytestmark = pytest.mark.compiled
 
@@ -26,10 +29,9 @@ SEEDS = range(3)
 def scores(name: str, dt: float, seed: int, reset: bool = True) -> dict[str, float]:
     """Run one controller of the study and score it."""
     settings = study.Settings(dt=dt, seed=seed, reset=reset)
-    run = study.simulate(
-        study.two_mass_spring(), study.controllers(settings)[name], study.scenario(settings)
-    )
-    return dict(study.score(run))
+    law = all_controllers(settings)[name]
+    run = study.simulate(study.two_mass_spring(), law, study.scenario(settings))
+    return dict(study.score(run) | study.margins(law, run))
 
 
 @pytest.mark.parametrize("dt", DTS)
@@ -75,6 +77,10 @@ def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_band
         (study.MF3, 0.0000, 14.2, 0.0505, 10_382.0),
         (study.L, 0.0000, 11.99, 0.042, 103.0),
         (study.MF_2, 0.00075, 11.9, 0.0355, 116.0),
+        (study.GUARDED, 0.0000, 12.1, 0.0423, 103.0),
+        (study.STATE, 0.0000, 12.2, 0.2245, 102.0),
+        (study.BIAS, 0.00047, 12.3, 0.0422, 109.0),
+        (study.L1_NO_U, 0.0105, 16.5, 0.037, 106.0),
     ],
 )
 def test_the_reference_figures_are_met(
@@ -139,3 +145,32 @@ def test_the_margins_with_a_learner_are_those_of_the_running_loop(
     run = ql.simulate(plant, controller, training, record_every=1000)
     loop = ql.analysis.analyse(plant, controller, at=run)
     assert 1.0 / loop.margins.modulus == pytest.approx(reference, rel=0.01)
+
+
+def test_the_ranges_are_those_of_single_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mean and interval over three seeds; the peaks under the other forces those of runs with them."""
+    settings = study.Settings(dt=1e-2, seeds=3)
+    laws = {name: study.controllers(settings)[name] for name in (study.MF, study.L)}
+    module = sys.modules[all_controllers.__module__]
+    monkeypatch.setattr(module, "all_controllers", lambda settings: laws)
+    found = ranges_of_study(settings)
+    assert [*found] == [*laws]
+    for name, law in laws.items():
+        single = [scores(name, 1e-2, seed) for seed in SEEDS]
+        for key in ("overshoot", "settling_time", "control_variation", "m_s", "m_ks"):
+            assert found[name][key] == range_of(each[key] for each in single)
+        peaks = range_of(each["disturbance_peak"] for each in single)
+        assert found[name]["peak_at_0.314"] == peaks
+        for seed, load in enumerate(study.LOADS):
+            run = study.quick_run(replace(settings, seed=seed), law, load)
+            peak, mean = study.score(run)["disturbance_peak"], found[name][f"peak_at_{load:.3g}"]
+            assert peak == pytest.approx(mean.mean, rel=2e-3)
+
+
+def test_a_range_is_students_interval_and_none_where_a_run_has_no_number() -> None:
+    """Of 1, 2 and 6: 3 ± 4.3027 · √7/√3; a mean of those runs alone that settled would mislead."""
+    found = range_of([1.0, 2.0, 6.0])
+    assert (found.mean, found.missing) == (3.0, 0)
+    assert found.half_width == pytest.approx(4.302653 * np.sqrt(7.0 / 3.0), rel=1e-6)
+    assert range_of([1.0, None]) == Range(None, None, 1)
+    assert range_of([2.0]) == Range(2.0, None, 0)

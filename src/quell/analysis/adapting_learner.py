@@ -20,8 +20,9 @@ features that move at rest, the constant 1 and the sinusoids, in units of the de
     P ← P − P φ (P φ)ᵀ/(φ·P φ + 1/dt) + Q dt,        gain = P φ/max(φ·P φ + 1/dt, φ·P φ/(λ_m dt))
 
 so they depend on the bandwidths of the design alone, for the bias γ ≈ λ dt. The other learners with
-a bias have γ = λ dt. Algorithm 1 learns from Δf̂ alone, the sum of the last ``batch`` samples: ``d ←
-d + α Σ Δf̂``.
+a bias have γ = λ dt. Algorithm 1 learns from Δf̂ alone, the sum of the last ``batch`` samples, and
+does not subtract means: at rest at (x̂_1, 0, …, u) each feature that is not zero is one more bias,
+so ``d ← d + α (1 + x̂_1² + u²) Σ Δf̂``.
 
 Frequencies that are still being adapted, a guard's changes of authority, and what is learned in
 motion are not in it.
@@ -212,7 +213,9 @@ def adaptation_of(design: Any, memory: Any) -> Adaptation:
     if isinstance(design, LinearDesign | OnlineDesign):
         return NOTHING._replace(level=design.inputs.bias_gain)
     if isinstance(design, BatchDesign):
-        return NOTHING._replace(level=design.rate, window=design.batch, compensated=False)
+        constant = memory.current[[0, design.order] if design.with_u else [0]]
+        level = design.rate * (1.0 + float(constant @ constant))
+        return NOTHING._replace(level=level, window=design.batch, compensated=False)
     return NOTHING
 
 

@@ -303,7 +303,8 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     best = first[0]
     if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
         ends = [end for e in first if (end := search(problem, structure, e.values, _ROUNDS))]
-        return min(ends, key=_rank, default=None)
+        # A search may end worse than it began, and more freedom must not give less.
+        return min([*ends, *first], key=_rank)
     over, members = SetResponses(task.plants, task.inputs), list[int]()
     for _ in range(_EXCHANGES):
         each = scores(task.objective, structure, best.values, over)

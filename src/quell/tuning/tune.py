@@ -54,7 +54,12 @@ from quell.tuning.result.scenario import (
 )
 from quell.tuning.result.setup_file import plant_table
 from quell.tuning.structures.base import resonances
-from quell.tuning.structures.registry import CASCADE, FEEDING_FORWARD, STRUCTURES
+from quell.tuning.structures.registry import (
+    CASCADE,
+    FEEDING_FORWARD,
+    STRUCTURES,
+    WITH_ONE_INTEGRATOR,
+)
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Check, Uncertain, checked
 from quell.types import Progress, Vector
@@ -123,7 +128,8 @@ def tune(
         (``Constraints``); the resolution of a plant's encoder is known.
     compare
         names of other structures; by default ``COMPARED``, and ``"p-pi-notch"`` for a plant with a
-        resonance. An empty list for none.
+        resonance. An empty list for none. A structure with several integrators is always compared
+        with the same of one.
     reference, duration
         signal for ``"tracking"`` and the limits of u, and how long it is followed [s].
     load
@@ -234,6 +240,8 @@ def tune(
     if compare is None:
         compare = (*COMPARED, CASCADE) if resonances(model) else COMPARED
     names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
+    if structure in WITH_ONE_INTEGRATOR:
+        names.append(WITH_ONE_INTEGRATOR[structure])
     if forward is not None:
         _check_feedforward(names if structure == SIMPLEST else [structure], feedforward)
     inputs = _inputs(objective, reference, duration, load, plants, forward)

@@ -5,10 +5,12 @@ May import ``experiments.common``.
 
 from quell.experiments.two_mass_spring.figures import draw, save
 from quell.experiments.two_mass_spring.gradient_range import Trial, stable_up_to, trials
+from quell.experiments.two_mass_spring.ranges import Range, ranges
 from quell.experiments.two_mass_spring.setup import (
     Settings,
     controller,
     controllers,
+    further_controllers,
     gradient_rate,
     scenario,
     score,
@@ -16,13 +18,16 @@ from quell.experiments.two_mass_spring.setup import (
 from quell.experiments.two_mass_spring.study import Result, run
 
 __all__ = [
+    "Range",
     "Result",
     "Settings",
     "Trial",
     "controller",
     "controllers",
     "draw",
+    "further_controllers",
     "gradient_rate",
+    "ranges",
     "run",
     "save",
     "scenario",

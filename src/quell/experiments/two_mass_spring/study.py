@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from quell.analysis.loop import analyse
-from quell.controllers.adrc.adrc import ADRC
 from quell.experiments.common.claims import Claim, ratio
 from quell.experiments.common.scores import Scores, ended_early
 from quell.experiments.two_mass_spring.gradient_range import Trial, stable_up_to, trials
+from quell.experiments.two_mass_spring.ranges import Ranges, ranges, ranges_to_json
 from quell.experiments.two_mass_spring.setup import (
     BAND,
     FORCE_WINDOW,
@@ -29,6 +28,7 @@ from quell.experiments.two_mass_spring.setup import (
     controller,
     controllers,
     gradient_rate,
+    margins,
     quick_run,
     scenario,
     score,
@@ -55,6 +55,7 @@ class Result:
     scores: Mapping[str, Scores]
     claims: tuple[Claim, ...]
     gradient_trials: tuple[Trial, ...]
+    ranges: Ranges | None = None  #: over ``settings.seeds`` seeds; None for one seed
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data for ``json.dump``; None for values that were not measured."""
@@ -67,6 +68,7 @@ class Result:
             "units": "SI; overshoot as a fraction of the step",
         }
         batches = sorted({trial.batch for trial in self.gradient_trials})
+        several = {} if self.ranges is None else ranges_to_json(self.ranges, self.settings)
         return {
             "settings": asdict(self.settings) | about,
             "controllers": {name: dict(score) for name, score in self.scores.items()},
@@ -75,33 +77,23 @@ class Result:
                 batch: stable_up_to(self.gradient_trials, batch) for batch in batches
             },
             "ended_early": ended_early(self.runs),
-        }
+        } | several
 
 
 def run(settings: Settings, progress: Progress | None = None) -> Result:
-    """Run the study."""
+    """Run the study; with several ``settings.seeds`` also its ranges, under three loads."""
     progress = progress or (lambda part, share: None)
     plant, paper = two_mass_spring(), scenario(settings)
     laws = controllers(settings)
     jobs = [partial(simulate, plant, each, paper) for each in laws.values()]
     done = in_parallel(jobs, partial(progress, "simulating"))
     runs = dict(zip(NAMES, done, strict=True))
-    scores = {name: score(run) | _margins(laws[name], run) for name, run in runs.items()}
+    scores = {name: score(run) | margins(laws[name], run) for name, run in runs.items()}
     needed = {name: _bandwidth_for(settings, name == MB, scores, progress) for name in (MF, MB)}
     variations = _batch_variations(settings)
     claims = tuple(_claims(runs, scores, needed, variations))
-    return Result(settings, runs, scores, claims, trials(settings, progress))
-
-
-def _margins(law: ADRC, run: Trajectory) -> Scores:
-    """Return M_s and M_ks [N/m] of the loop at the end of a run, its learner's adaptation included.
-
-    None for a run that diverged, and for a loop that is not stable at rest.
-    """
-    loop = None if run.diverged else analyse(two_mass_spring(), law, at=run)
-    if loop is None or not loop.stable:
-        return {"m_s": None, "m_ks": None}
-    return {"m_s": 1.0 / loop.margins.modulus, "m_ks": loop.noise_to_control_peak}
+    several = ranges(settings, progress) if settings.seeds > 1 else None
+    return Result(settings, runs, scores, claims, trials(settings, progress), several)
 
 
 def _bandwidth_for(

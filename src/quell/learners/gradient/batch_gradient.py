@@ -15,7 +15,7 @@ from quell.features import Features
 from quell.features.base import checked_design
 from quell.features.scaling import initial_scale, scaling
 from quell.features.sizes import initial_sizes, unscaled_indices
-from quell.kernels.sized import Size
+from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.gradient.buffers import (
     Buffers,
@@ -35,7 +35,8 @@ class BatchDesign(NamedTuple):
 
     rate: float  # α, per sample
     batch: int  # n
-    order: Size  # order of the plant; there are two more features
+    order: Size  # order of the plant; the bias is the last feature
+    with_u: Flag  # whether u is a feature
 
 
 @adapt.register(BatchDesign)
@@ -44,8 +45,9 @@ def _adapt(
 ) -> None:
     for i in range(learner.order):
         memory.current[i] = seen[i]
-    memory.current[learner.order] = u_before
-    memory.current[learner.order + 1] = 1.0
+    if learner.with_u:
+        memory.current[learner.order] = u_before
+    memory.current[memory.theta.size - 1] = 1.0
     take_step(memory, seen[learner.order], learner.rate)
 
 
@@ -53,7 +55,9 @@ def _adapt(
 def _predict(
     learner: BatchDesign, memory: Buffers, seen: Vector, u_before: float
 ) -> tuple[float, float]:
-    output = memory.theta[learner.order] * u_before + memory.theta[learner.order + 1]
+    output = memory.theta[memory.theta.size - 1]
+    if learner.with_u:
+        output = memory.theta[learner.order] * u_before + output
     for i in range(learner.order):
         output += memory.theta[i] * seen[i]
     return output, 0.0
@@ -99,16 +103,21 @@ class BatchGradient:
         ``batch`` and, per unit of time, with 1/dt.
     batch
         size n of the three buffers, in samples.
+    u
+        whether u is one of the paper's features. Without it the algorithm does not learn the
+        control law in place of the plant, and far larger rates are stable (docs/theory).
 
     Raises
     ------
     ValueError
-        for a negative rate, a batch below 1, or something that is no block of features.
+        for a negative rate, a batch below 1, or something that is no block of features; for
+        ``u = False`` beside ``features``, which say themselves what is used.
     """
 
     features: Features | None = None
     rate: float = 1e-6
     batch: int = 10
+    u: bool = True
 
     def __post_init__(self) -> None:
         given: Any = self.features
@@ -117,6 +126,9 @@ class BatchGradient:
             raise ValueError(f"features = {self.features!r}: {rule}")
         checks.non_negative("rate", self.rate)
         checks.whole("batch", self.batch, 1)
+        checks.flag("u", self.u)
+        if self.features is not None and not self.u:
+            raise ValueError("u = False: leave it out, as features say whether u is among them")
 
     def design(self, observer: ESO, omega_c: float) -> BatchDesign | ScaledDesign:
         """Return the parameters for an observer.
@@ -125,7 +137,7 @@ class BatchGradient:
         """
         rate, order = float(self.rate), observer.order
         if self.features is None:
-            return BatchDesign(rate, self.batch, order)
+            return BatchDesign(rate, self.batch, order, self.u)
         return ScaledDesign(
             rate=rate,
             batch=self.batch,
@@ -138,7 +150,7 @@ class BatchGradient:
     def memory(self, parameters: Any) -> Buffers | ScaledMemory:
         """Return empty buffers and θ = 0."""
         if isinstance(parameters, BatchDesign):
-            return empty_buffers(parameters.batch, parameters.order + 2)
+            return empty_buffers(parameters.batch, parameters.order + 1 + parameters.with_u)
         scale = initial_scale(parameters.scaling)
         order = scale.size - 2
         p = len(self.feature_names(order))
@@ -154,5 +166,5 @@ class BatchGradient:
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return ``("x1", …, "u", "bias")``, or the names of other features."""
         if self.features is None:
-            return (*(f"x{i + 1}" for i in range(order)), "u", "bias")
+            return (*(f"x{i + 1}" for i in range(order)), *["u"] * self.u, "bias")
         return self.features.names(order)

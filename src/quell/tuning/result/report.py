@@ -85,7 +85,26 @@ def costs(chosen: Design, designs: Mapping[str, Design], objective: str) -> list
                 f"{chosen.name} is the best of these structures; the next one, {best.name}, costs "
                 f"{100.0 * (1.0 - share):.3g} %"
             )
-    return lines
+    return lines + _integrators_line(chosen, usable, objective)
+
+
+def _integrators_line(chosen: Design, others: Mapping[str, Design], objective: str) -> list[str]:
+    """Return a line where several integrators bring nothing: one is at least as good."""
+    if _integrators(chosen) < 2:
+        return []
+    single = [each for each in others.values() if _integrators(each) == 1]
+    best = max(single, key=lambda each: relative(each, chosen, objective), default=None)
+    if best is None or relative(best, chosen, objective) < 1.0:
+        return []
+    what = {"tracking": "this reference"}.get(objective, "a step of the load")
+    return [
+        f"NOT better with {_integrators(chosen)} integrators: {best.name} has one, and is at least "
+        f"as good for {what}; take it, unless the load is a ramp or a slow sinusoid"
+    ]
+
+
+def _integrators(design: Design) -> int:
+    return 0 if design.solution is None else design.solution.structure.integrators
 
 
 def damping_line(design: Design, bound: float | None) -> str:

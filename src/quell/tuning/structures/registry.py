@@ -33,8 +33,15 @@ _ADRC = {
 LQG, CASCADE = "lqg", "p-pi-notch"
 STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE)
 """Names of the structures: forms of ADRC, PI and PID, LQG, and the cascade of servo drives."""
-SEVERAL_INTEGRATORS = tuple(name for name, form in _ADRC.items() if form.extended > 1)
-"""Names of those with more than one integrator, whose k_i is infinite."""
+WITH_ONE_INTEGRATOR = {
+    "bandwidths-2": "bandwidths",
+    "bandwidths-3": "bandwidths",
+    "freed-2": "freed",
+    "model-based-2": "model-based",
+}
+"""The same with one integrator for each structure with several, whose k_i is infinite."""
+SEVERAL_INTEGRATORS = tuple(WITH_ONE_INTEGRATOR)
+"""Names of those with more than one integrator."""
 FEEDING_FORWARD = (*_ADRC, CASCADE)
 """Names of those with the feedforward of a model."""
 
