@@ -47,7 +47,7 @@ SANITIZERS = {
     "none": ("gcc",),
 }
 # How often each function is called, of a million calls. ``start`` takes thousands of steps.
-SHARES = {"applied": 60_000, "track": 80_000, "hand_over": 20_000, "start": 60, "reset": 200,
+SHARES = {"applied": 60_000, "track": 80_000, "hand_over": 20_000, "start": 200, "reset": 200,
           "retune": 1000, "status": 5000, "get_estimate": 20_000, "stopping_point": 20_000,
           "step_counts": 150_000}  # fmt: skip
 HEADS = ("controller", "precision", "functions", "calls", "reports", "u not finite",
@@ -100,6 +100,10 @@ static REAL hostile(void)
             last = (REAL)1.0;
         return last;
     }
+    case 6: { /* the largest that can be, and none */
+        static const REAL ends[] = { LARGEST, -LARGEST, (REAL)NAN };
+        return ends[bits() % 3];
+    }
     default:
         return (REAL)(8.0 * (share() - 0.5));
     }
@@ -108,7 +112,7 @@ static REAL hostile(void)
 static void change_mood(void)
 {
     static const double spreads[] = { DIGITS, 0.4 * DIGITS, 0.1 * DIGITS, 4.0 };
-    mood = (int)(bits() % 6);
+    mood = (int)(bits() % 7);
     spread = spreads[bits() % 4];
 }
 
@@ -149,11 +153,17 @@ static int finite_bits(REAL u)
     return (pattern & EXPONENT) != EXPONENT;
 }
 
+static void note_real(REAL value)
+{
+    BITS pattern = 0;
+    if (value == value) /* the sign of a NaN is the compiler's */
+        memcpy(&pattern, &value, sizeof pattern);
+    note(pattern);
+}
+
 static void check(const NAME_state *state, REAL u)
 {
-    BITS pattern;
-    memcpy(&pattern, &u, sizeof pattern);
-    note(pattern);
+    note_real(u);
     note((uint64_t)NAME_status(state));
     not_finite += !finite_bits(u);
     LIMITS_CHECK
@@ -174,7 +184,6 @@ int main(int count, char **arguments)
     static NAME_parameters narrower;
     NAME_state *const state = &controller;
     const unsigned long calls = count > 1 ? (unsigned long)atof(arguments[1]) : 1000000UL;
-    volatile REAL used = (REAL)0.0;
 
     narrower = NAME_default_parameters;
     NARROWER
@@ -191,7 +200,6 @@ CASES        {
         }
     }
     printf("%lu %lu %016llx\n", not_finite, beyond, (unsigned long long)trace);
-    (void)used;
     return not_finite || beyond ? 2 : 0;
 }
 """
@@ -231,10 +239,17 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
                 call = f"mood ? {call[:-1]} : {step};"
             lines = [f"u = {call}", "check(state, u);"]
         elif operation == "get_estimate":
-            lines = [f"const {name}_estimate known = {call}", "memcpy((void *)&used, &known, "
-                     "sizeof used < sizeof known ? sizeof used : sizeof known);"]  # fmt: skip
-        elif operation in ("status", "stopping_point"):
-            lines = [f"used = ({real}){call}"]
+            channels = [
+                f"known.{channel}{f'[{i}]' if width > 1 else ''}"
+                for channel, width in source.channels
+                for i in range(width)
+            ]
+            lines = [f"const {name}_estimate known = {call}"]
+            lines += [f"note_real((REAL){each});" for each in channels]
+        elif operation == "stopping_point":
+            lines = [f"note_real({call[:-1]});"]
+        elif operation == "status":
+            lines = [f"note((uint64_t){call[:-1]});"]
         else:
             lines.append("check_copy(state);")
         body = "\n".join(f"            {line}" for line in lines)
@@ -250,6 +265,7 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
         "REAL": real,
         "BITS": "uint32_t" if single else "uint64_t",
         "EXPONENT": "0x7f800000u" if single else "UINT64_C(0x7ff0000000000000)",
+        "LARGEST": "1e12f" if single else "1e60",
         "DIGITS": "60.0" if single else "300.0",
         "SAMPLE_TIME": f"{name.upper()}_SAMPLE_TIME",
         "SEED": f"UINT64_C({0x9E3779B97F4A7C15 + seed})",
