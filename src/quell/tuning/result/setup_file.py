@@ -27,9 +27,11 @@ def toml_text(tables: Mapping[str, Any], comment: str = "") -> str:
     listed = {
         key: value
         for key, value in plain.items()
-        if isinstance(value, list | tuple) and value and isinstance(value[0], Mapping)
+        if isinstance(value, list | tuple)
+        and value
+        and all(isinstance(each, Mapping) for each in value)
     }
-    lines += [f"{key} = {_value(value)}" for key, value in plain.items() if key not in listed]
+    lines += [f"{_key(key)} = {_value(value)}" for key, value in plain.items() if key not in listed]
     for key, value in tables.items():
         if isinstance(value, Mapping):
             lines += ["", f"[{_key(key)}]"]
@@ -42,7 +44,7 @@ def toml_text(tables: Mapping[str, Any], comment: str = "") -> str:
 
 
 def _key(name: str) -> str:
-    bare = name.replace("-", "").replace("_", "").isalnum() and name.isascii()
+    bare = name.isascii() and re.fullmatch(r"[\w-]+", name) is not None
     return name if bare else _text(name)
 
 
