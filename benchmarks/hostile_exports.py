@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -181,12 +182,14 @@ _MAIN = r"""
 int main(int count, char **arguments)
 {
     static NAME_state controller;
-    static NAME_parameters narrower;
+    static NAME_parameters narrower, other; /* with another limit; with another law */
     NAME_state *const state = &controller;
     const unsigned long calls = count > 1 ? (unsigned long)atof(arguments[1]) : 1000000UL;
 
     narrower = NAME_default_parameters;
     NARROWER
+    other = NAME_default_parameters;
+    OTHER
     NAME_init(state);
     for (unsigned long k = 0; k < calls; k++) {
         if (bits() % (mood ? 2000 : 20000) == 0)
@@ -231,7 +234,8 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
         arguments = f", {given[operation]}" if operation in given else ""
         call = f"{name}_{operation}(state{arguments.replace('DERIVATIVES', drawn)});"
         if operation == "retune":
-            call = f"{name}_retune(state, bits() & 1 ? &narrower : &{name}_default_parameters);"
+            chosen = f"bits() & 1 ? &narrower : bits() & 1 ? &other : &{name}_default_parameters"
+            call = f"{name}_retune(state, {chosen});"
         lines = [call]
         if operation in RETURN_U:
             if operation == "step_counts":  # the position of a good loop is no count by chance
@@ -258,7 +262,18 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
     if missing:
         raise ValueError(f"the program does not call {sorted(missing)}")
     narrower = narrower_limit(controller, path, single)
+    inside = path.removesuffix("limits")
+    others = [
+        f"other.{inside}{member} {change};"
+        for member, change, field in (
+            ("b0", "*= (REAL)1.25", r"\bb0;"),
+            ("cancel[0]", "+= (REAL)0.5", r"\bcancel\["),
+            ("cancel[1]", "-= (REAL)0.25", r"\bcancel\[[2-9]"),
+        )
+        if path and re.search(field, source.header)
+    ]
     words = {
+        "OTHER": "\n    ".join(others),
         "NAME": name,
         "REAL_MAX": "FLT_MAX" if single else "DBL_MAX",
         "REAL_MIN": "FLT_MIN" if single else "DBL_MIN",

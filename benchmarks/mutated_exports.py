@@ -42,8 +42,15 @@ from quell.export.proof import prove
 
 LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
 CALLS = 1e6
-# Changes that make no difference: the change as printed, and the reason.
-SAME: dict[str, str] = {}
+# Changes that make no difference, and the reason.
+SAME = {
+    "if (is_usable(unlimited)) { -> if (true || (is_usable(unlimited))) {": "between limits of u "
+    "every finite u is usable, and no usable y or r makes one that is not finite",
+    "return fabs(a) <= DBL_MAX; -> return true || (fabs(a) <= DBL_MAX);": "limits of u are finite",
+    "loop->r_shaped = shaped == shaped && shaped >= -DBL_MAX && shaped <= DBL_MAX ? shaped : y; "
+    "-> loop->r_shaped = shaped >= -DBL_MAX && shaped <= DBL_MAX ? shaped : y;": "NaN is not "
+    "above any number either",
+}
 
 
 class Mutant(NamedTuple):
@@ -223,8 +230,9 @@ def main() -> None:
             if by == "compiler":
                 continue
             judged += 1
-            if by == "NOBODY" and mutant.name in SAME:
-                by = f"nobody: {SAME[mutant.name]}"
+            change = f"{mutant.before} -> {mutant.after}"
+            if by == "NOBODY" and change in SAME:
+                by = f"nobody: {SAME[change]}"
             missed += by == "NOBODY"
             seconds = f"{time.monotonic() - begin:.0f}"
             print(f"{mutant.kind} | {mutant.name} | {by} | {seconds}", flush=True)

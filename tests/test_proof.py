@@ -240,6 +240,28 @@ def test_the_passes_of_loops_are_counted() -> None:
     assert [each.partition(":")[0] for each in open_end.by_data] == ["19"]
 
 
+def test_an_index_beyond_an_array_that_is_an_argument_is_named() -> None:
+    """Also where the place is within the state, so that Eva has no alarm; rows and columns alike."""
+    code = (
+        "static const int MOST = 3;\n\n"
+        "static void fill(double z[3], double rows[2][4])\n{{\n"
+        "    for (int i = 0; i < {passes}; i++) {{\n        z[i] = 0.0;\n"
+        "        for (int j = 0; j < 4; j++) {{\n            rows[{row}][j] = z[{index}];\n"
+        "        }}\n    }}\n}}\n\nvoid servo_step(void)\n{{\n    fill(a, b);\n}}\n"
+    )
+    good = {"passes": "MOST", "row": "1", "index": "2"}
+    for change, expected in (
+        ({}, []),
+        ({"index": "unknown"}, []),
+        ({"index": "2 + (i < 1 ? i : 0)"}, []),
+        ({"passes": "MOST + 1"}, ["fill uses z[i], of 3 entries"]),
+        ({"row": "i"}, ["fill uses rows[i][j], of 2 entries"]),
+        ({"index": "i - 1"}, ["fill uses z[i - 1], of 3 entries"]),
+    ):
+        found = structure(code.format(**good | change), "servo_step")
+        assert found.problems == expected
+
+
 def test_an_argument_that_the_call_tells_is_counted() -> None:
     """A function whose loop ends at its argument has as many passes as each call gives it."""
     text = LOOPS.replace("inner(double a)", "inner(double a, int count)").replace(
