@@ -46,10 +46,9 @@ CALLS = 1e6
 SAME = {
     "if (is_usable(unlimited)) { -> if (true || (is_usable(unlimited))) {": "between limits of u "
     "every finite u is usable, and no usable y or r makes one that is not finite",
+    "if (is_usable(unlimited)) { -> if (false && (is_usable(unlimited))) {": "the line behind it "
+    "accepts every finite u, as the limits are finite",
     "return fabs(a) <= DBL_MAX; -> return true || (fabs(a) <= DBL_MAX);": "limits of u are finite",
-    "loop->r_shaped = shaped == shaped && shaped >= -DBL_MAX && shaped <= DBL_MAX ? shaped : y; "
-    "-> loop->r_shaped = shaped >= -DBL_MAX && shaped <= DBL_MAX ? shaped : y;": "NaN is not "
-    "above any number either",
 }
 
 
@@ -187,6 +186,14 @@ def judge(done: Exported, controller: Any, mutant: Mutant, right: str, proves: b
         file.write_text(source.source, encoding="utf-8")
 
 
+def why_same(mutant: Mutant) -> str:
+    """Return why a mutant changes nothing; nothing if that is not known."""
+    without = re.sub(r"(\w+(?:->\w+)?) == \1 && (?=\1 >)", "", mutant.before)
+    if mutant.after == without:
+        return "a comparison with a number is false for NaN, too; the test is there for Eva"
+    return SAME.get(f"{mutant.before} -> {mutant.after}", "")
+
+
 def right_trace(controller: Any, done: Exported) -> str:
     """Return the hash of the unchanged code in its hostile program."""
     with tempfile.TemporaryDirectory() as place:
@@ -230,9 +237,8 @@ def main() -> None:
             if by == "compiler":
                 continue
             judged += 1
-            change = f"{mutant.before} -> {mutant.after}"
-            if by == "NOBODY" and change in SAME:
-                by = f"nobody: {SAME[change]}"
+            if by == "NOBODY" and (reason := why_same(mutant)):
+                by = f"nobody: {reason}"
             missed += by == "NOBODY"
             seconds = f"{time.monotonic() - begin:.0f}"
             print(f"{mutant.kind} | {mutant.name} | {by} | {seconds}", flush=True)
