@@ -34,7 +34,7 @@ from rich.table import Table
 
 import quell as ql
 from quell.controllers import in_single_precision
-from quell.export import CSource, TranslationError
+from quell.export import CSource
 from quell.export.inspection import limits_path
 from quell.export.proof.files import CALLS, RETURN_U, narrower_limit
 
@@ -356,7 +356,7 @@ def row_of(name: str, controller: Any, precision: str, options: argparse.Namespa
             shown, source = exported_source(controller, precision == "single")
             program = built(Path(place), shown, source, options.seed, options.sanitizer)
             found = run(program, options.calls)
-        except TranslationError as error:
+        except ValueError as error:  # in Python
             return [name, precision, "refused", "", "", "", "", str(error)[:60]]
     seconds = f"{time.monotonic() - begin:.0f}"
     return [name, precision, f"{len(source.operations)}", f"{options.calls:g}", *found, seconds]

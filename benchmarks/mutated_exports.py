@@ -60,6 +60,12 @@ class Mutant(NamedTuple):
     line: int
     before: str
     after: str
+    block: str  # the lines behind it, as far as the function goes
+
+    @property
+    def next_line(self) -> str:
+        """The line behind it."""
+        return self.block.partition("\n")[0]
 
     @property
     def name(self) -> str:
@@ -126,9 +132,10 @@ def drawn(code: dict[str, str], count: int, chance: random.Random) -> list[Mutan
     found: dict[str, dict[str, list[Mutant]]] = {}
     for name, text in code.items():
         for number, line in enumerate(text.splitlines(), 1):
-            if line.startswith(("    ", "static")):
+            if line.startswith("    ") and not line.endswith((",", ")")):  # no head of a function
                 for kind, after in changes(line):
-                    mutant = Mutant(name, kind, number, line.strip(), after.strip())
+                    block = "\n".join(text.splitlines()[number:]).partition("\n}\n")[0]
+                    mutant = Mutant(name, kind, number, line.strip(), after.strip(), block)
                     found.setdefault(kind, {}).setdefault(name, []).append(mutant)
     chosen: list[Mutant] = []
     kinds = sorted(found)
@@ -188,6 +195,10 @@ def judge(done: Exported, controller: Any, mutant: Mutant, right: str, proves: b
 
 def why_same(mutant: Mutant) -> str:
     """Return why a mutant changes nothing; nothing if that is not known."""
+    if mutant.next_line.strip() == "}" and mutant.before.startswith("if"):
+        return "the branch is empty"
+    if "predicted[i]" in mutant.block and mutant.after.endswith("- 1; i++) {"):
+        return "f, the last state of the model, stays, and is there already"
     without = re.sub(r"(\w+(?:->\w+)?) == \1 && (?=\1 >)", "", mutant.before)
     if mutant.after == without:
         return "a comparison with a number is false for NaN, too; the test is there for Eva"
