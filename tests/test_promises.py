@@ -11,7 +11,9 @@ PAGE = (ROOT / "docs/promises.md").read_text(encoding="utf-8")
 
 def test_every_promise_is_checked_by_something_that_exists() -> None:
     """Each row names a test by file and function, a script of ``benchmarks``, a proof or a command."""
-    rows = [line for line in PAGE.splitlines() if line.startswith("| ") and "checked by" not in line]
+    rows = [
+        line for line in PAGE.splitlines() if line.startswith("| ") and "checked by" not in line
+    ]
     assert len(rows) > 25
     for row in rows:
         check = row.rsplit(" | ", 1)[1]
