@@ -8,6 +8,8 @@
 2. A client sends malformed messages, and well-formed ones with values that make no sense; each must
    be answered with an error, or a result, and a page beside it must go on as if nothing had been.
 3. Pages at once, each with runs of its own, that are killed and opened again.
+4. Connections that never send a request, and clients that send theirs byte by byte, all without
+   the token; meanwhile the page is asked for, and a run. The bars: 1 s, and a log below 1 MB.
 
 Memory is that of the server's process; it is shown after each tenth of the messages.
 """
@@ -16,14 +18,18 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import random
 import re
 import resource
+import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +55,15 @@ def main() -> None:
     parser.add_argument("--inputs", type=int, default=2000)
     parser.add_argument("--messages", type=int, default=100_000)
     parser.add_argument("--pages", type=int, default=20)
+    parser.add_argument("--idle", type=int, default=2000, help="connections without a request")
+    parser.add_argument("--slow", type=int, default=200, help="clients that send byte by byte")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     load = os.getloadavg()[0]
     print(f"{os.cpu_count()} cores, load of the last minute before: {load:.1f}")
     command = [sys.executable, "-m", "quell", "studio", "--no-browser", "--port", "0"]
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    log = tempfile.TemporaryFile()  # noqa: SIM115
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
     try:
         assert server.stdout is not None
         found = re.search(r"http\S+", server.stdout.readline())
@@ -63,9 +72,13 @@ def main() -> None:
         good = [given.inputs == 0 or pictures(url, given.inputs)]
         good.append(given.messages == 0 or hostile(url, server.pid, given.messages, given.seed))
         good.append(given.pages == 0 or many(url, server.pid, given.pages))
+        good.append(given.idle == 0 or idle(url, given.idle, given.slow))
     finally:
         server.terminate()
         server.wait(10)
+        size = log.seek(0, os.SEEK_END)
+        print(f"log of the server: {size / 1e3:.1f} kB (bar: 1000)")
+        good.append(size < 1e6)
     sys.exit(0 if all(good) else 1)
 
 
@@ -238,6 +251,73 @@ def many(url: str, process: int, count: int) -> bool:
     print(f"\n{count} pages at once, three times, 20 runs each: wrong answers {wrong[0]}")
     print(f"slowest answer {1e3 * slowest[0]:.0f} ms; memory {before:.0f} MB, then {after:.0f} MB")
     return wrong[0] == 0
+
+
+def idle(url: str, count: int, slow: int) -> bool:
+    """Open connections that ask for nothing or slowly; return whether pages are answered."""
+    wanted = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(wanted, count + slow + 500), wanted))
+    host, port = url.split("/")[2].split(":")
+    # A process of its own, so that it takes no time of the client that is measured.
+    apart = multiprocessing.get_context("fork")
+    ended, opened = apart.Event(), apart.Value("i", 0)
+    slowest = {"page": 0.0, "run": 0.0}
+    request = f"GET /wrong/ HTTP/1.1\r\nHost: {host}:{port}\r\nX: {'x' * 500}\r\n\r\n".encode()
+
+    def flood() -> None:
+        """Keep ``count`` connections open, and ``slow`` that send a byte in a tenth of a second."""
+        made: list[Any] = []
+        at = 0
+        while not ended.is_set():
+            for each in made[:]:
+                try:
+                    if each[1] is not None and each[1] < len(request):
+                        each[0].send(request[each[1] : each[1] + 1])
+                        each[1] += 1
+                    elif each[1] is None and each[0].recv(1, socket.MSG_DONTWAIT) == b"":
+                        raise ConnectionResetError
+                except BlockingIOError:
+                    continue
+                except OSError:
+                    each[0].close()
+                    made.remove(each)
+            while len(made) < count + slow and not ended.is_set():
+                one = socket.socket()
+                one.settimeout(1.0)
+                try:
+                    one.connect((host, int(port)))
+                except OSError:
+                    one.close()
+                    break
+                at += 1
+                made.append([one, 0 if at % (count + slow) < slow else None])
+            opened.value = at
+            time.sleep(0.1)
+        for each in made:
+            each[0].close()
+
+    page = Client(url)
+    page.run(TABLES)
+    flooding = apart.Process(target=flood)
+    flooding.start()
+    time.sleep(2.0)
+    for _ in range(30):
+        began = time.perf_counter()
+        with urllib.request.urlopen(url, timeout=60.0) as answer:
+            answer.read()
+        slowest["page"] = max(slowest["page"], time.perf_counter() - began)
+        began = time.perf_counter()
+        found = page.run(TABLES)
+        slowest["run"] = max(slowest["run"], time.perf_counter() - began)
+        assert found[-1]["kind"] == "loop"
+        other = Client(url)
+        other.socket.socket.close()
+        time.sleep(0.5)
+    ended.set()
+    flooding.join()
+    print(f"\n{count} idle and {slow} slow clients, {opened.value} connections in all")
+    print(f"slowest page {1e3 * slowest['page']:.0f} ms, slowest run {1e3 * slowest['run']:.0f} ms")
+    return max(slowest.values()) <= 1.0
 
 
 if __name__ == "__main__":

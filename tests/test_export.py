@@ -149,7 +149,7 @@ def test_no_function_of_the_export_takes_a_u_that_is_no_number(
     with as_python():
         for _ in range(3):
             last = control(design, state, 1.0, 0.0)
-        operations.applied(design, state, value)
+        operations.set_applied(design, state, value)
         assert status_flags(design, state) & Status.CONTROL_HELD
         if controller is not PID:
             operations.track(design, state, 1.0, 0.0, value)

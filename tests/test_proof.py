@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -18,6 +19,7 @@ from quell.export.proof.structure import structure
 from quell.features import Custom
 
 from .commands import in_this_process
+from .in_c import needs_gcc
 from .setups import TWO_MASS
 
 needs_frama_c = pytest.mark.skipif(
@@ -92,6 +94,20 @@ def test_the_proof_fails_for_a_wrong_controller(
     assert "# Proof of servo\n\nNOT proved" in report
 
 
+@needs_gcc
+def test_the_report_tells_the_stack_and_the_code_of_each_function(tmp_path: Path) -> None:
+    """The stack of a step is that of ``sizes``; what calls more has more of both."""
+    done = exported(tmp_path)
+    assert done.proof is not None
+    table = done.proof.text.partition("## Stack and code")[2].partition("## ")[0]
+    rows = dict(re.findall(r"^\| `servo_(\w+)` \| (\d+ \| \d+) \|$", table, re.MULTILINE))
+    assert set(rows) == set(done.source.operations)
+    found = {name: tuple(map(int, row.split(" | "))) for name, row in rows.items()}
+    assert found["step"][0] == done.sizes().stack
+    assert found["track"] > found["step"] > found["status"]
+    assert found["start"][1] > 20
+
+
 @needs_frama_c
 def test_the_script_comes_to_the_same_result(tmp_path: Path) -> None:
     """It ends with 0 if all is proved; with 1 if something is not, which it prints, or if the code does not compile."""
@@ -131,7 +147,9 @@ def test_without_frama_c_nothing_is_proved(
     shown = in_this_process((*arguments, "--prove", "--overwrite"), monkeypatch, capsys)
     assert shown.code == 5
     assert "NOT proved: there is no frama-c here" in shown.out
-    assert "apt-get install frama-c-base" in Path("out/proof/REPORT.md").read_text()
+    report = Path("out/proof/REPORT.md").read_text()
+    assert "apt-get install frama-c-base" in report
+    assert "NOT measured: there is no gcc here" in report
     names = {path.name for path in Path("out/proof").iterdir()}
     assert names == {"servo_contract.h", "servo_proof.c", "prove.sh", "REPORT.md"}
     fmu = in_this_process((*arguments, "--to", "fmu", "--prove"), monkeypatch, capsys)
@@ -220,6 +238,28 @@ def test_the_passes_of_loops_are_counted() -> None:
     open_end = structure(LOOPS.replace("minimum_int(truncated(r), 7)", "truncated(r)"), "a_step")
     assert open_end.passes["a_step"] is None
     assert [each.partition(":")[0] for each in open_end.by_data] == ["19"]
+
+
+def test_an_index_beyond_an_array_that_is_an_argument_is_named() -> None:
+    """Also where the place is within the state, so that Eva has no alarm; rows and columns alike."""
+    code = (
+        "static const int MOST = 3;\n\n"
+        "static void fill(double z[3], double rows[2][4])\n{{\n"
+        "    for (int i = 0; i < {passes}; i++) {{\n        z[i] = 0.0;\n"
+        "        for (int j = 0; j < 4; j++) {{\n            rows[{row}][j] = z[{index}];\n"
+        "        }}\n    }}\n}}\n\nvoid servo_step(void)\n{{\n    fill(a, b);\n}}\n"
+    )
+    good = {"passes": "MOST", "row": "1", "index": "2"}
+    for change, expected in (
+        ({}, []),
+        ({"index": "unknown"}, []),
+        ({"index": "2 + (i < 1 ? i : 0)"}, []),
+        ({"passes": "MOST + 1"}, ["fill uses z[i], of 3 entries"]),
+        ({"row": "i"}, ["fill uses rows[i][j], of 2 entries"]),
+        ({"index": "i - 1"}, ["fill uses z[i - 1], of 3 entries"]),
+    ):
+        found = structure(code.format(**good | change), "servo_step")
+        assert found.problems == expected
 
 
 def test_an_argument_that_the_call_tells_is_counted() -> None:

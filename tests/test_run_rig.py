@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -220,6 +221,41 @@ def test_a_driver_that_fails_leads_to_the_safe_action() -> None:
     assert run.changes[-2].cause in (Cause.LOST, Cause.STALLED)
     assert any("'cable out'" in note for note in run.notes)
     assert device.written[-1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("counted", "said"),
+    [
+        ({}, "the device gave no measurement, or none that is a number, for 0."),
+        ({"not_finite": 0, "stale": 2}, "no packet of the device came in time for 0."),
+        ({"not_finite": 7, "stale": 0}, "7 packets of the run had a value that is not finite"),
+    ],
+)
+def test_a_run_that_ends_without_measurements_says_what_came(
+    counted: dict[str, int], said: str
+) -> None:
+    """Silence for 20 samples is no wrong value; counters of before the run do not count."""
+
+    class Silent(Rig):
+        def __init__(self) -> None:
+            super().__init__()
+            self.counters |= dict.fromkeys(counted, 5)
+
+        def read(self) -> float:
+            y = super().read()
+            if 30 <= len(self.written) < 50:
+                for name, count in counted.items():
+                    self.counters[name] = 5 + count
+                return math.nan
+            return y
+
+    safety = Safety(settle=5, hold=3, most_overruns=10_000, ramp=10)
+    run = short(Silent(), 60.0, safety=safety)
+    assert run.changes[-2].cause in (Cause.LOST, Cause.STALLED)
+    (note,) = (each for each in run.notes if said in each)
+    found = re.search(r"\((\d+) samples\)", note)
+    assert found is not None
+    assert 4 <= int(found[1]) <= 60
 
 
 def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -382,3 +382,29 @@ def test_a_change_that_a_setup_does_not_have_is_named(
     setup = load(EXAMPLES / "two_mass.toml")
     with pytest.raises(SetupError, match=f"^two_mass.toml: .*{message}"):
         varied(setup, {path: value})
+
+
+CONTROL = 'a\x00b\x07\x1b[31m\x7f\r\n\t"\\ \x85 é'
+
+
+def test_texts_with_control_characters_reach_no_file_and_no_terminal() -> None:
+    """Titles, names of signals and units are refused; TOML and scripts are written so that they can be read."""
+    from quell.studio.texts import python_of, toml_of
+
+    tables = {
+        "dt": 0.01,
+        "plant": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0]},
+        "controller": {"kind": "pid", "kp": 1.0, "u_min": -1.0, "u_max": 1.0},
+    }
+    for wrong, key in (
+        (tables | {"title": CONTROL}, "title"),
+        (tables | {"title": "a\ud800"}, "title"),
+        (tables | {"plant": tables["plant"] | {"signals": {"y": "an\x1bgle [m]"}}}, "signals.y"),
+    ):
+        with pytest.raises(SetupError, match=rf"{key} = .*: must have no control characters"):
+            made("a setup", wrong)
+    text = toml_of(tables | {"title": CONTROL, CONTROL: {CONTROL: [CONTROL]}})
+    read = tomllib.loads(text)
+    assert (read["title"], read[CONTROL]) == (CONTROL, {CONTROL: [CONTROL]})
+    compile(python_of(tables, CONTROL, True, 0.0), "script", "exec")
+    assert made("a\x07b.toml", tables).title == "a?b"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import socket
+import time
 import urllib.error
 import urllib.request
 import zipfile
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,12 @@ from quell.analysis import analyse
 from quell.kernels.compile_time import compile_time
 from quell.setup import load, made
 from quell.setup.vary import changed
-from quell.studio import messages
+from quell.studio import messages, separate
+from quell.studio.connections import FIRST_REQUEST, MOST_CONNECTIONS
 from quell.studio.designs import varied
 from quell.studio.frames import Columns, frame, parsed
 from quell.studio.records import PageRecord
-from quell.studio.runs import Maker, loop_of
+from quell.studio.runs import Maker, StoppedError, loop_of
 from quell.studio.tasks import frames_for
 from quell.studio.texts import python_of, toml_of
 
@@ -134,6 +136,71 @@ def test_only_the_page_with_the_token_is_answered(url: str) -> None:
             Client(url, **wrong)
     with pytest.raises(InvalidStatus):
         Client(host + "/wrong/")
+
+
+def test_connections_that_ask_for_nothing_are_closed_and_lock_out_no_page(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Many that are silent, and some that send a request byte by byte: one line in the log."""
+    with running(TABLES) as address, ExitStack() as stack:
+        host, port = address.split("/")[2].split(":")
+        silent = [
+            stack.enter_context(socket.create_connection((host, int(port))))
+            for _ in range(MOST_CONNECTIONS + 100)
+        ]
+        slow = stack.enter_context(socket.create_connection((host, int(port))))
+        began = time.monotonic()
+        assert status(address) == 200
+        assert time.monotonic() - began < FIRST_REQUEST
+        page = Client(address)
+        for byte in b"GET / HT":
+            slow.send(bytes([byte]))
+            time.sleep(FIRST_REQUEST / 12)
+        assert "texts" in page.ask("texts", do="toml", setup=TABLES)
+        for each in (*silent, slow):
+            each.settimeout(5.0)
+            with suppress(ConnectionResetError):
+                assert each.recv(1) == b""
+        page.close()
+    lines = [each.getMessage() for each in caplog.records if "connections were closed" in each.msg]
+    assert len(lines) == 1
+
+
+def test_a_large_plant_is_analysed_apart_and_for_a_limited_time(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page of a plant of order 250 hears that it takes too long; another page does not wait."""
+    monkeypatch.setattr(separate, "LONGEST", 0.5)
+    heavy, other = Client(url), Client(url)
+    other.ask("loop", do="run", setup=TABLES)
+    den = np.poly(-np.linspace(1.0, 1.5, 250)).tolist()
+    number = heavy.send(do="run", setup=with_values(plant__den=den))
+    began = time.monotonic()
+    for omega_o in (41.0, 42.0, 43.0):
+        assert "loop" in other.ask("loop", do="run", setup=with_values(observer__omega_o=omega_o))
+    waited = time.monotonic() - began
+    found = heavy.answer("loop", number)
+    assert "took more than 0.5 s" in " ".join(found["error"][0]["text"])
+    assert waited < time.monotonic() - began
+    heavy.close()
+    other.close()
+
+
+def test_a_process_of_its_own_gives_the_same_frames() -> None:
+    """A list beyond the limit makes a setup large; errors are the same sentence; a stop ends it."""
+    den = np.poly(-np.linspace(1.0, 1.5, 45)).tolist()
+    setup = with_values(plant__den=den)
+    message = {"do": "toml", "id": 1, "setup": setup}
+    assert separate.is_large(message)
+    assert not separate.is_large({"do": "toml", "id": 1, "setup": TABLES})
+    about = messages.Granted(), PageRecord(), lambda: False, lambda part, share: None
+    apart = list(separate.frames_apart(message, *about))
+    assert apart == list(frames_for(message, Maker(), *about))
+    wrong = changed("tables", setup, {"observer.omega_o": None})
+    with pytest.raises(ValueError, match="omega_o"):
+        list(separate.frames_apart(message | {"setup": wrong}, *about))
+    with pytest.raises(StoppedError):
+        list(separate.frames_apart(message, about[0], about[1], lambda: True, about[3]))
 
 
 HOSTILE = (

@@ -324,6 +324,23 @@ def test_a_full_disk_ends_a_recording_and_nothing_else(
     assert "File too large" in telemetry.problems[0]
 
 
+@pytest.mark.parametrize("suffix", ["csv", "mcap"])
+def test_no_recording_begins_on_a_full_disk(header: Header, suffix: str, tmp_path: Path) -> None:
+    """The start fails, so no machine moves without its record; other sinks are closed."""
+    telemetry = TelemetryWriter(header, [MemorySink(), file_sink(tmp_path / f"run.{suffix}")])
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40, before[1]))
+    try:
+        with pytest.raises(ValueError, match=r"can't be written \(File too large"):
+            telemetry.start()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    again = TelemetryWriter(header, [file_sink(tmp_path / f"run.{suffix}", overwrite=True)])
+    again.start()
+    again.stop()
+    assert again.problems == []
+
+
 class Stuck(MemorySink):
     """A sink that blocks until it is freed."""
 

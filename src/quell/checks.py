@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import unicodedata
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -170,6 +171,18 @@ def weight(name: str, value: Any, size: int) -> Matrix:
     if least < -1e-9 * abs(most):
         raise ValueError(f"{name} has the eigenvalue {least:.3g}: must have none below zero")
     return array
+
+
+def printable(name: str, value: str) -> str:
+    """Return a text without control characters and halves of surrogate pairs.
+
+    No line of a terminal, and no file of TOML, XML, CSV, C or Python can hold them in a name.
+    """
+    bad = sorted({each for each in value if unicodedata.category(each) in ("Cc", "Cs")})
+    if bad:
+        codes = ", ".join(f"U+{ord(each):04X}" for each in bad[:5])
+        raise ValueError(f"{name} = {value!a:.60}: must have no control characters ({codes})")
+    return value
 
 
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:

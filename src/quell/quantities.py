@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+from quell import checks
+
 _TEXT = re.compile(r"\s*([^\[\]]*?)\s*(?:\[([^\[\]]*)\])?\s*")
 # A unit that needs brackets before "/s".
 _COMPOUND = re.compile(r"[\s/*·]")
@@ -118,4 +120,5 @@ def _quantity(argument: str, given: Any) -> Quantity:
     found = _TEXT.fullmatch(given) if isinstance(given, str) else None
     if found is None:
         raise ValueError(f"{argument} = {given!r:.60}: must be a name and a unit, like angle [rad]")
+    checks.printable(argument, given)
     return Quantity(found[1], (found[2] or "").strip())

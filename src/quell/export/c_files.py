@@ -207,7 +207,7 @@ class CFiles:
         tables: list[str] = []
         place = self._definitions.index(_INITIAL)
         self._definitions[place : place + 1] = [
-            "    memset(state, 0, sizeof *state);",
+            "    (void)memset(state, 0, sizeof *state);",
             f"    state->parameters = &{name}_default_parameters;",
             *initial_lines(structs, self.memory, self.state, tables),
         ]

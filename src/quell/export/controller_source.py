@@ -165,7 +165,7 @@ class _Writer:
             f"void NAME({self.state}, {real} u)",
             "Set the control signal that was really applied since the last step.\n\n"
             "One that is not finite is ignored; the status says so, until the next step.",
-            f"    {files.call(operations.applied, *both, u)};",
+            f"    {files.call(operations.set_applied, *both, u)};",
         )
 
     def _about_target(self) -> str:
@@ -199,7 +199,7 @@ class _Writer:
 
     def _add_counts(self, resolution: float) -> None:
         files, real, write = self.files, self.real, self.files.program.literals.write_real
-        moved = f"({real})(int32_t)((uint32_t)count - (uint32_t)state->origin) * resolution"
+        moved = f"({real})(int32_t)moved * resolution"
         files.members.append("int32_t origin; /* y is counted from here [counts] */")
         files.includes.append("#include <stdint.h>")
         files.add(
@@ -211,10 +211,12 @@ class _Writer:
             "y is then counted from this sample's count: servo_start and servo_track take y and r\n"
             "as differences to state->origin.".replace("servo", self.name),
             f"    static const {real} resolution = {write(resolution)};",
+            "    const uint32_t moved = (uint32_t)count - (uint32_t)state->origin;",
+            "    const uint32_t ahead = (uint32_t)r - (uint32_t)count;",
             f"    {files.call(operations.move_origin, *files.both, files.number(moved))};",
             "    state->origin = count;",
-            f"    return {self.name}_step(state, ({real})(int32_t)((uint32_t)r - (uint32_t)count) *"
-            f" resolution, {write(0.0)}{''.join(f', {each}' for each in self.names)});",
+            f"    return {self.name}_step(state, ({real})(int32_t)ahead * resolution, "
+            f"{write(0.0)}{''.join(f', {each}' for each in self.names)});",
         )
 
     def _add_start(self, samples: int) -> None:
@@ -290,10 +292,9 @@ class _Writer:
 
     def _add_estimate(self, channels: Channels) -> None:
         files, name, real = self.files, self.name, self.real
-        write = files.program.literals.write_real
         total = sum(width for _, width in channels)
         row = Value(Array((total,), Number.REAL), "row", root="row", mutable=True)
-        lines = [f"    {real} row[{total}] = {{{write(0.0)}}};", f"    {name}_estimate estimate;"]
+        lines = [f"    {real} row[{total}] = {{0}};", f"    {name}_estimate estimate;"]
         lines.append(f"    {files.call(write_row, *files.both, row)};")
         at = 0
         for channel, width in channels:

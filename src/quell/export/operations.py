@@ -47,7 +47,7 @@ def _add_flag_inside(design: PrefilteredDesign, state: PrefilteredState, flag: i
     add_flag(design.controller, state.controller, flag)
 
 
-def applied(design: Any, state: Any, u: float) -> None:
+def set_applied(design: Any, state: Any, u: float) -> None:
     """Set the control signal that was really applied; what is no number is ignored."""
     if is_usable(u):
         set_applied_control(design, state, u)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
+from quell import checks
 from quell.setup.errors import from_validation
 from quell.setup.schema import Table
 from quell.setup.toml_file import immutable
@@ -48,7 +50,9 @@ def _optional(description: str) -> Any:
 class Description(Table):
     """The tables and keys of a setup file."""
 
-    title: str = Field("", description="title of tables and figures; the file's name by default.")
+    title: Annotated[str, AfterValidator(partial(checks.printable, "title"))] = Field(
+        "", description="title of tables and figures; the file's name by default."
+    )
     dt: float = Field(description="sample time of the loop and all of its parts [s].")
     plant: Plant | None = _optional("the plant, for `quell run` and observers with a model.")
     observer: Observer | None = _optional("the observer of an `adrc` controller.")

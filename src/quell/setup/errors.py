@@ -67,6 +67,8 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
             lines.append(f"{path}.kind: missing")
         elif kind in ("union_tag_not_found", "union_tag_invalid"):
             lines.append(f"{path} = {_short(value)}: must be a table")
+        elif kind == "value_error" and str(context.get("error")).startswith(f"{path} = "):
+            lines.append(str(context["error"]))
         else:
             lines.append(f"{path} = {_short(value)}: {found['msg']}")
     lines += [f"{line} {' or '.join(dict.fromkeys(names))}" for line, names in expected.items()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -158,7 +159,10 @@ def assembled(
     windows = tuple(window.written() for window in tables.metrics)
     for i, window in enumerate(windows):
         builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
-    title = tables.title or name.removesuffix(".toml").replace("_", " ")
+    title = tables.title or "".join(
+        each if unicodedata.category(each)[0] != "C" else "?"
+        for each in name.removesuffix(".toml").replace("_", " ")
+    )
     tune = build("tune")
     built = controller, plant, scenario, rig, sweep, windows
     return Setup(name, title, *built, tables, tune, trust)

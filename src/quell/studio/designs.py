@@ -155,13 +155,13 @@ def band_frames(
     ranges = tables["plant"].get("uncertain") if isinstance(tables["plant"], dict) else None
     found: dict[str, list[Any]] = {"y": [], "u": []}
     cut, t = None, np.zeros(0)
-    diverged = 0
+    diverged, progress = 0, watched(stale)
     for _ in range(_PLANTS):
         if stale():
             raise StoppedError
         other = {**tables, "plant": varied(tables["plant"], percent, ranges, random)}
         plant = make(other).needed("plant")
-        run = simulate(plant, setup.controller, scenario, progress=watched(stale))
+        run = simulate(plant, setup.controller, scenario, progress=progress)
         if run.diverged:
             diverged += 1
             continue

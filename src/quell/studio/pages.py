@@ -17,6 +17,7 @@ from quell.studio.frames import frame
 from quell.studio.lanes import Lane
 from quell.studio.records import PageRecord
 from quell.studio.runs import Maker, StoppedError
+from quell.studio.separate import frames_apart, is_large
 from quell.studio.tasks import LONG, frames_for
 
 _LOG = logging.getLogger(__name__)
@@ -26,18 +27,21 @@ _LOG = logging.getLogger(__name__)
 _NOTICED = 0.4
 # Shortest time between two reports of progress [s]: ten a second are smooth.
 _REPORTS = 0.1
+# Processes for large setups at once.
+_APART = 2
 
 
 class Workers:
-    """The threads of all pages: one for runs, one for long tasks."""
+    """The threads of all pages: one for runs, one for long tasks, some that wait for processes."""
 
     def __init__(self) -> None:
         self.runs = ThreadPoolExecutor(1, thread_name_prefix="quell-studio-run")
         self.long = ThreadPoolExecutor(1, thread_name_prefix="quell-studio-long")
+        self.apart = ThreadPoolExecutor(_APART, thread_name_prefix="quell-studio-apart")
 
     def close(self) -> None:
         """Let the threads end; what waits is dropped."""
-        for pool in (self.runs, self.long):
+        for pool in (self.runs, self.long, self.apart):
             pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -102,9 +106,13 @@ class Page:
             report = self._reporter(message["id"])
             make = self._makers[name]
             about = self._granted, self._record, lane.stale, report
-            found = frames_for(message, make, *about)
             try:
-                await self._send_all(found, name, message["id"])
+                if is_large(message):
+                    found, pool = frames_apart(message, *about), self._workers.apart
+                else:
+                    found = frames_for(message, make, *about)
+                    pool = self._workers.long if name == "long" else self._workers.runs
+                await self._send_all(found, pool, name, message["id"])
             except StoppedError:
                 await self._send(frame({"kind": "stopped", "id": message["id"]}))
             except (ValueError, ArithmeticError, ImportError, OSError, MemoryError) as error:
@@ -114,9 +122,10 @@ class Page:
                 _LOG.exception("studio: a message failed")
                 await self._send(_problem(error, message["id"]))
 
-    async def _send_all(self, frames: Iterator[bytes], name: str, number: int) -> None:
+    async def _send_all(
+        self, frames: Iterator[bytes], pool: ThreadPoolExecutor, name: str, number: int
+    ) -> None:
         """Send frames as a thread makes them."""
-        pool = self._workers.long if name == "long" else self._workers.runs
         loop = asyncio.get_running_loop()
         while True:
             making = loop.run_in_executor(pool, partial(next, frames, None))

@@ -26,9 +26,10 @@ from quell.types import Vector
 NAME = "studio"
 """Stands for the name of the file in messages about a setup."""
 
-# Longest time of one run without what it compiles [s]; chosen by hand: a run of the longest
-# duration takes 0.3 s, with a large learner some seconds.
-_LONGEST = 20.0
+LONGEST = 20.0
+"""Longest time of a run, of all runs of a band, and of any task of a large setup, without what is
+compiled [s]; chosen by hand: a run of the longest duration takes 0.3 s, with a large learner
+some seconds."""
 _CHANNELS = ("r", "y", "u", "f_hat", "f_learned", "authority")
 _MARGIN_FREQUENCIES = 400  # of the Bode diagram, chosen by hand: a point for each second pixel
 
@@ -166,9 +167,9 @@ def watched(stale: Callable[[], bool]) -> Callable[[float], None]:
             began.append(now)
         if stale():
             raise StoppedError
-        if now - began[0] > _LONGEST:
+        if now - began[0] > LONGEST:
             raise ValueError(
-                f"the run took more than {_LONGEST:g} s: shorten scenario.duration, or take a "
+                f"the run took more than {LONGEST:g} s: shorten scenario.duration, or take a "
                 "smaller learner"
             )
 

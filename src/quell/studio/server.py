@@ -21,6 +21,7 @@ from typing import Any
 from quell import checks
 from quell.optional import import_extra
 from quell.parallel import one_blas_thread
+from quell.studio.connections import BACKLOG, Door
 from quell.studio.forms import forms
 from quell.studio.frames import frame
 from quell.studio.messages import MOST_BYTES, Granted, files_of
@@ -34,6 +35,8 @@ PORT = 8770
 _MOST_PAGES = 32
 # Messages of one page that wait in the server before its connection is no longer read.
 _QUEUE = 8
+# Connections that wait in the operating system until they are accepted.
+_QUEUED = 1024
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -100,6 +103,7 @@ class Studio:
         self.host = f"{HOST}:{port}"
         self._setup, self._files, self._workers = setup, page_files(), Workers()
         self._granted = Granted(files_of(setup), trust)
+        self.door = Door()
         self._pages = 0
 
     @property
@@ -191,7 +195,7 @@ def listen(
     uvicorn = import_extra("uvicorn", "studio", "the studio")
     import_extra("websockets", "studio", "the studio")
     try:
-        listener = socket.create_server((HOST, port), backlog=128)
+        listener = socket.create_server((HOST, port), backlog=_QUEUED)
     except OSError as error:
         raise ValueError(
             f"port = {port}: can't listen there ({error.strerror or error}); choose another port, "
@@ -205,6 +209,8 @@ def listen(
         studio = Studio(listener.getsockname()[1], setup, token, trust)
         config = uvicorn.Config(
             studio.app(),
+            http=studio.door.protocol(),
+            backlog=BACKLOG,
             ws="websockets-sansio",
             ws_max_size=MOST_BYTES,
             ws_max_queue=_QUEUE,
@@ -236,4 +242,15 @@ def serve(
     with listener, closing(studio), one_blas_thread():
         if ready is not None:
             ready(studio.url)
-        asyncio.run(server.serve(sockets=[listener]))
+
+        async def work() -> None:
+            asyncio.get_running_loop().set_exception_handler(studio.door.exceptions)
+            serving = asyncio.create_task(server.serve(sockets=[listener]))
+            while not (server.started or serving.done()):
+                await asyncio.sleep(0.01)
+            if not serving.done():
+                # Uvicorn has set it to ``BACKLOG``: a page would wait a second when it is full.
+                listener.listen(_QUEUED)
+            await serving
+
+        asyncio.run(work())

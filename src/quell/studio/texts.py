@@ -39,12 +39,18 @@ def python_of(tables: Mapping[str, Any], title: str, is_whole: bool, delay: floa
     """
     literal = pprint.pformat(_without_none(tables), indent=1, width=92, sort_dicts=False)
     return _SCRIPT.format(
-        title=" ".join(title.replace('"', "'").replace("\\", "/").split()) or "A setup",
+        title=_in_docstring(title) or "A setup",
         name=NAME,
         tables=literal,
         plant="setup.plant" if is_whole else "setup.plant.linear",
         delay="" if delay == 0.0 else f", delay={delay!r}",
     )
+
+
+def _in_docstring(title: str) -> str:
+    """Return a title for the first line of a script: without quotes and control characters."""
+    plain = "".join(each if each.isprintable() else " " for each in title)
+    return " ".join(plain.replace('"', "'").replace("\\", "/").split())
 
 
 def tables_of_text(text: Any, granted: Granted) -> dict[str, Any]:

@@ -14,7 +14,12 @@ from quell.export.c_files import CSource
 from quell.export.controller_source import c_source
 from quell.export.library.comparison import Comparison, compared
 from quell.export.library.texts import library_files
-from quell.export.library.toolchain import Sizes, measured_sizes
+from quell.export.library.toolchain import (
+    NoCompilerError,
+    Sizes,
+    function_sizes,
+    measured_sizes,
+)
 from quell.export.library.vectors import golden_vectors
 from quell.export.proof import Proof, proof_files, prove
 from quell.export.translate.naming import checked_name
@@ -133,8 +138,28 @@ def c(
     proving = proof_files(shown, source) if proof else {}
     vectors = golden_vectors(shown, source.operations)
     files = write_folder(folder, library_files(shown, source, vectors) | proving, overwrite)
-    done = prove(Path(folder), source) if proof else None
+    done = prove(Path(folder), source, sizes=_function_table(source)) if proof else None
     return Exported(Path(folder), files, source, comparison, done)
+
+
+def _function_table(source: CSource) -> str:
+    """Return a table in Markdown of what each public function takes, or why there is none."""
+    try:
+        place, functions = function_sizes(
+            source.name, source.header, source.source, source.precision, source.operations
+        )
+    except NoCompilerError as error:
+        return f"NOT measured: {error}.\n"
+    rows = "".join(
+        f"| `{each.name}` | {'–' if each.stack is None else each.stack} | {each.instructions} |\n"
+        for each in functions
+    )
+    return (
+        f"For {place}. Stack is the most that the function and all it calls take, by the\n"
+        "compiler's graph of calls; instructions are those of its code and of what it calls, each\n"
+        "counted once. Functions of the C library are not counted, nor registers of interrupts.\n\n"
+        f"| function | stack at most [bytes] | instructions in the code |\n|---|---|---|\n{rows}"
+    )
 
 
 def _check_comparison(comparison: Comparison | None, controller: Any) -> None:

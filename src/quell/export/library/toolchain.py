@@ -1,4 +1,4 @@
-"""Bytes of code, constants, state and stack of an exported controller, as a compiler tells."""
+"""Code, constants, state and stack of an exported controller and its functions, as gcc tells."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,6 +50,24 @@ class Sizes(NamedTuple):
     stack: int | None
 
 
+class FunctionSize(NamedTuple):
+    """What a public function of an exported controller takes on a processor.
+
+    Attributes
+    ----------
+    name
+        of the function.
+    stack
+        bytes at most, with all it calls, without the C library; None if the compiler can't tell.
+    instructions
+        of its code and that of all functions it calls, each counted once; not how many run.
+    """
+
+    name: str
+    stack: int | None
+    instructions: int
+
+
 class NoCompilerError(ValueError):
     """There is no C compiler for what is asked, or it fails."""
 
@@ -83,6 +102,51 @@ def measured_sizes(name: str, header: str, source: str, precision: str) -> Sizes
         _size_of("of_parameters", symbols),
         stack,
     )
+
+
+def function_sizes(
+    name: str, header: str, source: str, precision: str, operations: Iterable[str]
+) -> tuple[str, tuple[FunctionSize, ...]]:
+    """Return a text that names processor and compiler, and what each public function takes.
+
+    Arguments and errors are those of ``measured_sizes``; ``operations`` are the names of the
+    functions without prefix.
+    """
+    processor, prefix, flags = _compiler(precision)
+    if shutil.which(f"{prefix}objdump") is None:
+        raise NoCompilerError(f"there is no {prefix}objdump here")
+    with tempfile.TemporaryDirectory(prefix="quell-sizes-") as folder:
+        place = Path(folder)
+        (place / f"{name}.h").write_text(header, encoding="utf-8")
+        (place / f"{name}.c").write_text(source, encoding="utf-8")
+        _run(place, f"{prefix}gcc", *FLAGS, *flags, _CALLS, "-c", f"{name}.c")
+        code = _run(place, f"{prefix}objdump", "-d", "--no-show-raw-insn", f"{name}.o")
+        calls = (place / f"{name}.ci").read_text(encoding="utf-8")
+    counts = _instructions(code)
+    edges = _edges(calls)
+    found = []
+    for function in (f"{name}_{each}" for each in operations):
+        reached, waiting = {function}, [function]
+        while waiting:
+            more = edges.get(waiting.pop(), set()) - reached
+            reached |= more
+            waiting += more
+        total = sum(counts.get(each, 0) for each in reached)
+        found.append(FunctionSize(function, stack_of(function, calls), total))
+    return f"{processor}, {prefix}gcc {' '.join(FLAGS[1:])}", tuple(found)
+
+
+def _instructions(code: str) -> dict[str, int]:
+    """Return the number of instructions of each function in a listing of objdump."""
+    counts: dict[str, int] = {}
+    function = ""
+    for line in code.splitlines():
+        head = re.fullmatch(r"[0-9a-f]+ <([\w.]+)>:", line)
+        if head:
+            function = head[1]
+        elif re.match(r"\s+[0-9a-f]+:\t", line) and not re.search(r"\t\.(word|short|byte)", line):
+            counts[function] = counts.get(function, 0) + 1
+    return counts
 
 
 def _compiler(precision: str) -> tuple[str, str, tuple[str, ...]]:
@@ -128,12 +192,18 @@ def stack_of(function: str, calls: str) -> int | None:
             r'node: \{ title: "([^"]+)" label: "[^"]*?(\d+) bytes', calls.replace("\\n", " ")
         )
     }
-    edges: dict[str, set[str]] = {}
-    for found in re.finditer(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"', calls):
-        caller, called = (found[i].rpartition(":")[2] for i in (1, 2))
-        edges.setdefault(caller, set()).add(called)
+    edges = _edges(calls)
 
     def depth(name: str) -> int:
         return own.get(name, 0) + max((depth(each) for each in edges.get(name, ())), default=0)
 
     return depth(function) if function in own else None
+
+
+def _edges(calls: str) -> dict[str, set[str]]:
+    """Return the functions that each function calls, from the graph of gcc."""
+    edges: dict[str, set[str]] = {}
+    for found in re.finditer(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"', calls):
+        caller, called = (found[i].rpartition(":")[2] for i in (1, 2))
+        edges.setdefault(caller, set()).add(called)
+    return edges

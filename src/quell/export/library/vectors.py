@@ -107,7 +107,7 @@ class Player:
         r_, y_, given_ = real(r), real(y), real(given)
         with np.errstate(all="ignore"), as_python():
             if action is Action.APPLIED:
-                operations.applied(old, self.state, given_)
+                operations.set_applied(old, self.state, given_)
             elif action is Action.HAND_OVER:
                 operations.hand_over(old, self.state)
             elif action in (Action.LIMIT, Action.FREE):

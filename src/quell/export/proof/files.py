@@ -24,8 +24,7 @@ _OPTIONS = (
     *("-warn-special-float", "none", "-machdep", "gcc_x86_64"),
 )
 
-# Arguments of the functions, each call with other numbers.
-_CALLS = {
+CALLS = {
     "step": "any_real, any_realDERIVATIVES",
     "step_counts": "any_count, any_countDERIVATIVES",
     "applied": "any_real",
@@ -37,6 +36,7 @@ _CALLS = {
     "get_estimate": "",
     "stopping_point": "",
 }
+"""Arguments of the functions, each call with other numbers; without ``init`` and ``retune``."""
 RETURN_U = {"step": "REAL r, REAL y", "step_counts": "int32_t r, int32_t count",
              "track": "REAL r, REAL y, REAL u"}  # fmt: skip
 """Functions that return u, and their arguments but for derivatives of the reference."""
@@ -107,13 +107,13 @@ def _program(controller: Any, source: CSource, path: str) -> str:
     name, real = source.name, source.real
     more = ", any_real" * source.derivatives
     cases: list[str] = []
-    for i, (operation, given) in enumerate(_CALLS.items()):
+    for i, (operation, given) in enumerate(CALLS.items()):
         if operation in source.operations:
             arguments = "".join(f", {each}" for each in [given] if each)
             call = f"{name}_{operation}(state{arguments.replace('DERIVATIVES', more)});"
             cases += [f"        case {i}:", f"            {call}", "            break;"]
     counts = "step_counts" in source.operations
-    narrower = _narrower(controller, path, source.precision == "single")
+    narrower = narrower_limit(controller, path, source.precision == "single")
     retuning = [
         f"    narrower = {name}_default_parameters;",
         *([f"    narrower.{path}.high = {narrower};"] if narrower else []),
@@ -157,7 +157,7 @@ def _program(controller: Any, source: CSource, path: str) -> str:
     ])  # fmt: skip
 
 
-def _narrower(controller: Any, path: str, single: bool) -> str:
+def narrower_limit(controller: Any, path: str, single: bool) -> str:
     """Return an upper limit below that of the controller, as C code; nothing without limits."""
     if not path:
         return ""

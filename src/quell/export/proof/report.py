@@ -60,6 +60,8 @@ class Proof:
         the functions that return u.
     digest
         SHA-256 of header and source, one after the other: the proof is for these files alone.
+    sizes
+        stack and code of each function, in Markdown; empty if nobody has measured them.
     """
 
     folder: Path
@@ -69,6 +71,7 @@ class Proof:
     promised: int
     promising: tuple[str, ...]
     digest: str
+    sizes: str = ""
 
     @property
     def proved(self) -> bool:
@@ -116,6 +119,7 @@ class Proof:
             "results": "" if self.findings.failure else self._results(),
             "open": f"## What is open\n\n{lines}\n{_OPEN}" if lines else "",
             "library": ", ".join(f"`{each}`" for each in library) or "none",
+            "sizes": f"## Stack and code\n\n{self.sizes}\n" if self.sizes else "",
         })  # fmt: skip
 
     def _results(self) -> str:
@@ -154,7 +158,7 @@ def _meaning(alarm: Alarm) -> str:
     return known if alarm.status == "Unknown" else f"{known}, status {alarm.status}"
 
 
-def prove(folder: Path, source: CSource, *, longest: float = _LONGEST) -> Proof:
+def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: str = "") -> Proof:
     """Run the proof whose files are in ``folder/proof``, and write its report there.
 
     Parameters
@@ -165,6 +169,8 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST) -> Proof:
         its C code.
     longest
         time after which the analysis is ended, and nothing is proved [s].
+    sizes
+        stack and code of each function for the report, in Markdown.
     """
     contract = (folder / FOLDER / f"{source.name}_contract.h").read_text(encoding="utf-8")
     found = frama_c(folder, source.name, longest)
@@ -175,7 +181,7 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST) -> Proof:
     )
     promising = tuple(each for each in RETURN_U if each in source.operations)
     promised = contract.count("ensures ")
-    proof = Proof(folder, source.name, found, read, promised, promising, digest)
+    proof = Proof(folder, source.name, found, read, promised, promising, digest, sizes)
     with written_atomically(folder / FOLDER / REPORT, overwrite=True) as part:
         part.write_text(proof.text, encoding="utf-8")
     return proof

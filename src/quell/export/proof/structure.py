@@ -1,4 +1,4 @@
-"""What the text of exported C code shows by itself: no recursion, no allocation, loops that end.
+"""What the text of exported C shows by itself: no recursion or allocation, loops that end, arrays.
 
 The translator writes each function after those that it calls, and knows one form of loop, ``for``
 over a range of integers. That is read here from the text and not taken from the translator, so that
@@ -58,8 +58,12 @@ def structure(source: str, step: str) -> Structure:
     counter = _Counter(found, {name: (int(value), int(value)) for name, value in constants})
     for each in _FUNCTION.finditer(text):
         line = text.count("\n", 0, each.start(3)) + 1
-        names = tuple(re.findall(r"(\w+)(?:\[\w*\])*(?:,|$)", " ".join(each[2].split())))
+        given = " ".join(each[2].split())
+        names = tuple(re.findall(r"(\w+)(?:\[\w*\])*(?:,|$)", given))
         counter.functions[each[1]] = _Function(each[1], names, each[3], line)
+        lengths = {name: [int(size) for size in re.findall(r"\d+", sizes)]
+                   for name, sizes in re.findall(r"(\w+)((?:\[\d+\])+)(?:,|$)", given)}  # fmt: skip
+        found.problems += counter.outside(counter.functions[each[1]], lengths)
     if step not in counter.functions:
         found.problems.append(f"there is no function {step}")
     seen: set[str] = set()
@@ -123,6 +127,39 @@ class _Counter:
         if key not in self._known:
             self._known[key] = self._count(self.functions[name], arguments)
         return self._known[key]
+
+    def outside(self, function: _Function, lengths: dict[str, list[int]]) -> list[str]:
+        """Return the places where an array that is an argument is used beyond its length.
+
+        Eva takes the state for one object, in which an index may run from one array into the next.
+        What is checked are indices whose range is known in the function itself.
+        """
+        ranges: list[dict[str, tuple[int, int]]] = []
+        for loop in function.loops:
+            known = self._known_at(function, ranges, loop.start())
+            first, last = _range(loop[2], known), _range(loop[4] or loop[6], known)
+            ranges.append(_values(loop[1], first, last, loop[5]))
+        problems, plain = [], _LOOP.sub("", function.body)
+        tested = set(re.findall(r"(?<![\w.>])([A-Za-z_]\w*) (?:[<>]=?|[!=]=) ", plain))
+        for use in re.finditer(r"(?<![\w.>])(\w+)((?:\[[^\[\]]+\])+)", function.body):
+            known = self._known_at(function, ranges, use.start())
+            indices = re.findall(r"\[([^\[\]]+)\]", use[2])
+            for index, length in zip(indices, lengths.get(use[1], []), strict=False):
+                if any(each in tested for each in re.findall(r"[A-Za-z_]\w*", index)):
+                    continue  # a condition may narrow its range
+                low, high = _range(index, known)
+                if (low is not None and low < 0) or (high is not None and high >= length):
+                    problems.append(f"{function.name} uses {use[0]}, of {length} entries")
+        return problems
+
+    def _known_at(
+        self, function: _Function, ranges: list[dict[str, tuple[int, int]]], at: int
+    ) -> dict[str, tuple[int, int]]:
+        """Return the ranges of constants, and of the variables of the loops around a place."""
+        names = dict(self.constants)
+        for values, (begin, end) in zip(ranges, function.spans, strict=False):
+            names |= values if begin <= at < end else {}
+        return names
 
     def _count(self, function: _Function, arguments: tuple[Interval, ...]) -> int | None:
         given = dict(zip(function.parameters, arguments, strict=False))

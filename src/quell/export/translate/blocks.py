@@ -109,7 +109,8 @@ def _without(block: Block, unused: set[str]) -> Block:
             if item.target not in unused:
                 kept.append(item)
             elif item.calls:
-                kept.append(Line(item.code, comments=item.comments, behind=item.behind, calls=True))
+                code = f"(void){item.code}"
+                kept.append(Line(code, comments=item.comments, behind=item.behind, calls=True))
         elif isinstance(item, Branch):
             body, orelse = _without(item.body, unused), _without(item.orelse, unused)
             if body or orelse or _has_call(item.test):

@@ -192,7 +192,7 @@ class Calls:
             return Value(NOTHING)
         body.written.add(record.root)
         size = f"sizeof *{record.code}" if record.pointer else f"sizeof {record.code}"
-        return Value(NOTHING, f"memset({record.address}, 0, {size})", calls=True)
+        return Value(NOTHING, f"(void)memset({record.address}, 0, {size})", calls=True)
 
     def _resolve(
         self, body: Expressions, node: ast.Call, function: Any, arguments: list[Value]

@@ -70,7 +70,7 @@ def _array_lines(structs: Structs, value: Value, array: Any, tables: list[str]) 
     numbers = ", ".join(map(write, flat))
     kind = structs.number(value.kind.element)
     tables.append(f"static const {kind} {name}[{flat.size}] = {{{numbers}}}; /* {value.code} */")
-    return [f"    memcpy({value.code}, {name}, sizeof {name});"]
+    return [f"    (void)memcpy({value.code}, {name}, sizeof {name});"]
 
 
 def _loops(shape: tuple[int, ...], code: str, number: str) -> list[str]:

@@ -109,16 +109,19 @@ def block_lines(block: Block, result: str, indent: int = 4) -> list[str]:
 def _branch(item: Branch, result: str, indent: int, behind: str) -> list[str]:
     pad, lines = " " * indent, []
     opening = f"{pad}if ({item.test}) {{{behind}"
+    chained = False
     while True:
         lines += wrapped(opening)
         lines += block_lines(item.body, result, indent + 4)
         rest = item.orelse
         if not rest:
-            return [*lines, f"{pad}}}"]
+            # A chain of tests ends with else (MISRA C:2012, rule 15.7).
+            last = [f"{pad}}} else {{", f"{pad}    /* Nothing in any other case. */"]
+            return [*lines, *(last if chained else []), f"{pad}}}"]
         if len(rest) == 1 and isinstance(rest[0], Branch):
             item = rest[0]
             for comment in item.comments and [" ".join(item.comments)]:
                 lines += comment_block(comment, indent + 4)
-            opening = f"{pad}}} else if ({item.test}) {{"
+            opening, chained = f"{pad}}} else if ({item.test}) {{", True
             continue
         return [*lines, f"{pad}}} else {{", *block_lines(rest, result, indent + 4), f"{pad}}}"]

@@ -40,7 +40,7 @@ _HELPERS = {
     "is_finite": ("bool is_finite(real a)", "return fabs(a) <= REAL_MAX;",
                   "Return whether a is finite."),
     "truncated": ("int truncated(real a)",
-                  "return a == a && a > -{2147483648} && a < {2147483648} ? (int)a : 0;",
+                  "return a > -{2147483648} && a < {2147483648} ? (int)a : 0;",
                   "Return a without its fraction; 0 if it is not a number or too large."),
     "remainder_int": ("int remainder_int(int a, int b)",
                       "const int rest = a % b;\n    return rest != 0 && (rest < 0) != (b < 0) "

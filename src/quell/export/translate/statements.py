@@ -94,7 +94,8 @@ class Body:
 
     def _call_statement(self, value: Value, block: Block) -> None:
         if value.calls:
-            block.append(Line(value.code, calls=True))
+            unused = "" if value.kind == NOTHING else "(void)"
+            block.append(Line(f"{unused}{value.code}", calls=True))
 
     def _if(self, node: ast.If, block: Block) -> bool:
         test = self.expressions.translate(node.test)

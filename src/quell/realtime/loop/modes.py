@@ -46,7 +46,7 @@ class Cause(IntEnum):
 
     NONE = 0, "it began", Ending.NO
     SETTLED = 1, "enough good samples were seen", Ending.NO
-    MISSED = 2, "no measurement came, or one that is not finite", Ending.NO
+    MISSED = 2, "no measurement came in time, or one that is not finite", Ending.NO
     RECOVERED = 3, "a good measurement came", Ending.NO
     LOST = 4, "too many samples in a row were missed: look at the device and the wire"
     STALLED = 5, "the loop stood still for too many samples: look at the load of the machine"

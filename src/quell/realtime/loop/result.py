@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from quell.realtime.loop.modes import Cause, Ending, Mode
 from quell.realtime.loop.state import RESERVED, Rules, SupervisorState
 from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.histogram import Timing
+from quell.realtime.telemetry.channels import Event
 from quell.records.measures import Metrics
 from quell.records.trajectory import Trajectory
 
@@ -123,6 +124,52 @@ def lost_changes(state: SupervisorState, dt: float) -> tuple[str, ...]:
         return ()
     last = state.changes[kept - 1, 0] * dt
     return (f"only the first {kept} changes of mode, until {last:.3f} s, were kept",)
+
+
+def silence_of(
+    record: Trajectory,
+    changes: Sequence[ModeChange],
+    before: Mapping[str, int],
+    after: Mapping[str, int],
+) -> tuple[str, ...]:
+    """Return a note that says what came from the device when missed samples ended the run.
+
+    Parameters
+    ----------
+    record
+        all cycles.
+    changes
+        changes of mode.
+    before, after
+        the device's counters at the begin of the run and at its end.
+    """
+    end = next((each for each in changes if each.cause in (Cause.LOST, Cause.STALLED)), None)
+    if end is None:
+        return ()
+    missed = np.asarray(record["events"]).astype(np.int64) & (Event.MISSED | Event.GAP) != 0
+    at = int(np.searchsorted(record["k"], round(end.t / record.dt)))
+    first = last = min(at, missed.size - 1)
+    while first > 0 and missed[first - 1]:
+        first -= 1
+    while last < missed.size and missed[last]:
+        last += 1
+    count = max(last - first, 1)
+    begin = record["k"][first] * record.dt
+    span = f"for {count * record.dt:.3g} s ({count} samples) from {begin:.3f} s on"
+    if "not_finite" not in after:
+        return (f"the device gave no measurement, or none that is a number, {span}",)
+    wrong = after["not_finite"] - before.get("not_finite", 0)
+    if wrong:
+        return (
+            f"no good measurement came {span}; {wrong} packets of the run had a value that is not "
+            "finite: look at the sensor of the device",
+        )
+    late = after.get("stale", 0) - before.get("stale", 0)
+    return (
+        f"no packet of the device came in time {span}, and no value was wrong: the device, the "
+        f"network or this computer was busy, or the device has stopped ({late} packets were too "
+        "old); the safety rule hold, or hold_time, says how long u may be held",
+    )
 
 
 def scenario_part(record: Trajectory, state: SupervisorState, samples: int) -> Trajectory:

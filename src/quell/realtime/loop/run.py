@@ -25,6 +25,7 @@ from quell.realtime.loop.result import (
     lost_changes,
     mode_changes,
     scenario_part,
+    silence_of,
     tally,
 )
 from quell.realtime.loop.safety import Safety
@@ -143,6 +144,7 @@ def run_rig(
         writer.urgent = loop.interpreted and priority > 1
         if hasattr(device, "restart_session"):
             device.restart_session()  # compiling may have taken longer than the device waits
+        before = dict(getattr(device, "counters", {}))
         writer.header = replace(writer.header, started=time.time_ns())
         real_time = real_time_process(priority, loop.interpreted)
         # Signals first and last: a second Ctrl-C must not lose the end of the record.
@@ -157,13 +159,15 @@ def run_rig(
         notes.append(f"the device raised {count} errors, the last of them: {last!r}")
     notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
     record = replace(memory.trajectory(), u_limits=(rules.low, rules.high))
+    counters, changes = dict(getattr(device, "counters", {})), mode_changes(supervisor, dt)
+    notes += silence_of(record, changes, before, counters)
     return RigRun(
         trajectory=scenario_part(record, supervisor, reference.r.size),
         record=record,
         timing=loop.timing,
-        changes=mode_changes(supervisor, dt),
+        changes=changes,
         tally=tally(supervisor, writer.dropped),
-        counters=dict(getattr(device, "counters", {})),
+        counters=counters,
         notes=tuple(notes),
         rules=rules,
     )

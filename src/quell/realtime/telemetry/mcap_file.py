@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,7 @@ class McapSink:
         check_writable(self.path, self.overwrite)
 
     def open(self, header: Header) -> None:
-        """Begin the file; the header is on disk at once."""
+        """Begin the file; the header is on disk at once, or an ``OSError`` says why it is not."""
         foxglove = import_extra("foxglove", "telemetry", "an MCAP file")
         mcap = import_extra("foxglove.mcap", "telemetry", "an MCAP file")
         self.check()
@@ -99,6 +100,10 @@ class McapSink:
         self._topic = open_topic(foxglove, header, self._context)
         self._writer.flush()
         self._flushed = time.monotonic()
+        if self._file.error is not None:  # a full disk: nothing must move unrecorded
+            with suppress(OSError):
+                self.close()
+            raise self._file.error
 
     def write(self, rows: Matrix) -> None:
         """Add a message for each row."""

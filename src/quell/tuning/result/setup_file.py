@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,20 +13,25 @@ from quell.plants.delay import delayed
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix
 
+# A comment may have none of them, and a tab is of no use there.
+_CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+
 
 def toml_text(tables: Mapping[str, Any], comment: str = "") -> str:
     """Return a TOML file with top-level keys and tables; ``comment`` lines stand first.
 
     Numbers are written in full precision. Tables within tables are written inline.
     """
-    lines = [f"# {line}" for line in comment.splitlines()]
+    lines = [f"# {_CONTROL.sub(' ', line)}" for line in comment.splitlines()]
     plain = {key: value for key, value in tables.items() if not isinstance(value, Mapping)}
     listed = {
         key: value
         for key, value in plain.items()
-        if isinstance(value, list | tuple) and value and isinstance(value[0], Mapping)
+        if isinstance(value, list | tuple)
+        and value
+        and all(isinstance(each, Mapping) for each in value)
     }
-    lines += [f"{key} = {_value(value)}" for key, value in plain.items() if key not in listed]
+    lines += [f"{_key(key)} = {_value(value)}" for key, value in plain.items() if key not in listed]
     for key, value in tables.items():
         if isinstance(value, Mapping):
             lines += ["", f"[{_key(key)}]"]
@@ -37,13 +44,15 @@ def toml_text(tables: Mapping[str, Any], comment: str = "") -> str:
 
 
 def _key(name: str) -> str:
-    bare = name.replace("-", "").replace("_", "").isalnum() and name.isascii()
+    bare = name.isascii() and re.fullmatch(r"[\w-]+", name) is not None
     return name if bare else _text(name)
 
 
 def _text(value: str) -> str:
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-    return f'"{escaped}"'
+    # TOML has the escapes of JSON; it wants them for DEL, too, and halves of surrogate pairs are no
+    # text in UTF-8.
+    valid = value.encode("utf-8", "replace").decode("utf-8")
+    return json.dumps(valid, ensure_ascii=False).replace("\x7f", "\\u007F")
 
 
 def _value(value: Any) -> str:

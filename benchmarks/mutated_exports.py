@@ -1,0 +1,263 @@
+"""Wrong versions of exported C, drawn by chance: does a test find them, or the proof.
+
+    python benchmarks/mutated_exports.py [--count 30] [--seed 1] [--without-proof]
+
+Changes of one place are drawn from the C code of several controllers, as many of each kind:
+
+* *limit*: a comparison with a limit of u is turned round or dropped, a limit is taken for the
+  other, the smaller of two numbers for the larger;
+* *NaN*: a test whether a number is finite or usable is always true, always false, or loses a part;
+* *index*: a loop has a pass more or less, a place in an array is the next one.
+
+Each is given to four judges, until one finds it: the golden vectors of ``test_NAME.c`` with the
+sanitizers of gcc; the hostile program (``hostile_exports.py``), which finds reports and a bad u;
+the bits of all u and flags in that program, which must be those of the unchanged code (which
+repeats the kernels: ``exported.py``); and Frama-C (``quell export --prove``). A change that the
+compiler refuses is drawn again. What nobody finds ends the script with 1, unless ``SAME`` says why
+it changes nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import random
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hostile_exports import SANITIZERS, built, traced
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell.export.library import Exported
+from quell.export.proof import prove
+
+LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
+CALLS = 1e6
+# Changes that make no difference, and the reason.
+SAME = {
+    "if (is_usable(unlimited)) { -> if (true || (is_usable(unlimited))) {": "between limits of u "
+    "every finite u is usable, and no usable y or r makes one that is not finite",
+    "if (is_usable(unlimited)) { -> if (false && (is_usable(unlimited))) {": "the line behind it "
+    "accepts every finite u, as the limits are finite",
+    "return fabs(a) <= DBL_MAX; -> return true || (fabs(a) <= DBL_MAX);": "limits of u are finite",
+}
+
+
+class Mutant(NamedTuple):
+    """A changed line of exported code."""
+
+    controller: str
+    kind: str
+    line: int
+    before: str
+    after: str
+    block: str  # the lines behind it, as far as the function goes
+
+    @property
+    def next_line(self) -> str:
+        """The line behind it."""
+        return self.block.partition("\n")[0]
+
+    @property
+    def name(self) -> str:
+        """The change in one line."""
+        return f"{self.controller}, line {self.line}: {self.before} -> {self.after}"
+
+
+def controllers() -> dict[str, Any]:
+    """Return controllers with limits, most of whose kinds of checks differ."""
+    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
+    pid = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=0.01, **LIMITS)
+    move = ql.controllers.ProfileGenerator(0.5, 2.0, 5.0)
+    return {
+        "ADRC": ql.ADRC(observer, 1.5, **LIMITS),
+        "PID behind a shaper": ql.controllers.Prefiltered(pid, ql.baselines.ZV(3.0)),
+        "moves": ql.controllers.Prefiltered(
+            ql.ADRC(observer, 1.5, feedforward=True, **LIMITS), move
+        ),
+        "Kalman, Guard": ql.ADRC(
+            observer, 1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), **LIMITS
+        ),
+    }
+
+
+_NEXT = {"<": ">", ">": "<", "<=": ">=", ">=": "<="}
+_NAN = re.compile(r"is_usable|is_finite|is_usable_control|(\w+(?:->\w+)?) == \1\b|_MAX")
+
+
+def changes(line: str) -> Iterator[tuple[str, str]]:
+    """Yield kind and text of all changes of a line of C code."""
+    code = line.partition("/*")[0]
+    if re.search(r"\blimits(?:->|\.)|\bminimum\(|\bmaximum\(", code):
+        for found in re.finditer(r" (<=?|>=?) ", code):
+            yield "limit", f"{line[: found.start(1)]}{_NEXT[found[1]]}{line[found.end(1) :]}"
+        for one, other in (("low", "high"), ("high", "low"), ("minimum(", "maximum("),
+                           ("maximum(", "minimum("), ("least_change", "most_change"),
+                           ("most_change", "least_change")):  # fmt: skip
+            if re.search(rf"\b{re.escape(one)}", code):
+                yield "limit", line.replace(one, other, 1)
+        if re.fullmatch(r"\s+\w+ = [^;]*;\s*", code):
+            yield "limit", re.sub(r"\S.*", ";", line, count=1)
+    if _NAN.search(code):
+        test = re.fullmatch(r"(\s*(?:\} else )?if )\((.*)\)( \{.*)", line)
+        if test:
+            yield "NaN", f"{test[1]}(true || ({test[2]})){test[3]}"
+            yield "NaN", f"{test[1]}(false && ({test[2]})){test[3]}"
+        value = re.fullmatch(r"(\s*return )(.*)(;.*)", line)
+        if value and re.search(r"<=|>=|==|is_", value[2]) and "?" not in value[2]:
+            yield "NaN", f"{value[1]}true || ({value[2]}){value[3]}"
+        for found in re.finditer(r"(?<=\()[^()&|?]+ && |(\w+) == \1 && ", code):
+            yield "NaN", f"{line[: found.start()]}{line[found.end() :]}"
+    loop = re.match(r"\s*for \(int (\w+) = .*; \1 (<|>) ([^;]+); ", code)
+    if loop:
+        for more in (" + 1", " - 1"):
+            yield "index", f"{line[: loop.end(3)]}{more}{line[loop.end(3) :]}"
+    declares = re.match(r"\s*(?:const |static )*(?:double|float|int|servo_\w+)\b.*[;{(,]?$", code)
+    if not (declares and "=" not in code):
+        for found in re.finditer(r"(?<=[\w\]])\[([^\[\]]+)\]", code):
+            yield "index", f"{line[: found.end(1)]} + 1{line[found.end(1) :]}"
+
+
+def drawn(code: dict[str, str], count: int, chance: random.Random) -> list[Mutant]:
+    """Return mutants of the sources, equally many of each kind, from all controllers."""
+    found: dict[str, dict[str, list[Mutant]]] = {}
+    for name, text in code.items():
+        for number, line in enumerate(text.splitlines(), 1):
+            if line.startswith("    ") and not line.endswith((",", ")")):  # no head of a function
+                for kind, after in changes(line):
+                    block = "\n".join(text.splitlines()[number:]).partition("\n}\n")[0]
+                    mutant = Mutant(name, kind, number, line.strip(), after.strip(), block)
+                    found.setdefault(kind, {}).setdefault(name, []).append(mutant)
+    chosen: list[Mutant] = []
+    kinds = sorted(found)
+    while len(chosen) < count:
+        kind = kinds[len(chosen) % len(kinds)]
+        pool = found[kind][chance.choice(sorted(found[kind]))]
+        chosen.append(pool.pop(chance.randrange(len(pool))))
+    return chosen
+
+
+def changed(text: str, mutant: Mutant) -> str:
+    """Return the text of a source with one line changed."""
+    lines = text.splitlines(keepends=True)
+    old = lines[mutant.line - 1]
+    assert old.strip() == mutant.before
+    lines[mutant.line - 1] = old.replace(mutant.before, mutant.after)
+    return "".join(lines)
+
+
+def judge(done: Exported, controller: Any, mutant: Mutant, right: str, proves: bool) -> str:
+    """Return who finds a mutant; "compiler" where it is no program.
+
+    ``right`` is the hash that the hostile program gives for the unchanged code.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        folder, source = Path(place), done.source
+        wrong = dataclasses.replace(source, source=changed(source.source, mutant))
+        try:
+            program = built(folder, controller, wrong)
+        except RuntimeError:
+            return "compiler"
+        name = source.name
+        test = folder / "golden"
+        vectors = done.folder / f"test_{name}.c"
+        command = [*SANITIZERS["address"], "-std=c99", "-O1", "-ffp-contract=off", f"-I{folder}"]
+        command += [str(vectors), f"{name}.c", "-o", str(test), "-lm"]
+        subprocess.run(command, cwd=folder, capture_output=True, check=True)
+        if subprocess.run([test], capture_output=True, check=False, timeout=120).returncode:
+            return "golden vectors"
+        try:
+            *found, trace = traced(program, CALLS, 120.0)
+        except subprocess.TimeoutExpired:
+            return "hostile calls"
+        if found != ["0", "0", "0"]:
+            return "hostile calls"
+        if trace != right:
+            return "bits"
+    if not proves:
+        return "NOBODY"
+    file = done.folder / "src" / f"{name}.c"
+    try:
+        file.write_text(wrong.source, encoding="utf-8")
+        return "NOBODY" if prove(done.folder, wrong).proved else "proof"
+    finally:
+        file.write_text(source.source, encoding="utf-8")
+
+
+def why_same(mutant: Mutant) -> str:
+    """Return why a mutant changes nothing; nothing if that is not known."""
+    if mutant.next_line.strip() == "}" and mutant.before.startswith("if"):
+        return "the branch is empty"
+    if "predicted[i]" in mutant.block and mutant.after.endswith("- 1; i++) {"):
+        return "f, the last state of the model, stays, and is there already"
+    without = re.sub(r"(\w+(?:->\w+)?) == \1 && (?=\1 >)", "", mutant.before)
+    if mutant.after == without:
+        return "a comparison with a number is false for NaN, too; the test is there for Eva"
+    return SAME.get(f"{mutant.before} -> {mutant.after}", "")
+
+
+def right_trace(controller: Any, done: Exported) -> str:
+    """Return the hash of the unchanged code in its hostile program."""
+    with tempfile.TemporaryDirectory() as place:
+        return traced(built(Path(place), controller, done.source), CALLS)[3]
+
+
+def main() -> None:
+    """Draw mutants, judge them and print a table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--count", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--without-proof", action="store_true", help="the tests alone")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    chance, table = random.Random(options.seed), Table("kind", "change", "found by", "time [s]")
+    missed = 0
+    with tempfile.TemporaryDirectory() as place:
+        made = {
+            name: (
+                controller,
+                ql.export.c(controller, Path(place) / f"c{i}", name="servo", proof=False),
+            )
+            for i, (name, controller) in enumerate(controllers().items())
+        }
+        for controller, done in made.values():  # the files of the proof, without a proof
+            for path, text in ql.export.proof.proof_files(controller, done.source).items():
+                target = done.folder / path
+                target.parent.mkdir(exist_ok=True)
+                target.write_text(text, encoding="utf-8")
+        right = {name: right_trace(*each) for name, each in made.items()}
+        code = {name: done.source.source for name, (_, done) in made.items()}
+        judged = 0
+        for mutant in drawn(code, 3 * options.count, chance):
+            if judged == options.count:
+                break
+            begin = time.monotonic()
+            controller, done = made[mutant.controller]
+            by = judge(
+                done, controller, mutant, right[mutant.controller], not options.without_proof
+            )
+            if by == "compiler":
+                continue
+            judged += 1
+            if by == "NOBODY" and (reason := why_same(mutant)):
+                by = f"nobody: {reason}"
+            missed += by == "NOBODY"
+            seconds = f"{time.monotonic() - begin:.0f}"
+            print(f"{mutant.kind} | {mutant.name} | {by} | {seconds}", flush=True)
+            table.add_row(mutant.kind, mutant.name, by, seconds)
+    Console(width=170).print(table)
+    print(f"{judged - missed} of {judged} are found")
+    sys.exit(1 if missed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Exported C under sanitizers in hostile programs, its style, and wrong versions that are found."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import quell as ql
+
+from .benchmark_module import BENCHMARKS, benchmark
+from .in_c import needs_gcc
+
+LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
+OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
+ADRC = ql.ADRC(OBSERVER, 1.5, **LIMITS)
+LEARNING = ql.ADRC(
+    OBSERVER, 1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), feedforward=True, **LIMITS
+)
+MOVING = ql.controllers.Prefiltered(
+    ql.ADRC(OBSERVER, 1.5, feedforward=True, **LIMITS),
+    ql.controllers.ProfileGenerator(0.5, 2.0, 5.0),
+)
+SEARCHING = ql.ADRC(
+    OBSERVER, 1.5, learner=ql.learners.Harmonic(search=True), guard=ql.Guard(), **LIMITS
+)
+
+
+@pytest.fixture
+def hostile() -> Any:
+    """The benchmark of hostile programs."""
+    return benchmark("hostile_exports")
+
+
+@needs_gcc
+@pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
+@pytest.mark.parametrize(
+    "controller",
+    [
+        pytest.param(ADRC, id="ADRC, counts"),
+        pytest.param(LEARNING, id="Kalman, feedforward"),
+        pytest.param(MOVING, id="moves"),
+        pytest.param(SEARCHING, id="Harmonic, search"),
+        pytest.param(ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=0.01, **LIMITS), id="PID"),
+    ],
+)
+def test_any_calls_with_any_bits_leave_u_a_number_within_its_limits(
+    tmp_path: Path, hostile: Any, controller: Any, single: bool
+) -> None:
+    """200 000 calls of all functions by chance; no sanitizer reports anything."""
+    shown, source = hostile.exported_source(controller, single)
+    assert hostile.run(hostile.built(tmp_path, shown, source), 2e5) == ("0", "0", "0")
+
+
+WRONG = [
+    pytest.param({"        applied = limits->high;\n": ""}, ("0", "0", 1), id="no upper limit"),
+    pytest.param({
+        "return fabs(value) <= LARGEST_SIGNAL;": "return value == value;",
+        "if (!(applied == applied && applied >= -DBL_MAX && applied <= DBL_MAX)) {": "if (false) {",
+        "if (!is_usable_control(&design->limits, unlimited)) {": "if (false) {",
+    }, ("0", 1, "0"), id="no tests for NaN"),
+    pytest.param({"    state->z[0] -= distance;": "    state->z[(int)distance] -= distance;"},
+                 ("1: ", "", ""), id="index"),
+]  # fmt: skip
+
+
+@needs_gcc
+@pytest.mark.parametrize(("changes", "expected"), WRONG)
+def test_a_hostile_program_finds_what_is_wrong(
+    tmp_path: Path, hostile: Any, changes: dict[str, str], expected: tuple[Any, ...]
+) -> None:
+    """A limit, the tests for NaN or an index that is missing, in the generated code."""
+    shown, source = hostile.exported_source(ADRC, False)
+    code = source.source
+    for old, new in changes.items():
+        assert old in code
+        code = code.replace(old, new)
+    wrong = dataclasses.replace(source, source=code)
+    for found, wanted in zip(
+        hostile.run(hostile.built(tmp_path, shown, wrong), 2e5), expected, strict=True
+    ):
+        assert int(found) >= wanted if isinstance(wanted, int) else found.startswith(wanted)
+
+
+def test_the_program_calls_every_function(hostile: Any) -> None:
+    """It is refused for a function that it does not know, so none is forgotten."""
+    source = ql.export.c_source(ADRC, "servo", resolution=1e-4)
+    text = hostile.hostile_program(ADRC, source)
+    assert all(f"servo_{operation}(" in text for operation in source.operations)
+    more = dataclasses.replace(source, operations=(*source.operations, "explode"))
+    with pytest.raises(ValueError, match="explode"):
+        hostile.hostile_program(ADRC, more)
+
+
+@needs_gcc
+@pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is missing")
+@pytest.mark.parametrize("controller", [ADRC, LEARNING, MOVING], ids=["ADRC", "Kalman", "moves"])
+def test_exported_code_breaks_no_rule_but_the_listed_ones(
+    monkeypatch: pytest.MonkeyPatch, hostile: Any, controller: Any
+) -> None:
+    """Of MISRA C:2012, as far as cppcheck knows them; the analyser of gcc has nothing to report."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    style = benchmark("exported_style")
+    _, source = hostile.exported_source(controller, True)
+    found = style.style_of(source)
+    assert style.unexplained(found) == []
+    assert found["8.14"] > 0  # cppcheck has looked
+
+
+def test_the_deviations_of_the_documentation_are_those_of_the_benchmark(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The table in docs/target has each rule with its reason."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    page = (BENCHMARKS.parent / "docs/target.md").read_text(encoding="utf-8")
+    for rule, reason in benchmark("exported_style").DEVIATIONS.items():
+        kind, colon, text = reason.partition(": ")
+        row = f"| {rule} | {kind} | {text} |" if colon else f"| `{rule}` | | {reason} |"
+        assert row in page, row
