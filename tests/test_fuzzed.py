@@ -1,4 +1,4 @@
-"""Drawn messages, setups, texts and memory: each is taken, or refused with a documented error.
+"""Drawn messages, setups and texts: each is taken, or refused with a documented error.
 
 Hypothesis draws a few dozen examples in every run of the tests. ``QUELL_FUZZ=5000 pytest
 tests/test_fuzzed.py tests/test_frames.py tests/test_cobs.py`` draws as many of each kind, other
@@ -12,17 +12,11 @@ from __future__ import annotations
 import json
 import os
 import tomllib
-import zlib
-from collections.abc import Iterator
 from typing import Any
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from quell.realtime.wire import frames
-from quell.realtime.wire.shared_memory import HISTORY, SIZE
-from quell.realtime.wire.transport import receive
 from quell.setup import EXAMPLES, SetupError
 from quell.setup.description import describe, parsed
 from quell.studio import messages
@@ -30,7 +24,6 @@ from quell.studio.records import MOST_FILE, PageRecord
 from quell.tuning.result.setup_file import toml_text
 
 from .studio_server import TABLES
-from .test_shared_memory import Ends
 
 FUZZ = int(os.environ.get("QUELL_FUZZ", "0"))
 fuzzed = settings(
@@ -181,29 +174,3 @@ def test_what_is_written_as_toml_is_read_as_it_was(tables: dict[str, Any], comme
     """Any keys, texts and numbers; a comment with any characters ends with its line."""
     found = tomllib.loads(toml_text(tables, comment))
     assert found == tables
-
-
-@pytest.fixture
-def ends() -> Iterator[Ends]:
-    """A new wire in shared memory."""
-    wire = Ends()
-    yield wire
-    wire.close()
-
-
-@fuzzed
-@given(st.binary(min_size=1, max_size=64), st.integers(0, SIZE - 1), st.booleans())
-def test_any_image_of_the_shared_memory_is_survived(
-    ends: Ends, image: bytes, at: int, whole: bool
-) -> None:
-    """A segment, or a part of it, is overwritten: the reader ends, and accepts no broken frame."""
-    content = (image * (SIZE // len(image) + 1))[: SIZE - (0 if whole else at)]
-    content = content if whole else content[: len(image)]
-    os.pwrite(ends.device.own, content, 0 if whole else at)
-    frame, own = frames.buffer(), frames.endpoint(frames.MEASUREMENT, 1, 50)
-    count = 0
-    while (size := receive(ends.loop, frame)) >= 0:
-        count += 1
-        assert count <= 2 * HISTORY
-        if frames.is_well_formed(frame, size, own.counters):
-            assert zlib.crc32(frame.bytes[:36].tobytes()) == frame.words[9]
