@@ -10,9 +10,8 @@ from __future__ import annotations
 import argparse
 import time
 
-from quell.experiments.acc import DT, SPRINGS, box, designs, interval, judge_sampled
-from quell.experiments.acc.controllers import FREED, OURS
-from quell.experiments.acc.samples import boxed
+from quell.experiments.acc import DT, SPRINGS, designs, interval, judge_sampled, study
+from quell.experiments.acc.loops import FREED, OURS, boxed
 from quell.tuning.structures.base import vector
 
 # Seeds of the plants for the search, and of the fresh ones, which nothing else uses.
@@ -35,8 +34,8 @@ def main() -> None:
         began = time.perf_counter()
         samples = boxed(options.plants, SEARCHED)
         where = {"storage": options.storage, "executor": options.executor}
-        found, controller = box.tune(samples, trials=options.tune, **where)
-        best, made = found.best, box.build()
+        found, controller = study.tune(samples, trials=options.tune, **where)
+        best, made = found.best, study.build()
         print(
             f"{len(found.candidates)} candidates in {time.perf_counter() - began:.0f} s;", end=" "
         )
@@ -55,7 +54,7 @@ def main() -> None:
             low, high = interval(failures, options.count)
             rate = 100.0 * failures / options.count
             row += f"  {spring} {rate:5.1f} ({100.0 * low:.1f}–{100.0 * high:.1f})"
-        print(f"{row}  {box.noise_gain(controller):9.0f}", flush=True)
+        print(f"{row}  {study.noise_gain(controller):9.0f}", flush=True)
 
 
 if __name__ == "__main__":

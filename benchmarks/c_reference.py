@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 
 SOURCE = Path(__file__).with_name("reference.c")
 

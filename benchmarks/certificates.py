@@ -1,6 +1,6 @@
 """How conservative the certificate of a guarded loop is: the bound over the worst that was found.
 
-Random linear loops of orders 1 to 4 (``quell.experiments.stress.general.loops``: stable, unstable,
+Random linear loops of orders 1 to 4 (``quell.experiments.stress.loops``: stable, unstable,
 lagged, delayed, two masses; modulus margin 0.35 and more). κ is 1.2, or 0.9/Γ where that is less.
 In place of guard and learner stands whatever a guard with this bound could let pass: any e_L with
 ``|e_L| ≤ κ e``, where e is the largest |q| so far. The linear loop is that of the certificate,
@@ -32,16 +32,14 @@ from rich.console import Console
 from rich.table import Table
 
 from quell.analysis import certify
-from quell.experiments.stress.general.loops import draw_loop
-from quell.experiments.stress.random_loops import draw_loops
-from quell.experiments.stress.study import errors
+from quell.experiments.stress.loops import draw_loop
+from quell.experiments.stress.study import draw_loops, errors
 from quell.guard import Guard
-from quell.guard.correction import plain_loop, state_path
+from quell.guard.guard import plain_loop, state_path
 from quell.learners import Harmonic
-from quell.lti.norms import pulse_response
-from quell.lti.system import System
+from quell.lti.models import System, pulse_response
 from quell.parallel import in_parallel
-from quell.plants.sampled import sampled_plant
+from quell.plants.linear import sampled_plant
 
 FAMILIES = ("stable", "unstable", "lagged", "delayed", "two masses")
 LOADS = ("ramp", "step", "sine")

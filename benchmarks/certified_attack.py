@@ -26,14 +26,14 @@ from rich.table import Table
 
 import quell as ql
 from quell.analysis import Certificate, certify, observer_error
-from quell.experiments.stress.general.attacks import adversary_at, earn_and_spend
-from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
-from quell.experiments.stress.spender import Spender, draw_push
+from quell.experiments.stress.adversaries import Spender, draw_push
+from quell.experiments.stress.general import adversary_at, earn_and_spend
+from quell.experiments.stress.loops import GeneralLoop, draw_loop
 from quell.guard import Guard
-from quell.guard.correction import plain_loop, state_path
-from quell.lti.norms import pulse_response
+from quell.guard.guard import plain_loop, state_path
+from quell.lti.models import pulse_response
 from quell.parallel import in_parallel
-from quell.plants.sampled import sampled_plant
+from quell.plants.linear import sampled_plant
 from quell.simulation.simulate import simulate
 
 FAMILIES = ("stable", "unstable", "lagged", "delayed", "two masses")

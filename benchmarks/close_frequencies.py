@@ -2,7 +2,7 @@
 
     python benchmarks/close_frequencies.py [--loops 50] [--seed 7] [--other-loads]
 
-The plants and designs are those of ``quell.experiments.stress.random_loops``. From 90 s on two
+The plants and designs are those of ``quell.experiments.stress.study``. From 90 s on two
 sinusoids act on m2: the slower one of 0.15 to 0.8 rad/s, the other faster by the factor in the
 table, with amplitudes of 0.2 to 2 N and random phases. The figures are the largest errors over 40
 s, from one minute or one beat period after the start of the load on, whichever is later, over those
@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.experiments.stress.random_loops import LOAD_AT, Loop, draw_loops
+from quell.experiments.stress.study import LOAD_AT, Loop, draw_loops
 from quell.learners import Harmonic, Learner
 from quell.signals import Samples, Signal, Sinusoid
 from quell.types import Vector

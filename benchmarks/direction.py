@@ -8,10 +8,10 @@ testbed with friction and encoder), some delayed, some read by an encoder; ``b0`
 factor 2; ADRC with and without learner and guard; references that step, move, oscillate or stay;
 loads of 5 to 90 % of u's limit that step, grow or oscillate, at any time; noise. Three questions:
 
-* does ``quell.realtime.loop.direction`` end a run of an honest loop that is stable;
+* does ``quell.realtime.supervisor`` end a run of an honest loop that is stable;
 * how often, and how soon, does it end a run with the wrong sign;
 * how far does y of a stable loop leave the range of its reference, in units of that range plus the
-  reach of u: ``quell.realtime.loop.bounds`` allows ten.
+  reach of u: ``quell.realtime.supervisor`` allows ten.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ import numpy as np
 import quell as ql
 from quell.kernels.dispatch import call_specialised, compiled
 from quell.realtime import Safety
-from quell.realtime.loop.direction import ARMED, runs_away
-from quell.realtime.loop.state import initial_state
+from quell.realtime.supervisor import ARMED, initial_state, runs_away
 
 KINDS = ("integrators", "damped", "spring", "zero on the right", "torsional")
 LOADS = ("none", "step", "ramp", "sine")

@@ -39,11 +39,11 @@ from rich.table import Table
 
 import quell as ql
 from quell.controllers import in_single_precision
-from quell.controllers.adrc.handover import samples_to_settle
+from quell.controllers.adrc import samples_to_settle
 from quell.controllers.base import reset_loop
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 from quell.export import TranslationError
-from quell.export.inspection import limits_path
+from quell.export.controller_source import limits_path
 from quell.export.library.vectors import Action, Player
 
 HERE = Path(__file__).resolve().parent

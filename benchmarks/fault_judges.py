@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from quell.realtime import Safety, load
-from quell.realtime.loop.modes import Cause, Mode
-from quell.realtime.loop.supervisor import FLUSH
-from quell.realtime.rig.kernel import LIVE, LOG
+from quell.realtime.rig import LIVE, LOG
+from quell.realtime.supervisor import FLUSH, Cause, Mode
 
 DT, WATCHDOG, LIMIT = 1e-3, 20, 5.0
 SAFETY = Safety(hold_time=0.005, ramp_time=0.05, settle_time=0.05, most_error=3.0)

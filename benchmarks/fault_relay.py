@@ -1,6 +1,6 @@
 """A relay that injects faults between a loop and a rig, over any wire; for ``faults.py``.
 
-Over UDP it is ``quell.realtime.rig.fault_injection.Relay``. Over a serial line (two
+Over UDP it is ``quell.realtime.rig.Relay``. Over a serial line (two
 pseudoterminals) and shared memory it takes the frames from one wire, changes them by the same plan,
 and puts them on the other. Shared memory carries frames of 40 bytes only: shorter ones are filled
 with zeros, longer ones cut. On the serial line the changed frame is framed again, so that its
@@ -18,11 +18,12 @@ from typing import Any, Self
 import numpy as np
 
 from quell.kernels.dispatch import compiled, specialised
-from quell.realtime.devices.registry import listen
-from quell.realtime.rig.fault_injection import Fault, FaultInjector, Relay
-from quell.realtime.wire import cobs, frames
-from quell.realtime.wire.serial_line import SerialDevice
-from quell.realtime.wire.transport import receive, wait_for_frame
+from quell.realtime import transports
+from quell.realtime import wire as frames
+from quell.realtime.registry import listen
+from quell.realtime.rig import Fault, FaultInjector, Relay
+from quell.realtime.transports import SerialDevice
+from quell.realtime.wire import receive, wait_for_frame
 
 PRIORITY = 40  # below that of the loop and the rig
 WIRES = ("udp", "serial")
@@ -67,7 +68,7 @@ def _take(transport: Any, frame: frames.Buffer, nanoseconds: int) -> int:
 
 @compiled
 def _encode(coded: Any, values: Any) -> int:
-    return cobs.encode(values, values.size, coded)
+    return transports.encode(values, values.size, coded)
 
 
 class _SerialEnd(SerialDevice):

@@ -10,7 +10,7 @@ from rich.table import Table
 
 import quell as ql
 from quell import signals
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 
 TRAINED = 90.0
 

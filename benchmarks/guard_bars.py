@@ -30,8 +30,8 @@ from rich.table import Table
 from scipy.signal import lsim
 
 import quell as ql
-from quell.experiments.stress.general.loops.loads import Table as Values
-from quell.experiments.stress.general.program import INPUTS, Program, Watched
+from quell.experiments.stress.adversaries import INPUTS, Program, Watched
+from quell.experiments.stress.loops import Table as Values
 from quell.parallel import in_parallel
 from quell.types import Vector
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 from quell.learners import Harmonic
 from quell.signals import Signal, Sinusoid
 

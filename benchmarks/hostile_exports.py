@@ -35,8 +35,8 @@ from rich.table import Table
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.export import CSource
-from quell.export.inspection import limits_path
-from quell.export.proof.files import CALLS, RETURN_U, narrower_limit
+from quell.export.controller_source import limits_path
+from quell.export.proof import CALLS, RETURN_U, narrower_limit
 
 FLAGS = ("-std=c99", "-O2", "-g1", "-ffp-contract=off")
 SANITIZERS = {

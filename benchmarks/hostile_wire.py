@@ -38,12 +38,11 @@ from typing import Any
 import numpy as np
 
 import quell as ql
-from quell.realtime.devices.base import ask
-from quell.realtime.devices.registry import listen, open_device
-from quell.realtime.devices.twin import TwinDevice
-from quell.realtime.rig.kernel import APPLIED
-from quell.realtime.rig.server import Rig
-from quell.realtime.wire import cobs, frames
+from quell.realtime import transports
+from quell.realtime import wire as frames
+from quell.realtime.devices import TwinDevice, ask
+from quell.realtime.registry import listen, open_device
+from quell.realtime.rig import APPLIED, Rig
 
 DT, LIMIT, WATCHDOG = 0.01, 5.0, 50
 PLANT = ql.plants.two_mass_spring()
@@ -217,7 +216,7 @@ def attack_serial(session: Session, ends: tuple[int, int]) -> None:
                 (session.changed(), session.forged(other), *list(session.seen)[:-20][-1:])
             )
             raw = np.frombuffer(frame, dtype=np.uint8)
-            data = coded[: cobs.encode(raw, raw.size, coded)].tobytes()
+            data = coded[: transports.encode(raw, raw.size, coded)].tobytes()
             data = data[: draw.choice((len(data), len(data), draw.randrange(len(data))))]
         # Mostly with a final zero: otherwise no frame of the session would ever get through.
         data += b"\0" if draw.random() < 0.97 else b""

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy import signal
 
 import quell as ql
-from quell.identification.model.structure import Structure, output
-from quell.identification.search.delay import delayed
-from quell.identification.search.output_error import refine
-from quell.identification.validation import nrmse
+from quell.identification.model import Structure, output
+from quell.identification.output_error import refine
+from quell.identification.result import nrmse
+from quell.identification.search import delayed
 from quell.types import Vector
 
 HELD_OUT = 0.3

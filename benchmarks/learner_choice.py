@@ -25,7 +25,7 @@ from scipy import signal
 
 import quell as ql
 from quell.features import RBF, Bias, Friction, Periodic, Polynomial, State
-from quell.kernels.function_pointers import jit_user_function
+from quell.kernels.user_functions import jit_user_function
 from quell.learners import MLP, RLS, GaussianProcess, Harmonic, Kalman
 from quell.types import Vector
 

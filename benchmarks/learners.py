@@ -23,10 +23,10 @@ from c_reference import best, c_reference, row, show
 
 import quell as ql
 from quell.controllers.base import control
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 from quell.features import RBF, Bias, Input, RandomFourier, State
 from quell.kernels.dispatch import call_specialised, compiled
-from quell.learners.online.model import infer, learn
+from quell.learners.online import infer, learn
 
 TRIALS = 11
 DURATION = 60.0

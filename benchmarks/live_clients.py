@@ -25,11 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from quell.realtime import CsvSink, LiveSink, McapSink
-from quell.realtime.telemetry.channels import row_channels
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.load import load
-from quell.realtime.telemetry.ring import push
-from quell.realtime.telemetry.writer import TelemetryWriter
+from quell.realtime.recordings import Header, load, row_channels
+from quell.realtime.telemetry import TelemetryWriter, push
 
 CHANNELS = row_channels((("x_hat", 4), ("f_learned", 1), ("status", 1), ("theta", 9)))
 REQUEST = (

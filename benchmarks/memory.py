@@ -10,7 +10,7 @@ import resource
 import time
 
 import quell as ql
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 
 
 def main() -> None:

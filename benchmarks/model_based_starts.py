@@ -19,9 +19,7 @@ import numpy as np
 
 import quell as ql
 from quell.tuning import Constraints, designs
-from quell.tuning.optimiser.problem import limits
-from quell.tuning.optimiser.search import search
-from quell.tuning.optimiser.starts import starts
+from quell.tuning.optimiser.search import limits, search, starts
 
 SHAPES, STARTS, ROUNDS = 28, 50, 8
 

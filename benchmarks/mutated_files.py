@@ -56,7 +56,7 @@ READERS = {
 def read(kind: str, path: Path) -> None:
     """Read a file with the function for its kind, and look at what it holds."""
     import quell as ql
-    from quell.experiments.acc import samples
+    from quell.experiments.acc import loops
     from quell.identification import read_record
     from quell.realtime import load
     from quell.setup import load as load_setup
@@ -73,9 +73,9 @@ def read(kind: str, path: Path) -> None:
     elif kind == "record":
         read_record(path)
     elif kind == "samples":
-        for row in samples.read(path):
+        for row in loops.read(path):
             for cubic in (False, True):
-                samples.plant(row, cubic)
+                loops.plant(row, cubic)
     else:
         load_setup(path).as_json()
 
@@ -112,8 +112,8 @@ def command(reader: str, path: Path, valid: Path) -> str:
 
 def shorten_commands() -> None:
     """Shorten the main work of the commands, see the module."""
-    import quell.cli.commands.acc as acc
-    import quell.cli.commands.run_rig as run_rig
+    import quell.cli.reproduce as acc
+    import quell.cli.rig as run_rig
     import quell.simulation as simulation
 
     simulate = simulation.simulate
@@ -185,7 +185,7 @@ def work(folder: Path, seed: int, numbers: Iterator[int]) -> None:
     text = (valid / "setup4.toml").read_text().replace("order = 4", "order = 2")
     (valid / "replay.toml").write_text(text)
     shorten_commands()
-    import quell.experiments.acc.controllers
+    import quell.experiments.acc.loops
     import quell.identification
     import quell.realtime  # noqa: F401
 

@@ -21,7 +21,7 @@ import numpy as np
 import quell as ql
 from quell.identification import Identified, Measured, alternatives, decided, read_record
 from quell.identification import simulated_plant as plant_of
-from quell.tuning.identified import identified_plants
+from quell.tuning.plants import identified_plants
 
 # Columns, sample time [s], poles at first, zeros, and longest delay in samples, of each record.
 RECORDS: dict[str, tuple[tuple[str, ...], float | None, int, int, int]] = {

@@ -29,9 +29,8 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.controllers.single import SinglePrecision
-from quell.controllers.single.single import SingleDesign
-from quell.experiments.two_mass_spring import setup as study
+from quell.controllers.single import SingleDesign, SinglePrecision
+from quell.experiments import two_mass_spring as study
 from quell.kernels.single import in_single
 
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0], [[0.0], [1.0]])

@@ -19,7 +19,7 @@ import numpy as np
 from c_reference import best, c_reference, row, show
 
 import quell as ql
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 
 TRIALS = 15
 SAMPLES = round(study.END / study.Settings().dt) + 1

@@ -30,7 +30,7 @@ from scipy import signal
 
 import quell as ql
 from quell.identification import not_told_apart
-from quell.tuning.identified import identified_plants
+from quell.tuning.plants import identified_plants
 from quell.types import Vector
 
 RESTS, NOISES = (1, 5, 50), (0.001, 0.005, 0.02)

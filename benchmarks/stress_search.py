@@ -20,10 +20,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from quell.experiments.stress.general.attacks import FOUND
-from quell.experiments.stress.general.cross_entropy import judge, search
-from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
-from quell.experiments.stress.general.trial import HEALTHY, error_of, is_fragile
+from quell.experiments.stress.general import FOUND, HEALTHY, error_of, is_fragile, judge, search
+from quell.experiments.stress.loops import GeneralLoop, draw_loop
 from quell.guard import Guard
 
 ORDERS = (1, 2, 3, 4)

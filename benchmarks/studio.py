@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.studio.frames import parsed
+from quell.studio.messages import parsed_frame
 
 CHROMIUM = "/usr/bin/chromium"
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
@@ -137,7 +137,7 @@ class Client:
         """Return the header of the next frame."""
         data = self.socket.recv(timeout=300.0)
         assert isinstance(data, bytes)
-        return parsed(data)[0]
+        return parsed_frame(data)[0]
 
     def run(self, tables: dict[str, Any]) -> list[dict[str, Any]]:
         """Ask for a run, and return the headers of the answer."""

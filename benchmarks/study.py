@@ -10,7 +10,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 from quell.learners import Kalman
 
 COLUMNS = ("overshoot", "settling_time", "disturbance_peak", "control_variation")

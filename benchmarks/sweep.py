@@ -29,8 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quell.setup.loading import made
-from quell.setup.sweep import sweep_of
+from quell.setup.loading import made, sweep_of
 from quell.sweeping import Sweep, sweep
 
 SETUP = {

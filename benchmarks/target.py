@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 from quell.export import CSource, c_source
 
 HERE = Path(__file__).parent

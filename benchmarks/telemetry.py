@@ -19,12 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from quell.realtime import CsvSink, LiveSink, McapSink
-from quell.realtime.telemetry.channels import row_channels
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.load import load
-from quell.realtime.telemetry.ring import push
-from quell.realtime.telemetry.sinks import MemorySink, file_sink
-from quell.realtime.telemetry.writer import TelemetryWriter
+from quell.realtime.recordings import Header, MemorySink, file_sink, load, row_channels
+from quell.realtime.telemetry import TelemetryWriter, push
 
 CHANNELS = row_channels(
     (("x_hat", 4), ("f_residual", 1), ("f_learned", 1), ("status", 1), ("theta", 9))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import quell as ql
-from quell.analysis.frozen_learner import Frozen
+from quell.analysis.linearise import Frozen
 from quell.learners.base import NoLearnerMemory
 
 PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.4]], [0.0, 2.0], [1.0, 0.0])

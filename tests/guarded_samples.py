@@ -6,9 +6,8 @@ import numpy as np
 
 import quell as ql
 from quell.guard import assess, limit, record_output
-from quell.guard.bound import bounds_of
-from quell.guard.credit import removed_share
-from quell.learners.lag import lag_push
+from quell.guard.kernels import bounds_of, removed_share
+from quell.learners.base import lag_push
 
 OBSERVER = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3)
 

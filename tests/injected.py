@@ -11,11 +11,13 @@ from quell.learners.base import (
     adapt,
     coefficients,
     commit,
+    lag_memory,
+    lag_of,
+    lag_push,
     nothing_to_restart,
     predict,
     restart,
 )
-from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.types import Matrix, Vector
 
 

@@ -11,10 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import quell as ql
-from quell.realtime.telemetry.channels import row_channels
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC
-from quell.realtime.telemetry.sinks import file_sink
+from quell.realtime.recordings import MARK, SCHEMA, TOPIC, Header, file_sink, row_channels
 from quell.setup import EXAMPLES
 
 HEADER = Header(

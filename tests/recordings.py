@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 
 import quell as ql
-from quell.realtime.telemetry.channels import LOOP_CHANNELS, row_channels
-from quell.realtime.telemetry.header import Header
+from quell.realtime.recordings import LOOP_CHANNELS, Header, row_channels
 from quell.types import Matrix
 
 DT = 0.01

@@ -18,14 +18,11 @@ import pytest
 
 import quell as ql
 from quell.kernels.dispatch import as_python
-from quell.realtime.devices.base import ask
-from quell.realtime.devices.registry import listen
-from quell.realtime.rig.kernel import APPLIED
-from quell.realtime.rig.server import Rig
-from quell.realtime.wire.frames import LENGTH, RECEIVED, SENT
-from quell.realtime.wire.serial_line import SerialDevice
-from quell.realtime.wire.transport import wait_for_frame
-from quell.realtime.wire.udp import UdpDevice
+from quell.realtime.devices import ask
+from quell.realtime.registry import listen
+from quell.realtime.rig import APPLIED, Rig
+from quell.realtime.transports import SerialDevice, UdpDevice
+from quell.realtime.wire import LENGTH, RECEIVED, SENT, wait_for_frame
 
 DT = 0.01
 PLANT = ql.plants.two_mass_spring()

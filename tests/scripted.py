@@ -10,13 +10,12 @@ import numpy as np
 import quell as ql
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
-from quell.realtime.devices.base import read_measurement, write_command
-from quell.realtime.loop.control_loop import ControlLoop
-from quell.realtime.loop.reference import as_scenario, reference_samples
-from quell.realtime.loop.safety import Safety
-from quell.realtime.system.clock import pass_time, virtual_clock
-from quell.realtime.telemetry.channels import row_channels
-from quell.realtime.telemetry.ring import drain, ring
+from quell.realtime.cycle import ControlLoop
+from quell.realtime.devices import read_measurement, write_command
+from quell.realtime.recordings import row_channels
+from quell.realtime.supervisor import Safety, as_scenario, reference_samples
+from quell.realtime.system import pass_time, virtual_clock
+from quell.realtime.telemetry import drain, ring
 
 DT = 0.01
 
@@ -133,9 +132,9 @@ class Outcome(NamedTuple):
 
     def __getitem__(self, name: Any) -> Any:
         """Return a column of the rows."""
-        from quell.realtime.telemetry import channels
+        from quell.realtime import recordings
 
-        return self.rows[:, getattr(channels, name)]
+        return self.rows[:, getattr(recordings, name)]
 
 
 def run(

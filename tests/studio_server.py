@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.studio.frames import parsed
+from quell.studio.messages import parsed_frame
 from quell.types import Vector
 
 TABLES = {
@@ -83,7 +83,7 @@ class Client:
         """Return the next frame."""
         data = self.socket.recv(timeout=120.0)
         assert isinstance(data, bytes)
-        return parsed(data)
+        return parsed_frame(data)
 
     def send(self, **message: Any) -> int:
         """Send a message with the next id, and return the id."""

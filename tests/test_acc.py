@@ -15,22 +15,13 @@ from scipy.integrate import solve_ivp
 
 import quell as ql
 from quell.analysis import analyse, linear_law
-from quell.analysis.subsystems import closed_loop_matrix
+from quell.analysis.loop import closed_loop_matrix
 from quell.cli.app import app
-from quell.cli.commands.acc import _print_cases
+from quell.cli.reproduce import _print_cases
 from quell.experiments import acc
-from quell.experiments.acc import (
-    DT,
-    CaseResult,
-    box,
-    designs,
-    interval,
-    judge,
-    study,
-    unstable,
-)
-from quell.experiments.acc.controllers import MB, MF, freed
-from quell.experiments.acc.samples import BOX, boxed, generated
+from quell.experiments.acc import DT, CaseResult, designs, interval, judge, study, unstable
+from quell.experiments.acc import study as box
+from quell.experiments.acc.loops import BOX, MB, MF, boxed, freed, generated
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
 
@@ -286,7 +277,7 @@ def test_a_sweep_of_the_cubic_part_may_go_through_zero() -> None:
 
 def test_samples_are_read_or_drawn(tmp_path: Path) -> None:
     """Not both."""
-    from quell.cli.commands.acc import acc
+    from quell.cli.reproduce import acc
 
     (tmp_path / "a.csv").write_text(HEADER + "1,1,1,0,1,0.01\n")
     with pytest.raises(

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.learners.adapters.instances import INSTANCES, finite_number
+from quell.learners.python_model import INSTANCES, finite_number
 from quell.types import Status
 
 from .contracts.python_models import (

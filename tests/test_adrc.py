@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.adrc.law import law_gains
+from quell.controllers.law import law_gains
 from quell.observers.eso import ESO
 from quell.plants.base import advance, measure
 

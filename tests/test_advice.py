@@ -13,7 +13,7 @@ import pytest
 import quell as ql
 from quell import analysis
 from quell.controllers import warn_if_unwise
-from quell.controllers.design_checks import sampling_findings
+from quell.controllers.adrc import sampling_findings
 
 
 def adrc(

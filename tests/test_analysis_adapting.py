@@ -9,7 +9,7 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis import adapting_learner
+from quell.analysis import linearise
 from quell.learners import BatchGradient, Harmonic, Kalman, Repetitive
 
 from .analysed_loops import PLANT, adrc, chain
@@ -133,10 +133,10 @@ def test_slow_oscillators_take_longer_steps_to_the_same_gains(
     """The equation is one of densities; steps a tenth as many as the samples change the gains by less than 2 %."""
     learner = controller(Harmonic(omegas=(0.5,)))
     fine = analysis.adapting(learner).rates
-    monkeypatch.setattr(adapting_learner, "_MOST_STEPS", 400)
-    adapting_learner._averaged_gains.cache_clear()
+    monkeypatch.setattr(linearise, "_MOST_STEPS", 400)
+    linearise._averaged_gains.cache_clear()
     coarse = analysis.adapting(learner).rates
-    adapting_learner._averaged_gains.cache_clear()
+    linearise._averaged_gains.cache_clear()
     assert coarse.level == pytest.approx(fine.level, rel=0.02)
     assert not np.array_equal(coarse.drive, fine.drive)
     np.testing.assert_allclose(coarse.drive, fine.drive, atol=0.03 * np.max(np.abs(fine.drive)))

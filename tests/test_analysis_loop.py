@@ -13,8 +13,8 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis.subsystems import subsystem
-from quell.plants.sampled import sampled_plant
+from quell.analysis.loop import subsystem
+from quell.plants.linear import sampled_plant
 from tests.analysed_loops import PLANT, TRAINING, adrc, chain
 
 

@@ -13,7 +13,7 @@ import pytest
 import quell as ql
 from quell import analysis
 from quell.analysis.margins import _sign_changes, least, margins
-from quell.controllers.linear.law import LinearLaw
+from quell.controllers.linear import LinearLaw
 from tests.analysed_loops import PLANT, adrc, chain
 
 

@@ -13,13 +13,12 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.export.plant_source import plant_source
+from quell.export.c_files import plant_source
 from quell.plants import NonlinearPlant, labelled, signals_of
-from quell.plants.nonlinear.kernels import CompiledParametric
+from quell.plants.nonlinear import CompiledParametric
 from quell.realtime import open_device
 from quell.setup import SetupError, made, plant_given, plant_of, varied
-from quell.setup.sweep import sweep_of
-from quell.setup.tuning_task import tuning_task
+from quell.setup.loading import sweep_of, tuning_task
 from tests.commands import Shown
 
 DT = 0.01
@@ -150,7 +149,7 @@ def test_an_identified_model_has_its_delay_and_friction(files: Path) -> None:
 
 def analysis_part(plant: Any) -> tuple[Any, float]:
     """Return the linear plant and its delay."""
-    from quell.plants.linear_part import linear_part
+    from quell.plants.linearise import linear_part
 
     return linear_part(plant, DT)
 
@@ -259,7 +258,7 @@ def test_parameters_reach_equation_and_output_alike_in_python_c_and_machine_code
     for each, model in zip((plant, other), code, strict=True):
         x, w, dx = np.array([0.3, -0.2]), np.array([0.1]), np.zeros(2)
         from quell.plants.base import measure
-        from quell.plants.nonlinear.kernels import derivatives
+        from quell.plants.nonlinear import derivatives
 
         derivatives(model, 0.0, x, 0.5, w, dx)
         numbers = dict(each.parameters or {})

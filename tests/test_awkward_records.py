@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from quell.cli.app import app
-from quell.commissioning.records import is_record, measured, measured_records
+from quell.commissioning import is_record, measured, measured_records
 from quell.identification import Measured, read_record
 from quell.setup import SetupError
 from quell.setup import load as load_setup

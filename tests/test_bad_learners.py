@@ -13,9 +13,9 @@ import pytest
 import quell as ql
 from quell.features.base import Features, unit, write
 from quell.guard import Reason
-from quell.kernels.scalars import Scalars
+from quell.kernels.sized import Scalars
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.online.model import infer, learn
+from quell.learners.online import infer, learn
 from quell.types import Status
 
 from .contracts.python_models import CHAIN, OBSERVER, Broken, law

@@ -21,8 +21,8 @@ from quell.controllers.baselines import (
     Shaper,
     equivalent_pid,
 )
-from quell.controllers.baselines.observer_law import stationary_gain
-from quell.lti.discretize import gramian
+from quell.controllers.baselines.state_feedback import stationary_gain
+from quell.lti.models import gramian
 from quell.observers import continuous_gain
 
 TWO_MASS = ql.plants.two_mass_spring()

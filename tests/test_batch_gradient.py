@@ -7,7 +7,7 @@ import pytest
 
 import quell as ql
 from quell.learners.base import adapt, coefficients, predict, restart
-from quell.learners.gradient.buffers import outputs
+from quell.learners.batch_gradient import outputs
 from quell.observers.eso import ESO
 
 

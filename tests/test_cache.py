@@ -204,7 +204,7 @@ def test_a_long_compilation_is_announced_with_what_and_how_long(
 
     from numba import typeof
 
-    from quell.kernels import compile_time as module
+    from quell.kernels import cache as module
 
     class RlsModel(NamedTuple):
         rate: float

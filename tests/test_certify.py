@@ -11,11 +11,10 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse, certify, observer_error
-from quell.experiments.stress.spender import Spender, draw_push
-from quell.guard.correction import is_invertible
-from quell.lti.norms import peak_gain
-from quell.lti.system import System
-from quell.observers.base import observe
+from quell.experiments.stress.adversaries import Spender, draw_push
+from quell.guard.guard import is_invertible
+from quell.lti.models import System, peak_gain
+from quell.observers.forms import observe
 from tests.injected import Injected
 
 DT = 0.02

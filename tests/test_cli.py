@@ -14,9 +14,9 @@ import matplotlib.pyplot as plt
 import pytest
 
 from quell import experiments
-from quell.experiments.common.figures import save_figure
+from quell.experiments.common import save_figure
 from quell.identification import Identified
-from quell.kernels.compile_time import compile_time
+from quell.kernels.cache import compile_time
 
 from .commands import Shown, run_python
 

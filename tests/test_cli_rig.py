@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.cli.commands.rig import rig as run_rig
-from quell.realtime.devices.registry import listen, open_device
-from quell.realtime.wire import device as wire_device
+from quell.cli.rig import rig as run_rig
+from quell.realtime import wire as wire_device
+from quell.realtime.registry import listen, open_device
 
 from .commands import Shown
 from .rig_bench import connect

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.cli.commands.run_rig import exit_code
 from quell.cli.exit_codes import ExitCode
 from quell.cli.report import windowed_metrics
+from quell.cli.rig import exit_code
 from quell.realtime import CsvSink
 from quell.realtime import load as load_recording
-from quell.realtime.loop.modes import Cause, Mode
-from quell.realtime.loop.result import ModeChange, RigRun
-from quell.realtime.telemetry.channels import Event
-from quell.records.measures import MEASURES, STEP_MEASURES
+from quell.realtime.recordings import Event
+from quell.realtime.run import ModeChange, RigRun
+from quell.realtime.supervisor import Cause, Mode
+from quell.records.metrics import MEASURES, STEP_MEASURES
 from quell.setup import EXAMPLES, load
 
 from .commands import Shown
@@ -422,7 +422,7 @@ def test_a_run_that_is_ended_while_it_is_compiled_gives_the_device_free(
         "quell.realtime.run_rig",
         lambda *arguments, **options: os.kill(os.getpid(), number),
     )
-    monkeypatch.setattr("quell.cli.interrupt.os._exit", sys.exit)  # which would end this process
+    monkeypatch.setattr("quell.cli.exit_codes.os._exit", sys.exit)  # which would end this process
     before = signal.getsignal(number)
     (tmp_path / "rig.toml").write_text(RIG)
     shown = quell("run-rig", "rig.toml", "--no-figures")

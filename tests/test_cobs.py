@@ -7,21 +7,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quell.realtime.wire import cobs, frames
-from quell.realtime.wire.serial_line import FRAME_BITS
+from quell.realtime import transports, wire
+from quell.realtime.transports import FRAME_BITS
 
 
 def encoded(data):
     """What ``cobs`` makes of bytes."""
     out = np.zeros(len(data) + len(data) // 254 + 2, dtype=np.uint8)
-    return out[: cobs.encode(np.frombuffer(data, dtype=np.uint8), len(data), out)].tobytes()
+    return out[: transports.encode(np.frombuffer(data, dtype=np.uint8), len(data), out)].tobytes()
 
 
 def decoded(packet):
     """What it makes of a packet without its zero; None where that is none."""
     out = np.zeros(len(packet) + 1, dtype=np.uint8)
-    size = cobs.decode(np.frombuffer(packet, dtype=np.uint8), len(packet), out)
-    return None if size == cobs.INVALID else out[:size].tobytes()
+    size = transports.decode(np.frombuffer(packet, dtype=np.uint8), len(packet), out)
+    return None if size == transports.INVALID else out[:size].tobytes()
 
 
 def plainly_decoded(packet):
@@ -87,4 +87,4 @@ def test_any_bytes_decode_to_no_more_than_there_are_or_are_refused(packet):
 def test_a_frame_takes_42_bytes_whatever_is_in_it():
     """The figure by which rates are checked."""
     for fill in (0, 1, 255):
-        assert len(encoded(bytes([fill]) * frames.LENGTH)) * 10 == FRAME_BITS
+        assert len(encoded(bytes([fill]) * wire.LENGTH)) * 10 == FRAME_BITS

@@ -14,18 +14,17 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.cli.commands.tune_sources import Asked, identified
 from quell.cli.options import ModelOptions, ReadOptions
+from quell.cli.tune import Asked, identified
 from quell.commissioning import Experiment, Limits, experiment, verify
 from quell.identification import Measured, decided, excitation, identify
 from quell.kernels import dispatch
 from quell.plants import LinearPlant
-from quell.realtime import TwinDevice, open_device
-from quell.realtime.devices.registry import listen
-from quell.realtime.loop import run
-from quell.realtime.rig.server import Rig
-from quell.realtime.system.clock import virtual_clock
-from quell.tuning.identified import identified_plants
+from quell.realtime import TwinDevice, open_device, run
+from quell.realtime.registry import listen
+from quell.realtime.rig import Rig
+from quell.realtime.system import virtual_clock
+from quell.tuning.plants import identified_plants
 
 from .commands import Shown
 from .test_identification import answer

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import quell as ql
 from quell.plants.base import advance, measure
-from quell.plants.machines.dc_motor import cogging_torque
+from quell.plants.testbeds import cogging_torque
 
 RECORD = Path(__file__).resolve().parents[2] / "shared" / "data" / "cogging_a.csv"
 K, R, J, C = 0.05, 0.5, 2e-4, 1e-4

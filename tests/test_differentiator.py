@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from quell.controllers import Prefiltered
 from quell.controllers.baselines import PID
-from quell.controllers.prefilters.differentiator import (
+from quell.controllers.prefilters import (
     TrackingDesign,
     TrackingDifferentiator,
     TrackingMemory,
     fhan,
+    prefilter,
 )
-from quell.controllers.prefilters.prefilter import prefilter
 from quell.kernels.dispatch import compiled, interpreted
 from quell.types import Matrix, Vector
 

@@ -13,9 +13,9 @@ from numba.core import event
 from numba.core.errors import NumbaError
 
 from quell.controllers.base import control
-from quell.controllers.compiled_step import PackedController, entry_point, step_packed
+from quell.controllers.stateful import PackedController, entry_point, step_packed
 from quell.kernels import dispatch
-from quell.kernels.compile_time import compile_time
+from quell.kernels.cache import compile_time
 
 from .commands import run_python
 

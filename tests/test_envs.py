@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.envs.stacked import Stacked, member
+from quell.envs.loops import Stacked, member
 from quell.plants import batch, two_mass_spring
 from quell.plants.base import advance, measure
 
@@ -21,7 +21,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="gymnasium (extra envs) is n
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from quell.envs import Env, Policy, VectorEnv  # noqa: E402
-from quell.envs.registration import NAMES  # noqa: E402
+from quell.envs.env import NAMES  # noqa: E402
 
 from .commands import run_python  # noqa: E402
 

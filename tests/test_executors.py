@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from quell.executors import completed, executor_on
+from quell.parallel import completed, executor_on
 
 
 def test_tasks_give_their_results_on_threads_and_on_a_given_executor() -> None:
@@ -81,7 +81,7 @@ def test_worker_processes_end_with_a_parent_that_is_killed() -> None:
     """A parent that is killed can't tell them to end."""
     code = (
         "import os, time\n"
-        "from quell.executors import executor_on\n"
+        "from quell.parallel import executor_on\n"
         "if __name__ == '__main__':\n"
         "    with executor_on('processes', workers=1) as one:\n"
         "        print(one.submit(os.getpid).result(), flush=True)\n"

@@ -15,11 +15,9 @@ import pytest
 
 import quell as ql
 from quell.controllers.base import control, status_flags
-from quell.export import operations
-from quell.export.library.comparison import Comparison
-from quell.export.library.templates import filled
-from quell.export.library.toolchain import stack_of
-from quell.export.library.vectors import golden_vectors
+from quell.export import c_files
+from quell.export.library.exported import Comparison, stack_of
+from quell.export.library.vectors import filled, golden_vectors
 from quell.features import Periodic, State
 from quell.kernels import dispatch
 from quell.kernels.dispatch import as_python
@@ -149,15 +147,15 @@ def test_no_function_of_the_export_takes_a_u_that_is_no_number(
     with as_python():
         for _ in range(3):
             last = control(design, state, 1.0, 0.0)
-        operations.set_applied(design, state, value)
+        c_files.set_applied(design, state, value)
         assert status_flags(design, state) & Status.CONTROL_HELD
         if controller is not PID:
-            operations.track(design, state, 1.0, 0.0, value)
+            c_files.track(design, state, 1.0, 0.0, value)
             assert status_flags(design, state) & Status.CONTROL_HELD
-            operations.start_from(design, state, 50, value, 0.0, 1.0)
-            operations.start_from(design, state, 50, 0.0, value, 1.0)
+            c_files.start_from(design, state, 50, value, 0.0, 1.0)
+            c_files.start_from(design, state, 50, 0.0, value, 1.0)
             assert status_flags(design, state) & Status.CONTROL_HELD
-            operations.start_from(design, state, 50, 0.0, 0.0, value)
+            c_files.start_from(design, state, 50, 0.0, 0.0, value)
             assert status_flags(design, state) & Status.REFERENCE_HELD
         later = [control(design, state, 1.0, 0.0) for _ in range(20)]
     assert math.isfinite(last)

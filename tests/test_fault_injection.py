@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from quell.realtime.rig.fault_injection import KINDS, Fault, FaultInjector, Relay, random_faults
-from quell.realtime.wire import device as wire_device
-from quell.realtime.wire import frames
+from quell.realtime import wire
+from quell.realtime import wire as wire_device
+from quell.realtime.rig import KINDS, Fault, FaultInjector, Relay, random_faults
 
 from .rig_bench import DT, Bench, packed
 
@@ -28,10 +28,8 @@ from .rig_bench import DT, Bench, packed
 def test_a_fault_does_what_its_name_says(fault: Fault, expected: list[int]) -> None:
     """Frames one to six go in; hello passes, and is not counted."""
     spoiler = FaultInjector([fault], "rig")
-    assert spoiler.frames(packed(frames.HELLO, 0, 0, DT)) == [packed(frames.HELLO, 0, 0, DT)]
-    out = [
-        frame for k in range(1, 7) for frame in spoiler.frames(packed(frames.COMMAND, k, k, 0.0))
-    ]
+    assert spoiler.frames(packed(wire.HELLO, 0, 0, DT)) == [packed(wire.HELLO, 0, 0, DT)]
+    out = [frame for k in range(1, 7) for frame in spoiler.frames(packed(wire.COMMAND, k, k, 0.0))]
     assert [struct.unpack_from("<I", frame, 8)[0] for frame in out] == expected
 
 
@@ -49,14 +47,14 @@ def test_a_fault_does_what_its_name_says(fault: Fault, expected: list[int]) -> N
 def test_spoiled_frames_break_the_rule_they_are_meant_to(kind: str, rule: str) -> None:
     """Each time."""
     spoiler = FaultInjector([Fault(kind, "rig", 0, 50)], "rig")
-    own = frames.endpoint(frames.COMMAND, 0x5EED0001, 20)
+    own = wire.endpoint(wire.COMMAND, 0x5EED0001, 20)
     for k in range(1, 51):
-        (data,) = spoiler.frames(packed(frames.COMMAND, k, 0, 1.0))
-        frame = frames.buffer()
+        (data,) = spoiler.frames(packed(wire.COMMAND, k, 0, 1.0))
+        frame = wire.buffer()
         frame.bytes[: len(data)] = np.frombuffer(data[:48], dtype=np.uint8)[: frame.bytes.size]
-        if frames.is_well_formed(frame, min(len(data), 48), own.counters):
-            frames.accept(frame, own)
-    assert frames.counts_by_name(own.counters)[rule] == 50
+        if wire.is_well_formed(frame, min(len(data), 48), own.counters):
+            wire.accept(frame, own)
+    assert wire.counts_by_name(own.counters)[rule] == 50
 
 
 def test_random_plans_have_all_kinds_and_are_the_same_again() -> None:

@@ -24,8 +24,7 @@ from quell.features import (
     State,
 )
 from quell.features.base import unit, write, write_physical
-from quell.learners.base import adapt, coefficients, commit, predict
-from quell.learners.lag import lag_push
+from quell.learners.base import adapt, coefficients, commit, lag_push, predict
 
 STATE, U = np.array([0.3, -0.7, 0.5]), 0.2
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.adrc.feedforward import inverse_series, shifted
+from quell.controllers.feedforward import inverse_series, shifted
 from quell.setup import load
 
 from .benchmark_module import benchmark

@@ -15,12 +15,13 @@ import pytest
 import quell as ql
 from quell.files import (
     check_writable,
+    csv_rows,
     new_folder,
     nonfinite_to_none,
+    whole_text,
     write_json,
     written_atomically,
 )
-from quell.reading import csv_rows, whole_text
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ import pytest
 
 import quell as ql
 from quell import setup
-from quell.plants.fmu.instances import INSTANCES
-from quell.reading import TooLargeError
-from quell.realtime.devices.twin import TwinDevice
+from quell.files import TooLargeError
+from quell.plants.fmu import INSTANCES
+from quell.realtime.devices import TwinDevice
 
 from . import fmus
 from .in_c import needs_gcc

@@ -16,9 +16,9 @@ import pytest
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.export import TranslationError, fmu
-from quell.export.fmi import binary
-from quell.export.fmi.bandwidths import bandwidths, gain_coefficients
-from quell.simulation.sampled_scenario import SampledScenario
+from quell.export.fmi import fmu as binary
+from quell.export.fmi.parts import bandwidths, gain_coefficients
+from quell.simulation.driver import SampledScenario
 
 from .fmus import Driven
 from .in_c import STRICT, needs_gcc

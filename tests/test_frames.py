@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quell.kernels.dispatch import compiled, interpreted
-from quell.realtime.wire import frames
-from quell.realtime.wire.frames import (
+from quell.realtime import wire
+from quell.realtime.wire import (
     COMMAND,
     GOODBYE,
     MEASUREMENT,
@@ -34,7 +34,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "wire.md"
 
 @compiled
 def _accept(frame: Any, size: int, own: Any) -> bool:
-    return frames.is_well_formed(frame, size, own.counters) and frames.accept(frame, own)
+    return wire.is_well_formed(frame, size, own.counters) and wire.accept(frame, own)
 
 
 @compiled
@@ -56,7 +56,7 @@ def offered(own: Any, data: bytes, entry: Any = None) -> bool:
 
 def refused_as(own: Any) -> str:
     """Return by which rule the only frame that was offered has been refused."""
-    (rule,) = [name for name in frames.REFUSALS if counts_by_name(own.counters)[name]]
+    (rule,) = [name for name in wire.REFUSALS if counts_by_name(own.counters)[name]]
     return rule
 
 
@@ -71,7 +71,7 @@ def test_the_checksum_is_that_of_zlib(data: bytes) -> None:
 def test_a_frame_is_what_the_table_says(entry: Any) -> None:
     """Byte by byte the one that ``struct`` and ``zlib`` make."""
     own, out = endpoint(COMMAND, SESSION, 20), buffer()
-    own.numbers[frames.SENT], own.numbers[frames.RECEIVED] = 2**32 + 6, 41
+    own.numbers[wire.SENT], own.numbers[wire.RECEIVED] = 2**32 + 6, 41
     entry(out, own, MEASUREMENT, TIME, -1.5, 1)
     assert out.bytes[:40].tobytes() == packed(MEASUREMENT, 7, 41, -1.5, state=1)
 
@@ -85,7 +85,7 @@ def test_the_frame_on_the_page_is_one() -> None:
     data = bytes.fromhex(block)
     assert data == packed(COMMAND, 7, 41, 2.5)
     own = endpoint(COMMAND, SESSION, 20)
-    own.numbers[frames.SENT] = 41
+    own.numbers[wire.SENT] = 41
     assert offered(own, data)
 
 
@@ -108,12 +108,12 @@ def test_news_is_accepted_once_and_in_order(entry: Any) -> None:
 def test_numbers_go_on_behind_the_largest() -> None:
     """From 2^32 − 1 to 0, as RFC 1982 has it."""
     own = endpoint(COMMAND, SESSION, 20)
-    own.numbers[frames.SENT] = 2**32 + 3
-    own.numbers[frames.RECEIVED] = 2**32 - 2
+    own.numbers[wire.SENT] = 2**32 + 3
+    own.numbers[wire.RECEIVED] = 2**32 - 2
     for number in (2**32 - 1, 2**32, 2**32 + 1):
         assert offered(own, packed(COMMAND, number, number, 0.0))
     assert not offered(own, packed(COMMAND, 2**32 - 1, 2**32, 0.0))
-    assert own.numbers[frames.RECEIVED] == 2**32 + 1
+    assert own.numbers[wire.RECEIVED] == 2**32 + 1
     assert counts_by_name(own.counters)["reordered"] == 1
 
 
@@ -141,7 +141,7 @@ def test_numbers_go_on_behind_the_largest() -> None:
 def test_what_breaks_a_rule_is_counted_by_it(data: bytes, rule: str) -> None:
     """And changes nothing else. Of a hundred frames sent the last twenty may be answered."""
     own = endpoint(COMMAND, SESSION, 20)
-    own.numbers[frames.SENT] = 100
+    own.numbers[wire.SENT] = 100
     before = own.numbers.copy()
     assert not offered(own, data)
     assert refused_as(own) == rule
@@ -192,7 +192,7 @@ def test_what_is_accepted_obeys_all_rules(
 ) -> None:
     """Well-formed frames of any content, against the rules written down a second time."""
     own = endpoint(COMMAND, SESSION, 20)
-    own.numbers[frames.SENT], own.numbers[frames.RECEIVED] = 1000, 2**31
+    own.numbers[wire.SENT], own.numbers[wire.RECEIVED] = 1000, 2**31
     taken = offered(
         own, packed(kind, number, answers, value, session=session, version=version), _accept
     )
@@ -203,7 +203,7 @@ def test_what_is_accepted_obeys_all_rules(
         and number > 2**31
         and 980 <= answers <= 1000
     )
-    assert sum(counts_by_name(own.counters)[name] for name in ("accepted", *frames.REFUSALS)) == 1
+    assert sum(counts_by_name(own.counters)[name] for name in ("accepted", *wire.REFUSALS)) == 1
 
 
 def test_a_session_begins_with_nothing_heard() -> None:
@@ -211,6 +211,6 @@ def test_a_session_begins_with_nothing_heard() -> None:
     own = endpoint(COMMAND, SESSION, 20)
     assert offered(own, packed(COMMAND, 9, 0, 0.0))
     assert not offered(own, packed(GOODBYE, 0, 0, 0.0))
-    frames.start_session(own, 5)
+    wire.start_session(own, 5)
     assert own.numbers.tolist() == [5, 0, 0, 0, 0]
     assert counts_by_name(own.counters)["accepted"] == 1

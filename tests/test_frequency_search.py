@@ -6,25 +6,25 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.learners.kalman import search as room
-from quell.learners.kalman.oscillators import Oscillators
-from quell.learners.kalman.search import advance_search, is_locked, start_search_again
-from quell.learners.kalman.search_state import (
+from quell.learners import frequency_search as room
+from quell.learners.base import lag_memory, lag_push
+from quell.learners.frequency_search import (
+    ADOPT,
     ENTRIES,
     FIT,
+    LEARN_ANEW,
+    NOTHING,
     REFINE,
     SCAN,
     FrequencySearch,
     SearchMemory,
-)
-from quell.learners.kalman.search_verdict import (
-    ADOPT,
-    LEARN_ANEW,
-    NOTHING,
     _is_resolved,
+    advance_search,
+    is_locked,
     judge,
+    start_search_again,
 )
-from quell.learners.lag import lag_memory, lag_push
+from quell.learners.oscillators import Oscillators
 from quell.types import Vector
 
 DT, STEP = 0.01, 0.1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quell.kernels import dispatch
-from quell.kernels.function_pointers import call, evaluate
+from quell.kernels.user_functions import call, evaluate
 
 pytestmark = pytest.mark.compiled
 

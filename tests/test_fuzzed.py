@@ -22,7 +22,7 @@ from quell.setup import EXAMPLES, SetupError
 from quell.setup.description import describe, parsed
 from quell.studio import messages
 from quell.studio.records import MOST_FILE, PageRecord
-from quell.tuning.result.setup_file import toml_text
+from quell.tuning.report import toml_text
 
 from .studio_server import TABLES
 

@@ -16,10 +16,9 @@ from quell.controllers import in_single_precision
 from quell.experiments.compare import sensitivities
 from quell.export import c_source
 from quell.observers import continuous_gain
-from quell.observers.response import f_learned_response, response
-from quell.studio.forms import forms
-from quell.studio.messages import Granted
-from quell.tuning.result.setup_file import toml_text
+from quell.observers.design import f_learned_response, response
+from quell.studio.messages import Granted, forms
+from quell.tuning.report import toml_text
 
 from .in_c import InC, needs_gcc
 from .setups import TWO_MASS

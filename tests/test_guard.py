@@ -11,9 +11,8 @@ from scipy.linalg import expm
 
 import quell as ql
 from quell.guard import assess, confine, limit, record_output, start_again
-from quell.guard.credit import respond
-from quell.guard.state import CORRECTED
-from quell.learners.lag import lag_of, lag_push
+from quell.guard.kernels import CORRECTED, respond
+from quell.learners.base import lag_of, lag_push
 from tests.guarded_samples import OBSERVER, bounds, trusted
 
 

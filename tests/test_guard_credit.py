@@ -9,10 +9,8 @@ import pytest
 
 import quell as ql
 from quell.guard import assess, limit, record_output
-from quell.guard.bound import update_bound
-from quell.guard.credit import removed_share
-from quell.guard.state import CORRECTED
-from quell.learners.lag import lag_push
+from quell.guard.kernels import CORRECTED, removed_share, update_bound
+from quell.learners.base import lag_push
 from tests.guarded_samples import OBSERVER, feed, settle, trusted
 
 

@@ -23,10 +23,9 @@ from quell.experiments.stress.adversaries import (
     Adversary,
     Turncoat,
 )
-from quell.experiments.stress.random_loops import Loop
-from quell.guard.bound import bounds_of
-from quell.guard.credit import removed_share
-from quell.learners.lag import lag_of, lag_push
+from quell.experiments.stress.study import Loop
+from quell.guard.kernels import bounds_of, removed_share
+from quell.learners.base import lag_of, lag_push
 from quell.types import Status
 
 LOOP = Loop(m1=0.8, m2=1.3, k=1.4, gain_error=1.2, dt=5e-3, omega=0.5, amplitude=1.0, seed=4)

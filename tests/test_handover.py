@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.adrc.handover import samples_to_settle
-from quell.controllers.adrc.law import unlimited_control
+from quell.controllers.adrc import samples_to_settle
 from quell.controllers.base import control
-from quell.observers.base import expected_measurement
+from quell.controllers.law import unlimited_control
 from quell.observers.eso import ESO
+from quell.observers.forms import expected_measurement
 from quell.plants.base import advance, measure
 
 from .python_step import interpreted
@@ -340,7 +340,7 @@ def test_derivatives_are_fed_forward_in_manual_operation_too() -> None:
 @pytest.mark.compiled
 def test_retuning_does_not_compile_again() -> None:
     """The types stay, so the step stays."""
-    from quell.controllers.compiled_step import step_packed
+    from quell.controllers.stateful import step_packed
 
     controller = ql.ADRC(OBSERVER, omega_c=2.0)
     controller.step(1.0, 0.0)

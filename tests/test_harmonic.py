@@ -9,15 +9,17 @@ import pytest
 
 import quell as ql
 from quell.controllers.stateful import named_arrays
-from quell.learners.kalman.line_fit import (
+from quell.learners.oscillators import (
+    Oscillators,
     add_row,
     begin_pass,
     line_fit,
     next_row,
+    retune,
     solve,
+    turn_phases,
     write_deviations,
 )
-from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
 
 pytestmark = pytest.mark.compiled
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quell.realtime.system.histogram import BINS, Histogram, count_duration, empty_counts
+from quell.realtime.system import BINS, Histogram, count_duration, empty_counts
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=300))

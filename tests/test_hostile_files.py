@@ -21,13 +21,10 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.experiments.acc.samples import read as read_samples
+from quell.experiments.acc.loops import read as read_samples
+from quell.files import MAX_SIZE
 from quell.identification import read_record
-from quell.reading import MAX_SIZE
-from quell.realtime.telemetry.channels import LOOP_CHANNELS, row_channels
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.load import load
-from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC
+from quell.realtime.recordings import LOOP_CHANNELS, MARK, SCHEMA, TOPIC, Header, load, row_channels
 from quell.records import netcdf, netcdf_reader
 from quell.setup import load as load_setup
 from tests.mutations import mutated, write_seeds

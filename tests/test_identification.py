@@ -17,9 +17,8 @@ from scipy import signal
 import quell as ql
 from quell.cli.app import app
 from quell.identification import Identified, excitation, excited, frequency_response, read_record
-from quell.identification.model.roots import poles_of, root_covariance
-from quell.identification.model.structure import Structure, gradient, output
-from quell.identification.search.output_error import refine
+from quell.identification.model import Structure, output, output_gradient, poles_of, root_covariance
+from quell.identification.output_error import refine
 from quell.quantities import Signals
 
 from .commands import Shown
@@ -253,7 +252,7 @@ def test_the_gradient_is_that_of_differences() -> None:
     structure = Structure(3, 1, (1, 0))
     theta = np.array([0.02, 0.3, 0.01, 0.2, 0.05, 0.4, -0.1, 1.0])
     v = np.column_stack([np.sign(np.sin(0.3 * np.arange(400.0))), np.ones(400)])
-    y, psi = gradient(structure, theta, v)
+    y, psi = output_gradient(structure, theta, v)
     np.testing.assert_allclose(y, output(structure, theta, v), atol=1e-12)
     for i in range(theta.size):
         step = np.zeros(theta.size)

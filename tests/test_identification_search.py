@@ -12,12 +12,11 @@ from scipy import signal
 import quell as ql
 from quell.identification import Root, excitation, read_record
 from quell.identification.identify import identify
-from quell.identification.model.structure import Structure, gradient, output
-from quell.identification.search.delay import delayed
-from quell.identification.search.initial_estimate import stable
-from quell.identification.search.output_error import descend, projected
-from quell.identification.search.reduced import reduced_models
-from quell.identification.validation import residuals
+from quell.identification.model import Structure, output, output_gradient
+from quell.identification.output_error import descend, projected
+from quell.identification.result import residuals
+from quell.identification.search import delayed
+from quell.identification.starts import reduced_models, stable
 
 from .benchmark_module import benchmark
 from .test_identification import answer
@@ -138,7 +137,7 @@ def test_the_gradient_with_feedthrough_is_that_of_differences() -> None:
     structure = Structure(2, 0, (1, 0), direct=True)
     theta = np.array([0.02, 0.3, 0.01, 0.2, 0.05, 0.8, 0.4, -0.1])
     v = np.column_stack([np.sign(np.sin(0.3 * np.arange(200.0))), np.ones(200)])
-    y, psi = gradient(structure, theta, v)
+    y, psi = output_gradient(structure, theta, v)
     np.testing.assert_allclose(y, output(structure, theta, v), atol=1e-12)
     for i, step in enumerate(1e-6 * np.eye(theta.size)):
         slope = (output(structure, theta + step, v) - output(structure, theta - step, v)) / 2e-6

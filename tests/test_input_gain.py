@@ -14,9 +14,8 @@ from scipy.linalg import expm
 import quell as ql
 from quell.controllers.baselines import PID
 from quell.identification import InputGain, identify_b0
-from quell.identification.input_gain import MarginError
-from quell.identification.running_loop.bandwidth import Candidate, bandwidth
-from quell.identification.running_loop.model import Form, linear_columns, placed, predicted
+from quell.identification.input_gain import Candidate, MarginError, bandwidth
+from quell.identification.running_loop import Form, linear_columns, placed, predicted
 
 from .benchmark_module import benchmark
 from .commands import Shown

@@ -9,9 +9,17 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.learners.base import adapt, coefficients, commit, forget, predict
-from quell.learners.lag import lag_memory, lag_of, lag_push
-from quell.learners.noise_gate import relative_noise
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    forget,
+    lag_memory,
+    lag_of,
+    lag_push,
+    predict,
+    relative_noise,
+)
 
 OBSERVER = ql.ESO.model_free(order=2, b0=2.0, omega_o=21.0, dt=5e-3)
 DT, TAU = 5e-3, 3 / 21.0

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.learners.lag import group_delay, lag_memory, lag_of, lag_push
-from quell.observers.base import begin, observe
+from quell.learners.base import group_delay, lag_memory, lag_of, lag_push
 from quell.observers.design import FORMS
 from quell.observers.eso import ESO
+from quell.observers.forms import begin, observe
 
 from .contracts.examples import EXTENDED
 

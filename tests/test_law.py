@@ -10,9 +10,16 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.adrc.law import _finish_sample, unlimited_control
-from quell.controllers.base import control, reset_loop, set_reference_derivatives, write_row
-from quell.controllers.limits import Limits, apply_limits, largest_wish
+from quell.controllers.base import (
+    Limits,
+    apply_limits,
+    control,
+    largest_wish,
+    reset_loop,
+    set_reference_derivatives,
+    write_row,
+)
+from quell.controllers.law import _finish_sample, unlimited_control
 from quell.controllers.stateful import named_arrays
 from quell.guard import confine
 from quell.learners.base import commit, restart

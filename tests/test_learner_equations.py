@@ -10,17 +10,24 @@ import pytest
 
 import quell as ql
 from quell.features import RBF, Bias, Input, State
-from quell.features.base import unit, write
-from quell.features.scaling import update_scale
-from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
-from quell.learners.lag import group_delay, lag_memory, lag_of, lag_push
-from quell.learners.noise_gate import (
+from quell.features.base import unit, update_scale, write
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    forget,
+    group_delay,
+    lag_memory,
+    lag_of,
+    lag_push,
     noise_gate,
     noise_gate_memory,
+    predict,
     relative_noise,
+    restart,
     update_gate,
 )
-from quell.learners.online.model import infer, learn
+from quell.learners.online import infer, learn
 
 DT, OMEGA_O, FREQUENCY, B0 = 5e-3, 21.0, 0.8, 1.5
 OBSERVER = ql.ESO.model_free(order=2, b0=B0, omega_o=OMEGA_O, dt=DT)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.limits import Limits, apply_limits, checked_limits
+from quell.controllers.base import Limits, apply_limits, checked_limits
 from quell.types import Status
 
 OK, SATURATED, RATE_LIMITED = 0, int(Status.SATURATED), int(Status.RATE_LIMITED)

@@ -11,7 +11,7 @@ import pytest
 import quell as ql
 from quell.controllers import LinearController, LinearLaw, Prefiltered
 from quell.controllers.baselines import PID
-from quell.controllers.linear.transfer import anti_windup, as_state_space, realised, tustin
+from quell.controllers.linear import anti_windup, as_state_space, realised, tustin
 
 from .contracts.python_models import LeastMeanSquares
 

@@ -13,14 +13,18 @@ import numpy as np
 import pytest
 import websockets
 
-from quell.realtime import LiveSink, McapSink
-from quell.realtime.telemetry import viewers
-from quell.realtime.telemetry.channels import EVENTS, LOOP_WIDTH, K, row_channels
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.load import load
-from quell.realtime.telemetry.ring import push
-from quell.realtime.telemetry.ros_message import log_rows, open_topic
-from quell.realtime.telemetry.writer import TelemetryWriter
+from quell.realtime import LiveSink, McapSink, viewers
+from quell.realtime.recordings import (
+    EVENTS,
+    LOOP_WIDTH,
+    Header,
+    K,
+    load,
+    log_rows,
+    open_topic,
+    row_channels,
+)
+from quell.realtime.telemetry import TelemetryWriter, push
 from quell.types import Matrix
 
 HEADER = Header(row_channels((("status", 1),)), dt=1e-3, device="a lift", started=10**18)

@@ -12,22 +12,13 @@ import quell as ql
 from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compilations
 from quell.kernels.sized import layout_of
-from quell.realtime.devices.base import (
-    PythonHandle,
-    Tick,
-    read_measurement,
-    read_tick,
-    write_command,
-)
-from quell.realtime.loop.control_loop import ControlLoop
-from quell.realtime.loop.cycle import run_cycles
-from quell.realtime.loop.modes import Cause
-from quell.realtime.loop.reference import approach_curve, as_scenario, reference_samples
-from quell.realtime.loop.result import mode_changes
-from quell.realtime.loop.safety import Safety
-from quell.realtime.system.clock import now, pass_time, virtual_clock
-from quell.realtime.telemetry.channels import LOOP_WIDTH, Event, row_channels
-from quell.realtime.telemetry.ring import drain, ring
+from quell.realtime.cycle import ControlLoop, run_cycles
+from quell.realtime.devices import PythonHandle, Tick, read_measurement, read_tick, write_command
+from quell.realtime.recordings import LOOP_WIDTH, Event, row_channels
+from quell.realtime.run import mode_changes
+from quell.realtime.supervisor import Cause, Safety, approach_curve, as_scenario, reference_samples
+from quell.realtime.system import now, pass_time, virtual_clock
+from quell.realtime.telemetry import drain, ring
 
 from .scripted import DT, PLANT, ScriptedDevice, adrc, run
 

@@ -13,13 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.learners.lag import lag_of
+from quell.learners.base import lag_of
 from quell.lti.canonical import canonical
-from quell.observers.base import begin, observe
-from quell.observers.eso import ESO
-from quell.observers.noise import noise_gains
-from quell.observers.placement import place_poles
-from quell.observers.response import scaled_response
+from quell.observers.design import place_poles, scaled_response
+from quell.observers.eso import ESO, noise_gains
+from quell.observers.forms import begin, observe
 
 
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:

@@ -51,7 +51,7 @@ def test_it_obeys_newton(play: tuple[float, float], monkeypatch: pytest.MonkeyPa
 
     Contacts multiply small errors, so it is the limit of short sub-steps that is compared.
     """
-    monkeypatch.setattr("quell.plants.machines.n_mass._TURN", 0.0125)
+    monkeypatch.setattr("quell.plants.flexible._TURN", 0.0125)
     plant = ql.plants.n_mass(J, K, D, GROUND, play)
     u, dt, x0 = 0.5 * np.sign(np.sin(0.3 * np.arange(20))), 1e-3, np.zeros(6)
     found = moved(plant, u, x0, dt, w=(0.05,))

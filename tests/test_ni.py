@@ -13,10 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.realtime.devices.base import handle_of, read_measurement, write_command
-from quell.realtime.devices.ni.device import NiDevice, ni_device
-from quell.realtime.devices.twin import TwinDevice
-from quell.realtime.system.clock import virtual_clock
+from quell.realtime.devices import TwinDevice, handle_of, read_measurement, write_command
+from quell.realtime.ni import NiDevice, ni_device
+from quell.realtime.system import virtual_clock
 
 from . import scripted
 from .daqmx_standin import Card, Rack
@@ -135,7 +134,7 @@ def test_the_output_is_zero_before_and_after(rack):
 def test_the_output_is_zero_when_python_ends():
     """Also where nobody closed the device: here the program ends by an exception."""
     program = (
-        "from quell.realtime.devices.ni.device import NiDevice\n"
+        "from quell.realtime.ni import NiDevice\n"
         "from tests.daqmx_standin import Card, Rack\n"
         "from nidaqmx._lib import lib_importer as library\n"
         "import atexit\n"

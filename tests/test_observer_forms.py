@@ -12,13 +12,17 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 import quell as ql
-from quell.lti.discretize import zero_order_hold
-from quell.observers.base import acting_control, begin, expected_measurement, observe
-from quell.observers.eso import ESO
-from quell.observers.noise import noise_gains
-from quell.observers.nonlinear import fal
-from quell.observers.response import response
-from quell.observers.start import state_for
+from quell.lti.models import zero_order_hold
+from quell.observers.design import response
+from quell.observers.eso import ESO, noise_gains
+from quell.observers.forms import (
+    acting_control,
+    begin,
+    expected_measurement,
+    fal,
+    observe,
+    state_for,
+)
 
 from .python_step import interpreted
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.lti.canonical import canonical
 from quell.observers import continuous_gain
-from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
+from quell.observers.forms import begin, observe
 
 
 def error_polynomial(observer: ESO) -> np.ndarray:

@@ -10,12 +10,10 @@ import pytest
 
 import quell as ql
 from quell.features import Bias, State
-from quell.learners.base import adapt, commit, predict, restart
-from quell.learners.lag import lag_of, lag_push
-from quell.learners.least_squares import RlsRule, least_squares_gain
-from quell.learners.online.gaussian_process import GaussianProcessModel
-from quell.learners.online.model import infer, learn
-from quell.learners.online.network import Network
+from quell.learners.base import adapt, commit, lag_of, lag_push, predict, restart
+from quell.learners.gaussian_process import GaussianProcessModel
+from quell.learners.online import Network, infer, learn
+from quell.learners.rls import RlsRule, least_squares_gain
 from quell.types import Matrix, Vector
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=2e-3)

@@ -13,8 +13,7 @@ import pytest
 
 from quell.cli.app import app
 from quell.setup.description import describe
-from quell.setup.plants import PLANTS, plant_of
-from quell.setup.toml_file import immutable
+from quell.setup.schema import PLANTS, immutable, plant_of
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])

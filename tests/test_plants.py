@@ -15,8 +15,8 @@ from scipy.signal import cont2discrete
 
 import quell as ql
 from quell.plants.base import advance, measure
-from quell.plants.linear_part import linear_part
-from quell.plants.nonlinear.plant import CompiledNonlinear, PythonNonlinear
+from quell.plants.linearise import linear_part
+from quell.plants.nonlinear import CompiledNonlinear, PythonNonlinear
 
 pytestmark = pytest.mark.compiled
 

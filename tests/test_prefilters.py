@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.prefilters.prefilter import prefilter, settle, write_derivatives
+from quell.controllers.prefilters import prefilter, settle, write_derivatives
 
 DT = 0.01
 

@@ -13,16 +13,11 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.controllers import Prefiltered, ProfileGenerator
-from quell.controllers.prefilters.prefilter import (
-    prefilter,
-    settle,
-    stopping_point,
-    write_derivatives,
-)
+from quell.controllers.prefilters import prefilter, settle, stopping_point, write_derivatives
 from quell.export import c_source
 from quell.export.library.vectors import Action, Player
 from quell.kernels.dispatch import as_python
-from quell.signals.profile import PARTS, moved, plan
+from quell.signals.moves import PARTS, moved, plan
 
 from .in_c import InC, needs_gcc
 

@@ -13,9 +13,7 @@ import pytest
 
 import quell as ql
 from quell.export.library.exported import Exported
-from quell.export.proof import prove
-from quell.export.proof.frama_c import read_findings
-from quell.export.proof.structure import structure
+from quell.export.proof import prove, read_findings, structure
 from quell.features import Custom
 
 from .commands import in_this_process

@@ -11,7 +11,7 @@ import pytest
 
 import quell as ql
 from quell.controllers.base import control
-from quell.learners.recovery import (
+from quell.learners.base import (
     LearnerWatch,
     does_harm,
     has_escaped,

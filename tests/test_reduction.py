@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.lti.canonical import canonical
-from quell.lti.reduction import design_models, reduced_model, without_far_zeros
+from quell.lti.canonical import canonical, design_models, reduced_model, without_far_zeros
 from quell.types import DesignWarning
 
 DT, LATE = 2.5e-4, 2.5e-4

@@ -11,16 +11,16 @@ import pytest
 import quell as ql
 from quell.features import RBF, Bias, Friction, Input, Polynomial, State
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.least_squares import RlsRule
-from quell.learners.regression.kernels import keep_within, reset_uncertainty, update_theta
-from quell.learners.regression.nlms import NlmsRule
-from quell.learners.regression.relearning import (
+from quell.learners.regression import NlmsRule, keep_within, reset_uncertainty, update_theta
+from quell.learners.rls import (
     RelearningLoop,
     RelearningMemory,
+    RlsMemory,
+    RlsRule,
+    SelectionRule,
     relearning_rule,
+    selection_memory,
 )
-from quell.learners.regression.rls import RlsMemory
-from quell.learners.regression.selection import SelectionRule, selection_memory
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
 

@@ -9,9 +9,17 @@ import pytest
 
 import quell as ql
 from quell.learners import Repetitive
-from quell.learners.base import adapt, commit, forget, predict, restart
-from quell.learners.lag import lag_memory, lag_of, lag_push
-from quell.learners.repetitive.repetitive import correction_weights
+from quell.learners.base import (
+    adapt,
+    commit,
+    forget,
+    lag_memory,
+    lag_of,
+    lag_push,
+    predict,
+    restart,
+)
+from quell.learners.repetitive import correction_weights
 from quell.types import Vector
 
 DT = 0.01

@@ -11,14 +11,12 @@ import pytest
 
 import quell as ql
 from quell.controllers.baselines import PID, ZV
-from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.controllers.prefilters import Prefiltered
 from quell.plants.base import advance, measure
 from quell.realtime import CsvSink, McapSink
-from quell.realtime.loop.modes import Mode
-from quell.realtime.loop.replay import replay
-from quell.realtime.telemetry.channels import Event, row_channels
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.load import load, trajectory_of
+from quell.realtime.recordings import Event, Header, load, row_channels, trajectory_of
+from quell.realtime.run import replay
+from quell.realtime.supervisor import Mode
 from tests import scripted
 from tests.recordings import DT, OBSERVER, PLANT, controller, header_of, rows_of, simulated
 from tests.scripted import ScriptedDevice

@@ -14,12 +14,10 @@ import pytest
 
 import quell as ql
 from quell.kernels.dispatch import interpreted
-from quell.realtime.devices.base import ask
-from quell.realtime.devices.registry import listen
-from quell.realtime.devices.twin import TwinDevice
-from quell.realtime.rig.kernel import serve
-from quell.realtime.rig.server import Rig
-from quell.realtime.system.clock import virtual_clock
+from quell.realtime.devices import TwinDevice, ask
+from quell.realtime.registry import listen
+from quell.realtime.rig import Rig, serve
+from quell.realtime.system import virtual_clock
 
 from .rig_bench import DT, PLANT, Bench, law, url_of
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from quell.kernels.dispatch import compiled, interpreted
-from quell.realtime.telemetry.ring import drain, dropped, push, ring, waiting
+from quell.realtime.telemetry import drain, dropped, push, ring, waiting
 
 pytestmark = pytest.mark.compiled
 

@@ -18,10 +18,10 @@ import pytest
 
 import quell as ql
 from quell.realtime import Safety, TwinDevice, load, run_rig
-from quell.realtime.loop.modes import Cause, Mode
-from quell.realtime.loop.result import ModeChange
-from quell.realtime.system.scheduling import checked_cpu, enter_real_time, real_time_process
-from quell.realtime.telemetry.sinks import MemorySink
+from quell.realtime.recordings import MemorySink
+from quell.realtime.run import ModeChange
+from quell.realtime.supervisor import Cause, Mode
+from quell.realtime.system import checked_cpu, enter_real_time, real_time_process
 
 from .scripted import DT, PLANT, adrc
 
@@ -260,8 +260,8 @@ def test_a_run_that_ends_without_measurements_says_what_came(
 
 def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """A call that does not return: the device is closed by the main thread."""
-    monkeypatch.setattr("quell.realtime.loop.run._HUNG", 0.2)
-    monkeypatch.setattr("quell.realtime.loop.run._HUNG_SAMPLES", 1.0)
+    monkeypatch.setattr("quell.realtime.run._HUNG", 0.2)
+    monkeypatch.setattr("quell.realtime.run._HUNG_SAMPLES", 1.0)
     release = threading.Event()
 
     class Hanging(Rig):
@@ -370,8 +370,8 @@ def test_real_time_scheduling_that_is_not_permitted_is_noted(
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_setaffinity", refuse)
-    monkeypatch.setattr("quell.realtime.system.scheduling._mlockall", lambda flags: -1)
-    monkeypatch.setattr("quell.realtime.system.scheduling._LATENCY", "/dev/no such file")
+    monkeypatch.setattr("quell.realtime.system._mlockall", lambda flags: -1)
+    monkeypatch.setattr("quell.realtime.system._LATENCY", "/dev/no such file")
     interval = sys.getswitchinterval()
     with real_time_process(50, interpreted=True) as notes:
         assert sys.getswitchinterval() < interval

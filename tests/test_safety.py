@@ -11,11 +11,18 @@ import pytest
 
 import quell as ql
 from quell.realtime import Safety
-from quell.realtime.loop.bounds import plausible_range
-from quell.realtime.loop.direction import ARMED, OFF, SUSPECT, runs_away
-from quell.realtime.loop.modes import Cause, Mode
-from quell.realtime.loop.result import mode_changes
-from quell.realtime.loop.state import Rules, initial_state
+from quell.realtime.run import mode_changes
+from quell.realtime.supervisor import (
+    ARMED,
+    OFF,
+    SUSPECT,
+    Cause,
+    Mode,
+    Rules,
+    initial_state,
+    plausible_range,
+    runs_away,
+)
 from quell.setup import load
 
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run

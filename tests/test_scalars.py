@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compiled, interpreted
-from quell.kernels.scalars import Scalars, clear
+from quell.kernels.sized import Scalars, clear
 
 pytestmark = pytest.mark.compiled
 

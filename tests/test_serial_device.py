@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from quell.realtime.wire.serial_line import SerialDevice
+from quell.realtime.transports import SerialDevice
 
 pytest.importorskip("serial")
 COMPILER = shutil.which("cc")

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.realtime.wire import frames
-from quell.realtime.wire.serial_line import SerialDevice, SerialListener, serial_transport
-from quell.realtime.wire.transport import receive, send
+from quell.realtime import wire as frames
+from quell.realtime.transports import SerialDevice, SerialListener, serial_transport
+from quell.realtime.wire import receive, send
 
 from .test_cobs import encoded
 

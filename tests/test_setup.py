@@ -12,7 +12,7 @@ import pytest
 
 import quell as ql
 from quell.setup import EXAMPLES, SetupError, load, made, varied
-from quell.setup.reference import keys, markdown
+from quell.setup.loading import keys, markdown
 from quell.setup.registry import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 
 from .setups import TWO_MASS
@@ -389,7 +389,7 @@ CONTROL = 'a\x00b\x07\x1b[31m\x7f\r\n\t"\\ \x85 é'
 
 def test_texts_with_control_characters_reach_no_file_and_no_terminal() -> None:
     """Titles, names of signals and units are refused; TOML and scripts are written so that they can be read."""
-    from quell.studio.texts import python_of, toml_of
+    from quell.studio.runs import python_of, toml_of
 
     tables = {
         "dt": 0.01,

@@ -10,23 +10,19 @@ import pytest
 
 import quell as ql
 from quell.controllers import in_single_precision
-from quell.controllers.linear.delta import delta_law
-from quell.controllers.single import SinglePrecision
-from quell.controllers.single import single as single_module
-from quell.controllers.single.parts import single_design
+from quell.controllers import single as single_module
+from quell.controllers.linear import delta_law
+from quell.controllers.single import SinglePrecision, single_design
 from quell.controllers.stateful import named_arrays
 from quell.features import Bias, Custom, State
 from quell.kernels import dispatch, functions
 from quell.kernels.dispatch import is_finite
 from quell.kernels.functions import is_single
-from quell.kernels.single import in_single
-from quell.kernels.sums import add_small, add_symmetrically
-from quell.learners.base import adapt, commit
-from quell.learners.kalman.search import ENTRIES, advance_search
-from quell.learners.least_squares import multiply_lower, reduce_row
-from quell.learners.noise_gate import grown
-from quell.observers.base import begin, expected_measurement, observe
-from quell.observers.delta import delta_form
+from quell.kernels.single import add_small, add_symmetrically, in_single
+from quell.learners.base import adapt, commit, grown
+from quell.learners.frequency_search import ENTRIES, advance_search
+from quell.learners.rls import multiply_lower, reduce_row
+from quell.observers.forms import begin, delta_form, expected_measurement, observe
 
 DT = 0.01
 ORDER_2 = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.1, dt=DT)

@@ -16,9 +16,9 @@ from quell.kernels.dispatch import (
     compiled,
     compiled_loop,
     interpreted,
+    overlap,
     specialised,
 )
-from quell.kernels.overlaps import overlap
 from quell.kernels.sized import Constant, ConstantFlag, Flag, Size, SizedArray, layout_of, type_of
 from quell.simulation.driver import run_block
 
@@ -155,7 +155,7 @@ from numba.core.event import install_recorder
 import quell as ql
 from quell.kernels.dispatch import compilations
 from quell.simulation.driver import run_block
-from quell.simulation.precompile import precompile
+from quell.simulation.simulate import precompile
 
 if __name__ == "__main__":
     plant = ql.plants.LinearPlant.of(([1.0], [1.0, 1.0]))

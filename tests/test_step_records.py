@@ -12,14 +12,13 @@ import pytest
 from scipy import signal
 
 import quell as ql
-from quell.controllers.linear.law import LinearLaw
-from quell.controllers.linear.linear import LinearController
+from quell.controllers.linear import LinearController, LinearLaw
 from quell.files import write_json
 from quell.identification import alternatives, decided, excitation, not_told_apart
-from quell.identification.model.roots import gain_interval
-from quell.identification.search.output_error import noise_model
-from quell.plants.identified_file import identified
-from quell.tuning.identified import identified_plants
+from quell.identification.model import gain_interval
+from quell.identification.output_error import noise_model
+from quell.plants.registry import identified
+from quell.tuning.plants import identified_plants
 from quell.types import Vector
 
 from .benchmark_module import benchmark

@@ -14,9 +14,11 @@ import pytest
 import quell as ql
 from quell.analysis import analyse
 from quell.experiments.stress import axes
-from quell.experiments.stress.axes import arm, loops, near_rest, trial
-from quell.experiments.stress.axes.near_rest import RestOutcome, Settling
-from quell.experiments.stress.axes.trial import AxesResult, AxisErrors, AxisOutcome
+from quell.experiments.stress import axes as arm
+from quell.experiments.stress import axes as loops
+from quell.experiments.stress import axes as near_rest
+from quell.experiments.stress import axes as trial
+from quell.experiments.stress.axes import AxesResult, AxisErrors, AxisOutcome, RestOutcome, Settling
 from quell.plants.base import advance
 from tests.commands import Shown
 
@@ -136,7 +138,7 @@ def test_the_arm_moves_as_two_rods_do() -> None:
         return total
 
     x, scratch, torque = np.array([0.4, 1.1, 0.5, -2.0]), np.zeros(24), np.zeros(1)
-    plant, first = drawn.plant.sampled(arm.DT, True), energy(x)
+    plant, first = drawn.plant.sampled(arm.ARM_DT, True), energy(x)
     start = x.copy()
     for _ in range(500):
         advance(plant, x, scratch, 0.0, 0.0, torque)
@@ -149,7 +151,7 @@ def test_a_step_of_the_paper_settles_as_published() -> None:
     """Without learner after 16.6 s with 4.5 ‰ of overshoot (docs/theory); the learner of the trial settles sooner."""
     plain = near_rest.settle(None, None, range(2))
     assert plain == pytest.approx((16.61, 0.0045), rel=0.02)
-    found = near_rest.run_one(3, 1, None)
+    found = near_rest.run_near_rest(3, 1, None)
     assert found.guarded == found.unguarded
     assert found.unguarded.time < 0.8 * plain.time
     assert (found.longer, found.further) == (1.0, pytest.approx(0.0, abs=1e-3))

@@ -15,17 +15,19 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
-from quell.cli.commands.stress import _figure
-from quell.experiments.stress.general import attacks, measures, named, trial
-from quell.experiments.stress.general.cross_entropy import search
-from quell.experiments.stress.general.loops import GeneralLoop, draw_loop, loads, references
-from quell.experiments.stress.general.loops.plant import GeneralPlant
-from quell.experiments.stress.general.loops.random_plants import FAMILIES
-from quell.experiments.stress.general.measures import Measures
-from quell.experiments.stress.general.named import Case, perfect_case
-from quell.experiments.stress.general.program import INPUTS, Program, Watched
-from quell.experiments.stress.general.result import Bar, GeneralResult
-from quell.experiments.stress.general.trial import GeneralOutcome
+from quell.cli.stress import _figure
+from quell.experiments.stress import general, loops
+from quell.experiments.stress.adversaries import INPUTS, Program, Watched
+from quell.experiments.stress.general import (
+    Bar,
+    Case,
+    GeneralOutcome,
+    GeneralResult,
+    Measures,
+    perfect_case,
+    search,
+)
+from quell.experiments.stress.loops import FAMILIES, GeneralLoop, GeneralPlant, draw_loop
 from quell.kernels.dispatch import call_specialised, compiled, interpreted
 from quell.learners.base import adapt, commit, predict
 from quell.plants import LinearPlant
@@ -106,7 +108,7 @@ def test_a_loop_states_its_modulus_margin(family: str) -> None:
 
 def test_an_unstable_loop_has_no_margin() -> None:
     """A gain of the wrong sign."""
-    from quell.experiments.stress.general.loops.margin import modulus_margin
+    from quell.experiments.stress.loops import modulus_margin
 
     loop = one("stable", 2)
     wrong = LinearPlant(loop.plant.linear.A, -loop.plant.linear.B, loop.plant.linear.C)
@@ -118,8 +120,8 @@ def test_loops_repeat_and_are_of_all_kinds() -> None:
     drawn = [draw_loop(np.random.default_rng(seed)) for seed in range(150)]
     assert {loop.family for loop in drawn} == set(FAMILIES)
     assert {loop.order for loop in drawn} == {1, 2, 3, 4}
-    assert {loop.load for loop in drawn} == set(loads.LOADS)
-    assert {loop.reference for loop in drawn} == set(references.REFERENCES)
+    assert {loop.load for loop in drawn} == set(loops.LOADS)
+    assert {loop.reference for loop in drawn} == set(loops.REFERENCES)
     assert min(loop.margin for loop in drawn) >= 0.2
     for mine, again in zip(
         drawn[3].tables, draw_loop(np.random.default_rng(3)).tables, strict=True
@@ -127,11 +129,11 @@ def test_loops_repeat_and_are_of_all_kinds() -> None:
         assert np.array_equal(mine, again)
 
 
-@pytest.mark.parametrize("kind", loads.LOADS)
+@pytest.mark.parametrize("kind", loops.LOADS)
 def test_a_load_keeps_its_level_and_size(kind: str, rng: np.random.Generator) -> None:
     """From rest to the level, then what varies, of about the amplitude."""
     t = DT * np.arange(60_000)
-    w = loads.load_table(kind, t, rng, omega=0.5, amplitude=2.0, level=40.0, start=100.0, lag=0.5)
+    w = loops.load_table(kind, t, rng, omega=0.5, amplitude=2.0, level=40.0, start=100.0, lag=0.5)
     assert w[0] == 0.0
     assert w[(t > 20.0) & (t < 100.0)] == pytest.approx(40.0)
     varies = w[t >= 100.0] - 40.0
@@ -142,7 +144,7 @@ def test_the_ideal_response_is_that_of_equal_poles() -> None:
     """``1 − e^(−t) Σ t^k/k!`` to a step."""
     t = DT * np.arange(1000)
     for order in (1, 2, 3, 4):
-        found = references.ideal(np.ones_like(t), DT, order)
+        found = loops.ideal(np.ones_like(t), DT, order)
         terms = sum(t**k / math.factorial(k) for k in range(order))
         assert found == pytest.approx(1.0 - np.exp(-t) * terms, abs=2e-5)
 
@@ -151,7 +153,7 @@ def test_measures_of_an_error_that_is_known() -> None:
     """A burst of ten samples of size 2 in a hundred of zeros."""
     error = np.zeros(100)
     error[20:30] = -2.0
-    found = measures.measure_error(error, 20)
+    found = general.measure_error(error, 20)
     assert found.peak == 2.0
     assert found.rms == pytest.approx(2.0 * math.sqrt(0.1))
     assert found.window == pytest.approx(2.0 * math.sqrt(0.5))
@@ -180,7 +182,7 @@ def test_a_program_earns_trust_with_the_load_itself_and_then_spends_it() -> None
     state = controller.initial_state()
     assert state.learner.guard is state.guard
     plant = GeneralPlant(LinearPlant.of(([1.0], [1.0, 0.0])))
-    scenario = ql.Scenario(0.0, DT * (load.size - 1), (loads.Table(load, DT),))
+    scenario = ql.Scenario(0.0, DT * (load.size - 1), (loops.Table(load, DT),))
     run = ql.simulate(plant, controller, scenario)
     trusted = run["authority"] >= 0.9
     assert trusted.any()
@@ -220,7 +222,7 @@ def test_a_program_says_the_same_compiled_and_interpreted(rng: np.random.Generat
 def test_exact_weights_are_those_of_f() -> None:
     """``f = −a x + (b − b0) u + w``: with them, an ESO's remaining estimate is zero."""
     loop = one("stable", 2)
-    weights = dict(zip(INPUTS, attacks.exact_weights(loop), strict=True))
+    weights = dict(zip(INPUTS, general.exact_weights(loop), strict=True))
     a = -loop.plant.linear.A[-1]
     assert weights["k1 x1"] == pytest.approx(-a[0])
     assert weights["k2 x2"] == pytest.approx(-a[1] / 2.0)
@@ -231,8 +233,8 @@ def test_exact_weights_are_those_of_f() -> None:
 
 def test_a_perfect_learner_removes_the_load(monkeypatch: pytest.MonkeyPatch) -> None:
     """All but a thousandth without guard; with it, more than half; from 50 to 80 of the trial's 100 to 300 lags."""
-    monkeypatch.setattr(named, "PERFECT_FROM_LAGS", 50.0)
-    monkeypatch.setattr(named, "_PERFECT_LAGS", 80.0)
+    monkeypatch.setattr(general, "PERFECT_FROM_LAGS", 50.0)
+    monkeypatch.setattr(general, "_PERFECT_LAGS", 80.0)
     case = perfect_case(1, "sine", ql.Guard(), 0)
     assert case.unguarded < 1e-3 * case.plain
     assert case.lost_share < 0.5
@@ -241,8 +243,8 @@ def test_a_perfect_learner_removes_the_load(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.fixture
 def short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of 80 lags in place of the trial's 250."""
-    monkeypatch.setattr("quell.experiments.stress.general.loops.loop.RUN_LAGS", 80.0)
-    monkeypatch.setattr("quell.experiments.stress.general.loops.loop._LEAST_DURATION", 0.0)
+    monkeypatch.setattr("quell.experiments.stress.loops.RUN_LAGS", 80.0)
+    monkeypatch.setattr("quell.experiments.stress.loops._LEAST_DURATION", 0.0)
 
 
 @pytest.mark.usefixtures("short_runs")
@@ -252,7 +254,7 @@ def test_a_search_finds_learners_that_do_harm() -> None:
     found = search([loop], None, np.random.default_rng(0), generations=2, population=3)
     assert len(found.history) == 2
     assert found.score > 3.0
-    assert found.point.shape == (attacks.SIZE,)
+    assert found.point.shape == (general.SIZE,)
 
 
 @pytest.mark.usefixtures("short_runs")
@@ -262,9 +264,9 @@ def test_a_loop_is_fragile_if_u_hardly_suffices_for_the_load() -> None:
     enough = float(np.max(np.abs(loop.tables[1]))) * loop.gain_error / loop.b0
     for limit, fragile in ((enough, True), (2.0 * enough, False), (math.inf, False)):
         limited = replace(loop, u_limit=limit)
-        plain = trial.error_of(limited, None, None)
+        plain = general.error_of(limited, None, None)
         assert plain is not None
-        assert trial.is_fragile(limited, plain) == fragile
+        assert general.is_fragile(limited, plain) == fragile
 
 
 def test_another_draw_changes_the_noise_only() -> None:
@@ -280,9 +282,9 @@ def test_another_draw_changes_the_noise_only() -> None:
 @pytest.mark.usefixtures("short_runs")
 def test_other_noise_moves_the_ratios_of_mf_eso_a_little() -> None:
     """In a loop without friction; a loop that is lost with it counts as lost."""
-    found = trial.run_one(8, 1, "Kalman", None, honest=True)
+    found = general.run_one(8, 1, "Kalman", None, honest=True)
     again = found.of_other_noise
-    assert again.kind == trial.OTHER_NOISE
+    assert again.kind == general.OTHER_NOISE
     assert 0.0 < abs(again.rms - 1.0) < 0.05
     assert outcome(other_noise=Measures(*[math.nan] * 4)).of_other_noise.lost
 
@@ -352,7 +354,7 @@ def test_a_run_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_run(loop: GeneralLoop, learner: Any, guard: Any) -> None:
         drawn.append((loop.describe(), repr(learner)))
 
-    monkeypatch.setattr(trial, "error_of", no_run)
-    found = [trial.run_one(5, index, "delay", None) for index in (3, 3, 4)]
+    monkeypatch.setattr(general, "error_of", no_run)
+    found = [general.run_one(5, index, "delay", None) for index in (3, 3, 4)]
     assert drawn[0] == drawn[1] != drawn[2]
     assert all(each.plain_lost and not each.lost for each in found)

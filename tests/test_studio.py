@@ -19,17 +19,15 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
-from quell.kernels.compile_time import compile_time
+from quell.kernels.cache import compile_time
 from quell.setup import load, made
-from quell.setup.vary import changed
+from quell.setup.loading import changed
 from quell.studio import messages, separate
-from quell.studio.connections import FIRST_REQUEST, MOST_CONNECTIONS
-from quell.studio.designs import varied
-from quell.studio.frames import Columns, frame, parsed
+from quell.studio.messages import Columns, frame, parsed_frame
 from quell.studio.records import PageRecord
-from quell.studio.runs import Maker, StoppedError, loop_of
-from quell.studio.tasks import frames_for
-from quell.studio.texts import python_of, toml_of
+from quell.studio.runs import Maker, StoppedError, loop_of, python_of, toml_of
+from quell.studio.server import FIRST_REQUEST, MOST_CONNECTIONS
+from quell.studio.tasks import frames_for, varied
 
 from .studio_server import TABLES, Client, running
 
@@ -300,7 +298,7 @@ def test_the_script_analyses_what_the_page_does(tmp_path: Path) -> None:
         message = {"id": 1, "do": "toml", "setup": tables}
         how = PageRecord(), lambda: False, lambda part, share: None
         (answer,) = frames_for(message, make, granted, *how)
-        script, setup = parsed(answer)[0]["python"], make(tables)
+        script, setup = parsed_frame(answer)[0]["python"], make(tables)
         (line,) = (line for line in script.splitlines() if "analyse(" in line)
         found = eval(line.removeprefix("print(").removesuffix(")"), {"ql": ql, "setup": setup})
         assert found == loop_of(setup).summary()
@@ -308,7 +306,7 @@ def test_the_script_analyses_what_the_page_does(tmp_path: Path) -> None:
 
 def test_exported_c_is_that_of_the_command_line(client: Client, tmp_path: Path) -> None:
     """Each file in the archive has the bytes of ``quell export``."""
-    from quell.cli.commands.export import export
+    from quell.cli.run import export
 
     path = tmp_path / "setup.toml"
     path.write_text(toml_of(TABLES), encoding="utf-8")
@@ -363,7 +361,9 @@ def test_columns_keep_the_extrema_of_each_pixel() -> None:
 
 def test_a_frame_has_header_arrays_and_null_for_infinity() -> None:
     """The arrays begin at a multiple of four bytes."""
-    header, arrays, rest = parsed(frame({"kind": "run", "m": float("inf")}, {"y": [1.0, 2.5]}))
+    header, arrays, rest = parsed_frame(
+        frame({"kind": "run", "m": float("inf")}, {"y": [1.0, 2.5]})
+    )
     assert header["m"] is None
     assert np.array_equal(arrays["y"], [1.0, 2.5])
     assert rest == b""

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from quell.realtime import LiveSink
-from quell.realtime.telemetry.channels import LOOP_WIDTH, K, R, U, Y, row_channels
-from quell.realtime.telemetry.header import Header
-from quell.studio.texts import toml_of
+from quell.realtime.recordings import LOOP_WIDTH, Header, K, R, U, Y, row_channels
+from quell.studio.runs import toml_of
 
 from .studio_server import TABLES, Client, running, step_test
 

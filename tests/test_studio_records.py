@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.commissioning.records import measured
-from quell.studio.frames import parsed
+from quell.commissioning import measured
+from quell.studio.messages import parsed_frame
 from quell.studio.records import MOST_FILE, MOST_SAMPLES, PageRecord, for_page, record_frames
 from quell.studio.runs import StoppedError
-from quell.tuning.record_model import record_model
+from quell.tuning.plants import record_model
 
 from .studio_server import TABLES, Client, running, step_test
 
@@ -230,6 +230,6 @@ def test_a_double_integrator_gets_a_first_controller_with_damping() -> None:
     np.savetxt(table, np.column_stack([u, y]), header="u,y", delimiter=",", comments="")
     options = {"dt": 0.1, "order": 2, "integrators": 2, "max_delay": 0.0}
     frames = record_frames(PageRecord(), asked(table.getvalue(), **options), lambda: False, nothing)
-    header, _, _ = parsed(next(frames))
+    header, _, _ = parsed_frame(next(frames))
     assert header["structure"] == "pid"
     assert header["plants"][0]["gain"].endswith("of s² G")

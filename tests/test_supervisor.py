@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.controllers.base import control, set_applied_control, write_row
 from quell.realtime import Safety
-from quell.realtime.loop.modes import Cause, Mode, Request
-from quell.realtime.loop.result import mode_changes
-from quell.realtime.loop.supervisor import FLUSH
-from quell.realtime.telemetry.channels import Event
+from quell.realtime.recordings import Event
+from quell.realtime.run import mode_changes
+from quell.realtime.supervisor import FLUSH, Cause, Mode, Request
 
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
 

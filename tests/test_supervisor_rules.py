@@ -8,20 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.realtime.loop.modes import Cause, Mode, Request
-from quell.realtime.loop.result import (
-    ModeChange,
-    RigRun,
-    lost_changes,
-    mode_changes,
-    scenario_part,
-    tally,
-)
-from quell.realtime.loop.state import Rules, SupervisorState, initial_state
-from quell.realtime.loop.supervisor import (
+from quell.realtime.run import ModeChange, RigRun, lost_changes, mode_changes, scenario_part, tally
+from quell.realtime.supervisor import (
     FLUSH,
+    Cause,
+    Mode,
+    Request,
+    Rules,
+    SupervisorState,
     change_mode,
     finished,
+    initial_state,
     supervised_output,
     update_mode,
 )

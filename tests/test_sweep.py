@@ -21,7 +21,7 @@ import quell as ql
 from quell.plants import two_mass_spring
 from quell.setup import SetupError, made, varied
 from quell.setup.description import read
-from quell.setup.sweep import sweep_of
+from quell.setup.loading import sweep_of
 from quell.sweeping import Measure, Normal, Plan, Range, Sweep, sweep
 
 from .commands import Shown
@@ -253,7 +253,7 @@ def test_a_killed_process_leaves_whole_files_and_its_sweep_goes_on(tmp_path: Pat
     setup = setup_of(tmp_path, SETUP.replace("draws = 4", "draws = 12"))
     code = (
         "import quell as ql; from quell.kernels import dispatch; dispatch.interpret_all = True\n"
-        "from quell.setup import load; from quell.setup.sweep import sweep_of\n"
+        "from quell.setup import load; from quell.setup.loading import sweep_of\n"
         "ql.sweep(**sweep_of(load('drive.toml')), folder='killed', runs_per_file=5, workers=1)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)

@@ -10,10 +10,9 @@ import pytest
 
 import quell as ql
 from quell.export import plant_source
-from quell.realtime import open_device, record_target
-from quell.realtime.wire import frames
-from quell.realtime.wire.serial_line import SerialDevice, SerialListener
-from quell.realtime.wire.transport import receive, send, wait_for_frame
+from quell.realtime import open_device, record_target, wire
+from quell.realtime.transports import SerialDevice, SerialListener
+from quell.realtime.wire import receive, send, wait_for_frame
 from quell.signals import Sinusoid, Step
 from quell.types import Status
 
@@ -27,50 +26,48 @@ CHANNELS = (("r", 1), ("u", 1), ("x_hat", 2), ("status", 1))
 class Target(threading.Thread):
     """A device that computes u = 2 r at each command; ``lost`` frames are not sent, ``end`` after the tick ``last``."""
 
-    def __init__(self, lost=(), extra=0, last=10**6, end=frames.GOODBYE):
+    def __init__(self, lost=(), extra=0, last=10**6, end=wire.GOODBYE):
         super().__init__(daemon=True)
         self.line = SerialListener("serial://pty")
         self.lost, self.extra, self.last, self.end = lost, extra, last, end
-        self.own = frames.endpoint(frames.COMMAND, 0, 20)
+        self.own = wire.endpoint(wire.COMMAND, 0, 20)
         self.begin = threading.Event()
         self.start()
 
     def send(self, kind, number, value, state=0):
         """Send a frame of the session."""
-        out, own = frames.buffer(), self.own.numbers
-        frames.write_frame(
-            out, kind, own[frames.SESSION], number, own[frames.RECEIVED], 0, value, state
-        )
+        out, own = wire.buffer(), self.own.numbers
+        wire.write_frame(out, kind, own[wire.SESSION], number, own[wire.RECEIVED], 0, value, state)
         send(self.line.transport, out)
 
     def tick(self, r):
         """Send y and the telemetry of a tick."""
-        self.own.numbers[frames.SENT] += 1
-        k = int(self.own.numbers[frames.SENT])
+        self.own.numbers[wire.SENT] += 1
+        k = int(self.own.numbers[wire.SENT])
         if k > self.last:
             if self.end is not None:
-                self.send(self.end, k, 0.0, frames.WATCHDOG_TRIPPED)
+                self.send(self.end, k, 0.0, wire.WATCHDOG_TRIPPED)
             return
         values = (r, 2.0 * r, 10.0 + k, -1.0, 4.0, *[0.0] * self.extra)
         for channel, value in ((-1, k / 8.0), *enumerate(values)):
             if (k, channel) not in self.lost:
-                kind = frames.MEASUREMENT if channel < 0 else frames.TELEMETRY
+                kind = wire.MEASUREMENT if channel < 0 else wire.TELEMETRY
                 self.send(kind, k, value, max(channel, 0))
 
     def run(self):
         """Answer frames until the session ends."""
-        frame = frames.buffer()
+        frame = wire.buffer()
         while True:
             wait_for_frame(self.line.transport, 10**8)
             if receive(self.line.transport, frame) < 0:
                 continue
-            if frame.bytes[3] == frames.HELLO and self.own.numbers[frames.SESSION] == 0:
-                frames.start_session(self.own, int(frame.words[1]))
-                self.send(frames.WELCOME, 0, DT)
+            if frame.bytes[3] == wire.HELLO and self.own.numbers[wire.SESSION] == 0:
+                wire.start_session(self.own, int(frame.words[1]))
+                self.send(wire.WELCOME, 0, DT)
                 self.tick(0.0)
-            elif frame.bytes[3] == frames.GOODBYE:
+            elif frame.bytes[3] == wire.GOODBYE:
                 return
-            elif frames.accept(frame, self.own):
+            elif wire.accept(frame, self.own):
                 self.tick(float(frame.doubles[3]))
 
 
@@ -111,7 +108,7 @@ def test_lost_telemetry_is_no_number():
         ({"extra": 1}, ValueError, "5 numbers are named, and it has sent one with the index 5"),
         ({"last": 3}, ConnectionError, "the device has ended the session"),
         ({"last": 3, "end": None}, ConnectionError, "nothing has come for 0.2 s"),
-        ({"last": 3, "end": frames.MEASUREMENT}, ConnectionError, "no reference came in time"),
+        ({"last": 3, "end": wire.MEASUREMENT}, ConnectionError, "no reference came in time"),
     ],
 )
 def test_a_record_that_can_not_be_made_is_an_error(target, error, message):

@@ -16,13 +16,20 @@ import pytest
 
 import quell as ql
 from quell.realtime import CsvSink, McapSink
-from quell.realtime.telemetry.channels import EVENTS, LOOP_WIDTH, Y_MEASURED, Event, K, row_channels
-from quell.realtime.telemetry.delivery import Delivery
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.load import load, trajectory_of
-from quell.realtime.telemetry.ring import push
-from quell.realtime.telemetry.sinks import MemorySink, file_sink
-from quell.realtime.telemetry.writer import TelemetryWriter
+from quell.realtime.recordings import (
+    EVENTS,
+    LOOP_WIDTH,
+    Y_MEASURED,
+    Event,
+    Header,
+    K,
+    MemorySink,
+    file_sink,
+    load,
+    row_channels,
+    trajectory_of,
+)
+from quell.realtime.telemetry import Delivery, TelemetryWriter, push
 from quell.types import Matrix
 from tests.recordings import DT, controller, header_of, rows_of, simulated
 
@@ -230,11 +237,11 @@ def whole_rows(path: Path, rows: Matrix) -> int:
 KILLED = """
 import sys, time, os, signal
 import numpy as np
-from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.channels import row_channels
-from quell.realtime.telemetry.ring import push
-from quell.realtime.telemetry.sinks import file_sink
-from quell.realtime.telemetry.writer import TelemetryWriter
+from quell.realtime.recordings import Header
+from quell.realtime.recordings import row_channels
+from quell.realtime.telemetry import push
+from quell.realtime.recordings import file_sink
+from quell.realtime.telemetry import TelemetryWriter
 
 def begin(dt, count):
     sinks = [file_sink(f"{sys.argv[1]}/{count}.{suffix}") for suffix in ("csv", "mcap")]
@@ -493,7 +500,7 @@ def test_the_writer_has_the_priority_that_it_should(
     urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The lowest real-time priority for an interpreted loop if permitted, else an ordinary one."""
-    from quell.realtime.system import scheduling as module
+    from quell.realtime import system as module
 
     now = [module.os.SCHED_RR]
 

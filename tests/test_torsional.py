@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import quell as ql
-from quell.experiments.common.claims import Claim
-from quell.experiments.torsional import setup as study
+from quell.experiments import torsional as study
+from quell.experiments.common import Claim
 from quell.kernels.dispatch import compiled
 from quell.plants.base import advance, measure
 

@@ -13,13 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from quell.export.c_files import CFiles, translated
-from quell.export.translate.findings import Findings
 from quell.export.translate.program import Program
-from quell.export.translate.source import ascii_text
-from quell.export.translate.values import TranslationError
+from quell.export.translate.structs import Findings, ascii_text
+from quell.export.translate.text import TranslationError
 from quell.kernels.dispatch import generic, kernel
-from quell.kernels.scalars import Scalars, clear
-from quell.kernels.sized import Flag, Scratch, Size
+from quell.kernels.sized import Flag, Scalars, Scratch, Size, clear
 from quell.types import Matrix, Vector
 
 from .in_c import InC, needs_gcc

@@ -17,7 +17,7 @@ from quell.setup import load
 from quell.tuning import Constraints, designs
 from quell.tuning.optimiser.requirements import sizes
 from quell.tuning.plants import given_plants, model_of, plant_set
-from quell.tuning.structures.equivalent import equivalents
+from quell.tuning.structures.adrc import equivalents
 from quell.tuning.structures.registry import make_structure
 
 LAGS = ([1.0], [1.0, 3.0, 3.0, 1.0])

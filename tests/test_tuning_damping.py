@@ -11,11 +11,10 @@ import quell as ql
 from quell.analysis.linearise import linear_law
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.baselines.pid import PID
-from quell.setup.tuning_task import tuning_task
+from quell.setup.loading import tuning_task
 from quell.tuning import Constraints, designs
 from quell.tuning.by_simulation import LinearBounds
-from quell.tuning.optimiser.damping import Followed, Pole, closed_loop_poles, counted
-from quell.tuning.optimiser.requirements import sizes
+from quell.tuning.optimiser.requirements import Followed, Pole, closed_loop_poles, counted, sizes
 from quell.tuning.plants import given_plants, model_of, plant_set
 from quell.tuning.structures.registry import make_structure
 

@@ -16,7 +16,7 @@ from scipy.stats import binom
 import quell as ql
 from quell.cli.app import app
 from quell.setup import controllers_of, load, varied
-from quell.sweeping.shares import share_interval
+from quell.sweeping.sweep import share_interval
 from quell.tuning.simulated import (
     FailureRate,
     Mean,
@@ -28,7 +28,7 @@ from quell.tuning.simulated import (
     Worst,
     search,
 )
-from quell.tuning.simulated.statistics import Statistic
+from quell.tuning.simulated.problem import Statistic
 from quell.types import Matrix
 
 pytest.importorskip("optuna")

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.realtime.devices.base import (
+from quell.realtime.devices import (
     Device,
     PythonHandle,
+    TwinDevice,
     handle_of,
     read_measurement,
     write_command,
 )
-from quell.realtime.devices.twin import TwinDevice
-from quell.realtime.system.clock import system_clock
+from quell.realtime.system import system_clock
 
 from .rig_bench import DT, PLANT
 

@@ -13,15 +13,13 @@ import pytest
 
 import quell as ql
 from quell.kernels.dispatch import call_specialised, compiled
-from quell.realtime.devices.base import (
-    read_measurement,
-)
-from quell.realtime.devices.registry import listen
-from quell.realtime.devices.twin import TwinDevice
-from quell.realtime.system.clock import system_clock
-from quell.realtime.wire import device as wire_device
-from quell.realtime.wire import frames
-from quell.realtime.wire.transport import (
+from quell.realtime import wire as frames
+from quell.realtime import wire as wire_device
+from quell.realtime.devices import TwinDevice, read_measurement
+from quell.realtime.registry import listen
+from quell.realtime.system import system_clock
+from quell.realtime.transports import UdpDevice, UdpTransport
+from quell.realtime.wire import (
     connect_to_sender,
     is_from_other_side,
     receive,
@@ -29,7 +27,6 @@ from quell.realtime.wire.transport import (
     send,
     wait_for_frame,
 )
-from quell.realtime.wire.udp import UdpDevice, UdpTransport
 
 from .benchmark_module import benchmark
 from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from quell.experiments import acc
-from quell.experiments.acc import box
-from quell.experiments.acc.controllers import FREED, MB, MF, OURS, L
+from quell.experiments.acc import study
+from quell.experiments.acc.loops import FREED, MB, MF, OURS, L
 
 found, published = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
 ours = {name: controller for name, controller in acc.designs().items() if name in OURS}
@@ -38,7 +38,7 @@ boxed, rates = acc.boxed(60, 9), []
 for name in (MF, FREED):
     controller = acc.designs()[name]
     judged = acc.judge_sampled(controller, boxed, cubic=True)
-    (scores,) = box.scores(controller, list(boxed))
+    (scores,) = study.scores(controller, list(boxed))
     assert np.array_equal(np.round(scores), judged.fails)
     settled = ~judged.fails
     assert np.all(np.diff(scores[settled][np.argsort(judged.late_peak[settled])]) >= -1e-12)

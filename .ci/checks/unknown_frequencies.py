@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 
 import quell as ql
-from quell.experiments.two_mass_spring import setup as study
+from quell.experiments import two_mass_spring as study
 from quell.parallel import in_parallel
 
 settings, at, Sine, Harmonic = (

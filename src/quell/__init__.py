@@ -35,44 +35,42 @@ if TYPE_CHECKING:
         tuning,
     )
     from quell.controllers import baselines
-    from quell.controllers.adrc.adrc import ADRC
-    from quell.controllers.adrc.estimate import Estimate
-    from quell.controllers.adrc.feedforward import Feedforward
-    from quell.controllers.bandwidth import omega_c_for
+    from quell.controllers.adrc import ADRC, Estimate
+    from quell.controllers.base import omega_c_for
+    from quell.controllers.feedforward import Feedforward
     from quell.guard import Guard, Reason
     from quell.identification.identify import identify
     from quell.lti.canonical import canonical
     from quell.observers.eso import ESO
     from quell.records import metrics
-    from quell.records.batch_trajectory import BatchTrajectory
     from quell.records.plotting import style
-    from quell.records.trajectory import Trajectory
-    from quell.simulation.scenario import Scenario
+    from quell.records.trajectory import BatchTrajectory, Trajectory
+    from quell.simulation.driver import Scenario
     from quell.simulation.simulate import simulate
     from quell.sweeping.sweep import sweep
     from quell.tuning.tune import tune
     from quell.tuning.tuned import Tuned
     from quell.types import DesignWarning, Status
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Modules of the public classes and functions, and of modules that are deeper than ``quell.<name>``.
 _HOME = {
-    "ADRC": "quell.controllers.adrc.adrc",
+    "ADRC": "quell.controllers.adrc",
     "DesignWarning": "quell.types",
-    "BatchTrajectory": "quell.records.batch_trajectory",
+    "BatchTrajectory": "quell.records.trajectory",
     "ESO": "quell.observers.eso",
-    "Estimate": "quell.controllers.adrc.estimate",
-    "Feedforward": "quell.controllers.adrc.feedforward",
+    "Estimate": "quell.controllers.adrc",
+    "Feedforward": "quell.controllers.feedforward",
     "Guard": "quell.guard",
     "Reason": "quell.guard",
-    "Scenario": "quell.simulation.scenario",
+    "Scenario": "quell.simulation.driver",
     "Status": "quell.types",
     "Trajectory": "quell.records.trajectory",
     "Tuned": "quell.tuning.tuned",
     "canonical": "quell.lti.canonical",
     "identify": "quell.identification.identify",
-    "omega_c_for": "quell.controllers.bandwidth",
+    "omega_c_for": "quell.controllers.base",
     "simulate": "quell.simulation.simulate",
     "style": "quell.records.plotting",
     "sweep": "quell.sweeping.sweep",

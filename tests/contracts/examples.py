@@ -17,7 +17,7 @@ import numpy as np
 import quell as ql
 from quell import learners as learner_room
 from quell.features import RBF, Bias, Input, Periodic, Polynomial, RandomFourier, State
-from quell.learners.online.model import infer, learn
+from quell.learners.online import infer, learn
 from quell.observers.design import FORMS
 from quell.observers.eso import ESO
 from quell.plants import registry

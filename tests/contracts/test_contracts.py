@@ -19,18 +19,27 @@ from quell.controllers import in_single_precision
 from quell.controllers.base import control
 from quell.controllers.stateful import named_arrays as _named_arrays
 from quell.features import Bias, Input, Polynomial, State
-from quell.kernels.dispatch import (
-    call_specialised,
-    compiled,
-    dispatcher_for,
-    interpreted,
-    kernel,
+from quell.kernels.dispatch import call_specialised, compiled, dispatcher_for, interpreted, kernel
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    forget,
+    lag_memory,
+    lag_of,
+    lag_push,
+    predict,
+    restart,
+    trouble,
 )
-from quell.learners.base import adapt, coefficients, commit, forget, predict, restart, trouble
-from quell.learners.lag import lag_memory, lag_of, lag_push
-from quell.observers.base import acting_control, begin, expected_measurement, observe
-from quell.observers.delay import without_delay
 from quell.observers.design import FORMS
+from quell.observers.forms import (
+    acting_control,
+    begin,
+    expected_measurement,
+    observe,
+    without_delay,
+)
 from quell.plants import registry
 from quell.plants.base import advance, begin_run, measure
 from quell.simulation.driver import run_block

@@ -18,8 +18,8 @@ from quell.analysis.linearise import linear_law
 from quell.controllers import baselines as baseline_room
 from quell.controllers.base import bumpless_transfer
 from quell.controllers.stateful import named_arrays
-from quell.observers.base import expected_measurement
-from quell.tuning.optimiser.laws import law_of
+from quell.observers.forms import expected_measurement
+from quell.tuning.optimiser.loops import law_of
 
 from .test_contracts import CHAIN, SCENARIO, check_run
 

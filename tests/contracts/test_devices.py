@@ -15,17 +15,17 @@ import pytest
 import quell as ql
 from quell.cli.app import app
 from quell.kernels.dispatch import as_python
-from quell.realtime.devices.base import (
+from quell.realtime.devices import (
     Device,
     PythonHandle,
+    TwinDevice,
     handle_of,
     read_measurement,
     write_command,
 )
-from quell.realtime.devices.registry import SCHEMES, listen, open_device
-from quell.realtime.devices.twin import TwinDevice
-from quell.realtime.rig.server import Rig
-from quell.realtime.system.clock import system_clock
+from quell.realtime.registry import SCHEMES, listen, open_device
+from quell.realtime.rig import Rig
+from quell.realtime.system import system_clock
 from tests.rig_bench import DT, PLANT, WIRES, Bench, PlainRig
 
 DOCS = Path(__file__).parents[2] / "docs" / "devices.md"

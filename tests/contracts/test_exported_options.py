@@ -24,10 +24,10 @@ from quell import features as feature_room
 from quell import learners as learner_room
 from quell.controllers import baselines as baseline_room
 from quell.export import TranslationError
-from quell.export.inspection import parameters_of
+from quell.export.controller_source import parameters_of
 from quell.features import RBF, Bias, Input, Periodic, State
-from quell.kernels.function_pointers import origin_of
 from quell.kernels.sized import constant_fields
+from quell.kernels.user_functions import origin_of
 from quell.observers.design import FORMS
 from tests.in_c import built, needs_gcc
 
@@ -335,7 +335,7 @@ def programs() -> dict[str, dict[str, Any]]:
 
 @needs_gcc
 @pytest.mark.parametrize("name", PARTS)
-@pytest.mark.filterwarnings("ignore::quell.warn.DesignWarning")
+@pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")
 def test_every_program_repeats_the_kernels_bit_for_bit(tmp_path: Path, name: str) -> None:
     """Of every option that changes the code; with noise, NaN, saturation, manual operation and restarts."""
     for i, (row, controller) in enumerate(programs()[name].items()):

@@ -15,13 +15,13 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.commissioning.verification import Verification
+from quell.commissioning import Verification
 from quell.experiments import acc, compare, stress, torsional, two_mass_spring
-from quell.experiments.acc import figures as acc_figures
-from quell.experiments.acc.criteria import Judged
-from quell.experiments.torsional.setup import FRICTION, LINEAR
-from quell.experiments.torsional.setup import NAMES as TORSIONAL
-from quell.realtime.system.histogram import Histogram, Timing, count_duration, empty_counts
+from quell.experiments.acc import study as acc_figures
+from quell.experiments.acc.loops import Judged
+from quell.experiments.torsional import FRICTION, LINEAR
+from quell.experiments.torsional import NAMES as TORSIONAL
+from quell.realtime.system import Histogram, Timing, count_duration, empty_counts
 from quell.sweeping import sweep
 
 plt = importlib.import_module("matplotlib.pyplot")

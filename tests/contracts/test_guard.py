@@ -15,8 +15,8 @@ import pytest
 import quell as ql
 from quell.experiments.stress.adversaries import MULTIPLE, Adversary
 from quell.guard import limit, record_output
-from quell.guard.state import F_L
-from quell.learners.lag import lag_memory, lag_of, lag_push
+from quell.guard.kernels import F_L
+from quell.learners.base import lag_memory, lag_of, lag_push
 from quell.observers.design import FORMS
 from quell.plants import delayed, n_mass
 

@@ -34,22 +34,22 @@ parameters = { "observer.b0" = { low = 1.5, high = 2.5 } }
 _FIGURES, _SETUP = ("--no-figures",), ("setup.toml",)
 # What each command does its work with, where that takes long; its arguments are the output then.
 WORK = {
-    "reproduce two-mass": ("quell.experiments.two_mass_spring.study.run",),
-    "reproduce torsional": ("quell.experiments.torsional.study.run",),
+    "reproduce two-mass": ("quell.experiments.two_mass_spring.run",),
+    "reproduce torsional": ("quell.experiments.torsional.run",),
     "reproduce acc": ("quell.experiments.acc.study.run",),
-    "stress": ("quell.experiments.stress.study.run", "quell.experiments.stress.general.study.run"),
-    "rig": ("quell.realtime.rig.server.Rig",),
+    "stress": ("quell.experiments.stress.study.run", "quell.experiments.stress.general.run"),
+    "rig": ("quell.realtime.rig.Rig",),
     "studio": ("quell.studio.server.serve",),
     "run-rig": ("quell.realtime.run_rig",),
     "sweep": ("quell.sweeping.sweep",),
     "compare": (
-        "quell.experiments.compare.benchmark.two_mass",
+        "quell.experiments.compare.two_mass",
         "quell.experiments.compare.of_setup",
     ),
     "identify": ("quell.identification.identify",),
     "tune": (
         "quell.tuning.tune",
-        "quell.tuning.record_model.record_model",
+        "quell.tuning.plants.record_model",
         "quell.commissioning.experiment",
     ),
     "b0": ("quell.identification.identify_b0",),
@@ -237,7 +237,7 @@ def outcome(
                 stand_in = {"Rig": _Server, "serve": _opened}.get(name, partial(_told, target))
                 patch.setattr(importlib.import_module(module), name, stand_in)
             for name in ("two_mass", "torsional", "acc"):
-                module = importlib.import_module(f"quell.cli.commands.{name}")
+                module = importlib.import_module(f"quell.cli.run.{name}")
                 patch.setattr(module, "compile_loops", lambda *_: None)
             patch.setattr("webbrowser.open", lambda url: print("opened", url))
             shown = in_this_process((*command.split(), *arguments), patch, capsys)

@@ -6,9 +6,9 @@ import pytest
 
 import quell as ql
 from quell.analysis import certify
-from quell.guard.correction import plain_loop
-from quell.lti.norms import peak_gain
-from quell.plants.sampled import sampled_plant
+from quell.guard.guard import plain_loop
+from quell.lti.models import peak_gain
+from quell.plants.linear import sampled_plant
 
 # From a correction that is added in the law alone, at b/b0 = 0.7, 1.1, 1.3 and 1.6.
 LAW_ALONE = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.adrc.law import law_gains
+from quell.controllers.law import law_gains
 
 OMEGA_O = 20.0
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.prefilters.differentiator import TrackingDifferentiator, fhan
-from quell.controllers.prefilters.prefilter import prefilter
+from quell.controllers.prefilters import TrackingDifferentiator, fhan, prefilter
 
 pyadrc = pytest.importorskip("pyadrc")
 

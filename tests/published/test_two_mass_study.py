@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import Range, all_controllers, range_of
 from quell.experiments.two_mass_spring import ranges as ranges_of_study
-from quell.experiments.two_mass_spring import setup as study
-from quell.experiments.two_mass_spring.ranges import Range, all_controllers, range_of
 
 pytestmark = pytest.mark.compiled
 

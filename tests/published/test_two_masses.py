@@ -102,7 +102,7 @@ def test_the_margins_of_quell_are_those_of_the_independent_program(
 @pytest.mark.parametrize("name", ["MF-ESO m = 2", "MB-ESO m = 2"])
 def test_the_rows_of_the_study_are_those_of_the_independent_program(name: str) -> None:
     """Peak, overshoot and settling to three digits; the control variation to 2 %, as the noise is another draw."""
-    from quell.experiments.two_mass_spring import setup as study
+    from quell.experiments import two_mass_spring as study
 
     settings = study.Settings()
     controller = study.controllers(settings)[name]

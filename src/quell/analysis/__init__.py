@@ -3,23 +3,22 @@
 May import ``simulation``, ``records``, ``controllers`` and what they import.
 """
 
-from quell.analysis.adapting_learner import Adapting, adapting
 from quell.analysis.advice import advise
-from quell.analysis.certificate import Certificate, certify
-from quell.analysis.frozen_learner import Frozen, frozen
-from quell.analysis.linearise import linear_law
-from quell.analysis.loci import plot_nyquist, plot_root_locus
+from quell.analysis.certificate import Certificate, certify, observer_error
+from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
-from quell.analysis.observer_error import observer_error
 from quell.analysis.plots import (
+    loops_over_omega_o,
+    loops_over_time,
     plot_bode,
     plot_gang_of_four,
     plot_margins_against_omega_o,
     plot_margins_over_time,
+    plot_nyquist,
+    plot_root_locus,
 )
-from quell.analysis.sweeps import loops_over_omega_o, loops_over_time
-from quell.controllers.design_checks import Finding
+from quell.controllers.adrc import Finding
 
 __all__ = [
     "Adapting",

@@ -8,17 +8,15 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.adapting_learner import Adapting, adapting
-from quell.analysis.frozen_learner import Frozen
+from quell.analysis.linearise import Adapting, Frozen, adapting
 from quell.analysis.loop import LoopAnalysis, analyse, durations
-from quell.analysis.pure_delays import eigenvalues
-from quell.controllers.adrc.adrc import ADRC
+from quell.analysis.margins import eigenvalues
+from quell.controllers.adrc import ADRC, Finding, known_samples, sampling_findings
 from quell.controllers.base import Controller
-from quell.controllers.design_checks import Finding, known_samples, sampling_findings
 from quell.learners.base import NoLearner
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
-from quell.plants.linear_part import linear_part
+from quell.plants.linearise import linear_part
 
 # RMS of u as a share of its range: six standard deviations are then 30 % of it. Chosen by hand.
 _NOISE = 0.05

@@ -8,6 +8,8 @@ small-gain theorem::
 
 q_0 and y_0 are those of the same loop, loads and noise without learner. docs/theory has the proof
 and its assumptions.
+
+The error q of the plain observer in a record: what certificates are about.
 """
 
 from __future__ import annotations
@@ -16,22 +18,24 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from quell import checks
-from quell.controllers.adrc.adrc import ADRC
-from quell.controllers.adrc.feedback import LinearFeedback
-from quell.controllers.base import Controller
-from quell.controllers.limits import Limits
-from quell.controllers.prefilters.prefilter import without_prefilters
+from quell.controllers.adrc import ADRC
+from quell.controllers.base import Controller, Limits
+from quell.controllers.law import LinearFeedback
+from quell.controllers.prefilters import without_prefilters
 from quell.files import nonfinite_to_none
 from quell.guard import Guard, UnguardedDesign
-from quell.guard.certified import gains_of, named_plants
-from quell.guard.correction import CorrectionGains
-from quell.plants.delay import DelayedPlant
-from quell.plants.encoder import EncodedPlant
-from quell.plants.linear_part import linear_part
-from quell.plants.machines.cubic_spring import CubicSpringPlant
-from quell.plants.nonlinear.plant import NonlinearPlant
-from quell.plants.sampled import sampled_plant
+from quell.guard.guard import CorrectionGains, gains_of, named_plants
+from quell.observers.design import f_learned_response, response
+from quell.observers.forms import state_for, without_delay
+from quell.plants.flexible import CubicSpringPlant
+from quell.plants.linear import DelayedPlant, EncodedPlant, sampled_plant
+from quell.plants.linearise import linear_part
+from quell.plants.nonlinear import NonlinearPlant
+from quell.records.trajectory import Trajectory
+from quell.types import Vector
 
 
 @dataclass(frozen=True)
@@ -201,3 +205,45 @@ def _not_covered(plant: Any, limits: Limits) -> list[str]:
     if isinstance(plant, NonlinearPlant | CubicSpringPlant):
         found.append("large motions (the plant is linearised)")
     return found
+
+
+def observer_error(controller: Controller, run: Trajectory) -> Vector:
+    """Return ``q = f_plain − f_plain^F`` (samples,) [y-unit/s^n] of a run, from its y and u alone.
+
+    f_plain is what the observer would estimate without learner. Of a run without learner the
+    largest ``|q|`` is the ``q_0`` of a ``Certificate``.
+
+    Parameters
+    ----------
+    controller
+        the ``ADRC`` of the run.
+    run
+        a run of it from the start, with every sample recorded and no measurement missing.
+
+    Raises
+    ------
+    ValueError
+        for another controller, a nonlinear observer, a record that lacks samples.
+    """
+    controller = without_prefilters(controller)
+    if not isinstance(controller, ADRC):
+        raise ValueError(f"controller = {controller!r}: must be an ADRC")
+    y, u = run["y_measured"], run["u"]
+    if run.every != 1 or not np.all(np.isfinite(y)):
+        raise ValueError(
+            f"run has every = {run.every!r}: all samples must be recorded, with finite y_measured"
+        )
+    observer = controller.observer
+    n, estimates = observer.order, observer.estimates
+    plain = response(observer.model, estimates, n)
+    M, g, c, d = f_learned_response(response(without_delay(observer.model), estimates, n))
+    z = state_for(observer.model, np.append(y[0], np.zeros(n - 1)), np.zeros(1), 0.0)
+    lag, shown, q = np.zeros(M.shape[0]), 0.0, np.zeros(y.size)
+    for k in range(1, y.size):
+        given = np.array([y[k], u[k - 1], 0.0])
+        f_plain = float(plain.output[n] @ z + plain.feedthrough[n] @ given)
+        z = plain.transition @ z + plain.input @ given
+        q[k] = f_plain - shown
+        shown = float(c @ lag + d * f_plain)
+        lag = M @ lag + g * f_plain
+    return q

@@ -19,25 +19,141 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.adapting_learner import is_known
 from quell.analysis.certificate import Certificate, certify
-from quell.analysis.frequency_response import Complex, Response, frequencies, in_s_plane
-from quell.analysis.frozen_learner import Frozen
-from quell.analysis.linearise import linear_law
-from quell.analysis.margins import Margins, least, margins
-from quell.analysis.pure_delays import eigenvalues
-from quell.analysis.python_control import state_space, transfer_function
-from quell.analysis.subsystems import closed_loop, closed_loop_matrix, law_matrix, subsystem
-from quell.controllers.adrc.adrc import ADRC
+from quell.analysis.linearise import Frozen, is_known, linear_law
+from quell.analysis.margins import (
+    Complex,
+    Margins,
+    Response,
+    eigenvalues,
+    frequencies,
+    in_s_plane,
+    least,
+    margins,
+)
+from quell.checks import import_extra
+from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller
-from quell.controllers.linear.law import LinearLaw
-from quell.controllers.prefilters.prefilter import without_prefilters
+from quell.controllers.linear import LinearLaw
+from quell.controllers.prefilters import without_prefilters
 from quell.learners.base import NoLearner
-from quell.lti.norms import h2_squared
-from quell.lti.system import System
-from quell.plants.linear_part import linear_part
-from quell.plants.sampled import SampledPlant, sampled_plant
+from quell.lti.models import System, h2_squared
+from quell.plants.linear import SampledPlant, sampled_plant
+from quell.plants.linearise import linear_part
 from quell.types import Matrix, Vector
+
+# ---- Parts of a loop, open and closed, as sampled systems of one input and one output ----
+
+# Source and target, a letter each, of the closed-loop responses that have a name.
+_CLOSED = {"closed_loop": "ry", "PS": "dy", "CS": "nu", "S": "ny", "T": "ny"}
+_OPEN = ("P", "C_r", "C_y", "L")
+
+
+def closed_loop_matrix(A: Matrix, B: Matrix, C: Matrix, law: LinearLaw, inner: Matrix) -> Matrix:
+    """Return the matrix of a sampled plant in closed loop with a law, the plant's states first.
+
+    ``inner`` is ``law.A + B_u C``, the law with its own output applied. Pass A and ``inner`` both
+    as they are, or both less the unit matrix.
+    """
+    plant_rows = [A + law.D_y * np.outer(B, C), np.outer(B, law.C)]
+    return np.block([plant_rows, [np.outer(law.B_y + law.B_u * law.D_y, C), inner]])
+
+
+def law_matrix(law: LinearLaw) -> Matrix:
+    """Return ``A + B_u C − I``: the law with its own output applied, less the unit matrix."""
+    return law.A - np.eye(law.A.shape[0]) + np.outer(law.B_u, law.C)
+
+
+def subsystem(plant: SampledPlant, law: LinearLaw, name: str) -> System:
+    """Return the part ``name`` of the loop; see ``LoopAnalysis.system``."""
+    if "→" in name:
+        source, _, target = (part.strip() for part in name.partition("→"))
+        return closed_loop(plant, law, source, target)
+    checks.one_of("name", name, (*_OPEN, *_CLOSED, "source → target"))
+    if name in _OPEN:
+        return _open_loop(plant, law, name)
+    N, B, C, D = closed_loop(plant, law, *_CLOSED[name])
+    if name == "S":  # from noise to the measured y + n
+        return System(N, B, C, 1.0)
+    return System(N, B, -C, -D) if name in ("CS", "T") else System(N, B, C, D)
+
+
+def _open_loop(plant: SampledPlant, law: LinearLaw, name: str) -> System:
+    if name == "P":
+        return System(plant.N, plant.B, plant.C, 0.0)
+    N = law_matrix(law)
+    if name == "C_r":
+        return System(N, law.B_r + law.B_u * law.D_r, law.C, law.D_r)
+    C_y = System(N, law.B_y + law.B_u * law.D_y, -law.C, -law.D_y)
+    if name == "C_y":
+        return C_y
+    n, m = plant.N.shape[0], N.shape[0]
+    # L: the loop is broken at the plant's input, from which it leads through the plant to C_y.
+    A: Matrix = np.block([[plant.N, np.zeros((n, m))], [np.outer(C_y.B, plant.C), N]])
+    return System(A, np.append(plant.B, np.zeros(m)), np.concatenate([C_y.D * plant.C, C_y.C]), 0.0)
+
+
+def closed_loop(plant: SampledPlant, law: LinearLaw, source: str, target: str) -> System:
+    """Return the closed loop from an input to an output; see ``LoopAnalysis.closed_loop``."""
+    disturbances = (f"w{i + 1}" for i in range(plant.E.shape[1]))
+    checks.one_of("source", source, ("r", "d", "n", *disturbances))
+    checks.one_of("target", target, ("y", "u", "e"))
+    A = closed_loop_matrix(plant.N, plant.B, plant.C, law, law_matrix(law))
+    m = law.A.shape[0]
+    u_direct = {"r": law.D_r, "n": law.D_y}.get(source, 0.0)
+    if source in ("r", "n"):
+        into = law.B_r if source == "r" else law.B_y
+        B = np.concatenate([plant.B * u_direct, into + law.B_u * u_direct])
+    else:
+        B = np.append(plant.B if source == "d" else plant.E[:, int(source[1:]) - 1], np.zeros(m))
+    if target == "u":
+        return System(A, B, np.concatenate([law.D_y * plant.C, law.C]), u_direct)
+    C = np.append(plant.C, np.zeros(m))
+    return System(A, B, C if target == "y" else -C, float(target == "e" and source == "r"))
+
+
+# ---- Conversion of sampled systems to systems of python-control, an optional extra ----
+
+# Trailing coefficients below this share of the largest one count as rounding errors of a zero, some
+# hundred times the unit roundoff.
+_ROUNDING = 1e-13
+
+
+def state_space(system: System, dt: float) -> Any:
+    """Return a system as a ``control.StateSpace`` of sample time ``dt`` [s]."""
+    N, B, C, D = system
+    return _control().ss(N + np.eye(N.shape[0]), B[:, None], C[None, :], D, dt)
+
+
+def transfer_function(system: System, dt: float) -> Any:
+    """Return a system as a ``control.TransferFunction`` of sample time ``dt`` [s].
+
+    The denominator is ``det(zI − A)``. The numerator is its product with the impulse response D,
+    CB, CAB, …, which is as small as the numerator itself; in the difference of two characteristic
+    polynomials it would be lost to their rounding errors.
+    """
+    N, B, C, D = System.balanced(*system)
+    denominator = np.real(np.poly(1.0 + np.linalg.eigvals(N)))
+    impulse_response, x = [D], B
+    for _ in range(N.shape[0]):
+        impulse_response.append(float(C @ x))
+        x = x + N @ x
+    numerator = np.convolve(denominator, impulse_response)[: denominator.size]
+    # Cancel poles and zeros at z = 0: the last u may be a state of both plant and controller.
+    while denominator.size > 1 and all(
+        abs(part[-1]) < _ROUNDING * np.max(np.abs(part)) for part in (numerator, denominator)
+    ):
+        numerator, denominator = numerator[:-1], denominator[:-1]
+    return _control().tf(
+        np.trim_zeros(numerator, "f") if np.any(numerator) else [0.0], denominator, dt
+    )
+
+
+def _control() -> Any:
+    return import_extra("control", "control", "conversion to python-control")
+
+
+# ---- The loop of a linear plant and a controller ----
 
 
 def analyse(
@@ -52,7 +168,7 @@ def analyse(
     """Analyse the loop of a linear plant and a controller, unlimited, with a learner at rest.
 
     What a learner knows of the plant is a feedback, and its bias and oscillators go on adapting:
-    the loop contains both, linearised about rest (``adapting_learner.py``).
+    the loop contains both, linearised about rest (``analysis/linearise.py``).
 
     Raises ``ValueError`` for a nonlinear plant without operating point, a plant with direct
     feedthrough, a controller without a linear law, a delay of more than 200 samples.

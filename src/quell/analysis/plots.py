@@ -1,21 +1,102 @@
-"""Plots of loops: Bode plot, gang of four, margins over time or bandwidth."""
+"""Plots of loops: Bode plot, gang of four, margins over time or bandwidth.
+
+Plots of loops in the complex plane: Nyquist plot, and root locus over a design's parameter.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import LoopAnalysis
-from quell.analysis.sweeps import loops_over_omega_o
+from quell.analysis.linearise import adapting
+from quell.analysis.loop import LoopAnalysis, analyse
 from quell.controllers.base import Controller
 from quell.records.plotting import given_axes
+from quell.records.trajectory import Trajectory
+from quell.simulation import Scenario, simulate
 from quell.types import Vector
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+# ---- A loop at several instants of a run, and a design at several bandwidths ----
+
+
+def loops_over_time(
+    plant: Any, controller: Controller, run: Any, times: Any, **options: Any
+) -> list[LoopAnalysis]:
+    """Analyse the loop with its learner as it was at several instants.
+
+    Each is the loop that would follow if the plant came to rest there (``analyse``). That all of
+    them are stable does not prove that the loop with a learner that learns is stable
+    (docs/analysis). Raises
+    ``ValueError`` as ``frozen`` and ``analyse`` do, for a time outside of the run, and for a
+    scenario in which the loop diverges before it.
+
+    Parameters
+    ----------
+    plant, controller
+        as for ``analyse``; with a scenario the plant must be one that can be simulated.
+    run
+        a ``Trajectory``, whose record holds the learner's coefficients; or the ``Scenario`` of a
+        run, which is simulated up to each instant and works for every learner.
+    times
+        instants [s].
+    options
+        ``delay``, ``actuator_lag`` and ``operating_point``, as for ``analyse``.
+    """
+    instants = checks.vector("times", times).tolist()
+    if isinstance(run, Trajectory):
+        return [
+            analyse(plant, controller, at=adapting(controller, run, t), **options) for t in instants
+        ]
+    if not isinstance(run, Scenario):
+        raise ValueError(f"run = {run!r}: must be a Trajectory or a Scenario")
+    loops = []
+    for t in instants:
+        if not 0.0 < t <= run.duration:
+            raise ValueError(f"times has {t!r}: must lie within (0, duration = {run.duration!r}] s")
+        until = replace(run, duration=t, rest_at=tuple(at for at in run.rest_at if at < t))
+        # Only the final state is used.
+        record = simulate(plant, controller, until, record_every=10**9)
+        if record.diverged:
+            raise ValueError(f"times has {t!r}: the loop diverged at {record.ended:.6g} s")
+        loops.append(analyse(plant, controller, at=record, **options))
+    return loops
+
+
+def loops_over_omega_o(
+    plant: Any, make_controller: Callable[[float], Controller], omegas: Any, **options: Any
+) -> list[LoopAnalysis]:
+    """Analyse designs with several observer bandwidths.
+
+    Parameters
+    ----------
+    plant
+        as for ``analyse``.
+    make_controller
+        returns the controller for an omega_o [rad/s].
+    omegas
+        the bandwidths [rad/s], at least one.
+    options
+        ``delay``, ``actuator_lag`` and ``operating_point``, as for ``analyse``.
+
+    Raises
+    ------
+    ValueError
+        for a bandwidth that is not greater than zero; as ``analyse``.
+    """
+    bandwidths = checks.positive_vector("omegas", omegas)
+    if bandwidths.size == 0:
+        raise ValueError(f"omegas = {omegas!r}: must hold at least one bandwidth")
+    return [analyse(plant, make_controller(omega_o), **options) for omega_o in bandwidths.tolist()]
+
+
+# ---- Plots of loops ----
 
 _AID: dict[str, Any] = {"color": "0.5", "linewidth": 0.8}
 
@@ -267,3 +348,115 @@ def _finish(ax: Axes, label: str, loop: LoopAnalysis | None = None, scale: float
         ax.axvline(scale * np.pi / loop.dt, color="0.7", linestyle=":", linewidth=1.0)
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)
+
+
+# ---- Plots of loops in the complex plane ----
+
+# Part of the plane that a Nyquist plot shows: the point −1 and what is near it. By hand.
+_REACH = 2.5
+# Poles farther from the origin than so many times the median are not drawn. By hand.
+_FAR = 30.0
+
+
+def plot_nyquist(loop: LoopAnalysis, ax: Any = None, *, axes: Any = None, **style: Any) -> Axes:
+    """Plot ``L(jω)`` near the point −1, with the circle that it must not enter; return the axes.
+
+    The circle about −1 touches the curve: its radius is the modulus margin 1/M_s.
+
+    Parameters
+    ----------
+    loop
+        from ``analyse``.
+    ax, axes
+        matplotlib axes; those of a new figure by default.
+    style
+        of the curve, for example ``label``.
+    """
+    one = _one(given_axes(axes, ax))
+    L = loop.response("L", loop.omega[:-1])
+    (line,) = one.plot(L.real, L.imag, **style)
+    mirrored = {"color": line.get_color(), "linestyle": "--", "linewidth": 0.8, "alpha": 0.6}
+    one.plot(L.real, -L.imag, **mirrored)
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    one.plot(np.cos(angle), np.sin(angle), color="0.7", linewidth=0.8)
+    one.plot([-1.0], [0.0], "+", color="C3", markersize=10.0)
+    modulus = loop.margins.modulus
+    if np.isfinite(modulus) and modulus > 0.0:
+        circle = -1.0 + modulus * np.cos(angle), modulus * np.sin(angle)
+        one.plot(*circle, color="C3", linestyle=":", linewidth=1.0)
+        text = rf"modulus margin {modulus:.2f}, $M_s$ = {1.0 / modulus:.2f}"
+        one.set_title(text, loc="right", fontsize="small")
+    one.set(xlim=(-_REACH - 0.5, _REACH - 0.5), ylim=(-_REACH, _REACH), aspect="equal")
+    one.set(xlabel="Re L", ylabel="Im L")
+    one.grid(alpha=0.3)
+    return one
+
+
+def plot_root_locus(
+    plant: Any,
+    make_controller: Callable[[float], Controller],
+    values: Any,
+    ax: Any = None,
+    *,
+    axes: Any = None,
+    parameter: str = "omega_o",
+    **lags: Any,
+) -> Axes:
+    """Plot the poles of the loop in the s-plane over a design's parameter; return the axes.
+
+    Parameters
+    ----------
+    plant
+        as for ``analyse``.
+    make_controller
+        returns the controller for a value: of omega_o [rad/s], of b0, or of another number.
+    values
+        the values, greater than zero.
+    ax, axes
+        matplotlib axes; those of a new figure by default.
+    parameter
+        name of what is varied, for the colour bar.
+    lags
+        ``delay``, ``actuator_lag`` and ``operating_point``, as for ``analyse``.
+
+    Raises
+    ------
+    ValueError
+        as ``loops_over_omega_o``.
+    """
+    numbers = checks.positive_vector("values", values)
+    loops = loops_over_omega_o(plant, make_controller, numbers, **lags)
+    one = _one(given_axes(axes, ax))
+    poles = [loop.s_poles[np.isfinite(loop.s_poles)] for loop in loops]
+    far = _FAR * float(np.median(np.abs(np.concatenate(poles))))
+    points = np.concatenate([each[np.abs(each) <= far] for each in poles])
+    counts = [int(np.sum(np.abs(each) <= far)) for each in poles]
+    from matplotlib.colors import LogNorm
+
+    colors: dict[str, Any] = {"c": np.repeat(numbers, counts), "cmap": "viridis", "norm": LogNorm()}
+    shown = one.scatter(points.real, points.imag, s=9.0, **colors)
+    one.axvline(0.0, color="C3", linewidth=1.0)
+    unit = "rad/s" if parameter in ("omega_o", "omega_c") else ""
+    for at, marker in ((0, "x"), (-1, "o")):
+        ends = poles[at][np.abs(poles[at]) <= far]
+        style = {"color": "0.2", "markersize": 6.0, "fillstyle": "none", "linestyle": "none"}
+        label = f"{parameter} = {numbers[at]:.3g} {unit}".rstrip()
+        one.plot(ends.real, ends.imag, marker, label=label, **style)
+    one.figure.colorbar(shown, ax=one, label=f"{parameter} [{unit}]" if unit else parameter)
+    one.set(xlabel="Re s [1/s]", ylabel="Im s [rad/s]")
+    above: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "frameon": False}
+    one.legend(ncols=2, fontsize="small", **above)
+    one.grid(alpha=0.3)
+    return one
+
+
+def _one(ax: Any) -> Any:
+    """Return the axes, those of a new figure for None."""
+    if ax is not None:
+        found = np.ravel(np.asarray(ax, dtype=object))
+        if found.size != 1:
+            raise ValueError(f"ax: must be one of matplotlib's axes, got {found.size}")
+        return found[0]
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=(5.6, 5.0), layout="constrained")[1]

@@ -9,23 +9,14 @@ from typing import Any
 from cyclopts import App, CycloptsError
 
 from quell import __version__
-from quell.cli.commands.acc import acc
-from quell.cli.commands.b0 import b0
-from quell.cli.commands.compare import compare
-from quell.cli.commands.excite import excite
-from quell.cli.commands.export import export
-from quell.cli.commands.identify import identify
-from quell.cli.commands.replay import replay
-from quell.cli.commands.rig import rig
-from quell.cli.commands.run import run
-from quell.cli.commands.run_rig import run_rig
-from quell.cli.commands.stress import stress
-from quell.cli.commands.studio import studio
-from quell.cli.commands.sweep import sweep
-from quell.cli.commands.torsional import torsional
-from quell.cli.commands.tune import tune
-from quell.cli.commands.two_mass import two_mass
+from quell.cli.compare import compare
 from quell.cli.exit_codes import HELP, ExitCode
+from quell.cli.identify import b0, excite, identify
+from quell.cli.reproduce import acc, torsional, two_mass
+from quell.cli.rig import replay, rig, run_rig
+from quell.cli.run import export, run, studio, sweep
+from quell.cli.stress import stress
+from quell.cli.tune import tune
 
 # A shorter time of compiling is not worth a line [s].
 _LONG = 1.0
@@ -92,7 +83,7 @@ def main() -> None:
 
 def _compile_time() -> float:
     """Return how long this process has compiled unannounced [s]; import no compiler for that."""
-    module = sys.modules.get("quell.kernels.compile_time")
+    module = sys.modules.get("quell.kernels.cache")
     if module is None:
         return 0.0
     return float(module.compile_time.seconds - module.compile_time.told)

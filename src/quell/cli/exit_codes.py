@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from quell.cli.output import Console, print_line
 
 if TYPE_CHECKING:
     from quell.records.trajectory import Trajectory
+
+# ---- Exit codes of all commands ----
 
 
 class ExitCode(IntEnum):
@@ -59,3 +65,39 @@ def exit_if_diverged(runs: Iterable[Trajectory]) -> None:
     """End the process with the code for diverged runs if one of them diverged."""
     if any(run.diverged for run in runs):
         sys.exit(ExitCode.DIVERGED)
+
+
+# ---- Questions before something is applied to a real plant ----
+
+
+def confirm(console: Console, question: str, yes: bool) -> bool:
+    """Ask a question that ``yes`` answers at once; return whether the answer is yes.
+
+    Raises ``ValueError`` where nobody can answer.
+    """
+    if yes:
+        print_line(console, f"{question} yes (--yes)")
+        return True
+    if not sys.stdin.isatty():
+        raise ValueError("yes = False: there is no terminal to ask at; give --yes in scripts")
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+# ---- Ctrl-C and other signals that end a program, while code is compiled or loaded ----
+
+
+@contextmanager
+def exit_on_signal(close: Callable[[], Any]) -> Iterator[None]:
+    """Make signals that end a program call ``close`` and exit with 128 plus the signal's number.
+
+    An exception could be lost: compiling and loading run through callbacks that ignore exceptions.
+    """
+    from quell.realtime.system import termination_handler
+
+    def end(number: int, frame: Any) -> None:
+        close()
+        print("quell: interrupted", file=sys.stderr, flush=True)
+        os._exit(128 + number)
+
+    with termination_handler(end):
+        yield

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, Token
 
-from quell.reading import MAX_SIZE
+from quell.files import MAX_SIZE
 
 
 def whole_number(kind: Any, tokens: Sequence[Token]) -> int:

@@ -98,7 +98,7 @@ def check_outputs(outputs: T, figures: Sequence[str], recordings: Sequence[Path]
         for a file that exists, unless ``outputs.overwrite``; that cannot be written; or that two
         outputs have in common; or a folder that cannot be created.
     """
-    from quell.experiments.common.figures import figure_files, make_folder
+    from quell.experiments.common import figure_files, make_folder
     from quell.files import check_writable, new_folder
 
     named = (outputs.json, outputs.save if isinstance(outputs, RunOutputs) else None)
@@ -116,8 +116,8 @@ def check_outputs(outputs: T, figures: Sequence[str], recordings: Sequence[Path]
 
 def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:
     """Compile the loops of a study, or load them from the cache; print how long compiling took."""
-    from quell.kernels.compile_time import compile_time
-    from quell.simulation.precompile import precompile
+    from quell.kernels.cache import compile_time
+    from quell.simulation.simulate import precompile
 
     began = time.perf_counter()
     with console.status("Compiling what is not in the cache: some ten seconds, once."):

@@ -5,24 +5,25 @@ May import ``guard``, ``learners``, ``plants``, ``observers`` and what they impo
 """
 
 from quell.controllers import baselines
-from quell.controllers.adrc.adrc import ADRC
-from quell.controllers.adrc.dead_time import (
+from quell.controllers.adrc import (
+    ADRC,
     DeadTimeTuning,
+    Estimate,
     adrc_for_dead_time,
     dead_time_tuning,
+    warn_if_unwise,
 )
-from quell.controllers.adrc.estimate import Estimate
-from quell.controllers.adrc.feedback import NonlinearFeedback
-from quell.controllers.adrc.feedforward import Feedforward
-from quell.controllers.bandwidth import omega_c_for
-from quell.controllers.base import Controller
-from quell.controllers.design_checks import warn_if_unwise
-from quell.controllers.linear.law import LinearLaw
-from quell.controllers.linear.linear import LinearController
-from quell.controllers.prefilters.differentiator import TrackingDifferentiator
-from quell.controllers.prefilters.prefilter import Prefilter, Prefiltered
-from quell.controllers.prefilters.profile import ProfileGenerator
-from quell.controllers.prefilters.reference_model import ReferenceModel
+from quell.controllers.base import Controller, omega_c_for
+from quell.controllers.feedforward import Feedforward
+from quell.controllers.law import NonlinearFeedback
+from quell.controllers.linear import LinearController, LinearLaw
+from quell.controllers.prefilters import (
+    Prefilter,
+    Prefiltered,
+    ReferenceModel,
+    TrackingDifferentiator,
+)
+from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
 
 __all__ = [

@@ -13,13 +13,12 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell.envs.env import Env
-    from quell.envs.policy import Policy
-    from quell.envs.vector import VectorEnv
+    from quell.envs.env import Env, VectorEnv
+    from quell.envs.loops import Policy
 
 __all__ = ["Env", "Policy", "VectorEnv", "register"]
 
-_HOME = {"Env": "env", "Policy": "policy", "VectorEnv": "vector"}
+_HOME = {"Env": "env", "Policy": "loops", "VectorEnv": "env"}
 
 
 def __getattr__(name: str) -> Any:
@@ -39,7 +38,7 @@ def register() -> None:
     ImportError
         without Gymnasium.
     """
-    import_module("quell.envs.registration").register_all()
+    import_module("quell.envs.env").register_all()
 
 
 if find_spec("gymnasium") is not None:

@@ -1,20 +1,419 @@
-"""``Env``: one loop that a policy drives."""
+"""Spaces of observations and actions, with finite bounds.
+
+``Env``: one loop that a policy drives.
+
+``VectorEnv``: many loops that a policy drives, in one compiled call.
+
+The environments ``quell/…-v0``: the library's plants with scenarios that are drawn.
+
+Each name with ``-residual`` has an ADRC with ``Policy`` and ``Guard`` around the plant of the name
+without it. All other arguments of ``Env`` can be given, also in place of these here.
+
+Names of the library's environments in Gymnasium's registry.
+
+It imports nothing of quell that takes time.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.adrc.adrc import ADRC
-from quell.envs.driven import Driven
-from quell.envs.episodes import Draw
-from quell.envs.rendering import MODES, as_picture, as_text
-from quell.optional import import_extra
-from quell.plants.labelled import signals_of
-from quell.simulation.scenario import Scenario
+from quell import checks, plants
+from quell.checks import import_extra
+from quell.controllers.adrc import ADRC
+from quell.controllers.base import Controller, checked_limits
+from quell.envs.loops import Draw, GivenControl, GivenDesign, Loops, Policy
+from quell.guard import Guard
+from quell.lti.models import is_linear_model
+from quell.observers.eso import ESO
+from quell.plants.base import check_plant, signals_of
+from quell.plants.linear import LinearPlant
+from quell.quantities import UNKNOWN, Signals
+from quell.records.record import columns_of
+from quell.signals import BandLimitedNoise, Sinusoid, Step
+from quell.simulation.driver import Scenario
+from quell.types import Vector
+
+# ---- Spaces of observations and actions, with finite bounds ----
+
+OBSERVED_WITH_U = ("r", "y_measured", "u", "x")
+OBSERVED_WITH_F = ("r", "y_measured", "u", "x_hat", "f_residual", "f_learned")
+# Entries of a controller's status are flags below this (``types.Status``).
+_FLAGS = 2048.0
+
+
+class Action(NamedTuple):
+    """Values of the actions −1 and 1: ``middle ± reach``."""
+
+    middle: float
+    reach: float
+    u_min: float
+    u_max: float
+
+
+def loop_of(
+    controller: ADRC | None, dt: float | None, u_min: float, u_max: float
+) -> tuple[Controller, Action]:
+    """Return the controller of the loop and the meaning of its action.
+
+    Raises
+    ------
+    ValueError
+        for a controller without ``Policy``, without finite limits, or for missing arguments.
+    """
+    if controller is None:
+        if dt is None:
+            raise ValueError("dt = None: must be the sample time [s] if there is no controller")
+        dt = checks.positive("dt", dt, "s")
+        low, high = _limits(u_min, u_max, "u_min and u_max")
+        middle, reach = 0.5 * (low + high), 0.5 * (high - low)
+        given = GivenDesign(checked_limits(low, high, math.inf, dt))
+        return GivenControl(dt, given), Action(middle, reach, low, high)
+    if not isinstance(controller, ADRC) or not isinstance(controller.learner, Policy):
+        raise ValueError(
+            f"controller = {controller!r}: must be a quell.ADRC with learner=quell.envs.Policy(), "
+            "whose output the actions are, or None for actions that are u"
+        )
+    twice = {"dt": dt is not None, "u_min": u_min != -math.inf, "u_max": u_max != math.inf}
+    for name, is_given in twice.items():
+        if is_given:
+            raise ValueError(f"{name}: the controller has it; give it there only")
+    limits = controller.limits
+    low, high = _limits(limits.low, limits.high, "u_min and u_max of the controller")
+    most = controller.learner.most
+    if most is None:
+        most = 0.5 * abs(controller.observer.b0) * (high - low)
+    return controller, Action(0.0, most, low, high)
+
+
+def _limits(low: Any, high: Any, what: str) -> tuple[float, float]:
+    with suppress(TypeError, ValueError, OverflowError):
+        ends = float(low), float(high)
+        if -math.inf < ends[0] < ends[1] < math.inf:
+            return ends
+    raise ValueError(f"{what} = {low!r}, {high!r}: must be finite, the first one smaller")
+
+
+class Observed:
+    """The observed channels: their columns in a row, and their bounds.
+
+    A channel's bound is what it can be while ``|y|`` is within the limit L: L for r and y, the
+    limits for u, ``L omega_o^i`` for the i-th derivative that the observer estimates. States of the
+    plant have the bound ``x_limit``, disturbances L.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str] | None,
+        loop: Loops,
+        action: Action,
+        x_limit: Any,
+    ) -> None:
+        is_adrc = isinstance(loop.controller, ADRC)
+        default = OBSERVED_WITH_F if is_adrc else OBSERVED_WITH_U
+        if isinstance(names, str):
+            names = (names,)
+        if names is not None and not checks.is_sequence(names):
+            raise ValueError(f"observe = {names!r}: must be a list of names of channels")
+        self.names = tuple(names or default)
+        widths = {name: width for name, width in loop.channels if width}
+        for name in self.names:
+            checks.one_of("observe", name, tuple(widths))
+        if len({*self.names}) != len(self.names):
+            raise ValueError(f"observe = {names!r}: must be different channels")
+        most = _bounds(loop, action, x_limit)
+        high = [np.broadcast_to(most.get(name, loop.limit), widths[name]) for name in self.names]
+        low = [
+            np.full(1, action.u_min) if name == "u" else -each
+            for name, each in zip(self.names, high, strict=True)
+        ]
+        self.high: Vector = np.concatenate(high).astype(np.float64)
+        self.low: Vector = np.concatenate(low).astype(np.float64)
+        every = range(sum(widths.values()))
+        chosen = [every[columns_of(loop.channels, name)] for name in self.names]
+        self.columns = np.array([k for columns in chosen for k in columns])
+
+    def of(self, rows: Any) -> Any:
+        """Return the observations of rows (…, channels), clipped to the bounds."""
+        return np.clip(rows[..., self.columns], self.low, self.high)
+
+
+def _bounds(loop: Loops, action: Action, x_limit: Any) -> dict[str, Any]:
+    """Return the bounds that are not the limit, by channel."""
+    order, limit = loop.plant.order, loop.limit
+    x = np.full(order, limit) if x_limit is None else np.atleast_1d(x_limit)
+    if x.size == 1:
+        x = np.full(order, x[0])
+    found: dict[str, Any] = {"u": action.u_max}
+    found["x"] = checks.positive_vector("x_limit", x)
+    if x.size != order:
+        raise ValueError(f"x_limit has {x.size} entries: must be a number, or one for each state")
+    if isinstance(loop.controller, ADRC):
+        observer = loop.controller.observer
+        rates = limit * observer.omega_o ** np.arange(observer.estimates + 0.0)
+        n = observer.order
+        f = max(float(rates[n]), action.reach)
+        found |= dict.fromkeys(("f_residual", "f_learned", "error_plain", "error_learned"), f)
+        found |= {"x_hat": rates[:n], "f_derivatives": rates[n + 1 :]}
+        found |= {"authority": 1.0, "status": _FLAGS, "reason": _FLAGS}
+    return found
+
+
+# ---- Loops, spaces and the work of a step, which Env and VectorEnv share ----
+
+# Channels that ``info`` shows if there are any.
+_SHOWN = ("y", "u", "f_learned", "authority")
+
+
+class Driven:
+    """Loops that a policy drives; see ``Env`` for the parameters."""
+
+    def __init__(
+        self,
+        count: int,
+        plant: Any,
+        scenario: Scenario | Draw,
+        controller: ADRC | None = None,
+        *,
+        dt: float | None = None,
+        u_min: float = -math.inf,
+        u_max: float = math.inf,
+        action_repeat: int = 1,
+        limit: float | None = None,
+        cost_of_u: float = 0.0,
+        observe: Sequence[str] | None = None,
+        x_limit: Any = None,
+        interpret: bool = False,
+        workers: int | None = None,
+    ) -> None:
+        if not hasattr(plant, "sampled") and is_linear_model(plant):
+            plant = LinearPlant.of(plant)
+        if not checks.is_sequence(plant):
+            check_plant(plant)
+        law, self.action = loop_of(controller, dt, u_min, u_max)
+        u_most = max(abs(self.action.u_min), abs(self.action.u_max))
+        self.loops = Loops(
+            *(plant, scenario, law, count),
+            repeat=action_repeat,
+            limit=limit,
+            cost_of_u=cost_of_u,
+            u_most=u_most,
+            interpret=checks.flag("interpret", interpret),
+            workers=workers,
+        )
+        self.observed = Observed(observe, self.loops, self.action, x_limit)
+        names = [name for name, width in self.loops.channels if width]
+        self._shown = [name for name in _SHOWN if name in names]
+        self._columns = [self.loops.column(name) for name in self._shown]
+        self.step_time = law.dt * action_repeat
+        box = import_extra("gymnasium.spaces", "envs", "quell.envs").Box
+        self.observation_space = box(self.observed.low, self.observed.high, dtype=np.float64)
+        self.action_space = box(-1.0, 1.0, (1,), np.float64)
+
+    def begin(self, rngs: Sequence[np.random.Generator]) -> None:
+        """Begin an episode in each loop, and write its first row."""
+        count = self.loops.count
+        self.loops.reset(range(count), rngs)
+        self.loops.advance(np.zeros(count), np.zeros(count, np.int64))
+
+    def advance(self, actions: Vector, active: Any) -> None:
+        """Take the active loops through a step with actions from −1 to 1, which are clipped."""
+        if not np.all(np.isfinite(actions)):
+            raise ValueError(f"action = {actions!r}: must be finite")
+        middle, reach = self.action.middle, self.action.reach
+        self.loops.advance(middle + reach * np.clip(actions, -1.0, 1.0), active)
+
+    @property
+    def observations(self) -> Any:
+        """Observations of all loops (N, …)."""
+        return self.observed.of(self.loops.step.row)
+
+    @property
+    def ends(self) -> tuple[Any, Any]:
+        """Which loops have diverged, and which are at the end of their episode (N,)."""
+        step = self.loops.step
+        terminated = step.diverged != 0
+        return terminated, (step.sample >= self.loops.rules.samples - 1) & ~terminated
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Arrays (N,) of the time, of channels and of the step's status flags."""
+        step = self.loops.step
+        shown = dict(zip(self._shown, step.row[:, self._columns].T.copy(), strict=True))
+        return {"t": step.sample * self.loops.rules.dt, **shown, "status": step.status.copy()}
+
+
+# ---- VectorEnv ----
+
+_PURPOSE = "quell.envs.VectorEnv"
+vector = import_extra("gymnasium.vector", "envs", _PURPOSE)
+batch_space = import_extra("gymnasium.vector.utils", "envs", _PURPOSE).batch_space
+errors = import_extra("gymnasium.error", "envs", _PURPOSE)
+seeding = import_extra("gymnasium.utils.seeding", "envs", _PURPOSE)
+
+
+class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ignore]
+    """Many loops that a policy drives, advanced in one compiled call on all cores.
+
+    Loop i of ``reset(seed=s)`` is an ``Env`` with ``reset(seed=s + i)``, bit for bit; ``Env`` says
+    what is observed and rewarded. A loop whose episode has ended begins the next one in the step
+    after it: that step ignores its action, returns the first observation and the reward zero
+    (Gymnasium's ``AutoresetMode.NEXT_STEP``).
+
+    Parameters
+    ----------
+    num_envs
+        number of loops N.
+    plant
+        one plant for all loops, or a sequence with one for each, as from ``quell.plants.batch``:
+        linear plants of one order, nonlinear ones that differ in their ``parameters``, or others
+        that differ only in arrays.
+    scenario, controller
+        as for ``Env``. Scenarios that are drawn, or have noise, take 8 bytes for each loop, sample
+        and signal: 64 MB for 1000 loops, 2000 samples, r, noise and two disturbances.
+    workers
+        number of threads; by default one for each core.
+    options
+        all other arguments of ``Env`` but ``render_mode``.
+
+    Raises
+    ------
+    ImportError, ValueError
+        as for ``Env``, and for plants that do not fit together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import quell as ql
+    >>> from quell.envs import VectorEnv
+    >>> plants = ql.plants.batch(ql.plants.two_mass_spring, k=np.linspace(0.5, 2.0, 8))
+    >>> scenario = ql.Scenario(ql.signals.Step(), duration=5.0)
+    >>> env = VectorEnv(8, plants, scenario, dt=0.01, u_min=-1.0, u_max=1.0)
+    >>> observations, infos = env.reset(seed=1)
+    >>> observations.shape
+    (8, 7)
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        plant: Any,
+        scenario: Scenario | Draw,
+        controller: ADRC | None = None,
+        *,
+        workers: int | None = None,
+        **options: Any,
+    ) -> None:
+        self.num_envs = checks.whole("num_envs", num_envs, 1)
+        driven = Driven(self.num_envs, plant, scenario, controller, workers=workers, **options)
+        self._driven, self._ended = driven, np.zeros(self.num_envs, bool)
+        self.single_observation_space = driven.observation_space
+        self.single_action_space = driven.action_space
+        self.observation_space = batch_space(driven.observation_space, self.num_envs)
+        self.action_space = batch_space(driven.action_space, self.num_envs)
+        self.metadata = {"autoreset_mode": vector.AutoresetMode.NEXT_STEP, "render_modes": []}
+        self._rngs: list[np.random.Generator] = []
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in each loop; return the first observations and ``infos``.
+
+        ``seed`` s gives loop i the seed s + i; a sequence has the seed of each loop. Without seeds
+        the generators of the loops go on, and the first time are seeded by the system.
+        """
+        count = self.num_envs
+        seeds = (
+            [int(seed) + i for i in range(count)] if isinstance(seed, int | np.integer) else seed
+        )
+        if seeds is not None and not checks.is_sequence(seeds):
+            raise ValueError(f"seed = {seed!r}: must be a whole number, or a list of one for each")
+        if seeds is not None and len(seeds) != count:
+            raise ValueError(f"seed has {len(seeds)} entries, num_envs = {count}: must be equal")
+        if seeds is not None or not self._rngs:
+            before: list[Any] = [*self._rngs] or [None] * count
+            self._rngs = [
+                rng if each is None and rng is not None else seeding.np_random(each)[0]
+                for rng, each in zip(before, seeds or [None] * count, strict=True)
+            ]
+        self._driven.begin(self._rngs)
+        self._ended[:] = False
+        return self._driven.observations, self._infos()
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Take a step in each loop; return observations, rewards, terminations, truncations, infos.
+
+        ``actions`` are (N, 1).
+        """
+        if not self._rngs:
+            raise errors.ResetNeeded("step was called before reset: call reset first")
+        given = np.asarray(actions, dtype=np.float64)
+        if given.size != self.num_envs:
+            raise ValueError(f"actions have shape {given.shape}: must have ({self.num_envs}, 1)")
+        begin = np.flatnonzero(self._ended).tolist()
+        if begin:
+            self._driven.loops.reset(begin, self._rngs)
+        self._driven.advance(given.reshape(-1), (~self._ended).astype(np.int64))
+        terminated, truncated = self._driven.ends
+        self._ended = terminated | truncated
+        rewards = 0.0 - self._driven.loops.step.cost
+        return self._driven.observations, rewards, terminated, truncated, self._infos()
+
+    def _infos(self) -> dict[str, Any]:
+        infos = self._driven.info
+        everywhere = np.ones(self.num_envs, bool)
+        return infos | {f"_{name}": everywhere for name in infos}
+
+    def close_extras(self, **unused: Any) -> None:
+        """End the threads."""
+        self._driven.loops.close()
+
+
+# ---- Text and pictures of an episode ----
+
+MODES = ("ansi", "rgb_array")
+_SIZE, _DOTS = (6.4, 4.8), 100  # inches, and dots an inch: 640 x 480, as Gymnasium's own
+
+
+def as_text(past: Sequence[tuple[float, ...]], signals: Signals = UNKNOWN) -> str:
+    """Return the last of the rows (t, r, y, u) as a line with units."""
+    t, r, y, u = past[-1]
+    of_y, of_u = (f" {each.unit}" if each.unit else "" for each in (signals.y, signals.u))
+    return f"t = {t:8.3f} s   r = {r:10.4g}{of_y}   y = {y:10.4g}{of_y}   u = {u:10.4g}{of_u}\n"
+
+
+def as_picture(past: Sequence[tuple[float, ...]], signals: Signals = UNKNOWN) -> Any:
+    """Return rows (t, r, y, u) as a picture (480, 640, 3) of y over r, and of u, with units."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=_SIZE, dpi=_DOTS, layout="constrained")
+    canvas: Any = FigureCanvasAgg(figure)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    t, r, y, u = np.asarray(past).T
+    upper.plot(t, y, label="y")
+    upper.plot(t, r, "--", label="r")
+    upper.set_ylabel(signals.y.label("output"))
+    # u is held during the step that ends with its row.
+    lower.step(t, u, where="pre", label="u")
+    lower.set_ylabel(signals.u.label("control signal"))
+    lower.set_xlabel("time [s]")
+    for axes in (upper, lower):
+        # Above the axes, where it hides no data.
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[..., :3].copy()
+
+
+# ---- Env ----
 
 gymnasium = import_extra("gymnasium", "envs", "quell.envs.Env")
 
@@ -176,3 +575,123 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
     def close(self) -> None:
         """End the loop; of a single one nothing is left to release."""
         self._driven.loops.close()
+
+
+# ---- The environments quell/…-v0 ----
+
+# Bandwidths and b0 of the loops are those of the library's studies: two masses and the torsional
+# testbed of the paper (experiments/), the motor of benchmarks/cogging.py.
+
+
+def two_mass_scenario(rng: np.random.Generator) -> Scenario:
+    """Draw 20 s: a step of r of up to 1 m, a sinusoidal force on m2 of up to 0.3 N, noise."""
+    force = Sinusoid(
+        amplitude=float(rng.uniform(0.0, 0.3)),
+        omega=float(rng.uniform(0.2, 0.6)),
+        start=float(rng.uniform(0.0, 5.0)),
+    )
+    return Scenario(
+        reference=Step(height=float(rng.uniform(-1.0, 1.0))),
+        disturbances=(0.0, force),
+        noise=BandLimitedNoise(power=1e-12, sample_time=0.01),
+        duration=20.0,
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def dc_motor_scenario(rng: np.random.Generator) -> Scenario:
+    """Draw 2 s: a step of r of up to a turn, from 1 s on a load torque of up to 0.02 N m."""
+    return Scenario(
+        reference=Step(height=float(rng.uniform(-math.tau, math.tau))),
+        disturbances=(Step(height=float(rng.uniform(-0.02, 0.02)), at=1.0),),
+        duration=2.0,
+    )
+
+
+def torsional_scenario(rng: np.random.Generator) -> Scenario:
+    """Draw 4 s: a sinusoid of r of up to π/2 rad, and a quarter to half a turn a second."""
+    reference = Sinusoid(
+        amplitude=float(rng.uniform(0.0, 0.5 * math.pi)),
+        omega=float(rng.uniform(0.5 * math.pi, math.pi)),
+    )
+    return Scenario(reference, duration=4.0)
+
+
+def _loop(name: str) -> dict[str, Any]:
+    """Return the arguments of ``Env`` for the action u."""
+    if name == "two-mass":
+        loop = {"plant": plants.two_mass_spring(), "scenario": two_mass_scenario, "dt": 0.01}
+        return loop | {"u_min": -8.0, "u_max": 8.0, "limit": 10.0}
+    if name == "dc-motor":
+        loop = {"plant": plants.dc_motor(), "scenario": dc_motor_scenario, "dt": 1e-3}
+        limits = {"u_min": -24.0, "u_max": 24.0, "limit": 20.0, "x_limit": (20.0, 600.0)}
+        return loop | limits | {"action_repeat": 5}
+    plant = plants.torsional()
+    loop = {"plant": plant, "scenario": torsional_scenario, "dt": 1e-3}
+    return loop | {"u_min": -plant.u_max, "u_max": plant.u_max, "limit": 20.0, "action_repeat": 5}
+
+
+def _residual_loop(name: str) -> dict[str, Any]:
+    """Return the arguments of ``Env`` for the action f."""
+    loop = _loop(name)
+    dt, u_min, u_max = loop.pop("dt"), loop.pop("u_min"), loop.pop("u_max")
+    order, b0, omega_o, omega_c, most = {
+        "two-mass": (4, 1.0, 10.0, 1.0, 2.0),
+        "dc-motor": (2, 500.0, 200.0, 40.0, None),
+        "torsional": (4, 5.5e4, 90.0, 20.0, None),
+    }[name]
+    controller = ADRC(
+        ESO.model_free(order=order, b0=b0, omega_o=omega_o, dt=dt),
+        omega_c=omega_c,
+        learner=Policy(most),
+        guard=Guard(),
+        u_min=u_min,
+        u_max=u_max,
+    )
+    return loop | {"controller": controller}
+
+
+def arguments(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of the environment ``name``, with those that are given instead."""
+    plain = name.removesuffix("-residual")
+    loop = _loop(plain) if plain == name else _residual_loop(plain)
+    return loop | dict(given)
+
+
+def make(name: str, **given: Any) -> Any:
+    """Return the environment ``name`` of ``registration.NAMES``."""
+    return Env(**arguments(name, given))
+
+
+def make_vector(name: str, num_envs: int, **given: Any) -> Any:
+    """Return the same as a ``VectorEnv``."""
+    return VectorEnv(num_envs, **arguments(name, given))
+
+
+# ---- Names of the library's environments in Gymnasium's registry ----
+
+NAMES = (
+    "two-mass",
+    "two-mass-residual",
+    "dc-motor",
+    "dc-motor-residual",
+    "torsional",
+    "torsional-residual",
+)
+"""Environments of this file, by their names without namespace and version."""
+
+
+def register_all() -> None:
+    """Add what is missing to Gymnasium's registry."""
+    purpose = "quell.envs"
+    registration = import_extra("gymnasium.envs.registration", "envs", purpose)
+    for name in NAMES:
+        full_name = f"quell/{name}-v0"
+        if full_name in registration.registry:
+            continue
+        registration.register(
+            id=full_name,
+            entry_point="quell.envs.env:make",
+            vector_entry_point="quell.envs.env:make_vector",
+            kwargs={"name": name},
+        )

@@ -1,30 +1,492 @@
-"""Many loops that a policy drives step by step: the work of ``Env`` and ``VectorEnv``."""
+"""The quantity that a policy sets in each sample: f_L of an ADRC, or u itself.
+
+Both are controllers for the compiled loop, which calls ``set_action`` before each sample.
+
+Scenarios of episodes: one that is fixed, or one that is drawn for each.
+
+Many loops that a policy drives step by step: the work of ``Env`` and ``VectorEnv``.
+
+The compiled loop of the environments: some samples of each of many loops.
+
+Many states of one layout, one after the other in memory, for a compiled loop over them.
+
+A state is a NamedTuple of arrays. Compiled code gets the first one and the distance to the next;
+``member`` then moves the addresses of all its arrays, so that nothing is copied, and the shapes
+stay constants (``kernels/sized.py``).
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba.core import cgutils
+from numba.core import types as nb_types
+from numba.extending import intrinsic, overload
+from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.base import Controller
-from quell.envs.block import SIGNALS, Lane, Rules, Step, run_step
-from quell.envs.episodes import Draw, Episodes
-from quell.envs.stacked import Stacked
+from quell.checks import positive
+from quell.controllers.base import (
+    Controller,
+    Limits,
+    control,
+    reset_loop,
+    set_reference_derivatives,
+    status_flags,
+    write_row,
+)
+from quell.controllers.law import AdrcDesign, AdrcState
 from quell.kernels import dispatch
-from quell.kernels.dispatch import interpreted, specialised
+from quell.kernels.dispatch import (
+    compiled_loop,
+    explain_compile_errors,
+    generic,
+    interpreted,
+    is_finite,
+    specialised,
+)
+from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS
 from quell.kernels.sized import layout_of
-from quell.kernels.user_types import explain_compile_errors
-from quell.plants.base import Plant, begin_run, check_run
-from quell.plants.batch import PlantBatch
-from quell.records.channels import columns_of
-from quell.simulation.driver import logged_channels
-from quell.simulation.scenario import Scenario
-from quell.types import Channels, Vector
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    no_coefficients,
+    nothing_to_restart,
+    predict,
+    restart,
+)
+from quell.observers.eso import ESO
+from quell.plants.base import Plant, PlantBatch, advance, begin_run, check_run, measure
+from quell.records.record import columns_of
+from quell.simulation.driver import SampledScenario, Scenario, check_scenario, logged_channels
+from quell.types import Channels, Matrix, Vector
+
+# ---- The quantity that a policy sets in each sample ----
+
+
+@generic
+def set_action(controller: Any, state: Any, action: float) -> None:
+    """Set the action of the next sample: u [u-unit], or f_L [y-unit/s^n]."""
+    raise TypeError
+
+
+class PolicyDesign(NamedTuple):
+    """Parameters of ``Policy``: none."""
+
+
+class PolicyMemory(NamedTuple):
+    """State of ``Policy``."""
+
+    output: Vector  # f_L that the policy asks for (1,) [y-unit/s^n]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A learner whose output a policy sets from outside, sample by sample.
+
+    ``ADRC(…, learner=Policy(), guard=Guard())`` is the controller of an environment whose action is
+    a share of the disturbance that is fed forward. It learns nothing itself. Outside of an
+    environment, for example in ``simulate``, its output is zero, and the loop is the one without
+    learner.
+
+    Parameters
+    ----------
+    most
+        output f_L for the action 1 [y-unit/s^n]; by default what u can cancel,
+        ``b0 (u_max − u_min)/2``.
+    """
+
+    most: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.most is not None:
+            positive("most", self.most, "y-unit/s^n")
+
+    def design(self, observer: ESO, omega_c: float) -> PolicyDesign:
+        """Return no parameters."""
+        return PolicyDesign()
+
+    def memory(self, parameters: PolicyDesign) -> PolicyMemory:
+        """Return the state with the output zero."""
+        return PolicyMemory(np.zeros(1))
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return no names."""
+        return ()
+
+
+@adapt.register(PolicyDesign)
+def _adapt(
+    learner: PolicyDesign,
+    memory: PolicyMemory,
+    seen: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
+) -> None:
+    pass
+
+
+@predict.register(PolicyDesign)
+def _predict(
+    learner: PolicyDesign, memory: PolicyMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
+    return memory.output[0], 0.0
+
+
+@commit.register(PolicyDesign)
+def _commit(
+    learner: PolicyDesign, memory: PolicyMemory, seen: Vector, u: float, f_learned: float
+) -> None:
+    pass
+
+
+restart.register(PolicyDesign)(nothing_to_restart)
+coefficients.register(PolicyDesign)(no_coefficients)
+
+
+@set_action.register(AdrcDesign)
+def _set_feedforward(design: AdrcDesign, state: AdrcState, action: float) -> None:
+    state.learner.output[0] = action
+
+
+class GivenDesign(NamedTuple):
+    """Parameters of ``GivenControl``."""
+
+    limits: Limits  # of magnitude only
+
+
+class GivenState(NamedTuple):
+    """State of ``GivenControl``."""
+
+    u: Vector  # (1,)
+
+
+@dataclass(frozen=True)
+class GivenControl:
+    """The absence of a controller: u comes from outside, within limits."""
+
+    dt: float
+    parameters: GivenDesign
+    features: tuple[str, ...] = ()
+    channels: Channels = ()
+
+    def initial_state(self) -> GivenState:
+        """Return the state before the first sample."""
+        return GivenState(np.zeros(1))
+
+
+@control.register(GivenDesign)
+def _control(design: GivenDesign, state: GivenState, r: float, y: float) -> float:
+    return min(max(state.u[0], design.limits.low), design.limits.high)
+
+
+@set_action.register(GivenDesign)
+def _set_control(design: GivenDesign, state: GivenState, action: float) -> None:
+    state.u[0] = action
+
+
+@write_row.register(GivenDesign)
+def _write_row(design: GivenDesign, state: GivenState, row: Vector) -> None:
+    pass
+
+
+@status_flags.register(GivenDesign)
+def _status_flags(design: GivenDesign, state: GivenState) -> int:
+    return 0
+
+
+@reset_loop.register(GivenDesign)
+def _reset_loop(design: GivenDesign, state: GivenState) -> None:
+    state.u[0] = 0.0
+
+
+# ---- Scenarios of episodes ----
+
+Draw = Callable[[np.random.Generator], Scenario]
+# Seeds of the scenarios of episodes are below this: any 31 bits do.
+_SEEDS = 2**31
+
+
+class Episode(NamedTuple):
+    """An episode's signals and the plant's initial state."""
+
+    table: NDArray[np.float64]  # r, noise, derivatives of r, w (samples, …)
+    x0: Vector
+
+
+class Episodes:
+    """The episodes of an environment.
+
+    Parameters
+    ----------
+    scenario
+        a ``Scenario``, whose noise gets a new seed in each episode, or a function that draws a
+        scenario from a ``numpy.random.Generator``.
+    plant, controller
+        of the loop.
+    """
+
+    def __init__(self, scenario: Scenario | Draw, plant: Plant, controller: Controller) -> None:
+        if not callable(scenario):
+            check_scenario(scenario)
+        self._scenario, self._plant, self._controller = scenario, plant, controller
+        #: an episode that does not depend on the seed of the environment
+        self.example = self._sampled(self._drawn(np.random.default_rng(0)))
+        self._shared = None if self._is_random() else self._tabulated(self.example)
+
+    @property
+    def are_equal(self) -> bool:
+        """True if all episodes have the same signals."""
+        return self._shared is not None
+
+    def draw(self, rng: np.random.Generator) -> Episode:
+        """Return the next episode."""
+        if self._shared is not None:
+            return self._shared
+        return self._tabulated(self._sampled(self._drawn(rng)))
+
+    def _drawn(self, rng: np.random.Generator) -> Scenario:
+        if not callable(self._scenario):
+            return replace(self._scenario, seed=int(rng.integers(_SEEDS)))
+        drawn = self._scenario(rng)
+        check_scenario(drawn, "scenario(rng)")
+        return drawn
+
+    def _sampled(self, scenario: Scenario) -> SampledScenario:
+        if len(scenario.rest_at):
+            raise ValueError(
+                f"rest_at = {scenario.rest_at!r}: must be empty, each episode starts from rest"
+            )
+        found = SampledScenario.of(scenario, self._plant, self._controller, None)
+        if found.samples < 2:
+            raise ValueError(
+                f"duration = {scenario.duration!r} s with dt = {found.dt!r} s: must be at least "
+                "one sample"
+            )
+        example = getattr(self, "example", found)
+        if found.samples != example.samples:
+            raise ValueError(
+                f"scenario(rng) has duration = {scenario.duration!r} s, another one "
+                f"{(example.samples - 1) * found.dt:.9g} s: must be the same in all episodes"
+            )
+        return found
+
+    def _tabulated(self, scenario: SampledScenario) -> Episode:
+        whole = scenario.segment(0, scenario.samples)
+        parts: list[Any] = [whole.r, whole.noise, whole.derivatives, whole.w]
+        return Episode(np.column_stack(parts), scenario.x0)
+
+    def _is_random(self) -> bool:
+        """Return whether episodes differ, or may differ."""
+        if callable(self._scenario):
+            return True
+        seeds = (replace(self._scenario, seed=seed) for seed in (0, 1))
+        first, second = (each.seeded_signals(self._plant.disturbances) for each in seeds)
+        try:
+            return bool(first != second)
+        except ValueError:  # signals that hold arrays
+            return True
+
+
+# ---- Many states of one layout, one after the other in memory, for a compiled loop over them ----
+
+_ALIGNMENT = 8  # bytes, of each array
+_LINE = 64  # bytes of a line of the processor's cache: two threads never write into the same one
+
+
+class Stacked:
+    """Copies of a NamedTuple, or of several of one layout, in one block of memory.
+
+    Parameters
+    ----------
+    values
+        the NamedTuples; their arrays have equal shapes and types. Numbers in them are not copied.
+    """
+
+    def __init__(self, values: list[Any]) -> None:
+        self._sizes: list[int] = []
+        self._layout(values[0])
+        self.stride = -(-sum(self._sizes) // _LINE) * _LINE or _LINE
+        block = np.zeros(len(values) * self.stride + _LINE, np.uint8)
+        start = -block.ctypes.data % _LINE
+        self.memory = block[start : start + len(values) * self.stride].reshape(len(values), -1)
+        self.members = [self._view(value, i) for i, value in enumerate(values)]
+
+    def _layout(self, value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            self._sizes.append(-(-value.nbytes // _ALIGNMENT) * _ALIGNMENT)
+        elif isinstance(value, tuple):
+            for part in value:
+                self._layout(part)
+
+    def _view(self, value: Any, i: int) -> Any:
+        """Return a copy of the value in row i of the memory."""
+        place = 0
+
+        def copy(part: Any) -> Any:
+            nonlocal place
+            if isinstance(part, np.ndarray):
+                size = -(-part.nbytes // _ALIGNMENT) * _ALIGNMENT
+                block = self.memory[i, place : place + part.nbytes]
+                place += size
+                if part.nbytes == 0:
+                    return part.copy()
+                there = block.view(part.dtype).reshape(part.shape)
+                there[...] = part
+                return there
+            if isinstance(part, tuple):
+                parts = [copy(entry) for entry in part]
+                return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+            return part
+
+        return copy(value)
+
+
+def member(first: Any, stride: int, i: int) -> Any:
+    """Return member ``i`` of a stack, ``stride`` bytes each.
+
+    ``first`` is the first one for compiled code, and the list of all for Python. A list of one, or
+    a stride of zero, stands for members that are all the same.
+    """
+    return first[i if stride else 0]
+
+
+@overload(member, strict=False, jit_options=OPTIONS | KERNEL_OPTIONS)
+def _compiled_member(first: Any, stride: Any, i: Any) -> Any:
+    return lambda first, stride, i: _moved(first, stride * i)
+
+
+@intrinsic
+def _moved(typing_context: Any, first: Any, shift: Any) -> Any:
+    """Return a tuple whose arrays lie ``shift`` bytes behind those of ``first``."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        def move(kind: Any, value: Any) -> Any:
+            if isinstance(kind, nb_types.BaseTuple):
+                parts = [move(part, builder.extract_value(value, j)) for j, part in enumerate(kind)]
+                return context.make_tuple(builder, kind, parts)
+            if isinstance(kind, nb_types.Array):
+                array = context.make_array(kind)(context, builder, value)
+                place = cgutils.pointer_add(builder, array.data, values[1])
+                array.data = builder.bitcast(place, array.data.type)
+                return array._getvalue()
+            return value
+
+        return move(first, values[0])
+
+    return first(first, nb_types.intp), generate
+
+
+# ---- The compiled loop of the environments ----
+
+Integers = NDArray[np.int64]
+SIGNALS = 4  # r, y, y_measured, u: the first columns of ``Step.row``
+NOISE = 1  # column of the noise in a table of signals; the reference comes first, w last
+
+
+class Lane(NamedTuple):
+    """One loop between samples."""
+
+    x: Vector  # state of the plant (n,)
+    scratch: Vector  # (6 n,), see ``plants.base.advance``
+    controller: Any  # state of the controller
+
+
+class Step(NamedTuple):
+    """Results of a step, for each loop."""
+
+    row: Matrix  # all channels after the step, see ``Lanes.channels`` (N, …)
+    cost: Vector  # of the step (N,)
+    sample: Integers  # sample at which each loop is (N,)
+    status: Integers  # flags of the step (N,)
+    diverged: Integers  # 1 if ``|y|`` was beyond the limit (N,)
+
+
+class Rules(NamedTuple):
+    """Numbers that are the same for all loops."""
+
+    dt: float
+    samples: int  # of an episode
+    repeat: int  # samples of a step
+    limit: float  # |y| beyond it ends an episode
+    cost_of_u: float  # [y-unit²/u-unit²]
+    worst: float  # cost of a second beyond the limit [y-unit²], more than any within it
+    derivatives: int  # of the reference
+
+
+@compiled_loop("plants", "design", "rules", "actions", "active", "signals")
+def run_step(
+    plants: Any,
+    plant_stride: int,
+    lanes: Any,
+    lane_stride: int,
+    design: Any,
+    rules: Rules,
+    actions: Vector,
+    active: Integers,
+    signals: NDArray[np.float64],
+    step: Step,
+    first: int,
+    last: int,
+) -> None:
+    """Take the loops from ``first`` to before ``last`` through a step, and write their rows.
+
+    Those that are not ``active`` do not move. ``signals`` (N or 1, samples, 2 + …) has r, the
+    noise, the derivatives of r and w of each sample, for each loop or for all.
+    """
+    shared = signals.shape[0] == 1
+    begin = 2 + rules.derivatives
+    for i in range(first, last):
+        plant = member(plants, plant_stride, i)
+        lane = member(lanes, lane_stride, i)
+        table = signals[0 if shared else i]
+        row = step.row[i]
+        k = step.sample[i]
+        y = measure(plant, lane.x)
+        if active[i] != 0:
+            set_action(design, lane.controller, actions[i])
+            u, cost, status, diverged = 0.0, 0.0, 0, 0
+            for _ in range(min(rules.repeat, rules.samples - 1 - k)):
+                if rules.derivatives > 0:
+                    set_reference_derivatives(design, lane.controller, table[k, 2:begin])
+                u = control(design, lane.controller, table[k, 0], y + table[k, NOISE])
+                status |= status_flags(design, lane.controller)
+                advance(plant, lane.x, lane.scratch, k * rules.dt, u, table[k, begin:])
+                k += 1
+                y = measure(plant, lane.x)
+                if not abs(y) <= rules.limit:
+                    diverged = 1
+                    break
+                error = table[k, 0] - y
+                cost += (error * error + rules.cost_of_u * (u * u)) * rules.dt
+            if diverged != 0:
+                cost += (rules.samples - k) * rules.worst * rules.dt
+            row[3] = u
+            step.cost[i], step.status[i], step.diverged[i] = cost, status, diverged
+            step.sample[i] = k
+        row[0], row[1], row[2] = table[k, 0], y, y + table[k, NOISE]
+        at = SIGNALS
+        for j in range(begin, table.shape[1]):
+            row[at] = table[k, j]
+            at += 1
+        for j in range(lane.x.size):
+            row[at] = lane.x[j]
+            at += 1
+        write_row(design, lane.controller, row[at:])
+        if step.diverged[i] != 0:
+            for j in range(row.size):
+                row[j] = row[j] if is_finite(row[j]) else 0.0
+
+
+# ---- Many loops that a policy drives step by step ----
 
 # Loops for which a second thread is worth its start, about 20 µs: 64 samples take as long.
 _LOOPS_PER_THREAD = 64

@@ -3,13 +3,12 @@
 May import: everything but setups, experiments and the command line.
 """
 
-from quell.export.c_files import CSource
+from quell.export.c_files import CSource, plant_source
 from quell.export.controller_source import c_source
 from quell.export.fmi import fmu
 from quell.export.library import Comparison, Exported, NoCompilerError, Sizes, c
-from quell.export.plant_source import plant_source
 from quell.export.proof import Alarm, Proof
-from quell.export.translate.values import TranslationError
+from quell.export.translate.text import TranslationError
 
 __all__ = [
     "Alarm", "CSource", "Comparison", "Exported", "NoCompilerError", "Proof", "Sizes",

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from quell.controllers.adrc.adrc import ADRC
-from quell.controllers.adrc.handover import samples_to_settle
+import numpy as np
+
+from quell import checks
+from quell.controllers.adrc import ADRC, samples_to_settle
 from quell.controllers.base import (
+    Limits,
     check_controller,
     control,
     reset_loop,
@@ -14,20 +17,95 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.prefilters.prefilter import (
-    Prefiltered,
-    stopping_point,
-    without_prefilters,
-)
-from quell.export import operations
+from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
+from quell.controllers.single import SinglePrecision
+from quell.export import c_files
 from quell.export.c_files import CFiles, CSource, translated
-from quell.export.counts import check_counts
-from quell.export.inspection import in_double_precision, parameters_of
-from quell.export.translate.findings import Findings
-from quell.export.translate.layout import wrapped
-from quell.export.translate.values import Array, Number, TranslationError, Value
+from quell.export.translate.structs import Findings
+from quell.export.translate.text import Array, Number, TranslationError, Value, wrapped
 from quell.guard import Reason
 from quell.types import Channels, Status
+
+# ---- The parts of a controller that exports look at, in double or single precision ----
+
+
+def in_double_precision(controller: Any) -> Any:
+    """Return the controller, or the one in double precision that it was made from."""
+    return controller.controller if isinstance(controller, SinglePrecision) else controller
+
+
+def parameters_of(controller: Any) -> Any:
+    """Return the parameters of the kernels, in the controller's precision."""
+    parameters = controller.parameters
+    return parameters.controller if isinstance(controller, SinglePrecision) else parameters
+
+
+def limits_path(controller: Any) -> str:
+    """Return where the parameters have the limits of u, as ``controller.limits``; or nothing."""
+    parameters, path = parameters_of(controller), ""
+    while True:
+        fields = getattr(parameters, "_fields", ())
+        for name in fields:
+            if isinstance(getattr(parameters, name), Limits):
+                return f"{path}{name}"
+        if "controller" not in fields:
+            return ""
+        parameters, path = parameters.controller, f"{path}controller."
+
+
+def at_path(parameters: Any, path: str) -> Any:
+    """Return the part of nested parameters at a path such as ``controller.limits``."""
+    for name in path.split("."):
+        parameters = getattr(parameters, name)
+    return parameters
+
+
+# ---- The check that a controller may take y as counts from an origin that moves ----
+
+# Samples of the trial, and the largest change of u that is rounding, relative to the largest u.
+_SAMPLES, _ROUNDING = 200, 1e-6
+
+
+def check_counts(controller: Any, resolution: float) -> None:
+    """Check that another origin of y and r does not change a controller.
+
+    The origin is moved in each sample of a trial, in double precision, and u is compared with that
+    of the controller whose origin stays.
+
+    Raises
+    ------
+    TranslationError
+        if u changes: for a model with a position in it, such as a spring; for a learner; and for
+        controllers whose origin can't be moved.
+    """
+    checks.positive("resolution", resolution, "y-unit per count")
+    controller = in_double_precision(controller)
+    design = controller.parameters
+    if type(design) not in c_files.move_origin.implementations:
+        raise TranslationError(
+            f"resolution = {resolution!r}: {type(controller).__name__} can't take y as counts; an "
+            "ADRC without prefilter can"
+        )
+    fixed, moved = controller.initial_state(), controller.initial_state()
+    random, origin, y = np.random.default_rng(1), 0.0, 0.0
+    u = np.empty((_SAMPLES, 2))
+    with np.errstate(all="ignore"):
+        for k in range(_SAMPLES):
+            r = float(np.sin(0.05 * k))
+            y += 0.1 * (r - y) + 0.01 * float(random.standard_normal())
+            u[k, 0] = control(design, fixed, r, y)
+            c_files.move_origin(design, moved, y - origin)
+            origin = y
+            u[k, 1] = control(design, moved, r - y, 0.0)
+    same = np.max(np.abs(u[:, 1] - u[:, 0])) <= _ROUNDING * np.max(np.abs(u[:, 0]))
+    if design.learns or not same:  # what is learned acts much later than in this trial
+        raise TranslationError(
+            f"resolution = {resolution!r}: this controller needs the position itself, for a model "
+            "with a spring or for a learner; hand over y in its unit (NAME_step)"
+        )
+
+
+# ---- The two C files of a controller ----
 
 # Channels that hold integers.
 _WHOLE = ("status", "reason")
@@ -86,7 +164,7 @@ def _check_parts(controller: Any) -> None:
     parts = [(type(controller).__name__, controller.parameters)]
     while parts:
         name, value = parts.pop()
-        if type(value).__module__.startswith("quell.learners.adapters"):
+        if type(value).__module__.startswith("quell.learners.python_model"):
             raise TranslationError(
                 f"{name} = {type(value).__name__}: this learner calls Python at each sample, which "
                 "C can not; use Kalman, RLS, NLMS, MLP or GaussianProcess, or a model whose "
@@ -165,7 +243,7 @@ class _Writer:
             f"void NAME({self.state}, {real} u)",
             "Set the control signal that was really applied since the last step.\n\n"
             "One that is not finite is ignored; the status says so, until the next step.",
-            f"    {files.call(operations.set_applied, *both, u)};",
+            f"    {files.call(c_files.set_applied, *both, u)};",
         )
 
     def _about_target(self) -> str:
@@ -213,7 +291,7 @@ class _Writer:
             f"    static const {real} resolution = {write(resolution)};",
             "    const uint32_t moved = (uint32_t)count - (uint32_t)state->origin;",
             "    const uint32_t ahead = (uint32_t)r - (uint32_t)count;",
-            f"    {files.call(operations.move_origin, *files.both, files.number(moved))};",
+            f"    {files.call(c_files.move_origin, *files.both, files.number(moved))};",
             "    state->origin = count;",
             f"    return {self.name}_step(state, ({real})(int32_t)ahead * resolution, "
             f"{write(0.0)}{''.join(f', {each}' for each in self.names)});",
@@ -230,7 +308,7 @@ class _Writer:
             "reference of the next step. What was learned is kept. The observer takes\n"
             f"{samples} samples to settle: do not call this in an interrupt. If y or u is not\n"
             "finite nothing changes but the status; an r that is not finite is y.",
-            f"    {files.call(operations.start_from, *files.both, count, y, u, r)};",
+            f"    {files.call(c_files.start_from, *files.both, count, y, u, r)};",
         )
 
     def _add_manual_operation(self) -> None:
@@ -243,20 +321,20 @@ class _Writer:
             "\n\nReturn the control signal that the controller would have applied. A u that is not"
             "\nfinite is the one before; the status says so.",
             *self._derivatives(),
-            f"    return {files.call(operations.track, *files.both, r, y, u)};",
+            f"    return {files.call(c_files.track, *files.both, r, y, u)};",
         )
         files.add(
             "hand_over",
             f"bool NAME({self.state})",
             "End manual operation: the next step continues from the u of the last one.\n\n"
             "Return false before the first sample: then nothing has changed.",
-            f"    return {files.call(operations.hand_over, *files.both)};",
+            f"    return {files.call(c_files.hand_over, *files.both)};",
         )
 
     def _add_retune(self) -> None:
         files = self.files
         new = Value(files.design.kind, "parameters", root="new")
-        call = files.call(operations.retune, files.design, new, files.memory)
+        call = files.call(c_files.retune, files.design, new, files.memory)
         files.add(
             "retune",
             f"void NAME({self.state}, const {self.name}_parameters *parameters)",
@@ -287,7 +365,7 @@ class _Writer:
             "stopping_point",
             f"{self.real} NAME(const {self.state})",
             "Return where the move can stop soonest: it does if this is r of the next steps.",
-            f"    return {files.call(operations.stop_of_move, *files.both)};",
+            f"    return {files.call(c_files.stop_of_move, *files.both)};",
         )
 
     def _add_estimate(self, channels: Channels) -> None:

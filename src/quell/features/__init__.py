@@ -4,14 +4,8 @@ May import ``observers``, ``kernels`` and what stands before them. A new block n
 and its name here; users can also write one, see ``base.py``.
 """
 
-from quell.features.base import Features, Joined
-from quell.features.custom import Custom
-from quell.features.fourier import RandomFourier
-from quell.features.friction import Friction
-from quell.features.linear import Bias, Input, State
-from quell.features.periodic import Periodic
-from quell.features.polynomial import Polynomial
-from quell.features.radial import RBF
+from quell.features.base import Bias, Custom, Features, Input, Joined, Polynomial, State
+from quell.features.basis import RBF, Friction, Periodic, RandomFourier
 
 __all__ = [
     "RBF",

@@ -3,8 +3,10 @@
 May import ``learners`` and what they import.
 """
 
-from quell.guard.base import (
+from quell.guard.guard import Guard
+from quell.guard.kernels import (
     GUARD_CHANNELS,
+    Reason,
     UnguardedDesign,
     UnguardedMemory,
     assess,
@@ -15,8 +17,6 @@ from quell.guard.base import (
     start_again,
     write_channels,
 )
-from quell.guard.guard import Guard
-from quell.guard.reason import Reason
 
 __all__ = [
     "GUARD_CHANNELS",

@@ -7,17 +7,23 @@ search for its parameters, ``running_loop`` the same for the gain in records of 
 files here put them together.
 """
 
-from quell.identification.alternatives import Alternative, alternatives, decided, not_told_apart
-from quell.identification.experiment.excitation import Excitation, excitation
-from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
-from quell.identification.experiment.measured import Measured, excited
-from quell.identification.experiment.record_file import read_record
-from quell.identification.friction_plant import simulated_plant
-from quell.identification.identify import identify
+from quell.identification.excitation import (
+    Excitation,
+    FrequencyResponse,
+    excitation,
+    frequency_response,
+)
+from quell.identification.identify import (
+    Alternative,
+    alternatives,
+    decided,
+    identify,
+    not_told_apart,
+)
 from quell.identification.input_gain import Bandwidth, InputGain, MarginError, identify_b0
-from quell.identification.model.roots import Root
-from quell.identification.result import Identified
-from quell.identification.validation import Residuals
+from quell.identification.model import Root
+from quell.identification.record_file import Measured, excited, read_record
+from quell.identification.result import Identified, Residuals, simulated_plant
 
 __all__ = [
     "Alternative",

@@ -1,27 +1,454 @@
-"""b0, lag and delay of a plant from a record of its running loop."""
+"""Averages over the fits of several forms: means, physical units, the visible frequencies.
+
+The search for a plant behind a lag and a delay: starts, and the forms of the model.
+
+Each form, with or without lag, delay and drifting load, is fitted from several starts: the
+denominators of ``initial_estimate`` and that of a chain of integrators, a grid of delays or lags,
+and of a few bandwidths of the predictor. Forms with a drifting load are left out if the output
+error alone is white. Those with a load that forgets start at the ones whose load does not. In a
+loop the plant may be unstable, so unstable denominators are among the starts.
+
+The largest omega_c with which a loop keeps a phase margin, and the ratio of omega_o to it.
+
+The observer, with ``omega_o = r omega_c``, costs phase: the loop of y'' = b u has a margin of 41°
+with r = 5, at any omega_c, and 60° from r = 30 on. But a larger r meets the delay and the sample
+time at a lower omega_c. So r is searched for, too: the omega_c of each r of a grid is found, and
+the least r is taken whose omega_c comes near to the largest, because the noise in u grows with
+omega_o.
+
+An unstable plant needs an omega_c above a least one, so the range that keeps the margin is searched
+from its upper end.
+"""
 
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
-from quell.identification.running_loop.average import (
-    gain,
-    mean,
-    physical,
-    total_delay,
-    visible_up_to,
+from quell.analysis.linearise import linear_law
+from quell.analysis.loop import LoopAnalysis
+from quell.controllers.adrc import ADRC
+from quell.identification.model import Structure, autocorrelation, linear_columns, nonzero_lengths
+from quell.identification.result import residuals
+from quell.identification.running_loop import (
+    Form,
+    LoopFit,
+    fit,
+    is_exact,
+    is_unstable,
+    placed,
+    power,
+    responses,
 )
-from quell.identification.running_loop.bandwidth import Candidate, Reach, bandwidth, near
-from quell.identification.running_loop.fit import LoopFit
-from quell.identification.running_loop.search import fits
-from quell.identification.validation import residuals
+from quell.identification.search import delayed
+from quell.identification.starts import equation, filtered_estimates
+from quell.observers.eso import ESO
 from quell.parallel import one_blas_thread
-from quell.types import Matrix, Vector
+from quell.plants.linear import SampledPlant, sampled_plant
+from quell.types import DesignWarning, Matrix, Vector
+
+# ---- Averages over the fits of several forms ----
+
+# Least ratio of the power that u causes in y to that of noise, by frequency, that shows the plant.
+_VISIBLE = 1.0
+# Parts of the record over which spectra are averaged: chosen by hand.
+_SEGMENTS = 16
+
+
+def _places(one: LoopFit) -> list[int]:
+    """Return the places of a, b, τ and T in the covariance of a fit; −1 for what it has not."""
+    form = one.form
+    first = form.times.start
+    lag, delay = first if form.lag else -1, form.size - 1 if form.delay else -1
+    return [*range(form.order), form.size, lag, delay]
+
+
+def physical(one: LoopFit, unit: float, dt: float) -> tuple[Vector, Matrix]:
+    """Return the units of a (ascending), b, τ, T, and their covariance with a descending."""
+    n = one.form.order
+    scale = np.concatenate([dt ** (np.arange(float(n)) - n), [unit, dt, dt]])
+    places = _places(one)
+    known = np.array([place >= 0 for place in places])
+    covariance = one.covariance[np.ix_(places, places)] * np.outer(known, known)
+    order = np.r_[np.arange(n)[::-1], n : n + 3]
+    return scale, (covariance * np.outer(scale, scale))[np.ix_(order, order)]
+
+
+def gain(one: LoopFit) -> tuple[float, float]:
+    """Return b and its deviation, in units of a sample."""
+    place = one.form.size
+    return float(one.beta[0]), math.sqrt(max(float(one.covariance[place, place]), 0.0))
+
+
+def total_delay(one: LoopFit) -> tuple[float, float]:
+    """Return τ + T and its deviation [samples]."""
+    if one.form.share is not None:
+        place = one.form.times.start
+        return float(one.phi[place]), math.sqrt(max(float(one.covariance[place, place]), 0.0))
+    places = [place for place in _places(one)[-2:] if place >= 0]
+    variance = float(np.sum(one.covariance[np.ix_(places, places)]))
+    total = one.form.lag_of(one.phi) + one.form.delay_of(one.phi)
+    return total, math.sqrt(max(variance, 0.0))
+
+
+def mean(estimates: list[tuple[float, float]], weights: Vector) -> tuple[float, float]:
+    """Return mean and deviation of the mixture of values with deviations."""
+    values, spreads = np.array(estimates).T
+    mean = float(weights @ values)
+    return mean, math.sqrt(float(weights @ (spreads**2 + (values - mean) ** 2)))
+
+
+def visible_up_to(best: LoopFit, u: Vector, dt: float) -> float:
+    """Return the frequency up to which u moves y by more than the noise does [rad/s].
+
+    It compares the spectrum of u behind the plant with that of the error behind the noise's model,
+    whose gains hold for an unstable plant, too.
+    """
+    from scipy.signal import welch
+
+    length = min(max(64, u.size // _SEGMENTS), best.error.size)
+    frequency, moving = welch(u, nperseg=length)
+    _, disturbing = welch(best.error, nperseg=length)
+    omega = 2.0 * math.pi * frequency[1:]
+    of_u, of_error = responses(best.form, best.phi, best.error.size, omega)
+    with np.errstate(all="ignore"):
+        moved = (best.beta[0] * of_u) ** 2 * moving[1:]
+        seen = np.flatnonzero(moved > _VISIBLE * of_error**2 * disturbing[1:])
+    return float(omega[seen[-1]]) / dt if seen.size else 0.0
+
+
+# ---- The search for a plant behind a lag and a delay ----
+
+# Bandwidths of the predictor [1/sample], number of delays and lags, number of denominators, and the
+# shares of a lag in the sum of lag and delay, of the starts. Chosen by hand, so that the trial of
+# benchmarks/running_loop.py finds the same minimum as a start at the true plant.
+_RATES, _GRID, _DENOMINATORS, _SHARES = (0.01, 0.05, 0.2), 6, 3, (0.2, 0.5, 0.8)
+# Difference in AIC up to which a division of lag and delay is open, as in the mean of models; the
+# difference in b, in its deviations, from which on it matters; the shares of the lag that count.
+_OPEN, _SAME, _DIVISIONS = 20.0, 0.5, (0.2, 0.4, 0.6, 0.8)
+# Rates at which loads forget, of the starts [1/sample].
+_FORGETTING = (0.001, 0.01, 0.1)
+# Poles of the filters that give unstable denominators [1/sample] and their number, and the number
+# of these denominators that are tried.
+_FILTERS, _UNSTABLE = (0.003, 0.5, 6), 2
+# Lags of the test of whiteness, and its level: as in ``best_start``.
+_LAGS, _LEVEL = 50, 1e-3
+
+
+def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
+    """Return the fits of all forms, for delays and lags of up to ``most`` samples at the start.
+
+    u may begin before y; see ``model``.
+    """
+    a = _denominators(order, most, u, y)
+    found = _family(order, [], [*a], most, u, y)
+    best = min(found, key=lambda one: one.aic)
+    if not (is_exact(best, y) or _white(best, y)):
+        a = [best.phi[:order], *a]
+        placed_ones = [placed(one, rate) for one, rate in product(a, _RATES)]
+        drifting = _family(order, found, placed_ones, most, u, y)
+        found += drifting + [_forgetting(one, u, y) for one in drifting]
+    return found + _divided(found, u, y)
+
+
+def _divided(found: list[LoopFit], u: Vector, y: Vector) -> list[LoopFit]:
+    """Return fits with given shares of the lag in the sum of lag and delay, if data leave it open.
+
+    How the sum is divided moves b. Where a lag alone or a delay alone fits nearly as well, neither
+    its own deviation nor that of the fit of both, to first order, holds b's: the mean over shares
+    that are spread evenly does.
+    """
+    form = min(found, key=lambda one: one.aic).form
+    alike = [one for one in found if one.form[3:5] == form[3:5]]
+    both = next(one for one in alike if one.form.lag and one.form.delay)
+    ends = [one for one in alike if one.form.lag != one.form.delay]
+    near = [gain(one) for one in (both, *ends) if one.aic <= both.aic + _OPEN]
+    values = [value for value, _ in near]
+    if max(values) - min(values) <= _SAME * min(deviation for _, deviation in near):
+        return []  # also if only the fit of both is near
+    # A gain of u_l of one fit may have no stable predictor with the lag of another.
+    of_lag = both.form.gains.stop - 1
+    tried = []
+    for one in (both, *ends):
+        total = float(np.sum(one.phi[one.form.times]))
+        phi = np.append(one.phi[: one.form.times.start], total)
+        if both.form.drift and not one.form.lag:
+            phi = np.insert(phi, of_lag, 0.0)
+        tried.append(phi)
+        if both.form.drift and one.form.lag:
+            tried.append(np.where(np.arange(phi.size) == of_lag, 0.0, phi))
+
+    def at(share: float) -> LoopFit:
+        form = both.form._replace(share=share)
+        return fit(form, min(tried, key=lambda phi: power(form, phi, u, y)), u, y)
+
+    return [at(share) for share in _DIVISIONS]
+
+
+def _denominators(order: int, most: float, u: Vector, y: Vector) -> list[Vector]:
+    structure = Structure(order, 0, (0, 0))
+    late = delayed(u, round(0.25 * most))[u.size - y.size :]
+    v = np.column_stack([late, np.ones(y.size)])
+    estimates = filtered_estimates(structure, v, y)[:_DENOMINATORS]
+    found = [structure.denominator(theta) for theta in estimates if np.all(np.isfinite(theta))]
+    return [np.zeros(order), *found, *_unstable(structure, most, u, y)]
+
+
+def _unstable(structure: Structure, most: float, u: Vector, y: Vector) -> list[Vector]:
+    """Return the best unstable denominators by least squares on filtered signals.
+
+    ``filtered_estimates`` mirrors unstable poles into the left half plane: in an open loop the
+    noise is their reason. In a loop the plant may have them.
+    """
+    form, n = Form(structure.order, False, True, False), structure.order
+    found = []
+    for rate in np.geomspace(*_FILTERS):
+        prefilter: Vector = np.poly(np.full(n, -rate)).real[:0:-1].astype(np.float64)
+        for delay in (0, round(0.25 * most)):
+            late = delayed(u, delay)[u.size - y.size :]
+            v = np.column_stack([late, np.ones(y.size)])
+            target, regressors = equation(
+                structure, prefilter, linear_columns(structure, prefilter, v), y
+            )
+            size = nonzero_lengths(regressors)
+            theta = np.linalg.lstsq(regressors / size, target, rcond=1e-14)[0] / size
+            phi = np.append(structure.denominator(theta), float(delay))
+            if is_unstable(form, phi, y.size):
+                found.append((power(form, phi, u, y), phi[:-1]))
+    return [a for _, a in sorted(found, key=lambda one: one[0])[:_UNSTABLE]]
+
+
+def _family(
+    order: int, steady: list[LoopFit], starts: list[Vector], most: float, u: Vector, y: Vector
+) -> list[LoopFit]:
+    """Return the fits with neither, one and both of lag and delay.
+
+    They have a load that drifts if the fits without loads, ``steady``, are given; each form then
+    starts at its own of these, too.
+    """
+    drift = bool(steady)
+
+    def best(lag: bool, delay: bool, tried: list[Vector]) -> LoopFit:
+        form = Form(order, lag, delay, drift)
+        for one in steady:
+            if one.form[1:3] == form[1:3]:
+                gains = [placed(one.phi[:order], rate)[order:] for rate in _RATES]
+                zero = np.zeros(int(lag))
+                times = one.phi[one.form.times]
+                tried = tried + [np.hstack([one.phi[:order], each, zero, times]) for each in gains]
+        return fit(form, min(tried, key=lambda phi: power(form, phi, u, y)), u, y)
+
+    times = np.geomspace(0.5, max(most, 1.0), _GRID)
+    late = best(False, True, [np.append(phi, T) for phi in starts for T in (0.0, *times)])
+    shared = late.phi[:-1]
+    # A lag has a gain of its own where loads drift.
+    behind = np.append(shared, np.zeros(int(drift)))
+    slow = best(True, False, [np.append(behind, tau) for tau in (*times, max(late.phi[-1], 0.1))])
+    plain = best(False, False, [shared, *starts])
+    found = ((behind, late.phi[-1]), (slow.phi[:-1], slow.phi[-1]))
+    parts = [(*one, share) for one in found for share in _SHARES]
+    both = [np.append(phi, [share * T + 0.1, (1.0 - share) * T]) for phi, T, share in parts]
+    return [plain, late, slow, best(True, True, both)]
+
+
+def _forgetting(one: LoopFit, u: Vector, y: Vector) -> LoopFit:
+    """Return the fit of the same form with a load that forgets."""
+    form, place = one.form._replace(forgets=True), one.form.gains.stop
+    tried = [np.insert(one.phi, place, rate) for rate in _FORGETTING]
+    return fit(form, min(tried, key=lambda phi: power(form, phi, u, y)), u, y)
+
+
+def _white(found: LoopFit, y: Vector) -> bool:
+    """Return whether the error passes the test of whiteness of ``residuals``."""
+    from scipy.stats import chi2
+
+    lags = min(_LAGS, y.size // 4)
+    correlation = autocorrelation(found.error, lags)
+    return float(y.size * np.sum(correlation[1:] ** 2)) <= float(chi2.isf(_LEVEL, lags))
+
+
+# ---- The largest omega_c with which a loop keeps a phase margin ----
+
+# Range of omega_c relative to 1/dt: omega_o is 0.5/dt at most, below the limit of 1/dt that designs
+# warn of; and trials for each factor of ten. Chosen by hand.
+_LOWEST, _MOST_OBSERVER, _PER_DECADE = 1e-4, 0.5, 8
+# Relative errors of omega_c: to compare ratios, and of the result.
+_ROUGH, _TOLERANCE = 1e-2, 1e-6
+# Factors by which a neighbour of a rough omega_c is sought on the other side of the edge.
+_STEPS = (1.01, 1.05, 1.2, 1.5)
+# Ratios omega_o/omega_c that are tried: from the usual range of 3 to 10 (Gao 2003; Herbst 2013) to
+# where the observer costs hardly any phase. A double integrator has 60° from 30 on.
+RATIOS = tuple(np.geomspace(3.0, 100.0, 9).tolist())
+# Share of the largest omega_c that is enough for a smaller ratio: chosen by hand.
+_ENOUGH = 0.9
+# Loss of phase at an edge that is more than rounding [degrees].
+_JUMP = 1e-3
+# Phase margin that stands for an unstable loop [degrees].
+_UNSTABLE_BANDWIDTH = -180.0
+
+
+class Reach(NamedTuple):
+    """The largest omega_c that keeps a margin; if none does, the one of the largest margin."""
+
+    omega_c: float  #: [rad/s]; NaN if no loop is stable
+    ratio: float  #: omega_o/omega_c
+    phase: float  #: phase margin there [degrees]; −180 if no loop is stable
+    keeps: bool  #: whether it keeps the margin
+
+
+class Candidate:
+    """Loops of a sampled plant ``b/den`` behind a lag and a delay, and ADRC, by omega_c and ratio.
+
+    Parameters
+    ----------
+    b
+        gain of the plant.
+    den
+        its denominator of degree n, the first coefficient 1.
+    lag, delay
+        time constant of the lag, and the delay [s].
+    b0
+        gain that the model-free ESO assumes.
+    dt
+        sample time [s].
+    """
+
+    def __init__(
+        self, b: float, den: Vector, lag: float, delay: float, *, b0: float, dt: float
+    ) -> None:
+        self.order, self.b0, self.dt = den.size - 1, b0, dt
+        self.plant: SampledPlant = sampled_plant((np.array([b]), den), dt, delay, lag)
+
+    def loop(self, omega_c: float, ratio: float) -> LoopAnalysis:
+        """Return the loop."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DesignWarning)
+            controller = ADRC(
+                ESO.model_free(self.order, self.b0, ratio * omega_c, self.dt), omega_c
+            )
+        return LoopAnalysis(self.plant, linear_law(controller), self.dt)
+
+    def exact(self, omega_c: float, ratio: float) -> float:
+        """Return the phase margin [degrees]."""
+        loop = self.loop(omega_c, ratio)
+        return loop.margins.phase if loop.stable else _UNSTABLE_BANDWIDTH
+
+    def rough(self, omega_c: float, ratio: float) -> float:
+        """Return the phase margin to 0.1 degrees, by lines between frequencies: a third as long."""
+        loop = self.loop(omega_c, ratio)
+        if not loop.stable:
+            return _UNSTABLE_BANDWIDTH
+        with np.errstate(all="ignore"):  # a pole at a frequency
+            L = loop.response("L", loop.omega)
+            size = np.log(np.abs(L))
+            at = np.flatnonzero(np.signbit(size[:-1]) != np.signbit(size[1:]))
+            at = at[np.isfinite(size[at]) & np.isfinite(size[at + 1])]
+            share = size[at] / (size[at] - size[at + 1])
+            lead = np.angle(-L[at]) + share * np.angle(L[at + 1] / L[at])
+        if not at.size:
+            return math.inf
+        return math.degrees(np.min(np.abs(np.remainder(lead + np.pi, 2.0 * np.pi) - np.pi)))
+
+
+def bandwidth(loops: Candidate, margin: float, ratio: float | None = None) -> Reach:
+    """Return the largest omega_c with which ADRC keeps a phase margin [degrees].
+
+    Without a ``ratio`` that is searched for, too: of those of ``RATIOS`` whose omega_c is at least
+    0.9 times the largest, the least.
+    """
+    tried = [_reach(loops, margin, one) for one in (RATIOS if ratio is None else (ratio,))]
+    kept = [one for one in tried if one.keeps]
+    if not kept:
+        return max(tried, key=lambda one: one.phase)
+    enough = _ENOUGH * max(one.omega_c for one in kept)
+    found = next(one for one in kept if one.omega_c >= enough)
+    omega_c = near(loops, margin, found.omega_c, found.ratio)
+    if math.isnan(omega_c):  # kept by less than the error of the rough value
+        return found._replace(keeps=False, phase=loops.exact(found.omega_c, found.ratio))
+    return Reach(omega_c, found.ratio, loops.exact(omega_c, found.ratio), True)
+
+
+def near(loops: Candidate, margin: float, omega_c: float, ratio: float) -> float:
+    """Return the largest omega_c near a given one that keeps the margin, exactly; NaN for none."""
+    top = _MOST_OBSERVER / (ratio * loops.dt)
+
+    def excess(omega_c: float) -> float:
+        return min(loops.exact(omega_c, ratio), 180.0) - margin
+
+    keeps = excess(omega_c) >= 0.0
+    inside, outside = omega_c, omega_c
+    for factor in _STEPS:
+        if keeps and inside >= top:
+            return top
+        other = min(omega_c * factor, top) if keeps else omega_c / factor
+        if (excess(other) >= 0.0) != keeps:
+            inside, outside = (inside, other) if keeps else (other, outside)
+            return _edge(excess, inside, outside, _TOLERANCE)
+        inside, outside = (other, outside) if keeps else (inside, other)
+    return inside if keeps else math.nan
+
+
+def _reach(loops: Candidate, margin: float, ratio: float) -> Reach:
+    """Return the largest omega_c for a ratio, roughly."""
+    from scipy.optimize import minimize_scalar
+
+    def excess(omega_c: float) -> float:
+        return min(loops.rough(omega_c, ratio), 180.0) - margin
+
+    low, high = _LOWEST / loops.dt, _MOST_OBSERVER / (ratio * loops.dt)
+    count = max(round(math.log10(high / low) * _PER_DECADE) + 1, 3)
+    grid = np.geomspace(low, high, count)[::-1].tolist()
+    values: list[float] = []
+    for at, omega_c in enumerate(grid):
+        values.append(excess(omega_c))
+        if values[-1] >= 0.0:
+            edge = omega_c if at == 0 else _edge(excess, omega_c, grid[at - 1], _ROUGH)
+            return Reach(edge, ratio, margin, True)
+    best = int(np.argmax(values))
+    if values[best] + margin <= _UNSTABLE_BANDWIDTH:
+        return Reach(math.nan, ratio, _UNSTABLE_BANDWIDTH, False)
+    # A range that keeps it may lie between two trials.
+    ends = grid[min(best + 1, count - 1)], grid[max(best - 1, 0)]
+    top = minimize_scalar(
+        lambda x: -excess(math.exp(x)), bounds=np.log(ends), options={"xatol": _ROUGH}
+    )
+    omega_c, value = (grid[best], values[best])
+    if -float(top.fun) > value:
+        omega_c, value = math.exp(float(top.x)), -float(top.fun)
+    if value < 0.0:
+        return Reach(omega_c, ratio, value + margin, False)
+    return Reach(_edge(excess, omega_c, ends[1], _ROUGH), ratio, margin, True)
+
+
+def _edge(
+    excess: Callable[[float], float], inside: float, outside: float, tolerance: float
+) -> float:
+    """Return the last omega_c from ``inside``, which keeps the margin, to ``outside``."""
+    from scipy.optimize import brentq
+
+    if excess(outside) >= 0.0:
+        return outside
+    root = brentq(
+        lambda x: excess(math.exp(x)), math.log(inside), math.log(outside), xtol=tolerance
+    )
+    found = math.exp(float(root))
+    if excess(found) >= -_JUMP:
+        return found
+    # Where the gain comes to 1 at another frequency the margin jumps: the side that keeps it.
+    while outside > inside * (1.0 + tolerance):
+        middle = math.sqrt(inside * outside)
+        inside, outside = (middle, outside) if excess(middle) >= 0.0 else (inside, middle)
+    return inside
+
+
+# ---- b0, lag and delay of a plant from a record of its running loop ----
 
 # Least number of samples for each parameter, as in ``identify``.
 _SAMPLES_PER_PARAMETER = 10
@@ -33,7 +460,7 @@ _POOR = 0.15
 # Deviations within which the interval of 95 % lies, and within which a lag or delay may be zero
 # (99.7 %).
 _WITHIN_95, _WITHIN_99 = 1.96, 3.0
-# Longest delay of a loop that is analysed [samples], as in ``quell.plants.sampled``.
+# Longest delay of a loop that is analysed [samples], as in ``quell.plants.linear``.
 _MOST_SAMPLES = 200
 # Least motion of u and y, and the inverse of their largest size: their squares are numbers then.
 _LEAST_SIZE = 1e-100

@@ -6,16 +6,13 @@ imports.
 
 from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner
-from quell.learners.gradient.batch_gradient import BatchGradient
-from quell.learners.kalman.harmonic import Harmonic
-from quell.learners.kalman.kalman import Kalman
-from quell.learners.online.gaussian_process import GaussianProcess
-from quell.learners.online.learner import Online
-from quell.learners.online.model import Model, infer, learn
-from quell.learners.online.network import MLP
-from quell.learners.regression.nlms import NLMS
-from quell.learners.regression.rls import RLS
-from quell.learners.repetitive.repetitive import Repetitive
+from quell.learners.batch_gradient import BatchGradient
+from quell.learners.gaussian_process import GaussianProcess
+from quell.learners.kalman import Harmonic, Kalman
+from quell.learners.online import MLP, Model, Online, infer, learn
+from quell.learners.regression import NLMS
+from quell.learners.repetitive import Repetitive
+from quell.learners.rls import RLS
 
 __all__ = [
     "MLP",

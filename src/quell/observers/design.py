@@ -35,23 +35,92 @@ the reduced-order observer, at ``exp(−omega_o dt)``.
 With *half gain* the correction is L/2: nearly the same loop for half the gain from noise (Herbst,
 Hempel, Göhrt & Streif, IFAC World Congress 2020, arXiv 2003.03986; Herbst & Madonski, arXiv
 2211.07309).
+
+The steady-state Kalman gain of the extended state observer, from variances.
+
+White noise is assumed to drive the extended model: ``f^(m) = w`` with the density ``drift`` and m
+extended states, ``x_n' = … + f + v`` with the density ``jitter``. y is measured with noise of the
+variance ``noise`` in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23,
+1978)::
+
+    Q  = ∫_0^dt exp(A s) G exp(Aᵀ s) ds
+    P⁻ = Φ (P⁻ − P⁻ Cᵀ (C P⁻ Cᵀ + R)⁻¹ C P⁻) Φᵀ + Q,      L = P⁻ Cᵀ / (C P⁻ Cᵀ + R)
+
+With drift alone and fast sampling, the poles lie in a Butterworth pattern of the radius
+``(drift/(noise dt))^(1/2N)`` (symmetric root locus of a chain of N integrators; Anderson & Moore,
+*Optimal Control*, 1990).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
 from quell.lti.canonical import Canonical, format_roots
-from quell.lti.discretize import zero_order_hold
-from quell.lti.pole_pattern import pole_pattern
-from quell.observers.linear import EsoModel
-from quell.observers.placement import place_poles, sampled_zeros
+from quell.lti.models import gramian, pole_pattern, zero_order_hold
+from quell.observers.forms import EsoModel, NonlinearModel, observe, without_delay
 from quell.types import Matrix, Vector
+
+# ---- Pole placement for observers, in terms of 1 − pole to keep full precision near z = 1 ----
+
+
+def place_poles(difference: Matrix, offsets: Vector) -> Vector:
+    """Return L that puts the eigenvalues of ``(I − L C) Φ``, C = (1, 0, …), at ``1 − offsets``.
+
+    ``difference`` is ``Φ − I`` (N, N), in coordinates in which it is O(1) after division by the
+    largest offset; complex offsets (N,) come in conjugate pairs. L (N,) is NaN if Φ can't be
+    observed through C.
+
+    Ackermann's formula: ``L = Π (Φ − β_i I) O⁻¹ e_N`` with the rows ``C Φ (Φ − I)^i`` for O.
+    Differences instead of powers do not change ``O⁻¹ e_N`` and make O triangular for a chain of
+    integrators, where powers would be nearly parallel. Dividing by the largest offset makes them
+    O(1).
+    """
+    size = difference.shape[0]
+    unit = np.max(np.abs(offsets))
+    rate = difference / unit
+    rows = np.empty((size, size))
+    rows[0] = difference[0]
+    rows[0, 0] += 1.0
+    for i in range(1, size):
+        rows[i] = rows[i - 1] @ rate
+    try:
+        vector = np.linalg.solve(rows, np.eye(size)[-1])
+    except np.linalg.LinAlgError:
+        return np.full(size, np.nan)
+    for offset in offsets / unit:
+        vector = rate @ vector + offset * vector
+    gain: Vector = unit * np.real(vector)
+    return gain
+
+
+def sampled_zeros(difference: Matrix, zeros: Vector, dt: float) -> Vector:
+    """Return ``1 − ζ`` for the z-plane zeros ζ from f to y that belong to the plant's ``zeros``.
+
+    The plant's zeros [rad/s] come in conjugate pairs. ζ are close to ``exp(zeros dt)`` among the
+    finite eigenvalues of the pencil ``[[Φ − I − λ I, Γ], [C, 0]]`` with ``λ = ζ − 1``; the others
+    are due to sampling. Γ, the response to a held f, is the last column of Φ.
+    """
+    from scipy.linalg import eigvals
+
+    size = difference.shape[0]
+    pencil = difference.copy()
+    pencil[-1] = np.eye(size)[0]
+    found = eigvals(pencil, np.diag(np.append(np.ones(size - 1), 0.0)))
+    found = found[np.isfinite(found)]
+    offsets = np.empty(zeros.size, dtype=complex)
+    for i, zero in enumerate(zeros):
+        nearest = int(np.argmin(np.abs(found - np.expm1(zero * dt))))
+        offsets[i] = -found[nearest]
+        found = np.delete(found, nearest)
+    return offsets
+
+
+# ---- Design of the linear extended state observer ----
 
 FORMS = ("current", "predictor", "reduced")
 # In the coordinates of the design useful gains are at most O(1); far above, rounding decides where
@@ -205,3 +274,122 @@ def continuous_gain(a: Vector, omega_o: float, disturbance_order: int = 1) -> Ve
         known = sum(a[n - i + j] * ell[j] for j in range(i)) if i <= n else 0.0
         ell[i] = math.comb(size, i) * omega_o**i - known
     return ell[1:]
+
+
+# ---- The steady-state Kalman gain of the extended state observer, from variances ----
+
+
+def kalman_gain(
+    A: Matrix, order: int, dt: float, noise: float, drift: float, jitter: float
+) -> tuple[Vector, float]:
+    """Return L (N,) and the geometric mean of ``|ln z_i|/dt`` over the poles [rad/s].
+
+    L is in the coordinates of ``A`` (N, N), whose states from n + 1 on, with n the ``order``, are f
+    and its derivatives. The equation is solved in the time unit of the Butterworth pattern, where
+    the entries of Φ, Q and P have similar sizes.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    size = A.shape[0]
+    # With drift alone q/(r dt) is the bandwidth to the power 2N, with jitter alone to the power
+    # 2n, n being the order. Take the faster one.
+    density = noise * dt
+    with np.errstate(all="ignore"):
+        by_drift, by_jitter = np.float64(drift) / density, np.float64(jitter) / density
+        omega = float(max(by_drift ** (0.5 / size), by_jitter ** (0.5 / order)))
+    refusal = ValueError(
+        f"noise_variance = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with "
+        f"dt = {dt!r} s: no steady-state gain is found; they ask for about {omega:.3g} rad/s, "
+        "which should be between 1e-3/dt and 1/dt"
+    )
+    if not 0.0 < omega < np.inf:
+        raise refusal
+    scale = omega ** -np.arange(size, dtype=np.float64)
+    scaled = A * scale[:, None] / scale[None, :] / omega
+    drive = np.zeros((size, size))
+    drive[-1, -1] = drift / density * (scale[-1] / omega) ** 2
+    drive[order - 1, order - 1] = jitter / density * (scale[order - 1] / omega) ** 2
+    step = omega * dt
+    phi, _ = zero_order_hold(scaled, [], step)
+    phi[:order, order + 1 :] = 0.0  # f is held within a sample, as in the design above
+    C, R = np.eye(1, size), np.array([[1.0 / step]])
+    try:
+        with np.errstate(invalid="ignore"):  # what overflows is found below
+            P = solve_discrete_are(phi.T, C.T, gramian(scaled, drive, step), R)
+    except (np.linalg.LinAlgError, ValueError):
+        P = np.full((size, size), np.nan)
+    gain = P[:, 0] / (P[0, 0] + R[0, 0])
+    poles = np.array([np.inf])
+    if np.all(np.isfinite(gain)):
+        poles = np.linalg.eigvals((np.eye(size) - np.outer(gain, C)) @ phi)
+    with np.errstate(divide="ignore"):
+        rate = float(np.exp(np.mean(np.log(np.abs(np.log(poles.astype(complex)))))))
+    if not (np.max(np.abs(poles)) < 1.0 and rate < np.pi):
+        raise refusal
+    return np.asarray(gain / scale), rate / dt
+
+
+# ---- The matrices of a linear observer, found by applying its update to unit vectors ----
+
+
+class Response(NamedTuple):
+    """The update ``z⁺ = M z + G (y, u, f_L)`` and the estimates ``C z + D (y, u, f_L)``.
+
+    There are m states and N estimates, ``x̂_1 … x̂_n, Δf̂`` and its derivatives, if there are any.
+    """
+
+    transition: Matrix  #: M (m, m)
+    input: Matrix  #: G (m, 3)
+    output: Matrix  #: C (N, m)
+    feedthrough: Matrix  #: D (N, 3)
+    at_f: int  #: n, the place of Δf̂ among the estimates
+
+
+def response(model: Any, estimates: int, at_f: int) -> Response:
+    """Return the matrices of the update of a linear observer's ``model``, for N ``estimates``."""
+    if isinstance(without_delay(model), NonlinearModel):
+        raise ValueError(
+            "observer is nonlinear: it has no exact lag for learners and guards; use a linear one"
+        )
+    m = model.states
+    state, estimated = np.zeros((m, m + 3)), np.zeros((estimates, m + 3))
+    for i, one in enumerate(np.eye(m + 3)):
+        z, estimate = one[:m].copy(), np.zeros(estimates)
+        observe(model, z, estimate, *one[m:].tolist())
+        state[:, i], estimated[:, i] = z, estimate
+    parts = state[:, :m], state[:, m:], estimated[:, :m], estimated[:, m:]
+    transition, given, output, feedthrough = (part.copy() for part in parts)
+    return Response(transition, given, output, feedthrough, at_f)
+
+
+def f_learned_response(found: Response) -> tuple[Matrix, Vector, Vector, float]:
+    """Return ``(M, g, c, d)`` of ``s⁺ = M s + g f_L``, ``−Δf̂ = c·s + d f_L``, for y = u = 0."""
+    feedthrough = float(found.feedthrough[found.at_f, 2])
+    return found.transition, found.input[:, 2], -found.output[found.at_f], -feedthrough
+
+
+def scaled_response(model: Any, units: Vector, at_f: int) -> Response:
+    """Return the response without the delay of u, with the states divided by ``units`` (N,).
+
+    ``ESO.units`` makes the poles O(1) in the time unit ``1/omega_o``. The estimates keep theirs.
+    """
+    found = response(without_delay(model), units.size, at_f)
+    units = np.resize(units, found.transition.shape[0])
+    return found._replace(
+        transition=found.transition * units[None, :] / units[:, None],
+        input=found.input / units[:, None],
+        output=found.output * units[None, :],
+    )
+
+
+def total_time_constant(found: Response) -> float:
+    """Return ``Σ 1/|ln z_i|`` over the poles [samples], to second order ``tr (I − M)⁻¹ − m/2``."""
+    m = found.transition.shape[0]
+    return float(np.trace(np.linalg.inv(np.eye(m) - found.transition))) - 0.5 * m
+
+
+def f_lag(found: Response) -> float:
+    """Return the lag of the estimate behind a slowly varying f [samples], ``c (I − M)⁻² g``."""
+    M, g, c, _ = f_learned_response(found)
+    at_rest = np.eye(M.shape[0]) - M
+    return float(c @ np.linalg.solve(at_rest, np.linalg.solve(at_rest, g)))

@@ -5,23 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from quell import checks
-from quell.described import text
-from quell.lti.canonical import Canonical, canonical, format_roots
-from quell.lti.reduction import without_far_zeros
-from quell.observers.cascade import cascade_model, level_bandwidths
-from quell.observers.delay import delayed_model, without_delay
-from quell.observers.design import checked_disturbance_order, design_model
-from quell.observers.kalman_gains import kalman_gain
-from quell.observers.nonlinear import NonlinearModel, nonlinear_model
-from quell.observers.response import scaled_response, total_time_constant
-from quell.types import Vector
-from quell.warn import warn
+from quell.checks import text
+from quell.lti.canonical import Canonical, canonical, format_roots, without_far_zeros
+from quell.observers.design import (
+    checked_disturbance_order,
+    design_model,
+    kalman_gain,
+    scaled_response,
+    total_time_constant,
+)
+from quell.observers.forms import (
+    NonlinearModel,
+    cascade_model,
+    delayed_model,
+    level_bandwidths,
+    nonlinear_model,
+    without_delay,
+)
+from quell.types import Vector, warn
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +220,7 @@ class ESO:
         delay: float = 0.0,
         disturbance_order: int = 1,
     ) -> ESO:
-        """Design a cascade of model-free observers (``cascade.py``): less noise in u.
+        """Design a cascade of model-free observers (``observers/forms.py``): less noise in u.
 
         Parameters
         ----------
@@ -247,7 +254,7 @@ class ESO:
         delay: float = 0.0,
         disturbance_order: int = 1,
     ) -> ESO:
-        """Design Han's nonlinear observer (``nonlinear.py``).
+        """Design Han's nonlinear observer (``observers/forms.py``).
 
         It is linear while ``|y − z⁻_1|`` is below delta and corrects less beyond. It can not be
         combined with a learner or a guard: both need the observer's exact lag.
@@ -278,7 +285,7 @@ class ESO:
         delay: float = 0.0,
         disturbance_order: int = 1,
     ) -> ESO:
-        """Design a model-free ESO with the steady-state Kalman gain (``kalman_gains.py``).
+        """Design a model-free ESO with the steady-state Kalman gain (``observers/design.py``).
 
         It has the least variance if the densities are right. Its ``omega_o``, which learners and
         guards take for its speed, is the geometric mean of ``|ln z_i|/dt`` over its poles.
@@ -448,3 +455,47 @@ class ESO:
         rows = (x / size).reshape(-1, self.order)
         mapped: Vector = np.linalg.solve(self.plant.S / size[:, None], rows.T).T.reshape(x.shape)
         return mapped
+
+
+def noise_gains(observer: ESO) -> Vector:
+    """Return the variance (n + 1,) that white noise of unit variance in y causes in x̂ and f̂.
+
+    If all poles lie in one place, the formula of a model-free observer is used. In continuous time
+    ``x̂_i = Σ_{k=i}^{N} C(N, k) ω_o^k s^(N−k+i−1) / (s + ω_o)^N · y``, and sampled white noise has
+    the density dt, so the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` with the integrand at
+    ω_o = 1. This is accurate for small ``omega_o dt``. With other poles, or if f enters before the
+    last integrator, the variance is summed sample by sample instead.
+    """
+    kept = observer.order + 1
+    if observer.f_degree < observer.order or not observer.has_one_pole:
+        return _summed_noise_gains(observer)
+    unit = _unit_noise_gains(observer.estimates)[:kept]
+    return observer.dt * observer.omega_o ** (2.0 * np.arange(kept) + 1.0) * unit
+
+
+@cache
+def _unit_noise_gains(size: int) -> Vector:
+    """Return the integrals of ``noise_gains``, which depend only on the number of states."""
+    omega = np.geomspace(1e-4, 1e4, 4001)
+    s = 1j * omega
+    gains = np.empty(size)
+    for i in range(1, size + 1):
+        powers = (math.comb(size, k) * s ** (size - k + i - 1) for k in range(i, size + 1))
+        response = sum(powers) / (s + 1.0) ** size
+        gains[i - 1] = np.trapezoid(np.abs(response) ** 2, omega) / math.pi
+    gains.flags.writeable = False
+    return gains
+
+
+def _summed_noise_gains(observer: ESO) -> Vector:
+    """Return the diagonal of ``C P Cᵀ + d dᵀ``, ``P = Σ M^k g gᵀ M^kᵀ``, by doubling."""
+    found = scaled_response(observer.model, observer.units, observer.order)
+    gain, feedthrough, transition = found.input[:, 0], found.feedthrough[:, 0], found.transition
+    total = np.outer(gain, gain)
+    for _ in range(64):
+        total += transition @ total @ transition.T
+        transition = transition @ transition
+        if np.max(np.abs(transition)) < 1e-12:
+            break
+    variances: Vector = np.einsum("ij,jk,ik->i", found.output, total, found.output)
+    return (variances + feedthrough**2)[: observer.order + 1]

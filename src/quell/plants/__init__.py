@@ -4,20 +4,19 @@ May import ``lti``, ``kernels`` and what stands before them. A new machine needs
 ``machines``, a line in ``registry.py`` and, if it is public, its name here.
 """
 
-from quell.plants.base import Plant
-from quell.plants.batch import PlantBatch, batch
-from quell.plants.delay import delayed
-from quell.plants.encoder import encoded
-from quell.plants.fmu.plant import FMU
-from quell.plants.labelled import labelled, signals_of
-from quell.plants.linear import LinearPlant
+from quell.plants.base import Plant, PlantBatch, batch, labelled, signals_of
+from quell.plants.flexible import (
+    CubicSpringPlant,
+    NMassPlant,
+    lagged_two_mass_spring,
+    n_mass,
+    two_mass_spring,
+)
+from quell.plants.fmu import FMU
+from quell.plants.linear import LinearPlant, delayed, encoded
 from quell.plants.linearise import linearised
-from quell.plants.machines.cubic_spring import CubicSpringPlant, lagged_two_mass_spring
-from quell.plants.machines.dc_motor import DcMotor, dc_motor
-from quell.plants.machines.n_mass import NMassPlant, n_mass
-from quell.plants.machines.torsional import TorsionalPlant, torsional, torsional_identified
-from quell.plants.machines.two_mass_spring import two_mass_spring
-from quell.plants.nonlinear.plant import NonlinearPlant
+from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.testbeds import DcMotor, TorsionalPlant, dc_motor, torsional, torsional_identified
 
 __all__ = [
     "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NMassPlant", "NonlinearPlant", "Plant",

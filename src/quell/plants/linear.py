@@ -1,18 +1,58 @@
-"""Linear plants, sampled exactly."""
+"""Linear plants, sampled exactly.
+
+The plant as the controller sees it: zero-order hold, dead time and actuator lag included.
+
+Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in
+the sixth digit, and all slow dynamics are in that difference.
+
+A plant with an input delay.
+
+``x' = f(x, u(t − τ), w)`` with ``τ = d dt + l``, ``0 ≤ l < dt``. The state is that of the plant,
+followed by the last d values of u, d + 1 with a part l of a sample, newest first. The record shows
+this state, and a start from rest sets it to zero.
+
+With a part of a sample the plant sees ``u_(k−d−1)`` for the first l of each sample and ``u_(k−d)``
+for the rest: two exact steps of a linear plant.
+
+A plant whose output is quantized by an encoder with a finite number of counts a turn.
+
+``y = q floor(y_plant/q + 1/2)`` with ``q = turn/counts``. The counter is zeroed half-way between
+two edges, so its error is at most q/2 in both directions. Only the output is quantized, not the
+state.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
-from quell.described import Described
-from quell.lti.discretize import zero_order_hold
-from quell.lti.models import TransferFunction, check_matrices, read_model, to_state_space
-from quell.plants.base import advance, measure
+from quell.checks import Described
+from quell.kernels.dispatch import kernel
+from quell.kernels.sized import Size
+from quell.lti.models import (
+    TransferFunction,
+    check_matrices,
+    leading_gain,
+    read_model,
+    to_state_space,
+    zero_order_hold,
+)
+from quell.plants.base import (
+    Plant,
+    PlantWrapper,
+    advance,
+    begin_run,
+    check_plant,
+    check_run,
+    measure,
+)
 from quell.types import Matrix, Vector
+
+# ---- Linear plants, sampled exactly ----
 
 
 class LinearModel(NamedTuple):
@@ -156,3 +196,330 @@ class LinearPlant(Described):
                 "numbers; check the units of dt and of the plant"
             )
         return LinearModel(phi, gamma[:, 0].copy(), gamma_w, self.C[0].copy())
+
+
+# ---- The plant as the controller sees it ----
+
+# Limit on the states that a dead time adds; eigenvalues cost its cube. Chosen by hand.
+_MOST_SAMPLES = 200
+
+
+class SampledPlant(NamedTuple):
+    """``x⁺ − x = N x + B u + E w``, ``y = C x``."""
+
+    N: Matrix  # A − I (n, n)
+    B: Vector  # (n,)
+    E: Matrix  # (n, m)
+    C: Vector  # (n,)
+    b: dict[int, float]  # gain from u to y^(k), by k, for the first derivative that u reaches
+
+
+def sampled_plant(
+    plant: Any, dt: float, delay: float = 0.0, actuator_lag: float = 0.0
+) -> SampledPlant:
+    """Sample a linear plant exactly; see ``analyse`` for the parameters.
+
+    A system of python-control or scipy.signal may be sampled already, with the same dt. Raises
+    ``ValueError`` for another object, direct feedthrough, or a dead time of more than 200 samples.
+    """
+    delay = checks.non_negative("delay", delay, "s")
+    actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")
+    if getattr(plant, "dt", None):
+        if actuator_lag > 0.0 or not math.isclose(delay / dt, round(delay / dt), abs_tol=1e-9):
+            raise ValueError(
+                f"delay = {delay!r} s, actuator_lag = {actuator_lag!r} s: a sampled plant takes "
+                "whole samples of delay and no lag; give it in continuous time"
+            )
+        model = read_model(plant, dt=dt)
+        model = to_state_space(model) if isinstance(model, TransferFunction) else model
+        N, B = model.A - np.eye(model.C.size), model.B[:, None]
+        return _delayed(N, B, np.zeros_like(B), model.C, B, round(delay / dt), {})
+    linear = LinearPlant.of(plant)
+    A, B, C, E = linear.A, linear.B, linear.C[0], linear.E
+    first = leading_gain(A, B, linear.C)
+    gains = {} if first is None else {first[1]: first[0]}
+    if actuator_lag > 0.0:
+        n = A.shape[0]
+        A = np.block([[A, B], [np.zeros((1, n)), np.full((1, 1), -1.0 / actuator_lag)]])
+        B = np.vstack([np.zeros_like(B), [[1.0 / actuator_lag]]])
+        C, E = np.append(C, 0.0), np.vstack([E, np.zeros((1, E.shape[1]))])
+    if delay > _MOST_SAMPLES * dt:
+        limit = f"{_MOST_SAMPLES} samples of {dt!r} s"
+        raise ValueError(f"delay = {delay!r} s: must be at most {limit}")
+    samples = math.floor(delay / dt * (1.0 + 1e-12))
+    late = max(delay - samples * dt, 0.0)
+    if late < 1e-12 * dt:  # a whole number of samples, to rounding
+        late = 0.0
+    identity = np.eye(A.shape[0])
+    _, (whole, gamma_w) = zero_order_hold(A, [identity, E], dt)
+    # The first part of each sample still sees the control signal before.
+    _, (rest,) = zero_order_hold(A, [identity], dt - late)
+    before = (whole - rest) @ B
+    return _delayed(A @ whole, rest @ B, before, C, gamma_w, samples, gains)
+
+
+def _delayed(
+    N: Matrix, now: Matrix, before: Matrix, C: Vector, E: Matrix, samples: int, b: dict[int, float]
+) -> SampledPlant:
+    """Append the control signals that have not arrived yet as states, the newest last."""
+    n, waiting = N.shape[0], samples + bool(np.any(before))
+    A, B = np.zeros((n + waiting, n + waiting)), np.zeros(n + waiting)
+    A[:n, :n] = N
+    for i in range(waiting):
+        A[n + i, n + i] = -1.0
+        if i + 1 < waiting:
+            A[n + i, n + i + 1] = 1.0
+    if waiting:
+        B[-1] = 1.0
+    if waiting > samples:
+        A[:n, n] = before[:, 0]
+    # The state from which ``now`` arrives; without one, u itself.
+    at = n + waiting - samples
+    if samples:
+        A[:n, at] = now[:, 0]
+    else:
+        B[:n] = now[:, 0]
+    E = np.vstack([E, np.zeros((waiting, E.shape[1]))])
+    return SampledPlant(A, B, E, np.append(C, np.zeros(waiting)), b)
+
+
+# ---- A plant with an input delay ----
+
+# Part of a sample that is rounding. Chosen by hand, as in ``checks.samples``.
+_ROUNDING = 1e-6
+
+
+class DelayedPlantModel(NamedTuple):
+    """A sampled plant with a delay of at least one sample."""
+
+    inner: Any  # parameters of the plant without delay
+    size: Size  # number of its states
+
+
+@measure.register(DelayedPlantModel)
+def _measure_delay(plant: DelayedPlantModel, x: Vector) -> float:
+    return measure(plant.inner, x[: plant.size])
+
+
+@advance.register(DelayedPlantModel)
+def _advance_delay(
+    plant: DelayedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
+    last = x.size - 1
+    arriving = x[last]
+    for i in range(last, plant.size, -1):
+        x[i] = x[i - 1]
+    x[plant.size] = u
+    advance(plant.inner, x[: plant.size], scratch, t, arriving, w)
+
+
+@begin_run.register(DelayedPlantModel)
+def _begin_run(plant: DelayedPlantModel, x: Vector, scratch: Vector) -> None:
+    begin_run(plant.inner, x[: plant.size], scratch)
+
+
+@check_run.register(DelayedPlantModel)
+def _check_run(plant: DelayedPlantModel, scratch: Vector) -> None:
+    check_run(plant.inner, scratch)
+
+
+class PartlyDelayedModel(NamedTuple):
+    """A sampled plant with a delay that has a part of a sample."""
+
+    first: Any  # parameters for the part of a sample in which the older u still acts
+    rest: Any  # for the rest of it
+    late: float  # length of that part [s]
+    size: Size  # number of states of the plant without delay
+
+
+@measure.register(PartlyDelayedModel)
+def _measure_partly(plant: PartlyDelayedModel, x: Vector) -> float:
+    return measure(plant.first, x[: plant.size])
+
+
+@advance.register(PartlyDelayedModel)
+def _advance_partly(
+    plant: PartlyDelayedModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
+    last = x.size - 1
+    older, newer = x[last], u
+    if last > plant.size:
+        newer = x[last - 1]
+    for i in range(last, plant.size, -1):
+        x[i] = x[i - 1]
+    x[plant.size] = u
+    advance(plant.first, x[: plant.size], scratch, t, older, w)
+    advance(plant.rest, x[: plant.size], scratch, t + plant.late, newer, w)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DelayedPlant(PlantWrapper):
+    """A plant that u reaches ``samples`` samples of ``dt`` [s] and ``late`` [s] late.
+
+    Make it with ``delayed``.
+    """
+
+    plant: Plant
+    samples: int
+    dt: float
+    late: float = 0.0
+
+    @property
+    def delay(self) -> float:
+        """The whole delay [s]."""
+        return self.samples * self.dt + self.late
+
+    @property
+    def name(self) -> str:
+        """Name for tables and plots."""
+        return f"{self.plant.name}, {self.delay:g} s late"
+
+    @property
+    def order(self) -> int:
+        """Number of states, including the delayed values of u."""
+        return self.plant.order + self.samples + (self.late > 0.0)
+
+    def sampled(self, dt: float, interpret: bool = False) -> DelayedPlantModel | PartlyDelayedModel:
+        """Return the parameters for the sample time ``dt`` [s] of the delay."""
+        if abs(dt - self.dt) > 1e-9 * self.dt:
+            raise ValueError(
+                f"dt = {dt!r} s: this delayed plant was made for {self.dt!r} s; make another one"
+            )
+        if self.late > 0.0:
+            first, rest = (
+                self.plant.sampled(part, interpret) for part in (self.late, dt - self.late)
+            )
+            return PartlyDelayedModel(first, rest, self.late, self.plant.order)
+        return DelayedPlantModel(self.plant.sampled(dt, interpret), self.plant.order)
+
+
+def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
+    """Return a plant that u reaches ``delay`` seconds late.
+
+    Parameters
+    ----------
+    plant
+        any plant.
+    delay
+        [s]. That of a linear plant may have a part of a sample, which is exact for a u that is held
+        for a sample; other plants are solved in whole samples and take whole numbers of them.
+    dt
+        sample time of the later runs [s]; it decides how many values of u are stored.
+
+    Raises
+    ------
+    ValueError
+        if the delay is not positive, or for a plant that is not linear no whole number of samples;
+        or if ``plant`` is not a plant.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> late = ql.plants.delayed(ql.plants.two_mass_spring(), delay=0.02, dt=0.01)
+    >>> late.order
+    6
+    """
+    check_plant(plant)
+    delay, dt = checks.positive("delay", delay, "s"), checks.positive("dt", dt, "s")
+    if type(plant) is not LinearPlant:
+        rule = ", for a plant that is not linear; or take a smaller dt"
+        return DelayedPlant(plant, checks.samples("delay", delay, dt, rule), dt)
+    samples = round(delay / dt)
+    if abs(delay / dt - samples) <= _ROUNDING:
+        return DelayedPlant(plant, samples, dt) if samples else DelayedPlant(plant, 0, dt, delay)
+    samples = math.floor(delay / dt)
+    return DelayedPlant(plant, samples, dt, delay - samples * dt)
+
+
+# ---- A plant whose output is quantized by an encoder with a finite number of counts a turn ----
+
+
+class EncodedPlantModel(NamedTuple):
+    """A sampled plant with an encoder."""
+
+    inner: Any  # parameters of the plant without encoder
+    resolution: float  # q [y-unit]
+
+
+@kernel
+def quantized(value: float, resolution: float) -> float:
+    """Return the multiple of ``resolution`` nearest to ``value``."""
+    return resolution * np.floor(value / resolution + 0.5)
+
+
+@measure.register(EncodedPlantModel)
+def _measure_encoder(plant: EncodedPlantModel, x: Vector) -> float:
+    return quantized(measure(plant.inner, x), plant.resolution)
+
+
+@advance.register(EncodedPlantModel)
+def _advance_encoder(
+    plant: EncodedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
+    advance(plant.inner, x, scratch, t, u, w)
+
+
+@begin_run.register(EncodedPlantModel)
+def _begin_run_encoder(plant: EncodedPlantModel, x: Vector, scratch: Vector) -> None:
+    begin_run(plant.inner, x, scratch)
+
+
+@check_run.register(EncodedPlantModel)
+def _check_run_encoder(plant: EncodedPlantModel, scratch: Vector) -> None:
+    check_run(plant.inner, scratch)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class EncodedPlant(PlantWrapper):
+    """A plant whose output is read by an encoder of ``counts`` a turn.
+
+    Make it with ``encoded``.
+    """
+
+    plant: Plant
+    counts: int
+    turn: float = math.tau  #: y of one turn [y-unit]
+
+    @property
+    def resolution(self) -> float:
+        """Step of y that one count is [y-unit]."""
+        return self.turn / self.counts
+
+    @property
+    def name(self) -> str:
+        """Name for tables and plots."""
+        return f"{self.plant.name}, {self.counts} counts a turn"
+
+    def sampled(self, dt: float, interpret: bool = False) -> EncodedPlantModel:
+        """Return the parameters for a sample time ``dt`` [s]."""
+        return EncodedPlantModel(self.plant.sampled(dt, interpret), self.resolution)
+
+
+def encoded(plant: Plant, counts: int, turn: float = math.tau) -> EncodedPlant:
+    """Return a plant whose output y, an angle or a position, is read by an encoder.
+
+    Parameters
+    ----------
+    plant
+        any plant.
+    counts
+        counts of the encoder a turn, with all four edges of its two channels.
+    turn
+        y of one turn [y-unit]: 2π rad by default, 360 for degrees, the pitch of a screw [mm].
+
+    Raises
+    ------
+    ValueError
+        if ``counts`` is no whole number above zero, ``turn`` is not positive, or ``plant`` is not a
+        plant.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> seen = ql.plants.encoded(ql.plants.torsional_identified(), counts=16_000)
+    >>> round(seen.resolution, 7)
+    0.0003927
+    """
+    check_plant(plant)
+    counts = checks.whole("counts", counts, 1)
+    return EncodedPlant(plant, counts, checks.positive("turn", turn, "y-unit"))

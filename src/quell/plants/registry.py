@@ -2,21 +2,230 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
+import json
+import os
+import sys
+import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
-from quell.plants.base import Plant
-from quell.plants.delay import delayed
-from quell.plants.encoder import encoded
-from quell.plants.fmu.plant import FMU
-from quell.plants.identified_file import identified
-from quell.plants.linear import LinearPlant
-from quell.plants.machines.cubic_spring import lagged_two_mass_spring
-from quell.plants.machines.dc_motor import dc_motor
-from quell.plants.machines.n_mass import n_mass
-from quell.plants.machines.torsional import torsional, torsional_identified
-from quell.plants.machines.two_mass_spring import two_mass_spring
-from quell.plants.nonlinear.python_file import python_plant
+from quell import checks
+from quell.files import whole_text
+from quell.plants.base import Plant, check_plant
+from quell.plants.flexible import lagged_two_mass_spring, n_mass, two_mass_spring
+from quell.plants.fmu import FMU
+from quell.plants.linear import LinearPlant, delayed, encoded
+from quell.plants.nonlinear import NonlinearPlant, with_friction_and_delay
+from quell.plants.testbeds import dc_motor, torsional, torsional_identified
+from quell.types import warn
+
+# ---- Plants from the results of an identification ----
+
+
+def identified(path: str | os.PathLike[str], dt: float) -> Plant:
+    """Return the plant that `quell identify --json` or `quell tune --json` found in a record.
+
+    It is the transfer function with its delay and its dry friction, as
+    ``quell.identification.simulated_plant`` has it; designs use its part without friction. The
+    constant force is left out.
+
+    Parameters
+    ----------
+    path
+        the file of results, in JSON; relative to the folder where the command is run.
+    dt
+        sample time of the loop [s]; with friction the delay is rounded to whole samples.
+
+    Raises
+    ------
+    ValueError
+        for a file that can't be read or has no model, and for a model with direct feedthrough.
+    """
+    found = _model(path)
+    numbers: dict[str, Any] = {}
+    for name in ("num", "den"):
+        numbers[name] = checks.vector(f"{path}: {name}", found[name])
+    delay = checks.non_negative(f"{path}: delay", found.get("delay", 0.0), "s")
+    name = f"identified plant ({Path(path).name})"
+    linear = LinearPlant.of((numbers["num"], numbers["den"]), name=name)
+    force, width = found.get("friction"), found.get("friction_width")
+    if force and width:
+        force = checks.positive(f"{path}: friction", force, "u-unit")
+        width = checks.positive(f"{path}: friction_width", width, "y-unit/s")
+    elif force and "friction_width" not in found:
+        text = f"{path}: its friction is left out: the file is of an older quell; identify again"
+        warn(text)
+    dt = checks.positive("dt", dt, "s")
+    return with_friction_and_delay(linear, **numbers, force=force, width=width, delay=delay, dt=dt)
+
+
+def _model(path: str | os.PathLike[str]) -> Mapping[str, Any]:
+    where = f"path = {os.fspath(path)!r}"
+    try:
+        content = json.loads(whole_text(path))
+    except OSError as error:
+        raise ValueError(f"{where}: can't be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{where}: must be a file of results in JSON ({reason})") from None
+    for found in (content, content.get("model") if isinstance(content, dict) else None):
+        if isinstance(found, dict) and {"num", "den"} <= found.keys():
+            return found
+    raise ValueError(f"{where}: has no model; must be written by quell identify --json")
+
+
+# ---- Plants from a file of Python code, which is run only if the user trusts it ----
+
+# Modules by path and content: a sweep makes the same plant many times, and the same functions need
+# to be compiled only once.
+_MODULES: dict[tuple[Path, str], Any] = {}
+
+
+def python_plant(
+    source: str,
+    order: int | None = None,
+    parameters: Mapping[str, float] | None = None,
+    output: str | None = None,
+    disturbances: int = 1,
+    substeps: int | None = None,
+    operating_point: Mapping[str, Any] | None = None,
+    trust: bool = False,
+) -> Plant:
+    """Return the plant of a Python function, ``file.py:name``; this runs the file.
+
+    With ``order`` the function is the equation of a ``NonlinearPlant``, ``f(t, x, u, w, …)``. Else
+    it returns a plant, and is called with the parameters; it may also be a plant itself.
+
+    Parameters
+    ----------
+    source
+        file and name with a colon between, `pendulum.py:pendulum`; the file is relative to the
+        folder where the command is run.
+    order
+        number of states of an equation.
+    parameters
+        numbers by name for the function, `{m = 1.0}`.
+    output
+        of an equation: name of a function h(x, …) in the same file; the first state by default.
+    disturbances
+        of an equation: number of disturbance inputs.
+    substeps
+        of an equation: Runge-Kutta steps in a sample; chosen by default.
+    operating_point
+        of an equation: `{x = [3.14, 0.0], u = 0.0}`, about which designs take it as linear; zero by
+        default, if that is a state of rest.
+    trust
+        whether the file may be run.
+
+    Raises
+    ------
+    ValueError
+        without trust, for a file that can't be run, a name that it does not have, or a function
+        that returns no plant.
+    """
+    found, module = _named(source, trust)
+    numbers = dict(parameters or {})
+    only = {"output": output, "substeps": substeps, "operating_point": operating_point}
+    if order is None:
+        for key, value in only.items():
+            if value is not None:
+                raise ValueError(f"{key} = {value!r:.60}: is for an equation, which also has order")
+        return _made(source, found, numbers)
+    point = None
+    if operating_point is not None:
+        unknown = [key for key in operating_point if key not in ("x", "u")]
+        if unknown or "x" not in operating_point:
+            raise ValueError(f"operating_point = {operating_point!r}: must have x, and may have u")
+        point = operating_point["x"], operating_point.get("u", 0.0)
+    return NonlinearPlant(
+        found,
+        order,
+        None if output is None else _attribute(module, output, source),
+        disturbances,
+        substeps,
+        source.rpartition(":")[2],
+        numbers or None,
+        point,
+    )
+
+
+def _made(text: str, found: Any, numbers: dict[str, float]) -> Plant:
+    if callable(found) and not hasattr(found, "sampled"):
+        try:
+            found = found(**numbers)
+        except Exception as error:
+            raise ValueError(
+                f"source = {text!r}: fails with {type(error).__name__}: {error}; without order "
+                "it must return a plant, called with the parameters"
+            ) from None
+    elif numbers:
+        raise ValueError(f"parameters: {text!r} is a plant already; make it a function of them")
+    plant: Plant = found
+    try:
+        check_plant(plant, "it")
+    except ValueError:
+        raise ValueError(
+            f"source = {text!r}: returns {type(plant).__name__}, must return a plant; for an "
+            "equation f(t, x, u, w) give order, too"
+        ) from None
+    return plant
+
+
+def _named(text: str, trust: bool) -> tuple[Any, Any]:
+    """Return what ``file.py:name`` names, and the file's module."""
+    path, _, name = text.rpartition(":")
+    if not path.endswith(".py") or not name.isidentifier():
+        raise ValueError(f"source = {text!r}: must be a file and a name, like motor.py:motor")
+    if not trust:
+        raise ValueError(
+            f"source = {text!r}: would run this Python file; give --trust (in Python trust=True) "
+            "if you trust it"
+        )
+    module = _module(Path(path), text)
+    return _attribute(module, name, text), module
+
+
+def _attribute(module: Any, name: str, text: str) -> Any:
+    known = [key for key in vars(module) if not key.startswith("_")]
+    if name not in known:
+        raise ValueError(f"source = {text!r}: {name} is not in it; {checks.nearest(name, known)}")
+    return getattr(module, name)
+
+
+def _module(path: Path, text: str) -> Any:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"source = {text!r}: can't be read ({error.strerror})") from None
+    key = path.resolve(), hashlib.sha256(content).hexdigest()
+    if key in _MODULES:
+        return _MODULES[key]
+    name = f"quell_plant_{path.stem}_{key[1][:12]}"
+    spec = importlib.util.spec_from_file_location(name, key[0])
+    if spec is None or spec.loader is None:
+        raise ValueError(f"source = {text!r}: can't be imported")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[name]
+        if not isinstance(error, Exception | SystemExit):
+            raise
+        lines = [each.lineno for each in traceback.extract_tb(error.__traceback__)]
+        line = getattr(error, "lineno", None) or lines[-1]
+        raise ValueError(
+            f"source = {text!r}: {path.name} fails in line {line} with "
+            f"{type(error).__name__}: {' '.join(str(error).split())}"
+        ) from None
+    _MODULES[key] = module
+    return module
+
+
+# ---- The plants that setup files, rigs and twins know by name ----
 
 
 def linear(

@@ -18,34 +18,29 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell.realtime.devices.base import Device
-    from quell.realtime.devices.registry import open_device
-    from quell.realtime.devices.twin import TwinDevice
-    from quell.realtime.loop.replay import replay
-    from quell.realtime.loop.result import RigRun
-    from quell.realtime.loop.run import run_rig
-    from quell.realtime.loop.safety import Safety
-    from quell.realtime.rig.server import Rig
-    from quell.realtime.telemetry.csv_file import CsvSink
-    from quell.realtime.telemetry.live import LiveSink
-    from quell.realtime.telemetry.load import load
-    from quell.realtime.telemetry.mcap_file import McapSink
-    from quell.realtime.wire.target import record_target
+    from quell.realtime.devices import Device, TwinDevice
+    from quell.realtime.live import LiveSink
+    from quell.realtime.recordings import CsvSink, McapSink, load
+    from quell.realtime.registry import open_device
+    from quell.realtime.rig import Rig
+    from quell.realtime.run import RigRun, replay, run_rig
+    from quell.realtime.supervisor import Safety
+    from quell.realtime.target import record_target
 
 _HOME = {
-    "CsvSink": "telemetry.csv_file",
-    "Device": "devices.base",
-    "LiveSink": "telemetry.live",
-    "McapSink": "telemetry.mcap_file",
-    "Rig": "rig.server",
-    "RigRun": "loop.result",
-    "Safety": "loop.safety",
-    "TwinDevice": "devices.twin",
-    "load": "telemetry.load",
-    "open_device": "devices.registry",
-    "record_target": "wire.target",
-    "replay": "loop.replay",
-    "run_rig": "loop.run",
+    "CsvSink": "recordings",
+    "Device": "devices",
+    "LiveSink": "live",
+    "McapSink": "recordings",
+    "Rig": "rig",
+    "RigRun": "run",
+    "Safety": "supervisor",
+    "TwinDevice": "devices",
+    "load": "recordings",
+    "open_device": "registry",
+    "record_target": "target",
+    "replay": "run",
+    "run_rig": "run",
 }
 
 __all__ = [

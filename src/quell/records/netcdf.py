@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.files import TooLargeError, bytes_of, check_regular, check_size
 from quell.quantities import UNKNOWN, Signals, signals_from
-from quell.reading import TooLargeError, bytes_of, check_regular, check_size
 from quell.records import netcdf_reader
-from quell.records.sample_times import check_times
+from quell.records.record import check_times
 
 R = TypeVar("R")
 # Samples from one recorded sample to the next: as many as a scenario may have.

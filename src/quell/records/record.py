@@ -1,8 +1,14 @@
-"""Common part of the records of one run and of a batch: channels, times, NetCDF files."""
+"""Common part of the records of one run and of a batch: channels, times, NetCDF files.
+
+The channels of a record: names, columns, descriptions and units.
+
+A record as a table: a column for each number of a sample, for CSV and data frames.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -11,19 +17,139 @@ import numpy as np
 
 from quell import checks
 from quell.files import check_writable, written_atomically
-from quell.quantities import Signals
-from quell.records.channels import (
-    columns_of,
-    describe,
-    is_vector,
-    readable_names,
-    units_of,
-)
-from quell.records.sample_times import first_sample_at
+from quell.quantities import UNKNOWN, Signals
 from quell.types import Channels, Matrix, Vector
 
 if TYPE_CHECKING:
     import xarray
+
+# ---- The channels of a record ----
+
+# Channels that are vectors even if their width is one.
+_VECTORS = ("w", "x", "x_hat", "f_derivatives", "theta")
+# Description and unit.
+_DESCRIPTIONS = {
+    "r": ("reference", "y-unit"),
+    "r_shaped": ("reference behind the prefilter", "y-unit"),
+    "y": ("output", "y-unit"),
+    "y_measured": ("output as measured, with noise", "y-unit"),
+    "u": ("control signal as applied", "u-unit"),
+    "u_wished": ("control signal before limits", "u-unit"),
+    "w": ("disturbances", "w-unit"),
+    "x": ("state of the plant", "state-unit"),
+    "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),
+    "f_residual": ("residual total disturbance estimated by the observer", "y-unit/s^n"),
+    "f_derivatives": ("estimated derivatives of f, from the first on", "y-unit/s^(n+i)"),
+    "u_feedforward": ("feedforward of the model", "u-unit"),
+    "f_learned": ("total disturbance fed forward by the learner", "y-unit/s^n"),
+    "f_hat": ("estimated total disturbance", "y-unit/s^n"),
+    "authority": ("share of its output that the guard lets the learner have", "1"),
+    "error_plain": ("RMS of what an ESO without learner would have missed of f", "y-unit/s^n"),
+    "error_learned": (
+        "RMS of what would be missed with the learner at full authority",
+        "y-unit/s^n",
+    ),
+    "reason": ("why the authority is what it is (quell.guard.Reason)", "1"),
+    "status": ("status flags of the step", "1"),
+    "theta": ("coefficients of the learner", "y-unit/s^n per feature-unit"),
+    "k": ("index of the deadline", "1"),
+    "lateness": ("wake-up behind the deadline", "s"),
+    "step_time": ("from the wake-up until u was written", "s"),
+    "mode": ("state of the supervisor", "1"),
+    "events": ("events of the cycle (quell.realtime.recordings.Event)", "1"),
+}
+
+
+# The words of descriptions that a signal's name stands for.
+_NAMED = {
+    "y": "output",
+    "y_measured": "output",
+    "u": "control signal",
+    "u_wished": "control signal",
+}
+
+
+def describe(name: str, signals: Signals = UNKNOWN) -> tuple[str, str]:
+    """Return a channel's description and unit, those of the plant's ``signals`` if known."""
+    text, unit = _DESCRIPTIONS.get(name, (name, "1"))
+    if name in _NAMED:
+        known = signals.y if name.startswith("y") else signals.u
+        text = text.replace(_NAMED[name], known.name or _NAMED[name])
+    elif name == "w" and any(each.name for each in signals.w):
+        text = f"{text}: {', '.join(map(str, signals.w))}"
+    return text, signals.unit(unit)
+
+
+def units_of(name: str, width: int, signals: Signals = UNKNOWN) -> list[str]:
+    """Return the unit of each entry of a channel with ``width`` entries."""
+    if name == "x_hat" and signals.y.unit:
+        return [signals.derivative(i) for i in range(width)]
+    if name == "w" and len(signals.w) == width:
+        return [each.unit or "w-unit" for each in signals.w]
+    return [describe(name, signals)[1]] * width
+
+
+def signals_of_loop(signals: Signals, controller: Any) -> Signals:
+    """Return the plant's signals with the unit of the controller's f, if it has an observer."""
+    while controller is not None:
+        observer = getattr(controller, "observer", None)
+        if observer is not None:
+            return signals.with_f(getattr(observer, "f_degree", None))
+        controller = getattr(controller, "controller", None)
+    return signals
+
+
+def is_vector(name: str, width: int) -> bool:
+    """Return whether a channel has an axis for its entries, be it of length 1."""
+    return width > 1 or name in _VECTORS
+
+
+def readable_names(channels: Channels) -> tuple[str, ...]:
+    """Return the names of the channels that have columns, and ``f_hat`` if it can be computed."""
+    recorded = tuple(name for name, width in channels if width)
+    return (*recorded, "f_hat") if {"f_learned", "f_residual"} <= set(recorded) else recorded
+
+
+def columns_of(channels: Channels, name: str) -> slice:
+    """Return the columns of a channel in a log."""
+    start = 0
+    for channel, width in channels:
+        if channel == name:
+            return slice(start, start + width)
+        start += width
+    raise KeyError(name)
+
+
+# ---- Conversion of times to sample numbers, unaffected by rounding ----
+
+
+def check_times(samples: int, step: float) -> None:
+    """Raise a ``ValueError`` if the times of ``samples`` samples are beyond all numbers."""
+    if not math.isfinite(samples * step):
+        raise ValueError(f"its samples are {step:g} s apart: its times are beyond all numbers")
+
+
+def first_sample_at(time: float, step: float, samples: int) -> int:
+    """Return the first of ``samples`` samples, ``step`` apart, that is not before ``time``.
+
+    Returns ``samples`` if all are. A time that is a whole number of steps but for rounding is at
+    that sample.
+    """
+    if math.isnan(time):
+        raise ValueError(f"time = {time!r}: must be a number")
+    return math.ceil(in_steps(min(max(time, 0.0), samples * step), step))
+
+
+def in_steps(time: float, step: float) -> float:
+    """Return ``time / step``, rounded to a whole number if it is one but for rounding errors."""
+    count = time / step
+    nearest = float(round(count))
+    # Far above the rounding of a quotient (2e-16), far below any time that is meant to be between
+    # samples.
+    return nearest if math.isclose(count, nearest, rel_tol=1e-12, abs_tol=1e-9) else count
+
+
+# ---- Common part of the records of one run and of a batch ----
 
 
 class Record:
@@ -144,3 +270,58 @@ def _image(write: Callable[[Any], None]) -> bytes:
             write(netcdf)
         file.flush()
         return bytes(file.id.get_file_image())
+
+
+# ---- A record as a table ----
+
+# Rows that are converted to text at once; chosen by hand.
+_BLOCK = 10_000
+
+
+def columns(run: Record) -> tuple[list[str], list[str], Matrix]:
+    """Return names, units and numbers (samples, columns) of a run; the first column is the time."""
+    names, units, parts = ["time"], ["s"], [run.t[:, None]]
+    for name in run.names:
+        values = np.asarray(run[name])
+        if values.ndim == 1:
+            values, own = values[:, None], [name]
+        else:
+            labels = run.features if name == "theta" else ()
+            entries = range(values.shape[1])
+            own = [f"{name}[{labels[i] if i < len(labels) else i}]" for i in entries]
+        names += own
+        units += units_of(name, len(own), run.signals)
+        parts.append(values)
+    return names, units, np.hstack(parts)
+
+
+def to_pandas(run: Record) -> Any:
+    """Return a ``pandas.DataFrame`` over the time, with units in ``attrs["units"]``."""
+    from quell.checks import import_extra
+
+    pandas = import_extra("pandas", "pandas", "a data frame")
+    names, units, values = columns(run)
+    index = pandas.Index(values[:, 0], name="time")
+    frame = pandas.DataFrame(values[:, 1:], index=index, columns=names[1:])
+    frame.attrs["units"] = dict(zip(names[1:], units[1:], strict=True))
+    return frame
+
+
+def write_csv(run: Record, path: str | os.PathLike[str], overwrite: bool) -> None:
+    """Write a run as CSV: names, with units where they are known, then a line for each sample."""
+    check_writable(path, overwrite)
+    names, units, values = columns(run)
+    heads = [
+        f"{name} [{unit}]" if unit != "1" and "-unit" not in unit else name
+        for name, unit in zip(names, units, strict=True)
+    ]
+    with written_atomically(path, overwrite) as part, part.open("w", encoding="utf-8") as file:
+        file.write(",".join(_cell(head) for head in heads) + "\n")
+        for first in range(0, len(values), _BLOCK):
+            rows = values[first : first + _BLOCK].tolist()
+            file.write("".join(",".join(map(repr, row)) + "\n" for row in rows))
+
+
+def _cell(text: str) -> str:
+    quoted = text.replace('"', '""')
+    return f'"{quoted}"' if set(text) & set(',"\n') else text

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from quell import checks
+from quell.files import MAX_SIZE
 from quell.quantities import UNKNOWN, Signals
-from quell.reading import MAX_SIZE
-from quell.records.measures import MEASURES, Metrics, Window, measured
-from quell.records.metrics import SETTLING_BAND
+from quell.records.metrics import MEASURES, SETTLING_BAND, BatchMetrics, Metrics, Window, measured
 from quell.records.netcdf import Stored, load_record
 from quell.records.record import Record
-from quell.types import Channels, Matrix, Status
+from quell.types import Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
     import xarray
@@ -186,7 +187,7 @@ class Trajectory(Record):
         The entries of vector channels are columns of their own, ``x[0]`` and ``theta[x1]``; its
         ``attrs["units"]`` has the unit of each column.
         """
-        from quell.records.table import to_pandas
+        from quell.records.record import to_pandas
 
         return to_pandas(self)
 
@@ -195,7 +196,7 @@ class Trajectory(Record):
 
         A ``ValueError`` says that the file exists, unless ``overwrite`` allows to replace it.
         """
-        from quell.records.table import write_csv
+        from quell.records.record import write_csv
 
         write_csv(self, path, overwrite)
 
@@ -248,3 +249,204 @@ class Trajectory(Record):
 
         attributes = {"dt", "every", "status", "ended", "plant"}
         return load_record(path, "Trajectory.save", ("time",), attributes, set(), max_size, made)
+
+
+# Name, description and unit in a file of the values that each run has one of.
+_PER_RUN = {
+    "lengths": ("number of samples recorded", "1"),
+    "run_status": ("all status flags of the run (quell.Status)", "1"),
+    "ended": ("when the run ended", "s"),
+    "limit": ("the |y| at which it would have been ended", "y-unit"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class BatchTrajectory(Record):
+    """The record of a batch of runs.
+
+    ``runs["y"]`` is a channel: (runs, samples), or (runs, samples, width) for ``w``, ``x``,
+    ``x_hat`` and ``theta``; ``runs.t`` are their times [s]. After the end of a run that diverged,
+    its samples are NaN. ``runs.run(i)`` is the i-th run as a ``Trajectory``.
+
+    ``status`` has all ``Status`` flags that any step of a run reported, and ``DIVERGED`` if it
+    ended early; ``message`` is their summary. ``controller.read(runs.final_states[i])`` explains
+    the state of a controller at the end.
+    """
+
+    log: Matrix  #: the recorded channels side by side (runs, samples, columns)
+    channels: Channels  #: name and width of the channels, in the order of the columns
+    dt: float  #: sample time of the runs [s]
+    every: int  #: every ``every``-th sample was recorded
+    lengths: NDArray[np.int64]  #: number of recorded samples of each run (runs,)
+    status: NDArray[np.int64]  #: flags of each run (runs,)
+    ended: Vector  #: time at which each run ended [s] (runs,)
+    limit: Vector  #: the ``|y|`` beyond which a run would have been ended [y-unit] (runs,)
+    plant: str = ""  #: name of the plants
+    #: the parameters in which the plants differ, by name (runs,)
+    parameters: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
+    final_states: tuple[Any, ...] = ()
+    signals: Signals = UNKNOWN  #: names and units of y, u and disturbances
+
+    @property
+    def diverged(self) -> NDArray[np.bool_]:
+        """True for the runs that ended early (runs,)."""
+        return (self.status & int(Status.DIVERGED)) != 0
+
+    @property
+    def message(self) -> str:
+        """The number of runs that reported each flag, and the time at which the first diverged."""
+        runs, integration = len(self), Status.DIVERGED | Status.POORLY_INTEGRATED
+        causes = (self.status & int(integration)) == int(integration)
+        own = np.where(causes, self.status & ~int(integration), self.status)
+        counts = [(np.count_nonzero(own & int(flag)), flag.message) for flag in Status]
+        counts.append((np.count_nonzero(causes), integration.message))
+        sentences = [f"{count} of {runs} runs: {message}" for count, message in counts if count]
+        if np.any(self.diverged):
+            first = int(np.argmin(np.where(self.diverged, self.ended, np.inf)))
+            sentences.append(f"The first to diverge was run {first}, at {self.ended[first]:.6g} s.")
+        return " ".join(sentences) or f"No step reported a problem in any of {len(self)} runs."
+
+    def __getitem__(self, name: Any) -> Vector:
+        """Return a channel; a ``ValueError`` names the channels, or ``run`` for a number."""
+        if isinstance(name, int | np.integer):
+            raise ValueError(
+                f"channel = {name!r}: must be a name, as runs['y']; run number {name} is "
+                f"runs.run({name})"
+            )
+        return super().__getitem__(name)
+
+    def __len__(self) -> int:
+        """Return the number of runs."""
+        return int(self.log.shape[0])
+
+    def run(self, i: int) -> Trajectory:
+        """Return the i-th run, to its end, with the channels that were recorded."""
+        checks.whole("i", i, 0, len(self) - 1)
+        return Trajectory(
+            log=self.log[i, : self.lengths[i]],
+            channels=self.channels,
+            dt=self.dt,
+            every=self.every,
+            status=Status(int(self.status[i])),
+            ended=float(self.ended[i]),
+            limit=float(self.limit[i]),
+            plant=self.plant,
+            features=self.features,
+            signals=self.signals,
+            final_state=self.final_states[i] if self.final_states else None,
+        )
+
+    def metrics(
+        self,
+        start: float = 0.0,
+        stop: float | None = None,
+        *,
+        target: float | None = None,
+        band: float = SETTLING_BAND,
+    ) -> BatchMetrics:
+        """Return measures of each run in ``[start, stop)`` [s], as ``Trajectory.metrics`` does.
+
+        For a run that diverged within the window, its samples up to there count; see ``diverged``.
+        All measures of a run that ended before the window are NaN, and so are those that are
+        defined for other runs only.
+
+        Parameters
+        ----------
+        start, stop, target, band
+            as those of ``Trajectory.metrics``.
+
+        Returns
+        -------
+        BatchMetrics
+            a dictionary of arrays (runs,): ``peak_error`` and ``rms`` [y-unit], ``iae`` [y-unit s],
+            ``ise`` [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` and
+            ``total_variation`` [u-unit]; for a step ``overshoot`` (fraction of the step),
+            ``settling_time`` and ``rise_time`` [s]. Its ``missing[name]`` has the reason for each
+            run that does not have a measure.
+
+        Raises
+        ------
+        ValueError
+            as ``Trajectory.metrics``, but for runs that ended before the window only if all did.
+        """
+        window = self.window(start, np.inf if stop is None else stop)
+        reached = np.flatnonzero((self.lengths > window.start) | ~self.diverged).tolist()
+        found: dict[str, Vector] = {}
+        missing: dict[str, dict[int, str]] = {}
+        for i in reached or [0]:  # if no run reached the window, the first one raises the error
+            measures = self.run(i).metrics(start, stop, target=target, band=band)
+            for name, value in measures.items():
+                found.setdefault(name, np.full(len(self), np.nan))[i] = value
+            for name, reason in measures.missing.items():
+                missing.setdefault(name, {})[i] = reason
+        for i in sorted(set(range(len(self))) - set(reached)):
+            reason = f"the run diverged at {self.ended[i]:.6g} s, before the window"
+            for name in found:
+                missing.setdefault(name, {})[i] = reason
+        return BatchMetrics(found, missing, band)
+
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
+        """Draw output and control signal: median, bands of the runs, and when others diverged.
+
+        Parameters
+        ----------
+        axes, ax
+            two matplotlib axes; a new figure by default.
+        """
+        from quell.records.plotting import given_axes, plot_batch
+
+        return plot_batch(self, self.diverged, self.ended, given_axes(axes, ax))
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the record as an ``xarray.Dataset`` over ``run`` and ``time``.
+
+        The plants' parameters are coordinates of ``run``; one that has a channel's name is the
+        coordinate ``plant_<name>``.
+        """
+        data = self._dataset(("run", "time"), {"plant": self.plant, "message": self.message})
+        taken = {*map(str, data.variables), *map(str, data.dims), *_PER_RUN}
+        values_per_run = (self.lengths, self.status, self.ended, self.limit)
+        coordinates: dict[str, Any] = {"run": ("run", np.arange(len(self)))}
+        for (name, (about, unit)), values in zip(_PER_RUN.items(), values_per_run, strict=True):
+            coordinates[name] = ("run", values, {"long_name": about, "units": unit})
+        for name, values in self.parameters.items():
+            key = f"plant_{name}" if name in taken else name
+            coordinates[key] = ("run", values, {"parameter": name})
+        return data.assign_coords(coordinates)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> BatchTrajectory:
+        """Return the record that ``save`` wrote, without ``final_states``.
+
+        Parameters
+        ----------
+        path, max_size
+            as those of ``Trajectory.load``.
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            as ``Trajectory.load``.
+        """
+
+        def made(stored: Stored, fields: dict[str, Any]) -> BatchTrajectory:
+            runs, samples, _ = fields["log"].shape
+            values = {name: stored.values[name] for name in (*_PER_RUN, *stored.parameters)}
+            lengths = values["lengths"]
+            if any(each.shape != (runs,) for each in values.values()):
+                raise ValueError("must have one value of each parameter for each run")
+            if np.any((lengths < 0) | (lengths > samples)):
+                raise ValueError(f"lengths must be from 0 to {samples}")
+            return cls(
+                **fields,
+                lengths=lengths.astype(np.int64),
+                status=values["run_status"].astype(np.int64),
+                ended=values["ended"],
+                limit=values["limit"],
+                parameters={called: values[name] for name, called in stored.parameters.items()},
+            )
+
+        axes, attributes, variables = ("run", "time"), {"dt", "every", "plant"}, set(_PER_RUN)
+        writer = "BatchTrajectory.save"
+        return load_record(path, writer, axes, attributes, variables, max_size, made)

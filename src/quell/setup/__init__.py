@@ -12,24 +12,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quell.setup.description import Description
-    from quell.setup.errors import SetupError
-    from quell.setup.loading import EXAMPLES, Setup, load, made
-    from quell.setup.plants import plant_given, plant_of
-    from quell.setup.toml_file import read
-    from quell.setup.vary import controllers_of, varied
+    from quell.setup.loading import EXAMPLES, Setup, controllers_of, load, made, varied
+    from quell.setup.schema import SetupError, plant_given, plant_of, read
 
 _HOME = {
     "EXAMPLES": "loading",
     "Description": "description",
     "Setup": "loading",
-    "SetupError": "errors",
-    "controllers_of": "vary",
+    "SetupError": "schema",
+    "controllers_of": "loading",
     "load": "loading",
     "made": "loading",
-    "plant_given": "plants",
-    "plant_of": "plants",
-    "read": "toml_file",
-    "varied": "vary",
+    "plant_given": "schema",
+    "plant_of": "schema",
+    "read": "schema",
+    "varied": "loading",
 }
 
 __all__ = [

@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import AfterValidator, Field, ValidationError
 
 from quell import checks
-from quell.setup.errors import from_validation
-from quell.setup.schema import Table
-from quell.setup.toml_file import immutable
-from quell.setup.toml_file import parsed as parsed
-from quell.setup.toml_file import read as read
+from quell.setup.schema import Table, from_validation, immutable
+from quell.setup.schema import parsed as parsed
+from quell.setup.schema import read as read
 
 if TYPE_CHECKING:  # these types are made at run time, which a type checker cannot follow
     from quell.setup.schema import CallTable as Controller

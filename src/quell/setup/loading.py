@@ -1,29 +1,59 @@
-"""A setup: the objects that a file describes."""
+"""A setup: the objects that a file describes.
+
+Arguments of ``quell.tune`` from a setup file: the plant, its ranges, constraints.
+
+The sweep of a setup: the runs that its table ``[sweep]`` describes.
+
+A setup with other values: what sweeps and tuning change of a file.
+"""
 
 from __future__ import annotations
 
 import os
+import re
+import threading
+import types
 import unicodedata
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import PydanticUndefined
 
 from quell import checks
 from quell.controllers.base import Controller
-from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.controllers.prefilters import Prefiltered
 from quell.files import nonfinite_to_none
-from quell.plants.base import Plant
-from quell.plants.labelled import signals_of
-from quell.plants.linear_part import linear_model
+from quell.plants.base import Plant, signals_of
+from quell.plants.linear import delayed
+from quell.plants.linearise import linear_model
 from quell.records.metrics import SETTLING_BAND
-from quell.setup.build import Builder, parameters_of
 from quell.setup.description import Description, describe
-from quell.setup.errors import SetupError
-from quell.setup.schema import CallTable, Table
-from quell.setup.toml_file import read
-from quell.simulation.scenario import Scenario
+from quell.setup.registry import CASE
+from quell.setup.schema import (
+    Builder,
+    CallTable,
+    SetupError,
+    Table,
+    contents_of,
+    immutable,
+    parameters_of,
+    read,
+)
+from quell.simulation.driver import Scenario
+from quell.sweeping.runs import Measure, as_values, hash_of
+from quell.tuning.constraints import Constraints
+from quell.tuning.designs import SIMPLEST, range_of_u
+from quell.tuning.plants import with_known_noise
+from quell.tuning.report import late_tables, rest_of_plant
+from quell.tuning.structures.registry import FEEDING_FORWARD
+
+# ---- A setup ----
 
 Known: TypeAlias = dict[str, tuple[tuple[Any, ...], Any]]
 """Inputs and object of each part that was built, for ``assembled``."""
@@ -94,7 +124,7 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     ...     load(path)
     Traceback (most recent call last):
         ...
-    quell.setup.errors.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
+    quell.setup.schema.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
     """
     return made(*read(path), trust)
 
@@ -216,3 +246,456 @@ def _check_window(
     if target is not None:
         checks.finite("target", target)
     checks.positive("band", band)
+
+
+# ---- Tables of all keys of setup files in Markdown, for the documentation ----
+
+_TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
+
+
+def keys(of: type[Table]) -> list[tuple[str, str, str, str]]:
+    """Return name, type, default and description of each key of a table, except ``kind``."""
+    return [
+        (key, _type(field.annotation), _default(field.default), field.description or "")
+        for key, field in of.model_fields.items()
+        if key != "kind"
+    ]
+
+
+def table(of: type[Table]) -> str:
+    """Return the keys of a table in Markdown; an empty text for a table without keys."""
+    bar = r"\|"
+    rows = [
+        f"| `{key}` | {kind} | {default} | {text.replace('|', bar)} |"
+        for key, kind, default, text in keys(of)
+    ]
+    heading = ["| key | type | default | |", "|---|---|---|---|"]
+    return "\n".join(heading + rows if rows else []).replace("``", "`")
+
+
+def markdown(kinds: Mapping[str, type[CallTable]]) -> str:
+    """Return the kinds of a table and their keys in Markdown."""
+    return "\n\n".join(
+        f"**`{kind}`** {of.__doc__}\n\n{table(of)}".replace("``", "`") for kind, of in kinds.items()
+    )
+
+
+def _default(value: Any) -> str:
+    if value is PydanticUndefined:
+        return "**needed**"
+    if value is None:
+        return ""
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
+    return f"`{str(value).lower() if isinstance(value, bool) else repr(value)}`"
+
+
+def _type(annotation: Any) -> str:
+    """Return the name of a type in TOML."""
+    if annotation in _TYPES:
+        return _TYPES[annotation]
+    origin = get_origin(annotation)
+    inside = [part for part in get_args(annotation) if part is not types.NoneType]
+    if origin is tuple:
+        return "list"
+    if origin is dict:
+        return "table"
+    if origin in (Union, types.UnionType):
+        named = list(dict.fromkeys(_type(part) for part in inside))
+        return "table" if all(name == "table" for name in named) else ", ".join(named)
+    if origin is not None and inside:  # Annotated
+        return _type(inside[0])
+    return "table" if isinstance(annotation, type) and issubclass(annotation, Table) else "numbers"
+
+
+# ---- A setup with other values ----
+
+# A path is written as in the messages: plant.m1, scenario.disturbances[1].height.
+_STEP = re.compile(r"\.?([^.\[\]]+)|\[(\d+)\]")
+_PATH = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[\d+\])*")
+
+
+def varied(setup: Setup, changes: Mapping[str, Any]) -> Setup:
+    """Return the setup of the same file with other values.
+
+    Parameters
+    ----------
+    setup
+        from ``load``; it is not changed.
+    changes
+        values by path: ``{"plant.m1": 0.7, "scenario.disturbances[1].height": 2.0}``. A value may
+        be whatever the file may have there: a number, a list, a table (a dictionary), or None to
+        leave out an optional table.
+
+    Raises
+    ------
+    SetupError
+        if a path is none of the file's keys, or a value does not fit; it names the path.
+
+    Examples
+    --------
+    >>> from quell.setup import EXAMPLES, load
+    >>> setup = load(EXAMPLES / "two_mass.toml")
+    >>> lighter = varied(setup, {"plant.m1": 0.7, "learner": None})
+    >>> float(setup.plant.B[2, 0]), float(lighter.plant.B[2, 0])
+    (1.0, 1.4285714285714286)
+    """
+    if not isinstance(setup, Setup):
+        raise ValueError(f"setup = {setup!r:.80}: must be a Setup, as quell.setup.load returns it")
+    return made(setup.file, changed(setup.file, setup.tables(), changes), setup.trust)
+
+
+def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
+    """Return a function from values by path to the setup's controller with these values.
+
+    It is the ``build`` of ``quell.tuning.simulated.search``, which so varies any numbers of
+    observer, controller, learner and guard; it may be sent to other processes.
+
+    Raises
+    ------
+    SetupError
+        as ``varied``, when it is called.
+
+    Examples
+    --------
+    >>> from quell.setup import EXAMPLES, load
+    >>> build = controllers_of(load(EXAMPLES / "two_mass.toml"))
+    >>> build({"observer.omega_o": 9.0, "learner.prior": 1.0}).learner.prior
+    1.0
+    """
+    return partial(_controller, setup.file, setup.tables(), trust=setup.trust)
+
+
+def _controller(
+    name: str, tables: Mapping[str, Any], values: Mapping[str, float], trust: bool
+) -> Controller:
+    return made(name, changed(name, tables, values), trust).controller
+
+
+def changed(name: str, data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``data``, the content of the file ``name``, with other values at some paths."""
+    result: dict[str, Any] = dict(data)
+    for path, value in changes.items():
+        result = _with(name, result, steps_of(name, path), value, path)
+    return result
+
+
+def steps_of(name: str, path: str) -> list[str | int]:
+    """Return the keys and places in lists that a path goes through."""
+    if not isinstance(path, str) or not _PATH.fullmatch(path):
+        rule = "must be a path of keys, such as plant.m1 or scenario.disturbances[1].height"
+        raise SetupError([f"{name}: {path!r}: {rule}"])
+    return [key or int(place) for key, place in _STEP.findall(path)]
+
+
+def _with(name: str, where: Any, steps: list[str | int], value: Any, path: str) -> Any:
+    """Return a copy of ``where`` with ``value`` at the end of the steps."""
+    if not steps:
+        return value
+    step, *rest = steps
+    if isinstance(step, int):
+        if not isinstance(where, list | tuple):
+            raise SetupError(
+                [f"{name}: {path}: [{step}] is no place in a list here: {where!r:.60}"]
+            )
+        if step >= len(where):
+            raise SetupError(
+                [f"{name}: {path}: [{step}] is beyond the list's {len(where)} entries"]
+            )
+        parts = list(where)
+        parts[step] = _with(name, parts[step], rest, value, path)
+        return parts
+    if isinstance(where, str):  # a text in place of a table is its kind
+        where = {"kind": where}
+    if where is None:  # a table that the file does not have
+        where = {}
+    if not isinstance(where, Mapping):
+        raise SetupError([f"{name}: {path}: {step} is no key here, but in {where!r:.60}"])
+    return {**where, step: _with(name, where.get(step), rest, value, path)}
+
+
+# ---- Arguments of quell.tune from a setup file ----
+
+# What a tuning replaces. A law without effect stands in for the controller.
+_REPLACED = ("observer", "controller", "learner", "guard", "prefilter")
+_NO_CONTROLLER = {"kind": "pid", "kp": 0.0}
+
+
+class TuningTask(NamedTuple):
+    """Arguments of ``quell.tune``."""
+
+    plant: Any  # a plant, linear unless simulated; with ranges, a function that makes it
+    dt: float  # [s]
+    options: dict[str, Any]  # all others
+    setup: Setup
+
+
+def tuning_task(
+    path: str | os.PathLike[str],
+    changes: Mapping[str, Any] | None = None,
+    trust: bool = False,
+    limits: Mapping[str, float] | None = None,
+) -> TuningTask:
+    """Read a setup file for ``quell.tune``; ``changes`` are values of ``[tune]`` by name.
+
+    ``limits`` are limits of u that replace those of the file's controller.
+
+    Observer, controller, learner, guard and prefilter of the file are left out: they are what is
+    tuned. The limits of u stay, and the tuned controller has the feedforward of a model if the
+    file's feeds forward, unless ``[tune]`` says otherwise. Dry friction and limits of the plant are
+    left out, too; a tuning by simulation (``trials``) has them.
+
+    Raises
+    ------
+    SetupError
+        as ``load``; for a file without plant, and for ranges that are none of the plant's keys.
+    """
+    name, data = read(path)
+    given = data.get("controller", {})
+    kept = {key: value for key, value in data.items() if key not in _REPLACED}
+    kept["controller"] = _NO_CONTROLLER
+    table = data.get("tune", {})
+    if isinstance(table, Mapping):
+        asked = {**table, **(changes or {})}
+        structure = asked.get("structure", SIMPLEST)
+        if isinstance(given, Mapping) and structure in (SIMPLEST, *FEEDING_FORWARD):
+            asked = _feedforward(given) | asked
+        if asked:
+            kept["tune"] = asked
+    setup = made(name, kept, trust)
+    plant, ranges = setup.needed("plant"), _ranges(setup)
+    options = dict(setup.tune or {})
+    if isinstance(given, Mapping):
+        names = ("u_min", "u_max", "rate_limit")
+        options = {key: given[key] for key in names if key in given} | options
+    options |= limits or {}
+    bounds, u_limits = options.get("constraints") or Constraints(), range_of_u(options)
+    options["constraints"] = with_known_noise(bounds, plant, u_limits)
+    options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
+    delay = options.get("delay", 0.0)
+    if isinstance(delay, float) and delay > 0.0:  # the plant of the tuned file has it, too
+        try:
+            samples = delayed(plant, delay, setup.controller.dt).order - plant.order
+        except ValueError as error:
+            raise SetupError([f"{setup.file}: tune: {error}"]) from None
+        options["setup"] = late_tables(options["setup"], delay, samples)
+        if "tune" in data:
+            kept_keys = {key: value for key, value in data["tune"].items() if key != "delay"}
+            options["setup"]["tune"] = kept_keys
+    if "scenario" not in data:
+        with suppress(ValueError):  # of a plant without operating point, which tune refuses
+            options["rest"] = rest_of_plant(plant, setup.controller.dt)
+    part = linear_model
+    if "search" in options:
+        options["scenario"], part = setup.needed("scenario"), _whole
+    if not ranges:
+        return TuningTask(part(plant), setup.controller.dt, options, setup)
+    for key in ranges:
+        _with_tuning_task(
+            setup.file, kept, {key: ranges[key][0]}, trust
+        )  # an unknown key is an error now
+
+    def make(**values: float) -> Any:
+        return part(_with_tuning_task(name, kept, values, trust).plant)
+
+    return TuningTask(make, setup.controller.dt, {**options, "uncertain": ranges}, setup)
+
+
+def _feedforward(controller: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the feedforward of a controller's table as an option of [tune]."""
+    if controller.get("feedforward"):
+        return {"feedforward": controller["feedforward"]}
+    if "inertia" in controller:  # of a cascade
+        model = {key: controller[key] for key in ("inertia", "viscous") if key in controller}
+        return {"feedforward": {"kind": "rigid"} | model}
+    return {}
+
+
+def _whole(plant: Any) -> Any:
+    return plant
+
+
+def _with_tuning_task(
+    name: str, data: Mapping[str, Any], values: Mapping[str, float], trust: bool
+) -> Setup:
+    changes = {f"plant.{key}": value for key, value in values.items()}
+    return made(name, changed(name, data, changes), trust)
+
+
+def _ranges(setup: Setup) -> dict[str, tuple[float, float]]:
+    found = getattr(setup.description.plant, "uncertain", None)
+    if found == {}:
+        raise SetupError(
+            [f"{setup.file}: plant.uncertain: is empty; give a range, m1 = [0.6, 1.4]"]
+        )
+    return dict(found or {})
+
+
+# ---- The sweep of a setup ----
+
+# Tables that a simulated run does not use.
+_NOT_USED = ("sweep", "rig", "metrics", "title")
+
+
+def sweep_of(setup: Setup) -> dict[str, Any]:
+    """Return the arguments of ``quell.sweep`` for a setup, except the folder.
+
+    Raises
+    ------
+    SetupError
+        if the setup has no table ``[sweep]``, plant or scenario, or if a path or value in it is
+        none of the setup's.
+    """
+    for needed in ("plant", "scenario", "sweep"):
+        setup.needed(needed)
+    table: dict[str, Any] = dict(setup.sweep or {})
+    build = Variation(setup.file, setup.tables(), table.pop("cases"), setup.trust)
+    for name in build.cases:
+        _attempt(build, f"sweep.cases.{name}", {CASE: name})
+    for path, given in table["parameters"].items():
+        if path != CASE:
+            _check_parameter(build, path, given)
+    measures = _measures(setup, table.pop("metrics"))
+    table["limits"] = _limits(setup.file, table["limits"], measures)
+    return {"build": build, **table, "metrics": measures}
+
+
+def _check_parameter(build: Variation, path: str, given: Any) -> None:
+    """Check that the setup has a parameter, in all cases."""
+    where = "sweep.parameters"
+    try:
+        values = as_values(path, given)
+    except ValueError as error:
+        raise SetupError([f"{build.name}: {where}: {error}"]) from None
+    value = values[0] if isinstance(values, tuple) else float(values.ppf(np.array([0.5]))[0])
+    if not build.cases:
+        _attempt(build, where, {path: value})
+    lacking: list[SetupError] = []
+    having = []
+    for case in build.cases:
+        try:
+            _attempt(build, f"{where}, case {case}", {CASE: case, path: value})
+            having.append(case)
+        except SetupError as error:
+            lacking.append(error)
+    if not lacking:
+        return
+    first = list(lacking[0].mistakes)
+    if having:
+        first[-1] += (
+            f"; {path} fits the case {having[0]}, but a parameter must fit all cases: sweep those "
+            "that it fits apart from the others"
+        )
+    raise SetupError(first)
+
+
+def _attempt(build: Variation, where: str, values: Mapping[str, Any]) -> None:
+    """Build a setup; the place in the table stands in front of its errors."""
+    try:
+        build(**values)
+    except SetupError as error:
+        begin = f"{build.name}: "
+        lines = [line.removeprefix(begin) for line in error.mistakes]
+        raise SetupError([f"{begin}{where}: {line}" for line in lines]) from None
+
+
+def _measures(setup: Setup, names: Any) -> dict[str, Measure]:
+    """Return the measures in each window of a setup; of several windows they are numbered."""
+    rests = setup.scenario.rest_at if setup.scenario is not None else ()
+    windows = setup.windows or ({"start": float(rests[-1]) if len(rests) else 0.0},)
+    if not checks.is_sequence(names):
+        raise SetupError([f"{setup.file}: sweep.metrics = {names!r:.60}: must be a list of names"])
+    try:
+        return {
+            name if len(windows) == 1 else f"{name}_{i}": Measure(name, **window)
+            for i, window in enumerate(windows, 1)
+            for name in names
+        }
+    except ValueError as error:
+        raise SetupError([f"{setup.file}: sweep.{error}"]) from None
+
+
+def _limits(file: str, limits: Any, measures: Mapping[str, Measure]) -> dict[str, float]:
+    """Return the limit of each measure; that of a name holds in all windows."""
+    if not isinstance(limits, Mapping):
+        raise SetupError([f"{file}: sweep.limits = {limits!r:.60}: must be a table of numbers"])
+    found: dict[str, float] = {}
+    for name, value in limits.items():
+        which = [key for key, each in measures.items() if name in (key, each.name)]
+        if not which:
+            hint = checks.nearest(name, [*measures])
+            raise SetupError([f"{file}: sweep.limits.{name}: is none of the metrics, {hint}"])
+        try:
+            found |= dict.fromkeys(which, checks.finite(f"sweep.limits.{name}", value))
+        except ValueError as error:
+            raise SetupError([f"{file}: {error}"]) from None
+    return found
+
+
+class Variation:
+    """A function of values by path that returns a setup with these values.
+
+    Parts that are the same as in the last call are not built again.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        data: Mapping[str, Any],
+        cases: Mapping[str, Mapping[str, Any]],
+        trust: bool = False,
+    ) -> None:
+        self.name, self.cases, self.trust = name, cases, trust
+        self.data = {key: value for key, value in data.items() if key not in _NOT_USED}
+
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self.name, self.data, self.cases, self.trust
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.name, self.data, self.cases, self.trust = state
+
+    @property
+    def identity(self) -> Any:
+        """Name and contents of this function, for the folder of a sweep."""
+        told = nonfinite_to_none([self.data, self.cases])
+        found = {"setup": told[0], "cases": told[1], "hash": hash_of([self.data, self.cases])}
+        files = {name: digest for part in told for name, digest in contents_of(part)}
+        return {**found, "files": files} if files else found
+
+    def __call__(self, **values: Any) -> Setup:
+        """Return the setup; values are by path, and ``case`` is the name of a case."""
+        case = values.pop(CASE, None)
+        changes = {**({} if case is None else self.cases[case]), **values}
+        data = changed(self.name, self.data, changes)
+        tables = self._described(data, {str(steps_of(self.name, path)[0]) for path in changes})
+        return assembled(self.name, tables, self._known, self.trust)
+
+    def _described(self, data: dict[str, Any], keys: set[str]) -> Description:
+        """Return the tables of ``data``, of which only some keys were changed."""
+        try:
+            found = {key: _READERS[key].validate_python(immutable(data[key])) for key in keys}
+        except (KeyError, ValidationError):
+            return describe(self.name, data)  # which says what is wrong
+        return self._base.model_copy(update=found)
+
+    @cached_property
+    def _base(self) -> Description:
+        return describe(self.name, self.data)
+
+    @cached_property
+    def _local(self) -> threading.local:
+        return threading.local()
+
+    @property
+    def _known(self) -> dict[str, Any]:
+        """Parts of the last call, of this thread."""
+        known: dict[str, Any] = self._local.__dict__.setdefault("known", {})
+        return known
+
+
+# Readers of the tables of a file by their key; other keys are read with all tables.
+_READERS: dict[str, Any] = {
+    key: TypeAdapter(kind)
+    for key, kind in get_type_hints(Description, include_extras=True).items()
+    if key in Description.model_fields and kind not in (float, str)
+}

@@ -17,13 +17,25 @@ from dataclasses import fields
 from typing import Any
 
 from quell import checks
-from quell.signals.base import Constant, Scaled, Signal, Sum, Switched, as_signal, seeded_apart
-from quell.signals.excitation import PRBS, Multisine
-from quell.signals.limited_move import LimitedMove
-from quell.signals.noise import BandLimitedNoise
-from quell.signals.repeated import Repeated
-from quell.signals.samples import Samples
-from quell.signals.shapes import Chirp, Ramp, Sinusoid, SmoothMove, Step, Trapezoid
+from quell.signals.excitation import PRBS, BandLimitedNoise, Multisine
+from quell.signals.moves import LimitedMove
+from quell.signals.shapes import (
+    Chirp,
+    Constant,
+    Ramp,
+    Repeated,
+    Samples,
+    Scaled,
+    Signal,
+    Sinusoid,
+    SmoothMove,
+    Step,
+    Sum,
+    Switched,
+    Trapezoid,
+    as_signal,
+    seeded_apart,
+)
 
 __all__ = [
     "KINDS", "PRBS", "BandLimitedNoise", "Chirp", "Constant", "LimitedMove", "Multisine", "Ramp",

@@ -1,17 +1,212 @@
-"""Signals of a given shape."""
+"""The base class of signals, and how signals are combined."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from quell import checks
-from quell.signals.base import EDGE_TOLERANCE, Constant, Signal, check_finite_fields
-from quell.types import Vector
+from quell.types import Vector, warn
+
+# ---- The base class of signals, and how signals are combined ----
+
+# Tolerance [s] by which an edge on a sample belongs to it if rounding makes k dt fall short of it.
+# Chosen by hand, far below usable sample times; not tuned further.
+EDGE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Base class of signals; a new kind must define ``evaluate``."""
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the values at the times ``t`` [s], an array of the same shape."""
+        raise TypeError(f"{type(self).__name__} must define evaluate(t)")
+
+    def __call__(self, t: Any) -> Vector:
+        """Return the values at the times ``t`` [s]; a number gives a 0-d array."""
+        times = np.asarray(t, dtype=np.float64)
+        values = np.asarray(self.evaluate(times), dtype=np.float64)
+        if values.shape != times.shape:
+            raise ValueError(
+                f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape "
+                f"{times.shape}"
+            )
+        return values
+
+    def seeded(self, seed: int) -> Signal:
+        """Return this signal with its noise, if any, drawn from ``seed``."""
+        return self
+
+    def derivative(self) -> Signal:
+        """Return the derivative in time, without the impulses of jumps.
+
+        Raise a ``ValueError`` if it is not known in closed form.
+        """
+        raise ValueError(
+            f"reference has no derivative known in closed form, {type(self).__name__} has none: "
+            "take another signal, define derivative(), or use a prefilter"
+        )
+
+    def until(self, time: float, then: Signal | float) -> Signal:
+        """Return this signal before ``time`` [s] and ``then``, a signal or a number, from it on."""
+        return Switched((checks.finite("time", time),), (self, as_signal(then, "then")))
+
+    def __add__(self, other: Signal | float) -> Signal:
+        return Sum((self, as_signal(other)))
+
+    def __sub__(self, other: Signal | float) -> Signal:
+        return Sum((self, -1.0 * as_signal(other)))
+
+    def __mul__(self, factor: float) -> Signal:
+        return Scaled(checks.finite("factor", factor), self)
+
+    def __neg__(self) -> Signal:
+        return Scaled(-1.0, self)
+
+    def __rsub__(self, other: Signal | float) -> Signal:
+        return as_signal(other) - self
+
+    def __truediv__(self, factor: float) -> Signal:
+        factor = checks.nonzero("factor", factor, "a signal can't be divided by it")
+        return Scaled(1.0 / factor, self)
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+
+@dataclass(frozen=True)
+class Constant(Signal):
+    """A constant ``value``."""
+
+    value: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.finite("value", self.value)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the constant."""
+        return np.full(t.shape, float(self.value))
+
+    def derivative(self) -> Signal:
+        """Return zero."""
+        return Constant(0.0)
+
+
+@dataclass(frozen=True)
+class Scaled(Signal):
+    """``factor`` times another signal; written ``factor * signal``."""
+
+    factor: float
+    signal: Signal
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the scaled values."""
+        return self.factor * self.signal(t)
+
+    def derivative(self) -> Signal:
+        """Return the scaled derivative."""
+        return replace(self, signal=self.signal.derivative())
+
+    def seeded(self, seed: int) -> Signal:
+        """Return the signal with seeded noise."""
+        return replace(self, signal=self.signal.seeded(seed))
+
+
+@dataclass(frozen=True)
+class Sum(Signal):
+    """The sum of several signals; written ``a + b``."""
+
+    terms: tuple[Signal, ...]
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the sum."""
+        total = np.zeros(t.shape)
+        for term in self.terms:
+            total += term(t)
+        return total
+
+    def derivative(self) -> Signal:
+        """Return the sum of the derivatives."""
+        return replace(self, terms=tuple(term.derivative() for term in self.terms))
+
+    def seeded(self, seed: int) -> Signal:
+        """Return the sum with independently seeded terms."""
+        return replace(self, terms=seeded_apart(self.terms, seed))
+
+
+@dataclass(frozen=True)
+class Switched(Signal):
+    """Signals one after the other: ``pieces[i]`` from ``times[i − 1]`` to ``times[i]`` [s].
+
+    Each piece is evaluated at absolute time.
+    """
+
+    times: tuple[float, ...]
+    pieces: tuple[Signal, ...]
+
+    def __post_init__(self) -> None:
+        times = checks.vector("times", self.times)
+        if len(self.pieces) != times.size + 1:
+            sizes = f"pieces has {len(self.pieces)} entries, times {times.size}"
+            raise ValueError(f"{sizes}: there must be one piece more than times")
+        if np.any(np.diff(times) <= 0.0):
+            raise ValueError(f"times = {self.times!r}: must increase")
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the values of the piece at each time."""
+        edges = [time - EDGE_TOLERANCE for time in self.times]
+        if t.size:
+            first, last = bisect_right(edges, t.min()), bisect_right(edges, t.max())
+            if first == last:
+                return self.pieces[first](t)
+        which = np.searchsorted(edges, t, side="right")
+        values = np.empty(t.shape)
+        for i, piece in enumerate(self.pieces):
+            inside = which == i
+            values[inside] = piece(t[inside])
+        return values
+
+    def derivative(self) -> Signal:
+        """Return the derivatives of the pieces."""
+        return replace(self, pieces=tuple(piece.derivative() for piece in self.pieces))
+
+    def seeded(self, seed: int) -> Signal:
+        """Return the signal with independently seeded pieces."""
+        return replace(self, pieces=seeded_apart(self.pieces, seed))
+
+
+def as_signal(value: Signal | float, name: str = "signal") -> Signal:
+    """Return a signal as it is and a number as a constant; errors call the value ``name``."""
+    return value if isinstance(value, Signal) else Constant(checks.finite(name, value))
+
+
+def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
+    """Return the signals seeded from one seed, with independent streams."""
+    if not signals:
+        return ()
+    seeds = _seeds(seed, len(signals))
+    return tuple(signal.seeded(child) for signal, child in zip(signals, seeds, strict=True))
+
+
+@lru_cache(maxsize=64)
+def _seeds(seed: int, count: int) -> tuple[int, ...]:
+    return tuple(np.random.SeedSequence(seed).generate_state(count, np.uint32).tolist())
+
+
+def check_finite_fields(signal: Signal, *names: str) -> None:
+    """Raise a ``ValueError`` if a parameter, by default any, is not a finite number."""
+    for name in names or [f.name for f in fields(signal)]:
+        checks.finite(name, getattr(signal, name))
+
+
+# ---- Signals of a given shape ----
 
 
 @dataclass(frozen=True)
@@ -240,3 +435,210 @@ def _smooth_position(m: int, order: int) -> tuple[np.polynomial.Polynomial, floa
     power = np.polynomial.Polynomial([math.comb(m, i) * (-1.0) ** i for i in range(m + 1)])
     position = (power * np.polynomial.Polynomial.basis(m)).integ()
     return position.deriv(order) if order else position, position(0.5) * 2.0
+
+
+# ---- A signal that repeats another one ----
+
+# Largest number of repetitions: times are then still exact to a nanosecond within a period of 10 s.
+_MOST = 10**6
+
+
+@dataclass(frozen=True)
+class Repeated(Signal):
+    """A cycle that is repeated: ``cycle(t − start − k period)`` in repetition k.
+
+    Before ``start`` it is the cycle at negative times, and after the last repetition the cycle goes
+    on past its period. Noise in a cycle is repeated as well. A cycle should end where it begins,
+    else the signal jumps.
+
+    Parameters
+    ----------
+    cycle
+        signal of time since the beginning of the repetition [s]; used from 0 to ``period``.
+    period
+        time from one repetition to the next [s].
+    count
+        number of repetitions; by default it never ends.
+    start
+        time of the first repetition [s].
+
+    Raises
+    ------
+    ValueError
+        for a cycle that is no signal or number, a period that is not positive, or a count below 1.
+
+    Examples
+    --------
+    >>> there_and_back = Trapezoid(1.0, 1.0) - Trapezoid(1.0, 1.0, start=2.0)
+    >>> moves = Repeated(there_and_back, period=4.0, count=50)
+    >>> square_wave = Repeated(Constant(1.0).until(0.5, then=-1.0), period=1.0)
+    """
+
+    cycle: Signal | float
+    period: float
+    count: int | None = None
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cycle", as_signal(self.cycle, "cycle"))
+        checks.positive("period", self.period, "s")
+        checks.optional(checks.whole, "count", self.count, 1, _MOST)
+        checks.finite("start", self.start)
+
+    @property
+    def _cycle(self) -> Signal:
+        return as_signal(self.cycle)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the values of the cycle."""
+        since = t - self.start
+        repetition = np.maximum(np.floor((since + EDGE_TOLERANCE) / self.period), 0.0)
+        if self.count is not None:
+            repetition = np.minimum(repetition, self.count - 1.0)
+        return self._cycle(since - repetition * self.period)
+
+    def derivative(self) -> Signal:
+        """Return the repeated derivative of the cycle."""
+        return replace(self, cycle=self._cycle.derivative())
+
+    def seeded(self, seed: int) -> Signal:
+        """Return the signal with seeded noise, the same in all repetitions."""
+        return replace(self, cycle=self._cycle.seeded(seed))
+
+
+# ---- Recorded samples as a signal, with their derivatives ----
+
+# Degree of the spline: r to r'''' are continuous, as the feedforward of a flexible axis needs them.
+_DEGREE = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Samples(Signal):
+    """Recorded samples, interpolated or held; beyond the ends the first and last value hold.
+
+    Parameters
+    ----------
+    times
+        times of the samples [s], increasing.
+    values
+        of the same size.
+    hold
+        ``"linear"`` interpolates, ``"previous"`` holds each value until the next, ``"spline"`` lays
+        a spline of degree 5 through the samples, at rest (r' = r'' = 0) at both ends: its first
+        four derivatives are continuous inside. It smooths no noise.
+    derivatives
+        samples of r', r'', … [y-unit/s^i], as many as are known, each of the size of ``values``;
+        for ``"linear"`` and ``"previous"``. Else those of lines are their slopes, and there is no
+        second one: a controller with feedforward is warned.
+
+    Raises
+    ------
+    ValueError
+        for times that do not increase, other sizes, and derivatives beside a spline, which has its
+        own.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.linspace(0.0, 1.0, 11)
+    >>> move = Samples(t, 10 * t**3 - 15 * t**4 + 6 * t**5, hold="spline")
+    >>> round(float(move.derivative()(0.5)), 6)
+    1.875
+    """
+
+    times: Any
+    values: Any
+    hold: str = "linear"
+    derivatives: Sequence[Any] = ()
+
+    def __post_init__(self) -> None:
+        times = checks.vector("times", self.times)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", checks.vector("values", self.values, times.size))
+        checks.one_of("hold", self.hold, ("linear", "previous", "spline"))
+        if times.size == 0 or np.any(np.diff(times) <= 0.0):
+            raise ValueError("times: must hold at least one sample and increase")
+        if not checks.is_sequence(self.derivatives) and np.ndim(self.derivatives) != 2:
+            raise ValueError(f"derivatives = {self.derivatives!r}: must be a list of samples")
+        if self.hold == "spline" and len(self.derivatives):
+            raise ValueError(
+                "derivatives: are those of the spline; leave them out, or take hold = 'linear'"
+            )
+        if self.hold == "spline" and times.size < 2:
+            raise ValueError(f"times has {times.size} sample: a spline needs two")
+        known = [
+            checks.vector(f"derivatives[{i}]", each, times.size)
+            for i, each in enumerate(self.derivatives)
+        ]
+        object.__setattr__(self, "derivatives", tuple(known))
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the samples at ``t``."""
+        if self.hold == "linear":
+            return np.asarray(np.interp(t, self.times, self.values))
+        if self.hold == "spline":
+            return np.asarray(self._spline(np.clip(t, self.times[0], self.times[-1])))
+        index = np.searchsorted(self.times - EDGE_TOLERANCE, t, side="right") - 1
+        return np.asarray(self.values[np.maximum(index, 0)])
+
+    @cached_property
+    def _spline(self) -> Any:
+        from scipy.interpolate import make_interp_spline
+
+        rest = [(1, 0.0), (2, 0.0)]
+        return make_interp_spline(self.times, self.values, k=_DEGREE, bc_type=(rest, rest))
+
+    def derivative(self) -> Signal:
+        """Return the derivative: as given, of the spline, or the slope between samples."""
+        first, last = float(self.times[0]), float(self.times[-1])
+        if self.hold == "spline":
+            inside: Signal = _SplineDerivative(self._spline.derivative(), last)
+            return Constant(0.0).until(first, then=inside)
+        if len(self.derivatives):
+            own, *rest = self.derivatives
+            inside = replace(self, values=own, derivatives=tuple(rest))
+            return Constant(0.0).until(first, then=inside.until(last, then=0.0))
+        if self.hold == "previous" or self.times.size < 2:
+            return Constant(0.0)
+        slopes = np.diff(self.values) / np.diff(self.times)
+        lines = Samples(self.times, np.append(slopes, 0.0), hold="previous")
+        return Constant(0.0).until(first, then=lines)
+
+
+def check_derivative(signal: Signal) -> None:
+    """Warn if the derivative of a signal is zero because held samples in it have no other one."""
+    parts: list[Any] = [signal]
+    while parts:
+        part = parts.pop()
+        if isinstance(part, tuple):
+            parts += part
+        elif isinstance(part, Samples):
+            if part.hold == "previous" and not part.derivatives and np.ptp(part.values) > 0.0:
+                message = (
+                    "the reference has samples that are held, or joined by lines, without another "
+                    "derivative: feedforward gets zero; give Samples(derivatives=...), or take "
+                    'hold="spline"'
+                )
+                warn(message)
+                return
+        elif isinstance(part, Signal):
+            parts += [getattr(part, each.name) for each in fields(part)]
+
+
+@dataclass(frozen=True, eq=False)
+class _SplineDerivative(Signal):
+    """A derivative of a spline, zero from ``last`` [s] on."""
+
+    spline: Any
+    last: float
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the values."""
+        inside = t < self.last - EDGE_TOLERANCE
+        return np.where(inside, self.spline(np.minimum(t, self.last)), 0.0)
+
+    def derivative(self) -> Signal:
+        """Return the next derivative; zero beyond the degree."""
+        if self.spline.k == 0:
+            return Constant(0.0)
+        return replace(self, spline=self.spline.derivative())

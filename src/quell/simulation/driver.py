@@ -1,11 +1,37 @@
-"""The inner loop: a plant and a controller, sample by sample, in segments of a scenario."""
+"""A scenario: signals, duration and initial state of a run.
+
+The inner loop: a plant and a controller, sample by sample, in segments of a scenario.
+
+Verdict on finished runs: whether their integration is poor, or why a run diverged.
+
+A loop that diverges for its own reasons often becomes too fast for its sub-steps at last. So a run
+that diverged is repeated with enough sub-steps: only if it does not diverge then, the integration
+was the cause. A run whose state is suddenly no number has met a function of the user that is not
+defined there.
+
+Check of a plant's numerical integration along a run, by step doubling.
+
+From some recorded samples the plant is integrated over one sample with its sub-steps and with twice
+as many. Of a method of order 4 the difference is 15/16 of the error (Hairer, Nørsett & Wanner,
+*Solving Ordinary Differential Equations I*, II.4). Plants that are solved exactly are not checked.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from quell import checks
 from quell.controllers.base import (
     Controller,
     control,
@@ -14,12 +40,400 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.kernels.dispatch import compiled_loop, interpreted, is_available, specialised
-from quell.kernels.user_types import explain_compile_errors
+from quell.kernels.dispatch import (
+    call_specialised,
+    compiled,
+    compiled_loop,
+    explain_compile_errors,
+    interpreted,
+    is_available,
+    specialised,
+)
 from quell.plants.base import Plant, advance, begin_run, check_run, measure
-from quell.simulation.integration import IntegrationCheck, Samples
-from quell.simulation.sampled_scenario import SampledScenario, Segment
-from quell.types import Channels, Matrix, Status, Vector
+from quell.plants.linear import DelayedPlantModel, EncodedPlantModel
+from quell.plants.nonlinear import (
+    CompiledNonlinear,
+    CompiledParametric,
+    FrictionModel,
+    PythonNonlinear,
+    refined,
+)
+from quell.records.record import first_sample_at, in_steps
+from quell.signals import BandLimitedNoise, Constant, Signal, as_signal, seeded_apart
+from quell.signals.shapes import check_derivative
+from quell.types import Channels, Matrix, Status, Vector, warn
+
+# ---- A scenario ----
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Signals, duration and initial state of a run.
+
+    Parameters
+    ----------
+    reference
+        signal or number that y has to follow [y-unit].
+    disturbances
+        one signal or number for each disturbance input of the plant, in its order; missing ones are
+        zero.
+    noise
+        signal added to y before the controller sees it; none by default.
+    duration
+        length of the run [s]; the record has the samples from 0 to ``duration``, both included.
+    x0
+        the plant's state at the start; zero by default.
+    rest_at
+        times [s] at which the plant is put back to ``x0`` and the controller starts from rest; it
+        keeps what it has learned.
+    seed
+        seed of all random signals; the same seed gives the same bits.
+
+    Raises
+    ------
+    ValueError
+        if the duration is not positive, the seed is negative, a signal is none, or the times in
+        ``rest_at`` do not increase within the duration.
+    """
+
+    reference: Signal | float = 0.0
+    duration: float = 10.0
+    disturbances: Sequence[Signal | float] = ()
+    noise: Signal | float = 0.0
+    x0: ArrayLike | None = None
+    rest_at: Sequence[float] = field(default=())
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.positive("duration", self.duration, "s")
+        checks.whole("seed", self.seed, 0)
+        as_signal(self.reference, "reference")
+        as_signal(self.noise, "noise")
+        if not checks.is_sequence(self.disturbances):
+            raise ValueError(
+                f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers"
+            )
+        for i, disturbance in enumerate(self.disturbances):
+            as_signal(disturbance, f"disturbances[{i}]")
+        times = np.array([0.0, *checks.vector("rest_at", self.rest_at), self.duration])
+        if np.any(np.diff(times) <= 0.0):
+            rule = f"must increase and lie within (0, duration = {self.duration!r})"
+            raise ValueError(f"rest_at = {self.rest_at!r}: {rule}")
+
+    def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
+        """Return the reference, ``inputs`` disturbances and the noise, seeded."""
+        if len(self.disturbances) > inputs:
+            plant = f"the plant has {inputs} disturbance inputs"
+            raise ValueError(f"disturbances has {len(self.disturbances)} signals: {plant}")
+        given = (as_signal(self.reference), *map(as_signal, self.disturbances))
+        noise = as_signal(self.noise).seeded(self.seed)
+        # The noise has the seed itself: its bits must not depend on the number of disturbances.
+        reference, *disturbances = seeded_apart(given, self.seed)
+        return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
+
+
+def check_scenario(value: Any, name: str = "scenario") -> None:
+    """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a scenario."""
+    if isinstance(value, type) or not hasattr(value, "seeded_signals"):
+        raise ValueError(f"{name} = {value!r}: must be a quell.Scenario")
+
+
+# ---- A scenario as the samples of a loop, evaluated in segments ----
+
+# Samples for which signals are evaluated at once: enough that Python's share of the time is small,
+# few enough to stay in the processor's cache. Chosen by hand.
+_SEGMENT = 8192
+# Times the largest of 1, |x0| and the reference: |y| beyond it has diverged. Chosen by hand, far
+# above the overshoot of any loop.
+_DIVERGED = 1e6
+# Times the same: |y| beyond it is outside of the usual range. Chosen by hand.
+_UNUSUAL = 10.0
+_NOTHING = Constant(0.0)  # what inputs without a signal get
+# Noise with a shorter sample time, in units of dt, was not meant so. Chosen by hand: a sensor that
+# is sampled twice as quickly as the loop is usual.
+_QUICKEST_NOISE = 0.1
+# Up to here time in steps of dt is exact to a thousandth of a step (2e-16 · 1e12).
+_MOST_SAMPLES = 10**12
+
+
+class Segment(NamedTuple):
+    """The signals at some consecutive samples."""
+
+    first: int
+    dt: float
+    from_rest: bool  # true if the loop starts from rest at the first of them
+    r: Vector
+    derivatives: Matrix
+    w: Matrix
+    noise: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class SampledScenario:
+    """A scenario for a plant and a controller."""
+
+    signals: tuple[Signal, tuple[Signal, ...], Signal]
+    derivatives: tuple[Signal, ...]  # those of the reference that the controller uses
+    samples: int
+    dt: float
+    x0: Vector
+    limit: float
+    range: float  # |y| beyond it is unusual, though the run may not have diverged [y-unit]
+    rest_samples: frozenset[int]
+
+    @classmethod
+    def of(
+        cls, scenario: Scenario, plant: Plant, controller: Controller, limit: float | None
+    ) -> SampledScenario:
+        """Sample a scenario for a plant and a controller; ``limit`` as in ``simulate``."""
+        dt, duration = controller.dt, scenario.duration
+        if duration / dt > _MOST_SAMPLES:
+            raise ValueError(
+                f"duration = {duration!r} s with dt = {dt!r} s: must be at most "
+                f"{_MOST_SAMPLES:.0e} samples"
+            )
+        samples = math.floor(in_steps(duration, dt)) + 1
+        _warn_of_times(scenario, dt, samples)
+        given = scenario.x0
+        x0 = np.zeros(plant.order) if given is None else checks.vector("x0", given, plant.order)
+        signals = scenario.seeded_signals(plant.disturbances)
+        size = _size(signals[0], x0, samples, dt)
+        limit = _DIVERGED * size if limit is None else checks.positive("limit", limit)
+        rests = frozenset(first_sample_at(time, dt, samples) for time in scenario.rest_at)
+        derivative, derivatives = signals[0], []
+        for _ in range(getattr(controller, "derivatives", 0)):
+            check_derivative(derivative)
+            derivative = derivative.derivative()
+            derivatives.append(derivative)
+        usual = _UNUSUAL * size
+        return cls(signals, tuple(derivatives), samples, dt, x0, limit, usual, rests)
+
+    def segment(self, first: int, last: int) -> Segment:
+        """Return the samples from ``first`` to before ``last``."""
+        reference, disturbances, noise = self.signals
+        t = np.arange(first, last, dtype=np.float64)
+        t *= self.dt
+        derivatives, w = _columns(self.derivatives, t), _columns(disturbances, t)
+        r, added = (np.ascontiguousarray(s(t), np.float64) for s in (reference, noise))
+        return Segment(first, self.dt, first in self.rest_samples, r, derivatives, w, added)
+
+
+def segments(scenario: SampledScenario) -> Iterator[Segment]:
+    """Return an iterator over all segments, which evaluates the next one in another thread.
+
+    The compiled loop releases the interpreter lock, so the signals then cost no time.
+    """
+    bounds = deque(segment_bounds(scenario.samples, scenario.rest_samples))
+    if len(bounds) == 1:
+        yield scenario.segment(*bounds[0])
+        return
+    context = copy_context()  # with the caller's np.errstate
+
+    def evaluate(samples: tuple[int, int]) -> Segment:
+        return context.run(scenario.segment, *samples)
+
+    with ThreadPoolExecutor(1) as thread:
+        coming = thread.submit(evaluate, bounds.popleft())
+        while bounds:
+            segment = coming.result()
+            coming = thread.submit(evaluate, bounds.popleft())
+            yield segment
+        yield coming.result()
+
+
+def segment_bounds(samples: int, rest_samples: Iterable[int]) -> list[tuple[int, int]]:
+    """Return begin and end of segments; starts from rest are only at the beginning of one."""
+    return list(pairwise(sorted({*range(0, samples, _SEGMENT), *rest_samples, samples})))
+
+
+def _warn_of_times(scenario: Scenario, dt: float, samples: int) -> None:
+    """Warn of a duration between two samples, and of noise that is far quicker than the samples."""
+    last = (samples - 1) * dt
+    if in_steps(scenario.duration, dt) != samples - 1:
+        warn(
+            f"duration = {scenario.duration!r} s with dt = {dt!r} s: is no whole number of "
+            f"samples, so the run ends at {last:.9g} s; {last + dt:.9g} s is the next one"
+        )
+    for name, value in (("noise", scenario.noise), ("disturbances", scenario.disturbances)):
+        for noise in _noises(value):
+            if noise.power > 0.0 and noise.sample_time < _QUICKEST_NOISE * dt:
+                warn(
+                    f"{name}: sample_time = {noise.sample_time!r} s is far below dt = {dt!r} s: "
+                    "each sample sees one draw, whose variance power/sample_time = "
+                    f"{noise.power / noise.sample_time:.3g} is that of a much wider band; "
+                    "give sample_time = dt, or the power for it"
+                )
+
+
+def _noises(value: Any) -> Iterator[BandLimitedNoise]:
+    """Return an iterator over all noises in a signal, or in a sequence of signals."""
+    if isinstance(value, BandLimitedNoise):
+        yield value
+    elif isinstance(value, Signal) and is_dataclass(value):
+        for field in fields(value):
+            yield from _noises(getattr(value, field.name))
+    elif checks.is_sequence(value):
+        for part in value:
+            yield from _noises(part)
+
+
+def _columns(signals: tuple[Signal, ...], t: Vector) -> Matrix:
+    """Return signals at the times ``t`` as the columns of a matrix."""
+    columns = np.zeros((t.size, len(signals)))
+    for j, signal in enumerate(signals):
+        if signal != _NOTHING:
+            columns[:, j] = signal(t)
+    return columns
+
+
+def _size(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
+    """Return the largest of 1, ``|x0|`` and the reference in the first samples.
+
+    The limit depends on these because a loop in encoder counts has large values and is stable.
+    """
+    early = reference(np.arange(min(samples, _SEGMENT)) * dt)
+    largest = np.max(np.abs(early), initial=1.0, where=np.isfinite(early))
+    return float(np.max(np.abs(x0), initial=largest))
+
+
+# ---- Check of a plant's numerical integration along a run, by step doubling ----
+
+# Largest error of a state in a sample, as a share of the state's largest value. A linear mode
+# reaches it where h |λ| is about 1; stiff friction that is integrated well has 1e-4, and one that
+# is not resolved 0.1 and more. Chosen by hand.
+LARGEST_ERROR = 0.01
+# Samples that are checked in a segment: spread over it, and where the states turn most sharply.
+_SPREAD, _SHARPEST = 16, 16
+# Most doublings of the sub-steps that are tried for advice.
+_MOST_DOUBLINGS = 10
+_WRAPPERS = (EncodedPlantModel, DelayedPlantModel)
+
+
+class Samples(NamedTuple):
+    """Samples of a run, from which the plant is integrated over one sample."""
+
+    t: Vector  # [s] (k,)
+    u: Vector  # (k,)
+    w: Matrix  # (k, m)
+    x: Matrix  # (k, n)
+
+
+@compiled
+def step_differences(
+    coarse: Any,
+    fine: Any,
+    t: Vector,
+    u: Vector,
+    w: Matrix,
+    x: Matrix,
+    scratch: Vector,
+    after: Matrix,
+    difference: Matrix,
+) -> None:
+    """Write the states after a sample, and what ``coarse`` and ``fine`` differ by, (k, n) each."""
+    for k in range(t.size):
+        for j in range(x.shape[1]):
+            after[k, j] = x[k, j]
+            difference[k, j] = x[k, j]
+        advance(coarse, difference[k], scratch, t[k], u[k], w[k])
+        advance(fine, after[k], scratch, t[k], u[k], w[k])
+        for j in range(x.shape[1]):
+            difference[k, j] -= after[k, j]
+
+
+class IntegrationCheck:
+    """The check of one run.
+
+    ``error`` is the largest so far, as a share of the state's range; ``enough`` is a number of
+    sub-steps with which it is small, zero if none was found.
+    """
+
+    def __init__(self, model: Any, as_python: bool) -> None:
+        self._size = self._delay = 0
+        while isinstance(model, _WRAPPERS):
+            if isinstance(model, DelayedPlantModel):
+                self._size, self._delay = model.size, 1
+            model = model.inner
+        kinds = CompiledNonlinear | CompiledParametric | PythonNonlinear | FrictionModel
+        self.needed = isinstance(model, kinds)
+        self.model, self.error, self.enough = model, 0.0, 0
+        self._step_differences = (
+            interpreted(step_differences)
+            if as_python
+            else partial(call_specialised, step_differences)
+        )
+
+    def acquit(self) -> None:
+        """Forget the errors: the run diverges with enough sub-steps, too."""
+        self.error = 0.0
+
+    @property
+    def poor(self) -> bool:
+        """True if there were too few sub-steps."""
+        return self.error > LARGEST_ERROR
+
+    def add(self, samples: Samples, all_of_them: bool) -> None:
+        """Check samples of a segment, some or all of them."""
+        if not samples.t.size:
+            return
+        t, u, w, x = samples
+        finite = np.all(np.isfinite(x), axis=1)
+        if not np.all(finite):
+            self.add(Samples(*(part[finite] for part in samples)), all_of_them)
+            return
+        if self._delay:  # the state ends with the values of u on their way, the oldest last
+            u, x = x[:, -1], x[:, : self._size]
+        scale = np.max(np.abs(x), axis=0)
+        chosen = slice(None) if all_of_them else chosen_samples(x, scale)
+        picked = Samples(*(np.ascontiguousarray(part[chosen]) for part in (t, u, w, x)))
+        errors = self._errors(self.model, picked, scale)
+        error, worst = float(np.max(errors)), int(np.argmax(errors))
+        if error > max(self.error, LARGEST_ERROR):
+            factor = self._factor(Samples(*(part[worst : worst + 1] for part in picked)), scale)
+            self.enough = factor * self.model.substeps
+        self.error = max(self.error, error)
+
+    def _factor(self, worst: Samples, scale: Vector) -> int:
+        """Return how many times as many sub-steps are enough for a sample; 0 if none is found."""
+        factors = (2**i for i in range(1, _MOST_DOUBLINGS + 1))
+        enough = (
+            factor
+            for factor in factors
+            if self._errors(refined(self.model, factor), worst, scale)[0] <= LARGEST_ERROR
+        )
+        return next(enough, 0)
+
+    def _errors(self, model: Any, samples: Samples, scale: Vector) -> Vector:
+        """Return the largest error of a state in each sample, as a share of the state's range."""
+        after, difference = np.empty_like(samples.x), np.empty_like(samples.x)
+        with np.errstate(all="ignore"):
+            self._step_differences(
+                model, refined(model, 2), *samples, np.zeros(6 * scale.size), after, difference
+            )
+            before = after + difference  # with the plant's own sub-steps
+            range_ = np.maximum(scale, np.maximum(np.abs(after), np.abs(before)))
+            share = np.abs(difference) / np.where(range_ > 0.0, range_, 1.0)
+        return np.asarray(np.max(np.where(np.isfinite(share), share, 1.0), axis=1))
+
+
+def chosen_samples(x: Matrix, scale: Vector) -> Any:
+    """Return the indices of samples that are spread over a segment, or turn most sharply."""
+    if len(x) <= _SPREAD + _SHARPEST:
+        return slice(None)
+    spread = np.linspace(0, len(x) - 1, _SPREAD).astype(np.int64)
+    turn = np.abs(np.diff(x, 2, axis=0)) / np.where(scale > 0.0, scale, 1.0)
+    sharpest = np.argpartition(np.max(turn, axis=1), -_SHARPEST)[-_SHARPEST:] + 1
+    return np.unique(np.concatenate([spread, sharpest]))
+
+
+def with_substeps(model: Any, substeps: int) -> Any:
+    """Return the sampled plant of a check, or one that contains it, with so many sub-steps."""
+    if isinstance(model, _WRAPPERS):
+        return model._replace(inner=with_substeps(model.inner, substeps))
+    return refined(model, substeps // model.substeps)
+
+
+# ---- The inner loop ----
 
 SIGNALS = ("r", "y", "y_measured", "u")  # the first columns of a log
 
@@ -191,3 +605,69 @@ def logged_channels(plant: Plant, controller: Controller) -> Channels:
     """Return name and width of the columns that ``run_block`` logs, in order."""
     scalars = tuple((name, 1) for name in SIGNALS)
     return (*scalars, ("w", plant.disturbances), ("x", plant.order), *controller.channels)
+
+
+# ---- Verdict on finished runs ----
+
+
+def judge_integration(plant: str, loops: Sequence[Loop]) -> None:
+    """Find the cause of divergence, and warn of runs whose integration is poor.
+
+    Afterwards ``Loop.result_status`` has ``POORLY_INTEGRATED`` only where that stands. ``plant`` is
+    the plants' name.
+    """
+    for loop in loops:
+        _warn_of_undefined_functions(plant, loop)
+        if loop.integration.poor and loop.diverged and _diverges_anyway(loop):
+            loop.integration.acquit()
+    poor = [loop.integration for loop in loops if loop.integration.poor]
+    if not poor:
+        return
+    worst = max(poor, key=lambda check: check.error)
+    runs = f" in {len(poor)} of {len(loops)} runs" if len(loops) > 1 else ""
+    remedy = (
+        f"give at least substeps = {max(check.enough for check in poor)}, or a lower dt"
+        if all(check.enough for check in poor)
+        else "it is stiff, or f jumps: make f smoother, or give many more substeps"
+    )
+    warn(
+        f"{plant}: with {worst.model.substeps} sub-steps in a sample a state has an error of "
+        f"{100.0 * worst.error:.2g} % of its range in one sample{runs}, more than "
+        f"{100.0 * LARGEST_ERROR:g} %: {remedy}"
+    )
+
+
+def _warn_of_undefined_functions(plant: str, loop: Loop) -> None:
+    """Warn if a function of the user returned NaN or infinity while y was in its usual range."""
+    if not (loop.diverged and loop.integration.needed):
+        return
+    row, first = loop.last_row, 4 + loop.plant.disturbances
+    before = loop.x0 if row is None else row[first : first + loop.x.size]
+    usual = loop.ended == 0 if row is None else abs(row[1]) <= loop.scenario.range
+    with np.errstate(all="ignore"):
+        defined = bool(np.all(np.isfinite([*loop.x, measure(loop.model, loop.x)])))
+    if defined or not usual:
+        return
+    warn(
+        f"{plant}: f or output returns a number that is not finite; the run ended at t = "
+        f"{loop.ended * loop.scenario.dt:.9g} s. The last recorded state was "
+        f"{[float(f'{value:.4g}') for value in before]}: both must be defined wherever the "
+        "plant goes"
+    )
+
+
+def _diverges_anyway(loop: Loop) -> bool:
+    """Return whether a run that diverged leaves its usual range with enough sub-steps, too."""
+    if not loop.integration.enough:
+        return True
+    scenario = replace(loop.scenario, limit=loop.scenario.range)
+    model = with_substeps(loop.model, loop.integration.enough)
+    again = Loop(loop.plant, model, loop.controller, scenario, loop.interpret)
+    again.integration.needed = False
+    samples = loop.ended + 1
+    log, every = np.empty((1, loop.width)), samples
+    for first, last in segment_bounds(samples, (k for k in scenario.rest_samples if k < samples)):
+        again.run(scenario.segment(first, last), log, 0, every)
+        if again.diverged:
+            return True
+    return False

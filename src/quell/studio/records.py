@@ -17,24 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.commissioning.records import measured
+from quell.commissioning import measured
 from quell.identification import Measured
 from quell.lti.canonical import format_roots
 from quell.setup.loading import Setup
-from quell.studio.frames import Columns, frame
-from quell.studio.messages import columns
-from quell.studio.runs import (
-    Report,
-    Stale,
-    StoppedError,
-    caught_warnings,
-    linear_of,
-    stoppable,
-)
+from quell.studio.messages import Columns, columns, frame
+from quell.studio.runs import Report, Stale, StoppedError, caught_warnings, linear_of, stoppable
 from quell.tuning import Constraints, Tuned, tune
 from quell.tuning.designs import range_of_u
-from quell.tuning.plants import with_known_noise
-from quell.tuning.record_model import RecordModel, record_model
+from quell.tuning.plants import RecordModel, record_model, with_known_noise
 
 MOST_FILE = 8 * 2**20
 """Largest file of a record [bytes]; chosen by hand: 50 000 rows of ten columns take five MB."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pprint
 import threading
 import time
 import warnings
@@ -13,14 +14,16 @@ from typing import Any
 import numpy as np
 
 from quell.analysis import LoopAnalysis, analyse
-from quell.kernels.compile_time import compile_time
-from quell.plants.linear_part import linear_model, linear_part
-from quell.records.channels import describe
+from quell.kernels.cache import compile_time
+from quell.plants.linearise import linear_model, linear_part
+from quell.records.record import describe
 from quell.records.trajectory import Trajectory
 from quell.setup.description import describe as tables_of
+from quell.setup.description import parsed
 from quell.setup.loading import Known, Setup, assembled
 from quell.simulation import simulate
-from quell.studio.frames import Columns, frame
+from quell.studio.messages import MOST_BYTES, Columns, Granted, checked, frame
+from quell.tuning.report import toml_text
 from quell.types import Vector
 
 NAME = "studio"
@@ -235,3 +238,60 @@ def _analysis(loop: LoopAnalysis) -> tuple[dict[str, Any], dict[str, Vector]]:
     turns = math.floor((float(curves["phase"][0]) + 360.0) / 360.0) * 360.0
     curves["phase"] = curves["phase"] - turns
     return numbers, curves
+
+
+_SCRIPT = '''"""{title}: simulated, analysed and drawn."""
+
+import matplotlib.pyplot as plt
+
+import quell as ql
+
+setup = ql.setup.made("{name}", {tables})
+run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+print(run.metrics())
+print(ql.analysis.analyse({plant}, setup.controller{delay}).summary())
+run.plot()
+plt.show()
+'''
+
+
+def toml_of(tables: Mapping[str, Any]) -> str:
+    """Return the tables as a setup file."""
+    return toml_text(_without_none(tables))
+
+
+def python_of(tables: Mapping[str, Any], title: str, is_whole: bool, delay: float) -> str:
+    """Return a script that builds the same objects, runs them and draws the run.
+
+    A plant that ``is_whole`` is analysed as it is, others by their part ``linear`` and a ``delay``
+    [s].
+    """
+    literal = pprint.pformat(_without_none(tables), indent=1, width=92, sort_dicts=False)
+    return _SCRIPT.format(
+        title=_in_docstring(title) or "A setup",
+        name=NAME,
+        tables=literal,
+        plant="setup.plant" if is_whole else "setup.plant.linear",
+        delay="" if delay == 0.0 else f", delay={delay!r}",
+    )
+
+
+def _in_docstring(title: str) -> str:
+    """Return a title for the first line of a script: without quotes and control characters."""
+    plain = "".join(each if each.isprintable() else " " for each in title)
+    return " ".join(plain.replace('"', "'").replace("\\", "/").split())
+
+
+def tables_of_text(text: Any, granted: Granted) -> dict[str, Any]:
+    """Return the tables of the text of a setup file; raise a ``SetupError`` or ``ValueError``."""
+    if not isinstance(text, str) or len(text) > MOST_BYTES:
+        raise ValueError(f"text: must be the content of a TOML file, at most {MOST_BYTES} bytes")
+    return checked(parsed(NAME, text), granted)
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_none(part) for key, part in value.items() if part is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(part) for part in value]
+    return value

@@ -4,28 +4,332 @@ The address contains a random token as its first part, without which nothing is 
 for another host, which a page of the web could make by rebinding its name (DNS rebinding), and
 WebSockets of pages from elsewhere (their Origin header, RFC 6455 section 10.2) are refused. A page
 can reach no file: the few files of the page itself are in memory.
+
+The connection of one page: messages in, frames out.
+
+Messages of one page that wait for a thread: of those of one kind the newest wins.
+
+Connections of the studio's server: few at once, and none that never asks for anything.
+
+A program of the same computer can open connections without the token. Each takes a file
+descriptor, and a server without free ones accepts no page. So a connection has a few seconds until
+its first request is complete; and when there are many, the oldest one that waits is closed for a
+new one: a browser sends its request at once, and so it is served. A connection of a page is a
+WebSocket, which the server counts and limits itself.
 """
 
 from __future__ import annotations
 
 import asyncio
 import hmac
+import logging
 import secrets
 import socket
-from collections.abc import Callable, Mapping
-from contextlib import closing
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from functools import partial
 from importlib.resources import files
 from pathlib import PurePath
 from typing import Any
 
 from quell import checks
-from quell.optional import import_extra
+from quell.checks import import_extra
+from quell.kernels.cache import compile_time
 from quell.parallel import one_blas_thread
-from quell.studio.connections import BACKLOG, Door
-from quell.studio.forms import forms
-from quell.studio.frames import frame
-from quell.studio.messages import MOST_BYTES, Granted, files_of
-from quell.studio.pages import Page, Workers
+from quell.studio import messages
+from quell.studio.messages import MOST_BYTES, Granted, files_of, forms, frame
+from quell.studio.records import PageRecord
+from quell.studio.runs import Maker, StoppedError
+from quell.studio.separate import frames_apart, is_large
+from quell.studio.tasks import LONG, frames_for
+
+# ---- Messages of one page that wait for a thread ----
+
+# A run that a newer message replaces is finished all the same if it takes no longer than this [s]:
+# otherwise nothing would be drawn while a slider moves. Chosen by hand.
+_PATIENCE = 0.3
+
+
+class Lane:
+    """The newest message of each kind, and the one that is worked on."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, dict[str, Any]] = {}
+        self._some = asyncio.Event()
+        self._began = 0.0
+        self._closed = self._stopped = False
+
+    def put(self, message: dict[str, Any]) -> None:
+        """Take a message in place of an older one of its kind."""
+        self._waiting.pop(message["do"], None)
+        self._waiting[message["do"]] = message
+        self._some.set()
+
+    async def next(self) -> dict[str, Any]:
+        """Return the message that waits longest."""
+        while not self._waiting:
+            self._some.clear()
+            await self._some.wait()
+        self._began, self._stopped = time.monotonic(), False
+        return self._waiting.pop(next(iter(self._waiting)))
+
+    def stop(self) -> None:
+        """End what is worked on, and forget what waits."""
+        self._waiting.clear()
+        self._stopped = True
+
+    def close(self) -> None:
+        """End for good: the page is gone."""
+        self._closed = True
+        self.stop()
+
+    def stale(self) -> bool:
+        """Return whether what is worked on should end; called from its thread."""
+        if self._closed or self._stopped:
+            return True
+        return bool(self._waiting) and time.monotonic() - self._began > _PATIENCE
+
+
+# ---- The connection of one page ----
+
+_LOG = logging.getLogger(__name__)
+
+# A page hears that code is compiled, or that others are served first, after this time [s]; a person
+# notices a pause from about 0.4 s on.
+_NOTICED = 0.4
+# Shortest time between two reports of progress [s]: ten a second are smooth.
+_REPORTS = 0.1
+# Processes for large setups at once.
+_APART = 2
+
+
+class Workers:
+    """The threads of all pages: one for runs, one for long tasks, some that wait for processes."""
+
+    def __init__(self) -> None:
+        self.runs = ThreadPoolExecutor(1, thread_name_prefix="quell-studio-run")
+        self.long = ThreadPoolExecutor(1, thread_name_prefix="quell-studio-long")
+        self.apart = ThreadPoolExecutor(_APART, thread_name_prefix="quell-studio-apart")
+
+    def close(self) -> None:
+        """Let the threads end; what waits is dropped."""
+        for pool in (self.runs, self.long, self.apart):
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+class Page:
+    """A page, from its connection until it leaves.
+
+    Parameters
+    ----------
+    websocket
+        an accepted connection of Starlette.
+    workers
+        the threads.
+    granted
+        the files that it may name.
+    """
+
+    def __init__(self, websocket: Any, workers: Workers, granted: messages.Granted) -> None:
+        self._websocket, self._workers = websocket, workers
+        self._lanes = {"short": Lane(), "long": Lane()}
+        self._granted, self._record = granted, PageRecord()
+        self._makers = {name: Maker(trust=granted.trust) for name in self._lanes}
+        self._sending = asyncio.Lock()
+
+    async def serve(self) -> None:
+        """Answer messages until the page leaves."""
+        working = [asyncio.create_task(self._work(name)) for name in self._lanes]
+        try:
+            while True:
+                received = await self._websocket.receive()
+                if received["type"] != "websocket.receive":
+                    return
+                await self._take(received.get("text") or received.get("bytes") or "")
+        finally:
+            for lane in self._lanes.values():
+                lane.close()
+            for task in working:
+                task.cancel()
+            await asyncio.gather(*working, return_exceptions=True)
+
+    async def _take(self, text: str | bytes) -> None:
+        """Put a message where a thread takes it; answer a malformed one with its error."""
+        try:
+            message = messages.parsed(text)
+            if message["do"] == "part":
+                self._record.take_part(message)
+                return
+            if message["do"] == "record":
+                message["content"] = self._record.content(message.get("size"))
+        except ValueError as error:
+            await self._send(_problem(error, messages.identity(text)))
+            return
+        if message["do"] == "cancel":
+            self._lanes["long"].stop()
+            return
+        self._lanes["long" if message["do"] in LONG else "short"].put(message)
+
+    async def _work(self, name: str) -> None:
+        """Answer the messages of a lane, one after the other."""
+        lane = self._lanes[name]
+        while True:
+            message = await lane.next()
+            report = self._reporter(message["id"])
+            make = self._makers[name]
+            about = self._granted, self._record, lane.stale, report
+            try:
+                if is_large(message):
+                    found, pool = frames_apart(message, *about), self._workers.apart
+                else:
+                    found = frames_for(message, make, *about)
+                    pool = self._workers.long if name == "long" else self._workers.runs
+                await self._send_all(found, pool, name, message["id"])
+            except StoppedError:
+                await self._send(frame({"kind": "stopped", "id": message["id"]}))
+            except (ValueError, ArithmeticError, ImportError, OSError, MemoryError) as error:
+                await self._send(_problem(error, message["id"]))
+            except Exception as error:
+                # A message must not end the page, whatever it makes a library do.
+                _LOG.exception("studio: a message failed")
+                await self._send(_problem(error, message["id"]))
+
+    async def _send_all(
+        self, frames: Iterator[bytes], pool: ThreadPoolExecutor, name: str, number: int
+    ) -> None:
+        """Send frames as a thread makes them."""
+        loop = asyncio.get_running_loop()
+        while True:
+            making = loop.run_in_executor(pool, partial(next, frames, None))
+            done, _ = await asyncio.wait([making], timeout=_NOTICED)
+            if not done and name == "short":
+                await self._send(frame({"kind": "wait", "id": number, "compiles": _compiles()}))
+            made = await making
+            if made is None:
+                return
+            await self._send(made)
+
+    async def _send(self, data: bytes) -> None:
+        async with self._sending:
+            with suppress(RuntimeError):  # the page has left
+                await self._websocket.send_bytes(data)
+
+    def _reporter(self, number: int) -> Any:
+        """Return a function that sends progress from a thread."""
+        loop, last = asyncio.get_running_loop(), [0.0]
+
+        def report(part: str, share: float) -> None:
+            if time.monotonic() - last[0] >= _REPORTS:
+                last[0] = time.monotonic()
+                header = {"kind": "progress", "id": number, "part": part, "share": share}
+                asyncio.run_coroutine_threadsafe(self._send(frame(header)), loop)
+
+        return report
+
+
+def _compiles() -> bool:
+    """Return whether a thread compiles now."""
+    return compile_time.running > 0
+
+
+def _problem(error: BaseException, number: int | None) -> bytes:
+    """Return a frame with the message of an error."""
+    text = str(error) or type(error).__name__
+    if not isinstance(error, ValueError):
+        text = f"{type(error).__name__}: {text}"
+    lines = [" ".join(line.split())[:1000] for line in text.splitlines() if line.strip()]
+    return frame({"kind": "error", "id": number, "text": lines[:20]})
+
+
+# ---- Connections of the studio's server ----
+
+FIRST_REQUEST = 3.0
+"""Time until the first request of a connection is complete [s], as at the live port."""
+MOST_CONNECTIONS = 200
+"""Most connections that are no pages; chosen by hand: a browser opens six."""
+BACKLOG = 64
+"""Connections that are accepted in one go: fewer than may wait, so that the newest are read."""
+# Shortest time between two lines in the log [s].
+_QUIET = 60.0
+
+
+class Door:
+    """The connections that are no pages, and what the log says of those that were closed."""
+
+    def __init__(self) -> None:
+        self.waiting: dict[Any, None] = {}  # in the order in which they came
+        self._closed, self._said = 0, -_QUIET
+
+    def protocol(self) -> type[asyncio.Protocol]:
+        """Return the protocol of HTTP for uvicorn, with these limits."""
+        base: Any = import_extra("uvicorn.protocols.http.auto", "studio", "the studio")
+        door = self
+
+        class Limited(base.AutoHTTPProtocol):
+            """HTTP of uvicorn with a time limit for the first request."""
+
+            def connection_made(self, transport: Any) -> None:
+                super().connection_made(transport)
+                door.enter(self)
+                loop = asyncio.get_running_loop()
+                self.too_late = loop.call_later(FIRST_REQUEST, self.end_if_silent)
+
+            def connection_lost(self, exc: Exception | None) -> None:
+                self.too_late.cancel()
+                door.waiting.pop(self, None)
+                super().connection_lost(exc)
+
+            def end_if_silent(self) -> None:
+                """Close the connection if no request is complete, and it has not become a page."""
+                if self.transport.get_protocol() is not self:
+                    door.waiting.pop(self, None)
+                elif self.cycle is None:
+                    door.close(self)
+
+        return Limited
+
+    def enter(self, connection: Any) -> None:
+        """Take a new connection; close the oldest one that waits if there are too many."""
+        self.waiting[connection] = None
+        if len(self.waiting) <= MOST_CONNECTIONS:
+            return
+        for each in list(self.waiting):
+            if each.transport.get_protocol() is not each:  # it is a page now
+                del self.waiting[each]
+            elif each.cycle is None or each.cycle.response_complete:
+                self.close(each)
+            if len(self.waiting) <= MOST_CONNECTIONS:
+                return
+        self.close(connection)
+
+    def close(self, connection: Any) -> None:
+        """Close a connection; the log has one line in a minute at most."""
+        self.waiting.pop(connection, None)
+        connection.transport.abort()
+        self.note()
+
+    def note(self) -> None:
+        """Count a connection that was closed or not accepted, and say so now and then."""
+        self._closed += 1
+        if time.monotonic() - self._said >= _QUIET:
+            self._said = time.monotonic()
+            _LOG.warning(
+                "studio: connections were closed (%d until now): they sent no request within %g s, "
+                "or there were more than %d; pages go on",
+                *(self._closed, FIRST_REQUEST, MOST_CONNECTIONS),
+            )
+
+    def exceptions(self, loop: Any, context: dict[str, Any]) -> None:
+        """Take errors of the event loop: those of connections that it can't accept are counted."""
+        if isinstance(context.get("exception"), OSError):
+            self.note()
+        else:
+            loop.default_exception_handler(context)
+
+
+# ---- The server of the studio ----
 
 HOST = "127.0.0.1"
 PORT = 8770

@@ -3,10 +3,7 @@
 May import ``simulation``, ``records``, ``plants`` and what these import.
 """
 
-from quell.sweeping.measures import Measure
-from quell.sweeping.plan import Plan
-from quell.sweeping.result import Sweep
-from quell.sweeping.sweep import sweep
-from quell.sweeping.values import Normal, Range
+from quell.sweeping.runs import Measure, Normal, Plan, Range
+from quell.sweeping.sweep import Sweep, sweep
 
 __all__ = ["Measure", "Normal", "Plan", "Range", "Sweep", "sweep"]

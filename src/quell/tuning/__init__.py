@@ -7,7 +7,7 @@ and returns a ``Tuned``.
 """
 
 from quell.tuning.constraints import Constraints
-from quell.tuning.identified import identified_plants
+from quell.tuning.plants import identified_plants
 from quell.tuning.structures import STRUCTURES
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned

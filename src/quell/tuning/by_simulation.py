@@ -14,27 +14,23 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.frequency_response import Response
 from quell.analysis.linearise import linear_law
-from quell.analysis.loop import LoopAnalysis
-from quell.analysis.subsystems import law_matrix
+from quell.analysis.loop import LoopAnalysis, law_matrix
+from quell.analysis.margins import Response
 from quell.controllers.base import Controller
-from quell.lti.models import is_linear_model
-from quell.lti.system import System
+from quell.lti.models import System, is_linear_model
 from quell.plants.linear import LinearPlant
-from quell.plants.linear_part import linear_model
+from quell.plants.linearise import linear_model
 from quell.tuning.constraints import Constraints
-from quell.tuning.optimiser.damping import counted
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.problem import Solution
-from quell.tuning.optimiser.requirements import bounds_of, worst_ratio
+from quell.tuning.optimiser.requirements import bounds_of, counted, worst_ratio
+from quell.tuning.optimiser.search import Solution
 from quell.tuning.plants import as_list
-from quell.tuning.result.design import Design, design_of
+from quell.tuning.report import Design, design_of
 from quell.tuning.simulated import Problem, Search, SearchRange, search
 from quell.tuning.structures.base import Structure, named, vector
 from quell.tuning.structures.registry import SEVERAL_INTEGRATORS
-from quell.tuning.tuned import Tuned
-from quell.tuning.uncertain import Uncertain
+from quell.tuning.tuned import Tuned, Uncertain
 
 # Ranges around the start: a factor either way. Chosen by hand.
 _WIDE = 10.0

@@ -12,23 +12,33 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis
-from quell.controllers.adrc.feedforward import Feedforward
+from quell.controllers.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
-from quell.tuning.optimiser.extras import extras_of
-from quell.tuning.optimiser.laws import law_of
-from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.objectives import cost_of, scores
-from quell.tuning.optimiser.problem import Extra, Problem, Solution
-from quell.tuning.optimiser.requirements import KINDS, Bound, bounds_of, worst_ratio
-from quell.tuning.optimiser.search import FEW, best_solution, merit, search, solution_at
-from quell.tuning.optimiser.starts import starts
-from quell.tuning.optimiser.time_responses import Inputs, SetResponses
-from quell.tuning.result.design import Design, design_of, impossible, measured
-from quell.tuning.result.report import relative
-from quell.tuning.structures.adrc import AdrcStructure
+from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of
+from quell.tuning.optimiser.requirements import (
+    KINDS,
+    Bound,
+    bounds_of,
+    cost_of,
+    scores,
+    worst_ratio,
+)
+from quell.tuning.optimiser.search import (
+    FEW,
+    Extra,
+    Problem,
+    Solution,
+    best_solution,
+    extras_of,
+    merit,
+    search,
+    solution_at,
+    starts,
+)
+from quell.tuning.report import Design, design_of, impossible, measured, relative
+from quell.tuning.structures.adrc import AdrcStructure, equivalents
 from quell.tuning.structures.base import Model, Structure
-from quell.tuning.structures.equivalent import equivalents
-from quell.tuning.structures.pid import FilteredPID
+from quell.tuning.structures.baselines import FilteredPID
 from quell.tuning.structures.registry import make_structure, orders_of
 from quell.types import Matrix, Vector
 

@@ -1,24 +1,48 @@
-"""The plants that a tuning is for: one, a list, a batch, with a range of their gain."""
+"""The plants that a tuning is for: one, a list, a batch, with a range of their gain.
+
+The set of plants that an identified model stands for: its deviations as plants of their own.
+
+The coefficients θ of the model have a covariance P. With 95 % all of them together are in the
+ellipsoid ``(θ' − θ)ᵀ P⁻¹ (θ' − θ) ≤ k²``, k² being the 95 % quantile of χ² with as many degrees of
+freedom as there are coefficients. The set has the model itself, and the points of the ellipsoid
+that are farthest in the direction of each coefficient and of the gain K::
+
+    θ ± k P c/√(cᵀ P c),     c = e_i for each coefficient, and ∂K/∂θ
+
+so that each coefficient and the gain have their whole joint interval in the set (Scheffé's
+intervals: Seber & Lee, *Linear Regression Analysis*, 2nd ed. 2003, sec. 5.1.1). A delay that was
+searched is one of the coefficients: a longer one goes with faster poles. Other models that the
+record does not tell apart from it are plants of the set, too.
+
+The model of a record, those that the record does not tell apart from it, plants to tune for.
+
+``quell tune RECORD`` and the studio identify records in this way.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
+from quell.identification import Measured, identify, not_told_apart
+from quell.identification.result import Identified
 from quell.lti.canonical import canonical
-from quell.plants.batch import PlantBatch
-from quell.plants.delay import DelayedPlant
-from quell.plants.linear_part import linear_part
-from quell.plants.sampled import SampledPlant, sampled_plant
+from quell.parallel import part_of
+from quell.plants.base import PlantBatch
+from quell.plants.linear import DelayedPlant, SampledPlant, sampled_plant
+from quell.plants.linearise import linear_part
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.structures.base import Model
 from quell.types import Vector
+
+# ---- The plants that a tuning is for ----
 
 # A zero with a real part above this share of its size is in the right half plane.
 _RIGHT = 1e-9
@@ -148,3 +172,182 @@ def model_of(given: Given, plants: PlantSet, constraints: Constraints) -> Model:
         gain=gain,
         constraints=constraints,
     )
+
+
+# ---- The set of plants that an identified model stands for ----
+
+# Probability of the ellipsoid.
+_INSIDE = 0.95
+
+
+def identified_plants(
+    found: Identified, others: Sequence[Identified] = ()
+) -> tuple[list[tuple[Vector, Vector]], list[float]]:
+    """Return the plants ``(num, den)`` that a model stands for, itself first, and their delays [s].
+
+    Parameters
+    ----------
+    found
+        result of ``identify``.
+    others
+        further models of the record, as ``not_told_apart`` returns them behind the first.
+
+    Raises
+    ------
+    ValueError
+        for direct feedthrough, or what the record does not decide of sign and size of the gain, the
+        start at rest and the delay.
+    """
+    from scipy.stats import chi2
+
+    _ = found.plant  # says why not, for direct feedthrough
+    if found.undecided:
+        raise ValueError(f"found: {'; '.join(found.undecided)}")
+    free = found.den.size - 1 - found.integrators
+    theta = np.concatenate(
+        [found.den[::-1][found.integrators : -1], found.num[::-1], [found.delay]]
+    )
+    size = theta.size - 1
+    P = np.zeros((theta.size, theta.size))
+    P[:size, :size], P[size], P[:, size] = found.covariance, *[found.delay_covariance] * 2
+    if not np.all(np.isfinite(P)):
+        raise ValueError("found: its deviations are not finite; identify with a lower order")
+    directions = list(np.eye(theta.size))
+    if free and theta[0] != 0.0:
+        of_gain = np.zeros(theta.size)
+        of_gain[free], of_gain[0] = 1.0 / theta[0], -theta[free] / theta[0] ** 2
+        directions.append(of_gain)
+    known = int(np.sum(np.diag(P) > 0.0))
+    k = float(np.sqrt(chi2.ppf(_INSIDE, known))) if known else 0.0
+    points = [theta]
+    for c in directions:
+        spread = float(np.sqrt(max(float(c @ P @ c), 0.0)))
+        if spread > 0.0:
+            step = k * (P @ c) / spread
+            points += [_moved(theta, step, size), _moved(theta, -step, size)]
+    plants = []
+    for point in points:
+        den = np.concatenate([[1.0], point[:free][::-1], np.zeros(found.integrators)])
+        plants.append((point[free:size][::-1].copy(), den))
+    delays = [max(float(point[size]), 0.0) for point in points]
+    for other in others:
+        plants.append((other.num, other.den))
+        delays.append(other.delay)
+    return plants, delays
+
+
+def _moved(theta: Vector, step: Vector, size: int) -> Vector:
+    """Return θ after a step, ``θ exp(step/θ)`` if else the sign of the highest b would change.
+
+    Then a fast pole is uncertain, which changes all coefficients by the same factor.
+    """
+    point = theta + step
+    if point[size - 1] * theta[size - 1] <= 0.0:
+        known = theta[:size] != 0.0
+        part = np.where(known, theta[:size], 1.0)
+        point[:size] = np.where(known, part * np.exp(step[:size] / part), point[:size])
+    return point
+
+
+# ---- The model of a record, those that the record does not tell apart from it ----
+
+# Poles of the model at first: a flexible axis has four.
+_ORDER = 4
+
+
+@dataclass(frozen=True, eq=False)
+class RecordModel:
+    """The model of a record, and the models that the record does not tell apart from it."""
+
+    model: Identified
+    others: tuple[Identified, ...]
+    held_out: float | None  #: share of the record that was to be held out; None: by itself
+
+    @property
+    def lines(self) -> list[str]:
+        """The report; lines that begin with NOT say what the record does not show."""
+        model = self.model
+        found = model.describe().splitlines()
+        if model.held_from == model.y.size and self.held_out is None:
+            found.append("nothing is held out: u does not move at the end of the record")
+        for other in self.others:
+            found.append(f"the record does not tell it from {other!r}, which is tuned for, too")
+        return found
+
+    @property
+    def refusal(self) -> str:
+        """Why no controller should be tuned for the model, and what to do; empty if there is none.
+
+        The reasons are faults of the model, and what the record does not decide.
+        """
+        return "; ".join([*self.model.faults, *self.model.undecided])
+
+    @cached_property
+    def plants(self) -> tuple[list[Any], list[float]]:
+        """The plants ``(num, den)`` to tune for, the model first, and their delays [s].
+
+        Raises
+        ------
+        ValueError
+            if there is a ``refusal``, and for direct feedthrough.
+        """
+        if self.refusal:
+            raise ValueError(f"record: no plant to tune for: {self.refusal}")
+        return identified_plants(self.model, self.others)
+
+
+def record_model(
+    record: Measured,
+    order: int = _ORDER,
+    zeros: int = 0,
+    *,
+    integrators: int | None = None,
+    friction: bool | None = None,
+    rest: bool | None = None,
+    max_delay: float | None = None,
+    held_out: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> RecordModel:
+    """Identify a record with a first order, and take the structure that the record supports.
+
+    Parameters
+    ----------
+    record
+        of one experiment.
+    order, zeros, integrators, rest, held_out
+        as for ``identify``; fewer or more poles are taken where the record shows them.
+    friction
+        whether there is Coulomb friction; None: where it fits better.
+    max_delay
+        longest delay [s] that is searched; None: as long as the longest one is the best.
+    progress
+        called with a share of the work that is done; an exception in it ends the work.
+
+    Raises
+    ------
+    ValueError
+        as ``identify``.
+    """
+    delay = None if max_delay is None else (0.0, max_delay)
+    first = identify(
+        record.u,
+        record.y,
+        record.dt,
+        order,
+        zeros,
+        delay=delay,
+        integrators=integrators,
+        friction=bool(friction),
+        rest=rest,
+        held_out=held_out,
+        signals=record.signals,
+        progress=part_of(progress, 0.0, 0.5, 1.0),
+    )
+    model, *others = not_told_apart(
+        first,
+        delay,
+        integrators=integrators,
+        friction=friction,
+        progress=part_of(progress, 0.5, 1.0, 1.0),
+    )
+    return RecordModel(model, tuple(others), held_out)

@@ -12,11 +12,11 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
-from quell.controllers.adrc.feedforward import Feedforward, checked_feedforward
+from quell.controllers.feedforward import Feedforward, checked_feedforward
 from quell.parallel import one_blas_thread
-from quell.plants.labelled import signals_of
+from quell.plants.base import signals_of
 from quell.plants.linear import LinearPlant
-from quell.signals.base import Signal
+from quell.signals.shapes import Signal
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import (
@@ -28,31 +28,23 @@ from quell.tuning.designs import (
     with_noise_bound,
     without_damping,
 )
-from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.objectives import OBJECTIVES
-from quell.tuning.optimiser.time_responses import Inputs, load_step
-from quell.tuning.plants import (
-    Given,
-    as_list,
-    given_plants,
-    model_of,
-    plant_set,
-    with_known_noise,
-)
-from quell.tuning.result.design import Design
-from quell.tuning.result.reference_step import peak_of_u
-from quell.tuning.result.scenario import (
+from quell.tuning.optimiser.loops import Inputs, PlantSet, load_step
+from quell.tuning.optimiser.requirements import OBJECTIVES
+from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set, with_known_noise
+from quell.tuning.report import (
+    Design,
     Limits,
     Rest,
     checked_rest,
     held_sizes,
+    peak_of_u,
+    plant_table,
     rest_of_linear,
     rest_of_plant,
     rest_within,
     scenario_tables,
     windows_of,
 )
-from quell.tuning.result.setup_file import plant_table
 from quell.tuning.structures.base import resonances
 from quell.tuning.structures.registry import (
     CASCADE,
@@ -60,8 +52,7 @@ from quell.tuning.structures.registry import (
     STRUCTURES,
     WITH_ONE_INTEGRATOR,
 )
-from quell.tuning.tuned import Tuned
-from quell.tuning.uncertain import Check, Uncertain, checked
+from quell.tuning.tuned import Check, Tuned, Uncertain, checked
 from quell.types import Progress, Vector
 
 COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "freed", "model-based")

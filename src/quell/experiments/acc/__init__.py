@@ -3,15 +3,34 @@
 May import ``tuning``, ``experiments.common`` and ``experiments.compare``.
 """
 
-from quell.experiments.acc.cases import CaseResult, study_cases
-from quell.experiments.acc.controllers import DT, PUBLISHED, TransferFunction, designs
-from quell.experiments.acc.criteria import Judged, judge
-from quell.experiments.acc.figures import against_spread, draw, save
-from quell.experiments.acc.published import judge_published
-from quell.experiments.acc.samples import boxed, generated, plant, read, widened
-from quell.experiments.acc.stability import unstable
-from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records, run
-from quell.sweeping.shares import share_interval as interval
+from quell.experiments.acc.loops import (
+    DT,
+    PUBLISHED,
+    CaseResult,
+    Judged,
+    TransferFunction,
+    boxed,
+    designs,
+    generated,
+    judge,
+    judge_published,
+    plant,
+    read,
+    study_cases,
+    unstable,
+    widened,
+)
+from quell.experiments.acc.study import (
+    SPRINGS,
+    Result,
+    against_spread,
+    draw,
+    judge_sampled,
+    records,
+    run,
+    save,
+)
+from quell.sweeping.sweep import share_interval as interval
 
 __all__ = [
     "DT",

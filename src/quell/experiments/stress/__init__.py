@@ -3,11 +3,19 @@
 May import ``experiments.common``.
 """
 
-from quell.experiments.stress.adversaries import KINDS, Adversary, draw_adversary
+from quell.experiments.stress.adversaries import KINDS, Adversary, Turncoat, draw_adversary
 from quell.experiments.stress.figures import draw, save
-from quell.experiments.stress.random_loops import Loop, draw_loops
-from quell.experiments.stress.study import HONEST, Outcome, Result, errors, run, run_one, summary
-from quell.experiments.stress.turncoat import Turncoat
+from quell.experiments.stress.study import (
+    HONEST,
+    Loop,
+    Outcome,
+    Result,
+    draw_loops,
+    errors,
+    run,
+    run_one,
+    summary,
+)
 
 __all__ = [
     "HONEST",

@@ -3,19 +3,30 @@
 One type serves for most of them, so that a trial compiles once; ``kind`` selects the behaviour.
 Algorithm 1 is the real one (``learners.BatchGradient``), and ``Turncoat`` is a ``Kalman`` or
 ``Harmonic`` learner that turns hostile later.
+
+A hostile learner that knows plant and load: it earns trust with f, and spends it on harm.
+
+A learner that sees everything, and does what a table of numbers says: an adversary, or perfect.
+
+It has two modes, each a weighted sum of the same ``INPUTS``; it changes from the first to the
+second when the guard trusts it, and back when the guard does not, or after a time. So it can earn
+trust with what is right and spend it on what does harm. It knows the load in advance and reads the
+guard's authority and the typical error e in the guard's own memory, through ``Watched``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
-from quell.experiments.stress.turncoat import Turncoat
+from quell.controllers import ADRC
+from quell.controllers.law import AdrcState, law_gains
+from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory, write_channels
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Buffer
 from quell.learners import BatchGradient, Harmonic, Kalman, Learner
@@ -23,13 +34,216 @@ from quell.learners.base import (
     adapt,
     coefficients,
     commit,
+    lag_memory,
+    lag_of,
+    lag_push,
     no_coefficients,
     nothing_to_restart,
     predict,
     restart,
 )
 from quell.observers.eso import ESO
-from quell.types import Vector
+from quell.types import Matrix, Vector
+
+# ---- A hostile learner that knows plant and load ----
+
+
+class SpenderDesign(NamedTuple):
+    """Parameters."""
+
+    lag: Any
+    load: Buffer  # of each sample [y-unit/s^n]
+    gain_error: float  # b − b0
+    push: Buffer  # what it adds to g^F, in units of the largest |q| so far; NaN while it earns
+
+
+class SpenderMemory(NamedTuple):
+    """State."""
+
+    chain: Matrix  # lag filters of f_plain and of g
+    now: Vector  # (5,): f_plain^F, g^F, g, largest |q|, number of samples
+
+
+class Spender:
+    """A learner that returns f, or ``g^F + push e``, so that a guard gets ``e_L = push e`` to see.
+
+    Parameters
+    ----------
+    load, push
+        a value for each sample; where ``push`` is NaN it returns f.
+    gain_error
+        b − b0 of a chain of integrators.
+    """
+
+    def __init__(self, load: Any, push: Any, gain_error: float) -> None:
+        self.load, self.push = np.array(load, dtype=float), np.array(push, dtype=float)
+        self.gain_error = gain_error
+
+    def design(self, observer: ESO, omega_c: float) -> SpenderDesign:
+        """Return the parameters."""
+        return SpenderDesign(lag_of(observer), self.load, self.gain_error, self.push)
+
+    def memory(self, parameters: SpenderDesign) -> SpenderMemory:
+        """Return the state at rest."""
+        return SpenderMemory(lag_memory(parameters.lag, 2), np.zeros(5))
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return no names."""
+        return ()
+
+
+def draw_push(rng: np.random.Generator, pulse: Vector, samples: int, lag: float) -> Vector:
+    """Return what a random spender adds to g^F, in units of the largest |q| so far (samples,).
+
+    It earns for 20 to 60 lags of the observer, and then pushes in stages with the signs of the
+    pulse response backwards, the worst for q at the end of a stage; in half of the draws it earns
+    again between them.
+
+    Parameters
+    ----------
+    rng
+        of the draw.
+    pulse
+        response of q to a pulse of the correction.
+    samples
+        of the run.
+    lag
+        N/omega_o [samples].
+    """
+    push = np.full(samples, np.nan)
+    at, length = round(rng.uniform(20.0, 60.0) * lag), round(rng.uniform(0.3, 12.0) * lag)
+    # A guard clips what is larger than 1.2 e, or does not listen to what is far larger.
+    size, turn = (
+        rng.choice([0.5, 1.0, 1.2, 2.0, 2.9]) * rng.choice([-1.0, 1.0]),
+        rng.choice([-1, 1]),
+    )
+    rest = round(rng.uniform(0.0, 10.0) * lag) * int(rng.integers(2))
+    backwards = np.sign(pulse[:length][::-1])
+    while at < samples:
+        stage = push[at : at + length]
+        stage[:] = size * backwards[: stage.size]
+        at += length + rest
+        size *= turn
+    return push
+
+
+@adapt.register(SpenderDesign)
+def _adapt(
+    learner: SpenderDesign,
+    memory: SpenderMemory,
+    seen: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
+) -> None:
+    now = memory.now
+    now[3] = max(now[3], abs(f_plain - now[0]))
+    now[0] = lag_push(learner.lag, memory.chain, 0, f_plain)
+
+
+@predict.register(SpenderDesign)
+def _predict(
+    learner: SpenderDesign, memory: SpenderMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
+    now = memory.now
+    at = min(int(now[4]), learner.push.size - 1)
+    push = learner.push[at]
+    now[2] = now[1] + push * now[3]
+    if np.isnan(push):
+        now[2] = learner.load[min(at, learner.load.size - 1)] + learner.gain_error * u_before
+    return now[2], 0.0
+
+
+@commit.register(SpenderDesign)
+def _commit(
+    learner: SpenderDesign, memory: SpenderMemory, seen: Vector, u: float, f_learned: float
+) -> None:
+    now = memory.now
+    now[1] = lag_push(learner.lag, memory.chain, 1, now[2])
+    now[4] += 1.0
+
+
+restart.register(SpenderDesign)(nothing_to_restart)
+coefficients.register(SpenderDesign)(no_coefficients)
+
+
+# ---- A learner that turns hostile after it was honest for a while ----
+
+
+class TurncoatDesign(NamedTuple):
+    """Parameters of ``Turncoat``."""
+
+    honest: Any
+    turns: float  # number of honest samples
+    size: float  # factor of its prediction afterwards
+
+
+class TurncoatMemory(NamedTuple):
+    """State of ``Turncoat``."""
+
+    honest: Any
+    samples: Vector  # samples so far (1,)
+
+
+@adapt.register(TurncoatDesign)
+def _adapt_turncoat(
+    learner: TurncoatDesign,
+    memory: TurncoatMemory,
+    seen: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
+) -> None:
+    memory.samples[0] += 1.0
+    adapt(learner.honest, memory.honest, seen, y, u_before, f_plain)
+
+
+@predict.register(TurncoatDesign)
+def _predict_turncoat(
+    learner: TurncoatDesign, memory: TurncoatMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
+    constant, slope = predict(learner.honest, memory.honest, seen, u_before)
+    return (constant if memory.samples[0] < learner.turns else learner.size * constant), slope
+
+
+@commit.register(TurncoatDesign)
+def _commit_turncoat(
+    learner: TurncoatDesign, memory: TurncoatMemory, seen: Vector, u: float, f_learned: float
+) -> None:
+    commit(learner.honest, memory.honest, seen, u, f_learned)
+
+
+@restart.register(TurncoatDesign)
+def _restart_turncoat(learner: TurncoatDesign, memory: TurncoatMemory) -> None:
+    restart(learner.honest, memory.honest)
+
+
+coefficients.register(TurncoatDesign)(no_coefficients)
+
+
+@dataclass(frozen=True)
+class Turncoat:
+    """A learner that returns ``size`` times its prediction after ``turns`` seconds."""
+
+    honest: Learner
+    turns: float
+    size: float
+
+    def design(self, observer: ESO, omega_c: float) -> TurncoatDesign:
+        """Return the parameters."""
+        honest = self.honest.design(observer, omega_c)
+        return TurncoatDesign(honest, self.turns / observer.dt, self.size)
+
+    def memory(self, parameters: TurncoatDesign) -> TurncoatMemory:
+        """Return the state at the start."""
+        return TurncoatMemory(self.honest.memory(parameters.honest), np.zeros(1))
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return no names."""
+        return ()
+
+
+# ---- Hostile learners, which a guard has to withstand ----
 
 # Kinds of ``Adversary``.
 MULTIPLE, WHITE, CONSTANT, EXPONENTIAL, DELAYED, MINUS_U = range(6)
@@ -72,7 +286,7 @@ def normal(seed: Vector) -> float:
 
 
 @adapt.register(AdversaryDesign)
-def _adapt(
+def _adapt_adversaries(
     learner: AdversaryDesign,
     memory: AdversaryMemory,
     seen: Vector,
@@ -88,7 +302,7 @@ def _adapt(
 
 
 @predict.register(AdversaryDesign)
-def _predict(
+def _predict_adversaries(
     learner: AdversaryDesign, memory: AdversaryMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
     kind, size, now = learner.kind, learner.size, memory.now
@@ -123,7 +337,7 @@ def _predict(
 
 
 @commit.register(AdversaryDesign)
-def _commit(
+def _commit_adversaries(
     learner: AdversaryDesign, memory: AdversaryMemory, seen: Vector, u: float, f_learned: float
 ) -> None:
     at = int(memory.now[_AT])
@@ -233,3 +447,200 @@ def _sign(rng: np.random.Generator) -> float:
 
 def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(1, 2**31 - 1))
+
+
+# ---- A learner that sees everything, and does what a table of numbers says ----
+
+INPUTS = (
+    "f_plain",  # what an ESO without learner estimates
+    "q",  # f_plain − f_plain^F
+    "q − q^F",
+    "k1 x1",  # the estimates, times the gains of the law
+    "k2 x2",
+    "k3 x3",
+    "k4 x4",
+    "b0 u",
+    "e",  # the guard's typical error
+    "load",  # the load's table, in the sample that begins
+    "e sign(q)",
+    "e sign(x2)",
+    "e sin(omega t)",
+    "f_L",  # of the sample before
+    "f_plain'/omega_o",
+)
+"""Signals that the two modes weigh, all in the unit of f."""
+RULES = ("trusted", "distrusted", "least_time", "most_time")
+"""Authority from which it attacks, and at which it stops; least time [lags] in the first mode, and
+longest time in the second."""
+# Entries of ProgramMemory.now: f_plain, q and their lagged values, and the state of the modes.
+_COUNT_PROGRAM, _MODE, _SINCE, _F_PLAIN_PROGRAM, _SHOWN, _Q, _Q_SHOWN, _F_L_PROGRAM = range(8)
+_STATES = 4  # of which the inputs know
+
+
+class ProgramDesign(NamedTuple):
+    """Parameters of the learner."""
+
+    weights: Matrix  # of the two modes (2, inputs)
+    trusted: float
+    distrusted: float
+    least_time: float  # [samples]
+    most_time: float  # [samples]
+    scale: Vector  # factors of seen (N,), zero beyond the order
+    b0: float
+    rate: float  # 1/(omega_o dt)
+    omega: float  # [rad/sample]
+    lag: Any
+    load: Buffer  # a value for each sample
+    guard: Any
+
+
+class ProgramMemory(NamedTuple):
+    """State of the learner."""
+
+    now: Vector
+    chain: Matrix  # lag filters of f_plain and of q
+    channels: Vector  # what the guard writes
+    inputs: Vector
+    guard: Any  # the guard's memory
+
+
+@adapt.register(ProgramDesign)
+def _adapt_program(
+    learner: ProgramDesign,
+    memory: ProgramMemory,
+    seen: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
+) -> None:
+    now = memory.now
+    memory.inputs[14] = learner.rate * (f_plain - now[_F_PLAIN_PROGRAM])
+    now[_F_PLAIN_PROGRAM], now[_Q] = f_plain, f_plain - now[_SHOWN]
+    memory.inputs[1], memory.inputs[2] = now[_Q], now[_Q] - now[_Q_SHOWN]
+    now[_SHOWN] = lag_push(learner.lag, memory.chain, 0, f_plain)
+    now[_Q_SHOWN] = lag_push(learner.lag, memory.chain, 1, now[_Q])
+    write_channels(learner.guard, memory.guard, memory.channels)
+    now[_SINCE] += 1.0
+    if now[_MODE] == 0.0:
+        if memory.channels[0] >= learner.trusted and now[_SINCE] >= learner.least_time:
+            now[_MODE], now[_SINCE] = 1.0, 0.0
+    elif memory.channels[0] <= learner.distrusted or now[_SINCE] >= learner.most_time:
+        now[_MODE], now[_SINCE] = 0.0, 0.0
+
+
+@predict.register(ProgramDesign)
+def _predict_program(
+    learner: ProgramDesign, memory: ProgramMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
+    now, inputs, last = memory.now, memory.inputs, seen.size - 1
+    typical = memory.channels[1]
+    inputs[0] = now[_F_PLAIN_PROGRAM]
+    for i in range(min(last, _STATES)):
+        inputs[3 + i] = learner.scale[i] * seen[i]
+    inputs[7] = learner.b0 * u_before
+    inputs[8] = typical
+    at = min(int(now[_COUNT_PROGRAM]), learner.load.size - 1)
+    inputs[9] = learner.load[at]
+    inputs[10] = typical * _sign_program(now[_Q])
+    inputs[11] = typical * _sign_program(seen[1] if last > 1 else seen[0])
+    inputs[12] = typical * math.sin(learner.omega * now[_COUNT_PROGRAM])
+    inputs[13] = now[_F_L_PROGRAM]
+    now[_COUNT_PROGRAM] += 1.0
+    mode, output = int(now[_MODE]), 0.0
+    for i in range(inputs.size):
+        output += learner.weights[mode, i] * inputs[i]
+    return output, 0.0
+
+
+@kernel
+def _sign_program(value: float) -> float:
+    return 1.0 if value > 0.0 else -1.0 if value < 0.0 else 0.0
+
+
+@commit.register(ProgramDesign)
+def _commit_program(
+    learner: ProgramDesign, memory: ProgramMemory, seen: Vector, u: float, f_learned: float
+) -> None:
+    memory.now[_F_L_PROGRAM] = f_learned
+
+
+restart.register(ProgramDesign)(nothing_to_restart)
+coefficients.register(ProgramDesign)(no_coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A learner that sees everything; see the module.
+
+    Parameters
+    ----------
+    weights
+        of the ``INPUTS`` in the two modes (2, inputs).
+    rules
+        the ``RULES``. Without trust at infinity it stays in its first mode.
+    omega
+        of the input ``e sin(omega t)`` [rad/s].
+    load
+        a value for each sample [y-unit/s^n].
+    guard
+        of the controller that it is to watch.
+    """
+
+    weights: Sequence[Sequence[float]]
+    rules: tuple[float, float, float, float] = (math.inf, -1.0, 0.0, math.inf)
+    omega: float = 1.0
+    load: Any = (0.0,)
+    guard: Guard | None = None
+
+    def __repr__(self) -> str:
+        shown = [[float(f"{w:.3g}") for w in mode] for mode in self.weights]
+        rules = tuple(float(f"{rule:.3g}") for rule in self.rules)
+        return f"Program({shown}, rules={rules}, omega={self.omega:.3g})"
+
+    def design(self, observer: ESO, omega_c: float) -> ProgramDesign:
+        """Return the parameters."""
+        law = law_gains(observer.order, omega_c)
+        lag = observer.lag_time / observer.dt
+        guard = UnguardedDesign() if self.guard is None else self.guard.design(observer, law)
+        return ProgramDesign(
+            weights=np.array(self.weights, dtype=np.float64),
+            trusted=self.rules[0],
+            distrusted=self.rules[1],
+            least_time=self.rules[2] * lag,
+            most_time=self.rules[3] * lag,
+            scale=np.append(law, 1.0),
+            b0=observer.b0,
+            rate=1.0 / (observer.omega_o * observer.dt),
+            omega=self.omega * observer.dt,
+            lag=lag_of(observer),
+            load=np.array(self.load, dtype=np.float64),
+            guard=guard,
+        )
+
+    def memory(self, parameters: ProgramDesign) -> ProgramMemory:
+        """Return the state at the start; ``Watched`` puts the guard's memory in."""
+        nothing = UnguardedMemory(np.zeros(0))
+        channels = np.zeros(sum(width for _, width in GUARD_CHANNELS))
+        channels[0] = float(self.guard is None)  # full authority, until a guard writes another
+        return ProgramMemory(
+            now=np.zeros(8),
+            chain=lag_memory(parameters.lag, 2),
+            channels=channels,
+            inputs=np.zeros(len(INPUTS)),
+            guard=nothing if self.guard is None else self.guard.memory(parameters.guard),
+        )
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return no names."""
+        return ()
+
+
+class Watched(ADRC):
+    """A controller whose learner, a ``Program``, sees the guard's memory."""
+
+    def initial_state(self) -> AdrcState:
+        """Return the state; the learner's memory refers to the guard's arrays."""
+        state = super().initial_state()
+        if self.guard is None:
+            return state
+        return state._replace(learner=state.learner._replace(guard=state.guard))

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import save_figures
+from quell.experiments.common import save_figures
 from quell.experiments.stress.axes import AxesResult
-from quell.experiments.stress.general.result import GeneralResult
-from quell.experiments.stress.general.trial import HONEST as HONEST_LEARNERS
+from quell.experiments.stress.general import HONEST as HONEST_LEARNERS
+from quell.experiments.stress.general import GeneralResult
 from quell.experiments.stress.study import HONEST, Result
 from quell.records.plotting import grid_of_axes, new_figure
 

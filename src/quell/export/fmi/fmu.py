@@ -1,34 +1,475 @@
-"""``fmu``: a controller, a plant or a loop as a co-simulation FMU of FMI 3.0."""
+"""``fmu``: a controller, a plant or a loop as a co-simulation FMU of FMI 3.0.
+
+``model.h`` and ``model.c``: what an FMU samples, between ``sources/fmi3.c`` and generated code.
+
+A model is a controller, a plant, or both in a loop. It keeps the values of all variables in the
+order of their value references. A sample of a loop does what ``simulate`` does::
+
+    y = measure(x),   u = step(r, y + noise),   advance(x, u, w)
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import platform
+import shutil
+import subprocess
+import sys
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import check_controller
+from quell.export.c_files import plant_source
 from quell.export.controller_source import c_source
-from quell.export.fmi.binary import compiled, place
-from quell.export.fmi.description import build_description, model_description
-from quell.export.fmi.model import Model
-from quell.export.fmi.parts import ControllerPart, PlantPart
-from quell.export.plant_source import plant_source
-from quell.export.translate.naming import checked_name
-from quell.files import check_writable, written_atomically
+from quell.export.fmi.parts import (
+    FIXED,
+    INPUT,
+    LOCAL,
+    OUTPUT,
+    TUNABLE,
+    ControllerPart,
+    PlantPart,
+    Variable,
+    number,
+    ordered,
+    several,
+    tuning_lines,
+)
+from quell.export.library.exported import FLAGS, NoCompilerError
+from quell.export.translate.text import checked_name
+from quell.files import check_regular, check_writable, whole_text, written_atomically
 from quell.lti.models import is_linear_model
 from quell.plants.base import check_plant
 from quell.plants.linear import LinearPlant
-from quell.reading import check_regular, whole_text
+
+# ---- modelDescription.xml and buildDescription.xml of an FMU (FMI 3.0.1, 2.4 and 2.5) ----
+
+# Units by name, with their exponents of SI base units.
+_UNITS = {"s": {"s": "1"}, "rad/s": {"rad": "1", "s": "-1"}}
+_CAUSALITY = {FIXED: "parameter", TUNABLE: "parameter"}
+
+
+def model_description(
+    name: str, title: str, token: str, dt: float, variables: Sequence[Variable]
+) -> bytes:
+    """Return the description of a co-simulation FMU.
+
+    Parameters
+    ----------
+    name
+        identifier of the model, and of its binary.
+    title
+        what the model is, in words.
+    token
+        the ``instantiationToken``.
+    dt
+        sample time [s].
+    variables
+        all variables, in the order of their value references.
+    """
+    root = ElementTree.Element(
+        "fmiModelDescription",
+        fmiVersion="3.0",
+        modelName=name,
+        instantiationToken=token,
+        description=title,
+        generationTool="quell",
+        variableNamingConvention="structured",
+    )
+    _add(
+        root,
+        "CoSimulation",
+        modelIdentifier=name,
+        canHandleVariableCommunicationStepSize="true",
+        fixedInternalStepSize=number(dt),
+        canGetAndSetFMUState="true",
+        canSerializeFMUState="true",
+    )
+    units = _add(root, "UnitDefinitions")
+    for unit, powers in _UNITS.items():
+        _add(_add(units, "Unit", name=unit), "BaseUnit", **powers)
+    categories = _add(root, "LogCategories")
+    _add(categories, "Category", name="error", description="reasons of fmi3Error")
+    _add(root, "DefaultExperiment", startTime="0", stepSize=number(dt))
+    elements = _add(root, "ModelVariables")
+    for reference, variable in enumerate(variables):
+        _add_variable(elements, reference, variable)
+    structure = _add(root, "ModelStructure")
+    references = [str(i) for i, variable in enumerate(variables) if variable.role == OUTPUT]
+    for output in references:
+        # An output changes in fmi3DoStep only: it does not follow an input at once.
+        _add(structure, "Output", valueReference=output, dependencies="")
+    for output in references:
+        _add(structure, "InitialUnknown", valueReference=output)
+    return _text(root)
+
+
+def build_description(name: str, files: Sequence[str]) -> bytes:
+    """Return the description of the sources, C files in the folder of this file."""
+    root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
+    configuration = _add(root, "BuildConfiguration", modelIdentifier=name)
+    sources = _add(configuration, "SourceFileSet", language="C99")
+    for file in files:
+        _add(sources, "SourceFile", name=file)
+    _add(configuration, "Library", name="m", version="")
+    return _text(root)
+
+
+def _add_variable(parent: ElementTree.Element, reference: int, variable: Variable) -> None:
+    attributes = {
+        "name": variable.name,
+        "valueReference": str(reference),
+        "causality": _CAUSALITY.get(variable.role, variable.role),
+    }
+    if variable.role in _CAUSALITY:
+        attributes["variability"] = variable.role
+    elif variable.whole or variable.held:
+        attributes["variability"] = "discrete"
+    attributes["description"] = variable.description
+    if variable.unit:
+        attributes["unit"] = variable.unit
+    if variable.role in (INPUT, *_CAUSALITY):
+        attributes["start"] = number(variable.start)
+    elif variable.role in (OUTPUT, LOCAL):
+        attributes["initial"] = "calculated"
+    _add(parent, "Int32" if variable.whole else "Float64", **attributes)
+
+
+def _add(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
+    return ElementTree.SubElement(parent, tag, attributes)
+
+
+def _text(root: ElementTree.Element) -> bytes:
+    ElementTree.indent(root)
+    text: bytes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text + b"\n"
+
+
+# ---- model.h and model.c ----
+
+_ROLES = {INPUT: "MODEL_INPUT", FIXED: "MODEL_FIXED", TUNABLE: "MODEL_TUNABLE"}
+
+_HEADER = """\
+/* The model inside of the FMU: {title}. Generated by quell. */
+#ifndef MODEL_H
+#define MODEL_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+{includes}
+
+#define MODEL_TOKEN "{token}"
+#define MODEL_SAMPLE_TIME {dt} /* [s] */
+#define MODEL_REALS {reals} /* the first value references; the first of all is the time */
+#define MODEL_INTEGERS {integers} /* those that follow */
+
+/* Places of the variables: their value references. */
+enum {{
+{places}
+}};
+
+/* What may be set, and when. */
+typedef enum {{ MODEL_OUTPUT, MODEL_INPUT, MODEL_FIXED, MODEL_TUNABLE }} Role;
+
+typedef struct {{
+    double real[MODEL_REALS];
+    int32_t integer[MODEL_INTEGERS + 1];
+{members}
+}} model;
+
+extern const Role model_roles[MODEL_REALS];
+
+/* Set all variables to their start values. */
+void model_reset(model *m);
+/* Correct the addresses inside of a model that was copied. */
+void model_moved(model *m);
+/* Let parameters act; return what is wrong with them, or NULL. */
+const char *model_tune(model *m);
+/* Set the outputs before the first sample. */
+void model_begin(model *m);
+/* Take the sample at the time t [s]. */
+void model_sample(model *m, double t);
+
+#endif
+"""
+
+_SOURCE = """\
+/* See model.h. Generated by quell. */
+#include "model.h"
+
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+const Role model_roles[MODEL_REALS] = {{
+{roles}
+}};
+{helpers}
+void model_reset(model *m)
+{{
+{reset}
+}}
+
+void model_moved(model *m)
+{{
+{moved}
+}}
+
+const char *model_tune(model *m)
+{{
+{tune}
+}}
+
+void model_begin(model *m)
+{{
+{begin}
+}}
+
+void model_sample(model *m, double t)
+{{
+{sample}
+}}
+"""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A controller, a plant, or both in a loop."""
+
+    controller: ControllerPart | None
+    plant: PlantPart | None
+    dt: float
+    title: str
+
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """All variables, in the order of their value references."""
+        controller, plant, found = self.controller, self.plant, list[Variable]()
+        found += controller.inputs if controller else [Variable("u", INPUT, "control signal")]
+        if plant:
+            found += several("w", plant.disturbances, INPUT, "disturbance {i}")
+        if controller:
+            noise = Variable("noise", INPUT, "what is added to y before the controller sees it")
+            found.append(noise if plant else Variable("y", INPUT, "measurement"))
+            found.append(Variable("u", OUTPUT, "control signal", held=True))
+        if plant:
+            found.append(Variable("y", OUTPUT, "output of the plant"))
+        if controller:
+            found += [*controller.outputs, *controller.tunables]
+        if plant:
+            found += several("x", plant.order, LOCAL, "state {i} of the plant")
+            found += several("x0", plant.order, FIXED, "state {i} at the start", plant.x0)
+        return ordered(found)
+
+    def files(self, token: str) -> dict[str, str]:
+        """Return the texts of ``model.h`` and ``model.c`` of the FMU with this token."""
+        return {"model.h": self._header(token), "model.c": self._source()}
+
+    def _header(self, token: str) -> str:
+        variables = self.variables
+        integers = sum(variable.whole for variable in variables)
+        sources = [part.source for part in (self.controller, self.plant) if part]
+        return _HEADER.format(
+            title=self.title,
+            includes="\n".join(f'#include "{source.name}.h"' for source in sources),
+            token=token,
+            dt=repr(self.dt),
+            reals=len(variables) - integers,
+            integers=integers,
+            places=_indented(f"{each.constant}," for each in variables),
+            members=_indented(self._members()),
+        )
+
+    def _members(self) -> list[str]:
+        lines = []
+        if self.controller:
+            name = self.controller.source.name
+            lines += [
+                f"{name}_parameters parameters[2]; /* those that act, and the next ones */",
+                "int32_t acting;",
+                f"{name}_state controller;",
+            ]
+        if self.plant:
+            lines.append(f"{self.plant.source.name}_state plant;")
+        return lines
+
+    def _source(self) -> str:
+        reals = [variable for variable in self.variables if not variable.whole]
+        roles = (f"{_ROLES.get(v.role, 'MODEL_OUTPUT')}, /* {v.name} */" for v in reals)
+        starts = [
+            f"m->real[{v.constant}] = {_c_number(v.start)};" for v in reals if v.role in _ROLES
+        ]
+        reset, moved, tune = list[str](), ["(void)m;"], ["(void)m;", "return NULL;"]
+        helpers, begin, outputs = "", list[str](), list[str]()
+        if self.controller:
+            name = self.controller.source.name
+            helpers = _estimate_function(self.controller)
+            moved = ["m->controller.parameters = &m->parameters[m->acting];"]
+            reset += [
+                f"{name}_init(&m->controller);",
+                f"m->parameters[0] = {name}_default_parameters;",
+                "m->parameters[1] = m->parameters[0];",
+                "m->acting = 0;",
+                "model_moved(m);",
+            ]
+            tune = tuning_lines(self.controller)
+            outputs += ["set_estimate(m);"]
+        if self.plant:
+            name = self.plant.source.name
+            moved.append(f"m->plant.parameters = &{name}_default_parameters;")
+            reset.append(f"{name}_init(&m->plant);")
+            order = self.plant.order
+            begin = [f"m->plant.x[{i}] = m->real[AT_X0_{i + 1}];" for i in range(order)]
+            outputs += _plant_outputs(self.plant)
+        return _SOURCE.format(
+            roles=_indented(roles),
+            helpers=helpers,
+            reset=_indented([*starts, *reset]),
+            moved=_indented(moved),
+            tune=_indented(tune),
+            begin=_indented([*begin, *outputs]),
+            sample=_indented([*self._sample_lines(), *outputs]),
+        )
+
+    def _sample_lines(self) -> list[str]:
+        """Return the lines of a sample, without the outputs after it."""
+        lines = [] if self.plant else ["(void)t;"]
+        y = "m->real[AT_Y]"
+        if self.plant and self.controller:
+            lines.append(f"const double y = {self.plant.source.name}_measure(&m->plant);")
+            y = "y + m->real[AT_NOISE]"
+        if self.controller:
+            source = self.controller.source
+            real, state = source.real, "&m->controller"
+            cast = "" if real == "double" else f"({real})"
+            y = f"{cast}({y})" if cast else y
+            given = [state, f"{cast}m->real[AT_R]", y]
+            for i in range(source.derivatives):
+                given.append(f"{cast}m->real[AT_R_DERIVATIVE_{i + 1}]")
+            lines.append(f"m->real[AT_U] = {source.name}_step({', '.join(given)});")
+        if self.plant:
+            w = ", &m->real[AT_W_1]" if self.plant.disturbances else ""
+            name = self.plant.source.name
+            lines.append(f"{name}_advance(&m->plant, t, m->real[AT_U]{w});")
+        return lines
+
+
+def _plant_outputs(plant: PlantPart) -> list[str]:
+    lines = [f"m->real[AT_Y] = {plant.source.name}_measure(&m->plant);"]
+    return [*lines, *(f"m->real[AT_X_{i + 1}] = m->plant.x[{i}];" for i in range(plant.order))]
+
+
+def _estimate_function(controller: ControllerPart) -> str:
+    """Return the C function that copies the estimate to the outputs."""
+    name = controller.source.name
+    lines = [f"const {name}_estimate estimate = {name}_get_estimate(&m->controller);"]
+    has_status = "status" in dict(controller.source.channels)
+    fields = (
+        f"estimate.{'f' if channel == 'f_hat' else channel}" + (f"[{i}]" if width > 1 else "")
+        for channel, width in controller.channels
+        for i in range(width)
+    )
+    for output, field in zip(controller.outputs, fields, strict=True):
+        value = field
+        if output.name == "status" and not has_status:
+            value = f"{name}_status(&m->controller)"
+        target = (
+            f"integer[{output.constant} - MODEL_REALS]"
+            if output.whole
+            else f"real[{output.constant}]"
+        )
+        lines.append(f"m->{target} = {value};")
+    body = _indented(lines)
+    doc = "/* Copy what the controller knows to the outputs. */"
+    return f"\n{doc}\nstatic void set_estimate(model *m)\n{{\n{body}\n}}\n"
+
+
+def _indented(lines: Iterable[str]) -> str:
+    return "\n".join(f"    {line}" if line else "" for line in lines)
+
+
+def _c_number(value: float) -> str:
+    text = number(value)
+    return {"INF": "INFINITY", "-INF": "-INFINITY", "NaN": "NAN"}.get(text, text)
+
+
+# ---- The binary of an FMU for this machine, from a C compiler ----
+
+_COMPILERS = ("gcc", "clang", "cc")
+_OPTIONS = (*FLAGS, "-fPIC", "-shared", "-fvisibility=hidden")
+_SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib")}
+# Else a function that is missing would be noticed only by the tool that loads the FMU.
+_COMPLETE = {"linux": ("-Wl,-z,defs",)}
+_MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
+# A model of the largest learners takes some seconds. Chosen by hand.
+_LONGEST = 300.0
+
+
+def place(name: str) -> str:
+    """Return the path of the binary of the model ``name`` in an FMU, for this machine."""
+    if sys.platform not in _SYSTEMS:
+        raise ValueError(
+            f"binary = True: is not supported on {sys.platform}; give binary=False and compile the "
+            "sources of the FMU there (fmpy compile)"
+        )
+    system, suffix = _SYSTEMS[sys.platform]
+    machine = platform.machine().lower()
+    return f"binaries/{_MACHINES.get(machine, machine)}-{system}/{name}{suffix}"
+
+
+def compiler() -> str:
+    """Return the C compiler: that of the environment variable CC, or the first that is found.
+
+    Raises
+    ------
+    NoCompilerError
+        if there is none.
+    """
+    candidates = (os.environ["CC"],) if os.environ.get("CC") else _COMPILERS
+    for candidate in candidates:
+        if shutil.which(candidate):
+            return candidate
+    raise NoCompilerError(
+        f"binary = True: no C compiler was found ({', '.join(candidates)}); install one, set CC, "
+        "or give binary=False for an FMU of sources only"
+    )
+
+
+def compiled(folder: Path, files: Sequence[str], name: str) -> bytes:
+    """Return the shared library of C files in ``folder``.
+
+    Raises
+    ------
+    NoCompilerError
+        without a compiler, and with its first message if it fails.
+    """
+    library = folder / f"{name}.library"
+    last = (*_COMPLETE.get(sys.platform, ()), "-lm", "-o", library.name)
+    command = [compiler(), *_OPTIONS, *files, *last]
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST, check=False
+    )
+    if done.returncode != 0:
+        lines, marks = done.stderr.splitlines(), ("undefined", "error")
+        said = [line for mark in marks for line in lines if mark in line] or [done.stderr]
+        raise NoCompilerError(f"binary = True: {command[0]} failed: {said[0].strip()[:300]}")
+    return library.read_bytes()
+
+
+# ---- fmu ----
 
 # Files beside those that have the name of the model.
 _OWN_NAMES = ("fmi3", "fmi3_refused", "model", "refuse")

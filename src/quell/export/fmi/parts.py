@@ -1,15 +1,214 @@
-"""The parts of a model: a controller and a plant in C, and their variables."""
+"""Bandwidths as parameters that can be changed while an FMU runs: closed forms for C.
+
+*omega_c*: ``k_i = w_i omega_c^(m−i+1)`` with the binomial coefficients, or those of a pattern of
+poles, as w (``controllers/law.py``), and the factor ``exp(−omega_c dt)`` of the offset after a
+bumpless transfer. A guard takes the m gains for poles at ``ω_g = k_1^(1/m)``, and has the parameter
+``respond = 1 − exp(−ω_g dt)`` (``guard/guard.py``).
+
+*omega_o*: Ackermann's formula (``observers/design.py``) with N equal poles ``1 − ω``,
+``ω = 1 − exp(−omega_o dt)``, is a polynomial, because its last factor does not depend on ω::
+
+    L = (Φ − I + ω I)^N v = Σ_k C(N, k) ω^k (Φ − I)^(N−k) v,        v = O⁻¹ e_N
+
+A bandwidth is offered only where its closed form gives all that it changes in the parameters, which
+is checked; elsewhere it is fixed: omega_o with a learner, whose lag depends on it, with other poles
+and in forms that are not linear; omega_c with a nonlinear law, or a guard with a certified bound.
+
+The parts of a model: a controller and a plant in C, and their variables.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from quell.controllers.adrc import ADRC
+from quell.controllers.law import law_gains
+from quell.controllers.prefilters import Prefiltered
 from quell.export.c_files import CSource
-from quell.export.fmi.bandwidths import Bandwidths, bandwidths
-from quell.export.fmi.variables import INPUT, OUTPUT, TUNABLE, Variable, several
-from quell.export.inspection import at_path, limits_path, parameters_of
+from quell.export.controller_source import at_path, limits_path, parameters_of
+from quell.guard.kernels import GuardDesign
+from quell.learners import NoLearner
+from quell.observers.eso import ESO
+from quell.observers.forms import EsoModel
+from quell.types import Matrix, Vector
+
+# ---- Bandwidths as parameters that can be changed while an FMU runs ----
+
+# Relative error of the closed form of L where a bandwidth is still offered: it is 1e-11 at most for
+# the observers of the tests, and an observer to which the form does not apply is far off.
+_LARGEST_ERROR = 1e-9
+_OTHER = 1.25  # times omega_c: another value, for which the closed form is checked
+
+
+class Bandwidths(NamedTuple):
+    """Data that C needs for the bandwidths of an ADRC; None for a bandwidth that is fixed."""
+
+    path: str  # of the parameters of the ADRC within those of the controller, with a dot, or empty
+    dt: float
+    omega_c: float
+    weights: Vector | None  # w (m,)
+    guard: int | None  # m of its ω_g
+    omega_o: float
+    coefficients: Matrix | None  # of ω^k in L (N, N + 1)
+
+
+def bandwidths(controller: Any) -> Bandwidths | None:
+    """Return the bandwidths of a controller; None if it is no ADRC."""
+    path = ""
+    while isinstance(controller, Prefiltered):
+        path, controller = f"{path}controller.", controller.controller
+    if type(controller) is not ADRC:
+        return None
+    observer, guard = controller.observer, _guard_order(controller)
+    return Bandwidths(
+        path,
+        observer.dt,
+        controller.omega_c,
+        _weights(controller, guard),
+        guard,
+        observer.omega_o,
+        None if _learns(controller) else gain_coefficients(observer),
+    )
+
+
+def _learns(controller: ADRC) -> bool:
+    return not isinstance(controller.learner, NoLearner)
+
+
+def _guard_order(controller: ADRC) -> int | None:
+    has_guard = isinstance(controller.parameters.guard, GuardDesign)
+    return controller.observer.degree if has_guard else None
+
+
+def _weights(controller: ADRC, guard: int | None) -> Vector | None:
+    """Return the gains for omega_c = 1, if the closed forms give all that omega_c changes."""
+    observer, dt = controller.observer, controller.dt
+    weights = law_gains(observer.degree, 1.0, controller.law_poles)
+    weights *= 0.5 if controller.half_gain else 1.0
+    for omega_c in (controller.omega_c, _OTHER * controller.omega_c):
+        gains = weights * omega_c ** (observer.degree - np.arange(observer.degree))
+        closed = controller.parameters._replace(
+            law=np.append(gains, np.zeros(observer.order - observer.degree)),
+            fade=math.exp(-omega_c * dt),
+        )
+        if guard is not None:
+            omega = float(gains[0]) ** (1.0 / guard)
+            respond = -math.expm1(-omega * dt)
+            closed = closed._replace(guard=closed.guard._replace(respond=respond))
+        design = controller._design(observer, omega_c)
+        if not all(_equal(*pair) for pair in zip(_leaves(design), _leaves(closed), strict=True)):
+            return None
+    return weights
+
+
+def gain_coefficients(observer: ESO) -> Matrix | None:
+    """Return the coefficients of ω^k in L (N, N + 1), if all poles are equal; else None."""
+    model, n = observer.model, observer.plant.a.size
+    if type(model) is not EsoModel or not observer.has_one_pole:
+        return None
+    size, m = observer.estimates, observer.disturbance_order
+    # In the coordinates x_i dt^(i−1) and f^(j) dt^(q+j) of the design all entries are O(1).
+    scale = observer.dt ** np.append(np.arange(n), observer.plant.f_degree + np.arange(m))
+    difference = model.transition * scale[:, None] / scale[None, :] - np.eye(size)
+    rows = np.empty((size, size))
+    rows[0] = difference[0]
+    rows[0, 0] += 1.0
+    for i in range(1, size):
+        rows[i] = rows[i - 1] @ difference
+    vector = np.linalg.solve(rows, np.eye(size)[-1])
+    columns = []
+    for k in range(size, -1, -1):
+        columns.append(math.comb(size, k) * vector / scale)
+        vector = difference @ vector
+    coefficients = np.array(columns[::-1]).T
+    omega = -math.expm1(-observer.omega_o * observer.dt)
+    gain = coefficients @ omega ** np.arange(size + 1)
+    return coefficients if np.allclose(gain, model.gain, rtol=_LARGEST_ERROR, atol=0.0) else None
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    """Return an iterator over the numbers and arrays in nested NamedTuples."""
+    if isinstance(value, tuple):
+        for part in value:
+            yield from _leaves(part)
+    else:
+        yield value
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, float | np.ndarray):
+        return np.shape(one) == np.shape(other) and np.allclose(
+            one, other, rtol=_LARGEST_ERROR, atol=0.0, equal_nan=True
+        )
+    return bool(one == other)
+
+
+# ---- The variables of an exported FMU, with their value references ----
+
+INPUT, OUTPUT, LOCAL, FIXED, TUNABLE = "input", "output", "local", "fixed", "tunable"
+
+
+class Variable(NamedTuple):
+    """A variable; its value reference is its place in the list of all."""
+
+    name: str
+    role: str
+    description: str
+    start: float = 0.0  # of inputs and parameters
+    unit: str = ""
+    held: bool = False  # whether it is constant between samples
+    whole: bool = False  # whether it is an integer
+
+    @property
+    def constant(self) -> str:
+        """Name of the C constant for its place: ``AT_X_HAT_1`` for ``x_hat[1]``."""
+        return "AT_" + re.sub(r"\W+", "_", self.name).strip("_").upper()
+
+
+TIME = Variable("time", "independent", "time", unit="s")
+
+
+def ordered(variables: Iterable[Variable]) -> tuple[Variable, ...]:
+    """Return the time and the variables, integers last."""
+    given = (TIME, *variables)
+    return tuple(sorted(given, key=lambda variable: variable.whole))
+
+
+def several(
+    name: str,
+    count: int,
+    role: str,
+    description: str,
+    starts: Sequence[float] = (),
+    held: bool = False,
+) -> list[Variable]:
+    """Return ``count`` variables ``name[1]``, ``name[2]`` …; "{i}" in the description counts."""
+    return [
+        Variable(
+            f"{name}[{i + 1}]",
+            role,
+            description.format(i=i + 1),
+            starts[i] if starts else 0.0,
+            held=held,
+        )
+        for i in range(count)
+    ]
+
+
+def number(value: float) -> str:
+    """Return a number for XML: INF and NaN are those of XML Schema."""
+    if math.isfinite(value):
+        return repr(float(value))
+    return "NaN" if math.isnan(value) else "INF" if value > 0 else "-INF"
+
+
+# ---- The parts of a model ----
 
 _DESCRIPTIONS = {
     "x_hat": "estimate of y and its derivatives",
@@ -134,3 +333,95 @@ class PlantPart:
     order: int
     disturbances: int
     x0: Sequence[float]
+
+
+# ---- C code that lets limits and bandwidths act which were set while an FMU runs ----
+
+
+def tuning_lines(controller: ControllerPart) -> list[str]:
+    """Return the body of ``model_tune``.
+
+    Other parameters are those of the export with what was changed; the controller goes over to them
+    without a jump of u.
+    """
+    source, path = controller.source, controller.limits_path
+    name, real = source.name, source.real
+    cast = "" if real == "double" else f"({real})"
+    lines = [
+        "if (!(m->real[AT_U_MIN] < m->real[AT_U_MAX])) {",
+        '    return "u_min must be less than u_max";',
+        "}",
+    ]
+    known = controller.bandwidths
+    offered = [variable for variable in controller.tunables if variable.unit == "rad/s"]
+    for variable in offered:
+        at = f"m->real[{variable.constant}]"
+        lines += [
+            f"if (!({at} > 0.0 && isfinite({at}))) {{",
+            f'    return "{variable.name} must be finite and greater than zero";',
+            "}",
+        ]
+    lines += [
+        f"{name}_parameters *next = &m->parameters[1 - m->acting];",
+        f"*next = {name}_default_parameters;",
+        f"next->{path}.low = {cast}m->real[AT_U_MIN];",
+        f"next->{path}.high = {cast}m->real[AT_U_MAX];",
+    ]
+    if known is not None:
+        if known.weights is not None:
+            lines += _omega_c_lines(known, known.weights, cast)
+        if known.coefficients is not None:
+            lines += _omega_o_lines(known, known.coefficients, cast)
+    return [
+        *lines,
+        f"{name}_retune(&m->controller, next);",
+        "m->acting = 1 - m->acting;",
+        "return NULL;",
+    ]
+
+
+def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
+    """Return the lines for ``k_i = w_i omega_c^(m−i+1)`` (controllers/adrc/law.py)."""
+    count, dt = weights.size, known.dt
+    guard = []
+    if known.guard is not None:
+        power = repr(1.0 / known.guard)
+        guard = [
+            f"    const double omega_g = pow(weights[0] * pow(omega_c, {count}), {power});",
+            f"    next->{known.path}guard.respond = {cast}-expm1(-omega_g * {dt!r});",
+        ]
+    return [
+        f"if (m->real[AT_OMEGA_C] != {known.omega_c!r}) {{ /* else the numbers of the export */",
+        f"    static const double weights[{count}] = {_braced(weights.tolist())};",
+        "    const double omega_c = m->real[AT_OMEGA_C];",
+        f"    for (int i = 0; i < {count}; i++) {{",
+        f"        next->{known.path}law[i] = {cast}(weights[i] * pow(omega_c, {count} - i));",
+        "    }",
+        f"    next->{known.path}fade = {cast}exp(-omega_c * {dt!r});",
+        *guard,
+        "}",
+    ]
+
+
+def _omega_o_lines(known: Bandwidths, coefficients: Matrix, cast: str) -> list[str]:
+    """Return the lines for L as a polynomial in ``ω = 1 − exp(−omega_o dt)`` (bandwidths.py)."""
+    rows, columns = coefficients.shape
+    return [
+        f"if (m->real[AT_OMEGA_O] != {known.omega_o!r}) {{ /* else the numbers of the export */",
+        f"    static const double coefficients[{rows}][{columns}] = {{",
+        *(f"        {_braced(row)}," for row in coefficients.tolist()),
+        "    };",
+        f"    const double omega = -expm1(-m->real[AT_OMEGA_O] * {known.dt!r});",
+        f"    for (int i = 0; i < {rows}; i++) {{",
+        "        double gain = 0.0;",
+        f"        for (int k = {columns - 1}; k >= 0; k--) {{",
+        "            gain = gain * omega + coefficients[i][k];",
+        "        }",
+        f"        next->{known.path}eso.gain[i] = {cast}gain;",
+        "    }",
+        "}",
+    ]
+
+
+def _braced(numbers: Sequence[float]) -> str:
+    return "{" + ", ".join(map(repr, numbers)) + "}"

@@ -3,8 +3,6 @@
 May import everything in ``export`` but ``fmi``.
 """
 
-from quell.export.library.comparison import Comparison
-from quell.export.library.exported import Exported, c
-from quell.export.library.toolchain import NoCompilerError, Sizes
+from quell.export.library.exported import Comparison, Exported, NoCompilerError, Sizes, c
 
 __all__ = ["Comparison", "Exported", "NoCompilerError", "Sizes", "c"]

@@ -1,31 +1,483 @@
-"""``c``: a controller as a library in C, with test and description."""
+"""``c``: a controller as a library in C, with test and description.
+
+The files around an exported controller: project files, description and example.
+
+Code, constants, state and stack of an exported controller and its functions, as gcc tells.
+"""
 
 from __future__ import annotations
 
+import math
 import os
-from dataclasses import dataclass
+import platform
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from quell import checks
 from quell.controllers.base import check_controller
+from quell.controllers.prefilters import without_prefilters
 from quell.controllers.single import SinglePrecision, in_single_precision
 from quell.export.c_files import CSource
-from quell.export.controller_source import c_source
-from quell.export.library.comparison import Comparison, compared
-from quell.export.library.texts import library_files
-from quell.export.library.toolchain import (
-    NoCompilerError,
-    Sizes,
-    function_sizes,
-    measured_sizes,
+from quell.export.controller_source import c_source, in_double_precision, limits_path
+from quell.export.library.vectors import (
+    TOLERANCE_REASON,
+    Vectors,
+    filled,
+    golden_vectors,
+    test_program,
 )
-from quell.export.library.vectors import golden_vectors
 from quell.export.proof import Proof, proof_files, prove
-from quell.export.translate.naming import checked_name
+from quell.export.translate.text import checked_name
 from quell.files import check_folder, write_folder
+from quell.learners.gaussian_process import SINGLE_NOVELTY, GaussianProcess
 from quell.plants.base import Plant
-from quell.simulation.scenario import Scenario
+from quell.simulation.driver import Scenario
+from quell.simulation.simulate import simulate
+
+# ---- The files around an exported controller ----
+
+# Calls of the functions, and when they belong there; s is &state.
+_OPERATIONS = {
+    "init": ("init(s)", "once, before all others"),
+    "start": ("start(s, y, u, r)", "the plant rests at y under u; long: before the timer starts"),
+    "step": ("step(s, r, yDERIVATIVES)", "each sample; returns u"),
+    "step_counts": (
+        "step_counts(s, r, countDERIVATIVES)",
+        "instead of the step, with r and y as encoder counts; without rounding of the position",
+    ),
+    "applied": ("applied(s, u)", "after the step, if another u was applied"),
+    "track": ("track(s, r, y, uDERIVATIVES)", "instead of the step in manual operation, under u"),
+    "hand_over": (
+        "hand_over(s)",
+        "once, before the first step after manual operation; false before the first sample",
+    ),
+    "retune": ("retune(s, &parameters)", "between two samples: other parameters, without a jump"),
+    "reset": ("reset(s)", "from rest at the next sample; what was learned is kept"),
+    "stopping_point": (
+        "stopping_point(s)",
+        "after the step: where the move can stop soonest; as r of the next steps it stops there",
+    ),
+    "status": ("status(s)", "after the step: flags, see the enum in the header"),
+    "get_estimate": ("get_estimate(s)", "after the step: what the controller knows, for telemetry"),
+}
+_RETUNING = """## Other limits
+
+Parameters are constants. To change a limit while running, change a copy:
+
+```c
+static NAME_parameters derated;
+
+derated = NAME_default_parameters;
+derated.PATH.high = ONE;
+NAME_retune(&state, &derated); /* the copy must stay in memory, unchanged while it is in use */
+```
+"""
+_EXTERNALS = """## Your functions
+
+The controller calls functions that you have to link: FUNCTIONS. `src/NAME.c` declares them.
+
+"""
+_DOUBLE = """- `double` must have 8 bytes; where it has 4 (AVR) the file refuses to compile. A
+  processor without a unit for double (Cortex-M4F) needs about twenty times as long as for single
+  precision.
+
+"""
+
+_ONE_WORD = (
+    "volatile float reference; "
+    "/* the main loop writes it; one word, so that no half of it is read */"
+)
+_FED_FORWARD = """The controller feeds PRIMES of the reference forward, so they are arguments of
+`NAME_step`. They belong to the same move as r: take all of them from one formula (`next_reference`
+below), never from differences of r. At rest they are zero.
+"""
+_MOVES = """`r` is a target: the controller moves its reference there within limits of speed,
+acceleration and jerk, as quickly as they allow; a law with feedforward has the derivatives of the
+move. A new target may come in any sample, also during a move. `r_shaped` of `NAME_get_estimate` is
+the reference; it equals `r` when the move has ended. To stop as soon as the limits allow, call
+`NAME_stopping_point` once and hand its number over as `r` from the next step on. Other limits act
+at once, by `NAME_retune`: `prefilter.v_max`, `prefilter.a_max` and `prefilter.j_max` of the
+parameters, all above zero.
+
+"""
+
+
+def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[str, str]:
+    """Return the text of all files of the library by path.
+
+    Parameters
+    ----------
+    controller
+        the exported controller.
+    source
+        its C code.
+    vectors
+        a run of it.
+    """
+    name, single = source.name, source.precision == "single"
+    one = "1.0f" if single else "1.0"
+    given = "".join(f", r{i + 1}" for i in range(source.derivatives))
+    rows = (
+        f"| `{name}_{call.replace('DERIVATIVES', given)}` | {when} |"
+        for operation, (call, when) in _OPERATIONS.items()
+        if operation in source.operations
+    )
+    path = limits_path(controller)
+    retuning = _RETUNING.replace("PATH", path).replace("ONE", one) if path else ""
+    functions = ", ".join(f"`{each}`" for each in source.externals)
+    externals = _EXTERNALS.replace("FUNCTIONS", functions) if functions else ""
+    values = {
+        "name": name,
+        "NAME": name.upper(),
+        "title": f"Controller {type(in_double_precision(controller)).__name__}",
+        "precision": source.precision,
+        "real": source.real,
+        "one": one,
+        "zero": "0.0f" if single else "0.0",
+        "dt": repr(float(controller.dt)),
+        **_reference_texts(source),
+        "operations": "\n".join(rows),
+        "fast_math": ", and so do the compensated sums" if single else "",
+        "double": "" if single else _DOUBLE,
+        "retuning": retuning.replace("NAME", name),
+        "externals": externals.replace("NAME", name),
+        "external_note": " # and your functions" if functions else "",
+        "link": " YOUR_FILES" if functions else "",
+        "tolerance_reason": TOLERANCE_REASON,
+    }
+    texts = ("CMakeLists.txt", "library.json", "library.properties", "README.md")
+    return {
+        f"src/{name}.h": source.header,
+        f"src/{name}.c": source.source,
+        f"test_{name}.c": test_program(source, vectors),
+        f"examples/{name}/{name}.ino": filled("example.ino", values),
+        **{each: filled(each, values) for each in texts},
+    }
+
+
+def _reference_texts(source: CSource) -> dict[str, str]:
+    """Return the parts of the examples that make the reference of a sample."""
+    count, real = source.derivatives, source.real
+    zero = "0.0f" if source.precision == "single" else "0.0"
+    if not count:
+        moves = "stopping_point" in source.operations
+        target = " /* target of the moves */" if moves else ""
+        return {
+            "about_reference": _MOVES.replace("NAME", source.name) if moves else "",
+            "declared_reference": _ONE_WORD,
+            "defined_reference": f"static {real} reference = {zero};{target}",
+            "next_reference": "",
+            "reference": "reference",
+            "derivatives": "",
+        }
+    primes = ", ".join("r" + "'" * (i + 1) for i in range(count))
+    about = _FED_FORWARD.replace("NAME", source.name).replace("PRIMES", primes)
+    names = f"{real} r[{count + 1}]"
+    return {
+        "about_reference": about,
+        "declared_reference": f"extern void next_reference({names}); /* r, {primes} */",
+        "defined_reference": (
+            f"/* Set r, {primes} of a sample: replace it by your move, with its derivatives. */\n"
+            f"static void next_reference({names})\n{{\n"
+            f"    for (int i = 0; i <= {count}; i++)\n        r[i] = {zero};\n}}"
+        ),
+        "next_reference": f"    {names};\n\n    next_reference(r);\n",
+        "reference": "r[0]",
+        "derivatives": "".join(f", r[{i + 1}]" for i in range(count)),
+    }
+
+
+# ---- Code, constants, state and stack of an exported controller and its functions ----
+
+# Compilers for targets, of which the first that is here measures; then that of this machine.
+_ARM = ("-mthumb", "-mfloat-abi=hard")
+_TARGETS = {
+    "single": ("Cortex-M4F", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *_ARM)),
+    "double": ("Cortex-M7", ("-mcpu=cortex-m7", "-mfpu=fpv5-d16", *_ARM)),
+}
+_CROSS = "arm-none-eabi-"
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
+"""Flags with which the golden vectors hold bit for bit."""
+# A compiler that takes longer hangs: the largest learners take some seconds.
+_LONGEST = 120.0
+# gcc 10 and later write the calls of functions, with the stack of each.
+_CALLS = "-fcallgraph-info=su"
+
+
+class Sizes(NamedTuple):
+    """Bytes that a controller takes on a processor.
+
+    Attributes
+    ----------
+    processor, compiler
+        for which, and by which compiler (with ``-O2``).
+    code, constants
+        of all functions, without the C library.
+    state, parameters
+        of one ``NAME_state``, and of one ``NAME_parameters``, which is part of the constants.
+    stack
+        of ``NAME_step`` and all it calls, without the C library; None if the compiler can't tell.
+    """
+
+    processor: str
+    compiler: str
+    code: int
+    constants: int
+    state: int
+    parameters: int
+    stack: int | None
+
+
+class FunctionSize(NamedTuple):
+    """What a public function of an exported controller takes on a processor.
+
+    Attributes
+    ----------
+    name
+        of the function.
+    stack
+        bytes at most, with all it calls, without the C library; None if the compiler can't tell.
+    instructions
+        of its code and that of all functions it calls, each counted once; not how many run.
+    """
+
+    name: str
+    stack: int | None
+    instructions: int
+
+
+class NoCompilerError(ValueError):
+    """There is no C compiler for what is asked, or it fails."""
+
+
+def measured_sizes(name: str, header: str, source: str, precision: str) -> Sizes:
+    """Return the sizes of a controller, whose files are given as texts.
+
+    Raises
+    ------
+    NoCompilerError
+        if there is no gcc; and if it fails, with its first message.
+    """
+    processor, prefix, flags = _compiler(precision)
+    with tempfile.TemporaryDirectory(prefix="quell-sizes-") as folder:
+        place = Path(folder)
+        (place / f"{name}.h").write_text(header, encoding="utf-8")
+        (place / f"{name}.c").write_text(source, encoding="utf-8")
+        structs = f'#include "{name}.h"\nchar of_state[sizeof({name}_state)];\n'
+        structs += f"char of_parameters[sizeof({name}_parameters)];\n"
+        (place / "structs.c").write_text(structs, encoding="utf-8")
+        _run(place, f"{prefix}gcc", *FLAGS, *flags, _CALLS, "-c", f"{name}.c", "structs.c")
+        sections = _run(place, f"{prefix}size", "-A", f"{name}.o")
+        symbols = _run(place, f"{prefix}nm", "-S", "structs.o")
+        calls = place / f"{name}.ci"
+        stack = stack_of(f"{name}_step", calls.read_text(encoding="utf-8"))
+    return Sizes(
+        processor,
+        f"{prefix}gcc",
+        _sum(sections, ".text"),
+        _sum(sections, ".rodata"),
+        _size_of("of_state", symbols),
+        _size_of("of_parameters", symbols),
+        stack,
+    )
+
+
+def function_sizes(
+    name: str, header: str, source: str, precision: str, operations: Iterable[str]
+) -> tuple[str, tuple[FunctionSize, ...]]:
+    """Return a text that names processor and compiler, and what each public function takes.
+
+    Arguments and errors are those of ``measured_sizes``; ``operations`` are the names of the
+    functions without prefix.
+    """
+    processor, prefix, flags = _compiler(precision)
+    if shutil.which(f"{prefix}objdump") is None:
+        raise NoCompilerError(f"there is no {prefix}objdump here")
+    with tempfile.TemporaryDirectory(prefix="quell-sizes-") as folder:
+        place = Path(folder)
+        (place / f"{name}.h").write_text(header, encoding="utf-8")
+        (place / f"{name}.c").write_text(source, encoding="utf-8")
+        _run(place, f"{prefix}gcc", *FLAGS, *flags, _CALLS, "-c", f"{name}.c")
+        code = _run(place, f"{prefix}objdump", "-d", "--no-show-raw-insn", f"{name}.o")
+        calls = (place / f"{name}.ci").read_text(encoding="utf-8")
+    counts = _instructions(code)
+    edges = _edges(calls)
+    found = []
+    for function in (f"{name}_{each}" for each in operations):
+        reached, waiting = {function}, [function]
+        while waiting:
+            more = edges.get(waiting.pop(), set()) - reached
+            reached |= more
+            waiting += more
+        total = sum(counts.get(each, 0) for each in reached)
+        found.append(FunctionSize(function, stack_of(function, calls), total))
+    return f"{processor}, {prefix}gcc {' '.join(FLAGS[1:])}", tuple(found)
+
+
+def _instructions(code: str) -> dict[str, int]:
+    """Return the number of instructions of each function in a listing of objdump."""
+    counts: dict[str, int] = {}
+    function = ""
+    for line in code.splitlines():
+        head = re.fullmatch(r"[0-9a-f]+ <([\w.]+)>:", line)
+        if head:
+            function = head[1]
+        elif re.match(r"\s+[0-9a-f]+:\t", line) and not re.search(r"\t\.(word|short|byte)", line):
+            counts[function] = counts.get(function, 0) + 1
+    return counts
+
+
+def _compiler(precision: str) -> tuple[str, str, tuple[str, ...]]:
+    """Return the processor, the prefix of the compiler's programs, and its flags."""
+    processor, flags = _TARGETS[precision]
+    for found in ((processor, _CROSS, flags), (platform.machine(), "", ())):
+        if all(shutil.which(found[1] + program) for program in ("gcc", "size", "nm")):
+            return found
+    raise NoCompilerError("there is no gcc here")
+
+
+def _run(folder: Path, *command: str) -> str:
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST, check=False
+    )
+    if done.returncode:
+        lines = [line for line in done.stderr.splitlines() if "error" in line]
+        raise NoCompilerError(f"{command[0]} fails: {(lines or [done.stderr.strip()])[0]}")
+    return done.stdout
+
+
+def _sum(sections: str, kind: str) -> int:
+    pattern = rf"^{re.escape(kind)}\S*\s+(\d+)"
+    return sum(int(size) for size in re.findall(pattern, sections, re.MULTILINE))
+
+
+def _size_of(symbol: str, symbols: str) -> int:
+    found = re.search(rf"^\S+ (\S+) \w {symbol}$", symbols, re.MULTILINE)
+    if found is None:
+        raise NoCompilerError("the output of nm is not known")
+    return int(found[1], 16)
+
+
+def stack_of(function: str, calls: str) -> int | None:
+    """Return the stack of a function and the deepest of its calls, from the graph of gcc.
+
+    ``calls`` is the content of the ``.ci`` file, in the format VCG. Functions of other files count
+    as zero. None if the graph lacks the function.
+    """
+    own = {
+        found[1].rpartition(":")[2]: int(found[2])
+        for found in re.finditer(
+            r'node: \{ title: "([^"]+)" label: "[^"]*?(\d+) bytes', calls.replace("\\n", " ")
+        )
+    }
+    edges = _edges(calls)
+
+    def depth(name: str) -> int:
+        return own.get(name, 0) + max((depth(each) for each in edges.get(name, ())), default=0)
+
+    return depth(function) if function in own else None
+
+
+def _edges(calls: str) -> dict[str, set[str]]:
+    """Return the functions that each function calls, from the graph of gcc."""
+    edges: dict[str, set[str]] = {}
+    for found in re.finditer(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"', calls):
+        caller, called = (found[i].rpartition(":")[2] for i in (1, 2))
+        edges.setdefault(caller, set()).add(called)
+    return edges
+
+
+# ---- Single precision compared with double, in a scenario ----
+
+# Largest RMS difference of u that is accepted, relative to the RMS of u. Rounding acts on
+# u as noise does. One per cent of it is what a 6-bit converter adds, and does not show in y
+# (a torsional axis: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
+# unless the rounding of y itself, times omega_o^(n+1), is too much for u.
+LIMIT = 0.01
+
+
+class Comparison(NamedTuple):
+    """RMS differences in a scenario, relative to the RMS of the signal in double precision.
+
+    Attributes
+    ----------
+    u, y
+        of a run in single precision.
+    u_noise, y_noise
+        of a run in double precision without measurement noise; None if the scenario has none.
+    diverged
+        whether the run in single precision diverged, and that in double did not.
+    """
+
+    u: float
+    y: float
+    u_noise: float | None
+    y_noise: float | None
+    diverged: bool
+
+    def check(self, controller: Any) -> None:
+        """Raise a ``ValueError`` if single precision differs too much for ``controller``."""
+        if not self.diverged and self.u <= LIMIT:
+            return
+        what = "diverges" if self.diverged else f"changes u by {100 * self.u:.2g} % RMS"
+        raise ValueError(
+            f"precision = 'single': {what} in this scenario, and {100 * LIMIT:g} % is the limit; "
+            f"{_remedy(controller)}, or double precision would help; accept=True (--accept) "
+            "writes it all the same"
+        )
+
+
+def _remedy(controller: Any) -> str:
+    """Return what makes rounding smaller: of the learner's points, or else of y."""
+    learner = getattr(without_prefilters(in_double_precision(controller)), "learner", None)
+    if isinstance(learner, GaussianProcess) and learner.model.novelty < SINGLE_NOVELTY:
+        return (
+            f"novelty={SINGLE_NOVELTY:g} of GaussianProcess (points so close that the inverse of "
+            "their covariance loses its digits are then not stored)"
+        )
+    return (
+        "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
+        "resolution=, --resolution)"
+    )
+
+
+def compared(plant: Plant, controller: Any, scenario: Scenario) -> Comparison:
+    """Return what single precision changes in a scenario, and what the measurement noise does."""
+    controller = in_double_precision(controller)
+    double = simulate(plant, controller, scenario)
+    single = simulate(plant, controller, scenario, precision="single")
+    u_noise = y_noise = None
+    if not (isinstance(scenario.noise, int | float) and scenario.noise == 0.0):
+        quiet = simulate(plant, controller, replace(scenario, noise=0.0))
+        u_noise, y_noise = (_difference(double, quiet, name) for name in ("u", "y"))
+    return Comparison(
+        _difference(double, single, "u"),
+        _difference(double, single, "y"),
+        u_noise,
+        y_noise,
+        single.diverged and not double.diverged,
+    )
+
+
+def _difference(reference: Any, other: Any, name: str) -> float:
+    """Return the RMS difference, relative to the RMS of the reference."""
+    count = min(len(reference), len(other))
+    one, two = reference[name][:count], other[name][:count]
+    size, change = (float(np.sqrt(np.mean(np.square(each)))) for each in (one, two - one))
+    if change == 0.0:
+        return 0.0
+    return change / size if size > 0.0 else math.inf
+
+
+# ---- c ----
 
 # Targets that CMake, or a program for which it writes, has of its own.
 _CMAKE_TARGETS = """all all_build clean edit_cache help install list_install_components package

@@ -7,24 +7,33 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from quell.export.translate.blocks import words
-from quell.export.translate.calls import Calls
-from quell.export.translate.expressions import Expressions
-from quell.export.translate.findings import Findings
-from quell.export.translate.functions import Function
-from quell.export.translate.layout import block_lines, comment_block, wrapped
-from quell.export.translate.literals import Literals
-from quell.export.translate.naming import function_name, snake_case, unique
-from quell.export.translate.source import (
+from quell.export.translate.expressions import Calls, Expressions
+from quell.export.translate.statements import Function
+from quell.export.translate.structs import (
+    Findings,
     Source,
+    Structs,
     doc_of,
     into_procedure,
     local_names,
     module_doc,
     read_function,
 )
-from quell.export.translate.structs import Structs
-from quell.export.translate.values import Array, Kind, Struct, TranslationError, Value
+from quell.export.translate.text import (
+    Array,
+    Kind,
+    Literals,
+    Struct,
+    TranslationError,
+    Value,
+    block_lines,
+    comment_block,
+    function_name,
+    snake_case,
+    unique,
+    words,
+    wrapped,
+)
 
 # Helper functions in C; "real" stands for float or double, "" for the suffix of functions.
 _HELPERS = {

@@ -3,23 +3,53 @@
 All plants of a set are sampled with the controller's dt, dead time and lag included, and have their
 responses at the same frequencies. The responses are exact (``analysis.frequency_response``). The
 grid only brackets: ``peaks`` finds the largest values between its points.
+
+The linear law of a controller in closed form, quick enough for each step of a search.
+
+``quell.analysis`` measures the same matrices on the controller's own kernel, for any form of
+observer; here they are derived, for the forms that the structures of tuning make. Without learner,
+guard and nonlinear parts the state of an ADRC is the observer's prediction z⁻, its input the error
+``e = y − z⁻_1``. With the correction ``z = J z⁻ + H e`` and the estimates ``x̂ = T z⁻ + D e``::
+
+    z⁻⁺ = F z + Γ u = F J z⁻ + F H e + Γ u
+    u   = ( k_1 r + k_2 r' + … + r^(m) + (a − k)·x̂_{1…n} − Δf̂ ) / b0        (``law.py``)
+
+For an ESO (``observers/forms.py``) ``F = Φ``, ``H = L`` and ``J = I``; in the predictor form the
+estimates are z⁻ itself. In a cascade of p levels (``observers/forms.py``) each level corrects the
+next one. The terms with r', r'', … are left out: they change no pole.
+
+Responses of linear loops over time, for objectives and limits of u that are about them.
+
+The closed loop of a sampled plant and a law is linear, so every response is the convolution of a
+pulse response with the input. The pulse response ``D, C B, C A B, …`` is computed in blocks: with
+``R = (C; C A; …; C A^(b−1))`` and ``A^b``, b terms are one product.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, singledispatch
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.frequency_response import Complex, Response, frequencies, in_s_plane
-from quell.analysis.pure_delays import eigenvalues
-from quell.lti.system import System
-from quell.plants.sampled import SampledPlant
-from quell.types import Matrix, Vector
+from quell.analysis.loop import closed_loop
+from quell.analysis.margins import Complex, Response, eigenvalues, frequencies, in_s_plane
+from quell.controllers.base import Controller
+from quell.controllers.law import AdrcDesign, LinearFeedback, ModelFeedforward
+from quell.controllers.linear import LinearDesign, LinearLaw
+from quell.guard import UnguardedDesign
+from quell.learners.base import NoLearnerDesign
+from quell.lti.models import System
+from quell.observers.forms import CascadeModel, DelayedModel, EsoModel, without_delay
+from quell.plants.linear import SampledPlant
+from quell.tuning.structures.base import Structure
+from quell.types import DesignWarning, Matrix, Vector
+
+# ---- The loops of many controllers with a set of plants ----
 
 # The lowest frequency of the grid, in units of the phase crossover; a pole below a tenth of it
 # counts as an integrator.
@@ -244,3 +274,223 @@ def _beside(omega: Vector, poles: Complex) -> NDArray[np.bool_]:
     distance = np.abs(omega[:, None] / poles.imag[None, :] - 1.0)
     near: NDArray[np.bool_] = np.any(distance < 0.2, axis=1)
     return near
+
+
+# ---- The linear law of a controller in closed form, quick enough for each step of a search ----
+
+
+def law_of(controller: Controller) -> LinearLaw:
+    """Return the law of a linear controller, driven by y and by the applied u without delay.
+
+    Raises ``ValueError`` for a controller that is not linear.
+    """
+    law = _law(controller.parameters)
+    if law is None:
+        raise ValueError(f"controller = {controller!r}: must be linear")
+    return law
+
+
+class Prediction(NamedTuple):
+    """The matrices above for an observer of s states and N estimates."""
+
+    F: Matrix  # (s, s)
+    input: Vector  # Γ (s,)
+    J: Matrix  # (s, s)
+    H: Vector  # (s,)
+    T: Matrix  # (N, s)
+    D: Vector  # (N,)
+
+
+@singledispatch
+def _prediction(model: Any) -> Prediction | None:
+    """Return the matrices of a linear observer without delay; None for another one."""
+    return None
+
+
+@_prediction.register
+def _of_eso(model: EsoModel) -> Prediction:
+    size = model.gain.size
+    unit, L = np.eye(size), model.gain
+    D = np.zeros(size) if model.predictor else L
+    return Prediction(model.transition, model.input, unit, L, unit, D)
+
+
+@_prediction.register
+def _of_cascade(model: CascadeModel) -> Prediction:
+    levels, size = model.gains.shape
+    states, n = levels * size, model.at_f
+    F, J, H = np.zeros((states, states)), np.eye(states), np.zeros(states)
+    error, error_e = np.zeros(states), 1.0  # of a level, from z⁻ and from e
+    for level in range(levels):
+        own = slice(level * size, (level + 1) * size)
+        F[own, own] = model.transition
+        for before in range(level):
+            F[own, before * size + n] = model.feed
+        J[own] += np.outer(model.gains[level], error)
+        H[own] = model.gains[level] * error_e
+        error, error_e = J[level * size].copy(), H[level * size]  # less the next level's z⁻_1
+        error[(level + 1) * size % states] -= 1.0
+    last = np.zeros((size, states))
+    last[:, states - size :] = np.eye(size)
+    for i in range(n, size):
+        last[i, i::size] = 1.0  # Δf̂ and its derivatives are sums over the levels
+    return Prediction(F, np.tile(model.input, levels), J, H, last @ J, last @ H)
+
+
+@singledispatch
+def _law(parameters: Any) -> LinearLaw | None:
+    """Return the law of a controller with ``parameters``; None if it has none."""
+    return None
+
+
+@_law.register
+def _of_linear_controller(design: LinearDesign) -> LinearLaw:
+    return design.law
+
+
+@_law.register
+def _of_adrc(design: AdrcDesign) -> LinearLaw | None:
+    kinds = tuple(map(type, (design.learner, design.guard, design.feedback)))
+    found = _prediction(without_delay(design.eso))
+    if isinstance(design.feedforward, ModelFeedforward):
+        return None  # it acts on the observer with derivatives of r, and friction is not linear
+    if found is None or kinds != (NoLearnerDesign, UnguardedDesign, LinearFeedback):
+        return None
+    order = design.law.size
+    gains = np.zeros(found.D.size)
+    gains[: order + 1] = np.append(design.cancel - design.law, -design.cancel_f) / design.b0
+    law = LinearLaw(
+        A=found.F @ found.J,
+        B_r=np.zeros(found.H.size),
+        B_y=found.F @ found.H,
+        B_u=found.input,
+        C=gains @ found.T,
+        D_r=design.law[0] / design.b0,
+        D_y=float(gains @ found.D),
+    )
+    first = np.eye(law.C.size)[0]  # e = y − z⁻_1
+    law = law._replace(A=law.A - np.outer(law.B_y, first), C=law.C - law.D_y * first)
+    return _delayed(law, design.eso.samples) if isinstance(design.eso, DelayedModel) else law
+
+
+def _delayed(law: LinearLaw, samples: int) -> LinearLaw:
+    """Return the law with u acting on its state ``samples`` later, as further states."""
+    m = law.C.size
+    A = np.zeros((m + samples, m + samples))
+    A[:m, :m], A[:m, -1] = law.A, law.B_u
+    A[m + 1 :, m:-1] = np.eye(samples - 1)
+    B_u = np.zeros(m + samples)
+    B_u[m] = 1.0
+    none = np.zeros(samples)
+    B_r, B_y = np.append(law.B_r, none), np.append(law.B_y, none)
+    return LinearLaw(A, B_r, B_y, B_u, np.append(law.C, none), law.D_r, law.D_y)
+
+
+# ---- Responses of linear loops over time, for objectives and limits of u that are about them ----
+
+# Controllers whose responses are kept: those of one difference quotient, and some more.
+_KEPT = 64
+# Responses last so many radians of the plant's phase crossover, and at most so many samples.
+_LASTS, _MOST_SAMPLES = 150.0, 50_000
+# Beyond, a response is that of an unstable loop: it would overflow.
+_DIVERGED = 1e100
+
+
+class Inputs(NamedTuple):
+    """Inputs of a loop: the reference and the load at the plant's input, sample by sample.
+
+    With the feedforward of a model the loop is that of the errors ``y − r`` and ``u − u_ff``
+    (``controllers/feedforward.py``): the law sees ``y − r`` with a reference of zero, and the
+    plant has u_ff besides what the law gives.
+    """
+
+    r: Vector  # (k,) [y-unit]
+    d: Vector  # (k,) [u-unit]
+    u_ff: Vector | None = None  # (k,) [u-unit]
+
+    def of_loop(self) -> tuple[tuple[str, Vector], ...]:
+        """Return the inputs of the linear loop by their names in ``closed_loop``."""
+        if self.u_ff is None:
+            return ("r", self.r), ("d", self.d)
+        return ("n", -self.r), ("d", self.d + self.u_ff)
+
+
+def load_step(plants: PlantSet, size: float = 1.0, duration: float | None = None) -> Inputs:
+    """Return a step of the load, by default for 150 radians of the plants' crossover."""
+    last = _LASTS / plants.crossover if duration is None else duration
+    count = max(min(round(last / plants.dt), _MOST_SAMPLES), 10)
+    return Inputs(np.zeros(count), np.full(count, size))
+
+
+class SetResponses:
+    """The responses of plants of a set, kept for the last controllers that were asked for.
+
+    ``members`` are the numbers of these plants, all by default.
+    """
+
+    def __init__(
+        self, plants: PlantSet, inputs: Inputs, members: Sequence[int] | None = None
+    ) -> None:
+        self.plants, self.inputs = plants, inputs
+        scaled = plants.scaled()
+        self._scaled = scaled if members is None else [scaled[i] for i in members]
+        self._known: dict[tuple[int, bytes, str], list[Vector]] = {}
+
+    def of(self, structure: Structure, values: Vector, target: str = "y") -> list[Vector]:
+        """Return y or u with the controller of values (p,), one array (k,) for each plant."""
+        key = id(structure), values.tobytes(), target
+        if key not in self._known:
+            if len(self._known) >= _KEPT:
+                self._known.clear()
+            with warnings.catch_warnings():
+                # Of controllers on the way of a search; the result's own is made with warnings.
+                warnings.simplefilter("ignore", DesignWarning)
+                law = law_of(structure.controller(values))
+            self._known[key] = [response(p, law, self.inputs, target) for p in self._scaled]
+        return self._known[key]
+
+
+def response(plant: SampledPlant, law: LinearLaw, inputs: Inputs, target: str = "y") -> Vector:
+    """Return y or u (k,) of a loop from rest; infinite for an unstable one that overflows."""
+    size = inputs.r.size
+    total = np.zeros(size)
+    if target == "u" and inputs.u_ff is not None:
+        total += inputs.u_ff
+    for source, given in inputs.of_loop():
+        if np.any(given):
+            pulse = _pulse(closed_loop(plant, law, source, target), size)
+            if not np.max(np.abs(pulse)) < _DIVERGED:
+                return np.full(size, np.inf)
+            total += _convolved(pulse, given)
+    return total
+
+
+def _convolved(one: Vector, other: Vector) -> Vector:
+    """Return the first terms of the convolution of two vectors of the same length."""
+    found: Vector
+    if np.ptp(other) == 0.0:
+        found = other[0] * np.cumsum(one)
+        return found
+    length = 1 << (2 * one.size - 1).bit_length()
+    product = np.fft.rfft(one, length) * np.fft.rfft(other, length)
+    found = np.fft.irfft(product, length)[: one.size]
+    return found
+
+
+def _pulse(system: System, size: int) -> Vector:
+    """Return ``D, C B, C A B, …`` (size,)."""
+    N, B, C, D = System.balanced(*system)
+    n = N.shape[0]
+    block = max(math.isqrt(size), 1)
+    rows, x = np.empty((block, n)), B.copy()
+    rows[0] = C
+    for i in range(1, block):
+        rows[i] = rows[i - 1] + rows[i - 1] @ N
+    jump = np.linalg.matrix_power(N + np.eye(n), block)
+    count = -(-(size - 1) // block)
+    parts = np.empty((count, block))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i in range(count):
+            parts[i] = rows @ x
+            x = jump @ x
+    return np.append(D, parts.ravel()[: size - 1])

@@ -4,11 +4,20 @@
 controller from them, and a ``Problem``. May import ``executors`` and what stands before ``tuning``.
 """
 
-from quell.tuning.simulated.problem import Checked, Objective, Problem, Sample
-from quell.tuning.simulated.result import Candidate, Search
-from quell.tuning.simulated.search import search
-from quell.tuning.simulated.space import SearchRange, Space
-from quell.tuning.simulated.statistics import FailureRate, Mean, Quantile, Statistic, Worst
+from quell.tuning.simulated.problem import (
+    Checked,
+    FailureRate,
+    Mean,
+    Objective,
+    Problem,
+    Quantile,
+    Sample,
+    SearchRange,
+    Space,
+    Statistic,
+    Worst,
+)
+from quell.tuning.simulated.search import Candidate, Search, search
 
 __all__ = [
     "Candidate",

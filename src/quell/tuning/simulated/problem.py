@@ -3,6 +3,11 @@
 A sample is whatever differs between runs: a plant and the scenario that it runs through, or
 anything that the function ``evaluate`` understands. All candidates see the same samples with the
 same seeds (common random numbers), so a difference of scores is one of the candidates.
+
+Statistics of the scores on many samples: one number, and its confidence interval.
+
+A score is better if it is lower; one that is not a number counts as infinite. All intervals have
+95 % confidence, are two-sided and hold for samples that were not used for the search.
 """
 
 from __future__ import annotations
@@ -10,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -19,10 +24,195 @@ from quell.controllers.base import Controller
 from quell.plants.base import Plant
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
-from quell.simulation.scenario import check_scenario
-from quell.sweeping.shares import share_interval
-from quell.tuning.simulated.statistics import Mean, Statistic
-from quell.types import Matrix
+from quell.simulation.driver import check_scenario
+from quell.sweeping.sweep import share_interval
+from quell.types import Matrix, Vector
+
+# ---- The ranges in which a search varies parameters ----
+
+
+@dataclass(frozen=True)
+class SearchRange:
+    """The range of one parameter.
+
+    Parameters
+    ----------
+    low, high
+        its ends, which are allowed values.
+    log
+        whether the search moves in its logarithm; by default for a range above zero.
+    whole
+        whether only whole numbers are allowed.
+
+    Raises
+    ------
+    ValueError
+        for ends that are not finite or not in order, or a logarithm of numbers that are not above
+        zero.
+    """
+
+    low: float
+    high: float
+    log: bool | None = None
+    whole: bool = False
+
+    def __post_init__(self) -> None:
+        low, high = checks.finite("low", self.low), checks.finite("high", self.high)
+        if not low < high:
+            raise ValueError(f"low = {low!r}, high = {high!r}: low must be below high")
+        if self.log and low <= 0.0:
+            raise ValueError(f"low = {low!r}: must be above zero in a logarithmic range")
+        if self.whole and (int(low) != low or int(high) != high):
+            raise ValueError(f"low = {low!r}, high = {high!r}: must be whole numbers")
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether the search moves in the logarithm."""
+        return self.low > 0.0 if self.log is None else self.log
+
+    def suggested(self, trial: Any, name: str) -> float:
+        """Return the value that a trial of Optuna suggests for the parameter ``name``."""
+        if self.whole:
+            low, high = int(self.low), int(self.high)
+            return float(trial.suggest_int(name, low, high, log=self.is_logarithmic))
+        return float(trial.suggest_float(name, self.low, self.high, log=self.is_logarithmic))
+
+
+Space = Mapping[str, SearchRange]
+"""The ranges of all parameters, by name."""
+
+
+def checked_space(space: Any) -> Space:
+    """Return ``space`` if it maps names to ranges and is not empty."""
+    if not isinstance(space, Mapping) or not space:
+        raise ValueError(
+            f"space = {space!r}: must be a dictionary of at least one SearchRange, by name"
+        )
+    for name, value in space.items():
+        if not isinstance(value, SearchRange):
+            raise ValueError(f"space[{name!r}] = {value!r}: must be a SearchRange(low, high)")
+    return space
+
+
+def checked_start(space: Space, start: Mapping[str, float]) -> dict[str, float]:
+    """Return a start of the search, if it has a value within the range of each parameter."""
+    if set(start) != set(space):
+        names = ", ".join(space)
+        raise ValueError(f"starts has {sorted(start)}: each start must have a value for {names}")
+    for name, value in start.items():
+        low, high = space[name].low, space[name].high
+        if not low <= checks.finite(f"starts: {name}", value) <= high:
+            raise ValueError(f"starts: {name} = {value!r}: must lie within {low:g} … {high:g}")
+    return {name: float(start[name]) for name in space}
+
+
+# ---- Statistics of the scores on many samples ----
+
+_CONFIDENCE = 0.95
+
+
+class Statistic(Protocol):
+    """A number that stands for the scores on all samples."""
+
+    def value(self, scores: Vector) -> float:
+        """Return the number for scores (samples,)."""
+        ...
+
+    def interval(self, scores: Vector) -> tuple[float, float]:
+        """Return the ends of its confidence interval."""
+        ...
+
+
+@dataclass(frozen=True)
+class Mean:
+    """The mean; its interval is that of the central limit theorem."""
+
+    def value(self, scores: Vector) -> float:
+        """Return the mean of scores (samples,)."""
+        return float(np.mean(_numbers(scores)))
+
+    def interval(self, scores: Vector) -> tuple[float, float]:
+        """Return mean ± t s/√n; infinite with one sample."""
+        from scipy.stats import t
+
+        scores = _numbers(scores)
+        n, middle = scores.size, self.value(scores)
+        if n < 2 or not math.isfinite(middle):
+            return -math.inf, math.inf
+        half = float(t.ppf(0.5 + 0.5 * _CONFIDENCE, n - 1) * np.std(scores, ddof=1) / math.sqrt(n))
+        return middle - half, middle + half
+
+
+@dataclass(frozen=True)
+class Quantile:
+    """The least score that a share ``level`` of the samples does not exceed.
+
+    Its interval is free of assumptions on the distribution: its ends are the scores whose ranks are
+    the binomial distribution's quantiles (David & Nagaraja, *Order Statistics*, 3rd ed., 7.1).
+    """
+
+    level: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < checks.finite("level", self.level) < 1.0:
+            raise ValueError(f"level = {self.level!r}: must be between 0 and 1, without them")
+
+    def value(self, scores: Vector) -> float:
+        """Return the quantile of scores (samples,)."""
+        ordered = np.sort(_numbers(scores))
+        # Rounding must not move 0.9 · 10 to the tenth score.
+        return float(ordered[max(math.ceil(self.level * ordered.size - 1e-9), 1) - 1])
+
+    def interval(self, scores: Vector) -> tuple[float, float]:
+        """Return two of the scores, or infinite ends if there are too few samples."""
+        from scipy.stats import binom
+
+        ordered = np.sort(_numbers(scores))
+        n, tail = ordered.size, 0.5 * (1.0 - _CONFIDENCE)
+        # P(S_(i) ≤ q ≤ S_(j)) ≥ F(j − 1) − F(i − 1), with F of Binomial(n, level).
+        i = int(binom.ppf(tail, n, self.level))
+        j = int(binom.ppf(1.0 - tail, n, self.level)) + 1
+        low = float(ordered[i - 1]) if i >= 1 else -math.inf
+        return low, float(ordered[j - 1]) if j <= n else math.inf
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The largest score; nothing bounds that of further samples, so its interval is open."""
+
+    def value(self, scores: Vector) -> float:
+        """Return the largest of scores (samples,)."""
+        return float(np.max(_numbers(scores)))
+
+    def interval(self, scores: Vector) -> tuple[float, float]:
+        """Return the largest score and infinity."""
+        return self.value(scores), math.inf
+
+
+@dataclass(frozen=True)
+class FailureRate:
+    """The share of samples whose score is above ``limit``.
+
+    A score may be a truth value: True, a failure, is above the default limit. The interval is that
+    of Clopper & Pearson (*Biometrika* 26, 1934).
+    """
+
+    limit: float = 0.5
+
+    def value(self, scores: Vector) -> float:
+        """Return the share of scores (samples,) above the limit."""
+        return float(np.mean(_numbers(scores) > self.limit))
+
+    def interval(self, scores: Vector) -> tuple[float, float]:
+        """Return the exact interval of a binomial share."""
+        return share_interval(int(np.sum(_numbers(scores) > self.limit)), scores.size)
+
+
+def _numbers(scores: Vector) -> Vector:
+    return np.where(np.isnan(scores), np.inf, scores)
+
+
+# ---- Objectives of a search by simulation ----
 
 Score: TypeAlias = str | Callable[[Trajectory], float]
 """A name of ``Trajectory.metrics``, as ``"iae"``, or a function of a run; lower is better."""

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quell.analysis.frequency_response import Complex
-from quell.controllers.adrc.feedforward import Feedforward
+from quell.analysis.margins import Complex
 from quell.controllers.base import Controller
+from quell.controllers.feedforward import Feedforward
 from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
 from quell.types import Matrix, Vector

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from quell import checks
-from quell.lti.reduction import design_models
+from quell.lti.canonical import design_models
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
-from quell.tuning.structures.lqg import LqgStructure
-from quell.tuning.structures.p_pi import CascadeStructure
-from quell.tuning.structures.pid import FilteredPID
+from quell.tuning.structures.baselines import CascadeStructure, FilteredPID, LqgStructure
 
 _PID = {
     "pi": (False, True),

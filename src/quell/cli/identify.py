@@ -1,0 +1,346 @@
+"""``quell identify``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quell.cli.options import (
+    MODEL_OPTIONS,
+    OUTPUTS,
+    READ_OPTIONS,
+    ModelOptions,
+    Outputs,
+    Overwrite,
+    ReadOptions,
+    Trust,
+    Whole,
+    WholeOrNone,
+    refuse,
+)
+from quell.cli.output import Console, check_outputs, print_line, table, write_results
+
+if TYPE_CHECKING:
+    from quell.identification import Alternative, Identified, Root
+
+# ---- quell identify ----
+
+# Fits below which u and y may be swapped, and above which they are [%]: chosen by hand.
+_COLLAPSED, _GOOD = 20.0, 60.0
+_HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping")
+
+
+def identify(
+    *data: Path,
+    order: Whole = 4,
+    delay: float = 0.0,
+    dt: float | None = None,
+    horizon: Whole = 10,
+    validate: Path | None = None,
+    alternatives: bool = True,
+    read: ReadOptions = READ_OPTIONS,
+    of_model: ModelOptions = MODEL_OPTIONS,
+    outputs: Outputs = OUTPUTS,
+) -> None:
+    """Fit a continuous transfer function to recorded input and output.
+
+    Parameters
+    ----------
+    data
+        Records: tables t,u,y in text, recordings of quell run-rig, saved runs (.nc). Several have
+        one model, each its own initial state and constant force. A further column of --columns is
+        the external input of a closed loop.
+    order
+        Number of poles.
+    delay
+        Delay of u [s]; with --max-delay the shortest one.
+    dt
+        Sample time [s] of a record without times; columns are then u,y by default.
+    horizon
+        Number of samples of the prediction ahead.
+    validate
+        Another record, with the same columns, on which the model is judged, too.
+    alternatives
+        Fit other orders, with and without friction, and say what the record decides.
+    """
+    from quell.commissioning import measured_records
+    from quell.identification import alternatives as other_structures
+    from quell.identification import identify
+
+    how = read.columns, dt, read.time_unit, read.max_size
+    records = measured_records(data, *how)
+    record, several = records[0], len(records) > 1
+    most = of_model.max_delay
+    delays = delay if most is None else (delay, most)
+    options: dict[str, Any] = {
+        "friction": bool(of_model.friction),
+        "held_out": of_model.held_out,
+        "horizon": horizon,
+        "delay": delays,
+        "integrators": of_model.integrators,
+        "rest": of_model.rest,
+        "signals": record.signals,
+    }
+    if read.columns:  # a recording of a loop has a reference, which need not be used
+        options["reference"] = record.reference
+    if validate is not None:
+        _, other = measured_records([data[0], validate], *how)
+        options["validation"] = other.u, other.y
+    outputs = check_outputs(outputs, ["identified"])
+    console = Console()
+    u, y = [one.u for one in records], [one.y for one in records]
+    with console.status("Searching; the first time, code is compiled for some seconds."):
+        model = identify(
+            u if several else u[0],
+            y if several else y[0],
+            record.dt,
+            order,
+            of_model.zeros,
+            **options,
+        )
+    _print(console, model, ", ".join(path.name for path in data))
+    if model.held_from == model.y.size and of_model.held_out is None and not several:
+        print_line(console, "nothing is held out: u does not move at the end of the record")
+    if not several and _look_swapped(model, order, delays):
+        print_line(console, "NOT: u and y look swapped: the reverse fits well; see --columns")
+    others: tuple[Alternative, ...] = ()
+    if alternatives:
+        given: dict[str, Any] = {
+            "integrators": of_model.integrators,
+            "friction": of_model.friction,
+        }
+        if most is not None:
+            given["delay"] = delays
+        with console.status("Fitting other structures."):
+            others = other_structures(model, **given)
+    for line in filter(None, (one.describe(model) for one in others)):
+        print_line(console, line)
+    paths: list[Path] = []
+    if outputs.figures:
+        from quell.experiments.common import save_figure
+
+        figure = model.plot()[0].figure
+        paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
+    results = model.to_json() | {"alternatives": [one.to_json() for one in others]}
+    write_results(console, results, outputs, paths)
+
+
+def _look_swapped(model: Identified, order: int, delays: Any) -> bool:
+    """Return whether y explains u where u explains nothing of y."""
+    from quell.identification import identify
+
+    if model.fits["estimation"] > _COLLAPSED:
+        return False
+    try:
+        other = identify(model.y, model.u, model.dt, order, delay=delays, rest=False, held_out=0.0)
+    except ValueError:
+        return False
+    return other.fits["estimation"] > _GOOD
+
+
+def _print(console: Console, model: Identified, source: str) -> None:
+    from quell.identification.result import percent
+
+    lines = model.describe().splitlines()
+    print_line(console, f"{source}: {model.y.size} samples, dt = {model.dt:g} s")
+    print_line(console, "\n".join(lines[:2]))
+    roots = table("Poles and zeros", "", *_HEADINGS)
+    for name, group in (("pole", model.poles), ("zero", model.zeros)):
+        for root in group:
+            roots.add_row(name, *_cells(root))
+    console.print(roots)
+    fits = table("Fit (NRMSE)", "on", "%")
+    for name, value in model.fits.items():
+        ahead = f" {model.horizon} samples ahead" if name.endswith("predicted") else ""
+        fits.add_row(name + ahead, percent(value))
+    console.print(fits)
+    rest = lines[next(i for i, line in enumerate(lines) if line.startswith("gain ")) :]
+    print_line(console, "\n".join(line for line in rest if not line.startswith("fit, ")))
+
+
+def _cells(root: Root) -> tuple[str, ...]:
+    place = (f"{part:.6g}" for part in (root.value.real, root.value.imag))
+    spread = (f"{part:.2g}" for part in (root.real_std, root.imag_std))
+    damping = "–" if root.value == 0.0 else f"{root.damping:.4f}"
+    return (*place, *spread, f"{root.omega:.6g}", damping)
+
+
+# ---- quell b0 ----
+
+
+def b0(
+    record: Path,
+    *,
+    loop: Path | None = None,
+    order: WholeOrNone = None,
+    dt: float | None = None,
+    max_delay: float | None = None,
+    phase_margin: float = 60.0,
+    ratio: float | None = None,
+    read: ReadOptions = READ_OPTIONS,
+    json: Path | None = None,
+    trust: Trust = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Find b0, lag and delay in a record of a running loop, and the omega_c for a phase margin.
+
+    Parameters
+    ----------
+    record
+        The record: a recording of `quell run-rig` (.mcap or .csv), a run that was saved (.nc), or a
+        table of t,u,y in text, where u is what reached the plant.
+    loop
+        Setup, in TOML, of the controller that ran: it tells the order, omega_o over omega_c, and
+        which b0 it had. Without one the controller may be any.
+    order
+        Order of the plant for ADRC: u acts on this derivative of y. That of the loop by default.
+    dt
+        Sample time [s] of a table without times; columns are then u,y by default.
+    max_delay
+        Longest delay or lag to look for [s]; 20 samples by default.
+    phase_margin
+        Phase margin that omega_c is to keep [degrees].
+    ratio
+        omega_o over omega_c; that of the loop by default, or without one the ratio from 3 to 100
+        that allows the largest omega_c, nearly.
+    json
+        Write the results to this file, for programs.
+    """
+    from quell.commissioning import measured
+    from quell.files import check_writable, write_json
+    from quell.identification import identify_b0
+
+    if json is not None:
+        check_writable(json, overwrite)
+    samples = measured(record, read.columns, dt, read.time_unit, read.max_size)
+    ran = {} if loop is None else _of_loop(loop, samples.dt, trust)
+    order = ran.get("order") if order is None else order
+    if order is None:
+        raise ValueError(
+            "order: missing; give --order, or with --loop the setup of an ADRC, which has one"
+        )
+    ratio = ran.get("ratio") if ratio is None else ratio
+    console = Console()
+    with console.status("Searching; the first time, code is compiled for some seconds."):
+        found = identify_b0(samples.u, samples.y, samples.dt, order, max_delay=max_delay)
+    count = f"{samples.y.size} samples, dt = {samples.dt:g} s"
+    print_line(console, f"{record.name}: {count}, order {order}")
+    print_line(console, found.describe())
+    results: dict[str, Any] = found.to_json() | {"phase_margin": phase_margin}
+    if "b0" in ran:
+        results["b_over_b0"] = found.b0 / ran["b0"]
+        factor, spread = found.b0 / ran["b0"], found.b0_std / abs(ran["b0"])
+        print_line(
+            console, f"the loop ran with b0 = {ran['b0']:.5g}: b/b0 = {factor:.3g} ± {spread:.2g}"
+        )
+    results |= _print_bandwidth(console, found, phase_margin, ratio)
+    if json is not None:
+        write_json(json, results, overwrite)
+        print_line(console, f"Results: {json}")
+
+
+def _of_loop(path: Path, dt: float, trust: bool) -> dict[str, Any]:
+    """Return order, b0 and omega_o over omega_c of a setup's controller, if it has them."""
+    from quell.controllers.adrc import ADRC
+    from quell.controllers.prefilters import without_prefilters
+    from quell.setup import load
+
+    setup = load(path, trust)
+    controller = without_prefilters(setup.controller)
+    if abs(controller.dt - dt) > 1e-3 * dt:
+        rule = f"must be the sample time of the record, {dt:g} s"
+        raise ValueError(f"{setup.file}: dt = {controller.dt:g} s: {rule}")
+    if not isinstance(controller, ADRC):
+        return {}
+    observer = controller.observer
+    found: dict[str, Any] = {"order": observer.degree, "b0": float(observer.b0)}
+    if observer.omega_o is not None:
+        found["ratio"] = float(observer.omega_o) / float(controller.omega_c)
+    return found
+
+
+def _print_bandwidth(
+    console: Console, found: Any, phase_margin: float, ratio: float | None
+) -> dict[str, Any]:
+    """Print and return the omega_c that keeps the phase margin, if b0 is known well enough."""
+    from quell.identification.input_gain import MarginError
+
+    nothing = {"omega_c": None, "omega_c_std": None, "ratio": ratio}
+    if found.is_poor:
+        print_line(console, "omega_c: not computed, as b0 is not known")
+        return nothing
+    try:
+        with console.status("Searching for the omega_c that keeps the phase margin."):
+            omega_c, spread, ratio = found.omega_c(phase_margin, ratio)
+    except MarginError as error:
+        print_line(console, f"NOT: {error}")
+        return nothing | {"best_phase_margin": error.phase_margin}
+    beyond = ""
+    if ratio * omega_c > found.omega_max:
+        beyond = (
+            f"; omega_o is beyond {found.omega_max:.4g} rad/s, up to where the record shows the "
+            "plant: approach it in steps"
+        )
+    if ratio * omega_c * found.dt > 0.499:
+        beyond = f"; omega_o is at 0.5/dt, the most for this sample time{beyond}"
+    known = math.isfinite(spread)
+    deviation = f" ± {spread:.2g}" if known else " (within the deviations no omega_c may keep it)"
+    print_line(
+        console,
+        f"omega_c = {omega_c:.4g}{deviation} rad/s keeps {phase_margin:g}° of phase margin "
+        f"with omega_o = {ratio:.3g} omega_c and this b0{beyond}",
+    )
+    return {"omega_c": omega_c, "omega_c_std": spread if known else None, "ratio": ratio}
+
+
+# ---- quell excite ----
+
+
+def excite(
+    out: Path,
+    *,
+    kind: str = "prbs",
+    low: float = 0.5,
+    high: float = 60.0,
+    duration: float = 60.0,
+    dt: float = 1e-3,
+    u_min: float = -1.0,
+    u_max: float = 1.0,
+    seed: Whole = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Design an input that excites a band within limits, for quell identify, and write it as CSV.
+
+    Parameters
+    ----------
+    out
+        CSV file to write, with columns t,u.
+    kind
+        multisine, prbs or chirp.
+    low
+        Lowest frequency of the band [rad/s].
+    high
+        Highest frequency of the band [rad/s].
+    duration
+        Length of the input [s].
+    dt
+        Sample time [s].
+    u_min
+        Lower limit of u.
+    u_max
+        Upper limit of u.
+    seed
+        Start of a PRBS, or phases of a multisine.
+    """
+    from quell.files import check_writable
+    from quell.identification import excitation
+
+    if kind == "chirp":
+        refuse({"seed": (seed, 0)}, "a chirp has nothing random")
+    check_writable(out, overwrite)
+    design = excitation(kind, (low, high), duration, dt, u_min, u_max, seed=seed)
+    design.save(out, overwrite)
+    console = Console()
+    print_line(console, design.describe())
+    print_line(console, f"Samples: {out}, {design.u.size} of t,u")

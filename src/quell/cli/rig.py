@@ -1,0 +1,552 @@
+"""``quell rig``."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+from cyclopts import Parameter
+
+from quell.cli.exit_codes import ExitCode, exit_on_signal
+from quell.cli.options import (
+    RUN_OUTPUTS,
+    MaxSize,
+    Overwrite,
+    RunOutputs,
+    Switch,
+    Trust,
+    Whole,
+    WholeOrNone,
+    options_of,
+    refuse,
+)
+from quell.cli.output import (
+    Console,
+    check_outputs,
+    number,
+    print_line,
+    table,
+    write_record,
+    write_results,
+)
+from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
+from quell.files import MAX_SIZE
+from quell.realtime.registry import examples
+
+if TYPE_CHECKING:
+    from quell.realtime import Rig, RigRun
+    from quell.realtime.run import ModeChange
+    from quell.records.trajectory import Trajectory
+    from quell.setup import Setup
+
+# ---- quell rig ----
+
+_DEVICE = (
+    f"Address to listen at, like {examples(listening=True)}. At 127.0.0.1 it serves this computer "
+    "only; give another address of this computer to serve others."
+)
+
+
+def rig(
+    *,
+    device: Annotated[str, Parameter(help=_DEVICE)],
+    plant: str = "torsional",
+    dt: float = 1e-3,
+    watchdog: Whole = 20,
+    u_max: float = math.inf,
+    rest: bool = True,
+    wait: float = 0.0,
+    seconds: float | None = None,
+    log: Path | None = None,
+    overwrite: Overwrite = False,
+    priority: Whole = 50,
+    cpu: WholeOrNone = None,
+    trust: Trust = False,
+) -> None:
+    """Run a simulated plant as the device at the other end of a wire.
+
+    It has a clock and a watchdog of its own.
+
+    Parameters
+    ----------
+    plant
+        The plant: a name as torsional or two-mass, a setup file with [plant] (setup.toml), an
+        identified model (model.json), an FMU (motor.fmu), a Python function that returns a plant
+        (file.py:name, with --trust), or a table, '{kind = "linear", num = [1], den = [1, 1]}'.
+    dt
+        Length of a tick [s].
+    watchdog
+        After so many ticks in a row without a new command u is zero until a new session.
+    u_max
+        Limit of the commands, either way [V, N].
+    rest
+        Start each session from rest, or where the last one left the plant; from rest in any case if
+        that state is not finite, or beyond 1e9.
+    wait
+        How long a tick waits for the command that answers the measurement before it [s]. The plant
+        stands still meanwhile, as no real one does: a loop that is late then does as in a
+        simulation.
+    seconds
+        How long to run [s]; until interrupted by default.
+    log
+        Write each tick to this CSV file: y, u as applied, the command as it came, state.
+    priority
+        SCHED_FIFO priority of the ticks, 1 to 99; 0 for ordinary scheduling. A note at the end says
+        what is not permitted.
+    cpu
+        Number of the processor for the ticks; any by default.
+    """
+    from quell.realtime.registry import listen
+    from quell.realtime.rig import Rig, checked_seconds
+    from quell.realtime.system import checked_cpu, checked_priority, termination_handler
+    from quell.setup.schema import plant_given
+
+    model = plant_given(plant, dt, argument="--plant", trust=trust)
+    if seconds is not None:
+        checked_seconds("--seconds", seconds)
+    checked_priority(priority)
+    checked_cpu(cpu)
+    limits: dict[str, Any] = {
+        "watchdog": watchdog,
+        "u_max": u_max,
+        "rest": rest,
+        "log": log,
+        "wait": wait,
+        "overwrite": overwrite,
+    }
+    with closing(listen(device)) as listener, Rig(model, dt, listener=listener, **limits) as server:
+        with exit_on_signal(listener.close):  # compiling may take a minute the first time
+            server.prepare()
+        with termination_handler(lambda *_: server.stop()):
+            limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
+            rules = f"u = 0 after {watchdog} ticks without a command{limit}"
+            start = ", from rest" if rest else ""
+            start += f", waits up to {wait:g} s for each command" if wait > 0.0 else ""
+            print(f"{plant} at {listener.url}: a tick every {dt:g} s, {rules}{start}", flush=True)
+            notes = server.run(seconds, priority=priority, cpu=cpu)
+    _print_counters(server)
+    for note in notes:
+        print(note)
+
+
+def _print_counters(server: Rig) -> None:
+    from quell.realtime.wire import REFUSALS
+
+    count = server.counters
+    late = ", ".join(f"{key} {1e6 * value:.0f}" for key, value in server.lateness.summary().items())
+    refused = ", ".join(f"{name} {count[name]}" for name in REFUSALS if count[name]) or "none"
+    print(
+        f"ticks: {count['ticks']}, of which late by more than one: {count['caught_up']}; lateness "
+        f"[us]: {late}\n"
+        f"sessions: {count['sessions']}, refused: {count['refused']}, ended by the watchdog: "
+        f"{count['watchdog']}\n"
+        f"commands: {count['accepted']}, largest |u| {server.largest:.6g}, "
+        f"cut to the limit: {count['clipped']}, never used: {count['skipped']}\n"
+        f"frames that were not accepted: {refused}"
+    )
+    if count["restored"]:
+        print(
+            f"sessions that began at rest because the plant's state was destroyed (not finite, or "
+            f"beyond 1e9): {count['restored']}"
+        )
+    if server.unlogged:
+        print(f"the log lacks {server.unlogged} ticks: it could not be written as quickly")
+
+
+# ---- quell run-rig ----
+
+_DEVICE_RUN_RIG = f"Device in place of the file's, like {examples()}."
+
+
+def run_rig(
+    setup: Path | None = None,
+    *,
+    example: Switch = False,
+    device: Annotated[str | None, Parameter(help=_DEVICE_RUN_RIG)] = None,
+    seconds: float | None = None,
+    omega_c: float | None = None,
+    omega_o: float | None = None,
+    spin: float | None = None,
+    priority: WholeOrNone = None,
+    mcap: Path | None = None,
+    csv: Path | None = None,
+    live: WholeOrNone = None,
+    live_origin: list[str] | None = None,
+    trust: Trust = False,
+    outputs: RunOutputs = RUN_OUTPUTS,
+) -> None:
+    """Run a setup in real time around a device, for instance the twin that quell rig is.
+
+    The exit code is 0 where the scenario was run to its end, 3 where a limit or a fault ended it,
+    130 after Ctrl-C; u was ramped to zero in each case. It is 2 for an error in the arguments.
+
+    Parameters
+    ----------
+    setup
+        The file, in TOML; by default the paper's torsional experiment with an L-ESO, at
+        udp://127.0.0.1:5005.
+    example
+        Print that file, and do no more.
+    seconds
+        Duration in place of the scenario's [s].
+    omega_c
+        Controller bandwidth in place of the file's [rad/s].
+    omega_o
+        Observer bandwidth in place of the file's [rad/s].
+    spin
+        Keep the processor busy for so long before each deadline [s].
+    priority
+        Real-time priority, 1 to 99, where permitted; 0 for none.
+    mcap
+        Write the record to this file, ending in .mcap, while the loop runs; Foxglove and
+        PlotJuggler read it.
+    csv
+        The same, ending in .csv.
+    live
+        Port for Foxglove and PlotJuggler to watch at.
+    live_origin
+        Web page that may watch, too, such as https://app.foxglove.dev; by default only programs and
+        pages of this computer may.
+    """
+    from quell.setup import EXAMPLES, made, read
+
+    numbers: dict[str, Any] = {
+        "seconds": seconds,
+        "omega_c": omega_c,
+        "omega_o": omega_o,
+        "spin": spin,
+    }
+    others: dict[str, Any] = {
+        "device": device,
+        "priority": priority,
+        "mcap": mcap,
+        "csv": csv,
+        "live": live,
+    }
+    others |= numbers | {"live_origin": live_origin}
+    file = setup or EXAMPLES / "torsional_rig.toml"
+    if example:
+        unused = options_of(outputs, RUN_OUTPUTS) | {"setup": (setup, None)}
+        unused |= {name: (value, None) for name, value in others.items()}
+        refuse(unused, "has no effect beside --example, which only prints a file")
+        print((EXAMPLES / "torsional_rig.toml").read_text(encoding="utf-8"), end="")
+        return
+    changes = {
+        ("rig", "device"): device,
+        ("rig", "spin"): spin,
+        ("rig", "priority"): priority,
+        ("scenario", "duration"): seconds,
+        ("controller", "omega_c"): omega_c,
+        ("observer", "omega_o"): omega_o,
+    }
+    files = [path for path in (mcap, csv) if path is not None]
+    name, data = read(file)
+    given = made(name, _changed(data, changes), trust)
+    if code := _run(given, files, (live, live_origin or []), outputs):
+        sys.exit(code)
+
+
+def _run(
+    setup: Setup,
+    files: list[Path],
+    viewers: tuple[int | None, list[str]],
+    outputs: RunOutputs,
+) -> int:
+    """Run the loop, print and write its results; return the exit code."""
+    from quell.realtime import LiveSink
+
+    scenario, options = setup.needed("scenario"), dict(setup.needed("rig"))
+    files = [*map(Path, options.pop("telemetry", ())), *files]
+    check_recordings(files, outputs.overwrite)
+    outputs = check_outputs(outputs, [Path(setup.file).stem, "timing"], files)
+    options["overwrite"] = outputs.overwrite
+    (port, origins), live = viewers, options.pop("live")
+    port = live if port is None else port
+    url, dt = options.pop("device"), setup.controller.dt
+    console = Console()
+    what = f"{setup.title}: {url}, dt = {dt:g} s, for {scenario.duration:g} s"
+    print_line(console, f"{what}. Ctrl-C ramps u to zero.")
+    if port is None:
+        refuse({"live_origin": (origins, [])}, "goes with --live, a port to watch at")
+    # The port first: if it is in use no file is created.
+    sinks = files if port is None else [LiveSink(port, origins=origins), *files]
+    run = _close_loop(console, setup, url, options, sinks)
+    if run is None:
+        return ExitCode.ENDED_BY_SAFETY
+    record = run.trajectory
+    scores = windowed_metrics(record, setup)
+    _print_timing(console, run)
+    print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
+    learned = print_outcome(console, record)
+    code = exit_code(run)
+    results = {
+        "title": setup.title,
+        "device": url,
+        "dt": dt,
+        "verdict": run.verdict,
+        "exit_code": int(code),
+        **_as_json(run),
+        "metrics": scores,
+        "learned": learned,
+        "setup": setup.as_json(),
+    }
+    try:
+        _write(console, run, setup, results, outputs)
+    except OSError as error:  # the disk is full: the code of a run that safety ended goes first
+        if code == ExitCode.DONE:
+            raise
+        print(f"quell: {error}", file=sys.stderr)
+    return code
+
+
+def _write(
+    console: Console, run: RigRun, setup: Setup, results: dict[str, Any], outputs: RunOutputs
+) -> None:
+    """Write figures, record and results where they are asked for."""
+    record, paths = run.trajectory, []
+    if outputs.figures and len(record):
+        paths = save_run_figure(record, setup.title, outputs, Path(setup.file).stem)
+        paths += _save_timing_figure(run, setup, outputs.figures, outputs.overwrite)
+    write_record(console, record, outputs, "Record")
+    write_results(console, results, outputs, paths)
+
+
+def _close_loop(
+    console: Console, setup: Setup, url: str, options: dict[str, Any], sinks: list[Any]
+) -> RigRun | None:
+    """Run the loop and print each change of mode; return None if the device failed."""
+    from quell.realtime import LiveSink, Safety, run_rig
+    from quell.setup.schema import with_path
+
+    began = False
+
+    def print_change(change: ModeChange) -> None:
+        nonlocal began
+        live = () if began else [sink for sink in sinks if isinstance(sink, LiveSink)]
+        for sink in live:
+            console.print(f"Live: {sink.url}")
+        began = True
+        print_line(console, str(change))
+
+    settings = {"telemetry": sinks, "on_change": print_change, **options}
+    controller, scenario = setup.controller, setup.needed("scenario")
+    try:
+        rules = (options.get("safety") or Safety()).rules(controller, scenario)
+        print_line(console, f"Safety: {rules.text(controller.dt)}.")
+        device = _device(url, setup)
+        with exit_on_signal(device.close):
+            return run_rig(device, controller, scenario, **settings)
+    except ValueError as error:
+        raise with_path(setup.file, "rig", error, ["device", *options]) from None
+    except ConnectionError as error:
+        if not began:
+            raise
+        print(f"quell: {error}", file=sys.stderr)
+        return None
+
+
+def _device(url: str, setup: Setup) -> Any:
+    """Return the device; ``twin:`` is the plant of the setup itself."""
+    from quell import realtime
+
+    if url == "twin:":
+        return realtime.TwinDevice(setup.needed("plant"), setup.controller.dt)
+    return realtime.open_device(url, setup.controller.dt, *((True,) if setup.trust else ()))
+
+
+def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
+    """Return a file's tables with other values for some keys; None changes nothing."""
+    tables = {k: dict(v) if isinstance(v, Mapping) else v for k, v in data.items()}
+    for (table_name, key), value in changes.items():
+        if value is not None and isinstance(tables.setdefault(table_name, {}), dict):
+            tables[table_name][key] = value
+    return tables
+
+
+def check_recordings(files: Iterable[Path], overwrite: bool) -> None:
+    """Check suffixes and places of recordings, before the device is opened."""
+    from quell.realtime.recordings import file_sink
+
+    for file in files:
+        file_sink(file, overwrite).check()
+
+
+def exit_code(run: RigRun) -> int:
+    """Return the exit code of a run."""
+    from quell.realtime.supervisor import Ending
+
+    if run.completed:
+        return ExitCode.DONE
+    asked = any(change.cause.ending is Ending.REQUESTED for change in run.changes)
+    return ExitCode.INTERRUPTED if asked else ExitCode.ENDED_BY_SAFETY
+
+
+def _print_timing(console: Console, run: RigRun) -> None:
+    histograms = {"lateness": run.timing.lateness, "step time": run.timing.step}
+    rows = table("Punctuality", "[µs]", "p50", "p99", "p99.9", "max")
+    for label, histogram in histograms.items():
+        values = [1e6 * value for value in histogram.summary().values()]
+        rows.add_row(label, *("–" if value != value else f"{value:.1f}" for value in values))
+    console.print(rows)
+    for label, histogram in histograms.items():
+        bars = "\n".join(histogram.text().splitlines()[1:])
+        heading = f"{label.capitalize()}, cycles (bars are logarithmic):"
+        console.print(f"{heading}\n{bars}\n", highlight=False)
+    print_line(console, f"Loop: {_counted(run.tally._asdict())}")
+    if run.counters:
+        print_line(console, f"Device: {_counted(run.counters)}")
+    for note in run.notes:
+        if not note.startswith("telemetry: "):  # these were logged at once
+            print_line(console, f"Note: {note}")
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
+
+
+def _save_timing_figure(run: RigRun, setup: Setup, folder: Path, overwrite: bool) -> list[Path]:
+    import matplotlib.pyplot as plt
+
+    from quell.experiments.common import save_figure
+
+    figure, axes = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
+    run.timing.plot(axes)
+    axes.axvline(1e6 * setup.controller.dt, color="0.3", linestyle="--", linewidth=1.0, label="dt")
+    axes.legend()
+    axes.set_title(f"{setup.title}: {run.tally.cycles} cycles, {run.overruns} overruns")
+    return save_figure(figure, folder, "timing", overwrite)
+
+
+def _as_json(run: RigRun) -> dict[str, Any]:
+    from quell.files import nonfinite_to_none
+
+    timing = {"lateness": run.timing.lateness.summary(), "step": run.timing.step.summary()}
+    results = {
+        "completed": run.completed,
+        "rules": run.rules._asdict(),
+        "timing": timing,
+        "tally": run.tally._asdict(),
+        "counters": run.counters,
+        "changes": [{"t": c.t, "mode": c.mode.name, "cause": c.cause.text} for c in run.changes],
+        "notes": list(run.notes),
+    }
+    return dict(nonfinite_to_none(results))
+
+
+# ---- quell replay ----
+
+_HEADINGS = ("RMS of f̂", "RMS of residual", "learned share\n[%]", "RMS of x̂1 − y")
+_FACTORS = (1.0, 1.0, 100.0, 1.0)
+
+
+def replay(
+    record: Path,
+    setup: Path | None = None,
+    *,
+    max_size: MaxSize = MAX_SIZE,
+    trust: Trust = False,
+    outputs: RunOutputs = RUN_OUTPUTS,
+) -> None:
+    """Run a setup's observer and learner on a recorded run, and compare the estimates.
+
+    Parameters
+    ----------
+    record
+        File that `quell run-rig` recorded, ending in .mcap or .csv.
+    setup
+        The file of the controller, in TOML, with the record's sample time; by default that of
+        `quell run-rig`.
+    """
+    from quell.controllers import ADRC
+    from quell.realtime import load as load_record
+    from quell.realtime import replay as replay_record
+    from quell.records import metrics
+    from quell.setup import EXAMPLES, load
+    from quell.setup.schema import with_path
+
+    given = load(setup or EXAMPLES / "torsional_rig.toml", trust)
+    name = f"{record.stem}-replayed"
+    outputs = check_outputs(outputs, [name])
+    recorded = load_record(record, max_size)
+    try:  # replay refuses a controller that is no ADRC
+        replayed = replay_record(recorded, cast(ADRC, given.controller))
+    except ValueError as error:
+        raise with_path(given.file, "", error, ()) from None
+    console = Console()
+    part = _controlled(recorded)
+    scores = {"recorded": _scores(recorded, part), "replayed": _scores(replayed, part)}
+    rows = table(f"{record.name} through {given.title}", "", *_HEADINGS)
+    for name, values in scores.items():
+        pairs = zip(values.values(), _FACTORS, strict=True)
+        rows.add_row(name, *(number(value, ".4g", factor) for value, factor in pairs))
+    console.print(rows)
+    _print_gaps(console, recorded)
+    difference = metrics.rms((replayed["u_wished"] - replayed["u"])[part])
+    console.print(
+        f"Wished u less applied u, RMS: {difference:.4g}. Judged: the {part.stop - part.start} "
+        "samples under control."
+    )
+    learned = print_outcome(console, replayed)
+    paths = save_run_figure(replayed, given.title, outputs, name, _draw_wished)
+    write_record(console, replayed, outputs, "Replay")
+    results = {
+        "record": str(record),
+        "title": given.title,
+        "dt": recorded.dt,
+        "scores": scores,
+        "u_wished_rms": difference,
+        "learned": learned,
+        "setup": given.as_json(),
+    }
+    write_results(console, results, outputs, paths)
+
+
+def _controlled(run: Trajectory) -> slice:
+    """Return the samples in which the loop ran; all of a record without modes."""
+    from quell.realtime.supervisor import Mode
+
+    if "mode" not in run.names or Mode.RUN not in run["mode"]:
+        return slice(0, len(run))
+    running = (run["mode"] == Mode.RUN).nonzero()[0]
+    return slice(int(running[0]), int(running[-1]) + 1)
+
+
+def _scores(run: Trajectory, part: slice) -> dict[str, float | None]:
+    """Return the RMS of the estimate of f, of the observer's part of it, and of the innovation."""
+    from quell.records import metrics
+
+    def rms(name: str) -> float | None:
+        return metrics.rms(run[name][part]) if name in run.names else None
+
+    f, residual = rms("f_hat"), rms("f_residual")
+    known = "x_hat" in run.names
+    return {
+        "f": f,
+        "residual": residual,
+        "share_learned": 1.0 - (residual or 0.0) / f if f else None,
+        "innovation": metrics.rms(run["x_hat"][part, 0] - run["y"][part]) if known else None,
+    }
+
+
+def _print_gaps(console: Console, recorded: Trajectory) -> None:
+    from quell.realtime.recordings import Event
+
+    if "events" not in recorded.names:
+        return
+    gaps = (recorded["events"].astype(int) & Event.GAP).nonzero()[0]
+    if gaps.size:
+        first = f"the first at {recorded.t[gaps[0]]:.3f} s"
+        skipped = f"{gaps.size} of {len(recorded)} samples were skipped by the loop, {first}"
+        meaning = "to the replay, as to the loop, they are samples without a measurement."
+        print_line(console, f"{skipped}: {meaning}")
+
+
+def _draw_wished(run: Trajectory, axes: Any) -> None:
+    from quell.records.plotting import draw_line
+
+    draw_line(axes[1], run.t, run["u_wished"], label="u wished", color="C3", linewidth=0.8)
+    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize="small", frameon=False)

@@ -1,0 +1,442 @@
+"""``quell run``."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from quell.cli.exit_codes import ExitCode, exit_if_diverged
+from quell.cli.options import (
+    RUN_OUTPUTS,
+    Overwrite,
+    RunOutputs,
+    Switch,
+    Trust,
+    Whole,
+    WholeOrNone,
+    options_of,
+    refuse,
+)
+from quell.cli.output import (
+    COMPILING,
+    Console,
+    check_outputs,
+    print_line,
+    progress_bar,
+    write_record,
+    write_results,
+)
+from quell.cli.report import (
+    print_metrics,
+    print_outcome,
+    print_summary,
+    save_run_figure,
+    stored_alike,
+    summary,
+    windowed_metrics,
+)
+
+if TYPE_CHECKING:
+    from quell.export import Comparison, Exported
+    from quell.setup import Setup
+    from quell.sweeping import Sweep
+
+# ---- quell run ----
+
+
+def run(
+    setup: Path | None = None,
+    *,
+    example: Switch = False,
+    trust: Trust = False,
+    outputs: RunOutputs = RUN_OUTPUTS,
+) -> None:
+    """Simulate the plant, controller and scenario of a setup file.
+
+    If the run diverges the exit code is 4; the part before that is recorded and drawn.
+
+    Parameters
+    ----------
+    setup
+        The file, in TOML; docs/setup has all keys.
+    example
+        Print such a file, and do no more.
+    """
+    from quell.setup import EXAMPLES, SetupError, load
+    from quell.simulation import simulate
+
+    if example:
+        unused = {"setup": (setup, None)} | options_of(outputs, RUN_OUTPUTS)
+        refuse(unused, "has no effect beside --example, which only prints a file")
+        print((EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"), end="")
+        return
+    if setup is None:
+        raise ValueError("setup: missing; must be a TOML file, and quell run --example prints one")
+    given = load(setup, trust)
+    plant, scenario = given.needed("plant"), given.needed("scenario")
+    late = [
+        f"{given.file}: metrics[{i}].start = {window['start']:g}: "
+        f"must be less than the scenario's duration, {scenario.duration:g} s"
+        for i, window in enumerate(given.windows)
+        if window.get("start", 0.0) >= scenario.duration
+    ]
+    if late:
+        raise SetupError(late)
+    outputs = check_outputs(outputs, [setup.stem])
+    console = Console()
+    with progress_bar(console, COMPILING) as report:
+        progress = partial(report, COMPILING)
+        try:
+            result = simulate(plant, given.controller, scenario, progress=progress)
+        except ValueError as error:
+            raise SetupError([f"{given.file}: {error}"]) from None
+    scores = windowed_metrics(result, given)
+    print_metrics(
+        console, f"{given.title}: {result.plant}, dt = {result.dt:g} s", scores, result.signals
+    )
+    learned = print_outcome(console, result)
+    paths = save_run_figure(result, given.title, outputs, setup.stem)
+    write_record(console, result, outputs, "Record")
+    results = {
+        "title": given.title,
+        "plant": result.plant,
+        "dt": result.dt,
+        "status": result.status.name or "OK",
+        "diverged": result.diverged,
+        "metrics": scores,
+        "learned": learned,
+        "setup": given.as_json(),
+    }
+    write_results(console, results, outputs, paths)
+    exit_if_diverged([result])
+
+
+# ---- quell sweep ----
+
+_WORST = 5
+_LABEL = "simulating (the first runs compile for some seconds)"
+
+
+def sweep(
+    setup: Path,
+    *,
+    folder: Path | None = None,
+    dask: Annotated[str | None, Parameter(show_default=False)] = None,
+    workers: WholeOrNone = None,
+    repeat: WholeOrNone = None,
+    worst: Whole = _WORST,
+    trust: Trust = False,
+    outputs: RunOutputs = RUN_OUTPUTS,
+) -> None:
+    """Do the runs of a setup's table [sweep], and store their measures.
+
+    A sweep that was interrupted or killed goes on where it stopped when the command is given again.
+    Failing runs are recorded and do not stop it.
+
+    Parameters
+    ----------
+    setup
+        The file, in TOML; docs/setup has all keys, docs/scale an example.
+    folder
+        Where the results are; by default the setup's name with -sweep.
+    dask
+        Address tcp://HOST:PORT of a Dask scheduler, whose workers do the runs; docs/scale.
+    workers
+        Number of processes on this machine; the number of cores by default.
+    repeat
+        Only repeat the run of this number, with its table of metrics and figure.
+    worst
+        Number of worst runs to print.
+    """
+    from quell.setup import load
+    from quell.setup.loading import sweep_of
+
+    given = load(setup, trust)
+    plan = sweep_of(given)
+    where = Path(f"{setup.stem}-sweep") if folder is None else folder
+    console = Console()
+    if repeat is not None:
+        many = {"dask": (dask, None), "workers": (workers, None), "worst": (worst, _WORST)}
+        refuse(many, "is for many runs; --repeat does one")
+        _repeat(console, given, plan, repeat, where, outputs)
+        return
+    if outputs.save is not None:
+        raise ValueError("--save is for the record of one run; give its number with --repeat")
+    from quell.sweeping import sweep as run_sweep
+
+    varied = [name for name, each in plan["parameters"].items() if _varies(each)]
+    figures = {name: f"{setup.stem}-{_slug(name)}" for name in varied}
+    outputs = check_outputs(outputs, list(figures.values()))
+    # One process does no more than one thread of this one, and takes longer to start.
+    if dask is not None and "://" not in dask:
+        raise ValueError(f"dask = {dask!r}: must be the address of a scheduler, tcp://HOST:PORT")
+    if dask is not None:
+        refuse({"workers": (workers, None)}, "is for this machine; --dask names other workers")
+    executor = dask or ("threads" if workers == 1 else "processes")
+    with _progress(console) as report:
+        try:
+            found = run_sweep(
+                **plan, folder=where, executor=executor, workers=workers, progress=report
+            )
+        except KeyboardInterrupt:
+            print_line(console, f"The same command goes on with what is done, in {where}/.")
+            raise
+    results = summary(found, worst)
+    where_option = "" if folder is None else f" --folder {folder}"
+    print_summary(console, given.title, found, results, f"quell sweep {setup}{where_option}")
+    paths = _save_figures(found, figures, outputs)
+    write_results(console, {**results, "setup": given.as_json()}, outputs, paths)
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar with the time that remains; return the callback for the share done."""
+    from rich.progress import TaskProgressColumn, TimeRemainingColumn
+
+    with progress_bar(console, _LABEL, TaskProgressColumn(), TimeRemainingColumn()) as report:
+        yield partial(report, _LABEL)
+
+
+def _varies(given: Any) -> bool:
+    from quell.sweeping.runs import as_values
+
+    values = as_values("", given)
+    return not isinstance(values, tuple) or len(values) > 1
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^\w]+", "-", name).strip("-")
+
+
+def _save_figures(found: Sweep, figures: dict[str, str], outputs: RunOutputs) -> list[Path]:
+    """Save the figure of each parameter; return the paths of the files."""
+    from quell.experiments.common import save_figure
+
+    if outputs.figures is None:
+        return []
+    paths = []
+    for parameter, name in figures.items():
+        paths += save_figure(found.plot(parameter), outputs.figures, name, outputs.overwrite)
+    return paths
+
+
+def _repeat(
+    console: Console,
+    given: Setup,
+    arguments: dict[str, Any],
+    number: int,
+    folder: Path,
+    outputs: RunOutputs,
+) -> None:
+    """Repeat a run alone, print and draw it, and compare it with the stored measures."""
+    from quell.simulation import simulate
+    from quell.sweeping.sweep import parts_of
+
+    name = f"{given.file.removesuffix('.toml')}-run-{number}"
+    text, parts = parts_of(number, arguments)
+    outputs = check_outputs(outputs, [name])
+    with progress_bar(console, COMPILING) as report:
+        run = simulate(*parts, progress=partial(report, COMPILING))
+    scores = windowed_metrics(run, replace(given, scenario=parts.scenario, plant=parts.plant))
+    print_metrics(console, f"{given.title}, {text}", scores)
+    learned = print_outcome(console, run)
+    same = stored_alike(folder, number, text, run, arguments["metrics"])
+    if same is not None:
+        print_line(console, f"In {folder}/: {'the same, bit for bit' if same else 'other values'}.")
+    paths = save_run_figure(run, f"{given.title}, run {number}", outputs, name)
+    write_record(console, run, outputs, "Record")
+    results = {"run": text, "status": run.status.name or "OK", "metrics": scores}
+    write_results(console, {**results, "as_stored": same, "learned": learned}, outputs, paths)
+    exit_if_diverged([run])
+
+
+# ---- quell export ----
+
+
+def export(
+    setup: Path,
+    *,
+    to: Literal["c", "fmu"] = "c",
+    out: Path,
+    name: str | None = None,
+    precision: Literal["double", "single"] = "double",
+    what: Literal["controller", "plant", "loop"] = "controller",
+    resolution: float | None = None,
+    accept: Switch = False,
+    prove: Switch = False,
+    trust: Trust = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the controller of a setup for another machine: as C files, or as an FMU.
+
+    The C files (C99) are a library for CMake, Arduino and PlatformIO with golden vectors and a
+    README. In single precision the scenario of the setup is simulated in both precisions before,
+    and nothing is written if they differ too much.
+
+    Parameters
+    ----------
+    setup
+        The file, in TOML; docs/setup has all keys.
+    to
+        c or fmu, which is an FMU of FMI 3.0 for co-simulation.
+    out
+        The folder for the C files, or the file .fmu.
+    name
+        Begins all names in C; controller by default, and for an FMU the name of the file.
+    precision
+        Of the C code: double, or single for a processor that has no double precision.
+    what
+        Of an FMU: controller, plant or loop.
+    resolution
+        Of an encoder [y-unit per count]: adds NAME_step_counts to the C code, which takes r and y
+        as integers.
+    accept
+        Write in single precision even if it differs too much, or can't be compared.
+    prove
+        Write the folder proof beside the C code, and prove with Frama-C that no behaviour is
+        undefined and u is always a number within its limits. What is not proved is printed, and the
+        exit code is not 0.
+    """
+    from quell.export import c
+    from quell.setup import load
+
+    if to == "fmu":
+        if precision != "double" or accept or prove or resolution is not None:
+            rule = "are for --to c; an FMU is in double"
+            raise ValueError(f"--precision, --resolution, --accept and --prove: {rule}")
+        _to_fmu(load(setup, trust), what, out, name or "", overwrite)
+        return
+    if what != "controller":
+        raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
+    if precision == "double":
+        refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
+    given = load(setup, trust)
+    if precision == "single" and not accept:
+        given.needed("plant")
+        given.needed("scenario")
+    exported = c(
+        given.controller,
+        out,
+        name=name or "controller",
+        precision=precision,
+        plant=given.plant,
+        scenario=given.scenario,
+        resolution=resolution,
+        accept=accept,
+        proof=prove,
+        overwrite=overwrite,
+    )
+    _print(given.title, exported)
+    if exported.proof is not None and not exported.proof.proved:
+        sys.exit(ExitCode.NOT_PROVED)
+
+
+def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> None:
+    from quell.export import fmu
+
+    controller, dt = given.controller, given.controller.dt
+    part = controller if what == "controller" else given.needed("plant")
+    if what == "loop":
+        part = part, controller
+    scenario = given.scenario
+    x0 = None if what == "controller" or scenario is None else scenario.x0
+    fmu(part, out, name=name, dt=dt, x0=x0, overwrite=overwrite)
+    print_line(Console(), f"FMU of the {what}: {out}")
+
+
+def _print(title: str, exported: Exported) -> None:
+    """Print what was written, the differences of the precisions, and the sizes."""
+    source, folder = exported.source, exported.folder
+    name = source.name
+    console = Console()
+    print_line(console, f"{title}: {folder}/src/{name}.h and .c, in {source.precision} precision")
+    if exported.comparison is not None:
+        for line in _differences(exported.comparison):
+            print_line(console, line)
+    print_line(console, _sizes(exported))
+    if exported.proof is not None:
+        print_line(console, exported.proof.summary)
+        for line in exported.proof.open:
+            print_line(console, f"NOT proved: {line}")
+        print_line(console, f"Report: {folder}/proof/REPORT.md; again: {folder}/proof/prove.sh")
+    print_line(console, f"Test: {folder}/test_{name}.c; how to use it: {folder}/README.md")
+
+
+def _differences(found: Comparison) -> list[str]:
+    """Return lines about single precision, next to the effect of the noise."""
+    if found.diverged:
+        return ["Single precision: the run diverges; in double precision it does not"]
+    rows = {"u": (found.u, found.u_noise), "y": (found.y, found.y_noise)}
+    lines = []
+    for signal, (difference, noise) in rows.items():
+        text = f"Single precision changes {signal} by {100 * difference:.2g} % RMS"
+        if noise is not None:
+            text += f"; the measurement noise changes it by {100 * noise:.2g} %"
+        lines.append(text)
+    return lines
+
+
+def _sizes(exported: Exported) -> str:
+    """Return a line with the sizes, or with the reason why there are none."""
+    from quell.export import NoCompilerError
+
+    try:
+        sizes = exported.sizes()
+    except NoCompilerError as error:
+        return f"Sizes of code, state and stack: not measured, {error}"
+    stack = "not measured (gcc 10 can)" if sizes.stack is None else f"{sizes.stack} B"
+    return (
+        f"{sizes.processor} ({sizes.compiler} -O2): code {sizes.code} B, constants "
+        f"{sizes.constants} B, state {sizes.state} B, stack {stack}; without the C library"
+    )
+
+
+# ---- quell studio ----
+
+
+def studio(
+    setup: Path | None = None, *, port: Whole = 8770, browser: bool = True, trust: Trust = False
+) -> None:
+    """Open a page in the browser that simulates a setup while its sliders move.
+
+    The page shows response, estimates, Bode and Nyquist diagrams and margins, tunes, compares,
+    exports, and watches a running quell run-rig. It is served at this computer only, at an address
+    with a random token, until Ctrl-C.
+
+    Parameters
+    ----------
+    setup
+        A setup file in TOML to begin with; an example by default.
+    port
+        TCP port; 0 takes a free one.
+    browser
+        Open the page in the browser; otherwise only print its address.
+    """
+    from quell.setup import read
+    from quell.studio.messages import Granted, checked, files_of
+    from quell.studio.runs import Maker
+    from quell.studio.server import serve
+
+    tables = None
+    if setup is not None:
+        name, data = read(setup)
+        tables = checked(data, Granted(files_of(data), trust))
+        tables.setdefault("title", name.removesuffix(".toml").replace("_", " "))
+        Maker(name, trust)(tables)
+
+    def ready(url: str) -> None:
+        print(f"Studio: {url} (Ctrl-C ends it)", flush=True)
+        if browser:
+            import webbrowser
+
+            webbrowser.open(url)
+
+    serve(tables, port, ready, trust)

@@ -1,0 +1,347 @@
+"""Feedforward by a model of the plant, which the observer knows.
+
+The control signal that moves a plant along the reference is the inverse of its model. For a linear
+model ``y = G(s) e^(−sT) u`` it is, as a series in derivatives of the reference::
+
+    u_ff(t) = c_0 r + c_1 r' + … + c_m r^(m) at t + T
+            + F sign(r') + u_0,                           Σ c_i s^i = 1/G(s)
+
+with Coulomb friction F and a constant u_0, such as gravity. Without zeros 1/G is a polynomial: y is
+a flat output, and the series ends (Fliess, Lévine, Martin & Rouchon, *Int. J. Control* 61, 1995).
+With zeros the series converges for moves that are slow against the slowest zero; cut off after the
+rigid part it is the feedforward of inertia and friction that drives have. u is held for a sample,
+so it acts half a sample late: T is the delay plus dt/2, and the derivatives of r give r(t + T).
+
+**The observer** models the plant with its own b_0 and a, ``y^(n) = −a·(y … y^(n−1)) + b_0 u + f``,
+and b_0 is a number for robustness, not the gain of the plant. On the reference, with u = u_ff, the
+model of the feedforward and that of the observer together say what f is::
+
+    f_m = D(s) r − b_0 u_ff,             D(s) = s^n + a_{n−1} s^(n−1) + … + a_0
+
+(for a model with zeros D is the series of its inverse, times b). f_m is fed to the observer as a
+known part of f, as the output of a learner is, so it is not in Δf̂. The law is that of
+``controllers/law.py`` with f_m as a part of f̂::
+
+    u = ( k_1 (r − x̂_1) + … + k_n (r^(n−1) − x̂_n) + r^(n) + a·x̂ − f_L − Δf̂ − f_m ) / b_0
+      = u_ff + ( Σ k_i (r^(i−1) − x̂_i) + a·(x̂ − (r … r^(n−1))) − f_L − Δf̂ ) / b_0
+
+If the model is exact, y = r is a solution with ``x̂ = (r, r', …)`` and ``Δf̂ = 0``, so u = u_ff: the
+feedback part is zero for every b_0. In the errors ``y − r`` and ``u − u_ff`` the loop is the one
+without feedforward: stability, margins and the answer to loads do not depend on it. What the model
+has wrong is a disturbance at the plant's input, and the observer finds it.
+
+In the sampled loop f_m of the sample that begins is ``D r`` in its middle less b_0 times the u_ff
+that acts then; an observer that knows the delay gets the one of the same time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.law import ModelFeedforward, ReferenceOnly
+from quell.lti.canonical import Canonical, canonical, format_roots
+from quell.observers.eso import ESO
+from quell.observers.forms import DelayedModel
+from quell.plants.linear import DelayedPlant, EncodedPlant
+from quell.plants.linearise import linear_model
+from quell.plants.nonlinear import FrictionPlant
+from quell.signals.shapes import Signal
+from quell.types import Vector
+
+# The highest derivative of the reference: a move knows no more with sense, and the numbers of an
+# observer of order 8 need no more. Chosen by hand.
+_MOST = 10
+
+
+@dataclass(frozen=True)
+class Feedforward:
+    """The feedforward of a model of the plant, for ``ADRC(..., feedforward=...)``.
+
+    ``rigid`` makes it from an inertia, ``of`` from a linear or identified plant. It does not depend
+    on b0, and the observer knows it: the head of this file has the equations.
+
+    Parameters
+    ----------
+    coefficients
+        c_0, c_1, … of ``u_ff = c_0 r + c_1 r' + c_2 r'' + …`` [u-unit s^i/y-unit], 1 to 11 of them:
+        of an inertia J with viscous friction c they are 0, c, J.
+    coulomb
+        Coulomb friction F, ``F sign(r')`` [u-unit]; negative where a positive u moves y down.
+    coulomb_speed
+        speed below which it is in proportion to r' [y-unit/s]; by default it jumps with the sign.
+    constant
+        constant u_0 [u-unit], such as gravity.
+    delay
+        time from u to the plant [s], which is compensated by higher derivatives; by default the one
+        that the observer knows. Half a sample for the hold of u is added.
+    derivatives
+        highest derivative of the reference that is used; by default one more than the highest
+        coefficient's, so that delay and hold are compensated in the highest term, too: with it the
+        error that they leave was a hundredth in the trials.
+
+    Raises
+    ------
+    ValueError
+        naming the argument, its value and the rule.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> observer = ql.ESO.model_free(order=2, b0=4000.0, omega_o=500.0, dt=2.5e-4)
+    >>> axis = Feedforward.rigid(1.27e-3, coulomb=0.02)
+    >>> controller = ql.ADRC(observer, omega_c=100.0, feedforward=axis)
+    >>> round(controller.step(0.0, 0.0, 0.0, 100.0), 6)  # J r'' + F, half a sample ahead
+    0.147
+    """
+
+    coefficients: Sequence[float]
+    coulomb: float = 0.0
+    coulomb_speed: float = 0.0
+    constant: float = 0.0
+    delay: float | None = None
+    derivatives: int | None = None
+
+    def __post_init__(self) -> None:
+        found = checks.vector("coefficients", self.coefficients)
+        if not 1 <= found.size <= _MOST + 1:
+            raise ValueError(
+                f"coefficients has {found.size} numbers: must have 1 to {_MOST + 1}, of r, r', …"
+            )
+        object.__setattr__(self, "coefficients", tuple(found.tolist()))
+        checks.finite("coulomb", self.coulomb)
+        checks.non_negative("coulomb_speed", self.coulomb_speed, "y-unit/s")
+        checks.finite("constant", self.constant)
+        if self.coulomb_speed > 0.0 and self.coulomb == 0.0:
+            raise ValueError(
+                f"coulomb_speed = {self.coulomb_speed!r} without coulomb: has no effect; give the "
+                "Coulomb friction, too, or leave it out"
+            )
+        checks.optional(checks.non_negative, "delay", self.delay, "s")
+        if self.derivatives is not None:
+            checks.whole("derivatives", self.derivatives, 1, _MOST)
+
+    @classmethod
+    def rigid(
+        cls,
+        inertia: float,
+        *,
+        viscous: float = 0.0,
+        coulomb: float = 0.0,
+        coulomb_speed: float = 0.0,
+        constant: float = 0.0,
+        delay: float | None = None,
+        derivatives: int | None = None,
+    ) -> Feedforward:
+        """Return the feedforward of a rigid axis, ``J y'' = u − c y' − F sign(y') − u_0``.
+
+        Parameters
+        ----------
+        inertia
+            J, of all that moves [u-unit s²/y-unit]: the reciprocal of the rigid gain.
+        viscous
+            viscous friction c [u-unit s/y-unit].
+        coulomb, coulomb_speed, constant, delay, derivatives
+            as for ``Feedforward``.
+        """
+        inertia = checks.nonzero("inertia", inertia, "or u does not move the axis")
+        friction = checks.finite("viscous", viscous)
+        return cls((0.0, friction, inertia), coulomb, coulomb_speed, constant, delay, derivatives)
+
+    @classmethod
+    def of(
+        cls,
+        plant: Any,
+        *,
+        terms: int | None = None,
+        coulomb: float | None = None,
+        coulomb_speed: float | None = None,
+        constant: float = 0.0,
+        delay: float | None = None,
+        derivatives: int | None = None,
+    ) -> Feedforward:
+        """Return the feedforward of a plant: the series of its inverse.
+
+        Parameters
+        ----------
+        plant
+            a linear plant of any kind that ``LinearPlant.of`` accepts, or one with a linear part,
+            such as that of an identification; its delay and its dry friction are used, an encoder
+            has no effect.
+        terms
+            highest power of s of the series; by default the plant's order. It is exact from there
+            on for a plant without zeros. For one with zeros, 2 is the rigid part of an axis, and
+            each further term comes closer for moves that are slow against the slowest zero.
+        coulomb, coulomb_speed, delay
+            as for ``Feedforward``; by default those of the plant.
+        constant, derivatives
+            as for ``Feedforward``.
+
+        Raises
+        ------
+        ValueError
+            also for a plant with a zero at s = 0, whose output can't follow a constant.
+
+        Examples
+        --------
+        >>> [round(c, 9) for c in Feedforward.of(([2.0], [1.0, 0.6, 0.0])).coefficients]
+        [0.0, 0.3, 0.5]
+        """
+        late, friction, width = 0.0, 0.0, 0.0
+        while isinstance(plant, DelayedPlant | EncodedPlant):
+            late += plant.delay if isinstance(plant, DelayedPlant) else 0.0
+            plant = plant.plant
+        if isinstance(plant, FrictionPlant):
+            friction, width = plant.signed_force, plant.width
+        model = canonical(linear_model(plant))
+        highest = model.a.size if terms is None else checks.whole("terms", terms, 1, _MOST)
+        friction = friction if coulomb is None else coulomb
+        if coulomb_speed is None:
+            coulomb_speed = width if friction != 0.0 else 0.0
+        if delay is None and late > 0.0:
+            delay = late
+        series = inverse_series(model, highest) / model.b
+        return cls(tuple(series.tolist()), friction, coulomb_speed, constant, delay, derivatives)
+
+    @property
+    def order(self) -> int:
+        """The highest derivative of the reference that is used."""
+        highest = min(len(self.coefficients), _MOST)
+        return highest if self.derivatives is None else self.derivatives
+
+    def series(self, highest: int) -> Vector:
+        """Return c_0, c_1, … up to a power (highest + 1,), zero where there are no more."""
+        found = np.zeros(highest + 1)
+        given = np.asarray(self.coefficients, dtype=np.float64)[: found.size]
+        found[: given.size] = given
+        return found
+
+    def linear_part(self, reference: Signal, t: Vector, dt: float) -> Vector:
+        """Return u_ff without friction and constant at times (k,) [s], of a sampled controller.
+
+        The derivatives of the reference give it at the time when u acts, half a sample and
+        ``delay`` later.
+        """
+        total, lead = np.zeros(t.shape), (self.delay or 0.0) + 0.5 * dt
+        for coefficient in shifted(self.series(self.order), lead).tolist():
+            total += coefficient * reference(t)
+            reference = reference.derivative()
+        return total
+
+    def describe(self) -> str:
+        """Return u_ff as a formula."""
+        names = ["r" + "'" * i if i < 4 else f"r^({i})" for i in range(len(self.coefficients))]
+        terms = [f"{c:.4g} {name}" for c, name in zip(self.coefficients, names, strict=True) if c]
+        terms += [f"{self.coulomb:.4g} sign(r')"] if self.coulomb else []
+        terms += [f"{self.constant:.4g}"] if self.constant else []
+        late = "the delay that the observer knows" if self.delay is None else f"{self.delay:g} s"
+        total = " + ".join(terms).replace("+ -", "- ") or "0"
+        return f"u = {total}, ahead by half a sample and {late}"
+
+    def table(self) -> dict[str, Any]:
+        """Return it as a table of a setup file."""
+        found: dict[str, Any] = {"kind": "series", "coefficients": list(self.coefficients)}
+        defaults = Feedforward((0.0,))
+        for name in ("coulomb", "coulomb_speed", "constant", "delay", "derivatives"):
+            value = getattr(self, name)
+            if value != getattr(defaults, name):
+                found[name] = value
+        return found
+
+    def design(self, observer: ESO) -> ModelFeedforward:
+        """Return the parameters for an observer.
+
+        Raises ``ValueError`` for an observer whose f enters elsewhere than u.
+        """
+        plant, degree = observer.plant, observer.degree
+        if not plant.matched:
+            raise ValueError(
+                "feedforward is a model, and the observer's f enters through E, not where u does: "
+                "what the model knows can't be told to it; leave E out"
+            )
+        m = max(self.order, degree)
+        model = observer.model
+        known = model.samples * observer.dt if isinstance(model, DelayedModel) else 0.0
+        half = 0.5 * observer.dt
+        lead = (known if self.delay is None else self.delay) + half
+        own = self.series(m)
+        inverse = inverse_series(plant, m)
+        wish = np.zeros(m + 1)
+        wish[degree] = 1.0
+        acting = shifted(own, lead - known)
+        return ModelFeedforward(
+            control=shifted(own, lead),
+            wish=wish - inverse,
+            share=shifted(inverse, half) - observer.b0 * acting,
+            b0=observer.b0,
+            coulomb=float(self.coulomb),
+            full_speed=float(self.coulomb_speed),
+            constant=float(self.constant),
+            lead=lead,
+            lead_acting=lead - known,
+        )
+
+
+def inverse_series(plant: Canonical, highest: int) -> Vector:
+    """Return the series of ``b/G(s)`` about s = 0 up to a power (highest + 1,), lowest first.
+
+    Raises ``ValueError`` for a zero at s = 0.
+    """
+    n = plant.a.size
+    if np.any(plant.zeros == 0.0):
+        raise ValueError(
+            f"plant has a zero at s = 0 (zeros: {format_roots(plant.zeros)} rad/s): no u makes its "
+            "output follow a constant; feed nothing forward, or measure another output"
+        )
+    numerator = np.zeros(max(n, highest + 1))
+    for k in range(n):  # from the Markov parameters B
+        numerator[n - 1 - k] = sum(plant.a[n - j] * plant.B[k - j] for j in range(1, k + 1))
+        numerator[n - 1 - k] += plant.B[k]
+    denominator = np.zeros(max(n, highest) + 1)
+    denominator[: n + 1] = np.append(plant.a, 1.0)
+    numerator = numerator / plant.b
+    series = np.zeros(highest + 1)
+    for i in range(highest + 1):
+        rest = sum(series[j] * numerator[i - j] for j in range(i))
+        series[i] = (denominator[i] - rest) / numerator[0]
+    return series
+
+
+def shifted(series: Vector, lead: float) -> Vector:
+    """Return the series of ``Σ c_i s^i e^(s lead)`` up to the same power."""
+    found = np.zeros(series.size)
+    power = 1.0
+    for j in range(series.size):
+        found[j:] += power * series[: series.size - j]
+        power *= lead / (j + 1)
+    return found
+
+
+def checked_feedforward(feedforward: Any) -> bool | Feedforward:
+    """Return ``feedforward`` if it is a flag or the feedforward of a model."""
+    if isinstance(feedforward, Feedforward):
+        return feedforward
+    if isinstance(feedforward, bool | np.bool_):
+        return bool(feedforward)
+    raise ValueError(
+        f"feedforward = {feedforward!r}: must be true or false, or quell.Feedforward, for example "
+        "Feedforward.rigid(inertia) or Feedforward.of(plant)"
+    )
+
+
+def feedforward_design(feedforward: bool | Feedforward, observer: ESO) -> Any:
+    """Return the parameters of the feedforward, also without a model."""
+    if isinstance(feedforward, Feedforward):
+        return feedforward.design(observer)
+    return ReferenceOnly()
+
+
+def derivatives_used(feedforward: bool | Feedforward, degree: int) -> int:
+    """Return the number of derivatives of the reference that a controller uses."""
+    if isinstance(feedforward, Feedforward):
+        return max(feedforward.order, degree)
+    return degree if feedforward else 0

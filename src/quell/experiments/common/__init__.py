@@ -1,4 +1,0 @@
-"""Parts that several experiments use: claims, scores and figures.
-
-May import ``records`` and ``files``, and no experiment.
-"""

@@ -1,0 +1,799 @@
+"""A proof for an exported controller: what its C code can never do, whatever it is given.
+
+* The first part writes a program that calls all functions in any order with any numbers, a contract
+  for them in ACSL, and a script.
+* The second runs Frama-C and reads what it has proved.
+* The third reads from the code that it has no recursion, and counts the passes of its loops.
+* The last says the result in words.
+
+What the text of exported C shows by itself: no recursion or allocation, loops that end, arrays.
+
+The translator writes each function after those that it calls, and knows one form of loop, ``for``
+over a range of integers. That is read here from the text and not taken from the translator, so that
+it is checked for the file that is delivered.
+
+The number of passes is an upper bound for a call: that of all loops, in all branches, each with the
+most passes that its ends allow. Ends are constants, variables of the loops around, arguments whose
+range the call tells, sums and products of them, and the smaller of
+such a number and another one.
+
+The files of a proof: a program that does everything, a contract, and a script.
+
+Frama-C: its run over the files of a proof, and what it says.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import math
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import time
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from quell.export.c_files import CSource
+from quell.export.controller_source import at_path, limits_path, parameters_of
+from quell.export.translate.text import Literals
+from quell.files import written_atomically
+
+# ---- What the text of exported C shows by itself ----
+
+_KEYWORDS = frozenset({"if", "for", "while", "switch", "return", "sizeof", "do"})
+_FUNCTION = re.compile(r"^(?:[A-Za-z_][\w ]*[ *])(\w+)\(([^;{}]*)\)\n\{\n(.*?)^\}", re.M | re.S)
+_LOOP = re.compile(
+    r"for \(int (\w+) = ([^;,]+?)(?:, (\w+) = ([^;]+))?; "
+    r"\1 (<|>) ([^;]+); \1(\+\+|--| \+= (-?\d+))\) \{"
+)
+_CALL = re.compile(r"(?<![\w.>])([A-Za-z_]\w*)\(")
+
+
+Interval = tuple[int | None, int | None]
+
+
+@dataclass
+class Structure:
+    """What was read from the text.
+
+    Attributes
+    ----------
+    library
+        functions that are called and not defined: those of the C library.
+    passes
+        the most passes of loops in a call of each function; None where they depend on data.
+    by_data
+        places ``line: header`` of loops in a step whose passes depend on data.
+    problems
+        what is not as claimed.
+    """
+
+    library: set[str] = field(default_factory=set)
+    passes: dict[str, int | None] = field(default_factory=dict)
+    by_data: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+def structure(source: str, step: str) -> Structure:
+    """Read the text of a C file, whose function of each sample is ``step``."""
+    text = re.sub(r"/\*.*?\*/", lambda found: re.sub(r"[^\n]", " ", found[0]), source, flags=re.S)
+    found = Structure()
+    constants = re.findall(r"^static const int (\w+) = (-?\d+);", text, re.M)
+    counter = _Counter(found, {name: (int(value), int(value)) for name, value in constants})
+    for each in _FUNCTION.finditer(text):
+        line = text.count("\n", 0, each.start(3)) + 1
+        given = " ".join(each[2].split())
+        names = tuple(re.findall(r"(\w+)(?:\[\w*\])*(?:,|$)", given))
+        counter.functions[each[1]] = _Function(each[1], names, each[3], line)
+        lengths = {name: [int(size) for size in re.findall(r"\d+", sizes)]
+                   for name, sizes in re.findall(r"(\w+)((?:\[\d+\])+)(?:,|$)", given)}  # fmt: skip
+        found.problems += counter.outside(counter.functions[each[1]], lengths)
+    if step not in counter.functions:
+        found.problems.append(f"there is no function {step}")
+    seen: set[str] = set()
+    for name, function in counter.functions.items():
+        called = set(_CALL.findall(function.body)) - _KEYWORDS
+        for other in sorted(called & set(counter.functions) - seen):
+            rule = "which is defined later: recursion is possible"
+            found.problems.append(f"{name} calls {other}, {rule}")
+        seen.add(name)
+        found.library |= called - set(counter.functions)
+        found.problems += function.problems()
+    allocating = found.library & {"malloc", "calloc", "realloc", "alloca", "free"}
+    found.problems += [f"{each} is called" for each in sorted(allocating)]
+    if not found.problems:
+        found.passes[step] = counter.passes(step, ())
+        found.by_data = list(counter.by_data)
+        for name in counter.functions:
+            found.passes[name] = counter.passes(name, ())
+    return found
+
+
+class _Function:
+    """A function of the file, with its loops and what they span."""
+
+    def __init__(self, name: str, parameters: tuple[str, ...], body: str, line: int) -> None:
+        self.name, self.parameters, self.body = name, parameters, body
+        self.loops = list(_LOOP.finditer(body))
+        self.spans = [(loop.end(), _end_of(body, loop.end())) for loop in self.loops]
+        self.lines = [line + body.count("\n", 0, loop.start()) for loop in self.loops]
+
+    def problems(self) -> list[str]:
+        """Return what is no loop over a range of integers with an end that stays."""
+        found = [
+            f"{self.name} has '{word}'" for word in re.findall(r"\b(?:while|do|goto)\b", self.body)
+        ]
+        if len(self.loops) != len(re.findall(r"\bfor\b", self.body)):
+            found.append(f"{self.name} has a loop that is no range of integers")
+        for loop, (begin, end), line in zip(self.loops, self.spans, self.lines, strict=True):
+            names = {loop[1], *re.findall(r"(?<![\w.>])[A-Za-z_]\w*(?!\w*\()", loop[3] or loop[6])}
+            for name in sorted(names):
+                change = rf"(?<![\w.>])(?:{name} ?(?:[-+*/]?=[^=]|\+\+|--)|(?:\+\+|--){name}\b)"
+                if re.search(change, self.body[begin:end]):
+                    found.append(f"{self.name} changes {name} in its loop, line {line}")
+            if "->" in (loop[3] or loop[6]):
+                found.append(f"{self.name} has a loop whose end may change, line {line}")
+        return found
+
+
+class _Counter:
+    """The passes of functions for known ranges of their arguments."""
+
+    def __init__(self, found: Structure, constants: dict[str, tuple[int, int]]) -> None:
+        self.found, self.constants = found, constants
+        self.functions: dict[str, _Function] = {}
+        self.by_data: list[str] = []
+        self._known: dict[tuple[str, tuple[Interval, ...]], int | None] = {}
+
+    def passes(self, name: str, arguments: tuple[Interval, ...]) -> int | None:
+        """Return the most passes of loops in a call of a function."""
+        key = name, arguments
+        if key not in self._known:
+            self._known[key] = self._count(self.functions[name], arguments)
+        return self._known[key]
+
+    def outside(self, function: _Function, lengths: dict[str, list[int]]) -> list[str]:
+        """Return the places where an array that is an argument is used beyond its length.
+
+        Eva takes the state for one object, in which an index may run from one array into the next.
+        What is checked are indices whose range is known in the function itself.
+        """
+        ranges: list[dict[str, tuple[int, int]]] = []
+        for loop in function.loops:
+            known = self._known_at(function, ranges, loop.start())
+            first, last = _range(loop[2], known), _range(loop[4] or loop[6], known)
+            ranges.append(_values(loop[1], first, last, loop[5]))
+        problems, plain = [], _LOOP.sub("", function.body)
+        tested = set(re.findall(r"(?<![\w.>])([A-Za-z_]\w*) (?:[<>]=?|[!=]=) ", plain))
+        for use in re.finditer(r"(?<![\w.>])(\w+)((?:\[[^\[\]]+\])+)", function.body):
+            known = self._known_at(function, ranges, use.start())
+            indices = re.findall(r"\[([^\[\]]+)\]", use[2])
+            for index, length in zip(indices, lengths.get(use[1], []), strict=False):
+                if any(each in tested for each in re.findall(r"[A-Za-z_]\w*", index)):
+                    continue  # a condition may narrow its range
+                low, high = _range(index, known)
+                if (low is not None and low < 0) or (high is not None and high >= length):
+                    problems.append(f"{function.name} uses {use[0]}, of {length} entries")
+        return problems
+
+    def _known_at(
+        self, function: _Function, ranges: list[dict[str, tuple[int, int]]], at: int
+    ) -> dict[str, tuple[int, int]]:
+        """Return the ranges of constants, and of the variables of the loops around a place."""
+        names = dict(self.constants)
+        for values, (begin, end) in zip(ranges, function.spans, strict=False):
+            names |= values if begin <= at < end else {}
+        return names
+
+    def _count(self, function: _Function, arguments: tuple[Interval, ...]) -> int | None:
+        given = dict(zip(function.parameters, arguments, strict=False))
+        fixed = {name: (low, high) for name, (low, high) in given.items()
+                 if low is not None and high is not None}  # fmt: skip
+        most: list[int | None] = []
+        ranges: list[dict[str, tuple[int, int]]] = []
+
+        def known(at: int) -> dict[str, tuple[int, int]]:
+            names = {**self.constants, **fixed}
+            for values, (begin, end) in zip(ranges, function.spans, strict=False):
+                names |= values if begin <= at < end else {}
+            return names
+
+        for loop, line in zip(function.loops, function.lines, strict=True):
+            names = known(loop.start())
+            first, last = _range(loop[2], names), _range(loop[4] or loop[6], names)
+            step = {"++": 1, "--": -1}.get(loop[7]) or int(loop[8])
+            most.append(_count(first, last, step, loop[5]))
+            ranges.append(_values(loop[1], first, last, loop[5]))
+            place = f"{line}: {loop[0].removesuffix(' {')}"
+            if most[-1] is None and place not in self.by_data:
+                self.by_data.append(place)
+        total: int | None = 0
+        for own, loop in zip(most, function.loops, strict=True):
+            total = _sum(total, _times(own, _product(most, function.spans, loop.start())))
+        for call in _CALL.finditer(function.body):
+            if call[1] in self.functions:
+                parts = _arguments(function.body, call.end())
+                values = tuple(_range(part, known(call.start())) for part in parts)
+                inner = self.passes(call[1], values)
+                if inner != 0:
+                    times = _product(most, function.spans, call.start())
+                    total = _sum(total, _times(inner, times))
+        return total
+
+
+def _arguments(body: str, begin: int) -> list[str]:
+    """Return the arguments of a call, which begin after its parenthesis."""
+    found, depth = [""], 0
+    for sign in body[begin:]:
+        depth += {"(": 1, "[": 1, ")": -1, "]": -1}.get(sign, 0)
+        if depth < 0:
+            break
+        if sign == "," and depth == 0:
+            found.append("")
+        else:
+            found[-1] += sign
+    return found
+
+
+def _product(most: list[int | None], spans: list[tuple[int, int]], at: int) -> int | None:
+    """Return how often a place is reached: the product of the passes of the loops around it."""
+    product: int | None = 1
+    for passes, (begin, end) in zip(most, spans, strict=True):
+        if begin <= at < end:
+            product = _times(product, passes)
+    return product
+
+
+def _end_of(body: str, begin: int) -> int:
+    depth = 1
+    for at in range(begin, len(body)):
+        depth += {"{": 1, "}": -1}.get(body[at], 0)
+        if depth == 0:
+            return at
+    return len(body)
+
+
+def _sum(one: int | None, other: int | None) -> int | None:
+    return None if one is None or other is None else one + other
+
+
+def _times(one: int | None, other: int | None) -> int | None:
+    return None if one is None or other is None else one * other
+
+
+def _count(first: Interval, last: Interval, step: int, sign: str) -> int | None:
+    ends = (first[0], last[1]) if sign == "<" else (last[0], first[1])
+    if ends[0] is None or ends[1] is None or (step > 0) != (sign == "<"):
+        return None
+    return max(-((ends[0] - ends[1]) // abs(step)), 0)
+
+
+def _values(name: str, first: Interval, last: Interval, sign: str) -> dict[str, tuple[int, int]]:
+    """Return the range of a loop's variable, if it is known."""
+    low, high = (first[0], last[1]) if sign == "<" else (last[0], first[1])
+    if low is None or high is None:
+        return {}
+    low, high = (low, high - 1) if sign == "<" else (low + 1, high)
+    return {name: (min(low, high), high)}
+
+
+def _range(code: str, known: dict[str, tuple[int, int]]) -> Interval:
+    """Return the least and the largest value of an expression of integers; None if unknown."""
+    try:
+        tree = ast.parse(code.strip().replace("->", "."), mode="eval").body
+    except SyntaxError:
+        return None, None
+    return _interval(tree, known)
+
+
+def _interval(node: ast.expr, known: dict[str, tuple[int, int]]) -> Interval:
+    if isinstance(node, ast.Constant) and isinstance(node.value, int):
+        return node.value, node.value
+    if isinstance(node, ast.Name):
+        return known.get(node.id, (None, None))
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        low, high = _interval(node.operand, known)
+        return None if high is None else -high, None if low is None else -low
+    if isinstance(node, ast.BinOp):
+        return _operation(node.op, _interval(node.left, known), _interval(node.right, known))
+    if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "minimum_int":
+        one, other = (_interval(each, known) for each in node.args)
+        highs = [each for each in (one[1], other[1]) if each is not None]
+        low = None if one[0] is None or other[0] is None else min(one[0], other[0])
+        return low, min(highs, default=None)
+    return None, None
+
+
+def _operation(sign: ast.operator, one: Interval, other: Interval) -> Interval:
+    if isinstance(sign, ast.Add):
+        return _sum(one[0], other[0]), _sum(one[1], other[1])
+    if isinstance(sign, ast.Sub):
+        low = None if one[0] is None or other[1] is None else one[0] - other[1]
+        return low, None if one[1] is None or other[0] is None else one[1] - other[0]
+    if isinstance(sign, ast.Mult) and None not in (*one, *other):
+        products = [a * b for a in one for b in other]  # type: ignore[operator]
+        return min(products), max(products)
+    return None, None
+
+
+# ---- The files of a proof ----
+
+FOLDER = "proof"
+"""The folder of these files."""
+PROPERTIES = "properties.csv"
+"""The file with all that Frama-C has looked at."""
+
+# One set of intervals at each place of the code, and short loops pass by pass: so arrays that they
+# fill are known to be filled. Level 1 took four times as long and proved no more. Results that are
+# infinite or no number are no alarm by themselves.
+_OPTIONS = (
+    *("-eva", "-eva-precision", "0", "-eva-auto-loop-unroll", "64"),
+    *("-warn-special-float", "none", "-machdep", "gcc_x86_64"),
+)
+
+CALLS = {
+    "step": "any_real, any_realDERIVATIVES",
+    "step_counts": "any_count, any_countDERIVATIVES",
+    "applied": "any_real",
+    "track": "any_real, any_real, any_realDERIVATIVES",
+    "hand_over": "",
+    "start": "any_real, any_real, any_real",
+    "reset": "",
+    "status": "",
+    "get_estimate": "",
+    "stopping_point": "",
+}
+"""Arguments of the functions, each call with other numbers; without ``init`` and ``retune``."""
+RETURN_U = {"step": "REAL r, REAL y", "step_counts": "int32_t r, int32_t count",
+             "track": "REAL r, REAL y, REAL u"}  # fmt: skip
+"""Functions that return u, and their arguments but for derivatives of the reference."""
+
+
+def frama_c_options(name: str) -> tuple[str, ...]:
+    """Return the arguments of frama-c, in the folder of the proof."""
+    sources = (f"../src/{name}.c", f"{name}_proof.c")
+    return (*_OPTIONS, "-cpp-extra-args=-I../src", *sources, "-then", "-report-csv", PROPERTIES)
+
+
+def proof_files(controller: Any, source: CSource) -> dict[str, str]:
+    """Return the text of the files of a proof by path.
+
+    Raises
+    ------
+    ValueError
+        for a controller that calls functions of the user in C: nothing is known of them.
+    """
+    if source.externals:
+        names = ", ".join(source.externals)
+        raise ValueError(
+            f"proof = True: the controller calls {names}, which is in C and which the proof can't "
+            "see; leave the proof out, or the c_function: then its translation is proved, too"
+        )
+    name, path = source.name, limits_path(controller)
+    options = shlex.join(frama_c_options(name))
+    script = (resources.files(__package__) / "templates" / "prove.sh").read_text("utf-8")
+    return {
+        f"{FOLDER}/{name}_contract.h": _contract(source, path),
+        f"{FOLDER}/{name}_proof.c": _program(controller, source, path),
+        f"{FOLDER}/prove.sh": script.replace("@name@", name).replace("@options@", options),
+    }
+
+
+def _contract(source: CSource, path: str) -> str:
+    """Return the declarations of the functions that return u, with what they promise."""
+    name, upper = source.name, source.name.upper()
+    more = "".join(f", {source.real} r{i + 1}" for i in range(source.derivatives))
+    limits = f"state->parameters->{path}"
+    promises = ["ensures a_number: \\is_finite(\\result);"]
+    if path:
+        promises.append(f"ensures within_limits: {limits}.low <= \\result <= {limits}.high;")
+    lines = [
+        f"/* What {name} promises, in ACSL: u is a number within the limits, for any arguments.",
+        " *",
+        " * A program with this header in place of the other one can be checked against it. */",
+        f"#ifndef {upper}_CONTRACT_H",
+        f"#define {upper}_CONTRACT_H",
+        "",
+        f'#include "{name}.h"',
+    ]
+    for operation, given in RETURN_U.items():
+        if operation in source.operations:
+            arguments = f"{name}_state *state, {given}{more}".replace("REAL", source.real)
+            lines += [
+                "",
+                "/*@ requires a_state: \\valid(state) && \\valid_read(state->parameters);",
+                *(f"    {each}" for each in promises),
+                "*/",
+                f"{source.real} {name}_{operation}({arguments});",
+            ]
+    return "\n".join([*lines, "", "#endif", ""])
+
+
+def _program(controller: Any, source: CSource, path: str) -> str:
+    """Return the program that calls all functions in any order, with any numbers."""
+    name, real = source.name, source.real
+    more = ", any_real" * source.derivatives
+    cases: list[str] = []
+    for i, (operation, given) in enumerate(CALLS.items()):
+        if operation in source.operations:
+            arguments = "".join(f", {each}" for each in [given] if each)
+            call = f"{name}_{operation}(state{arguments.replace('DERIVATIVES', more)});"
+            cases += [f"        case {i}:", f"            {call}", "            break;"]
+    counts = "step_counts" in source.operations
+    narrower = narrower_limit(controller, path, source.precision == "single")
+    retuning = [
+        f"    narrower = {name}_default_parameters;",
+        *([f"    narrower.{path}.high = {narrower};"] if narrower else []),
+        "    while (any_int) {",
+        f"        {name}_retune(&controller, &narrower);",
+        "        operate(&controller);",
+        f"        {name}_retune(&controller, &{name}_default_parameters);",
+        "        operate(&controller);",
+        "    }",
+    ]
+    return "\n".join([
+        f"/* All that a program can do with {name}: every function, in any order, for ever, with",
+        " * any numbers, also infinities and NaN. Each read of a volatile variable is another. */",
+        f'#include "{name}_contract.h"',
+        "",
+        f"static volatile {real} any_real;",
+        "static volatile int any_int;",
+        *(["static volatile int32_t any_count;"] if counts else []),
+        f"static {name}_state controller;",
+        f"static {name}_parameters narrower;",
+        "",
+        f"static void operate({name}_state *state)",
+        "{",
+        "    while (any_int) {",
+        "        switch (any_int) {",
+        *cases,
+        "        default:",
+        "            break;",
+        "        }",
+        "    }",
+        "}",
+        "",
+        "int main(void)",
+        "{",
+        f"    {name}_init(&controller);",
+        "    operate(&controller);",
+        *retuning,
+        "    return 0;",
+        "}",
+        "",
+    ])  # fmt: skip
+
+
+def narrower_limit(controller: Any, path: str, single: bool) -> str:
+    """Return an upper limit below that of the controller, as C code; nothing without limits."""
+    if not path:
+        return ""
+    limits = at_path(parameters_of(controller), path)
+    low, high = float(limits.low), float(limits.high)
+    write = Literals(single).write_real
+    if math.isfinite(low) and math.isfinite(high):
+        return write(0.5 * low + 0.5 * high)
+    if math.isfinite(low):
+        return write(low + 1.0 + abs(low))
+    return write(high - 1.0 - abs(high) if math.isfinite(high) else 1.0)
+
+
+# ---- Frama-C ----
+
+INSTALL = "there is no frama-c here (Debian and Ubuntu: apt-get install frama-c-base)"
+_PROVED = ("Valid", "Considered valid")  # the second are contracts of the C library
+# What functions of the C library change is an assumption, of which the report names the functions.
+_ASSUMED = ("assigns clause", "from clause")
+# What the contract promises; without these the proof did not look at what it is for.
+_PROMISES = ("a_number: ", "within_limits: ")
+
+
+class Alarm(NamedTuple):
+    """A property that is not proved.
+
+    Attributes
+    ----------
+    file, line, function
+        where it stands.
+    kind
+        such as ``"index_bound"`` or ``"postcondition"``, as Frama-C names it.
+    status
+        ``"Unknown"``: it may hold; ``"Invalid"``: it does not.
+    claim
+        what should hold, in ACSL.
+    """
+
+    file: str
+    line: int
+    function: str
+    kind: str
+    status: str
+    claim: str
+
+    @property
+    def place(self) -> str:
+        """File and line."""
+        return f"{self.file}:{self.line}"
+
+
+class Findings(NamedTuple):
+    """What Frama-C has found.
+
+    Attributes
+    ----------
+    version
+        of Frama-C.
+    seconds
+        that it took.
+    alarms
+        all that is not proved.
+    promises
+        number of the contract's promises that are proved.
+    functions, statements
+        how many were reached and how many there are, as text.
+    assumed
+        functions of the C library that are known by their contracts alone.
+    failure
+        why there is no result; empty if there is one.
+    """
+
+    version: str = ""
+    seconds: float = 0.0
+    alarms: tuple[Alarm, ...] = ()
+    promises: int = 0
+    functions: str = ""
+    statements: str = ""
+    assumed: tuple[str, ...] = ()
+    failure: str = ""
+
+
+def frama_c(folder: Path, name: str, longest: float) -> Findings:
+    """Run Frama-C in ``folder/proof`` for at most ``longest`` seconds."""
+    program = shutil.which("frama-c")
+    if program is None:
+        return Findings(failure=INSTALL)
+    place = (folder / FOLDER).resolve()  # Frama-C takes the folder from PWD
+    (place / PROPERTIES).unlink(missing_ok=True)
+    version = _output(program, "-version")
+    begin = time.monotonic()
+    try:
+        with (place / "eva.log").open("w", encoding="utf-8") as log:
+            code = subprocess.run(
+                [program, *frama_c_options(name)], cwd=place, stdout=log, stderr=subprocess.STDOUT,
+                timeout=longest, check=False, env={**os.environ, "PWD": str(place)},
+            ).returncode  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return Findings(version, longest, failure=f"the analysis did not end in {longest:g} s")
+    seconds = time.monotonic() - begin
+    text = (place / "eva.log").read_text(encoding="utf-8", errors="replace")
+    table = place / PROPERTIES
+    if code or not table.exists() or "[eva:summary]" not in text:
+        last = text.strip().splitlines()[-1:] or ["no output"]
+        return Findings(version, seconds, failure=f"frama-c ended with {code}: {last[0][:200]}")
+    return read_findings(version, seconds, text, table.read_text(encoding="utf-8"))
+
+
+def read_findings(version: str, seconds: float, log: str, table: str) -> Findings:
+    """Return what a log and a table of properties say."""
+    rows = [line.split("\t") for line in table.splitlines()[1:]]
+    alarms = [
+        Alarm(Path(file).name, int(line), function, kind, status, text)
+        for place, file, line, function, kind, status, text in rows
+        if status not in _PROVED and not (place.startswith("FRAMAC_SHARE") and kind in _ASSUMED)
+    ]
+    promises = sum(
+        status == "Valid" and kind == "postcondition" and text.startswith(_PROMISES)
+        for *_, kind, status, text in rows
+    )
+    failure = ""
+    errors = re.search(r"by the (Eva analyzer|Frama-C kernel): +([1-9]\d*) error", log)
+    functions = _found(r"(\d+) functions analyzed \(out of (\d+)\)", log)
+    if errors:
+        failure = f"{errors[2]} errors of the {errors[1]}, see eva.log"
+    elif "ecursive call" in log:
+        failure = "the analysis found a recursive call, see eva.log"
+    return Findings(
+        version,
+        seconds,
+        tuple(alarms),
+        promises,
+        functions,
+        _found(r"(\d+) statements reached \(out of (\d+)\)", log),
+        tuple(sorted(set(re.findall(r"using specification for function (\w+)", log)))),
+        failure,
+    )
+
+
+def _found(pattern: str, text: str) -> str:
+    match = re.search(pattern, text)
+    return f"{match[1]} of {match[2]}" if match else "unknown"
+
+
+def _output(*command: str) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+    return done.stdout.strip()
+
+
+# ---- The proof of an exported controller, and what it says to a safety engineer ----
+
+REPORT = "REPORT.md"
+# Controllers with large learners took some minutes.
+_LONGEST = 3600.0
+# What an alarm of each kind would mean; Frama-C's names.
+_MEANINGS = {
+    "postcondition": "u may leave its limits or may be no number",
+    "index_bound": "a place outside of an array may be read or written",
+    "mem_access": "memory outside of an object may be read or written",
+    "initialization": "a variable may be read before it is set",
+    "signed_overflow": "a sum or product of integers may overflow",
+    "float_to_int": "a number too large for an integer may be converted to one",
+    "is_nan_or_infinite": "a number that is not finite may be converted to an integer",
+    "division_by_zero": "an integer may be divided by zero",
+    "shift": "a shift may have a count out of range",
+    "precondition": "a function may be called with an argument that it does not allow",
+}
+_OPEN = """An open property need not be an error: the analysis computes with sets that contain more
+than can happen. Somebody must look at it before anybody relies on the proof.
+
+"""
+_LIMITS = """
+  It is at least the lower and at most the upper limit of u in the parameters in use, also after
+  these have changed."""
+_ENDS = "Each counts an integer to an end that does not change meanwhile, so it ends."
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What was proved of an exported controller.
+
+    Attributes
+    ----------
+    folder
+        the exported folder; the files of the proof are in ``proof``.
+    name
+        of the controller.
+    findings
+        what Frama-C has found; its ``failure`` says why there is no result, if there is none.
+    structure
+        what the text of the code shows.
+    promised
+        number of promises in the contract.
+    promising
+        the functions that return u.
+    digest
+        SHA-256 of header and source, one after the other: the proof is for these files alone.
+    sizes
+        stack and code of each function, in Markdown; empty if nobody has measured them.
+    """
+
+    folder: Path
+    name: str
+    findings: Findings
+    structure: Structure
+    promised: int
+    promising: tuple[str, ...]
+    digest: str
+    sizes: str = ""
+
+    @property
+    def proved(self) -> bool:
+        """Whether everything is proved."""
+        return not self.open
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """What Frama-C could not prove."""
+        return self.findings.alarms
+
+    @property
+    def open(self) -> tuple[str, ...]:
+        """What is not proved, a sentence each."""
+        found = self.findings
+        if found.failure:
+            return (found.failure, *self.structure.problems)
+        lines = [
+            f"{alarm.place}, in {alarm.function}: {_meaning(alarm)} ({alarm.claim})"
+            for alarm in found.alarms
+        ]
+        if found.promises < self.promised:
+            lines.append(f"{found.promises} of {self.promised} promises on u are proved")
+        return (*lines, *self.structure.problems)
+
+    @property
+    def summary(self) -> str:
+        """The result in a line."""
+        if self.findings.failure:
+            return f"NOT proved: {self.findings.failure}"
+        where = f"Frama-C {self.findings.version}, {self.findings.seconds:.0f} s"
+        if not self.proved:
+            return f"NOT proved: {len(self.open)} properties are open ({where})"
+        return f"Proved: no undefined behaviour, u is always a number within its limits ({where})"
+
+    @property
+    def text(self) -> str:
+        """The report in Markdown."""
+        library = self.findings.assumed
+        lines = "".join(f"- NOT proved: {each}\n" for each in self.open)
+        return _filled("REPORT.md", {
+            "name": self.name,
+            "summary": self.summary,
+            "digest": self.digest,
+            "results": "" if self.findings.failure else self._results(),
+            "open": f"## What is open\n\n{lines}\n{_OPEN}" if lines else "",
+            "library": ", ".join(f"`{each}`" for each in library) or "none",
+            "sizes": f"## Stack and code\n\n{self.sizes}\n" if self.sizes else "",
+        })  # fmt: skip
+
+    def _results(self) -> str:
+        found, promising = self.findings, self.promising
+        return _filled("results.md", {
+            "name": self.name,
+            "head": "What is proved" if self.proved else "What holds but for the open properties",
+            "functions": " or ".join(f"`{self.name}_{each}`" for each in promising),
+            "limits": _LIMITS if self.promised > len(promising) else " There are no limits of u.",
+            "loops": self._loops(),
+            "called": ", ".join(f"`{each}`" for each in sorted(self.structure.library)) or "none",
+            "version": found.version,
+            "seconds": f"{found.seconds:.1f}",
+            "reached": f"{found.functions} functions and {found.statements} statements",
+        })  # fmt: skip
+
+    def _loops(self) -> str:
+        passes = self.structure.passes.get(f"{self.name}_step")
+        if passes is not None:
+            start = self.structure.passes.get(f"{self.name}_start")
+            more = "" if start is None else f", `{self.name}_start` {start}"
+            return f"{_ENDS}\n  A step has {passes} passes of loops at most{more}."
+        places = "".join(f"\n  - line {each}" for each in self.structure.by_data)
+        return (
+            f"{_ENDS}\n  NOT counted: the passes of a step, as these ends depend on data:{places}"
+        )
+
+
+def _filled(name: str, values: dict[str, str]) -> str:
+    text = (resources.files(__package__) / "templates" / name).read_text("utf-8")
+    return re.sub(r"@(\w+)@", lambda found: values[found[1]], text)
+
+
+def _meaning(alarm: Alarm) -> str:
+    known = _MEANINGS.get(alarm.kind, f"'{alarm.kind}' is not excluded")
+    return known if alarm.status == "Unknown" else f"{known}, status {alarm.status}"
+
+
+def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: str = "") -> Proof:
+    """Run the proof whose files are in ``folder/proof``, and write its report there.
+
+    Parameters
+    ----------
+    folder
+        of the exported controller.
+    source
+        its C code.
+    longest
+        time after which the analysis is ended, and nothing is proved [s].
+    sizes
+        stack and code of each function for the report, in Markdown.
+    """
+    contract = (folder / FOLDER / f"{source.name}_contract.h").read_text(encoding="utf-8")
+    found = frama_c(folder, source.name, longest)
+    header, code = ((folder / "src" / f"{source.name}{end}").read_bytes() for end in (".h", ".c"))
+    read, digest = (
+        structure(code.decode("utf-8"), f"{source.name}_step"),
+        hashlib.sha256(header + code).hexdigest(),
+    )
+    promising = tuple(each for each in RETURN_U if each in source.operations)
+    promised = contract.count("ensures ")
+    proof = Proof(folder, source.name, found, read, promised, promising, digest, sizes)
+    with written_atomically(folder / FOLDER / REPORT, overwrite=True) as part:
+        part.write_text(proof.text, encoding="utf-8")
+    return proof
+
+
+# ---- A proof for an exported controller ----
+
+__all__ = ["Alarm", "Proof", "proof_files", "prove"]

@@ -1,0 +1,659 @@
+"""Machine code of a user's differential equation whose parameters are numbers by name.
+
+The numbers are an array beside the addresses of the code: other numbers need no other code.
+
+The equation of a nonlinear plant in a sample: Runge-Kutta over the user's function.
+
+A transfer function whose input acts against Coulomb friction, as identification finds it.
+
+::
+
+    x' = A x + B (u + w − σ F tanh(y'/v)),      y = x_1
+
+σ is the sign of the gain from u to the motion, so that friction acts against it. In order 1 y is
+the speed, and stands in the place of y'. v is small against the speeds of motion. The sign of the
+speed is smooth, so that Runge-Kutta steps solve the equation; a plant at rest creeps slowly under
+less than F.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba.core import types as nb_types
+from numba.np.unsafe.ndarray import to_fixed_tuple
+
+from quell import checks
+from quell.checks import Described
+from quell.kernels import user_functions
+from quell.kernels.dispatch import generic
+from quell.kernels.functions import tanh
+from quell.kernels.user_functions import POINTER, call, evaluate
+from quell.plants.base import Plant, advance, labelled, measure, signals_of
+from quell.plants.linear import LinearPlant, delayed
+from quell.types import Matrix, Vector, warn
+
+# ---- Machine code of a user's differential equation whose parameters are numbers by name ----
+
+_RATE_SIGNATURE = nb_types.void(
+    nb_types.float64, POINTER, nb_types.float64, POINTER, POINTER, POINTER
+)
+_OUTPUT_SIGNATURE = nb_types.float64(POINTER, POINTER)
+# Pairs of functions whose code is kept, for plants that are made again with other numbers. Chosen
+# by hand: more than the plants of a study.
+_KEPT = 32
+
+
+def named_parameters(function: Callable[..., Any], first: int) -> dict[str, Any]:
+    """Return the parameters of a function after its ``first`` ones, and their defaults."""
+    try:
+        takes = [*inspect.signature(function).parameters.values()][first:]
+    except (TypeError, ValueError):
+        return {}
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return {each.name: each.default for each in takes if each.kind not in variable}
+
+
+def checked_parameters(
+    given: Mapping[str, Any], f: Callable[..., Any], output: Any
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the numbers that f and the output take after (t, x, u, w) and (x), in their order.
+
+    Raises
+    ------
+    ValueError
+        for a name that neither takes, a missing one, or a value that is no finite number.
+    """
+    if not isinstance(given, Mapping):
+        raise ValueError(f"parameters = {given!r:.60}: must be numbers by name")
+    taken = named_parameters(f, 4), named_parameters(output, 1) if callable(output) else {}
+    known = list(dict.fromkeys([*taken[0], *taken[1]]))
+    for name in given:
+        if name not in known:
+            hint = checks.nearest(str(name), known) if known else "f takes (t, x, u, w) only"
+            raise ValueError(f"parameters[{name!r}]: is no argument of f or output; {hint}")
+    found = []
+    for names in taken:
+        values = {}
+        for name, default in names.items():
+            value = given.get(name, default)
+            if value is inspect.Parameter.empty:
+                raise ValueError(f"parameters: {name} is missing, f or output takes it")
+            values[name] = checks.finite(f"parameters[{name!r}]", value)
+        found.append(values)
+    return found[0], found[1]
+
+
+def bound(function: Callable[..., Any], values: Mapping[str, float]) -> Callable[..., Any]:
+    """Return a function with its numbers given, for Python."""
+    return partial(function, **values) if values else function
+
+
+@lru_cache(maxsize=_KEPT)
+def row_output(row: tuple[float, ...]) -> Callable[[Vector], float]:
+    """Return the function ``C x`` of a row C."""
+
+    def linear(x: Vector) -> float:
+        y = 0.0
+        for i in range(len(row)):
+            y += row[i] * x[i]
+        return y
+
+    return linear
+
+
+@lru_cache(maxsize=_KEPT)
+def machine_code(
+    rate_of: Callable[..., Any],
+    output_of: Callable[..., Any],
+    sizes: tuple[int, int],
+    counts: tuple[int, int],
+) -> tuple[Any, Any]:
+    """Return the compiled f and output, which take a pointer to all numbers as well.
+
+    Parameters
+    ----------
+    rate_of, output_of
+        the user's functions.
+    sizes
+        numbers of states and of disturbances.
+    counts
+        numbers of parameters of f and of the output, which follow each other in the array.
+
+    Raises
+    ------
+    NotCompilableError
+        if Numba can't compile a function.
+    """
+    (n, m), (own, more) = sizes, counts
+    every = own + more
+    f = user_functions.jit_user_function(rate_of)
+    h = user_functions.jit_user_function(output_of)
+
+    def rate(t, px, u, pw, pp, pdx):  # type: ignore[no-untyped-def]
+        dx = numba.carray(pdx, (n,))
+        values = to_fixed_tuple(numba.carray(pp, (every,))[:own], own)
+        derivatives = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (m,)), *values)
+        for i in range(n):
+            dx[i] = derivatives[i]
+
+    def output(px, pp):  # type: ignore[no-untyped-def]
+        values = to_fixed_tuple(numba.carray(pp, (every,))[own:], more)
+        return h(numba.carray(px, (n,)), *values)
+
+    compile_cfunc = user_functions.compile_cfunc
+    return compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
+
+
+def as_array(*values: Mapping[str, float]) -> Vector:
+    """Return all numbers in their order."""
+    return np.array([number for each in values for number in each.values()])
+
+
+# ---- The equation of a nonlinear plant in a sample ----
+
+
+class CompiledNonlinear(NamedTuple):
+    """A nonlinear plant with compiled functions.
+
+    They are given by address, so one compiled driver serves all of them.
+    """
+
+    rate: int
+    output: int
+    step: float  # length of a sub-step [s]
+    substeps: int
+
+
+class CompiledParametric(NamedTuple):
+    """A nonlinear plant with compiled functions that take an array of parameters, too."""
+
+    rate: int
+    output: int
+    step: float  # length of a sub-step [s]
+    substeps: int
+    parameters: Vector  # those of the rate, then those of the output
+
+
+class PythonNonlinear(NamedTuple):
+    """A nonlinear plant whose functions only Python can run; fields as ``CompiledNonlinear``."""
+
+    rate: Callable[..., Any]
+    output: Callable[..., Any]
+    step: float
+    substeps: int
+
+
+@generic
+def derivatives(plant: Any, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
+    """Write the derivatives of the state into ``dx`` (n,)."""
+    raise TypeError
+
+
+@advance.register(CompiledNonlinear)
+@advance.register(CompiledParametric)
+@advance.register(PythonNonlinear)
+def runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    """Take ``substeps`` classical Runge-Kutta steps.
+
+    Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, table II.1.2.
+    """
+    n = x.size
+    k1, k2, k3 = scratch[:n], scratch[n : 2 * n], scratch[2 * n : 3 * n]
+    k4, inner = scratch[3 * n : 4 * n], scratch[4 * n : 5 * n]
+    h = plant.step
+    for i in range(plant.substeps):
+        now = t + i * h
+        derivatives(plant, now, x, u, w, k1)
+        for j in range(n):
+            inner[j] = x[j] + 0.5 * h * k1[j]
+        derivatives(plant, now + 0.5 * h, inner, u, w, k2)
+        for j in range(n):
+            inner[j] = x[j] + 0.5 * h * k2[j]
+        derivatives(plant, now + 0.5 * h, inner, u, w, k3)
+        for j in range(n):
+            inner[j] = x[j] + h * k3[j]
+        derivatives(plant, now + h, inner, u, w, k4)
+        for j in range(n):
+            x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
+
+
+@measure.register(CompiledNonlinear)
+def _measure(plant: CompiledNonlinear, x: Vector) -> float:
+    return evaluate(plant.output, x)
+
+
+@derivatives.register(CompiledNonlinear)
+def _derivatives(
+    plant: CompiledNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
+) -> None:
+    call(plant.rate, t, x, u, w, dx)
+
+
+@measure.register(CompiledParametric)
+def _measure_parametric(plant: CompiledParametric, x: Vector) -> float:
+    return evaluate(plant.output, x, plant.parameters)
+
+
+@derivatives.register(CompiledParametric)
+def _derivatives_parametric(
+    plant: CompiledParametric, t: float, x: Vector, u: float, w: Vector, dx: Vector
+) -> None:
+    call(plant.rate, t, x, u, w, plant.parameters, dx)
+
+
+@measure.register(PythonNonlinear)
+def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
+    return float(value_or_nan(plant.output, x))
+
+
+@derivatives.register(PythonNonlinear)
+def _derivatives_python(
+    plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
+) -> None:
+    dx[:] = value_or_nan(plant.rate, t, x, u, w)
+
+
+def value_or_nan(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the function's value, or NaN as compiled code does, for example for log(-1.0).
+
+    A run with NaN ends as diverged.
+    """
+    try:
+        return function(*arguments)
+    except Exception as error:
+        if isinstance(error, ArithmeticError) or "math domain" in str(error):
+            return np.nan
+        raise
+
+
+def refined(model: Any, factor: int) -> Any:
+    """Return a sampled nonlinear plant with ``factor`` times as many sub-steps."""
+    return model._replace(step=model.step / factor, substeps=model.substeps * factor)
+
+
+# ---- Nonlinear plants, given by the differential equation of the user ----
+
+# Largest h |λ| of a sub-step h, λ an eigenvalue of the linearised plant. The error of a sub-step is
+# then below (h λ)^5 / 120 = 0.8 % of that mode; Runge-Kutta of order 4 is stable up to 2.8 (Hairer
+# & Wanner, *Solving Ordinary Differential Equations II*, IV.2).
+_LARGEST_STEP = 1.0
+# Most sub-steps that are chosen: with more, the fast part of the plant is better left out of f.
+_MOST_SUBSTEPS = 1000
+# Differences for the linearisation at rest. Where the slope grows as the difference shrinks, f has
+# a jump, for example sign(v): no number of sub-steps resolves it, and none is chosen for it.
+_DIFFERENCE, _SMALL_DIFFERENCE, _JUMP = 1e-6, 1e-8, 10.0
+
+_RATE_SIGNATURE_PLANT = nb_types.void(nb_types.float64, POINTER, nb_types.float64, POINTER, POINTER)
+_OUTPUT_SIGNATURE_PLANT = nb_types.float64(POINTER)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NonlinearPlant(Described):
+    """A plant ``x' = f(t, x, u, w, …)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
+
+    Parameters
+    ----------
+    f
+        ``f(t, x, u, w)`` returns the n derivatives as a tuple, list or array; t [s], x (n,), u a
+        number, w (m,). Numba compiles it if it can; else it runs as Python, about a hundred times
+        slower, and a warning says why. Further arguments are parameters.
+    order
+        number of states n.
+    output
+        the output y: a function ``h(x)``, or the row C of ``y = C x``; the first state by default.
+        It may take parameters, too.
+    disturbances
+        number m of disturbance inputs.
+    substeps
+        Runge-Kutta steps in a sample; u and w are held over the sample. By default one, or so many
+        that ``h |λ| <= 1`` for each eigenvalue λ of the plant linearised at rest (x, u, w and t
+        zero): stiff friction, for example, needs them. ``simulate`` checks the integration along
+        the run and reports ``Status.POORLY_INTEGRATED`` if there are too few.
+    name
+        for tables and plots.
+    parameters
+        numbers by name that f and output take as further arguments; ``with_parameters`` changes
+        them, and compiles nothing.
+    operating_point
+        state and control signal (x, u) about which designs and ``analyse`` take the plant as
+        linear. By default x and u are zero if that is a state of rest.
+
+    Raises
+    ------
+    ValueError
+        if ``f`` does not return n numbers, or ``output`` is neither a row nor a function that
+        returns a number.
+
+    Examples
+    --------
+    >>> import math
+    >>> pendulum = NonlinearPlant(lambda t, x, u, w: (x[1], u - 9.81 * math.sin(x[0])), order=2)
+
+    With parameters:
+
+    >>> def swing(t, x, u, w, m, length):
+    ...     return x[1], u / (m * length**2) - 9.81 / length * math.sin(x[0])
+    >>> pendulum = NonlinearPlant(swing, order=2, parameters={"m": 1.0, "length": 0.5})
+    >>> pendulum.with_parameters(m=2.0).parameters
+    {'m': 2.0, 'length': 0.5}
+    """
+
+    f: Callable[..., Any]
+    order: int
+    output: Any = None
+    disturbances: int = 1
+    substeps: int | None = None
+    name: str = "nonlinear plant"
+    parameters: Mapping[str, float] | None = None
+    operating_point: Any = None
+
+    def __post_init__(self) -> None:
+        n = checks.whole("order", self.order, 1)
+        m = checks.whole("disturbances", self.disturbances, 0)
+        checks.optional(checks.whole, "substeps", self.substeps, 1)
+        if not callable(self.f):
+            raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
+        rule = (
+            "f takes (t, x, u, w) and the names in parameters, output takes (x), with arrays x and "
+            "w of the plant's sizes"
+        )
+        if self.parameters is not None:
+            own, more = self._numbers
+            object.__setattr__(self, "parameters", {**own, **more})
+        if self.operating_point is not None:
+            x, u = checked_point(self.operating_point)
+            checks.vector("operating_point[0]", x, n)
+            checks.finite("operating_point[1]", u)
+        returned = user_functions.attempt_kernel(
+            "f(0.0, zeros, 0.0, zeros)", rule, self._rate, 0.0, np.zeros(n), 0.0, np.zeros(m)
+        )
+        if returned is not user_functions.UNKNOWN and np.shape(returned) != (n,):
+            raise ValueError(
+                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of x"
+            )
+        if not callable(self.output):
+            checks.vector("output", self._row, n)
+        elif np.shape(
+            user_functions.attempt_kernel("output(zeros)", rule, self._measured, np.zeros(n))
+        ):
+            raise ValueError("output(x) must return one number")
+
+    def with_parameters(self, **values: float) -> NonlinearPlant:
+        """Return the plant with other numbers for some parameters; nothing is compiled again."""
+        made = replace(self, parameters={**(self.parameters or {}), **values})
+        signals = signals_of(self)
+        return labelled(made, *signals[:3]) if signals.known else made
+
+    @property
+    def _numbers(self) -> tuple[dict[str, float], dict[str, float]]:
+        """The numbers that f and the output take, in their order."""
+        if self.parameters is None:
+            return {}, {}
+        return checked_parameters(self.parameters, self.f, self.output)
+
+    @cached_property
+    def _rate(self) -> Callable[..., Any]:
+        """The function f(t, x, u, w), with the parameters in it."""
+        return bound(self.f, self._numbers[0])
+
+    @cached_property
+    def _measured(self) -> Callable[..., Any]:
+        """The function h(x), with the parameters in it."""
+        return bound(self._output_function, self._numbers[1])
+
+    @property
+    def _row(self) -> Any:
+        return np.eye(self.order)[0] if self.output is None else self.output
+
+    @cached_property
+    def _output_function(self) -> Callable[..., Any]:
+        if callable(self.output):
+            return self.output
+        return row_output(tuple(np.asarray(self._row, dtype=float).tolist()))
+
+    @cached_property
+    def _machine_code(self) -> tuple[Any, Any] | None:
+        """The two compiled functions, kept as long as their addresses; None if Numba can't."""
+        n, m = self.order, self.disturbances
+
+        def rate(t, px, u, pw, pdx):  # type: ignore[no-untyped-def]
+            dx = numba.carray(pdx, (n,))
+            derivatives = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (m,)))
+            for i in range(n):
+                dx[i] = derivatives[i]
+
+        def output(px):  # type: ignore[no-untyped-def]
+            return h(numba.carray(px, (n,)))
+
+        try:
+            if self.parameters is not None:
+                own, more = self._numbers
+                both, counts = (self.f, self._output_function), (len(own), len(more))
+                return machine_code(*both, (n, m), counts)
+            f = user_functions.jit_user_function(self.f)
+            h = user_functions.jit_user_function(self._output_function)
+            compile_cfunc = user_functions.compile_cfunc
+            return compile_cfunc(_RATE_SIGNATURE_PLANT, rate), compile_cfunc(
+                _OUTPUT_SIGNATURE_PLANT, output
+            )
+        except user_functions.NotCompilableError as error:
+            warn(
+                f"{self.name}: f or output can't be compiled and runs as Python, which is slow "
+                f"({error})",
+                UserWarning,
+            )
+            return None
+
+    @property
+    def compiled(self) -> bool:
+        """Whether Numba could compile the functions."""
+        return self._machine_code is not None
+
+    def sampled(self, dt: float, interpret: bool = False) -> Any:
+        """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
+        checks.positive("dt", dt, "s")
+        substeps = self._chosen_substeps(dt) if self.substeps is None else self.substeps
+        step = dt / substeps
+        if interpret or self._machine_code is None:
+            return PythonNonlinear(self._rate, self._measured, step, substeps)
+        rate, output = self._machine_code
+        set_origin = user_functions.set_origin
+        if self.parameters is None:
+            set_origin(rate.address, self.f)
+            set_origin(output.address, self._output_function)
+            return CompiledNonlinear(rate.address, output.address, step, substeps)
+        own, more = (len(each) for each in self._numbers)
+        set_origin(rate.address, self.f, numbers=(0, own))
+        set_origin(output.address, self._output_function, numbers=(own, more))
+        numbers = as_array(*self._numbers)
+        return CompiledParametric(rate.address, output.address, step, substeps, numbers)
+
+    def _chosen_substeps(self, dt: float) -> int:
+        """Return the number of sub-steps for which ``h |λ|`` is small enough at rest."""
+        wanted = dt * self._largest_eigenvalue / _LARGEST_STEP
+        if wanted <= _MOST_SUBSTEPS:
+            return max(math.ceil(wanted), 1)
+        warn(
+            f"{self.name}: stiff, it has an eigenvalue of {self._largest_eigenvalue:.3g} 1/s at "
+            f"rest and would need {wanted:.3g} sub-steps in dt = {dt!r} s; it gets "
+            f"{_MOST_SUBSTEPS}: leave its fastest part out of f, or give substeps"
+        )
+        return _MOST_SUBSTEPS
+
+    @cached_property
+    def _largest_eigenvalue(self) -> float:
+        """Largest magnitude of the eigenvalues at rest [1/s]; zero if f has a jump there."""
+        slopes = [self._slopes_at_rest(by) for by in (_DIFFERENCE, _SMALL_DIFFERENCE)]
+        if not np.all(np.isfinite(slopes)):
+            return 0.0
+        largest, of_smaller = (float(np.max(np.abs(np.linalg.eigvals(m)))) for m in slopes)
+        return largest if of_smaller <= _JUMP * largest else 0.0
+
+    def _slopes_at_rest(self, by: float) -> Matrix:
+        """Return the derivatives of f by x (n, n) at rest, from central differences ``by``."""
+        n, w = self.order, np.zeros(self.disturbances)
+        slopes = np.full((n, n), np.nan)
+        with np.errstate(all="ignore"):
+            for j, shift in enumerate(by * np.eye(n)):
+                ends = [value_or_nan(self._rate, 0.0, x, 0.0, w) for x in (shift, -shift)]
+                slopes[:, j] = (np.asarray(ends[0]) - np.asarray(ends[1])) / (2.0 * by)
+        return slopes
+
+
+def checked_point(given: Any) -> tuple[Any, float]:
+    """Return the state and the control signal of an operating point."""
+    try:
+        x, u = given
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"operating_point = {given!r}: must be a state and a control signal, (x, u)"
+        ) from None
+    return x, u
+
+
+# ---- A transfer function whose input acts against Coulomb friction ----
+
+# Largest h |λ| of a sub-step h with the eigenvalue of largest magnitude at rest, as for nonlinear
+# plants, and most sub-steps: beyond, friction is stiffer than any sample shows. By hand.
+_LARGEST_STEP_FRICTION, _MOST_SUBSTEPS_FRICTION = 1.0, 1000
+
+
+class FrictionModel(NamedTuple):
+    """Parameters of a transfer function with friction."""
+
+    A: Matrix  # observable companion form (n, n)
+    B: Vector  # (n,)
+    force: float  # σ F [u-unit]
+    width: float  # v [y-unit/s]
+    step: float  # length of a sub-step [s]
+    substeps: int
+
+
+@measure.register(FrictionModel)
+def _measure_friction(plant: FrictionModel, x: Vector) -> float:
+    return x[0]
+
+
+@derivatives.register(FrictionModel)
+def _derivatives_friction(
+    plant: FrictionModel, t: float, x: Vector, u: float, w: Vector, dx: Vector
+) -> None:
+    n = plant.B.size
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += plant.A[i, j] * x[j]
+        dx[i] = total
+    speed = dx[0] if n > 1 else x[0]
+    drive = u + w[0] - plant.force * tanh(speed / plant.width)
+    for i in range(n):
+        dx[i] += plant.B[i] * drive
+
+
+advance.register(FrictionModel)(runge_kutta)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrictionPlant(Described):
+    """A transfer function with Coulomb friction: of order 1, or of relative degree 2 or more.
+
+    Parameters
+    ----------
+    linear
+        the plant without friction: for design.
+    num, den
+        its transfer function, highest power of s first.
+    force
+        Coulomb friction F [u-unit].
+    width
+        speed v at which three quarters of it act [y-unit/s].
+    """
+
+    linear: LinearPlant
+    num: Vector
+    den: Vector
+    force: float
+    width: float
+    name: str = "plant with friction"
+    disturbances = 1
+    compiled = True
+
+    def __post_init__(self) -> None:
+        checks.positive("force", self.force, "u-unit")
+        checks.positive("width", self.width, "y-unit/s")
+        if self.den[0] == 0.0:
+            raise ValueError(f"den[0] = {self.den[0]}: must not be zero; leave it out")
+        if self.order > 1 and len(self.num) > self.order - 1:
+            raise ValueError(
+                f"num has {len(self.num)} coefficients, den {len(self.den)}: the relative degree "
+                "must be 2 or more, or u moves the speed at once"
+            )
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.den) - 1
+
+    @property
+    def signed_force(self) -> float:
+        """F with the sign of the gain: friction acts against the motion that u causes [u-unit]."""
+        return math.copysign(self.force, self.num[0] / self.den[0])
+
+    def sampled(self, dt: float, interpret: bool = False) -> FrictionModel:
+        """Return the parameters for a sample time ``dt`` [s]."""
+        n, lead = self.order, float(self.den[0])
+        A = np.diag(np.ones(n - 1), 1)
+        A[:, 0] -= np.asarray(self.den[1:], dtype=np.float64) / lead
+        B = np.zeros(n)
+        B[n - len(self.num) :] = np.asarray(self.num, dtype=np.float64) / lead
+        force = self.signed_force
+        speed = A[0] if n > 1 else np.ones(1)
+        at_rest = A - force / self.width * np.outer(B, speed)
+        fastest = float(np.max(np.abs(np.linalg.eigvals(at_rest))))
+        wanted = checks.positive("dt", dt, "s") * fastest / _LARGEST_STEP_FRICTION
+        substeps = min(max(math.ceil(wanted), 1), _MOST_SUBSTEPS_FRICTION)
+        return FrictionModel(A, B, force, self.width, dt / substeps, substeps)
+
+
+# ---- A transfer function with the dry friction and the delay that an identification found ----
+
+
+def with_friction_and_delay(
+    linear: LinearPlant,
+    num: Vector,
+    den: Vector,
+    force: float | None,
+    width: float | None,
+    delay: float,
+    dt: float,
+) -> Plant:
+    """Return the plant ``linear`` for simulations, as identified.
+
+    Parameters
+    ----------
+    linear
+        the plant without friction and delay.
+    num, den
+        its transfer function, highest power of s first.
+    force, width
+        Coulomb friction [u-unit] and the speed at which three quarters of it act [y-unit/s]; None
+        or zero for none.
+    delay
+        [s]; with friction rounded to a whole number of samples.
+    dt
+        sample time of the loop [s].
+    """
+    plant: Plant = linear
+    if force and width:
+        plant = FrictionPlant(linear, num, den, force, width, linear.name)
+    if plant is not linear:
+        delay = round(delay / dt) * dt
+    return delayed(plant, delay, dt) if delay > 0.0 else plant

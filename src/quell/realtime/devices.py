@@ -1,0 +1,258 @@
+"""The interface between the loop and a device: a plant in hardware, simulated, or behind a wire.
+
+A device is an object with ``read() -> y``, ``write(u)`` and ``close()``. A device that can be used
+from compiled code also has a ``handle``: a NamedTuple for whose type ``read_measurement`` and
+``write_command`` are registered. Any other device gets a ``PythonHandle``; its loop runs as Python.
+
+A device with its own clock sends a numbered measurement at each of its ticks; its attribute
+``paced`` is True, and ``read_tick`` waits for the next one. Other devices answer at any time.
+
+A plant in this process as a device: it has no clock, and advances by a sample at each write.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quell import checks
+from quell.kernels.dispatch import call_specialised, compiled, generic, generic_with_default
+from quell.plants.base import (
+    Plant,
+    advance,
+    begin_run,
+    check_plant,
+    check_run,
+    is_destroyed,
+    measure,
+    signals_of,
+)
+from quell.types import Vector
+
+# ---- The interface between the loop and a device ----
+
+
+@runtime_checkable
+class Device(Protocol):
+    """A plant that can be read and written, one sample at a time."""
+
+    def read(self) -> float:
+        """Return the newest measurement [y-unit], NaN if none has come in time."""
+
+    def write(self, u: float) -> None:
+        """Apply the control signal ``u`` [u-unit] until the next one."""
+
+    def close(self) -> None:
+        """Set u to zero and release the device; a second call does nothing."""
+
+
+class Listener(Protocol):
+    """The device's end of a wire, made from a URL by ``listen`` of the registry.
+
+    Constructors raise a ``ValueError`` for a wrong URL, and if it is in use or can't be opened.
+    """
+
+    url: str
+    transport: Any  # its type has the functions of ``quell.realtime.wire``
+
+    def close(self) -> None:
+        """Release the wire."""
+
+
+@generic
+def read_measurement(handle: Any, clock: Any, until: int) -> tuple[float, int]:
+    """Return the newest measurement [y-unit] and the time spent waiting for it [ns].
+
+    Each measurement is returned once. If there is no new one, the handle of a paced device waits
+    until the time ``until`` [ns] of ``clock``. NaN if none has come, or if the device has sent NaN.
+    """
+    raise TypeError
+
+
+class Tick(NamedTuple):
+    """A tick of a device with its own clock."""
+
+    y: float  #: measurement [y-unit]; NaN if none came, or if the device has sent NaN
+    steps: int  #: ticks since the last one that was returned; 0 if none came in time
+    u: float  #: control signal from this tick on [u-unit]; NaN if it is not known
+    left: int  #: number of newer ticks that have come already
+    waited: int  #: time spent waiting [ns]
+
+
+@generic
+def read_tick(handle: Any, clock: Any, until: int) -> Tick:
+    """Return the next tick of a paced device in order, however late it comes.
+
+    If there is none, wait for it until the time ``until`` [ns] of ``clock``.
+    """
+    raise TypeError
+
+
+@generic
+def write_command(handle: Any, u: float) -> int:
+    """Apply ``u`` [u-unit]; return 0, 1 if it can't be sent, more if the device keeps u at zero."""
+    raise TypeError
+
+
+@generic_with_default
+def ask(handle: Any) -> None:
+    """Ask a paced device, which sends only as long as it hears from the loop, for measurements."""
+
+
+class PythonHandle(NamedTuple):
+    """A device that only Python can use."""
+
+    device: Device
+    errors: list[Exception]  #: the exception that it raised last, if any
+    faults: NDArray[np.int64]  #: number of exceptions that it raised (1,)
+
+
+def handle_of(device: Device) -> Any:
+    """Return the handle of a device, a ``PythonHandle`` if it has none."""
+    if isinstance(device, type) or not isinstance(device, Device):
+        raise ValueError(
+            f"device = {device!r}: must have read(), write(u) and close(), "
+            "for example quell.realtime.TwinDevice(plant, dt)"
+        )
+    handle = getattr(device, "handle", None)
+    return PythonHandle(device, [], np.zeros(1, dtype=np.int64)) if handle is None else handle
+
+
+@read_measurement.register(PythonHandle)
+def _read_measurement(handle: PythonHandle, clock: Any, until: int) -> tuple[float, int]:
+    try:
+        return float(handle.device.read()), 0
+    except Exception as error:  # whatever a driver raises, the loop must go on to its safe action
+        _count_error(handle, error)
+        return math.nan, 0
+
+
+@write_command.register(PythonHandle)
+def _write_command(handle: PythonHandle, u: float) -> int:
+    try:
+        handle.device.write(float(u))
+    except Exception as error:
+        _count_error(handle, error)
+        return 1
+    return 0
+
+
+def _count_error(handle: PythonHandle, error: Exception) -> None:
+    handle.faults[0] += 1
+    handle.errors[:] = [error]
+
+
+# ---- A plant in this process as a device ----
+
+
+class TwinHandle(NamedTuple):
+    """A sampled plant and its state."""
+
+    plant: Any
+    x: Vector  # state of the plant (n,)
+    scratch: Vector
+    w: Vector  # disturbances: zero (m,)
+    t: Vector  # samples since the start, and the sample time [s] (2,)
+
+
+@read_measurement.register(TwinHandle)
+def _read_measurement_twin(handle: TwinHandle, clock: Any, until: int) -> tuple[float, int]:
+    return measure(handle.plant, handle.x), 0
+
+
+@write_command.register(TwinHandle)
+def _write_command_twin(handle: TwinHandle, u: float) -> int:
+    advance(handle.plant, handle.x, handle.scratch, handle.t[0] * handle.t[1], u, handle.w)
+    handle.t[0] += 1.0
+    return 0
+
+
+@compiled
+def _read(handle: TwinHandle) -> float:
+    return measure(handle.plant, handle.x)
+
+
+@compiled
+def _write(handle: TwinHandle, u: float) -> None:
+    write_command(handle, u)
+
+
+class TwinDevice:
+    """A simulated plant: ``read`` measures it, ``write(u)`` advances it by a sample ``dt`` [s].
+
+    It starts from the state ``x0`` (n,), zero by default. u acts at once. Over a wire it acts a
+    sample later; ``quell.plants.delayed(plant, dt, dt)`` adds the same delay to this device.
+
+    Raises
+    ------
+    ValueError
+        if ``plant`` is not a plant, dt is not positive, or x0 has the wrong size.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> from quell.realtime.devices import TwinDevice
+    >>> twin = TwinDevice(ql.plants.two_mass_spring(), dt=0.01)
+    >>> twin.write(1.0)
+    >>> f"{twin.read():.3g}"
+    '4.17e-10'
+    """
+
+    paced = False
+    lost = False
+
+    def __init__(self, plant: Plant, dt: float, x0: ArrayLike | None = None) -> None:
+        check_plant(plant)
+        self.dt = checks.positive("dt", dt, "s")
+        order = plant.order
+        x = np.zeros(order) if x0 is None else checks.vector("x0", x0, order)
+        scratch, w = np.zeros(6 * order), np.zeros(plant.disturbances)
+        model = plant.sampled(dt, not plant.compiled)
+        self._x0 = x.copy()
+        self.signals = signals_of(plant)
+        begin_run(model, x, scratch)
+        self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]))
+        # Without a public handle the loop runs as Python.
+        self.handle = self._handle if plant.compiled else None
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Number of samples written."""
+        return {"written": int(self._handle.t[0])}
+
+    @property
+    def x(self) -> Vector:
+        """State of the plant, as a copy (n,)."""
+        return self._handle.x.copy()
+
+    def read(self) -> float:
+        """Return y [y-unit]."""
+        if self.handle is None:
+            return float(measure(self._handle.plant, self._handle.x))
+        return float(call_specialised(_read, self.handle))
+
+    def write(self, u: float) -> None:
+        """Apply u [u-unit] for a sample."""
+        if self.handle is None:
+            write_command(self._handle, float(u))
+        else:
+            call_specialised(_write, self.handle, float(u))
+        check_run(self._handle.plant, self._handle.scratch)
+
+    def close(self) -> None:
+        """Put a plant whose state is destroyed back to ``x0``, so that the device can be reused."""
+        plant, x, scratch, _, t = self._handle
+        if is_destroyed(x, self._x0):
+            x[:], t[0] = self._x0, 0.0
+            begin_run(plant, x, scratch)
+
+
+def twin_device(url: str, dt: float, trust: bool = False) -> TwinDevice:
+    """Return the device ``twin:PLANT``; PLANT is what ``quell.setup.schema.plant_given`` takes."""
+    from quell.setup.schema import plant_given
+
+    text = url.partition(":")[2]
+    return TwinDevice(plant_given(text, dt, argument="device", trust=trust), dt)

@@ -1,0 +1,818 @@
+"""Sinks, which take the rows of a loop: their protocol, memory, and files by their suffix.
+
+Recordings as CSV: a line of names, then a line for each row; the header is in ``<name>.json``.
+
+The first column is ``time`` [s]; the others are those of the row, ``x_hat[0]`` the first entry of a
+vector channel. Numbers have the digits that it takes to read the same bits back; NaN is ``nan``.
+
+Recordings as MCAP: a message for each row, and the header as metadata.
+
+The topic is ``/loop``, the metadata record ``quell``. The file is written by foxglove-sdk, in
+chunks. A finished chunk is on disk; here chunks are finished twice a second. They are not
+compressed: the values of a loop are mostly noise, of which compression saves about a tenth
+for milliseconds of work. The log time of a message is its deadline.
+
+Recordings in MCAP, read within a limit of size.
+
+The records of the file (mcap.dev/spec) and of its chunks are taken apart here, and the package
+``mcap`` reads the fields of the few that a recording needs. Its own reader takes each length in the
+file for true, and expands a chunk to any size.
+
+Rows as ROS 2 messages, which PlotJuggler and Foxglove read without configuration.
+
+The definition (``ros2msg``) has a line for each channel. The message in plain CDR, little endian
+(OMG DDSI-RTPS 2.5, section 10.2), is a mark of four bytes and then the values: all have 64 bits, so
+nothing is padded, and arrays of fixed length have no count.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import operator
+import os
+import struct
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from enum import IntFlag
+from functools import partial
+from io import BytesIO
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, Protocol
+
+import numpy as np
+
+from quell import checks
+from quell.checks import import_extra
+from quell.files import (
+    MAX_SIZE,
+    TooLargeError,
+    byte_lines,
+    bytes_of,
+    check_regular,
+    check_settings,
+    check_size,
+    check_writable,
+    whole_text,
+    written_atomically,
+)
+from quell.quantities import Signals, signals_from
+from quell.records.record import check_times, columns_of, describe, is_vector
+from quell.records.trajectory import Trajectory
+from quell.types import Channels, Matrix, Status, Vector
+
+# ---- Channels of a row, which the loop writes each cycle, and its event flags ----
+
+LOOP_CHANNELS = (
+    ("k", 1),  # index of the deadline, its time is k dt; it jumps where deadlines were skipped
+    ("lateness", 1),  # time from the deadline until the loop woke [s]
+    ("step_time", 1),  # time from then until u was written [s]
+    ("mode", 1),  # state of the supervisor
+    ("events", 1),  # Event flags of this cycle
+    ("r", 1),
+    ("y", 1),  # last good measurement
+    ("y_measured", 1),  # as received; NaN if nothing was
+    ("u", 1),  # applied from this cycle to the next
+)
+"""Names and widths of the first channels of every row; ``controller.channels`` follow."""
+
+K, LATENESS, STEP_TIME, MODE, EVENTS, R, Y, Y_MEASURED, U = range(len(LOOP_CHANNELS))
+LOOP_WIDTH = len(LOOP_CHANNELS)
+
+
+class Event(IntFlag):
+    """Events of a cycle; flags add up. The low sixteen bits are the loop's."""
+
+    MISSED = 1  #: no finite measurement came in time
+    OVERRUN = 2  #: the loop woke, or ended its cycle, after the next deadline and skipped it
+    CLIPPED = 4  #: the supervisor's limits changed the controller's u
+    UNSENT = 8  #: the command could not be sent
+    CHANGED = 16  #: the mode changed
+    GAP = 1 << 16  #: no recorded cycle: deadline skipped, or row lost; ``load`` filled it in
+
+
+def row_channels(controller_channels: Channels) -> Channels:
+    """Return the channels of a row for a controller with these channels."""
+    return (*LOOP_CHANNELS, *controller_channels)
+
+
+# ---- Header of a recording ----
+
+# Numbers in a row, far above those of any controller: chosen by hand.
+_MOST_COLUMNS = 10_000
+VERSION = 1  # version of the recording's layout; a reader refuses others
+
+
+@dataclass(frozen=True)
+class Header:
+    """Description of a recording.
+
+    Parameters
+    ----------
+    channels : tuple of pairs
+        names and widths in a row, in order; the first ones are ``LOOP_CHANNELS``.
+    dt
+        sample time [s]: row k belongs to the time ``k dt``.
+    features
+        factors of the entries of ``theta``.
+    device, controller
+        names of the device and the controller.
+    units
+        of ``y`` and ``u``, such as ``{"y": "rad", "u": "A"}``; by default ``y-unit``, ``u-unit``.
+    notes
+        anything else that JSON can represent.
+    started
+        deadline of the row with k = 0, in nanoseconds since 1970, UTC.
+    """
+
+    channels: Channels
+    dt: float
+    features: tuple[str, ...] = ()
+    device: str = ""
+    controller: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    started: int = field(default_factory=time.time_ns)
+
+    def __post_init__(self) -> None:
+        checks.positive("dt", self.dt, "s")
+        if any(width < 0 for _, width in self.channels) or self.width > _MOST_COLUMNS:
+            raise ValueError(
+                f"channels: a row of {self.width} numbers; must be at most {_MOST_COLUMNS}"
+            )
+        if tuple(self.channels[: len(LOOP_CHANNELS)]) != LOOP_CHANNELS:
+            first = ", ".join(name for name, _ in LOOP_CHANNELS)
+            raise ValueError(f"channels = {self.channels!r}: must begin with {first}")
+
+    @property
+    def signals(self) -> Signals:
+        """Names and units of y and u, which ``notes`` may have."""
+        return signals_from(self.notes.get("signals"))
+
+    @property
+    def width(self) -> int:
+        """Number of values in a row."""
+        return sum(width for _, width in self.channels)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Name of each value in a row; ``x_hat[0]`` is the first entry of a vector channel."""
+        names: list[str] = []
+        for name, width in self.channels:
+            vector = is_vector(name, width)
+            names += [f"{name}[{i}]" for i in range(width)] if vector else [name] * width
+        return tuple(names)
+
+    def to_json(self) -> str:
+        """Return the header as JSON."""
+        return json.dumps({"quell_recording": VERSION, **asdict(self)}, ensure_ascii=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> Header:
+        """Return the header that ``to_json`` wrote."""
+        try:
+            fields = json.loads(text)
+            version = fields.pop("quell_recording")
+            fields["channels"] = tuple(_channel(*entry) for entry in fields["channels"])
+            fields["features"] = tuple(map(str, fields["features"]))
+            fields["device"] = str(fields["device"])
+            if version != VERSION:
+                raise ValueError(f"its layout has version {version!r}, this quell reads {VERSION}")
+            if not isinstance(fields.get("notes", {}), dict):
+                raise TypeError("notes")
+            return cls(**fields)
+        except RecursionError:
+            raise ValueError("its header is nested too deeply") from None
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"its header is not that of a quell recording ({error!r})") from None
+
+
+def _channel(name: Any, width: Any) -> tuple[str, int]:
+    return str(name), checks.whole("width", width, 0)
+
+
+# ---- Recordings as CSV ----
+
+# Numbers that are converted to an array at once when reading; chosen by hand, not tuned further.
+_BLOCK = 100_000
+
+
+class CsvSink:
+    """Write rows to a CSV file ``path``, which grows as they come, and a header beside it.
+
+    Files that exist are refused, or replaced if ``overwrite`` is True.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        self.path, self.overwrite = Path(path), overwrite
+        self.name = str(self.path)
+        self._file: BinaryIO | None = None
+        self._dt = 0.0
+        self._first = True
+
+    def check(self) -> None:
+        """Raise a ``ValueError`` if a file can't be written or may not be replaced."""
+        for path in (self.path, header_path(self.path)):
+            check_writable(path, self.overwrite)
+
+    def open(self, header: Header) -> None:
+        """Write the line of names, and the header beside the file."""
+        self.check()
+        self.path.unlink(missing_ok=True)
+        with written_atomically(header_path(self.path), self.overwrite) as part:
+            part.write_text(header.to_json() + "\n", encoding="utf-8")
+        self._dt, self._first = header.dt, True
+        self._file = self.path.open("xb")
+        self._file.write((",".join(("time", *header.columns)) + "\n").encode())
+        self._file.flush()
+
+    def write(self, rows: Matrix) -> None:
+        """Add a line for each row."""
+        assert self._file is not None
+        lines = []
+        for row in rows.tolist():
+            numbers = [row[K] * self._dt, *row]
+            # Some readers (PlotJuggler 3.15) take the type of a column from the first line, and
+            # 1e-05 for text.
+            text = partial(np.format_float_positional, trim="0") if self._first else repr
+            lines.append(",".join(map(text, numbers)))
+            self._first = False
+        self._file.write(("\n".join(lines) + "\n").encode())
+
+    def flush(self) -> None:
+        """Pass what was written to the operating system, where it outlives the process."""
+        if self._file is not None:
+            self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            file, self._file = self._file, None
+            file.close()
+
+
+def header_path(path: Path) -> Path:
+    """Return the path of the header of a CSV file."""
+    return path.with_name(path.name + ".json")
+
+
+def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
+    """Return header and rows of a ``CsvSink``'s file, without a last line that was cut short.
+
+    Without the header beside it, dt comes from the column ``time``; ``features`` are unknown. The
+    rows may take ``most`` bytes.
+    """
+    lines = byte_lines(path)
+    names = next(lines, b"").decode("utf-8", errors="replace").strip().split(",")
+    if names[:2] != ["time", "k"]:
+        raise ValueError("its first line is not the names of a recording's columns: time, k, …")
+    beside = header_path(path)
+    header = Header.from_json(whole_text(beside)) if beside.is_file() else None
+    channels = _channels(names[1:]) if header is None else header.channels
+    table = _table(lines, len(names), most)
+    time, rows = table[:, 0], np.ascontiguousarray(table[:, 1:])
+    if header is None:
+        header = Header(channels, _sample_time(time, rows[:, K]), started=0)
+    if header.columns != tuple(names[1:]):
+        raise ValueError(f"its columns differ from those in {beside.name}")
+    return header, rows
+
+
+def _table(lines: Iterator[bytes], width: int, most: int) -> Matrix:
+    """Return lines of ``width`` numbers as a matrix of at most ``most`` bytes."""
+    filled = ((number, line) for number, line in enumerate(lines, 2) if line.strip())
+    blocks, size = [np.empty((0, width))], 0
+    while block := list(islice(filled, max(1, _BLOCK // width))):
+        size += 8 * width * len(block)
+        check_size(size, most)
+        rows = _numbers([line for _, line in block])
+        if rows is None or rows.shape[1] != width:
+            numbers = (number for number, line in block if not _is_row(line, width))
+            raise ValueError(f"line {next(numbers)} is not {width} numbers")
+        blocks.append(rows)
+    return np.concatenate(blocks)
+
+
+def _numbers(lines: list[bytes]) -> Matrix | None:
+    """Return lines as a matrix; None if they are not equally many numbers each."""
+    try:
+        return np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
+    except ValueError:
+        return None
+
+
+def _is_row(line: bytes, width: int) -> bool:
+    row = _numbers([line])
+    return row is not None and row.shape[1] == width
+
+
+def _channels(columns: list[str]) -> Channels:
+    """Return the channels with these columns."""
+    widths: dict[str, int] = {}
+    for column in columns:
+        name = column.partition("[")[0]
+        widths[name] = widths.get(name, 0) + 1
+    return tuple(widths.items())
+
+
+def _sample_time(time: Vector, k: Vector) -> float:
+    """Return the dt with the fewest digits for which all rows have exactly ``time = k dt``."""
+    later = np.flatnonzero(k > 0)
+    if later.size == 0:
+        raise ValueError(
+            "its sample time is unknown: it has no row after the first and no header beside it"
+        )
+    last = later[-1]
+    about = float(time[last] / k[last])
+    rounded = [float(f"{about:.{digits}g}") for digits in (3, 6, 9, 12, 15)]
+    with np.errstate(all="ignore"):  # a damaged file may hold any numbers
+        candidates = [*rounded, about, *np.nextafter(about, [0.0, 2.0 * about]).tolist()]
+        return next((dt for dt in candidates if np.array_equal(k * dt, time)), about)
+
+
+# ---- Rows as ROS 2 messages, which PlotJuggler and Foxglove read without configuration ----
+
+SCHEMA = "quell/msg/Cycle"
+TOPIC = "/loop"
+MARK = b"\x00\x01\x00\x00"  # first bytes of a message: plain CDR, little endian, no options
+
+
+def definition(header: Header) -> str:
+    """Return the definition of a row's message, with meanings and units as comments."""
+    lines = []
+    for name, width in header.channels:
+        if width:
+            text, unit = describe(name, header.signals)
+            kind = f"float64[{width}]" if is_vector(name, width) else "float64"
+            lines.append(f"{kind} {name}  # {text} [{header.units.get(name, unit)}]")
+    return "\n".join(lines) + "\n"
+
+
+def advertised(header: Header) -> dict[str, Any]:
+    """Return the channel for rows as a Foxglove server advertises it."""
+    names = {"id": 1, "topic": TOPIC, "encoding": "cdr", "schemaName": SCHEMA}
+    return {**names, "schemaEncoding": "ros2msg", "schema": definition(header)}
+
+
+def message(row: Vector) -> bytes:
+    """Return a row as a message."""
+    return MARK + row.astype("<f8", copy=False).tobytes()
+
+
+def row_time(header: Header, k: float) -> int:
+    """Return the time of the deadline k, in nanoseconds since 1970."""
+    return header.started + round(k * header.dt * 1e9)
+
+
+def open_topic(foxglove: Any, header: Header, context: Any) -> Any:
+    """Return a Foxglove channel for rows in a context."""
+    schema = foxglove.Schema(name=SCHEMA, encoding="ros2msg", data=definition(header).encode())
+    return foxglove.Channel(TOPIC, schema=schema, message_encoding="cdr", context=context)
+
+
+def log_rows(topic: Any, header: Header, rows: Matrix) -> None:
+    """Log a message for each row, at the time of its deadline."""
+    for row, k in zip(rows, rows[:, K].tolist(), strict=True):
+        topic.log(message(row), log_time=row_time(header, k))
+
+
+# ---- Recordings as MCAP ----
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD = "quell"  # name of the metadata record with the header
+
+# Time between two chunks [s]: with the writer's 0.25 s a killed process loses less than 1 s.
+_CHUNK_TIME = 0.5
+# A chunk is finished at this size, too [bytes]; a full disk costs the rows of the last one. Chosen
+# by hand: a third of a second at 1 kHz and 24 values a row.
+_CHUNK_SIZE = 65_536
+
+
+class _File:
+    """File for foxglove's writer that keeps the first error instead of raising it.
+
+    The writer would hide the reason of a failure and log each later message. It is told that all
+    went well; ``error`` holds the failure.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._raw = path.open("xb", buffering=0)
+        self._position = self._end = 0
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        """Write all of ``data``, or keep the error."""
+        rest = memoryview(data)
+        try:
+            while rest and self.error is None:
+                rest = rest[self._raw.write(rest) :]
+        except OSError as error:
+            self.error = error
+        self._position += len(data)
+        self._end = max(self._end, self._position)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Move to a position: the length of a finished chunk is written before it."""
+        self._position = offset + (0, self._position, self._end)[whence]
+        if self.error is None:
+            self._raw.seek(self._position)
+        return self._position
+
+    def flush(self) -> None:
+        """Do nothing: the file has no buffer."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._raw.close()
+
+
+class McapSink:
+    """Write rows to an MCAP file ``path``, which grows as they come.
+
+    A file that exists is refused, or replaced if ``overwrite`` is True.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        self.path, self.overwrite = Path(path), overwrite
+        self.name = str(self.path)
+        self._writer: Any = None
+        self._flushed = 0.0
+
+    def check(self) -> None:
+        """Raise a ``ValueError`` if the file can't be written or may not be replaced."""
+        check_writable(self.path, self.overwrite)
+
+    def open(self, header: Header) -> None:
+        """Begin the file; the header is on disk at once, or an ``OSError`` says why it is not."""
+        foxglove = import_extra("foxglove", "telemetry", "an MCAP file")
+        mcap = import_extra("foxglove.mcap", "telemetry", "an MCAP file")
+        self.check()
+        self.path.unlink(missing_ok=True)
+        self._header = header
+        self._context = foxglove.Context()  # kept: a topic is closed with it
+        self._file = _File(self.path)
+        options = mcap.MCAPWriteOptions(compression=None, chunk_size=_CHUNK_SIZE)
+        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
+        self._writer.write_metadata(RECORD, {"header": header.to_json()})
+        self._topic = open_topic(foxglove, header, self._context)
+        self._writer.flush()
+        self._flushed = time.monotonic()
+        if self._file.error is not None:  # a full disk: nothing must move unrecorded
+            with suppress(OSError):
+                self.close()
+            raise self._file.error
+
+    def write(self, rows: Matrix) -> None:
+        """Add a message for each row."""
+        log_rows(self._topic, self._header, rows)
+        self._check()
+
+    def flush(self) -> None:
+        """Finish the chunk if it is half a second old."""
+        if time.monotonic() - self._flushed >= _CHUNK_TIME:
+            self._writer.flush()
+            self._flushed = time.monotonic()
+        self._check()
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            self._topic.close()
+            writer.close()
+            self._file.close()
+            self._check()
+
+    def _check(self) -> None:
+        """Raise the error that the file kept."""
+        if self._file.error is not None:
+            raise self._file.error
+
+
+# ---- Recordings in MCAP, read within a limit of size ----
+
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA = 0x03, 0x04, 0x05, 0x06, 0x0C
+_START = struct.Struct("<BQ")  # opcode and length of a record
+_MESSAGE_START = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
+# Messages that are converted to an array at once; chosen by hand, not tuned further.
+_BLOCK_MCAP_READER = 4096
+# A record counts as at least so many bytes, however short it is: about what it takes in memory, and
+# a limit of the time that many empty records can take. Chosen by hand.
+_LEAST_RECORD = 64
+
+
+class _DamagedError(Exception):
+    """The records end here: cut short, or no MCAP."""
+
+
+class _Record(NamedTuple):
+    opcode: int
+    body: bytes
+
+
+def read_mcap(path: Path, most: int) -> tuple[Header, Matrix]:
+    """Return header and rows of a ``McapSink``'s file, up to its last complete chunk.
+
+    The contents may take ``most`` bytes.
+    """
+    import_extra("mcap", "telemetry", "reading an MCAP file")
+    header: Header | None = None
+    schemas: dict[int, str] = {}
+    ours: set[int] = set()  # numbers of the channels that have the rows
+    messages: list[bytes] = []
+    blocks: list[Matrix] = []
+    with contextlib.suppress(_DamagedError):  # all up to there is good
+        for opcode, body in _records(path, most):
+            if opcode == _MESSAGE:
+                if int.from_bytes(body[:2], "little") in ours and len(body) >= _MESSAGE_START.size:
+                    messages.append(body[_MESSAGE_START.size :])
+                    if len(messages) == _BLOCK_MCAP_READER:
+                        blocks.append(_rows(messages))
+                        messages = []
+            elif opcode == _SCHEMA:
+                schema = _fields("Schema", body)
+                schemas[schema.id] = schema.name
+            elif opcode == _CHANNEL:
+                channel = _fields("Channel", body)
+                if (channel.topic, schemas.get(channel.schema_id)) == (TOPIC, SCHEMA):
+                    ours.add(channel.id)
+                else:
+                    ours.discard(channel.id)
+            elif opcode == _METADATA:
+                check_settings(len(body))
+                metadata = _fields("Metadata", body)
+                if metadata.name == RECORD:
+                    header = Header.from_json(metadata.metadata.get("header", ""))
+    if header is None:
+        raise ValueError(f"it has no metadata record {RECORD!r}: it was not recorded by quell")
+    blocks = [block for block in (*blocks, _rows(messages)) if block.size]
+    if any(block.shape[1] != header.width for block in blocks):
+        raise ValueError(f"a message on {TOPIC} is not a row of {header.width} numbers")
+    return header, np.concatenate(blocks) if blocks else np.empty((0, header.width))
+
+
+def _rows(messages: list[bytes]) -> Matrix:
+    """Return the rows (messages, width) of messages."""
+    if not messages:
+        return np.empty((0, 0))
+    size = len(messages[0])
+    if size % 8 != len(MARK) or not all(
+        len(message) == size and message.startswith(MARK) for message in messages
+    ):
+        raise ValueError(f"the messages on {TOPIC} are not rows of the same width")
+    values = np.frombuffer(b"".join(message[len(MARK) :] for message in messages), dtype="<f8")
+    return values.reshape(len(messages), -1).astype(np.float64)
+
+
+def _records(path: Path, most: int) -> Iterator[_Record]:
+    """Yield the records that matter; a ``_DamagedError`` ends them."""
+    size = 0
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        for record in _top_level(file, os.fstat(file.fileno()).st_size, most):
+            in_chunk = record.opcode == _CHUNK
+            for each in _split(_expanded(record.body, most)) if in_chunk else (record,):
+                size += max(len(each.body), _LEAST_RECORD)
+                check_size(size, most)
+                yield each
+
+
+def _top_level(file: BinaryIO, end: int, most: int) -> Iterator[_Record]:
+    """Yield the records of a file of ``end`` bytes; others than ours are not read."""
+    while len(start := file.read(_START.size)) == _START.size:
+        opcode, length = _START.unpack(start)
+        if length > end - file.tell():
+            return
+        if opcode in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA):
+            check_size(length, most)
+            yield _Record(opcode, file.read(length))
+        else:
+            file.seek(length, os.SEEK_CUR)
+
+
+def _split(content: bytes) -> Iterator[_Record]:
+    """Yield the records of a chunk."""
+    at, end = 0, len(content)
+    while at + _START.size <= end:
+        opcode, length = _START.unpack_from(content, at)
+        at += _START.size
+        if length > end - at:
+            raise _DamagedError
+        if opcode in (_SCHEMA, _CHANNEL, _MESSAGE):
+            yield _Record(opcode, content[at : at + length])
+        else:
+            yield _Record(0, b"")
+        at += length
+
+
+def _expanded(body: bytes, most: int) -> bytes:
+    """Return the content of a chunk, of at most ``most`` bytes."""
+    chunk = _fields("Chunk", body)
+    if not chunk.compression:
+        return chunk.data
+    size = chunk.uncompressed_size
+    check_size(size, most)
+    if chunk.compression not in _DECOMPRESS:
+        raise ValueError(f"its compression {chunk.compression!r} is unknown; must be zstd or lz4")
+    content = _DECOMPRESS[chunk.compression](chunk.data, size + 1)
+    if len(content) != size:
+        raise _DamagedError
+    return content
+
+
+def _from_zstd(data: bytes, most: int) -> bytes:
+    zstandard = import_extra("zstandard", "telemetry", "reading a compressed MCAP file")
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            content: bytes = reader.read(most)
+            return content
+    except zstandard.ZstdError:
+        raise _DamagedError from None
+
+
+def _from_lz4(data: bytes, most: int) -> bytes:
+    lz4 = import_extra("lz4.frame", "telemetry", "reading a compressed MCAP file")
+    try:
+        content: bytes = lz4.LZ4FrameDecompressor().decompress(data, max_length=most)
+        return content
+    except (RuntimeError, EOFError):
+        raise _DamagedError from None
+
+
+# The functions that expand a chunk to at most so many bytes, by the name of its compression.
+_DECOMPRESS = {"zstd": _from_zstd, "lz4": _from_lz4}
+
+
+def _fields(kind: str, body: bytes) -> Any:
+    """Return the fields of a record, as the package ``mcap`` reads them."""
+    from mcap import records
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import McapError
+
+    try:
+        return getattr(records, kind).read(ReadDataStream(BytesIO(body)))
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError):
+        raise _DamagedError from None
+
+
+# ---- Recordings as trajectories ----
+
+# Up to here whole numbers are exact in a row of floats.
+_LAST = 2.0**53
+
+
+def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory:
+    """Read a recorded run, CSV or MCAP, also if its process was killed.
+
+    A sample of the trajectory is a deadline; time counts from the first one in the file. If
+    deadlines were skipped or rows lost, samples are filled in: r, y, u and the controller's
+    channels stay as they were; ``y_measured``, ``lateness`` and ``step_time`` are NaN, and
+    ``events`` is ``Event.GAP``.
+
+    Parameters
+    ----------
+    path
+        the file.
+    max_size
+        limit of what the file may unpack to, gaps filled in [MB].
+
+    Raises
+    ------
+    ValueError
+        if there is no such file, it is not a recording by quell, or it unpacks to more than
+        ``max_size``.
+    ImportError
+        if an MCAP file can't be read because the package mcap is missing.
+    """
+    file, most = Path(path), bytes_of(max_size)
+    where = f"path = {os.fspath(path)!r}"
+    try:
+        check_regular(file, where)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from None
+    try:
+        with file.open("rb") as opened:
+            read = read_mcap if opened.read(len(MAGIC)) == MAGIC else read_csv
+        return trajectory_of(*read(file, most), most)
+    except OSError as error:
+        raise ValueError(f"{where}: can't be read ({error.strerror})") from None
+    except TooLargeError as error:
+        raise ValueError(f"{where}: {error}") from None
+    except ValueError as error:
+        raise ValueError(f"{where}: must be a recording by quell, CSV or MCAP: {error}") from None
+
+
+def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE)) -> Trajectory:
+    """Return rows (rows, width) as a trajectory with gaps filled in, see ``load``.
+
+    It may take ``most`` bytes.
+    """
+    if rows.shape[0] == 0:
+        raise ValueError("it has no row")
+    log, status = _filled(rows, most), 0
+    check_times(log.shape[0], header.dt)
+    if any(name == "status" for name, _ in header.channels):
+        status = _all_flags(rows[:, columns_of(header.channels, "status").start])
+    return Trajectory(
+        log=log,
+        channels=header.channels,
+        dt=header.dt,
+        status=Status(status),
+        ended=(log.shape[0] - 1) * header.dt,
+        plant=header.device,
+        features=header.features,
+        signals=header.signals,
+    )
+
+
+def _all_flags(column: Vector) -> int:
+    """Return the flags that any row has; a number that is no sum of flags counts as none."""
+    known = functools.reduce(operator.or_, Status)
+    valid = np.where((column >= 0.0) & (column <= known), column, 0.0)
+    return int(np.bitwise_or.reduce(valid.astype(np.int64)))
+
+
+def _filled(rows: Matrix, most: int) -> Matrix:
+    """Return rows whose k increases by one, of at most ``most`` bytes."""
+    k = rows[:, K]
+    if not (np.all(np.abs(k) <= _LAST) and np.all(k == np.rint(k)) and np.all(np.diff(k) >= 1.0)):
+        raise ValueError("the indices of its deadlines are not whole numbers that increase")
+    recorded = (k - k[0]).astype(np.int64)
+    check_size(8 * rows.shape[1] * (int(recorded[-1]) + 1), most)
+    every = np.arange(recorded[-1] + 1)
+    if every.size == recorded.size:
+        return rows
+    filled = rows[np.searchsorted(recorded, every, side="right") - 1]
+    gaps = np.ones(every.size, dtype=bool)
+    gaps[recorded] = False
+    filled[:, K] = k[0] + every
+    for column in (Y_MEASURED, LATENESS, STEP_TIME):
+        filled[gaps, column] = np.nan
+    filled[gaps, EVENTS] = Event.GAP
+    return filled
+
+
+# ---- Sinks, which take the rows of a loop ----
+
+
+class Sink(Protocol):
+    """A receiver of rows; all methods except ``open`` are called on the writer's thread."""
+
+    name: str  #: name in messages
+
+    def open(self, header: Header) -> None:
+        """Begin a recording; raise a ``ValueError`` with the reason if that is impossible."""
+
+    def write(self, rows: Matrix) -> None:
+        """Take the next rows (rows, width), in order."""
+
+    def flush(self) -> None:
+        """Store what was taken where it outlives this process; called after each round of rows."""
+
+    def close(self) -> None:
+        """End the recording."""
+
+
+class MemorySink:
+    """Keep rows in memory: about 20 values a cycle, which is 10 MB a minute at 1 kHz."""
+
+    name = "memory"
+
+    def __init__(self) -> None:
+        self._header: Header | None = None
+        self._rows: list[Matrix] = []
+
+    def open(self, header: Header) -> None:
+        """Begin a new recording."""
+        self._header, self._rows = header, []
+
+    def write(self, rows: Matrix) -> None:
+        """Keep the rows."""
+        self._rows.append(rows)
+
+    def flush(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def trajectory(self) -> Trajectory:
+        """Return the recording as ``load`` does for a file."""
+        if self._header is None:
+            raise ValueError("nothing was recorded yet")
+        rows = np.concatenate(self._rows) if self._rows else np.empty((0, self._header.width))
+        return trajectory_of(self._header, rows)
+
+
+def file_sink(path: str | os.PathLike[str], overwrite: bool = False) -> CsvSink | McapSink:
+    """Return the sink for a file by its suffix, ``.csv`` or ``.mcap``."""
+    kinds: dict[str, type[CsvSink | McapSink]] = {".csv": CsvSink, ".mcap": McapSink}
+    suffix = Path(path).suffix.lower()
+    if suffix not in kinds:
+        raise ValueError(f"path = {os.fspath(path)!r}: must end in {' or '.join(kinds)}")
+    return kinds[suffix](path, overwrite)

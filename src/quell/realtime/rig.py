@@ -1,0 +1,868 @@
+"""The device's side of a wire: a simulated plant with a clock, a watchdog and sessions.
+
+At each tick k the rig
+
+1. reads what has come since the last tick: the newest valid command is u from now on;
+2. samples y_k and sends it;
+3. applies u over ``[t_k, t_k + dt]``.
+
+So a u that answers y_k acts from the tick k + 1 on: one sample late, as in
+``quell.plants.delayed(plant, dt, dt)``. If the rig is late, it makes up for the missed ticks and
+skips none: the motion of the plant depends only on the command at each tick.
+
+=======  ========================================================================================
+state    meaning
+=======  ========================================================================================
+idle     no session: u = 0, nothing is sent
+waiting  a hello was answered: measurements are sent, u = 0 until the first command
+live     u is the last command
+tripped  no fresh, finite command for ``watchdog`` ticks in a row: u = 0 until a new session
+=======  ========================================================================================
+
+A simulated plant need not move on while the loop is late: with ``wait`` a tick waits for the
+command that answers the measurement before it, and the rig's clock stands still meanwhile.
+
+A hello begins a session, unless one is live or waits for less than ``patience`` ticks. A goodbye
+ends it. A session begins at ``x0`` if ``rest``, or if the last one destroyed the plant's state: no
+motion can go on from there.
+
+Commands, goodbyes and repeated hellos of a session are accepted only from the address that
+opened it.
+
+Measurements are sent only as long as the other side asks for them, so that nobody can direct an
+endless stream to an address: a hello is worth ``HELLO_WORTH`` measurements, an accepted command
+those of the watchdog's time and ``LAST_WORDS`` more, which report that it has tripped. After that
+the rig is silent until the next hello or command.
+
+The rig: it listens at a wire, ticks on its own thread, writes its log and counts events.
+
+A relay between a loop and its rig that loses, duplicates, delays and corrupts frames by a plan.
+
+To test a loop of your own, start the rig at one port, the relay in front of it, and connect the
+loop to the relay::
+
+    from quell.realtime.rig import Fault, Relay
+
+    plan = [Fault("drop", towards="rig", first=500, count=10)]
+    with Relay("udp://127.0.0.1:0", "udp://127.0.0.1:5005", plan) as relay:
+        ...  # the loop's device is relay.url
+        print(relay.done)
+
+Measurements to the loop and commands to the rig are counted separately, so a plan does the same in
+each run. Hello, welcome and goodbye pass unchanged.
+"""
+
+from __future__ import annotations
+
+import random
+import selectors
+import socket
+import struct
+import threading
+import time
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Self, TextIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quell import checks
+from quell.files import check_writable
+from quell.kernels.dispatch import call_specialised, compiled, is_finite, kernel
+from quell.plants.base import Plant, advance, check_plant, is_destroyed, measure
+from quell.realtime import wire
+from quell.realtime.devices import Listener
+from quell.realtime.system import (
+    Histogram,
+    checked_cpu,
+    checked_priority,
+    count_duration,
+    empty_counts,
+    enter_real_time,
+    load_acquire,
+    now,
+    real_time_process,
+    store_release,
+    system_clock,
+    wait_until,
+)
+from quell.realtime.telemetry import Ring, drain, dropped, push, ring
+from quell.realtime.transports import UdpListener, resolved
+from quell.realtime.wire import (
+    COMMAND,
+    LENGTH,
+    MEASUREMENT,
+    MOST_AT_ONCE,
+    Buffer,
+    Endpoint,
+    connect_to_sender,
+    is_from_other_side,
+    receive,
+    reply,
+    send,
+    wait_for_frame,
+)
+from quell.types import Vector
+
+# ---- The device's side of a wire ----
+
+IDLE, WAITING, LIVE, TRIPPED = range(4)
+STATES = ("idle", "waiting", "live", "tripped")
+
+# Longest wait before ``stop`` is checked again [ns]: 0.1 s, short for a person. Chosen by hand.
+_CHECK_STOP_EVERY = 100_000_000
+
+HELLO_WORTH = 2
+"""Measurements for a hello. With the welcome it is answered by three times its bytes at most, the
+limit of RFC 9000 (QUIC), section 8.1, for an address that has not proved that it receives."""
+# Measurements after the watchdog has tripped, if no command comes any more: one of ten arrives even
+# over a bad wire. Chosen by hand.
+LAST_WORDS = 10
+
+# Entries of ``RigModel.counts``: state, ticks without a fresh command, all ticks, ticks since the
+# plant was at rest, sessions, refused hellos, trips of the watchdog, clipped commands, late ticks,
+# destroyed states that were put back to rest, measurements that the other side has asked for.
+STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
+RESTORED, ASKED = 9, 10
+COUNTS = 11
+# Entries of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
+APPLIED, COMMANDED, LARGEST = range(3)
+
+LOG = ("tick", "t", "session", "state", "y", "u", "command")
+"""Columns of the log: number of the tick and its time [s], session, state (0 idle … 3 tripped), y,
+u as applied, and the command that came in this tick, NaN if none has."""
+
+
+class RigModel(NamedTuple):
+    """Parameters and state of the rig."""
+
+    plant: Any
+    transport: Any
+    endpoint: Endpoint
+    inbox: Buffer
+    outbox: Buffer
+    dt: float  # time between ticks [s]
+    u_max: float  # largest |u| that is applied [u-unit]
+    watchdog: int  # ticks without a fresh command before u is set to zero
+    patience: int  # ticks that a session has for its first command before another may replace it
+    wait: int  # how long a tick waits for the answer to the measurement before it [ns]
+    rest: bool  # whether each session starts from ``x0``, and not only after a destroyed state
+    x: Vector
+    x0: Vector
+    scratch: Vector
+    w: Vector
+    counts: NDArray[np.int64]
+    signals: Vector
+    row: Vector
+    log: Ring
+    logged: bool
+    lateness: NDArray[np.int64]  # histogram of how late ticks were, see ``system.histogram``
+    stop: NDArray[np.int64]  # ``serve`` ends if this is not zero (1,)
+
+
+@kernel
+def tick(rig: RigModel, time: int, fresh: bool) -> None:
+    """Perform one tick; the rig's clock shows ``time`` [ns].
+
+    ``fresh`` says whether a fresh command has been received since the last tick already.
+    """
+    counts, signals = rig.counts, rig.signals
+    fresh |= _receive_command(rig, time)
+    _update_watchdog(rig, fresh)
+    y = measure(rig.plant, rig.x)
+    if counts[STATE] != IDLE and counts[ASKED] > 0:
+        counts[ASKED] -= 1
+        state = wire.WATCHDOG_TRIPPED if counts[STATE] == TRIPPED else 0
+        wire.write_next_frame(rig.outbox, rig.endpoint, wire.MEASUREMENT, time, y, state)
+        if send(rig.transport, rig.outbox) != 0:
+            rig.endpoint.counters[wire.NOT_SENT] += 1
+    if rig.logged:
+        _log(rig, y)
+    signals[COMMANDED] = np.nan
+    advance(rig.plant, rig.x, rig.scratch, counts[SINCE_REST] * rig.dt, signals[APPLIED], rig.w)
+    counts[SINCE_REST] += 1
+    counts[TICKS] += 1
+
+
+@kernel
+def _receive_command(rig: RigModel, time: int) -> bool:
+    """Read all frames that have come; return whether a fresh, finite command was among them."""
+    own, frame, signals = rig.endpoint, rig.inbox, rig.signals
+    u, accepted = 0.0, 0
+    for _ in range(MOST_AT_ONCE):
+        size = receive(rig.transport, frame)
+        if size < 0:
+            break
+        if not wire.is_well_formed(frame, size, own.counters):
+            continue
+        kind = frame.bytes[3]
+        if kind == wire.HELLO:
+            if _answer_hello(rig, time):
+                accepted = 0
+        elif kind == wire.GOODBYE:
+            _end_session(rig)
+        elif rig.counts[STATE] == IDLE:
+            own.counters[wire.WRONG_SESSION] += 1
+        elif _is_foreign(rig):
+            own.counters[wire.ADDRESS] += 1
+        elif wire.accept(frame, own):
+            rig.counts[ASKED] = rig.watchdog + LAST_WORDS
+            value = frame.doubles[3]
+            if is_finite(value):
+                u = value
+                accepted += 1
+                signals[LARGEST] = max(signals[LARGEST], abs(value))
+    if wire.is_backlog(own, accepted) or accepted == 0 or rig.counts[STATE] == IDLE:
+        return False
+    signals[COMMANDED] = u
+    if rig.counts[STATE] != TRIPPED:
+        signals[APPLIED] = min(max(u, -rig.u_max), rig.u_max)
+        if abs(u) > rig.u_max:
+            rig.counts[CLIPPED] += 1
+    return True
+
+
+@kernel
+def _update_watchdog(rig: RigModel, fresh: bool) -> None:
+    counts = rig.counts
+    if counts[STATE] == WAITING and fresh:
+        counts[STATE] = LIVE
+    counts[SILENT] = 0 if fresh else counts[SILENT] + 1
+    if counts[STATE] == LIVE and counts[SILENT] >= rig.watchdog:
+        counts[STATE] = TRIPPED
+        counts[TRIPS] += 1
+    if counts[STATE] != LIVE:
+        rig.signals[APPLIED] = 0.0
+
+
+@kernel
+def _answer_hello(rig: RigModel, time: int) -> bool:
+    """Answer a hello; return whether it begins a session."""
+    counts, own = rig.counts, rig.endpoint
+    session, dt = int(rig.inbox.words[1]), rig.inbox.doubles[3]
+    known = session == own.numbers[wire.SESSION]
+    state, begins = 0, False
+    if session == 0 or (known and (counts[STATE] == IDLE or counts[STATE] == TRIPPED)):
+        own.counters[wire.WRONG_SESSION] += 1  # a session that has ended can't begin again
+        return False
+    if _is_foreign(rig):
+        own.counters[wire.ADDRESS] += 1
+        return False
+    if not known:
+        if not abs(dt - rig.dt) <= 1e-9 * rig.dt:  # a tolerance for rounding; also refuses NaN
+            state = wire.OTHER_DT
+        elif counts[STATE] == LIVE or (counts[STATE] == WAITING and counts[SILENT] < rig.patience):
+            state = wire.BUSY
+        else:
+            begins = True
+    if begins:
+        wire.start_session(own, session)
+        connect_to_sender(rig.transport)
+        counts[STATE] = WAITING
+        counts[SILENT] = counts[ASKED] = 0
+        counts[SESSIONS] += 1
+        rig.signals[APPLIED] = 0.0
+        destroyed = is_destroyed(rig.x, rig.x0)
+        counts[RESTORED] += 1 if destroyed else 0
+        if rig.rest or destroyed:
+            counts[SINCE_REST] = 0
+            for i in range(rig.x.size):
+                rig.x[i] = rig.x0[i]
+    elif state != 0:
+        counts[REFUSED] += 1
+    if state == 0:
+        counts[ASKED] = max(counts[ASKED], HELLO_WORTH)
+    wire.write_frame(rig.outbox, wire.WELCOME, session, 0, 0, time, rig.dt, state)
+    reply(rig.transport, rig.outbox)
+    return begins
+
+
+@kernel
+def _end_session(rig: RigModel) -> None:
+    """End the session if the goodbye received belongs to it."""
+    own = rig.endpoint
+    if rig.counts[STATE] == IDLE or int(rig.inbox.words[1]) != own.numbers[wire.SESSION]:
+        own.counters[wire.WRONG_SESSION] += 1
+    elif _is_foreign(rig):
+        own.counters[wire.ADDRESS] += 1
+    else:
+        rig.counts[STATE] = IDLE
+
+
+@kernel
+def _is_foreign(rig: RigModel) -> bool:
+    """Return whether the frame has the session's number but not its address."""
+    known = int(rig.inbox.words[1]) == rig.endpoint.numbers[wire.SESSION]
+    return known and not is_from_other_side(rig.transport)
+
+
+@kernel
+def _log(rig: RigModel, y: float) -> None:
+    """Write the tick's row to the log."""
+    counts, row = rig.counts, rig.row
+    row[0] = counts[TICKS]
+    row[1] = counts[TICKS] * rig.dt
+    row[2] = rig.endpoint.numbers[wire.SESSION]
+    row[3] = counts[STATE]
+    row[4] = y
+    row[5] = rig.signals[APPLIED]
+    row[6] = rig.signals[COMMANDED]
+    push(rig.log, row)
+
+
+@compiled
+def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
+    """Tick until ``rig.stop`` is set, or ``most`` times if it is not negative.
+
+    If ``paced``, there is one tick each dt; otherwise they follow each other at once.
+    """
+    begin = now(clock)
+    period = 1e9 * rig.dt
+    k = 0
+    while k != most and load_acquire(rig.stop, 0) == 0:
+        time = begin
+        if paced:
+            deadline = begin + int(np.rint(k * period))
+            time = now(clock)
+            while deadline - time > _CHECK_STOP_EVERY and load_acquire(rig.stop, 0) == 0:
+                time = wait_until(clock, time + _CHECK_STOP_EVERY)
+            if load_acquire(rig.stop, 0) != 0:
+                break
+            time = wait_until(clock, deadline)
+            late = time - deadline
+            count_duration(rig.lateness, late)
+            if late > period:
+                rig.counts[CAUGHT_UP] += 1
+        fresh = False
+        if rig.wait > 0:
+            fresh, waited = _await_answer(rig, clock)
+            begin += waited
+        tick(rig, time, fresh)
+        k += 1
+
+
+@kernel
+def _await_answer(rig: RigModel, clock: Any) -> tuple[bool, int]:
+    """Wait for the command that answers the last measurement, for ``rig.wait`` [ns] at most.
+
+    Return whether a fresh command has come, and how long it took [ns].
+    """
+    own = rig.endpoint
+    begin = now(clock)
+    fresh = _receive_command(rig, begin)
+    waited = 0
+    while (
+        rig.counts[STATE] == LIVE
+        and wire.ahead_of(own.numbers[wire.ANSWERED], own.numbers[wire.SENT]) != 0
+        and waited < rig.wait
+        and load_acquire(rig.stop, 0) == 0
+    ):
+        wait_for_frame(rig.transport, min(rig.wait - waited, _CHECK_STOP_EVERY))
+        waited = now(clock) - begin
+        fresh |= _receive_command(rig, begin + waited)
+    return fresh, waited
+
+
+# ---- The rig ----
+
+# Time between two writes to the log [s]; time that its buffer holds [s], and least rows. By hand.
+_WRITE_EVERY = 0.05
+_BUFFERED, _LEAST_ROWS = 5.0, 100
+# Time that a new session is protected while its first command is missing [s]: its loop may have to
+# be compiled first. Chosen by hand; not tuned further.
+_PATIENCE = 60.0
+# Range of dt [s] and largest watchdog [ticks]: far beyond any use; they catch typing errors.
+_SHORTEST, _LONGEST = 1e-6, 100.0
+_MOST_TICKS = 1_000_000
+# Longest run [s]: thirty years, so that the number of ticks fits into an integer.
+_LONGEST_RUN = 1e9
+
+
+class Rig:
+    """A simulated plant at the end of a wire.
+
+    Parameters
+    ----------
+    plant
+        any compiled plant.
+    dt
+        time between ticks [s].
+    listener
+        its end of the wire; ``close`` closes it.
+    watchdog
+        ticks in a row without a fresh, finite command after which u is zero until a new session.
+    u_max
+        larger commands are cut to it [u-unit].
+    rest
+        whether each session starts from ``x0``, or from where the last one left the plant. If that
+        state is not finite, or beyond 10⁹, the session starts from ``x0`` in any case.
+    wait
+        how long a tick waits for the command that answers the measurement before it [s]; the later
+        ticks are shifted by that time. A loop that is late then has no effect on the motion.
+    x0
+        the plant's state at the start (n,); zero by default.
+    log
+        CSV file for y, u, command and state of each tick (``quell.realtime.rig.LOG``).
+    overwrite
+        whether a log that exists is replaced; it is refused otherwise.
+
+    Raises
+    ------
+    ValueError
+        for a plant that is not compiled, numbers out of range, or a log that can't be written.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        dt: float,
+        listener: Listener,
+        *,
+        watchdog: int = 20,
+        u_max: float = np.inf,
+        rest: bool = True,
+        wait: float = 0.0,
+        x0: ArrayLike | None = None,
+        log: str | Path | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        check_plant(plant)
+        dt = checks.positive("dt", dt, "s")
+        if not _SHORTEST <= dt <= _LONGEST:
+            raise ValueError(f"dt = {dt!r} s: must be from {_SHORTEST:g} to {_LONGEST:g} s")
+        if not plant.compiled:
+            raise ValueError(
+                f"plant = {plant!r}: must be a compiled plant; this one runs only as Python"
+            )
+        u_max = u_max if u_max == np.inf else checks.positive("u_max", u_max)
+        watchdog = checks.whole("watchdog", watchdog, 1, _MOST_TICKS)
+        start = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)
+        rows = max(round(_BUFFERED / dt), _LEAST_ROWS)
+        self.listener = listener
+        self.dt = dt
+        self.model = RigModel(
+            plant=plant.sampled(dt),
+            transport=listener.transport,
+            endpoint=wire.endpoint(wire.COMMAND, 0, watchdog),
+            inbox=wire.buffer(),
+            outbox=wire.buffer(),
+            dt=dt,
+            u_max=u_max,
+            watchdog=watchdog,
+            patience=max(round(_PATIENCE / dt), 1),
+            wait=round(1e9 * _checked_wait(wait)),
+            rest=checks.flag("rest", rest),
+            x=start.copy(),
+            x0=start,
+            scratch=np.zeros(6 * plant.order),
+            w=np.zeros(plant.disturbances),
+            counts=np.zeros(COUNTS, dtype=np.int64),
+            signals=np.array([0.0, np.nan, 0.0]),
+            row=np.zeros(len(LOG)),
+            log=ring(1 if log is None else rows, len(LOG)),
+            logged=log is not None,
+            lateness=empty_counts(),
+            stop=np.zeros(1, dtype=np.int64),
+        )
+        self._file = None if log is None else _opened(log, overwrite)
+        self._log_failure = ""
+        self._clock = system_clock()
+        self._open = True
+
+    @property
+    def x(self) -> Vector:
+        """The plant's state, as a copy (n,)."""
+        return self.model.x.copy()
+
+    @property
+    def state(self) -> str:
+        """One of idle, waiting, live, tripped."""
+        return STATES[self.model.counts[STATE]]
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Number of frames by result, see ``quell.realtime.wire``, and of other events."""
+        more = {
+            "sessions": SESSIONS,
+            "refused": REFUSED,
+            "watchdog": TRIPS,
+            "clipped": CLIPPED,
+            "ticks": TICKS,
+            "caught_up": CAUGHT_UP,
+            "restored": RESTORED,
+        }
+        return wire.counts_by_name(self.model.endpoint.counters) | {
+            name: int(self.model.counts[index]) for name, index in more.items()
+        }
+
+    @property
+    def largest(self) -> float:
+        """Largest ``|command|`` received [u-unit], applied or not."""
+        return float(self.model.signals[LARGEST])
+
+    @property
+    def lateness(self) -> Histogram:
+        """Lateness of the ticks in ``run`` [s]."""
+        return Histogram.of(self.model.lateness)
+
+    @property
+    def unlogged(self) -> int:
+        """Ticks that are missing in the log because it could not be written fast enough."""
+        return dropped(self.model.log) if self.model.logged else 0
+
+    def tick(self, count: int = 1) -> None:
+        """Perform ``count`` ticks at once, without a clock: for tests that go step by step."""
+        self._serve(count, False)
+        self._write_log()
+
+    def prepare(self) -> None:
+        """Compile what ``run`` needs, or load it from the disk."""
+        self._serve(0, False)
+
+    def run(
+        self, seconds: float | None = None, *, priority: int = 0, cpu: int | None = None
+    ) -> list[str]:
+        """Tick in real time for ``seconds``, or until a signal or another thread calls ``stop``.
+
+        The ticks run on their own thread, which needs no Python; the calling thread writes the log.
+        Return sentences about which requests the system has granted.
+
+        Parameters
+        ----------
+        seconds
+            duration [s]; by default until ``stop``.
+        priority
+            SCHED_FIFO priority of the ticks, 1 to 99, together with locked memory; 0 for neither.
+        cpu
+            number of the processor for the ticks; any by default.
+
+        Raises
+        ------
+        ValueError
+            for arguments out of range.
+        """
+        most = -1
+        if seconds is not None:
+            most = max(round(checked_seconds("seconds", seconds) / self.dt), 1)
+        priority, cpu = checked_priority(priority), checked_cpu(cpu)
+        self.prepare()
+        raised: list[BaseException] = []
+        with real_time_process(priority, False) as notes:
+
+            def work() -> None:
+                try:
+                    enter_real_time(priority, cpu, notes)
+                    self._serve(most, True)
+                    self._end_session()  # at once: the loop holds u while it waits for measurements
+                except BaseException as error:
+                    raised.append(error)
+
+            thread = threading.Thread(target=work, name="quell-rig")
+            thread.start()
+            try:
+                while thread.is_alive():
+                    thread.join(_WRITE_EVERY)
+                    self._write_log()
+            finally:
+                self.stop()
+                thread.join()
+                self._write_log()
+        if raised:
+            raise raised[0]
+        if self._log_failure:
+            notes.append(self._log_failure)
+        return notes
+
+    def stop(self) -> None:
+        """End ``run`` at its next tick."""
+        store_release(self.model.stop, 0, 1)
+
+    def close(self) -> None:
+        """End the session, if there is one, and release the wire; a second call does nothing."""
+        if not self._open:
+            return
+        self._open = False
+        self._end_session()
+        self.listener.close()
+        if self._file is not None:
+            self._write_log()
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _end_session(self) -> None:
+        """Send a goodbye if there is a session."""
+        model = self.model
+        if model.counts[STATE] == IDLE:
+            return
+        session, now = int(model.endpoint.numbers[wire.SESSION]), time.monotonic_ns()
+        wire.write_frame(model.outbox, wire.GOODBYE, session, 0, 0, now, 0.0, wire.GONE)
+        send(model.transport, model.outbox)
+        model.counts[STATE] = IDLE
+
+    def _serve(self, most: int, paced: bool) -> None:
+        call_specialised(serve, self.model, self._clock, most, paced)
+
+    def _write_log(self) -> None:
+        if self._file is None or self._file.closed:
+            return
+        try:
+            for row in drain(self.model.log):
+                k, t, session, state, *values = row.tolist()
+                cells = f"{int(k)},{t:.9g},{int(session)},{int(state)}"
+                self._file.write(",".join((cells, *map(repr, values))) + "\n")
+            self._file.flush()
+        except OSError as error:  # a full disk must not end the loop
+            self._log_failure = f"the log was given up: {error.strerror}"
+            with suppress(OSError):
+                self._file.close()
+
+
+def _checked_wait(wait: float) -> float:
+    if checks.non_negative("wait", wait, "s") > _LONGEST:
+        raise ValueError(f"wait = {wait!r} s: must be at most {_LONGEST:g} s")
+    return wait
+
+
+def checked_seconds(name: str, seconds: float) -> float:
+    """Return the duration of a run [s], at most thirty years."""
+    if checks.positive(name, seconds, "s") > _LONGEST_RUN:
+        raise ValueError(f"{name} = {seconds!r}: must be at most {_LONGEST_RUN:g} s, or left out")
+    return seconds
+
+
+def _opened(path: str | Path, overwrite: bool) -> TextIO:
+    """Return the open log, with its header written; a device like /dev/null may be one, too."""
+    target = Path(path)
+    if target.is_file():
+        check_writable(target, overwrite)
+    try:
+        if target.is_file():
+            target.unlink()
+        file = target.open("w" if target.exists() else "x", encoding="utf-8", newline="")
+    except OSError as error:
+        raise ValueError(f"log = {str(path)!r}: can't be written ({error.strerror})") from None
+    file.write(",".join(LOG) + "\n")
+    return file
+
+
+# ---- A relay between a loop and its rig that loses, duplicates ----
+
+DIRECTIONS = ("loop", "rig")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of consecutive frames.
+
+    Parameters
+    ----------
+    kind
+        ``drop``; ``burst``: the frames are held and sent together with the next one; ``duplicate``;
+        ``delay``: each is sent ``late`` frames later, after newer ones; ``nan``: the value is NaN
+        or infinite, with a correct CRC; ``flip``: a bit is wrong; ``short``, ``long``: bytes are
+        missing or added; ``foreign``: another session; ``version``: of the protocol.
+    towards
+        ``loop`` for measurements, ``rig`` for commands.
+    first, count
+        number of the first frame, from 0, and number of frames.
+    late
+        frames, for ``delay``.
+    """
+
+    kind: str
+    towards: str = "loop"
+    first: int = 0
+    count: int = 1
+    late: int = 3
+
+    def __post_init__(self) -> None:
+        checks.one_of("kind", self.kind, KINDS)
+        checks.one_of("towards", self.towards, DIRECTIONS)
+        checks.whole("first", self.first, 0)
+        checks.whole("count", self.count, 1)
+        checks.whole("late", self.late, 1)
+
+
+def random_faults(number: int, frames: int, seed: int = 0, longest: int = 50) -> list[Fault]:
+    """Return random faults, 1 to ``longest`` of the first ``frames`` long, in both directions."""
+    checks.whole("number", number, 1)
+    last = checks.whole("frames", frames, 1) - 1
+    most = checks.whole("longest", longest, 1)
+    draw = random.Random(checks.whole("seed", seed, 0))
+    return [
+        Fault(
+            draw.choice(KINDS),
+            draw.choice(DIRECTIONS),
+            draw.randint(0, last),
+            round(most ** draw.random()),  # log-uniform: short faults are as frequent as long ones
+            draw.randint(1, 10),  # a delay in frames; chosen by hand
+        )
+        for _ in range(number)
+    ]
+
+
+class FaultInjector:
+    """The faults of one direction: ``frames(data)`` returns what is sent in place of ``data``."""
+
+    def __init__(self, faults: Sequence[Fault], towards: str, seed: int = 0) -> None:
+        self._faults = [fault for fault in faults if fault.towards == towards]
+        self._kind = MEASUREMENT if towards == "loop" else COMMAND
+        self._random = random.Random(f"{seed} {towards}")
+        self.number = 0
+        """Frames so far."""
+        self.done: Counter[str] = Counter()
+        """Number of frames by kind of fault."""
+        self._burst: list[bytes] = []
+        self._delayed: list[tuple[int, bytes]] = []
+
+    def frames(self, data: bytes) -> list[bytes]:
+        """Return what is sent in place of ``data``, in this order."""
+        if len(data) != LENGTH or data[3] != self._kind:
+            return [data]
+        number, out = self.number, [data]
+        self.number += 1
+        burst = False
+        for fault in self._faults:
+            if not fault.first <= number < fault.first + fault.count:
+                continue
+            self.done[fault.kind] += 1
+            if fault.kind == "drop":
+                out = []
+            elif fault.kind == "duplicate":
+                out = out + out
+            elif fault.kind == "delay":
+                self._delayed += [(number + fault.late, one) for one in out]
+                out = []
+            elif fault.kind == "burst":
+                burst = True
+            else:
+                out = [_CORRUPTIONS[fault.kind](one, self._random) for one in out]
+        out += [one for due, one in self._delayed if due <= number]
+        self._delayed = [(due, one) for due, one in self._delayed if due > number]
+        if burst:
+            self._burst += out
+            return []
+        out, self._burst = self._burst + out, []
+        return out
+
+
+class Relay:
+    """A relay between a loop and a rig, on its own thread.
+
+    Parameters
+    ----------
+    url
+        where the loop connects, for example ``udp://127.0.0.1:0`` for any free port; the attribute
+        ``url`` contains the port taken.
+    rig
+        URL of the rig.
+    faults
+        the plan.
+    seed
+        seed of what is random in it, such as which bit is wrong.
+    """
+
+    def __init__(self, url: str, rig: str, faults: Sequence[Fault] = (), seed: int = 0) -> None:
+        family, address = resolved(rig)
+        self._injectors = {towards: FaultInjector(faults, towards, seed) for towards in DIRECTIONS}
+        self._front = UdpListener(url)
+        self.url = self._front.url
+        self._back = socket.socket(family, socket.SOCK_DGRAM)
+        self._back.setblocking(False)
+        self._back.connect(address)
+        self._loop: Any = None
+        self._stop_reader, self._stop_writer = socket.socketpair()
+        self._thread = threading.Thread(target=self._work, name="quell-relay", daemon=True)
+        self._thread.start()
+
+    @property
+    def passed(self) -> dict[str, int]:
+        """Number of measurements to the loop and of commands to the rig, by direction."""
+        return {towards: injector.number for towards, injector in self._injectors.items()}
+
+    @property
+    def done(self) -> dict[str, dict[str, int]]:
+        """Number of frames by kind of fault, for each direction."""
+        return {towards: dict(injector.done) for towards, injector in self._injectors.items()}
+
+    def close(self) -> None:
+        """End the thread and release the ports."""
+        if self._thread.is_alive():
+            self._stop_writer.send(b"x")
+            self._thread.join()
+        for one in (self._front, self._back, self._stop_reader, self._stop_writer):
+            one.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _work(self) -> None:
+        front = self._front.socket
+        with selectors.DefaultSelector() as selector:
+            for one in (front, self._back, self._stop_reader):
+                selector.register(one, selectors.EVENT_READ)
+            while True:
+                ready = [key.fileobj for key, _ in selector.select()]
+                if self._stop_reader in ready:
+                    return
+                if front in ready:
+                    self._to_rig(front)
+                if self._back in ready:
+                    self._to_loop(front)
+
+    def _to_rig(self, front: socket.socket) -> None:
+        with suppress(OSError):  # without a rig the frames are lost
+            data, self._loop = front.recvfrom(4 * LENGTH)
+            for frame in self._injectors["rig"].frames(data):
+                self._back.send(frame)
+
+    def _to_loop(self, front: socket.socket) -> None:
+        with suppress(OSError):
+            data = self._back.recv(4 * LENGTH)
+            for frame in self._injectors["loop"].frames(data):
+                if self._loop is not None:
+                    front.sendto(frame, self._loop)
+
+
+def _signed(frame: bytes) -> bytes:
+    """Return the frame with a correct CRC."""
+    return frame[:-4] + struct.pack("<I", zlib.crc32(frame[:-4]))
+
+
+def _nan(frame: bytes, draw: random.Random) -> bytes:
+    value = draw.choice((float("nan"), float("inf"), float("-inf")))
+    return _signed(frame[:24] + struct.pack("<d", value) + frame[32:])
+
+
+def _flip(frame: bytes, draw: random.Random) -> bytes:
+    bit = draw.randrange(8 * len(frame))
+    return bytes(byte ^ (1 << bit % 8 if i == bit // 8 else 0) for i, byte in enumerate(frame))
+
+
+def _foreign(frame: bytes, draw: random.Random) -> bytes:
+    (session,) = struct.unpack_from("<I", frame, 4)
+    return _signed(frame[:4] + struct.pack("<I", session ^ draw.randrange(1, 1 << 32)) + frame[8:])
+
+
+_CORRUPTIONS: dict[str, Callable[[bytes, random.Random], bytes]] = {
+    "nan": _nan,
+    "flip": _flip,
+    "short": lambda frame, draw: frame[: draw.randrange(LENGTH)],
+    "long": lambda frame, draw: frame + draw.randbytes(draw.randrange(1, LENGTH)),
+    "foreign": _foreign,
+    "version": lambda frame, draw: _signed(frame[:2] + bytes([draw.randrange(2, 256)]) + frame[3:]),
+}
+KINDS = ("drop", "burst", "duplicate", "delay", *_CORRUPTIONS)

@@ -1,0 +1,574 @@
+"""A run at a rig: from a device and a controller to a record.
+
+Replay of a recorded run through another controller: its estimates and the u it wishes.
+
+The controller gets the recorded reference and measurements, sample by sample, and the recorded u as
+the applied one. So its observer and its learner run on what really happened. Its own u is recorded
+as ``u_wished`` but never acts: how *the loop* would have behaved is a question for ``simulate``.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from os import PathLike
+from types import FrameType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+from quell.controllers.base import (
+    Controller,
+    bumpless_transfer,
+    check_controller,
+    control,
+    set_applied_control,
+    set_reference_derivatives,
+    status_flags,
+    write_row,
+)
+from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors
+from quell.quantities import UNKNOWN, Signals
+from quell.realtime.cycle import ControlLoop
+from quell.realtime.devices import Device, PythonHandle, handle_of
+from quell.realtime.recordings import Event, Header, MemorySink, Sink, file_sink, row_channels
+from quell.realtime.supervisor import (
+    RESERVED,
+    Cause,
+    Ending,
+    Mode,
+    Request,
+    Rules,
+    Safety,
+    SupervisorState,
+    as_scenario,
+    reference_samples,
+)
+from quell.realtime.system import (
+    Timing,
+    checked_cpu,
+    checked_priority,
+    enter_real_time,
+    load_acquire,
+    real_time_process,
+    system_clock,
+    termination_handler,
+)
+from quell.realtime.telemetry import TelemetryWriter
+from quell.records.metrics import Metrics
+from quell.records.record import signals_of_loop
+from quell.records.trajectory import Trajectory
+from quell.signals import Signal
+from quell.simulation.driver import Scenario
+from quell.types import Matrix, Status, Vector
+
+# ---- The result of a run at a rig ----
+
+
+class ModeChange(NamedTuple):
+    """A change of the supervisor's mode."""
+
+    t: float  # time since the loop's first cycle [s]
+    mode: Mode
+    cause: Cause
+
+    def __str__(self) -> str:
+        """Return the change as a sentence."""
+        return f"{self.t:9.3f} s  {self.mode.name}: {self.cause.text}"
+
+
+class Tally(NamedTuple):
+    """Numbers of cycles and of events in them."""
+
+    cycles: int
+    overruns: int  # cycles that woke, or ended, after the next deadline
+    skipped: int  # deadlines that were skipped because of that
+    missed: int  # cycles without a good measurement
+    clipped: int  # cycles in which the supervisor's limits changed the controller's u
+    unsent: int  # commands that could not be sent
+    rows_lost: int  # rows that found the telemetry's ring full
+
+
+@dataclass(frozen=True, eq=False)
+class RigRun:
+    """The record of one run at a rig."""
+
+    trajectory: Trajectory  #: the samples of the scenario; ``ended`` is zero if it did not begin
+    record: Trajectory  #: all cycles, also before the scenario (START) and after it (RAMP, STOPPED)
+    timing: Timing  #: histograms of lateness and step time
+    changes: tuple[ModeChange, ...]  #: changes of the supervisor's mode and their causes
+    tally: Tally  #: numbers of cycles, overruns, missed samples and so on
+    counters: dict[str, int]  #: the device's counters, of frames for instance
+    notes: tuple[str, ...]  #: remarks, for example on permitted real-time scheduling
+    rules: Rules  #: safety rules of the run, with those that were derived; ``rules.text(dt)``
+
+    @property
+    def overruns(self) -> int:
+        """Cycles that woke, or ended, after the next deadline."""
+        return self.tally.overruns
+
+    @property
+    def completed(self) -> bool:
+        """Whether the scenario was run to its end."""
+        return any(change.cause.ending is Ending.COMPLETED for change in self.changes)
+
+    @property
+    def verdict(self) -> str:
+        """The reason of the end, in a sentence."""
+        changes = (change for change in reversed(self.changes) if change.cause is not Cause.RAMPED)
+        return str(next(changes, "it never began")).strip()
+
+    def metrics(self, start: float = 0.0, stop: float | None = None, **options: Any) -> Metrics:
+        """Return ``Trajectory.metrics``; times count from the scenario's first sample [s].
+
+        If the run was ended early, there are no measures of a step in the window in which it ended,
+        and ``missing`` says why, as does the error about a window without samples.
+        """
+        run, why = self.trajectory, f"the run was ended early: {self.verdict}"
+        try:
+            found = run.metrics(start, stop, **options)
+        except ValueError as error:
+            if self.completed:
+                raise
+            raise ValueError(f"{error}; {why}") from None
+        if self.completed or (stop is not None and stop <= run.ended):
+            return found
+        return found.without_step(why)
+
+    def text(self) -> str:
+        """Return changes, counters, timing and notes as lines of text."""
+        device = counters_text({name: n for name, n in self.counters.items() if n})
+        return "\n".join(
+            [
+                *map(str, self.changes),
+                counters_text(self.tally._asdict()),
+                *([f"device: {device}"] if device else []),
+                self.timing.text(),
+                *self.notes,
+            ]
+        )
+
+
+def counters_text(counters: Mapping[str, int]) -> str:
+    """Return counters as a line of text."""
+    return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counters.items())
+
+
+def tally(state: SupervisorState, rows_lost: int) -> Tally:
+    """Return the supervisor's counters, and the number of lost rows."""
+    return Tally._make([*state.counters.view(np.int64).tolist(), rows_lost])
+
+
+def mode_changes(state: SupervisorState, dt: float, first: int = 0) -> tuple[ModeChange, ...]:
+    """Return the changes of mode from number ``first`` on; the loop may be running meanwhile."""
+    rows = state.changes[first : load_acquire(state.changed, 0)]
+    return tuple(ModeChange(k * dt, Mode(mode), Cause(cause)) for k, mode, cause in rows.tolist())
+
+
+def lost_changes(state: SupervisorState, dt: float) -> tuple[str, ...]:
+    """Return a note if there were more changes of mode than are kept."""
+    kept, limit = int(state.changed[0]), state.changes.shape[0]
+    if kept < limit - RESERVED:
+        return ()
+    last = state.changes[kept - 1, 0] * dt
+    return (f"only the first {kept} changes of mode, until {last:.3f} s, were kept",)
+
+
+def silence_of(
+    record: Trajectory,
+    changes: Sequence[ModeChange],
+    before: Mapping[str, int],
+    after: Mapping[str, int],
+) -> tuple[str, ...]:
+    """Return a note that says what came from the device when missed samples ended the run.
+
+    Parameters
+    ----------
+    record
+        all cycles.
+    changes
+        changes of mode.
+    before, after
+        the device's counters at the begin of the run and at its end.
+    """
+    end = next((each for each in changes if each.cause in (Cause.LOST, Cause.STALLED)), None)
+    if end is None:
+        return ()
+    missed = np.asarray(record["events"]).astype(np.int64) & (Event.MISSED | Event.GAP) != 0
+    at = int(np.searchsorted(record["k"], round(end.t / record.dt)))
+    first = last = min(at, missed.size - 1)
+    while first > 0 and missed[first - 1]:
+        first -= 1
+    while last < missed.size and missed[last]:
+        last += 1
+    count = max(last - first, 1)
+    begin = record["k"][first] * record.dt
+    span = f"for {count * record.dt:.3g} s ({count} samples) from {begin:.3f} s on"
+    if "not_finite" not in after:
+        return (f"the device gave no measurement, or none that is a number, {span}",)
+    wrong = after["not_finite"] - before.get("not_finite", 0)
+    if wrong:
+        return (
+            f"no good measurement came {span}; {wrong} packets of the run had a value that is not "
+            "finite: look at the sensor of the device",
+        )
+    late = after.get("stale", 0) - before.get("stale", 0)
+    return (
+        f"no packet of the device came in time {span}, and no value was wrong: the device, the "
+        f"network or this computer was busy, or the device has stopped ({late} packets were too "
+        "old); the safety rule hold, or hold_time, says how long u may be held",
+    )
+
+
+def scenario_part(record: Trajectory, state: SupervisorState, samples: int) -> Trajectory:
+    """Return the samples of a record that belong to the scenario."""
+    k, began = record["k"], state.memory[0].began
+    inside = (k >= began) & (k < began + samples) & (began >= 0)
+    log = np.ascontiguousarray(record.log[inside])
+    return replace(record, log=log, ended=max(log.shape[0] - 1, 0) * record.dt)
+
+
+# ---- A run at a rig ----
+
+# Time between two looks of the main thread at the loop [s]; chosen by hand; not tuned further.
+_LOOK = 0.05
+# A call of a device's driver is given up after so many seconds, or samples if that is longer;
+# chosen by hand; not tuned further.
+_HUNG, _HUNG_SAMPLES = 3.0, 30.0
+
+
+def run_rig(
+    device: Device,
+    controller: Controller,
+    scenario: Scenario | Signal | float,
+    *,
+    duration: float | None = None,
+    safety: Safety | None = None,
+    approach: float = 1.0,  # chosen by hand
+    telemetry: Sequence[str | PathLike[str] | Sink] = (),
+    spin: float = 0.0,
+    priority: int = 50,  # the middle of the range; chosen by hand
+    cpu: int | None = None,
+    on_change: Callable[[ModeChange], None] | None = None,
+    overwrite: bool = False,
+    signals: Signals | None = None,
+) -> RigRun:
+    """Close a controller's loop around a device in real time, at the controller's sample time.
+
+    The controller starts with nothing learned, on a state of its own, as in ``simulate``. For
+    ``safety.settle_time`` it observes, with u at zero and y as its reference; then it takes over
+    without a bump, and the scenario's time begins. At the end, on Ctrl-C or SIGTERM, when its
+    terminal is closed, and after any fault, u is ramped to zero; a second Ctrl-C makes it zero at
+    once. The device is closed in any case.
+
+    Parameters
+    ----------
+    device
+        see ``quell.realtime.Device``; ``open_device(url, dt)`` makes one.
+    controller
+        any controller with finite ``u_min`` and ``u_max``, here or in ``safety``.
+    scenario
+        a reference, or a ``Scenario``, of which reference, duration and seed count: the rig has its
+        own disturbances and noise.
+    duration
+        duration [s]; the scenario's own by default.
+    safety
+        limits, and what happens beyond them; ``Safety()`` by default. ``safety.rules(controller,
+        scenario).text(dt)`` shows the rules before a run, ``RigRun.rules`` after it.
+    approach
+        time [s] in which the reference moves, with the least jerk, from where y is to the
+        scenario's; 0 for a jump.
+    telemetry
+        files that end in ``.csv`` or ``.mcap``, or other sinks
+        (``quell.realtime.recordings``); a record in memory is kept in any case.
+    spin
+        time before each deadline in which the loop polls the clock instead of sleeping [s]: it
+        wakes more punctually and heats the processor.
+    priority
+        SCHED_FIFO priority of the loop, 1 to 99, together with locked memory; 0 for an ordinary
+        process. ``notes`` say what is not permitted.
+    cpu
+        number of the processor for the loop; any by default.
+    on_change
+        called with each change of the supervisor's mode, soon after it, in this thread.
+    overwrite
+        whether files of ``telemetry`` that exist are replaced; they are refused otherwise.
+    signals
+        names and units of y and u for records, telemetry and plots, `{y = "angle [rad]", u =
+        "voltage [V]"}`; those of the device, or of the plant in the setup, by default.
+
+    Raises
+    ------
+    ValueError
+        for u without finite limits, a device of another dt, a reference that is not finite.
+    ConnectionError
+        if a call of the device's driver does not return.
+    """
+    handle = handle_of(device)
+    with closing(device):
+        check_controller(controller)
+        dt = controller.dt
+        own = getattr(device, "dt", dt)
+        if abs(own - dt) > 1e-9 * dt:  # allows for the rounding of 1 / rate
+            raise ValueError(
+                f"device has dt = {own!r} s, the controller {dt!r} s: must be the same"
+            )
+        scenario = as_scenario(scenario, duration)
+        rules = (Safety() if safety is None else safety).rules(controller, scenario)
+        derivatives = getattr(controller, "derivatives", 0)
+        reference = reference_samples(scenario, dt, derivatives, approach)
+        priority, cpu = checked_priority(priority), checked_cpu(cpu)
+        memory = MemorySink()
+        writer = TelemetryWriter(
+            _header(device, controller, signals), [memory, *_sinks(telemetry, overwrite)]
+        )
+        if isinstance(handle, PythonHandle):
+            device.read()  # an error of the driver comes before compiling
+        loop = ControlLoop.of(device, controller, reference, rules, system_clock(spin), writer.ring)
+        supervisor = loop.controller.supervisor
+        writer.urgent = loop.interpreted and priority > 1
+        if hasattr(device, "restart_session"):
+            device.restart_session()  # compiling may have taken longer than the device waits
+        before = dict(getattr(device, "counters", {}))
+        writer.header = replace(writer.header, started=time.time_ns())
+        real_time = real_time_process(priority, loop.interpreted)
+        # Signals first and last: a second Ctrl-C must not lose the end of the record.
+        with _requests_by_signals(supervisor.requests), writer, real_time as notes:
+            _run_thread(loop, dt, priority, cpu, notes, on_change)
+            device.close()  # before the record is finished, which may take time
+    if scenario.disturbances or scenario.noise != 0.0:
+        notes.append("disturbances and noise of the scenario are ignored: the rig has its own")
+    handle = loop.handle
+    if isinstance(handle, PythonHandle) and handle.errors:
+        count, last = int(handle.faults[0]), handle.errors[0]
+        notes.append(f"the device raised {count} errors, the last of them: {last!r}")
+    notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
+    record = replace(memory.trajectory(), u_limits=(rules.low, rules.high))
+    counters, changes = dict(getattr(device, "counters", {})), mode_changes(supervisor, dt)
+    notes += silence_of(record, changes, before, counters)
+    return RigRun(
+        trajectory=scenario_part(record, supervisor, reference.r.size),
+        record=record,
+        timing=loop.timing,
+        changes=changes,
+        tally=tally(supervisor, writer.dropped),
+        counters=counters,
+        notes=tuple(notes),
+        rules=rules,
+    )
+
+
+def _header(device: Device, controller: Controller, signals: Signals | None) -> Header:
+    known = getattr(device, "signals", UNKNOWN) if signals is None else signals
+    known = signals_of_loop(known, controller)
+    units = {"y": known.y.unit, "u": known.u.unit}
+    return Header(
+        channels=row_channels(controller.channels),
+        dt=controller.dt,
+        features=tuple(controller.features),
+        device=getattr(device, "name", type(device).__name__),
+        controller=getattr(controller, "name", type(controller).__name__),
+        units={name: unit for name, unit in units.items() if unit},
+        notes={"signals": known.texts()} if known.known else {},
+    )
+
+
+def _sinks(telemetry: Sequence[str | PathLike[str] | Sink], overwrite: bool) -> list[Sink]:
+    """Return the sinks; those for files are checked, because compiling may take a minute."""
+    if isinstance(telemetry, str | PathLike):
+        raise ValueError(f"telemetry = {str(telemetry)!r}: must be a list of files and sinks")
+    sinks: list[Sink] = []
+    for entry in telemetry:
+        if isinstance(entry, str | PathLike):
+            file = file_sink(entry, overwrite)
+            file.check()
+            sinks.append(file)
+        else:
+            sinks.append(entry)
+    return sinks
+
+
+def _run_thread(
+    loop: ControlLoop,
+    dt: float,
+    priority: int,
+    cpu: int | None,
+    notes: list[str],
+    on_change: Callable[[ModeChange], None] | None,
+) -> None:
+    """Run the loop on a thread of its own; report changes of mode, give up a driver that hangs."""
+    raised: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            enter_real_time(priority, cpu, notes)
+            if isinstance(loop.handle, PythonHandle):
+                # The driver may set itself up with the first write, and start a watchdog: not
+                # before the loop is ready.
+                loop.handle.device.write(0.0)
+            loop.run()
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=work, name="quell-loop", daemon=True)
+    thread.start()
+    supervisor = loop.controller.supervisor
+    counters = supervisor.counters[0]
+    seen, cycles, progressed, hung = 0, -1, time.monotonic(), False
+    try:
+        while thread.is_alive() and not hung:
+            thread.join(_LOOK)
+            for change in mode_changes(supervisor, dt, seen):
+                seen += 1
+                if on_change is not None:
+                    on_change(change)
+            if counters.cycles != cycles or not loop.interpreted:
+                cycles, progressed = int(counters.cycles), time.monotonic()
+            hung = time.monotonic() - progressed > max(_HUNG, _HUNG_SAMPLES * dt)
+    except BaseException:
+        supervisor.requests[0] = max(int(supervisor.requests[0]), Request.RAMP)
+        thread.join(max(_HUNG, (loop.controller.rules.ramp + _HUNG_SAMPLES) * dt))
+        raise
+    if hung:
+        seconds = time.monotonic() - progressed
+        raise ConnectionError(
+            f"device: read() or write() did not return for {seconds:.1f} s; it was closed"
+        )
+    if raised:
+        raise raised[0]
+
+
+@contextmanager
+def _requests_by_signals(requests: NDArray[np.int64]) -> Iterator[None]:
+    """Request a ramp at the first signal and zero at the second, if this is the main thread."""
+
+    def request(number: int, frame: FrameType | None) -> None:
+        first = requests[0] == Request.NONE
+        requests[0] = Request.RAMP if first else Request.ZERO
+
+    if threading.current_thread() is threading.main_thread():
+        with termination_handler(request):
+            yield
+    else:
+        yield
+
+
+# ---- Replay of a recorded run through another controller ----
+
+_RECORDED = ("r", "y", "y_measured", "u")
+_NO_DERIVATIVES = np.zeros(0)
+
+
+def replay(run: Trajectory, controller: Controller, *, u_before: float | None = None) -> Trajectory:
+    """Let a controller follow a recorded run.
+
+    It starts with nothing learned, on a state of its own, as in ``simulate``. The controller that
+    made the run gives the recorded estimates again, to rounding. Skipped deadlines are samples
+    without measurement, as they were on the rig, whose loop passes on ``Safety.hold`` of them at
+    once at most: if it skipped more, the run ended, and its last estimates differ. Derivatives of
+    the reference are not recorded: a controller with feedforward gets none, which changes
+    ``u_wished`` only.
+
+    Parameters
+    ----------
+    run
+        a run with all its samples: recorded on a rig (``load``, or ``RigRun.record``), or from
+        ``simulate`` with ``record_every=1``.
+    controller
+        any controller with the run's sample time.
+    u_before
+        control signal under which the plant rested before the first sample [u-unit]. The controller
+        then starts as by ``controller.start(y, u_before)``; by default as by its first sample.
+
+    Returns
+    -------
+    Trajectory
+        ``r``, ``y``, ``y_measured``, ``u`` of the run; ``u_wished``; the controller's channels.
+
+    Raises
+    ------
+    ValueError
+        for a run without r, y, y_measured or u, with samples left out, without measurements, or
+        with another sample time; for ``u_before`` with a controller that can't start under load.
+    """
+    check_controller(controller)
+    if not isinstance(run, Trajectory):
+        raise ValueError(
+            f"run = {run!r}: must be a Trajectory, for example quell.realtime.load('run.mcap')"
+        )
+    recorded = np.column_stack([run[name] for name in _RECORDED])
+    u = recorded[:, 3]
+    if run.every != 1:
+        raise ValueError(
+            f"run has every {run.every}th sample: a replay needs all; record with record_every=1"
+        )
+    if run.dt != controller.dt:
+        raise ValueError(
+            f"controller has dt = {controller.dt!r} s: must have that of the run, {run.dt!r} s"
+        )
+    if not np.all(np.isfinite(u)):
+        time = run.t[np.argmin(np.isfinite(u))]
+        raise ValueError(f"run has no finite u at {time:.6g} s: the applied u must be known")
+    measured = np.flatnonzero(np.isfinite(recorded[:, 2]))
+    if measured.size == 0:
+        raise ValueError("run has no finite y_measured: there is nothing to observe")
+    design, state = controller.parameters, controller.initial_state()
+    if u_before is not None:
+        r, _, y, _ = recorded[measured[0]].tolist()
+        design, state = _started(controller, y, checks.finite("u_before", u_before), r)
+    channels = (*((name, 1) for name in _RECORDED), ("u_wished", 1), *controller.channels)
+    log = np.empty((len(run), sum(width for _, width in channels)))
+    log[:, : len(_RECORDED)] = recorded
+    began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
+    with np.errstate(over="ignore", invalid="ignore"), explain_compile_errors(design):
+        status = call_specialised(_follow, design, state, _NO_DERIVATIVES, began, log)
+    return Trajectory(
+        log=log,
+        channels=channels,
+        dt=run.dt,
+        status=Status(int(status)),
+        ended=(len(run) - 1) * run.dt,
+        plant=run.plant,
+        features=controller.features,
+        signals=signals_of_loop(run.signals, controller),
+        u_limits=run.u_limits,
+        final_state=state,
+    )
+
+
+def _started(controller: Any, y: float, u: float, r: float) -> tuple[Any, Any]:
+    """Return parameters and initial state for a plant that rests at ``y`` under ``u``."""
+    if not hasattr(controller, "start"):
+        kind = type(controller).__name__
+        raise ValueError(f"u_before = {u!r}: {kind} has no start under load; leave it out")
+    follower = copy.copy(controller)
+    follower.reset()
+    follower.start(y, u, r if math.isfinite(r) else None)
+    return follower.parameters, follower._state
+
+
+@compiled
+def _follow(design: Any, state: Any, derivatives: Vector, began: int, log: Matrix) -> int:
+    """Run the controller on the first columns of ``log``, write the others; return status flags.
+
+    From sample ``began`` on the controller was in control.
+    """
+    status = 0
+    for k in range(log.shape[0]):
+        if k == began and k > 0:
+            bumpless_transfer(design, state)
+        set_reference_derivatives(design, state, derivatives)
+        wished = control(design, state, log[k, 0], log[k, 2])
+        status |= status_flags(design, state)
+        log[k, 4] = wished
+        write_row(design, state, log[k, 5:])
+        if log[k, 3] != wished:
+            set_applied_control(design, state, log[k, 3])
+    return status

@@ -1,0 +1,743 @@
+"""The frame that carries one number between a device and the loop: 40 bytes on every wire.
+
+======  ====  =======  ==========================================================================
+offset  size  type     content
+======  ====  =======  ==========================================================================
+0       2     bytes    ``QL``
+2       1     uint8    version of the protocol: 1
+3       1     uint8    kind: 1 measurement, 2 command, 3 hello, 4 welcome, 5 goodbye,
+                       6 telemetry of a controller on the device (``target``)
+4       4     uint32   session: drawn by the loop for each run, never 0
+8       4     uint32   number of the frame: the sender's count of ticks or cycles from 1, mod 2^32
+12      4     uint32   answers: number of the newest frame accepted from the other side; 0 if none
+16      8     int64    time: the sender's monotonic clock [ns]
+24      8     float64  value: y [y-unit], u [u-unit]; in hello and welcome the sample time [s]
+32      4     uint32   state flags of the sender: 1 its watchdog has set u to zero (measurement);
+                       2 another session is active, 4 the sample time differs (welcome); 8 the
+                       device has ended the session (goodbye); index of the channel (telemetry)
+36      4     uint32   CRC-32 of the 36 bytes before it (IEEE 802.3, as in zlib, Ethernet and PNG)
+======  ====  =======  ==========================================================================
+
+All numbers are little-endian. Hello, welcome and goodbye have the number 0 and answer nothing.
+
+A receiver accepts a measurement or a command if its length, its first three bytes and its CRC are
+right, its kind is the expected one, its session is the receiver's, its number is newer than the
+last accepted one (modulo 2^32, RFC 1982), and the frame it answers was sent at most ``most_age``
+frames ago. Each rejected frame is counted under the first rule that it breaks.
+
+Functions that carry frames: each kind of wire implements them for its transport.
+
+A transport is a NamedTuple; ``receive``, ``send`` and ``wait_for_frame`` are registered for its
+type, and ``reply``, ``connect_to_sender`` and ``is_from_other_side`` if anyone can send to it. See
+``realtime/transports.py`` for a complete example. None of these functions allocates memory, and
+only ``wait_for_frame`` waits.
+
+The base class of devices at the other end of a wire: sessions, reading and writing in Python.
+
+The loop's access to a device at the other end of a wire, the same for every transport.
+
+The device has its own clock and sends a measurement at each tick. ``read_tick`` takes them in order
+and waits for the next if there is none, ``read_measurement`` takes the newest. ``write_command``
+sends a command that names the measurement it answers; a measurement names the command that acts
+from its tick on.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+from quell.kernels.dispatch import (
+    call_specialised,
+    compiled,
+    generic,
+    generic_with_default,
+    is_finite,
+    kernel,
+    specialised,
+)
+from quell.realtime.devices import Tick, ask, read_measurement, read_tick, write_command
+from quell.realtime.system import SystemClock, external, now, system_clock
+
+# ---- The frame that carries one number between a device and the loop ----
+
+LENGTH = 40
+VERSION = 1
+MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE, TELEMETRY = range(1, 7)
+WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE = 1, 2, 4, 8
+
+REFUSALS = (
+    *("malformed", "version", "kind", "session", "duplicated", "reordered", "stale"),
+    "address",
+)
+COUNTERS = ("accepted", *REFUSALS, "not_finite", "skipped", "not_sent")
+"""Names of the counters. ``skipped`` frames were lost, or replaced by a newer one before use;
+those under ``address`` came from somebody who has not opened the session."""
+ACCEPTED, MALFORMED, WRONG_VERSION, WRONG_KIND, WRONG_SESSION = range(5)
+DUPLICATED, REORDERED, STALE, ADDRESS, NOT_FINITE, SKIPPED, NOT_SENT = range(5, 12)
+
+_MAGIC = int.from_bytes(b"QL", "little")
+# Frame numbers are 32 bits wide.
+_MODULUS = 1 << 32
+
+
+def _crc_table() -> NDArray[np.uint32]:
+    table = np.zeros(256, dtype=np.uint32)
+    for byte in range(256):
+        value = byte
+        for _ in range(8):
+            value = value >> 1 ^ (0xEDB88320 if value & 1 else 0)
+        table[byte] = value
+    return table
+
+
+_CRC = _crc_table()
+
+
+class Buffer(NamedTuple):
+    """Memory for a frame as bytes and as numbers; all arrays share it."""
+
+    bytes: NDArray[np.uint8]  # (48,): longer than a frame, to notice a datagram that is too long
+    shorts: NDArray[np.uint16]
+    words: NDArray[np.uint32]
+    longs: NDArray[np.int64]
+    doubles: NDArray[np.float64]
+    address: int  # address of the first byte
+
+
+def buffer() -> Buffer:
+    """Return an empty buffer for a frame."""
+    raw = np.zeros(LENGTH // 8 + 1).view(np.uint8)
+    shorts, words = raw.view("<u2"), raw.view("<u4")
+    return Buffer(raw, shorts, words, raw.view("<i8"), raw.view("<f8"), raw.ctypes.data)
+
+
+class Endpoint(NamedTuple):
+    """The session as one side sees it; make it with ``endpoint``."""
+
+    expects: int  # the kind it accepts: MEASUREMENT or COMMAND
+    most_age: int  # a frame is stale if it answers one sent more than this number of frames ago
+    numbers: NDArray[np.int64]
+    """Session, number of the last frame sent, number of the last one accepted, the number that this
+    one answered, and its state flags (5,)."""
+    counters: NDArray[np.int64]  # number of frames for each name in ``COUNTERS`` (12,)
+
+
+SESSION, SENT, RECEIVED, ANSWERED, STATE = range(5)
+
+
+def endpoint(expects: int, session: int, most_age: int) -> Endpoint:
+    """Return an endpoint that has neither sent nor received a frame."""
+    numbers = np.array([session, 0, 0, 0, 0], dtype=np.int64)
+    return Endpoint(expects, most_age, numbers, np.zeros(len(COUNTERS), dtype=np.int64))
+
+
+@kernel
+def crc32(data: NDArray[np.uint8], size: int) -> int:
+    """Return the CRC-32 of the first ``size`` bytes."""
+    value = 0xFFFFFFFF
+    for i in range(size):
+        value = (value >> 8) ^ int(_CRC[(value ^ int(data[i])) & 0xFF])
+    return value ^ 0xFFFFFFFF
+
+
+@kernel
+def write_frame(
+    out: Buffer,
+    kind: int,
+    session: int,
+    number: int,
+    answers: int,
+    time: int,
+    value: float,
+    state: int,
+) -> None:
+    """Write a frame to ``out``."""
+    out.shorts[0] = _MAGIC
+    out.bytes[2] = VERSION
+    out.bytes[3] = kind
+    out.words[1] = session
+    out.words[2] = number % _MODULUS
+    out.words[3] = answers % _MODULUS
+    out.longs[2] = time
+    out.doubles[3] = value
+    out.words[8] = state
+    out.words[9] = crc32(out.bytes, LENGTH - 4)
+
+
+@kernel
+def write_next_frame(
+    out: Buffer, own: Endpoint, kind: int, time: int, value: float, state: int
+) -> None:
+    """Write the next frame of the session to ``out``."""
+    numbers = own.numbers
+    numbers[SENT] += 1
+    write_frame(out, kind, numbers[SESSION], numbers[SENT], numbers[RECEIVED], time, value, state)
+
+
+@kernel
+def is_well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> bool:
+    """Return whether the first ``size`` bytes are a frame of this version; count them if not."""
+    if (
+        size != LENGTH
+        or frame.shorts[0] != _MAGIC
+        or int(frame.words[9]) != crc32(frame.bytes, LENGTH - 4)
+    ):
+        counters[MALFORMED] += 1
+        return False
+    if frame.bytes[2] != VERSION:
+        counters[WRONG_VERSION] += 1
+        return False
+    return True
+
+
+@kernel
+def ahead_of(number: int, of: int) -> int:
+    """Return how far ``number`` (modulo 2^32) is ahead of the count ``of``: −2^31 … 2^31 − 1."""
+    return (number - of + _MODULUS // 2) % _MODULUS - _MODULUS // 2
+
+
+@kernel
+def accept(frame: Buffer, own: Endpoint) -> bool:
+    """Return whether a well-formed frame is a new one of the expected kind; count it in any case.
+
+    A frame whose value is not finite is accepted, because it shows that the other side is alive. It
+    is also counted as ``not_finite``.
+    """
+    counters, numbers = own.counters, own.numbers
+    if frame.bytes[3] != own.expects:
+        counters[WRONG_KIND] += 1
+        return False
+    if int(frame.words[1]) != numbers[SESSION]:
+        counters[WRONG_SESSION] += 1
+        return False
+    ahead = ahead_of(int(frame.words[2]), numbers[RECEIVED])
+    if ahead <= 0:
+        counters[DUPLICATED if ahead == 0 else REORDERED] += 1
+        return False
+    age = -ahead_of(int(frame.words[3]), numbers[SENT])
+    if age > own.most_age or age < 0:
+        counters[STALE] += 1
+        return False
+    counters[SKIPPED] += ahead - 1
+    numbers[RECEIVED] += ahead
+    numbers[ANSWERED] = int(frame.words[3])
+    # GONE stays set: frames that were sent before a goodbye may be read after it.
+    numbers[STATE] = int(frame.words[8]) | (numbers[STATE] & GONE)
+    counters[ACCEPTED] += 1
+    if not is_finite(frame.doubles[3]):
+        counters[NOT_FINITE] += 1
+    return True
+
+
+@kernel
+def is_backlog(own: Endpoint, accepted: int) -> bool:
+    """Count all but the newest of the frames accepted at once as skipped; return whether too many.
+
+    More than ``most_age`` frames at once may come from a queue that was full. Then even the newest
+    of them may be old; it is counted as stale.
+    """
+    if accepted > 1:
+        own.counters[SKIPPED] += accepted - 1
+    if accepted <= own.most_age:
+        return False
+    own.counters[STALE] += 1
+    return True
+
+
+@kernel
+def start_session(own: Endpoint, session: int) -> None:
+    """Reset all numbers for a new session; the counters continue."""
+    for i in range(own.numbers.size):
+        own.numbers[i] = 0
+    own.numbers[SESSION] = session
+
+
+def counts_by_name(counters: NDArray[np.int64]) -> dict[str, int]:
+    """Return the counters by their names."""
+    return dict(zip(COUNTERS, map(int, counters), strict=True))
+
+
+# ---- Functions that carry frames ----
+
+MOST_AT_ONCE = 1024
+"""Packets read at once: a sender that floods the wire can't keep the other side from its cycle.
+Chosen by hand; not tuned further."""
+
+
+@generic
+def receive(transport: Any, frame: Buffer) -> int:
+    """Write the next packet to ``frame``; return its length in bytes, or -1 if none is waiting."""
+    raise TypeError
+
+
+@generic
+def send(transport: Any, frame: Buffer) -> int:
+    """Send a frame to the other side; return 0, or another number if it could not be sent."""
+    raise TypeError
+
+
+@generic
+def wait_for_frame(transport: Any, nanoseconds: int) -> None:
+    """Wait until a packet may have come, at most ``nanoseconds`` [ns]."""
+    raise TypeError
+
+
+@generic_with_default
+def reply(transport: Any, frame: Buffer) -> int:
+    """Send a frame to the sender of the packet received last; return the same as ``send``."""
+    return send(transport, frame)
+
+
+@generic_with_default
+def connect_to_sender(transport: Any) -> None:
+    """Make the sender of the packet received last the other side; nothing if there is only one."""
+
+
+@generic_with_default
+def is_from_other_side(transport: Any) -> bool:
+    """Return whether the packet received last came from the other side; True if only it can send.
+
+    The other side is the sender for which ``connect_to_sender`` was called last.
+    """
+    return True
+
+
+# ---- Wait for a file descriptor, from compiled code and from Python ----
+
+_SECOND = 1_000_000_000
+# From poll.h: data can be read; error, hang-up or an invalid descriptor.
+_POLLIN = 0x1
+_GONE = 0x38
+# Where the 16 bits of ``revents`` start in a pollfd that is read as one little-endian word.
+_REVENTS = 48
+
+_ppoll = external("ppoll", "int", "address", "long", "address", "address")
+
+
+class Descriptor(NamedTuple):
+    """A file descriptor to wait for; make it with ``descriptor``."""
+
+    fd: int
+    words: NDArray[np.int64]  # A pollfd, seconds and nanoseconds (3,)
+    address: int  # address of ``words``
+
+
+def descriptor(fd: int) -> Descriptor:
+    """Return a ``Descriptor`` for the file descriptor ``fd``."""
+    words = np.zeros(3, dtype=np.int64)
+    words[:1].view(np.int32)[0] = fd
+    words[:1].view(np.int16)[2] = _POLLIN
+    return Descriptor(fd, words, words.ctypes.data)
+
+
+@kernel
+def wait_readable(descriptor: Descriptor, nanoseconds: int) -> None:
+    """Wait until there is something to read, at most ``nanoseconds`` [ns]."""
+    descriptor.words[1] = nanoseconds // _SECOND
+    descriptor.words[2] = nanoseconds % _SECOND
+    _ppoll(descriptor.address, 1, descriptor.address + 8, 0)
+
+
+@kernel
+def is_gone(descriptor: Descriptor) -> bool:
+    """Return whether the last wait found that the descriptor can't be used any more."""
+    return (descriptor.words[0] >> _REVENTS & _GONE) != 0
+
+
+@kernel
+def pause(descriptor: Descriptor, nanoseconds: int) -> None:
+    """Sleep for less than a second [ns], whatever the descriptor does."""
+    descriptor.words[1] = 0
+    descriptor.words[2] = nanoseconds
+    _ppoll(0, 0, descriptor.address + 8, 0)
+
+
+# ---- The loop's access to a device at the other end of a wire, the same for every transport ----
+
+COMMAND_NOT_SENT, TRIPPED, SESSION_GONE = 1, 2, 3
+"""Faults that ``write_command`` returns: the command could not be sent; the device's watchdog has
+set u to zero until a new session; the device has ended the session."""
+
+
+QUEUED = 64
+"""Measurements that wait for the loop at most; more than 50 at once are stale anyway."""
+SENT_KEPT = 128
+"""Commands that are remembered: the device accepts none that is older than its watchdog."""
+_FIRST, _WAITING, _LAST = range(3)
+
+
+class TickQueue(NamedTuple):
+    """Measurements that have come and were not used yet; make it with ``tick_queue``."""
+
+    counts: NDArray[np.int64]
+    """Index of the oldest, how many wait, number of the last one used (3,)."""
+    numbers: NDArray[np.int64]  # (64,)
+    y: NDArray[np.float64]  # [y-unit] (64,)
+    u: NDArray[np.float64]  # what acts since then [u-unit] (64,)
+    sent: NDArray[np.float64]  # the command of each number, modulo 128 (128,)
+
+
+def tick_queue() -> TickQueue:
+    """Return an empty queue."""
+    numbers, y, u = np.zeros(QUEUED, dtype=np.int64), np.zeros(QUEUED), np.zeros(QUEUED)
+    return TickQueue(np.zeros(3, dtype=np.int64), numbers, y, u, np.zeros(SENT_KEPT))
+
+
+class WireHandle(NamedTuple):
+    """The loop's end of a wire."""
+
+    transport: Any
+    endpoint: Endpoint
+    inbox: Buffer
+    outbox: Buffer
+    watch: SystemClock  # limits waiting: a wire takes real time even if the loop's clock is virtual
+    dt: float  # sample time, in hellos [s]
+    queue: TickQueue
+
+
+@read_measurement.register(WireHandle)
+def _read_measurement(handle: WireHandle, clock: Any, until: int) -> tuple[float, int]:
+    """Return the newest measurement; those before it are left out."""
+    tick = read_tick(handle, clock, until)
+    waited, skipped = tick.waited, 0
+    while tick.left > 0:
+        tick = read_tick(handle, clock, 0)
+        skipped += 1
+    handle.endpoint.counters[SKIPPED] += skipped
+    return tick.y, waited
+
+
+@read_tick.register(WireHandle)
+def _read_tick(handle: WireHandle, clock: Any, until: int) -> Tick:
+    begin = now(clock)
+    waited = 0
+    _fetch(handle)
+    if handle.queue.counts[_WAITING] == 0:
+        end = now(handle.watch) + until - begin
+        left = until - begin
+        while handle.queue.counts[_WAITING] == 0 and left > 0:
+            wait_for_frame(handle.transport, left)
+            _fetch(handle)
+            left = end - now(handle.watch)
+        waited = now(clock) - begin
+    return _next(handle, waited)
+
+
+@kernel
+def _fetch(handle: WireHandle) -> None:
+    """Put the measurements that have come into the queue."""
+    own, frame, queue = handle.endpoint, handle.inbox, handle.queue
+    accepted, received = 0, 0
+    while received < MOST_AT_ONCE:
+        size = receive(handle.transport, frame)
+        if size < 0:
+            break
+        received += 1
+        if not is_well_formed(frame, size, own.counters):
+            continue
+        if is_own(own, frame, GOODBYE):
+            own.numbers[STATE] |= GONE
+        elif not is_own(own, frame, WELCOME) and accept(frame, own):
+            accepted += 1
+            at = (queue.counts[_FIRST] + queue.counts[_WAITING]) % QUEUED
+            queue.y[at] = frame.doubles[3] if is_finite(frame.doubles[3]) else math.nan
+            queue.u[at] = _acting(handle)
+            queue.numbers[at] = own.numbers[RECEIVED]
+            if queue.counts[_WAITING] < QUEUED:
+                queue.counts[_WAITING] += 1
+            else:
+                queue.counts[_FIRST] = (queue.counts[_FIRST] + 1) % QUEUED
+                own.counters[SKIPPED] += 1
+    if accepted > own.most_age and is_backlog(own, accepted):
+        queue.counts[_WAITING] = 0
+
+
+@kernel
+def _acting(handle: WireHandle) -> float:
+    """Return the u that acts since the measurement accepted last, NaN if it is not known."""
+    own = handle.endpoint
+    sent, answered = own.numbers[SENT], own.numbers[ANSWERED]
+    if answered == 0 or own.numbers[STATE] != 0:  # before the first command, or tripped
+        return 0.0
+    age = ahead_of(sent, answered)
+    return handle.queue.sent[(sent - age) % SENT_KEPT] if age < SENT_KEPT else math.nan
+
+
+@kernel
+def _next(handle: WireHandle, waited: int) -> Tick:
+    """Take the oldest measurement from the queue."""
+    counts = handle.queue.counts
+    if counts[_WAITING] == 0:
+        return Tick(math.nan, 0, math.nan, 0, waited)
+    at = counts[_FIRST]
+    number = handle.queue.numbers[at]
+    steps = number - counts[_LAST]
+    counts[_LAST] = number
+    counts[_FIRST] = (at + 1) % QUEUED
+    counts[_WAITING] -= 1
+    return Tick(handle.queue.y[at], steps, handle.queue.u[at], counts[_WAITING], waited)
+
+
+@ask.register(WireHandle)
+def _ask(handle: WireHandle) -> None:
+    """Repeat the hello of the session: a device is silent if it hears nothing."""
+    own, time = handle.endpoint, now(handle.watch)
+    session = own.numbers[SESSION]
+    write_frame(handle.outbox, HELLO, session, 0, 0, time, handle.dt, 0)
+    send(handle.transport, handle.outbox)
+
+
+@kernel
+def is_own(own: Endpoint, frame: Buffer, kind: int) -> bool:
+    """Return whether a frame is of this kind and of the endpoint's session."""
+    return frame.bytes[3] == kind and int(frame.words[1]) == own.numbers[SESSION]
+
+
+@write_command.register(WireHandle)
+def _write_command(handle: WireHandle, u: float) -> int:
+    own = handle.endpoint
+    write_next_frame(handle.outbox, own, COMMAND, now(handle.watch), u, 0)
+    handle.queue.sent[own.numbers[SENT] % SENT_KEPT] = u
+    failed = send(handle.transport, handle.outbox) != 0
+    if failed:
+        own.counters[NOT_SENT] += 1
+    state = own.numbers[STATE]
+    if state & GONE:
+        return SESSION_GONE
+    if state & WATCHDOG_TRIPPED:
+        return TRIPPED
+    return COMMAND_NOT_SENT if failed else 0
+
+
+# ---- The base class of devices at the other end of a wire ----
+
+# A measurement is stale if it answers a command older than this number of samples, or if more than
+# this number came at once. Chosen by hand; not tuned further.
+_MOST_AGE = 50
+# Time between two hellos [s]. Chosen by hand; not tuned further.
+_HELLO_EVERY = 0.05
+# A device that has not fallen silent sends within so many samples. Chosen by hand.
+_SPEAKS_WITHIN = 3
+
+_FAULTS = {
+    COMMAND_NOT_SENT: "the command could not be sent",
+    TRIPPED: "the device's watchdog has set u to zero; begin a new session",
+    SESSION_GONE: "the device has ended the session",
+}
+
+
+@compiled
+def _read(handle: WireHandle, clock: SystemClock, until: int) -> tuple[float, int]:
+    return read_measurement(handle, clock, until)
+
+
+@compiled
+def _write(handle: WireHandle, u: float) -> int:
+    return write_command(handle, u)
+
+
+class WireDevice:
+    """A device at the other end of a wire; a subclass opens the wire and releases it.
+
+    ``paced`` is True: the device has its own clock, and ``read`` waits for the next measurement.
+
+    Parameters
+    ----------
+    url
+        URL of the device.
+    dt
+        sample time [s]; the device must have the same.
+    timeout
+        longest time until the device answers [s].
+
+    Raises
+    ------
+    ValueError
+        for a wrong URL, a wire that can't be opened, or if the device has another sample time.
+    ConnectionError
+        if no device answers, or if it has another session.
+    """
+
+    paced = True
+    _hint = "start one with: quell rig --device {url}"  # advice if no device answers
+
+    def __init__(self, url: str, dt: float, timeout: float = 3.0) -> None:
+        self.url = url
+        self.dt = checks.positive("dt", dt, "s")
+        own = endpoint(MEASUREMENT, _new_session(), _MOST_AGE)
+        inbox, outbox, watch = buffer(), buffer(), system_clock()
+        self.handle = WireHandle(self._connect(), own, inbox, outbox, watch, self.dt, tick_queue())
+        # Not the handle's: compiled code takes it that its arguments share no memory.
+        self._clock = system_clock()
+        self._timeout = timeout
+        self._open, self._compiled = True, False
+        self._answered = 0  # commands sent before the last reading
+        try:
+            self._begin_session()
+        except BaseException:
+            # A device that receives the hello later must not wait for a loop that has gone.
+            self.close()
+            raise
+
+    def _connect(self) -> Any:
+        """Open the wire; return its transport."""
+        raise NotImplementedError
+
+    def _release(self) -> None:
+        """Release the wire."""
+        raise NotImplementedError
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Number of frames from the device by result, see ``quell.realtime.wire``."""
+        return counts_by_name(self.handle.endpoint.counters)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the device's watchdog has set u to zero, or the device has ended the session."""
+        state = self.handle.endpoint.numbers[STATE]
+        return bool(state & (WATCHDOG_TRIPPED | GONE))
+
+    def read(self) -> float:
+        """Return the newest measurement [y-unit]; NaN if none has come for fifty samples."""
+        return self._read_within(_MOST_AGE * self.dt)
+
+    def write(self, u: float) -> None:
+        """Send u [u-unit].
+
+        Raises
+        ------
+        ConnectionError
+            if u could not be sent, or the device will not apply it: its watchdog has set u to zero,
+            or it has ended the session.
+        """
+        self._check_open()
+        fault = call_specialised(_write, self.handle, float(u))
+        if fault:
+            raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
+
+    def restart_session(self) -> None:
+        """Replace this session by a new one: a device waits only so long for the first command."""
+        self._check_open()
+        former = self._session
+        self._send(GOODBYE, 0.0, former)
+        # If a frame replaces the one before it, the device must have time to read the goodbye.
+        time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
+        start_session(self.handle.endpoint, _new_session())
+        self.handle.queue.counts[:] = 0
+        self._begin_session(former)
+
+    def tick(self, timeout: float = 1.0) -> int:
+        """Wait for the next measurement; return the monotonic time of its arrival [ns].
+
+        Raise a ``ConnectionError`` if none has come for ``timeout`` [s].
+        """
+        counters = self.handle.endpoint.counters
+        self._read_within(0.0)
+        before = counters[ACCEPTED]
+        self._read_within(timeout)
+        if counters[ACCEPTED] == before:
+            raise ConnectionError(f"{self.url}: no measurement has come for {timeout:g} s")
+        return time.monotonic_ns()
+
+    def close(self) -> None:
+        """Send a goodbye, after which the device sets u to zero; a second call does nothing."""
+        if self._open:
+            self._open = False
+            self._send(GOODBYE, 0.0, self._session)
+            self._release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def _session(self) -> int:
+        return int(self.handle.endpoint.numbers[SESSION])
+
+    def _begin_session(self, former: int = 0) -> None:
+        """Send hellos until a welcome comes.
+
+        If the device is busy, the goodbye of the session ``former`` may have been lost; repeat it.
+        """
+        refusal = 0
+        apart = max(_HELLO_EVERY, 2.0 * self.dt)
+        deadline = time.monotonic() + max(self._timeout, 2.0 * apart)
+        while time.monotonic() < deadline:
+            self._send(HELLO, self.dt, self._session)
+            for state in self._welcomes(apart):
+                if state == 0:
+                    return
+                refusal = state
+                if former:
+                    self._send(GOODBYE, 0.0, former)
+        if refusal & BUSY:
+            raise ConnectionError(
+                f"{self.url}: another session is active there; end it first; "
+                "a session whose loop was killed ends after a minute"
+            )
+        raise ConnectionError(f"{self.url}: no device answers; {self._hint.format(url=self.url)}")
+
+    def _welcomes(self, seconds: float) -> Iterator[int]:
+        """Yield the state flags of each welcome that comes within ``seconds``."""
+        handle, end = self.handle, time.monotonic() + seconds
+        frame, own = handle.inbox, handle.endpoint
+        while (left := end - time.monotonic()) > 0.0:
+            wait_for_frame(handle.transport, round(1e9 * left))
+            while (size := receive(handle.transport, frame)) >= 0:
+                if not is_well_formed(frame, size, own.counters):
+                    continue
+                if not is_own(own, frame, WELCOME):
+                    continue
+                state, dt = int(frame.words[8]), float(frame.doubles[3])
+                if state & OTHER_DT:
+                    raise ValueError(
+                        f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; "
+                        "both must be the same"
+                    )
+                yield state
+
+    def _send(self, kind: int, value: float, session: int) -> None:
+        out = self.handle.outbox
+        write_frame(out, kind, session, 0, 0, time.monotonic_ns(), value, 0)
+        send(self.handle.transport, out)
+
+    def _read_within(self, seconds: float) -> float:
+        """Return the newest measurement, or the first that comes within ``seconds``.
+
+        If there was no command since the last reading, the device must be asked for one.
+        """
+        self._check_open()
+        handle, clock = self.handle, self._clock
+        if not self._compiled:  # this may take seconds and must not count as waiting
+            self._compiled = True
+            for entry, arguments in ((_read, (clock, 0)), (_write, (0.0,))):
+                specialised(entry, handle, *arguments)
+        read = specialised(_read, handle, clock, 0)
+        numbers, counters = handle.endpoint.numbers, handle.endpoint.counters
+        unanswered, self._answered = self._answered == numbers[SENT], numbers[SENT]
+        accepted, begin = counters[ACCEPTED], time.monotonic_ns()
+        soon = min(seconds, _SPEAKS_WITHIN * self.dt) if unanswered else seconds
+        y = float(read(handle, clock, begin + round(1e9 * soon))[0])
+        if counters[ACCEPTED] > accepted or soon == seconds:
+            return y
+        ask(handle)
+        return float(read(handle, clock, begin + round(1e9 * seconds))[0])
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise ValueError(f"{self.url}: is closed; make a new device")
+
+
+def _new_session() -> int:
+    return secrets.randbelow((1 << 32) - 1) + 1
