@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from numba.core.errors import NumbaError
 
 from quell.controllers.base import control
 from quell.controllers.stateful import PackedController, entry_point, step_packed
-from quell.kernels import dispatch
+from quell.kernels import dispatch, numba_internals
 from quell.kernels.cache import compile_time
 
 from .commands import run_python
@@ -308,3 +309,39 @@ def test_a_packed_controller_has_the_parameters_and_the_state_of_the_interpreted
     packed = PackedController(other, state, before=packed)
     assert step(packed, 2.0, 0.5) == control(other, state, 2.0, 0.5)
     assert state.calls[0] == 2 * (2 - 7)
+
+
+def test_an_older_numba_is_refused_and_a_newer_one_is_warned_about() -> None:
+    """Both say which version is tested and how to install it; the tested ones are silent."""
+    remedy = r"tested with Numba 0\.68, and this is {}.*pip install 'numba==0\.68\.\*'"
+    for version in ("0.61.2", "0.67.0", "0.9"):
+        with pytest.raises(ImportError, match=remedy.format(version)):
+            numba_internals.check_version(version)
+    for version in ("0.69.0", "0.100.0rc1", "1.0.0", "unknown"):
+        with pytest.warns(RuntimeWarning, match=remedy.format(version)):
+            numba_internals.check_version(version)
+        assert not numba_internals.is_tested(version)
+    for version in ("0.68.0", "0.68.1", "0.68.2dev0+3.gabc"):
+        numba_internals.check_version(version)
+        assert numba_internals.is_tested(version)
+
+
+def test_a_numba_that_lacks_what_kernels_need_is_named_at_the_import() -> None:
+    """One of another version, whose private modules have moved, is no riddle of a missing name."""
+    program = (
+        "import sys, numba\n"
+        "sys.modules['numba.core.targetconfig'] = None\n"
+        "numba.__version__ = '0.75.0'\n"
+        "import quell.kernels.linking\n"
+    )
+    failed = run_python(program, check=False)
+    assert failed.returncode != 0
+    assert "0.75.0 lacks what it needs" in failed.stderr
+    assert "pip install 'numba==0.68.*'" in failed.stderr
+
+
+def test_the_oldest_numba_that_can_be_installed_is_the_oldest_that_is_tested() -> None:
+    """In the requirements of the package."""
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
+    needs = [need for need in project["project"]["dependencies"] if need.startswith("numba")]
+    assert needs == ["numba>={}.{}".format(*numba_internals.OLDEST)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 from collections.abc import Iterable, Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -127,3 +128,21 @@ def test_every_folder_says_what_it_may_import() -> None:
     folders = list(ROOT.glob("*/**/__init__.py"))
     silent = [file for file in folders if "May import" not in file.read_text(encoding="utf-8")]
     assert not silent, silent
+
+
+def test_one_file_imports_the_private_modules_of_numba() -> None:
+    """A new version of Numba can move them: then one file has to change, with a check of versions."""
+    public = {"numba", "numba.extending"}
+    private = {}
+    for module, file in MODULES.items():
+        for node in statements([ast.parse(file.read_text(encoding="utf-8"))]):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module]
+            numba = [n for n in names if n.partition(".")[0] in ("numba", "llvmlite")]
+            if set(numba) - public:
+                private.setdefault(module, []).extend(numba)
+        text = file.read_text(encoding="utf-8")
+        if re.search(r"\bnumba\.(core|np|typed|_\w+)\.", text.replace("numba.__version__", "")):
+            private.setdefault(module, []).append("by attribute")
+    assert private.keys() == {"kernels.numba_internals"}, private

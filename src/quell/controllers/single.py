@@ -36,6 +36,7 @@ from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels import dispatch
 from quell.kernels.functions import single
 from quell.kernels.linking import KERNEL_OPTIONS, in_both_precisions
+from quell.kernels.numba_internals import REMEDY
 from quell.kernels.single import in_single
 from quell.learners.base import Lag, NoiseGate, NoiseGateMemory
 from quell.learners.kalman import KalmanDesign, KalmanMemory, needs_carries
@@ -194,7 +195,7 @@ def check_compilable() -> None:
     if not KERNEL_OPTIONS:
         raise ValueError(
             f"precision = 'single': is compiled with Numba 0.68 only, and this is "
-            f"{numba.__version__}; pip install 'numba==0.68.*', or run with interpret=True"
+            f"{numba.__version__}; {REMEDY}, or run with interpret=True"
         )
 
 

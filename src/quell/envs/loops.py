@@ -25,8 +25,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core import cgutils
-from numba.core import types as nb_types
+from numba import types as nb_types
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
@@ -52,6 +51,7 @@ from quell.kernels.dispatch import (
     specialised,
 )
 from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS
+from quell.kernels.numba_internals import pointer_add
 from quell.kernels.sized import layout_of
 from quell.learners.base import (
     adapt,
@@ -375,7 +375,7 @@ def _moved(typing_context: Any, first: Any, shift: Any) -> Any:
                 return context.make_tuple(builder, kind, parts)
             if isinstance(kind, nb_types.Array):
                 array = context.make_array(kind)(context, builder, value)
-                place = cgutils.pointer_add(builder, array.data, values[1])
+                place = pointer_add(builder, array.data, values[1])
                 array.data = builder.bitcast(place, array.data.type)
                 return array._getvalue()
             return value

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba.core import types as nb_types
+from numba import types as nb_types
 from numpy.typing import NDArray
 
 from quell import checks

@@ -31,9 +31,9 @@ from typing import Any
 
 import numba
 import platformdirs
-from numba.core import config as numba_config
-from numba.core import event, types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba import types
+
+from quell.kernels.numba_internals import CompileResultCacheImpl, FunctionCache, event
 
 # Versions kept: the current one and those of a few other branches or environments. Chosen by hand.
 _VERSIONS_KEPT = 4
@@ -115,14 +115,14 @@ def code_cache(function: Callable[..., Any]) -> FunctionCache | None:
     folder = cache_path()
     if folder is None:
         return None
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(folder)
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(folder)
     try:
         return _FaultTolerantCache(function)
     except (RuntimeError, OSError):  # no place for the files of this function, or no source file
         return None
     finally:
-        numba_config.CACHE_DIR = before
+        numba.config.CACHE_DIR = before
 
 
 class _FilesInCacheDirectory(CompileResultCacheImpl):

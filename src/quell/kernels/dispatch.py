@@ -27,13 +27,13 @@ from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core import types as nb_types
-from numba.core.errors import NumbaError
+from numba import types as nb_types
 from numba.extending import overload, register_jitable
 
 from quell.kernels.cache import code_cache
 from quell.kernels.functions import is_single
 from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS, EntryCompiler, WithoutOverlaps
+from quell.kernels.numba_internals import NumbaError
 from quell.kernels.sized import layout_of, type_of
 
 # ---- Check whether arguments of a compiled loop share memory that the loop changes ----

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
-from numba.core import types as nb_types
+from numba import types as nb_types
 from numba.extending import overload
 
 from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS

@@ -21,21 +21,28 @@ import weakref
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import llvmlite.binding as llvm
 import numba
 import numpy as np
-from llvmlite import ir
-from numba._dynfunc import make_function
-from numba.core import ir as numba_ir
-from numba.core import types as nb_types
-from numba.core.cgutils import normalize_ir_text
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import AnalysisPass, FunctionPass, register_pass
-from numba.core.ir_utils import build_definitions
-from numba.core.targetconfig import ConfigStack
-from numba.core.typed_passes import NativeLowering
-from numba.core.untyped_passes import IRProcessing
+from numba import types as nb_types
+
+from quell.kernels.numba_internals import (
+    AnalysisPass,
+    CompilerBase,
+    ConfigStack,
+    DefaultPassBuilder,
+    FunctionPass,
+    IRProcessing,
+    JITCodeLibrary,
+    NativeLowering,
+    build_definitions,
+    ir,
+    is_tested,
+    llvm,
+    make_function,
+    normalize_ir_text,
+    numba_ir,
+    register_pass,
+)
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -227,10 +234,9 @@ class WithoutOverlaps(EntryCompiler):
 
 # Options for ``overload`` and ``register_jitable``. They depend on internals of Numba: with
 # versions that were not tested, kernels are compiled in Numba's own way, which takes twice as long.
-_TESTED_VERSIONS = ("0.68.",)
 KERNEL_OPTIONS: dict[str, Any] = (
     {"no_cfunc_wrapper": True, "pipeline_class": KernelCompiler}
-    if numba.__version__.startswith(_TESTED_VERSIONS)
+    if is_tested(numba.__version__)
     else {}
 )
 

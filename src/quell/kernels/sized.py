@@ -47,14 +47,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self, Ty
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils
-from numba.core import types as nb_types
-from numba.core.datamodel import models
-from numba.extending import NativeValue, intrinsic, lower_cast, overload, register_model, unbox
+from numba import types as nb_types
+from numba.extending import (
+    NativeValue,
+    intrinsic,
+    lower_cast,
+    models,
+    overload,
+    register_model,
+    unbox,
+)
 from numpy.typing import NDArray
 
 from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS
+from quell.kernels.numba_internals import DataModel, ir, memset
 
 Size: TypeAlias = Annotated[int, "constant"]
 """Annotates an integer field of a NamedTuple that is a constant in compiled code."""
@@ -147,7 +153,7 @@ class _SizedArrayModel(models.ArrayModel):
         return ir.Constant(self._model_of(name).get_value_type(), None)
 
 
-class _ConstantModel(models.DataModel):
+class _ConstantModel(DataModel):
     """As an argument, nothing."""
 
     def get_argument_type(self) -> Any:
@@ -337,7 +343,7 @@ def _set_to_zero(typing_context: Any, scalars: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         array = context.make_array(scalars)(context, builder, values[0])
         size = context.get_constant(nb_types.intp, scalars.dtype.size)
-        cgutils.memset(builder, array.data, size, 0)
+        memset(builder, array.data, size, 0)
         return context.get_dummy_value()
 
     return nb_types.void(scalars), generate

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types as nb_types
+from numba import types as nb_types
 from numba.extending import intrinsic, overload
 
 from quell.kernels.dispatch import Generic, set_display_name
+from quell.kernels.numba_internals import ir
 from quell.kernels.sized import Scalars
 from quell.types import Vector
 

@@ -27,14 +27,14 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba.core import types as nb_types
-from numba.np.unsafe.ndarray import to_fixed_tuple
+from numba import types as nb_types
 
 from quell import checks
 from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
 from quell.kernels.functions import tanh
+from quell.kernels.numba_internals import to_fixed_tuple
 from quell.kernels.user_functions import POINTER, call, evaluate
 from quell.plants.base import Plant, advance, labelled, measure, signals_of
 from quell.plants.linear import LinearPlant, delayed

@@ -42,13 +42,13 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core import types as nb_types
-from numba.core.cgutils import get_item_pointer
+from numba import types as nb_types
 from numba.extending import intrinsic, overload
 from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
 from quell.kernels.dispatch import generic, kernel
+from quell.kernels.numba_internals import get_item_pointer
 from quell.types import Vector
 
 # ---- Atomic loads and stores of int64 words that two threads or two processes share ----
