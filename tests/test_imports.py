@@ -139,6 +139,9 @@ def test_one_file_imports_the_private_modules_of_numba() -> None:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = [node.module]
+                if node.module == "numba":
+                    hidden = (alias.name for alias in node.names if alias.name in ("core", "np"))
+                    names.extend(f"numba.{name}" for name in hidden)
             numba = [n for n in names if n.partition(".")[0] in ("numba", "llvmlite")]
             if set(numba) - public:
                 private.setdefault(module, []).extend(numba)
