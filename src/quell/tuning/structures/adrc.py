@@ -4,7 +4,7 @@ The poles of the law and of the observer are each one number, the bandwidth, or 
 ``s² + 2 ζ ω s + ω²`` for each two of them, real or complex, and a real pole if their number is odd.
 A freed ADRC of order 1 has the feedback of a PI controller with a filter of first order, one of
 order 2 that of a PID controller with a filter of second order (``controllers/baselines/pid.py``),
-as long as the loop with its own nominal plant is stable; this file finds these as starts.
+as long as the loop with its own nominal plant is stable. The search starts from these.
 
 The freed ADRC whose feedback is that of a given PI or PID controller with a filter.
 
