@@ -1,4 +1,6 @@
-"""The exact linear law in discrete time that a controller is without limits.
+"""The linear law that a controller is without limits, with a learner that is frozen or adapts.
+
+The exact linear law in discrete time that a controller is without limits.
 
 It is measured, not derived: without limits a controller is a linear map from its state, r and y to
 its next state and u, so unit vectors through its own ``control`` give the matrices, for any form of

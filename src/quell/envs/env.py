@@ -1,4 +1,6 @@
-"""Spaces of observations and actions, with finite bounds.
+"""``Env`` and ``VectorEnv``: environments for Gymnasium, and those of the library.
+
+Spaces of observations and actions, with finite bounds.
 
 ``Env``: one loop that a policy drives.
 

@@ -1,4 +1,6 @@
-"""The guard as users make it; ``kernels.py`` has its equations.
+"""``Guard`` as users make it, and the bound that is certified for a set of plants.
+
+The guard as users make it; ``kernels.py`` has its equations.
 
 Effect of a learner's correction on the loop of a linear plant and the plain observer.
 

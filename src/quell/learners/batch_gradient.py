@@ -1,4 +1,6 @@
-"""The buffers of Algorithm 1 and its gradient step, O(p) a sample for any buffer size.
+"""``BatchGradient``: Algorithm 1 of the paper, with its features or others.
+
+The buffers of Algorithm 1 and its gradient step, O(p) a sample for any buffer size.
 
 Three buffers of size n hold the newest features I, residuals ``ΔF = Δf̂`` and outputs
 ``F_L = h_θ(I)``. Once they are full, each sample replaces the oldest entry, takes one step down the

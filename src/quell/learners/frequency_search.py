@@ -1,4 +1,6 @@
-"""Parameters and state of the search for frequencies, and the beginnings of its passes.
+"""The search of ``Harmonic`` for the frequencies of a load in the past.
+
+Parameters and state of the search for frequencies, and the beginnings of its passes.
 
 Search for the frequencies of a load in the past of f_plain.
 

@@ -1,4 +1,6 @@
-"""The lag-compensated learner: a Kalman filter that accounts for the observer's own lag.
+"""``Kalman`` and ``Harmonic``: lag-compensated Kalman filters as learners.
+
+The lag-compensated learner: a Kalman filter that accounts for the observer's own lag.
 
 With the features φ (state, bias, sinusoids, u) and their lag-filtered values φ^F
 (``learners/base.py``), each sample::

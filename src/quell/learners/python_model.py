@@ -1,4 +1,6 @@
-"""Copies of Python models that learn, and the function by which compiled loops call them.
+"""``PythonModel``: a learner whose model is any Python object.
+
+Copies of Python models that learn, and the function by which compiled loops call them.
 
 A loop's memory contains only numbers, so it contains the number of its instance. The instance is a
 copy of the user's model that belongs to one loop; it is deleted together with the array that holds

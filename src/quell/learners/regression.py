@@ -1,4 +1,6 @@
-"""Kernels of the learners ``f_L = θ · φ(x̂, u)`` that compensate the observer's lag exactly.
+"""Linear regressions on features: kernels, base class, and ``NLMS``.
+
+Kernels of the learners ``f_L = θ · φ(x̂, u)`` that compensate the observer's lag exactly.
 
 The features pass through the observer's own lag filter (``learners/base.py``), so that
 

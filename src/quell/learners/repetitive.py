@@ -1,4 +1,6 @@
-"""Kernels of repetitive learning: f over the phase of a cycle, corrected from cycle to cycle.
+"""``Repetitive``: f over the phase of a cycle, corrected from cycle to cycle.
+
+Kernels of repetitive learning: f over the phase of a cycle, corrected from cycle to cycle.
 
 The output is a table g with one number for each sample of the cycle. What it leaves is known one
 lag of the observer late, and smoothed (``learners/base.py``):

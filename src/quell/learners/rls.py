@@ -1,4 +1,6 @@
-"""Recursive least squares with directional forgetting, O(p²) a sample.
+"""``RLS``: recursive least squares, with directional forgetting, relearning and selection.
+
+Recursive least squares with directional forgetting, O(p²) a sample.
 
 With ``ζ = φ·Pφ/R`` and ``λ = exp(−dt/T)`` for the memory time T,
 

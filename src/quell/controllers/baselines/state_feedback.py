@@ -1,4 +1,6 @@
-"""State feedback of an observer with a disturbance state, as one linear law.
+"""State feedback as a baseline: LQG, and resonance ratio control of two masses.
+
+State feedback of an observer with a disturbance state, as one linear law.
 
 The sampled plant with a disturbance that is a random walk, z = (x, d)::
 

@@ -1,4 +1,6 @@
-"""The loops of many controllers with a set of plants: responses, stability, peaks.
+"""Loops of many controllers with a set of plants: responses in frequency and in time.
+
+The loops of many controllers with a set of plants: responses, stability, peaks.
 
 All plants of a set are sampled with the controller's dt, dead time and lag included, and have their
 responses at the same frequencies. The responses are exact (``analysis.frequency_response``). The

@@ -1,4 +1,6 @@
-"""ADRC by bandwidths, with poles of its own, at half gain, of reduced order, with a model.
+"""ADRC as a structure: bandwidths, own poles, models, sampled feedback, equivalents of PID.
+
+ADRC by bandwidths, with poles of its own, at half gain, of reduced order, with a model.
 
 The poles of the law and of the observer are each one number, the bandwidth, or *freed*: a factor
 ``s² + 2 ζ ω s + ω²`` for each two of them, real or complex, and a real pole if their number is odd.
