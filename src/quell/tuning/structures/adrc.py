@@ -21,8 +21,8 @@ taken for which all poles are damped. The sampled controllers agree to first ord
 
 The feedback of many sampled ADRC designs at many frequencies, without building controllers.
 
-With the observer in its current form, c = (1, 0, …) and the law ``u = −K ẑ`` (``observers/linear``,
-``controllers/adrc/law``), z⁻ the prediction and d the samples by which u is delayed::
+With the observer in its current form, c = (1, 0, …) and the law ``u = −K ẑ`` (``observers/forms``,
+``controllers/law``), z⁻ the prediction and d the samples by which u is delayed::
 
     ẑ = z⁻ + L (y − c z⁻),     z z⁻ = (Φ − z^(−d) Γ K) ẑ
     C_y = z K ( z I − (I − L c) (Φ − z^(−d) Γ K) )⁻¹ L
