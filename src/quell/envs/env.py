@@ -680,7 +680,7 @@ NAMES = (
     "torsional",
     "torsional-residual",
 )
-"""Environments of this file, by their names without namespace and version."""
+"""The environments of the library, by their names without namespace and version."""
 
 
 def register_all() -> None:

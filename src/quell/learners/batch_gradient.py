@@ -19,11 +19,11 @@ samples, and every sample costs the same.
 
 Algorithm 1 of the paper: batch gradient descent on the observer's own estimates.
 
-This file has the paper's features ``I = (x̂_1 … x̂_n, u, 1)``.
+``BatchGradient`` without features uses those of the paper, ``I = (x̂_1 … x̂_n, u, 1)``.
 
 Algorithm 1 with user-defined features, scaled.
 
-The head of this file describes the method; here ``I = φ(x̂, u)``. The state, u and Δf̂ are divided by
+The method is the one above, with ``I = φ(x̂, u)``. The state, u and Δf̂ are divided by
 powers of two (``features/base.py``). When a scale grows, θ is converted and the buffers are
 filled again. Nothing is learned until the observer's initial transient has decayed: it would give
 wrong scales.

@@ -223,7 +223,7 @@ class Repetitive:
 
     It suits moves that are repeated (``signals.Repeated``), and loads of any shape that repeat with
     a known period: no model of the plant or of the load is needed, but all has to repeat. The first
-    cycle is controlled without it. The head of this file has the equations.
+    cycle is controlled without it. The docstring of this module has the equations.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ Recursive least squares as a rule of linear learners.
 
 The variance of noise is ``R = τ/dt`` with the observer's lag τ = N/omega_o, because the noise in f̂
 is correlated over that time; so the result does not depend on dt. R is larger where measurement
-noise hides what is to be learned (``noise_gate.confidence``).
+noise hides what is to be learned (``confidence`` of ``learners/base.py``).
 """
 
 from __future__ import annotations

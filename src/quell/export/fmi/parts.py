@@ -383,7 +383,7 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
 
 
 def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
-    """Return the lines for ``k_i = w_i omega_c^(m−i+1)`` (controllers/adrc/law.py)."""
+    """Return the lines for ``k_i = w_i omega_c^(m−i+1)`` (controllers/law.py)."""
     count, dt = weights.size, known.dt
     guard = []
     if known.guard is not None:
