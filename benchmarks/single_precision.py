@@ -5,7 +5,7 @@
 
 The table has the RMS difference of u between the two precisions, relative to the RMS of u, for the
 controller as it is with its parameters and averages in single precision (*straight*), and with the
-observer in delta form and compensated sums (``observers/delta.py``), beside what the prototype of
+observer in delta form and compensated sums (``observers/forms.py``), beside what the prototype of
 this form reached (``prototype``); *y* is the RMS difference of y relative to the RMS of the control
 error. The step of u from sample to sample shows what the measurement noise does to u. The two-mass
 rows are the paper's scenario with other noise.

@@ -119,7 +119,7 @@ def _write_records(folder: Path) -> list[Path]:
 
 
 def _write_samples(folder: Path) -> list[Path]:
-    names = ",".join(ql.experiments.acc.samples.COLUMNS)
+    names = ",".join(ql.experiments.acc.loops.COLUMNS)
     (folder / "samples.csv").write_text(f"{names}\n1,1,1,0,1,0.01\n1,1.1,0.9,-0.1,1,0.02\n")
     return [folder / "samples.csv"]
 

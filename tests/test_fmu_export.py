@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import shutil
 import subprocess
@@ -16,7 +17,6 @@ import pytest
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.export import TranslationError, fmu
-from quell.export.fmi import fmu as binary
 from quell.export.fmi.parts import bandwidths, gain_coefficients
 from quell.simulation.driver import SampledScenario
 
@@ -56,8 +56,9 @@ Maker = Callable[[str], Driven]
 def _compile_quickly() -> Iterator[None]:
     """Compile without optimisation: the bits are the same, in a third of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        quick = tuple(option for option in binary._OPTIONS if option != "-O2")
-        patch.setattr(binary, "_OPTIONS", quick)
+        module = importlib.import_module("quell.export.fmi.fmu")
+        quick = tuple(option for option in module._OPTIONS if option != "-O2")
+        patch.setattr(module, "_OPTIONS", quick)
         yield
 
 

@@ -37,7 +37,7 @@ LEARNERS = {
 
 
 class Reference:
-    """The equations of ``learners/kalman/kernels.py`` and ``oscillators.py``, with matrices."""
+    """The equations of ``learners/kalman.py`` and ``oscillators.py``, with matrices."""
 
     def __init__(self, learner: ql.learners.Kalman, omega_c: float) -> None:
         frequency = omega_c if learner.frequency is None else learner.frequency

@@ -193,7 +193,7 @@ def test_an_offset_beyond_all_limits_of_u_is_dropped(
 
 
 def test_only_limits_of_the_law_count_as_limits_for_the_watch() -> None:
-    """Neither a u within them nor one of manual operation; see ``learners/recovery.py``."""
+    """Neither a u within them nor one of manual operation; see ``learners/base.py``."""
     law = ql.ADRC(OBSERVER, 3.0, learner=ql.learners.Kalman(), u_min=-1.0, u_max=1.0)
     watch = law._state.watch[0]
     step(law, 0.0, 0.0)

@@ -36,7 +36,7 @@ STARTUP = round(2.0 * LAG / DT)
 
 
 class Gate:
-    """The equations of ``learners/noise_gate.py``."""
+    """The equations of ``learners/base.py``."""
 
     def __init__(self, frequency: float = FREQUENCY) -> None:
         self.frequency = frequency

@@ -26,7 +26,7 @@ _OPERATORS = re.compile(
     "|ReplaceAndWithOr|ReplaceOrWithAnd|ReplaceBreakWithContinue|ReplaceContinueWithBreak"
     "|NumberReplacer|ZeroIterationForLoop)"
 )
-# An array of one record (``kernels/scalars.py``): [-1] is the same and [1] never runs.
+# An array of one record (``kernels/sized.py``): [-1] is the same and [1] never runs.
 _RECORD = re.compile(r"\[ ?(0|1|-1)\]")
 _SIMPLE = (ast.Assign, ast.AugAssign, ast.Expr, ast.Return, ast.Continue, ast.Break, ast.Raise)
 

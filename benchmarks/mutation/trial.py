@@ -55,15 +55,22 @@ LEFT_OUT = [
     *("twin", "wire"),
 ]
 AREAS = {
-    "law": ("controllers/adrc/law.py", "controllers/bad_samples.py"),
-    "hand-over": ("controllers/adrc/handover.py", "controllers/stateful.py"),
+    "law": ("controllers/law.py", "controllers/base.py"),
+    "hand-over": ("controllers/adrc.py", "controllers/stateful.py"),
     "guard": ("guard/*.py",),
-    "learners": tuple(f"learners/{x}*.py" for x in ("", "kalman/", "regression/", "repetitive/")),
-    "gradient learners": ("learners/gradient/*.py", "learners/online/*.py"),
-    "observers": ("observers/*.py", "lti/pole_pattern.py"),
-    "precision": ("kernels/single.py", "kernels/sums.py", "controllers/single/*.py"),
-    "limits": ("controllers/limits.py",),
-    "supervisor": ("realtime/loop/supervisor.py", "realtime/loop/direction.py"),
+    "learners": (
+        *("learners/base.py", "learners/kalman.py", "learners/oscillators.py"),
+        *("learners/frequency_search.py", "learners/regression.py", "learners/rls.py"),
+        "learners/repetitive.py",
+    ),
+    "gradient learners": (
+        *("learners/batch_gradient.py", "learners/online.py", "learners/gaussian_process.py"),
+        "learners/python_model.py",
+    ),
+    "observers": ("observers/*.py", "lti/models.py"),
+    "precision": ("kernels/single.py", "controllers/single.py"),
+    "limits": ("controllers/base.py",),
+    "supervisor": ("realtime/supervisor.py",),
     "metrics": ("records/metrics.py",),
     "margins": ("analysis/margins.py",),
 }

@@ -13,8 +13,9 @@ Public names are imported when they are first used, so that ``import quell`` is 
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from quell import (
@@ -54,29 +55,32 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-# Modules of the public classes and functions, and of modules that are deeper than ``quell.<name>``.
-_HOME = {
-    "ADRC": "quell.controllers.adrc",
-    "DesignWarning": "quell.types",
-    "BatchTrajectory": "quell.records.trajectory",
-    "ESO": "quell.observers.eso",
-    "Estimate": "quell.controllers.adrc",
-    "Feedforward": "quell.controllers.feedforward",
-    "Guard": "quell.guard",
-    "Reason": "quell.guard",
-    "Scenario": "quell.simulation.driver",
-    "Status": "quell.types",
-    "Trajectory": "quell.records.trajectory",
-    "Tuned": "quell.tuning.tuned",
-    "canonical": "quell.lti.canonical",
-    "identify": "quell.identification.identify",
-    "omega_c_for": "quell.controllers.base",
-    "simulate": "quell.simulation.simulate",
-    "style": "quell.records.plotting",
-    "sweep": "quell.sweeping.sweep",
-    "tune": "quell.tuning.tune",
+_HOMES = {
+    "ADRC": "controllers.adrc",
+    "DesignWarning": "types",
+    "BatchTrajectory": "records.trajectory",
+    "ESO": "observers.eso",
+    "Estimate": "controllers.adrc",
+    "Feedforward": "controllers.feedforward",
+    "Guard": "guard",
+    "Reason": "guard",
+    "Scenario": "simulation.driver",
+    "Status": "types",
+    "Trajectory": "records.trajectory",
+    "Tuned": "tuning.tuned",
+    "canonical": "lti.canonical",
+    "identify": "identification.identify",
+    "omega_c_for": "controllers.base",
+    "simulate": "simulation.simulate",
+    "style": "records.plotting",
+    "sweep": "sweeping.sweep",
+    "tune": "tuning.tune",
 }
-_MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
+_MODULES = (
+    "analysis", "controllers", "controllers.baselines", "envs", "experiments", "export", "features",
+    "identification", "learners", "observers", "plants", "realtime", "records.metrics", "setup",
+    "signals", "sweeping", "tuning",
+)  # fmt: skip
 
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Feedforward", "Guard",
@@ -87,15 +91,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'quell' has no attribute {name!r}")
-    if name in _HOME:
-        value = getattr(importlib.import_module(_HOME[name]), name)
-    else:
-        value = importlib.import_module(_MODULES.get(name, f"quell.{name}"))
-    globals()[name] = value
-    return value
+__getattr__ = imported_on_use(__name__, _HOMES, _MODULES)
 
 
 def __dir__() -> list[str]:

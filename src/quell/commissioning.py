@@ -1,4 +1,6 @@
-"""The limits of an experiment at a rig.
+"""From a rig to a tuned controller: records, an experiment within limits, a verifying step.
+
+The limits of an experiment at a rig.
 
 Records from files: tables in text, recordings of ``quell run-rig``, and saved runs.
 

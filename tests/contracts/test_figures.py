@@ -173,32 +173,31 @@ def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str
 _DRAWS = re.compile(r"^ *def (plot(?:_\w+)?|draw)\(", re.MULTILINE)
 # Files of functions that draw, and those that are drawn above.
 _PUBLIC = {
-    "records/trajectory.py plot": "Trajectory",
-    "records/batch_trajectory.py plot": "BatchTrajectory",
+    "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory
     "tuning/tuned.py plot": "Tuned",
     "identification/result.py plot": "Identified",
-    "commissioning/verification.py plot": "Verification",
-    "sweeping/result.py plot": "Sweep",
-    "realtime/system/histogram.py plot": "Timing",
-    "experiments/compare/figures.py draw": "compare",
+    "commissioning.py plot": "Verification",
+    "sweeping/sweep.py plot": "Sweep",
+    "realtime/system.py plot": "Timing",
+    "experiments/compare.py draw": "compare",
     "experiments/stress/figures.py draw": "stress",
-    "experiments/two_mass_spring/figures.py draw": "position",
-    "experiments/torsional/figures.py draw": "torsional-position",
-    "experiments/acc/figures.py draw": "acc-failures",
+    "experiments/two_mass_spring.py draw": "position",
+    "experiments/torsional.py draw": "torsional-position",
+    "experiments/acc/study.py draw": "acc-failures",
     "analysis/plots.py plot_bode": "bode",
     "analysis/plots.py plot_gang_of_four": "gang",
     "analysis/plots.py plot_margins_over_time": "over time",
     "analysis/plots.py plot_margins_against_omega_o": "over omega_o",
-    "analysis/loci.py plot_nyquist": "nyquist",
-    "analysis/loci.py plot_root_locus": "locus",
+    "analysis/plots.py plot_nyquist": "nyquist",
+    "analysis/plots.py plot_root_locus": "locus",
 }
 # What those call, and what is no figure.
 _INSIDE = {
     "records/plotting.py plot_run",
     "records/plotting.py plot_batch",
-    "sweeping/figures.py plot_over",
-    "tuning/result/plots.py draw",
-    "envs/episodes.py draw",  # draws random numbers
+    "sweeping/sweep.py plot_over",
+    "tuning/report.py draw",
+    "envs/loops.py draw",  # draws random numbers
 }
 
 

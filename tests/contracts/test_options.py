@@ -236,9 +236,7 @@ def outcome(
                 module, _, name = target.rpartition(".")
                 stand_in = {"Rig": _Server, "serve": _opened}.get(name, partial(_told, target))
                 patch.setattr(importlib.import_module(module), name, stand_in)
-            for name in ("two_mass", "torsional", "acc"):
-                module = importlib.import_module(f"quell.cli.run.{name}")
-                patch.setattr(module, "compile_loops", lambda *_: None)
+            patch.setattr("quell.cli.reproduce.compile_loops", lambda *_: None)
             patch.setattr("webbrowser.open", lambda url: print("opened", url))
             shown = in_this_process((*command.split(), *arguments), patch, capsys)
             new = sorted(path for path in folder.rglob("*") if path.is_file())

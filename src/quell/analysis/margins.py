@@ -1,4 +1,6 @@
-"""Stability margins of a loop from its frequency response.
+"""Frequency responses of sampled systems, and stability margins from them.
+
+Stability margins of a loop from its frequency response.
 
 With L the loop, broken at the plant's input, and ``S = 1/(1 + L)``, a stable loop stays stable as
 long as

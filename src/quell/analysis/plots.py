@@ -1,4 +1,6 @@
-"""Plots of loops: Bode plot, gang of four, margins over time or bandwidth.
+"""Plots of loops: Bode and Nyquist plots, gang of four, root locus, margins over time or bandwidth.
+
+Plots of loops: Bode plot, gang of four, margins over time or bandwidth.
 
 Plots of loops in the complex plane: Nyquist plot, and root locus over a design's parameter.
 """

@@ -1,4 +1,4 @@
-"""Exit codes of all commands."""
+"""How a command ends: exit codes, questions before it acts, Ctrl-C."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``quell identify``."""
+"""``quell identify``, ``quell b0`` and ``quell excite``: models and experiments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``quell reproduce two-mass``."""
+"""``quell reproduce``: published experiments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``quell rig``."""
+"""``quell rig``, ``quell run-rig`` and ``quell replay``: real time."""
 
 from __future__ import annotations
 

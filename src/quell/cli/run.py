@@ -1,4 +1,4 @@
-"""``quell run``."""
+"""``quell run``, ``quell sweep``, ``quell export`` and ``quell studio``: what a setup is for."""
 
 from __future__ import annotations
 

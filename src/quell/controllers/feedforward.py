@@ -63,7 +63,7 @@ class Feedforward:
     """The feedforward of a model of the plant, for ``ADRC(..., feedforward=...)``.
 
     ``rigid`` makes it from an inertia, ``of`` from a linear or identified plant. It does not depend
-    on b0, and the observer knows it: the head of this file has the equations.
+    on b0, and the observer knows it. The docstring of this module has the equations.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""The sampled linear law of two degrees of freedom, its checks and its state of rest.
+"""Sampled linear controllers of two degrees of freedom, in double and in single precision.
+
+The sampled linear law of two degrees of freedom, its checks and its state of rest.
 
 A sampled linear law from a transfer function in s: realisation, sampling, anti-windup.
 

@@ -1,4 +1,6 @@
-"""The base class of controllers around another: behind a prefilter, or in single precision.
+"""Controllers around another: prefilters of the reference, a reference model, a differentiator.
+
+The base class of controllers around another: behind a prefilter, or in single precision.
 
 A prefilter of the reference in front of any controller.
 

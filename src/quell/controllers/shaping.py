@@ -113,7 +113,7 @@ class Shaper:
         object.__setattr__(self, "amplitudes", tuple(amplitudes.tolist()))
 
     def residual(self, omega: float, zeta: float = 0.0) -> float:
-        """Return the vibration V of a mode after the last impulse; see this file's equation."""
+        """Return the vibration V of a mode after the last impulse, as the module defines it."""
         omega, zeta = _mode(omega, zeta)
         damped = omega * math.sqrt(1.0 - zeta**2)
         vibration = sum(

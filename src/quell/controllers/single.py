@@ -1,4 +1,6 @@
-"""Parameters and states of controllers in single precision.
+"""Controllers in single precision.
+
+Parameters and states of controllers in single precision.
 
 A controller that calculates in single precision, as it does on a processor without double.
 

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from quell.envs.env import Env, VectorEnv
@@ -18,13 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Env", "Policy", "VectorEnv", "register"]
 
-_HOME = {"Env": "env", "Policy": "loops", "VectorEnv": "env"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'quell.envs' has no attribute {name!r}")
-    return getattr(import_module(f"quell.envs.{_HOME[name]}"), name)
+__getattr__ = imported_on_use(__name__, {"Env": "env", "Policy": "loops", "VectorEnv": "env"})
 
 
 def register() -> None:

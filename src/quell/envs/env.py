@@ -1,4 +1,6 @@
-"""Spaces of observations and actions, with finite bounds.
+"""``Env`` and ``VectorEnv``: environments for Gymnasium, and those of the library.
+
+Spaces of observations and actions, with finite bounds.
 
 ``Env``: one loop that a policy drives.
 
@@ -678,7 +680,7 @@ NAMES = (
     "torsional",
     "torsional-residual",
 )
-"""Environments of this file, by their names without namespace and version."""
+"""The environments of the library, by their names without namespace and version."""
 
 
 def register_all() -> None:

@@ -1,4 +1,6 @@
-"""The quantity that a policy sets in each sample: f_L of an ADRC, or u itself.
+"""The compiled loops of the environments: what a policy sets, episodes, many loops at once.
+
+The quantity that a policy sets in each sample: f_L of an ADRC, or u itself.
 
 Both are controllers for the compiled loop, which calls ``set_action`` before each sample.
 

@@ -9,16 +9,13 @@ An experiment is imported when it is first used: whoever repeats one does not wa
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from quell.experiments import acc, compare, stress, torsional, two_mass_spring
 
 __all__ = ["acc", "compare", "stress", "torsional", "two_mass_spring"]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'quell.experiments' has no attribute {name!r}")
-    return import_module(f"quell.experiments.{name}")
+__getattr__ = imported_on_use(__name__, {}, __all__)

@@ -1,4 +1,6 @@
-"""A published claim, the measured value, and whether the claim holds.
+"""What several experiments use: claims, figures as files, scores.
+
+A published claim, the measured value, and whether the claim holds.
 
 Figures as files: PNG, SVG and PDF, each written completely or not at all.
 

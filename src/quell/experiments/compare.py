@@ -1,4 +1,6 @@
-"""Controllers for a comparison, each tuned for the best load rejection under the same constraints.
+"""Controllers side by side: tuned under equal constraints, on a benchmark or for a setup.
+
+Controllers for a comparison, each tuned for the best load rejection under the same constraints.
 
 ``quell.tuning`` maximises the integral gain of each structure. A PID controller whose integral gain
 is the largest may ring for long; it is tuned for the least integral of ``|y|`` after a step of the

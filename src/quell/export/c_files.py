@@ -1,4 +1,6 @@
-"""A pair of C files around translated kernels: structs, public functions, default parameters.
+"""C files around translated kernels: the pair of files, those of a plant, operations beside a step.
+
+A pair of C files around translated kernels: structs, public functions, default parameters.
 
 Operations of the exported controller besides a step, as kernels that are translated to C.
 

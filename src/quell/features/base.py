@@ -1,4 +1,6 @@
-"""The interface of a block of features.
+"""Features: their interface and scaling, linear and polynomial ones, and those of the user.
+
+The interface of a block of features.
 
 A block (``State()``, ``Bias()``, …) is an immutable description; blocks are joined by ``+``.
 ``design(order)`` returns its parameters, a NamedTuple, for whose type ``write`` and ``unit`` are

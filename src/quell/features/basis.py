@@ -1,4 +1,6 @@
-"""Random Fourier features.
+"""Features of the state that are nonlinear: Fourier, radial, periodic, friction.
+
+Random Fourier features.
 
 Forces that are periodic in position: cogging, eccentricity, screw pitch, gear mesh.
 

@@ -1,4 +1,6 @@
-"""The guard as users make it; ``kernels.py`` has its equations.
+"""``Guard`` as users make it, and the bound that is certified for a set of plants.
+
+The guard as users make it; ``kernels.py`` has its equations.
 
 Effect of a learner's correction on the loop of a linear plant and the plain observer.
 
@@ -251,7 +253,7 @@ def _is_part_of_a_plant(value: Any) -> bool:
 # ---- The guard as users make it ----
 
 # These values were chosen by hand on tuning seeds of `quell stress`, which judges them as a set on
-# other seeds (docs/theory). Times are in lags N/omega_o of the observer.
+# other seeds (studies/notes/guard_parts.md). Times are in lags N/omega_o of the observer.
 # T of the averages:
 _AVERAGING_LAGS = 15.0
 # T_C/T: a learner that explains a part of a sinusoidal load has full authority after 25 lags.

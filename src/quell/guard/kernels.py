@@ -102,12 +102,12 @@ that asks for more than 4 κ_0 e, a is smaller: a chain of four lags that is pus
 all of κ_0 e swings for a hundred lags. A plant with zeros responds to e_L otherwise, in ways that ℓ
 does not have: nothing is taken back there. A learner that never had authority has e_L = 0.
 
-For observers with which that recursion is unstable (``correction.is_invertible``), F is here the
+For observers with which that recursion is unstable (``guard.is_invertible``), F is here the
 filter of a chain of integrators with the same omega_o; for them nothing is certified.
 
 An output that is not finite, or a hundred times larger than f, is cut off within the sample.
 
-docs/theory, "The guard", gives theorem, proof and measurements.
+docs/theory, "Guard", gives theorem, proof and measurements.
 
 Functions of a guard, registered for the type of its parameters; their defaults limit nothing.
 
@@ -351,7 +351,7 @@ _MESSAGES = {
 # ---- Credit and account of a learner, and its authority ----
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
-# judges them as a set on other seeds (docs/theory).
+# judges them as a set on other seeds (studies/notes/guard_parts.md).
 # Credit from which the authority is full; between that and 1 a learner may err for a while.
 _FULL_CREDIT = 0.5
 # Largest energy of p in units of that of q: p of a good learner is at most a little too large.
@@ -521,7 +521,7 @@ def withdraw_authority(memory: GuardMemory) -> None:
 # ---- The error e, and the bound of a correction in units of it ----
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
-# judges them as a set on other seeds (docs/theory).
+# judges them as a set on other seeds (studies/notes/guard_parts.md).
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
 # c_L counts so many times for o: less would let motion that learner and loop make together raise o.

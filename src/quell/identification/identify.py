@@ -1,4 +1,6 @@
-"""The public function ``identify``: checks of its arguments, the search, and the judged result.
+"""``identify``: checks of its arguments, the search, the judged result, and alternatives to it.
+
+The public function ``identify``: checks of its arguments, the search, and the judged result.
 
 Other structures for the same record, and whether the record decides between them.
 

@@ -1,4 +1,6 @@
-"""Averages over the fits of several forms: means, physical units, the visible frequencies.
+"""``identify_b0``: b0, lag and delay of a plant from a record of its running loop.
+
+Averages over the fits of several forms: means, physical units, the visible frequencies.
 
 The search for a plant behind a lag and a delay: starts, and the forms of the model.
 

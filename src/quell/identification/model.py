@@ -1,4 +1,6 @@
-"""Sample correlations of two signals, by the fast Fourier transform.
+"""The model of a record: structure, derivatives, exact filters, poles and correlations.
+
+Sample correlations of two signals, by the fast Fourier transform.
 
 Poles, zeros and gain with their deviations.
 

@@ -1,4 +1,6 @@
-"""Columns of a record: which of the names in a file are time, input and output.
+"""Layout of a record in a text file: columns, separators, dates.
+
+Columns of a record: which of the names in a file are time, input and output.
 
 Layout of a record in a text file: where its table begins, and what separates its cells.
 """

@@ -1,4 +1,6 @@
-"""The result of an identification.
+"""The result of an identification: report, tests of its errors, plots, plants.
+
+The result of an identification.
 
 Quality of a model on a record: fits of simulation and prediction, and tests of the error.
 

@@ -1,4 +1,6 @@
-"""The predictor of a plant behind a lag and a delay, under a drifting load: sampled exactly.
+"""The plant behind a lag and a delay in a running loop: predictor and prediction-error fits.
+
+The predictor of a plant behind a lag and a delay, under a drifting load: sampled exactly.
 
     y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b u_l + d + w
     d' = −λ d + w_d,     τ u_l' + u_l = u(t − T)

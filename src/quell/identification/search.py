@@ -1,4 +1,6 @@
-"""The search for the delay of u, in whole samples.
+"""The search for a model: start, refinement, friction, delay, poles at zero.
+
+The search for the delay of u, in whole samples.
 
 A model with a wrong delay has other poles, so the error of one model at several delays says little,
 and it has a local minimum for each period of a resonance. Therefore a model is estimated at every

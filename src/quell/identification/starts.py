@@ -1,4 +1,6 @@
-"""The start at rest: whether a record shows it, and its model in the general form.
+"""Starts of the search: at rest, least squares, reduced models, closed loops.
+
+The start at rest: whether a record shows it, and its model in the general form.
 
 In a record of one step soon after the start, gain, constant force and initial state are not told
 apart: after the step only 1 and the free motions e^(p_i t) are there, n + 1 shapes for n + 2

@@ -1,4 +1,4 @@
-"""Equinox modules, trained by an optax optimiser, as learners."""
+"""Models of scikit-learn, river, PyTorch and JAX as learners."""
 
 from __future__ import annotations
 

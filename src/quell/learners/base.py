@@ -1,4 +1,6 @@
-"""The contract between a controller and its learner.
+"""The base of learners: contract, recovery, noise gate, lag filter, learners on features.
+
+The contract between a controller and its learner.
 
 A learner is an immutable description (``Kalman(...)``). ``design(observer, omega_c)`` returns its
 parameters (a NamedTuple), and ``memory(parameters)`` its whole state (a NamedTuple of arrays). The

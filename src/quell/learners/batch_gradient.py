@@ -1,4 +1,6 @@
-"""The buffers of Algorithm 1 and its gradient step, O(p) a sample for any buffer size.
+"""``BatchGradient``: Algorithm 1 of the paper, with its features or others.
+
+The buffers of Algorithm 1 and its gradient step, O(p) a sample for any buffer size.
 
 Three buffers of size n hold the newest features I, residuals ``ΔF = Δf̂`` and outputs
 ``F_L = h_θ(I)``. Once they are full, each sample replaces the oldest entry, takes one step down the
@@ -17,11 +19,11 @@ samples, and every sample costs the same.
 
 Algorithm 1 of the paper: batch gradient descent on the observer's own estimates.
 
-This file has the paper's features ``I = (x̂_1 … x̂_n, u, 1)``.
+``BatchGradient`` without features uses those of the paper, ``I = (x̂_1 … x̂_n, u, 1)``.
 
 Algorithm 1 with user-defined features, scaled.
 
-The head of this file describes the method; here ``I = φ(x̂, u)``. The state, u and Δf̂ are divided by
+The method is the one above, with ``I = φ(x̂, u)``. The state, u and Δf̂ are divided by
 powers of two (``features/base.py``). When a scale grows, θ is converted and the buffers are
 filled again. Nothing is learned until the observer's initial transient has decayed: it would give
 wrong scales.

@@ -1,4 +1,6 @@
-"""Parameters and state of the search for frequencies, and the beginnings of its passes.
+"""The search of ``Harmonic`` for the frequencies of a load in the past.
+
+Parameters and state of the search for frequencies, and the beginnings of its passes.
 
 Search for the frequencies of a load in the past of f_plain.
 
@@ -167,7 +169,7 @@ def begin_rows(search: FrequencySearch, memory: SearchMemory) -> None:
 # ---- The verdict on a fit of frequencies ----
 
 # The constants were chosen by hand on 50 random loops each for four factors between two frequencies
-# (`benchmarks/close_frequencies.py --seed 2` to 5; docs/theory).
+# (`benchmarks/close_frequencies.py --seed 2` to 5; studies/notes/harmonic.md).
 # Share of what state and u leave that a good fit may leave. The fits with right frequencies in 60
 # loops left 0.07 at most in nine of ten, those of windows that contain the start of the load 0.3 or
 # more, and those of coloured loads 0.8.

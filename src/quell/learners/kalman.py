@@ -1,4 +1,6 @@
-"""The lag-compensated learner: a Kalman filter that accounts for the observer's own lag.
+"""``Kalman`` and ``Harmonic``: lag-compensated Kalman filters as learners.
+
+The lag-compensated learner: a Kalman filter that accounts for the observer's own lag.
 
 With the features φ (state, bias, sinusoids, u) and their lag-filtered values φ^F
 (``learners/base.py``), each sample::
@@ -31,7 +33,7 @@ bias at that mean.
 **Start.** After a start from rest Δf̂ contains the observer's initial error, which is no
 disturbance: the learner does not learn for 2 τ.
 
-docs/theory, "Learning without lag", has the derivation and measurements.
+docs/theory, "Lag compensation", has the derivation and measurements.
 
 The learner ``Kalman``: features, bandwidths and prior of a Kalman filter.
 
@@ -399,7 +401,7 @@ def _coefficients(learner: KalmanDesign, memory: KalmanMemory, theta: Vector) ->
 class Kalman:
     """A linear learner that compensates the observer's lag: ``f_L = θ · (x̂_1 … x̂_n, 1, u)``.
 
-    It does not depend on the units of y and u. The head of this file has the equations.
+    It does not depend on the units of y and u. The docstring of this module has the equations.
 
     Parameters
     ----------
@@ -537,7 +539,8 @@ class Kalman:
 # ---- The learner of periodic loads ----
 
 # Initial frequencies by default: omega_c, then each this multiple of the one before. This and the
-# other defaults are from 300 random loops (docs/theory; quell.experiments.stress.study).
+# other defaults are from 300 random loops (quell.experiments.stress.study;
+# studies/notes/harmonic.md).
 _SPREAD = 0.3
 # Default limits of the frequencies as multiples of omega_c and omega_o.
 _LOWEST, _HIGHEST = 0.02, 0.5

@@ -1,4 +1,6 @@
-"""The contract of a model, from which ``Online`` makes a learner.
+"""``Online``: a learner of any model that learns in each sample; ``MLP``, a small network.
+
+The contract of a model, from which ``Online`` makes a learner.
 
 A model predicts a number from features and learns from pairs (features, target). It is a NamedTuple
 of parameters, a NamedTuple of arrays as its state, and two functions that are registered for the

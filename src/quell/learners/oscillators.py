@@ -52,7 +52,7 @@ from quell.kernels.sized import Size
 from quell.learners.base import lag_push
 from quell.types import Matrix, Vector
 
-# κ and c: a broad optimum over random loops (docs/theory).
+# κ and c: a broad optimum over random loops (studies/notes/harmonic.md).
 _FREQUENCY_GAIN, _UNEXPLAINED_WEIGHT = 0.4, 60.0
 
 

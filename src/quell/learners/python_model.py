@@ -1,8 +1,10 @@
-"""Copies of Python models that learn, and the function by which compiled loops call them.
+"""``PythonModel``: a learner whose model is any Python object.
+
+Copies of Python models that learn, and the function by which compiled loops call them.
 
 A loop's memory contains only numbers, so it contains the number of its instance. The instance is a
 copy of the user's model that belongs to one loop; it is deleted together with the array that holds
-its number. No exception may leave this file: the caller is compiled code and cannot handle one.
+its number. No function lets an exception out: its caller is compiled code and can't handle one.
 
 Kernels of a learner whose model is a Python object.
 
@@ -258,7 +260,7 @@ def _unregister(number: int) -> None:
 def _warn(problem: str) -> None:
     try:
         warnings.warn(problem, RuntimeWarning, stacklevel=2)
-    except RuntimeWarning:  # warnings are errors, and no exception may leave this file
+    except RuntimeWarning:  # warnings may be errors, and compiled code can't handle them
         print(problem, file=sys.stderr)
 
 

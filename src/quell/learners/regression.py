@@ -1,4 +1,6 @@
-"""Kernels of the learners ``f_L = θ · φ(x̂, u)`` that compensate the observer's lag exactly.
+"""Linear regressions on features: kernels, base class, and ``NLMS``.
+
+Kernels of the learners ``f_L = θ · φ(x̂, u)`` that compensate the observer's lag exactly.
 
 The features pass through the observer's own lag filter (``learners/base.py``), so that
 
@@ -32,7 +34,7 @@ Normalised least mean squares: the cheapest rule, O(p) a sample.
 
 with the error ε and the filtered features φ. Along φ the error decays as ``exp(−rate t)``, for
 features of any size and for any dt; it decays more slowly where noise hides it
-(``noise_gate.confidence``).
+(``confidence`` of ``learners/base.py``).
 """
 
 from __future__ import annotations

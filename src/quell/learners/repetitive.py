@@ -1,4 +1,6 @@
-"""Kernels of repetitive learning: f over the phase of a cycle, corrected from cycle to cycle.
+"""``Repetitive``: f over the phase of a cycle, corrected from cycle to cycle.
+
+Kernels of repetitive learning: f over the phase of a cycle, corrected from cycle to cycle.
 
 The output is a table g with one number for each sample of the cycle. What it leaves is known one
 lag of the observer late, and smoothed (``learners/base.py``):
@@ -221,7 +223,7 @@ class Repetitive:
 
     It suits moves that are repeated (``signals.Repeated``), and loads of any shape that repeat with
     a known period: no model of the plant or of the load is needed, but all has to repeat. The first
-    cycle is controlled without it. The head of this file has the equations.
+    cycle is controlled without it. The docstring of this module has the equations.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""Recursive least squares with directional forgetting, O(p²) a sample.
+"""``RLS``: recursive least squares, with directional forgetting, relearning and selection.
+
+Recursive least squares with directional forgetting, O(p²) a sample.
 
 With ``ζ = φ·Pφ/R`` and ``λ = exp(−dt/T)`` for the memory time T,
 
@@ -37,7 +39,7 @@ Recursive least squares as a rule of linear learners.
 
 The variance of noise is ``R = τ/dt`` with the observer's lag τ = N/omega_o, because the noise in f̂
 is correlated over that time; so the result does not depend on dt. R is larger where measurement
-noise hides what is to be learned (``noise_gate.confidence``).
+noise hides what is to be learned (``confidence`` of ``learners/base.py``).
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Linear models as users give them, converted to state space or a transfer function.
+"""Linear models: reading, poles as users give them, exact sampling, norms.
+
+Linear models as users give them, converted to state space or a transfer function.
 
 ``canonical`` and ``LinearPlant.of`` read models with ``read_model``; whatever takes a linear plant
 uses one of the two.

@@ -1,7 +1,7 @@
 """Extended state observers: estimates of the plant's state and of the total disturbance.
 
-May import ``lti`` and what stands before it. ``eso.py`` has the class; each kind of observer has
-its own file with parameters and kernels, and only ``noise.py`` imports ``eso.py``.
+May import ``lti`` and what stands before it. ``eso.py`` has the class, ``forms.py``
+parameters and kernels of each kind of observer, ``design.py`` the poles and gains.
 """
 
 from quell.lti.canonical import Canonical, canonical

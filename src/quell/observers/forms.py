@@ -1,4 +1,6 @@
-"""Generic functions that the controller calls on an observer.
+"""The forms of observers as kernels: linear, cascade, nonlinear, delayed, in delta form.
+
+Generic functions that the controller calls on an observer.
 
 An observer is an ``ESO``. Its ``model`` is a NamedTuple of parameters with ``states``, the length
 of the running state ``z``. Entry n of ``z`` is a summand of the estimated f, so a controller may

@@ -1,4 +1,6 @@
-"""The interface of a plant: a protocol for its description and two functions for its kernels.
+"""Plants: their interface, states that end a run, names of signals, batches.
+
+The interface of a plant: a protocol for its description and two functions for its kernels.
 
 ``Plant.sampled`` returns a NamedTuple of parameters. ``measure`` and ``advance`` are registered for
 the type of that NamedTuple; ``linear.py`` is a complete example.

@@ -1,4 +1,6 @@
-"""Inertias in a chain, with stiffness, damping and play in each coupling: a flexible axis.
+"""Flexible axes: inertias in a chain, two masses and a spring, a cubic spring.
+
+Inertias in a chain, with stiffness, damping and play in each coupling: a flexible axis.
 
 The first inertia is driven. With the angles θ_i and the twist ``φ_i = θ_i − θ_{i+1}`` of the
 coupling between inertia i and the next one::

@@ -1,4 +1,6 @@
-"""FMU files as ZIP archives, unpacked within limits.
+"""``FMU``: a plant that a co-simulation FMU computes, and the file it comes from.
+
+FMU files as ZIP archives, unpacked within limits.
 
 Instances of FMUs, and the function by which loops advance them.
 

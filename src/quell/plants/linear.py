@@ -1,4 +1,6 @@
-"""Linear plants, sampled exactly.
+"""Linear plants, sampled exactly; any plant behind a delay or an encoder.
+
+Linear plants, sampled exactly.
 
 The plant as the controller sees it: zero-order hold, dead time and actuator lag included.
 

@@ -1,4 +1,6 @@
-"""Machine code of a user's differential equation whose parameters are numbers by name.
+"""Nonlinear plants: the differential equation of the user, and friction at the input.
+
+Machine code of a user's differential equation whose parameters are numbers by name.
 
 The numbers are an array beside the addresses of the code: other numbers need no other code.
 

@@ -1,4 +1,4 @@
-"""The plants that setup files, rigs and twins know by name."""
+"""Plants by name, from the results of an identification, and from files of Python code."""
 
 from __future__ import annotations
 

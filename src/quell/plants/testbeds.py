@@ -1,4 +1,6 @@
-"""The ECP 205 torsional plant, the paper's testbed (section V): two disks on a shaft with a motor.
+"""Plants from physical parameters: the ECP 205 torsional testbed and a DC motor.
+
+The ECP 205 torsional plant, the paper's testbed (section V): two disks on a shaft with a motor.
 
 The motor drives the lower disk (1) by a belt; the angle of the upper disk (2) is measured. With the
 angles θ and speeds ω::

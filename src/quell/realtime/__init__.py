@@ -14,8 +14,9 @@ The public names, imported when first used::
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from quell.realtime.devices import Device, TwinDevice
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from quell.realtime.supervisor import Safety
     from quell.realtime.target import record_target
 
-_HOME = {
+_HOMES = {
     "CsvSink": "recordings",
     "Device": "devices",
     "LiveSink": "live",
@@ -48,11 +49,4 @@ __all__ = [
     "load", "open_device", "record_target", "replay", "run_rig",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'quell.realtime' has no attribute {name!r}")
-    home = importlib.import_module(f"quell.realtime.{_HOME[name]}")
-    value = getattr(home, name)
-    globals()[name] = value
-    return value
+__getattr__ = imported_on_use(__name__, _HOMES)

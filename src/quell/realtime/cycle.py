@@ -1,4 +1,6 @@
-"""The loop by deadlines: one function for the whole run, compiled if the device allows it.
+"""The loop of a run: by deadlines or by the ticks of a device, compiled before the first sample.
+
+The loop by deadlines: one function for the whole run, compiled if the device allows it.
 
 Cycle k has the deadline ``origin + k dt``. The loop sleeps until this time, takes the measurement,
 calls supervisor and controller, writes u, and pushes a row to the telemetry. A cycle that ends

@@ -1,4 +1,6 @@
-"""The interface between the loop and a device: a plant in hardware, simulated, or behind a wire.
+"""Devices: the interface to the loop, and a plant in this process as a device.
+
+The interface between the loop and a device: a plant in hardware, simulated, or behind a wire.
 
 A device is an object with ``read() -> y``, ``write(u)`` and ``close()``. A device that can be used
 from compiled code also has a ``handle``: a NamedTuple for whose type ``read_measurement`` and

@@ -1,4 +1,6 @@
-"""The package ``nidaqmx``, and its errors in one line with a remedy.
+"""Cards of National Instruments as a device.
+
+The package ``nidaqmx``, and its errors in one line with a remedy.
 
 Tasks of the driver NI-DAQmx: a counter, an analog output, digital lines and a watchdog.
 

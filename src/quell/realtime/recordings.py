@@ -1,4 +1,6 @@
-"""Sinks, which take the rows of a loop: their protocol, memory, and files by their suffix.
+"""Recordings: sinks, headers, CSV and MCAP files, and their way back to trajectories.
+
+Sinks, which take the rows of a loop: their protocol, memory, and files by their suffix.
 
 Recordings as CSV: a line of names, then a line for each row; the header is in ``<name>.json``.
 

@@ -1,4 +1,6 @@
-"""The device's side of a wire: a simulated plant with a clock, a watchdog and sessions.
+"""The rig: a simulated plant at the other end of a wire, and faults between it and the loop.
+
+The device's side of a wire: a simulated plant with a clock, a watchdog and sessions.
 
 At each tick k the rig
 

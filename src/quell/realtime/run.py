@@ -1,4 +1,6 @@
-"""A run at a rig: from a device and a controller to a record.
+"""``run_rig`` and ``replay``: a run at a rig, its result, and the same through another controller.
+
+A run at a rig: from a device and a controller to a record.
 
 Replay of a recorded run through another controller: its estimates and the u it wishes.
 

@@ -1,4 +1,6 @@
-"""The supervisor: after a fault it holds u, then ramps it to zero, then stops.
+"""The supervisor: safety rules, modes, the reference of a run, and the safe action after a fault.
+
+The supervisor: after a fault it holds u, then ramps it to zero, then stops.
 
 ::
 

@@ -1,4 +1,6 @@
-"""Atomic loads and stores of int64 words that two threads or two processes share.
+"""The operating system: clocks, scheduling, signals, atomic words, histograms of durations.
+
+Atomic loads and stores of int64 words that two threads or two processes share.
 
 The writer stores data first and then, as a *release*, a word that announces it. A reader that loads
 this word as an *acquire* and finds the new value also finds the data.

@@ -1,4 +1,6 @@
-"""The telemetry writer: a thread that takes the loop's rows out of a ring and passes them to sinks.
+"""Telemetry: a ring buffer, the thread that empties it, delivery to slow sinks.
+
+The telemetry writer: a thread that takes the loop's rows out of a ring and passes them to sinks.
 
 The loop puts a row into the ring each cycle and never waits. The writer empties the ring some
 twenty times a second. Each sink has a thread of its own (``delivery``): one that fails (disk full,

@@ -1,4 +1,6 @@
-"""Frames over UDP: one datagram each.
+"""Frames over UDP and over serial lines.
+
+Frames over UDP: one datagram each.
 
 ``frames`` handles datagrams that are lost, duplicated or overtaken. The device listens at
 ``udp://HOST:PORT``; the loop uses any free port.

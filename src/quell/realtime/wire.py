@@ -1,4 +1,6 @@
-"""The frame that carries one number between a device and the loop: 40 bytes on every wire.
+"""Devices at the other end of a wire: frames, sessions, reading and writing in ticks.
+
+The frame that carries one number between a device and the loop: 40 bytes on every wire.
 
 ======  ====  =======  ==========================================================================
 offset  size  type     content

@@ -1,4 +1,6 @@
-"""Common part of the records of one run and of a batch: channels, times, NetCDF files.
+"""Records: channels, times, tables, and the common part of one run and of a batch.
+
+Common part of the records of one run and of a batch: channels, times, NetCDF files.
 
 The channels of a record: names, columns, descriptions and units.
 

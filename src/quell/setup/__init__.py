@@ -7,15 +7,16 @@ wait for the tables of controllers and tuning.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from quell.setup.description import Description
     from quell.setup.loading import EXAMPLES, Setup, controllers_of, load, made, varied
     from quell.setup.schema import SetupError, plant_given, plant_of, read
 
-_HOME = {
+_HOMES = {
     "EXAMPLES": "loading",
     "Description": "description",
     "Setup": "loading",
@@ -43,11 +44,4 @@ __all__ = [
     "varied",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'quell.setup' has no attribute {name!r}")
-    home = importlib.import_module(f"quell.setup.{_HOME[name]}")
-    value = getattr(home, name)
-    globals()[name] = value
-    return value
+__getattr__ = imported_on_use(__name__, _HOMES)

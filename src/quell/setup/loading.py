@@ -1,4 +1,6 @@
-"""A setup: the objects that a file describes.
+"""Setups: the objects that a file describes, its sweep and its tuning, and other values.
+
+A setup: the objects that a file describes.
 
 Arguments of ``quell.tune`` from a setup file: the plant, its ranges, constraints.
 

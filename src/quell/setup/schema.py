@@ -1,4 +1,6 @@
-"""Descriptions from docstrings: of a function, and of its parameters.
+"""Tables of a setup file: TOML, schema from signatures, errors, builders, plants.
+
+Descriptions from docstrings: of a function, and of its parameters.
 
 Errors of a setup file: one line each, with file, path of the key, value and rule.
 

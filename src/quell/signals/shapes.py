@@ -1,4 +1,4 @@
-"""The base class of signals, and how signals are combined."""
+"""Signals: the base class, shapes, sums, repeats, recorded samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A scenario: signals, duration and initial state of a run.
+"""The compiled driver: scenarios in segments, plant and controller, judgement of the integration.
+
+A scenario: signals, duration and initial state of a run.
 
 The inner loop: a plant and a controller, sample by sample, in segments of a scenario.
 

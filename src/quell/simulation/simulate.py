@@ -1,4 +1,6 @@
-"""``simulate``: one run of a plant and a controller through a scenario, or a batch of runs.
+"""``simulate``: one run or a batch on all cores, and compilation before a study.
+
+``simulate``: one run of a plant and a controller through a scenario, or a batch of runs.
 
 Many runs at once, on all cores: what ``simulate`` does with a batch.
 """

@@ -1,4 +1,6 @@
-"""Messages of the page: what they may ask for, and how large that may be.
+"""Messages and frames of the page, and the tables from which it makes its forms.
+
+Messages of the page: what they may ask for, and how large that may be.
 
 Frames for the page: a JSON header and arrays of float32, little endian.
 

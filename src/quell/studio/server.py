@@ -1,4 +1,6 @@
-"""The server of the studio: static files and one WebSocket, for this computer only.
+"""The server of the studio: files, connections, and one WebSocket for each page.
+
+The server of the studio: static files and one WebSocket, for this computer only.
 
 The address contains a random token as its first part, without which nothing is answered. Requests
 for another host, which a page of the web could make by rebinding its name (DNS rebinding), and

@@ -1,4 +1,6 @@
-"""The plan of a sweep: the parameters, seed and name of each run.
+"""Runs of a sweep: plan and values, what a worker does and measures, the folder.
+
+The plan of a sweep: the parameters, seed and name of each run.
 
 The values of a sweep's parameters: ranges, normal distributions, lists.
 

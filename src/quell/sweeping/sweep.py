@@ -1,4 +1,6 @@
-"""``sweep``: many runs over parameters, on many cores or machines.
+"""``sweep``: many runs on many cores or machines, and their results.
+
+``sweep``: many runs over parameters, on many cores or machines.
 
 The results of a sweep as one ``xarray.Dataset`` that reads its files when values are needed.
 

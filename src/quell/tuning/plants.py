@@ -1,4 +1,6 @@
-"""The plants that a tuning is for: one, a list, a batch, with a range of their gain.
+"""The plants that a tuning is for: given, identified, or those of a record.
+
+The plants that a tuning is for: one, a list, a batch, with a range of their gain.
 
 The set of plants that an identified model stands for: its deviations as plants of their own.
 

@@ -1,4 +1,6 @@
-"""The result of a tuning as text.
+"""Results of a tuning: designs, text, figures, scenario and setup file.
+
+The result of a tuning as text.
 
 The step of the reference: overshoot, settling time, and a prefilter where it overshoots.
 

@@ -1,4 +1,6 @@
-"""The filtered PID controller of two degrees of freedom.
+"""PID controllers: with a filter, with a notch, cascaded, and the one that equals an ADRC.
+
+The filtered PID controller of two degrees of freedom.
 
 ::
 

@@ -1,4 +1,6 @@
-"""State feedback of an observer with a disturbance state, as one linear law.
+"""State feedback as a baseline: LQG, and resonance ratio control of two masses.
+
+State feedback of an observer with a disturbance state, as one linear law.
 
 The sampled plant with a disturbance that is a random walk, z = (x, d)::
 
@@ -21,7 +23,7 @@ LQG: state feedback with a Kalman filter that also estimates a disturbance at th
     minimise ∫ y² + ρ u² dt,      u = −K x̂ − d̂ + N r,      N = 1 / ( C (I − Φ + Γ K)⁻¹ Γ )
 
 (Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, sections 8.5 and 9;
-observer_law.py has the filter.) The cost is sampled exactly (Van Loan, *IEEE Trans. Automatic
+the filter is the one above.) The cost is sampled exactly (Van Loan, *IEEE Trans. Automatic
 Control* 23, 1978) and K comes from its Riccati equation.
 
 The weights follow from two bandwidths. If u reaches y through ν integrators with the gain b, cheap
@@ -51,7 +53,7 @@ observer so slow that both masses move as one).
 
 They measure the motor and estimate T by a disturbance observer there. Here the only measurement y
 is the position of either mass, so x_1, x_1' and T come from a Kalman filter of both masses with a
-slow force d on the load (observer_law.py). The reference is corrected for d at rest::
+slow force d on the load (above). The reference is corrected for d at rest::
 
     r_1 = r − d̂/k − κ d̂/(m_1 k_p)
 

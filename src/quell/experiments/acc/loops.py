@@ -1,4 +1,6 @@
-"""The three design cases of Wie & Bernstein (*J. Guidance, Control, and Dynamics* 15, 1992).
+"""Loops of the ACC benchmark: controllers, design cases, uncertain plants, criteria.
+
+The three design cases of Wie & Bernstein (*J. Guidance, Control, and Dynamics* 15, 1992).
 
 Masses of 1 kg, no actuator lag, u on m1, y = x2:
 

@@ -1,4 +1,6 @@
-"""Random flexible axes: a motor and one or two inertias, the encoder at either end.
+"""The trial of the guard on flexible axes, on coupled joints, and near rest.
+
+Random flexible axes: a motor and one or two inertias, the encoder at either end.
 
 J_motor is 1e-4 to 1e-3 kg m², J_load/J_motor 0.3 to 10. The load swings against a held motor at 15
 to 90 Hz, with a damping of 0, 0.005 or 0.03 (not 0 where a design would invert it); a third

@@ -1,4 +1,6 @@
-"""Measures of a run: RMS error, largest error, worst window.
+"""The trial of the guard in general loops: runs, named cases, searched learners, the result.
+
+Measures of a run: RMS error, largest error, worst window.
 
 Cases that the first guard failed, each by its name: levels, a slow process, perfect knowledge.
 

@@ -1,4 +1,6 @@
-"""Loads of the trial, each a table of one value for each sample.
+"""Random loops of the trial: plants, references, loads, margins.
+
+Loads of the trial, each a table of one value for each sample.
 
 Random loops of orders 1 to 4: plants, references, loads; each with MF-ESO, its margin stated.
 

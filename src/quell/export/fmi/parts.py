@@ -1,4 +1,6 @@
-"""Bandwidths as parameters that can be changed while an FMU runs: closed forms for C.
+"""The parts of an FMU: controller and plant in C, variables, bandwidths that can be changed.
+
+Bandwidths as parameters that can be changed while an FMU runs: closed forms for C.
 
 *omega_c*: ``k_i = w_i omega_c^(m−i+1)`` with the binomial coefficients, or those of a pattern of
 poles, as w (``controllers/law.py``), and the factor ``exp(−omega_c dt)`` of the offset after a
@@ -381,7 +383,7 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
 
 
 def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
-    """Return the lines for ``k_i = w_i omega_c^(m−i+1)`` (controllers/adrc/law.py)."""
+    """Return the lines for ``k_i = w_i omega_c^(m−i+1)`` (controllers/law.py)."""
     count, dt = weights.size, known.dt
     guard = []
     if known.guard is not None:

@@ -7,6 +7,6 @@ is never taken, a loop without a pass and a number that never changes do not exi
 
 May import: ``kernels``.
 
-``program.py`` is the whole, ``functions.py`` translates a function, ``expressions.py`` and
-``calls.py`` what is in it, ``blocks.py`` places declarations, ``structs.py`` defines the structs.
+``program.py`` is the whole, ``statements.py`` and ``expressions.py`` translate what is in a
+function, ``structs.py`` defines the structs, ``text.py`` writes the lines of C.
 """

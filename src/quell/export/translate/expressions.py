@@ -1,4 +1,6 @@
-"""The program as the parts of the translator know it.
+"""Translation of Python expressions and calls to C.
+
+The program as the parts of the translator know it.
 
 Translation of Python expressions: the values of names, and operators on them.
 

@@ -1,4 +1,6 @@
-"""The local variables of a function in C.
+"""Translation of functions to C: variables, statements, parameters and result.
+
+The local variables of a function in C.
 
 A variable that has the same known value wherever it is set does not exist in C. That is assumed of
 every variable; where it proves wrong, ``Assumptions`` keeps that, and the function is translated

@@ -1,4 +1,6 @@
-"""Results of a translation of a program, for the next one.
+"""What kernels are made of: their source, and C structs for NamedTuples and records.
+
+Results of a translation of a program, for the next one.
 
 The translator assumes as much as possible to be constant. Where it finds the opposite, it notes
 that here, and the program is translated again, until nothing new is found.

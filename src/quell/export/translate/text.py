@@ -1,4 +1,6 @@
-"""A translated Python expression: its kind, its C code, its value where that is known.
+"""Translated values and the text of C code: blocks, layout, numbers, names.
+
+A translated Python expression: its kind, its C code, its value where that is known.
 
 The statements of a C function as a tree, and the placement of its declarations.
 

@@ -1,4 +1,6 @@
-"""The loops of many controllers with a set of plants: responses, stability, peaks.
+"""Loops of many controllers with a set of plants: responses in frequency and in time.
+
+The loops of many controllers with a set of plants: responses, stability, peaks.
 
 All plants of a set are sampled with the controller's dt, dead time and lag included, and have their
 responses at the same frequencies. The responses are exact (``analysis.frequency_response``). The
@@ -12,7 +14,7 @@ guard and nonlinear parts the state of an ADRC is the observer's prediction z⁻
 ``e = y − z⁻_1``. With the correction ``z = J z⁻ + H e`` and the estimates ``x̂ = T z⁻ + D e``::
 
     z⁻⁺ = F z + Γ u = F J z⁻ + F H e + Γ u
-    u   = ( k_1 r + k_2 r' + … + r^(m) + (a − k)·x̂_{1…n} − Δf̂ ) / b0        (``law.py``)
+    u   = ( k_1 r + k_2 r' + … + r^(m) + (a − k)·x̂_{1…n} − Δf̂ ) / b0        (``controllers/law.py``)
 
 For an ESO (``observers/forms.py``) ``F = Φ``, ``H = L`` and ``J = I``; in the predictor form the
 estimates are z⁻ itself. In a cascade of p levels (``observers/forms.py``) each level corrects the

@@ -1,4 +1,6 @@
-"""The closed loop's poles: their damping, and the frequencies at which narrow peaks stand.
+"""Requirements of a tuning as numbers: damping, bounds over frequency, objectives.
+
+The closed loop's poles: their damping, and the frequencies at which narrow peaks stand.
 
 A pole z of the sampled loop is ``s = log(z)/dt``, its damping ``ζ = −Re s/|s|``. A bound of it is a
 sector of the s-plane (Ackermann, *Robust Control*, Springer 1993, chapter 4). It is about the

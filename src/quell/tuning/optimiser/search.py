@@ -1,4 +1,6 @@
-"""The optimiser: several starts, sequential quadratic programming, exchange of frequencies.
+"""The optimiser: starts, sequential quadratic programming, exchange of frequencies.
+
+The optimiser: several starts, sequential quadratic programming, exchange of frequencies.
 
 The problem ``max k_i`` subject to bounds at *all* frequencies has infinitely many constraints. It
 is solved as a sequence of problems with finitely many (exchange, Hettich & Kortanek, *SIAM Review*

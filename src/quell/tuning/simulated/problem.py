@@ -1,4 +1,6 @@
-"""Objectives of a search by simulation: scores of a controller on samples.
+"""Objectives of a search by simulation: scores, ranges of parameters, statistics.
+
+Objectives of a search by simulation: scores of a controller on samples.
 
 A sample is whatever differs between runs: a plant and the scenario that it runs through, or
 anything that the function ``evaluate`` understands. All candidates see the same samples with the

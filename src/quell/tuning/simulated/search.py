@@ -1,4 +1,6 @@
-"""The search: Optuna suggests values, simulations score them, in groups of candidates.
+"""The search by simulation: candidates from Optuna, their study, the result.
+
+The search: Optuna suggests values, simulations score them, in groups of candidates.
 
 Optuna's study behind a search: its sampler and pruner, and its trials in a journal file.
 

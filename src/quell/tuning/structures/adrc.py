@@ -1,10 +1,12 @@
-"""ADRC by bandwidths, with poles of its own, at half gain, of reduced order, with a model.
+"""ADRC as a structure: bandwidths, own poles, models, sampled feedback, equivalents of PID.
+
+ADRC by bandwidths, with poles of its own, at half gain, of reduced order, with a model.
 
 The poles of the law and of the observer are each one number, the bandwidth, or *freed*: a factor
 ``s² + 2 ζ ω s + ω²`` for each two of them, real or complex, and a real pole if their number is odd.
 A freed ADRC of order 1 has the feedback of a PI controller with a filter of first order, one of
 order 2 that of a PID controller with a filter of second order (``controllers/baselines/pid.py``),
-as long as the loop with its own nominal plant is stable; this file finds these as starts.
+as long as the loop with its own nominal plant is stable. The search starts from these.
 
 The freed ADRC whose feedback is that of a given PI or PID controller with a filter.
 
@@ -19,8 +21,8 @@ taken for which all poles are damped. The sampled controllers agree to first ord
 
 The feedback of many sampled ADRC designs at many frequencies, without building controllers.
 
-With the observer in its current form, c = (1, 0, …) and the law ``u = −K ẑ`` (``observers/linear``,
-``controllers/adrc/law``), z⁻ the prediction and d the samples by which u is delayed::
+With the observer in its current form, c = (1, 0, …) and the law ``u = −K ẑ`` (``observers/forms``,
+``controllers/law``), z⁻ the prediction and d the samples by which u is delayed::
 
     ẑ = z⁻ + L (y − c z⁻),     z z⁻ = (Φ − z^(−d) Γ K) ẑ
     C_y = z K ( z I − (I − L c) (Φ − z^(−d) Γ K) )⁻¹ L

@@ -1,4 +1,6 @@
-"""PI and PID controllers with their filters, as the references of every tuning.
+"""PI, PID, cascaded P-PI and LQG as structures: the references of every tuning.
+
+PI and PID controllers with their filters, as the references of every tuning.
 
 The response is exact for the sampled controller, because Tustin's rule maps each frequency to one:
 ``C(s)`` at ``s = 2j tan(ω dt/2)/dt`` (Franklin, Powell & Workman, *Digital Control of Dynamic

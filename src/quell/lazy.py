@@ -1,0 +1,37 @@
+"""Public names of a package that are imported when they are first used."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+
+def imported_on_use(
+    package: str, homes: Mapping[str, str], modules: Iterable[str] = ()
+) -> Callable[[str], Any]:
+    """Return the function ``__getattr__`` of a package.
+
+    Parameters
+    ----------
+    package
+        its name.
+    homes
+        the module of each public class and function, below the package.
+    modules
+        public modules, below the package.
+    """
+    known = {path.rpartition(".")[2]: path for path in modules}
+
+    def get(name: str) -> Any:
+        if name in homes:
+            value = getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+        elif name in known:
+            value = importlib.import_module(f"{package}.{known[name]}")
+        else:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return get
