@@ -14,6 +14,7 @@ names = [
     "MB-ESO (3x bandwidth)",
     "MF-ESO m = 2",
     "MB-ESO m = 2",
+    "L-ESO, guarded",
 ]
 keys = {"overshoot", "settling_time", "disturbance_peak", "disturbance_rms", "control_variation"}
 assert list(result["controllers"]) == names, list(result["controllers"])
