@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 import quell as ql
-from quell.guard import assess, confine, limit, record_output, start_again
+from quell.guard import assess, limit, nearest_permitted, record_output, start_again
 from quell.guard.kernels import CORRECTED, respond
 from quell.learners.base import lag_of, lag_push
 from tests.guarded_samples import OBSERVER, bounds, trusted
@@ -62,9 +62,9 @@ def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None
             assert (slope, cut) == (0.0, False)
             reason = memory.sample[0].reason
             assert (reason == ql.Reason.OUT_OF_BOUNDS) == (not inside)
-            assert confine(design, memory, permitted) == permitted
+            assert nearest_permitted(design, memory, permitted) == permitted
             beyond = 3.0 * e + 1.001 * side * authority * bound
-            assert confine(design, memory, beyond) == pytest.approx(
+            assert nearest_permitted(design, memory, beyond) == pytest.approx(
                 3.0 * e + side * authority * bound
             )
 

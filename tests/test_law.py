@@ -21,7 +21,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.law import _finish_sample, unlimited_control
 from quell.controllers.stateful import named_arrays
-from quell.guard import confine
+from quell.guard import nearest_permitted
 from quell.learners.base import commit, restart
 from quell.types import Status
 
@@ -233,7 +233,7 @@ def test_the_guard_bounds_the_output_for_the_u_that_was_applied_too(slope: float
     for used, bounded in ((slope, True), (0.0, False)):
         loop.constant, loop.slope = 2.0, used
         expected = 2.0 + used * 1e3
-        permitted = confine(law.parameters.guard, law._state.guard, expected)
+        permitted = nearest_permitted(law.parameters.guard, law._state.guard, expected)
         assert permitted != expected
         _finish_sample(law.parameters, law._state, 1e3)
         assert loop.f_learned == (permitted if bounded else expected)

@@ -28,9 +28,9 @@ from quell.learners.base import (
     lag_memory,
     lag_of,
     lag_push,
+    learner_flags,
     predict,
     restart,
-    trouble,
 )
 from quell.observers.design import FORMS
 from quell.observers.forms import (
@@ -405,7 +405,7 @@ def drive(
         measured, f_plain = show(loop, seen, k, y[k], f[k], applied, f_learned)
         adapt(design, memory, loop.seen, measured, applied, f_plain)
         constant, slope = predict(design, memory, loop.seen, applied)
-        said[k, 0], said[k, 1], said[k, 2] = constant, slope, trouble(design, memory)
+        said[k, 0], said[k, 1], said[k, 2] = constant, slope, learner_flags(design, memory)
         said[k, 3] = measured
         if not given:
             applied, f_learned = act(loop, k, constant, slope)

@@ -60,8 +60,8 @@ from quell.controllers.base import (
 )
 from quell.guard import (
     assess,
-    confine,
     limit,
+    nearest_permitted,
     record_output,
     reset_filters,
     start_again,
@@ -82,10 +82,10 @@ from quell.learners.base import (
     is_excessive,
     is_in_proportion,
     lag_push,
+    learner_flags,
     predict,
     reset_lag,
     restart,
-    trouble,
 )
 from quell.lti.models import pole_pattern
 from quell.observers.forms import acting_control, begin, expected_measurement, fal, observe
@@ -400,7 +400,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
-            status |= trouble(design.learner, state.learner)
+            status |= learner_flags(design.learner, state.learner)
     loop.f_known = known_share(design.feedforward, loop.r, state.reference)
     constant, slope = predict(design.learner, state.learner, seen, u_acting)
     output = constant + slope * u_acting
@@ -414,7 +414,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     if slope != 0.0:
         # The guard's bound holds for the new u, too: beyond it the output counts as a constant.
         f_learned = constant + slope * acting_control(design.eso, state.z, unlimited)
-        permitted = confine(design.guard, state.guard, f_learned)
+        permitted = nearest_permitted(design.guard, state.guard, f_learned)
         if permitted != f_learned:
             constant, slope = permitted, 0.0
             unlimited = unlimited_control(design, state, constant, slope)
@@ -492,7 +492,7 @@ def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> Non
     loop = state.loop[0]
     f_learned = loop.constant + loop.slope * u_acting
     if loop.slope != 0.0:
-        f_learned = confine(design.guard, state.guard, f_learned)
+        f_learned = nearest_permitted(design.guard, state.guard, f_learned)
     loop.f_learned = f_learned
     loop.f_learned_shown = lag_push(design.lag, state.shadow, 0, f_learned)
     commit(design.learner, state.learner, state.seen, u_acting, f_learned)

@@ -112,7 +112,8 @@ docs/theory, "Guard", gives theorem, proof and measurements.
 Functions of a guard, registered for the type of its parameters; their defaults limit nothing.
 
 In each sample the controller calls ``assess`` before the learner adapts, ``limit`` after it has
-predicted, ``confine`` for each u that it tries, and ``record_output`` when the applied u is known.
+predicted, ``nearest_permitted`` for each u that it tries, and ``record_output`` when the applied u
+is known.
 """
 
 from __future__ import annotations
@@ -288,7 +289,7 @@ def limit(
 
 
 @generic_with_default
-def confine(guard: Any, memory: Any, f_learned: float) -> float:
+def nearest_permitted(guard: Any, memory: Any, f_learned: float) -> float:
     """Return the permitted f_L next to ``f_learned``, after ``limit``."""
     return f_learned
 
@@ -664,7 +665,7 @@ def _limit(
         sample.target = f_shown
         clear_carry(memory, TARGET)
         withdraw_authority(memory)
-        return confine(guard, memory, f_shown), 0.0, not finite
+        return nearest_permitted(guard, memory, f_shown), 0.0, not finite
     before, sample.output = sample.output, output
     if sample.share < 0.0:
         before, sample.share = output, -sample.share
@@ -689,10 +690,10 @@ def _limit(
         sample.reason = _OUT_OF_BOUNDS if authority > 0.0 else sample.reason
     elif guard.least_slope <= sample.share * slope <= guard.largest_slope:
         return base + sample.share * constant, sample.share * slope, False
-    return confine(guard, memory, sample.target), 0.0, False
+    return nearest_permitted(guard, memory, sample.target), 0.0, False
 
 
-@confine.register(GuardDesign)
+@nearest_permitted.register(GuardDesign)
 def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float:
     least, largest = bounds_of(guard, memory, removed_share(guard, memory))
     shown = memory.shown[F_L]

@@ -6,7 +6,7 @@ A learner is an immutable description (``Kalman(...)``). ``design(observer, omeg
 parameters (a NamedTuple), and ``memory(parameters)`` its whole state (a NamedTuple of arrays). The
 functions below are registered for the type of the parameters. In each sample the controller calls
 
-1. ``adapt`` with the newest estimates of the observer, then ``trouble``;
+1. ``adapt`` with the newest estimates of the observer, then ``learner_flags``;
 2. ``predict`` for the feedforward ``f_L = constant + slope · u``, which is affine in u so that a
    learner with u among its features is compensated exactly, not one sample late;
 3. ``commit`` with the u that was applied.
@@ -173,7 +173,7 @@ def coefficients(learner: Any, memory: Any, theta: Vector) -> None:
 
 
 @generic_with_default
-def trouble(learner: Any, memory: Any) -> int:
+def learner_flags(learner: Any, memory: Any) -> int:
     """Return the learner's ``Status`` flags for this sample; by default none."""
     return 0
 

@@ -41,10 +41,10 @@ from quell.learners.base import (
     coefficients,
     commit,
     forget,
+    learner_flags,
     no_coefficients,
     predict,
     restart,
-    trouble,
     write_features,
 )
 from quell.learners.online import Online, OnlineDesign, OnlineMemory, has_pairs, infer, learn
@@ -451,7 +451,7 @@ def _forget(learner: PythonDesign, memory: PythonMemory) -> None:
     )
 
 
-@trouble.register(PythonDesign)
+@learner_flags.register(PythonDesign)
 def _trouble(learner: PythonDesign, memory: PythonMemory) -> int:
     return int(memory.answer[STATUS])
 
