@@ -13,7 +13,7 @@ Norms of sampled systems: the peak-to-peak gain, and the sum of the squared impu
 impulse response, ``Γ = |D| + Σ |h_k|`` with ``h_k = C A^k B`` (Dahleh & Pearson, *IEEE Trans.
 Automatic Control* 32, 1987): the input ``sign(h_{K−k})`` attains it in the limit. The first m terms
 are added. The others are bounded: with ``M = A^m`` and ``‖M‖ = μ < 1``, and m split into ``m = J
-b``, h is made of the rows ``R_j = C A^(jb)`` and the columns ``X_i = A^i B``, so that
+b``, h is made of the rows ``R_j = C A^(jb)`` and the columns ``X_i = A^i B``, so that::
 
     Σ_{k ≥ m} |h_k| = Σ_{l ≥ 1} Σ_{j, i} |R_j M^l X_i| ≤ μ/(1 − μ) · Σ_j ‖R_j‖ · Σ_i ‖X_i‖
 
