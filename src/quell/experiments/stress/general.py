@@ -22,9 +22,9 @@ The whole trial in general loops: random runs and named cases, beside MF-ESO.
 The trial in general loops: hostile and honest learners, each beside MF-ESO on the same seed.
 
 Errors are those of y against the response that the loop is designed for. A run's ratios are its
-measures (``measures``) over those of MF-ESO. A run is *lost* if it diverges, or leaves
-``|y|`` = 100, where MF-ESO does not. Bars hold for loops whose modulus margin is at least ``HEALTHY``. With limits
-of u the margin of the linear part says little: a loop in which MF-ESO itself hardly holds is
+measures (``measures``) over those of MF-ESO. A run is *lost* if it diverges, or leaves ``|y|`` =
+100, where MF-ESO does not. Bars hold for loops whose modulus margin is at least ``HEALTHY``. With
+limits of u the margin of the linear part says little: a loop in which MF-ESO itself hardly holds is
 *fragile*, and does not count: with limits that are 20 % lower it is lost, or has measures 1.5 times
 as large.
 
