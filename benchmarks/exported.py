@@ -28,7 +28,8 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -252,12 +253,8 @@ def bits(options: argparse.Namespace, console: Console) -> None:
         if options.only not in name:
             continue
         for precision in ("double", "single"):
-            cells = known.get((name, precision))
-            if cells is None:
-                cells = row_of(name, controller, precision, options)
-                if options.results:
-                    with options.results.open("a", encoding="utf-8") as file:
-                        print(json.dumps(cells), file=file)
+            make = partial(row_of, name, controller, precision, options)
+            cells = ready_row(known, (name, precision), make, options.results)
             wrong += cells[2] != "refused" and cells[3:5] != ["0", "0"]
             console.print(" | ".join(cells), highlight=False)
             table.add_row(*cells)
@@ -283,6 +280,47 @@ def earlier_rows(file: Path | None) -> dict[tuple[str, str], list[str]]:
         return {}
     rows = map(json.loads, file.read_text(encoding="utf-8").splitlines())
     return {(row[0], row[1]): row for row in rows}
+
+
+def ready_row(
+    known: Mapping[tuple[str, str], list[str]],
+    key: tuple[str, str],
+    make: Callable[[], list[str]],
+    results: Path | None,
+) -> list[str]:
+    """Return a row that is known, or make it and add it to the file of rows."""
+    if key in known:
+        return known[key]
+    cells = make()
+    if results:
+        with results.open("a", encoding="utf-8") as file:
+            print(json.dumps(cells), file=file)
+    return cells
+
+
+def chosen_rows(text: str, part: str, precision: str | None = None) -> list[tuple[str, Any, str]]:
+    """Return controllers whose name has a text, in one precision or both; ``part`` is I/N."""
+    precisions = [precision] if precision else ["double", "single"]
+    rows = [(name, each, kind) for name, each in cases() for kind in precisions if text in name]
+    first, step = map(int, part.split("/"))
+    return rows[first - 1 :: step]
+
+
+def shown_rows(
+    rows: Iterable[tuple[str, Any, str]],
+    heads: Sequence[str],
+    make: Callable[[str, Any, str], list[str]],
+    results: Path | None,
+) -> list[list[str]]:
+    """Make a row for each controller, print it when it is ready, and all of them as a table."""
+    console, table, known, done = Console(width=160), Table(*heads), earlier_rows(results), []
+    for name, controller, precision in rows:
+        work = partial(make, name, controller, precision)
+        done.append(ready_row(known, (name, precision), work, results))
+        console.print(" | ".join(done[-1]), highlight=False)
+        table.add_row(*done[-1])
+    console.print(table)
+    return done
 
 
 def speed(console: Console) -> None:

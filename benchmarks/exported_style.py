@@ -88,22 +88,19 @@ def unexplained(found: Counter[str]) -> list[str]:
 
 def main() -> None:
     """Read the rows and print a table of rules."""
-    from exported import cases
+    from exported import chosen_rows
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rows", default="", help="controllers whose name has this text")
     parser.add_argument("--part", default="1/1", help="I/N: each N-th row from the I-th on")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    first, step = map(int, options.part.split("/"))
-    rows = [(name, each, single) for name, each in cases() for single in (False, True)
-            if options.rows in name]  # fmt: skip
     places: Counter[str] = Counter()
     having: Counter[str] = Counter()
     count, bad = 0, False
-    for name, controller, single in rows[first - 1 :: step]:
+    for name, controller, precision in chosen_rows(options.rows, options.part):
         try:
-            _, source = exported_source(controller, single)
+            _, source = exported_source(controller, precision == "single")
         except ValueError:  # a model in Python
             continue
         found = style_of(source)

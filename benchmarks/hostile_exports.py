@@ -19,18 +19,15 @@ added when it is ready, and whose rows are not run again; ``--part I/N`` takes e
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import subprocess
 import sys
 import tempfile
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.table import Table
 
 import quell as ql
 from quell.controllers import in_single_precision
@@ -369,7 +366,7 @@ def is_good(cells: list[str]) -> bool:
 
 def main() -> None:
     """Run the rows and print a table."""
-    from exported import cases, earlier_rows
+    from exported import chosen_rows, shown_rows
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--calls", type=float, default=1e7, help="calls of each row")
@@ -381,24 +378,10 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    console = Console(width=160)
-    table, known, bad = Table(*HEADS), earlier_rows(options.results), 0
-    precisions = [options.precision] if options.precision else ["double", "single"]
-    first, step = map(int, options.part.split("/"))
-    rows = [(name, each, precision) for name, each in cases() for precision in precisions
-            if options.rows in name]  # fmt: skip
-    for name, controller, precision in rows[first - 1 :: step]:
-        cells = known.get((name, precision))
-        if cells is None:
-            cells = row_of(name, controller, precision, options)
-            if options.results:
-                with options.results.open("a", encoding="utf-8") as file:
-                    print(json.dumps(cells), file=file)
-        bad += not is_good(cells)
-        console.print(" | ".join(cells), highlight=False)
-        table.add_row(*cells)
-    console.print(table)
-    console.print(f"{bad} rows have a report or a bad u" if bad else "no report, no bad u")
+    rows = chosen_rows(options.rows, options.part, options.precision)
+    done = shown_rows(rows, HEADS, partial(row_of, options=options), options.results)
+    bad = sum(not is_good(cells) for cells in done)
+    print(f"{bad} rows have a report or a bad u" if bad else "no report, no bad u")
     sys.exit(1 if bad else 0)
 
 

@@ -12,16 +12,13 @@ row from the I-th on.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import warnings
 from pathlib import Path
 from typing import Any
 
-from exported import cases, earlier_rows
-from rich.console import Console
-from rich.table import Table
+from exported import chosen_rows, shown_rows
 
 import quell as ql
 from quell.export import TranslationError
@@ -62,23 +59,9 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    console = Console(width=160)
-    table, known, bad = Table(*HEADS), earlier_rows(options.results), 0
-    precisions = [options.precision] if options.precision else ["double", "single"]
-    first, step = map(int, options.part.split("/"))
-    rows = [(name, each, precision) for name, each in cases() for precision in precisions
-            if options.only in name]  # fmt: skip
-    for name, controller, precision in rows[first - 1 :: step]:
-        cells = known.get((name, precision))
-        if cells is None:
-            cells = row_of(name, controller, precision)
-            if options.results:
-                with options.results.open("a", encoding="utf-8") as file:
-                    print(json.dumps(cells), file=file)
-        bad += cells[2] not in ("yes", "refused") and name not in OPEN
-        console.print(" | ".join(cells), highlight=False)
-        table.add_row(*cells)
-    console.print(table)
+    rows = chosen_rows(options.only, options.part, options.precision)
+    done = shown_rows(rows, HEADS, row_of, options.results)
+    bad = any(cells[2] not in ("yes", "refused") and cells[0] not in OPEN for cells in done)
     sys.exit(1 if bad else 0)
 
 
