@@ -20,7 +20,6 @@ from quell.cli.app import app
 from quell.cli.reproduce import _print_cases
 from quell.experiments import acc
 from quell.experiments.acc import DT, CaseResult, designs, interval, judge, study, unstable
-from quell.experiments.acc import study as box
 from quell.experiments.acc.loops import BOX, MB, MF, boxed, freed, generated
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
@@ -301,11 +300,11 @@ def test_a_box_is_filled_evenly_by_masses_and_stiffness() -> None:
 
 def test_the_search_for_the_box_begins_at_mf_eso_and_may_reach_its_result() -> None:
     """The structure's start has the same gains; the result is within the poles' and the noise's bounds."""
-    made, ours = box.build(), designs()[MF]
-    start = made(box.start(made))
+    made, ours = study.build(), designs()[MF]
+    start = made(study.start(made))
     np.testing.assert_allclose(start.parameters.law, ours.parameters.law, rtol=1e-9)
     np.testing.assert_allclose(start.parameters.eso.gain, ours.parameters.eso.gain, rtol=1e-9)
-    tuned, noise = freed(), box.TooMuchNoise()
+    tuned, noise = freed(), study.TooMuchNoise()
     loop = analyse(two_mass_spring(), tuned)
     assert noise(ours) == pytest.approx(-math.log(10.0))
     assert -0.1 < noise(tuned) < 0.0
@@ -319,7 +318,7 @@ def test_the_score_of_the_search_counts_failures_and_ranks_by_late_motion() -> N
     """A plant that fails scores about 1, another about 0, and more where it moves more late; ``.ci/run`` has 60 plants."""
     samples = boxed(6, 9)[1::2]
     judged = acc.judge_sampled(designs()[MF], samples, cubic=True, workers=1)
-    (scores,) = box.scores(designs()[MF], list(samples))
+    (scores,) = study.scores(designs()[MF], list(samples))
     assert np.array_equal(np.round(scores), judged.fails)
     assert set(judged.fails) == {False, True}
     settled = ~judged.fails

@@ -14,10 +14,6 @@ import pytest
 import quell as ql
 from quell.analysis import analyse
 from quell.experiments.stress import axes
-from quell.experiments.stress import axes as arm
-from quell.experiments.stress import axes as loops
-from quell.experiments.stress import axes as near_rest
-from quell.experiments.stress import axes as trial
 from quell.experiments.stress.axes import AxesResult, AxisErrors, AxisOutcome, RestOutcome, Settling
 from quell.plants.base import advance
 from tests.commands import Shown
@@ -27,7 +23,7 @@ from tests.commands import Shown
 def test_axes_are_drawn_within_their_ranges(structure: str, rng: np.random.Generator) -> None:
     """Each has the margin that it states, the model that its structure asks for, and the same loop again for the same seed."""
     axis = axes.draw_axis(rng, structure)
-    found = analyse(axis.linear, axis.controller(), delay=loops.DT)
+    found = analyse(axis.linear, axis.controller(), delay=axes.DT)
     assert found.stable
     assert found.margins.modulus == pytest.approx(axis.margin)
     assert axis.margin >= 0.45
@@ -47,13 +43,13 @@ def test_axes_are_drawn_within_their_ranges(structure: str, rng: np.random.Gener
 
 def test_a_trial_is_paired_and_plain_data(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short runs: without learner in both loops the ratios are one to the bit; results are for ``json.dump``."""
-    monkeypatch.setattr(loops, "_RUN_LAGS", 4.0)
-    monkeypatch.setattr(loops, "_PERIODS", 0.1)
-    monkeypatch.setattr(trial, "DRAWS", 2)
-    monkeypatch.setattr(arm, "_DURATION", 0.2)
-    monkeypatch.setattr(arm, "_JUDGED_AT", 0.1)
-    monkeypatch.setattr(near_rest, "settle", lambda learner, guard, draws: Settling(16.6, 0.004))
-    monkeypatch.setattr(trial, "HONEST", {"none": None, "Kalman": ql.learners.Kalman()})
+    monkeypatch.setattr(axes, "_RUN_LAGS", 4.0)
+    monkeypatch.setattr(axes, "_PERIODS", 0.1)
+    monkeypatch.setattr(axes, "DRAWS", 2)
+    monkeypatch.setattr(axes, "_DURATION", 0.2)
+    monkeypatch.setattr(axes, "_JUDGED_AT", 0.1)
+    monkeypatch.setattr(axes, "settle", lambda learner, guard, draws: Settling(16.6, 0.004))
+    monkeypatch.setattr(axes, "HONEST", {"none": None, "Kalman": ql.learners.Kalman()})
     result = axes.run(2, 3, guard=None)
     assert [outcome.learner for outcome in result.outcomes] == ["none", "Kalman"]
     assert result.outcomes[0].unguarded == AxisErrors(1.0, 1.0)
@@ -102,11 +98,11 @@ def test_an_arm_and_a_step_near_rest_have_bars_of_their_own() -> None:
     assert far.figure == pytest.approx(0.0005)
 
 
-@pytest.mark.parametrize("too_small", arm.LEAST_MARGIN)
+@pytest.mark.parametrize("too_small", axes.LEAST_MARGIN)
 def test_arms_are_drawn_within_their_ranges(too_small: float, rng: np.random.Generator) -> None:
     """Each loop of an eigenvalue over the motion is stable with the margin that the arm states; b0 is the gain of each joint alone."""
-    drawn = arm.draw_arm(rng, too_small)
-    assert drawn.margin >= arm.LEAST_MARGIN[too_small]
+    drawn = axes.draw_arm(rng, too_small)
+    assert drawn.margin >= axes.LEAST_MARGIN[too_small]
     gains = drawn.gains()
     one, _ = drawn.controllers(None, None)
     for gain in (gains.min(), float(np.median(gains)), gains.max()):
@@ -114,13 +110,13 @@ def test_arms_are_drawn_within_their_ranges(too_small: float, rng: np.random.Gen
         assert analyse(plant, one).margins.modulus >= drawn.margin - 1e-3
     alone = np.linalg.inv(drawn.inertia(drawn.elbow))
     np.testing.assert_allclose(too_small * drawn.b0, np.diag(alone))
-    again = (arm.draw_arm(np.random.default_rng(5), too_small) for _ in range(2))
+    again = (axes.draw_arm(np.random.default_rng(5), too_small) for _ in range(2))
     assert len({each.describe() for each in again}) == 1
 
 
 def test_the_arm_moves_as_two_rods_do() -> None:
     """Free under gravity its energy stays the same, where that is the sum over points of the rods, of which the equations know nothing."""
-    drawn = replace(arm.draw_arm(np.random.default_rng(2)), gravity=9.81)
+    drawn = replace(axes.draw_arm(np.random.default_rng(2)), gravity=9.81)
     points = (np.arange(2000) + 0.5) / 2000.0
 
     def energy(x: np.ndarray) -> float:
@@ -138,7 +134,7 @@ def test_the_arm_moves_as_two_rods_do() -> None:
         return total
 
     x, scratch, torque = np.array([0.4, 1.1, 0.5, -2.0]), np.zeros(24), np.zeros(1)
-    plant, first = drawn.plant.sampled(arm.ARM_DT, True), energy(x)
+    plant, first = drawn.plant.sampled(axes.ARM_DT, True), energy(x)
     start = x.copy()
     for _ in range(500):
         advance(plant, x, scratch, 0.0, 0.0, torque)
@@ -149,9 +145,9 @@ def test_the_arm_moves_as_two_rods_do() -> None:
 @pytest.mark.compiled
 def test_a_step_of_the_paper_settles_as_published() -> None:
     """Without learner after 16.6 s with 4.5 ‰ of overshoot (docs/theory); the learner of the trial settles sooner."""
-    plain = near_rest.settle(None, None, range(2))
+    plain = axes.settle(None, None, range(2))
     assert plain == pytest.approx((16.61, 0.0045), rel=0.02)
-    found = near_rest.run_near_rest(3, 1, None)
+    found = axes.run_near_rest(3, 1, None)
     assert found.guarded == found.unguarded
     assert found.unguarded.time < 0.8 * plain.time
     assert (found.longer, found.further) == (1.0, pytest.approx(0.0, abs=1e-3))

@@ -209,15 +209,14 @@ def compare(
         _compare_setup(setup.stem, given, controllers, (m_s, m_t, m_ks), load_at, outputs)
         return
     _only_for(setup=True, m_s=m_s, m_t=m_t, m_ks=m_ks, load_at=load_at)
-    from quell.experiments import compare as benchmark
-    from quell.experiments import compare as figures
-    from quell.experiments.compare import STRUCTURES, sensitivities
+    from quell.experiments import compare as experiment
+    from quell.experiments.compare import STRUCTURES
     from quell.plants import two_mass_spring
 
-    settings = benchmark.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
-    names = _names(controllers, (*benchmark.NAMES, *STRUCTURES))
+    settings = experiment.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
+    names = _names(controllers, (*experiment.NAMES, *STRUCTURES))
     fixed = [name for name in names if name not in STRUCTURES]
-    designs = {name: benchmark.controller(name, dt, u_max) for name in fixed}
+    designs = {name: experiment.controller(name, dt, u_max) for name in fixed}
     outputs = check_outputs(outputs, ["compare"])
     console = Console()
     to_tune = [name for name in names if name in STRUCTURES]
@@ -225,12 +224,12 @@ def compare(
     bounds = None
     with progress_bar(console, COMPILING) as report:
         if to_tune:
-            entries, bounds = benchmark.tuned_controllers(to_tune, dt, u_max, report)
+            entries, bounds = experiment.tuned_controllers(to_tune, dt, u_max, report)
         more = {name: e.controller for name, e in entries.items() if e.controller is not None}
-        result = benchmark.two_mass(settings, fixed, partial(report, COMPILING), more)
+        result = experiment.two_mass(settings, fixed, partial(report, COMPILING), more)
     designs |= more
     plant = two_mass_spring(m1, m2, k)
-    gains = {name: sensitivities(plant, design) for name, design in designs.items()}
+    gains = {name: experiment.sensitivities(plant, design) for name, design in designs.items()}
     stable = {name: _is_stable(design, plant) for name, design in designs.items()}
     proofs = {name: _certificate(d, settings) for name, d in designs.items() if _is_guarded(d)}
     title = f"Designed for m1 = m2 = k = 1, run on {m1:g}, {m2:g}, {k:g}"
@@ -239,7 +238,7 @@ def compare(
     print_gains(console, gains, entries, bounds)
     for name, proof in proofs.items():
         console.print(f"{name}: {proof}", soft_wrap=True, highlight=False)
-    paths = figures.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
+    paths = experiment.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
     about = {"m1": m1, "m2": m2, "k": k, "dt": dt, "seed": seed}
     limit = {} if u_max == inf else {"u_max": u_max}
     results = as_json(result, stable, gains, entries, bounds)
@@ -259,8 +258,7 @@ def _compare_setup(
     outputs: Outputs,
 ) -> None:
     from quell.experiments import compare as experiment
-    from quell.experiments import compare as figures
-    from quell.experiments.compare import STRUCTURES, of_setup
+    from quell.experiments.compare import STRUCTURES
     from quell.setup import SetupError
 
     names = _names(controllers, ("setup", *STRUCTURES))
@@ -272,7 +270,7 @@ def _compare_setup(
     console = Console()
     with progress_bar(console, COMPILING) as report:
         try:
-            run = of_setup(given, names, limits, load_at, report)
+            run = experiment.of_setup(given, names, limits, load_at, report)
         except ValueError as error:
             if isinstance(error, SetupError):
                 raise
@@ -292,7 +290,7 @@ def _compare_setup(
     paths = []
     if outputs.figures:
         name = f"{stem}-compare"
-        paths = figures.save(run.result, outputs.figures, outputs.overwrite, name)
+        paths = experiment.save(run.result, outputs.figures, outputs.overwrite, name)
     results = as_json(run.result, stable, gains, run.entries, run.constraints)
     about = {"setup": given.as_json(), "load_at": run.load_at, "notes": list(run.notes)}
     write_results(console, {**about, **results}, outputs, paths)

@@ -86,27 +86,24 @@ def two_mass(
         With more than 1: means and 95 % intervals over so many seeds, from --seed on, under forces
         of three frequencies. 10 seeds take about half a minute, and more to compile once.
     """
-    from quell.experiments import two_mass_spring as figures
-    from quell.experiments import two_mass_spring as setup
     from quell.experiments import two_mass_spring as study
-    from quell.experiments.two_mass_spring import all_controllers
     from quell.plants import two_mass_spring
 
-    settings = setup.Settings(dt=dt, seed=seed, omega_o=omega_o, reset=reset, seeds=seeds)
+    settings = study.Settings(dt=dt, seed=seed, omega_o=omega_o, reset=reset, seeds=seeds)
     try:
-        controllers = setup.controllers(settings)
+        controllers = study.controllers(settings)
         if seeds > 1:
-            controllers = all_controllers(settings)
+            controllers = study.all_controllers(settings)
     except ValueError as error:
         raise ValueError(f"{error} (the study goes up to 3 times omega_o)") from None
-    outputs = check_outputs(outputs, figures.FIGURE_NAMES)
+    outputs = check_outputs(outputs, study.FIGURE_NAMES)
     console = Console()
     compile_loops(console, [(two_mass_spring(), each) for each in controllers.values()])
     with progress_bar(console, width=15) as report:
         result = study.run(settings, report)
         paths = []
         if outputs.figures:
-            paths = figures.save(result, outputs.figures, report, outputs.overwrite)
+            paths = study.save(result, outputs.figures, report, outputs.overwrite)
     _print_claims(console, result)
     _print_scores(console, result)
     if result.ranges is not None:
@@ -199,22 +196,20 @@ def torsional(*, dt: float = 1e-3, seed: Whole = 0, outputs: Outputs = OUTPUTS) 
     seed
         Seed of the positions between two edges of the encoder in which the runs start.
     """
-    from quell.experiments import torsional as figures
-    from quell.experiments import torsional as setup
     from quell.experiments import torsional as study
 
-    settings = setup.Settings(dt=dt, seed=seed)
-    outputs = check_outputs(outputs, figures.FIGURE_NAMES)
+    settings = study.Settings(dt=dt, seed=seed)
+    outputs = check_outputs(outputs, study.FIGURE_NAMES)
     console = Console()
-    controllers = setup.controllers(settings, *setup.CASES[0]).values()
-    plants = [setup.plant(kind) for kind in setup.PLANTS]
+    controllers = study.controllers(settings, *study.CASES[0]).values()
+    plants = [study.plant(kind) for kind in study.PLANTS]
     compile_loops(console, list(product(plants, controllers)))
     with progress_bar(console, width=15) as report:
         result = study.run(settings, report)
         paths = []
         if outputs.figures:
-            paths = figures.save(result, outputs.figures, report, outputs.overwrite)
-    about = f"dt = {dt:g} s, medians of {setup.STARTS} starts, seed {seed}"
+            paths = study.save(result, outputs.figures, report, outputs.overwrite)
+    about = f"dt = {dt:g} s, medians of {study.STARTS} starts, seed {seed}"
     for case in result.cases:
         _print_scores_torsional(console, case, about)
     console.print(
@@ -290,7 +285,6 @@ def acc(
     """
     from quell.experiments.acc import loops as plant_samples
     from quell.experiments.acc import study
-    from quell.experiments.acc import study as figures
     from quell.experiments.acc.loops import DT, designs
 
     if box and not (samples is None and spread is None):
@@ -309,7 +303,7 @@ def acc(
         raise ValueError(f"--samples reads plants, {others}: give one or the other")
     else:
         plants, source = plant_samples.read(samples, max_size), samples.name
-    outputs = check_outputs(outputs, figures.NAMES)
+    outputs = check_outputs(outputs, study.NAMES)
     console = Console()
     first = [plant_samples.plant(plants[0], cubic) for cubic in (False, True)]
     compile_loops(console, list(product(first, designs(DT).values())))
@@ -317,7 +311,7 @@ def acc(
         result = study.run(plants, source, report)
         paths = []
         if outputs.figures:
-            paths = figures.save(result, outputs.figures, report, outputs.overwrite)
+            paths = study.save(result, outputs.figures, report, outputs.overwrite)
     _print_rates(console, result, DT)
     _print_cases(console, result)
     write_results(console, result.to_json(), outputs, paths)

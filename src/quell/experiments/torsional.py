@@ -317,7 +317,7 @@ def save(
 
 
 def draw(result: Result, name: str, ax: Any = None) -> Any:
-    """Draw one of the figures ``NAMES`` and return its axes.
+    """Draw one of the figures ``FIGURE_NAMES`` and return its axes.
 
     Parameters
     ----------

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from scipy.special import stdtrit
 
 from quell import checks
 from quell.analysis.loop import analyse
@@ -301,11 +300,11 @@ def range_of(values: Iterable[float | None]) -> Range:
     given = np.array([value for value in every if value is not None])
     if given.size < len(every) or given.size == 0:
         return Range(None, None, len(every) - given.size)
-    half = None
-    if given.size > 1:
-        deviation = float(np.std(given, ddof=1))
-        half = float(stdtrit(given.size - 1, 0.975)) * deviation / math.sqrt(given.size)
-    return Range(float(np.mean(given)), half, 0)
+    if given.size == 1:
+        return Range(float(given[0]), None, 0)
+    from quell.tuning.simulated.problem import half_width_of_mean
+
+    return Range(float(np.mean(given)), half_width_of_mean(given), 0)
 
 
 def ranges_to_json(found: Ranges, settings: Settings) -> dict[str, Any]:
@@ -537,7 +536,7 @@ def save(
 
 
 def draw(result: Result, name: str, ax: Any = None) -> Any:
-    """Draw one of the figures ``NAMES`` and return its axes.
+    """Draw one of the figures ``FIGURE_NAMES`` and return its axes.
 
     Parameters
     ----------

@@ -380,19 +380,6 @@ def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Mat
     return sampled[:n, :n].copy(), [sampled[:n, part].copy() for part in parts]
 
 
-def zero_order_holds(A: Stack, B: Stack, dt: float) -> tuple[Stack, Stack]:
-    """Return Φ and Γ of many models with the same sizes, by the same method."""
-    from scipy.linalg import expm
-
-    models, n, _ = A.shape
-    size = n + B.shape[2]
-    block = np.zeros((models, size, size))
-    block[:, :n, :n], block[:, :n, n:] = A, B
-    with one_blas_thread():
-        sampled = np.asarray(expm(block * dt))
-    return sampled[:, :n, :n], sampled[:, :n, n:]
-
-
 @lru_cache(maxsize=64)
 def _exponential(size: int, block: bytes) -> Matrix:
     """Return exp of a matrix; kept, because a plant is sampled again for each of its runs."""

@@ -125,6 +125,14 @@ class Statistic(Protocol):
         ...
 
 
+def half_width_of_mean(scores: Vector) -> float:
+    """Return t s/√n, half of the 95 % interval of the mean of two scores or more (samples,)."""
+    from scipy.special import stdtrit
+
+    quantile = float(stdtrit(scores.size - 1, 0.5 + 0.5 * _CONFIDENCE))
+    return quantile * float(np.std(scores, ddof=1)) / math.sqrt(scores.size)
+
+
 @dataclass(frozen=True)
 class Mean:
     """The mean; its interval is that of the central limit theorem."""
@@ -135,13 +143,11 @@ class Mean:
 
     def interval(self, scores: Vector) -> tuple[float, float]:
         """Return mean ± t s/√n; infinite with one sample."""
-        from scipy.stats import t
-
         scores = _numbers(scores)
-        n, middle = scores.size, self.value(scores)
-        if n < 2 or not math.isfinite(middle):
+        middle = self.value(scores)
+        if scores.size < 2 or not math.isfinite(middle):
             return -math.inf, math.inf
-        half = float(t.ppf(0.5 + 0.5 * _CONFIDENCE, n - 1) * np.std(scores, ddof=1) / math.sqrt(n))
+        half = half_width_of_mean(scores)
         return middle - half, middle + half
 
 
