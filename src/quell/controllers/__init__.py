@@ -13,6 +13,7 @@ from quell.controllers.adrc import (
     warn_if_unwise,
 )
 from quell.controllers.base import Controller, omega_c_for
+from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
 from quell.controllers.law import NonlinearFeedback
@@ -28,6 +29,7 @@ from quell.controllers.single import in_single_precision
 
 __all__ = [
     "ADRC",
+    "Compensated",
     "Compensator",
     "Controller",
     "DeadTimeTuning",
