@@ -69,7 +69,12 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import NO_LIMITS, Controller, control
-from quell.controllers.compensated import Compensated, CompensatedDesign, CompensatedState
+from quell.controllers.compensated import (
+    Compensated,
+    CompensatedDesign,
+    CompensatedState,
+    compensating_part,
+)
 from quell.controllers.compensator import Compensator
 from quell.controllers.law import AdrcState, without_forces
 from quell.controllers.linear import LinearLaw
@@ -152,10 +157,10 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
         so the learner's features must be states, u, a constant and sinusoids. Freeze any other
         learner at the end of a run that ends at that time.
     """
-    if isinstance(controller, Compensated):
-        controller = controller.compensator
-    if not isinstance(controller, Compensator):
+    part = compensating_part(controller)
+    if part is None:
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a compensator")
+    controller = part
     if run is None:
         return _from_state(controller, controller._state)
     if isinstance(run, AdrcState | CompensatedState):
@@ -387,9 +392,9 @@ def adapting(controller: Controller, run: Any = None, t: float | None = None) ->
         controller's own.
     """
     known = frozen(controller, run, t)
-    if isinstance(controller, Compensated):
-        controller = controller.compensator
-    assert isinstance(controller, Compensator)
+    part = compensating_part(controller)
+    assert part is not None
+    controller = part
     design = controller.parameters.learner
     state = controller._state if run is None else getattr(run, "final_state", run)
     memory = (controller.initial_state() if state is None else _learning_state(state)).learner

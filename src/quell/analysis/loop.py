@@ -34,8 +34,7 @@ from quell.analysis.margins import (
 from quell.checks import import_extra
 from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller
-from quell.controllers.compensated import Compensated
-from quell.controllers.compensator import Compensator
+from quell.controllers.compensated import compensating_part
 from quell.controllers.linear import LinearLaw
 from quell.controllers.prefilters import without_prefilters
 from quell.learners.base import NoLearner
@@ -214,8 +213,8 @@ def analyse(
         how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
         certificate = partial(certify, plant, controller, operating_point=operating_point, **how)
     law, note = linear_law(controller, at), ""
-    part = controller.compensator if isinstance(controller, Compensated) else controller
-    if isinstance(part, Compensator) and not isinstance(at, Frozen):
+    part = compensating_part(controller)
+    if part is not None and not isinstance(at, Frozen):
         design = part.parameters.learner
         if not is_known(design):
             name = type(part.learner).__name__

@@ -73,7 +73,7 @@ from quell.guard import Guard
 from quell.learners.base import Learner
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
-from quell.types import Channels, DesignWarning, warn
+from quell.types import Channels, DesignWarning, Vector, warn
 
 # ---- Design rules for the sample time and a known delay, judged from the design alone ----
 
@@ -270,6 +270,12 @@ class ADRC(Compensator):
             feedforward=feedforward_design(self.feedforward, observer),
             fade=math.exp(-omega_c * observer.dt),
         )
+
+    @property
+    def gains(self) -> Vector:
+        """Gains k (n,) of the law."""
+        law: Vector = self.parameters.law
+        return law
 
     @property
     def derivatives(self) -> int:

@@ -9,6 +9,8 @@ Limits are those of the sum. What they take is taken from u_0: the controller is
 applied ``u_0 + u − u_unlimited``, so that its integrator does not wind up, whichever of the two
 parts asked for too much. In manual operation, too.
 
+Where a measurement is missing, both receive the one that the observer expects.
+
 With an integrator in C the loop has two, one in C and one in the observer, which share a constant
 load: the observer takes it within its lag, and the integrator of C comes to rest where it would be
 without load.
@@ -32,6 +34,7 @@ from quell.controllers.base import (
     bumpless_transfer,
     check_controller,
     control,
+    is_usable,
     reset_loop,
     set_applied_control,
     set_reference_derivatives,
@@ -44,6 +47,7 @@ from quell.controllers.prefilters import Wrapper, without_prefilters
 from quell.controllers.stateful import StatefulController
 from quell.kernels.sized import Scalars, clear
 from quell.observers.eso import ESO
+from quell.observers.forms import expected_measurement
 from quell.types import Channels, Status, Vector
 
 _CUT = int(Status.SATURATED | Status.RATE_LIMITED)
@@ -73,7 +77,12 @@ class CompensatedState(NamedTuple):
 @control.register(CompensatedDesign)
 def _control(design: CompensatedDesign, state: CompensatedState, r: float, y: float) -> float:
     loop, inner = state.loop[0], state.compensator.loop[0]
-    given = control(design.controller, state.controller, r, y)
+    measured = y
+    if not is_usable(y) and inner.started != 0.0:
+        known = inner.f_learned + inner.f_known
+        eso, z = design.compensator.eso, state.compensator.z
+        measured = expected_measurement(eso, z, inner.u, known)
+    given = control(design.controller, state.controller, r, measured)
     u = control(design.compensator, state.compensator, given, y)
     loop.u_given = given
     if int(inner.status) & _CUT != 0 or inner.manual != 0.0:
@@ -125,6 +134,17 @@ def _bumpless_transfer(design: CompensatedDesign, state: CompensatedState) -> No
     bumpless_transfer(design.compensator, state.compensator)
 
 
+def compensating_part(controller: Any) -> Compensator | None:
+    """Return the part of a controller with the observer: itself, or its compensator; else None."""
+    part = controller.compensator if isinstance(controller, Compensated) else controller
+    return part if isinstance(part, Compensator) else None
+
+
+def takes_control(controller: Any) -> bool:
+    """Return whether the reference of a controller is u_0: whether it is a compensator alone."""
+    return isinstance(controller, Compensator) and not isinstance(controller, ADRC)
+
+
 class Compensated(Wrapper):
     """A controller with a compensator on top: ``u = u_0 − (f_L + Δf̂)/b0``.
 
@@ -173,7 +193,7 @@ class Compensated(Wrapper):
                 "a controller without observer such as quell.baselines.PID, and give a learner or "
                 "a guard of an ADRC to itself"
             )
-        if not isinstance(compensator, Compensator) or isinstance(compensator, ADRC):
+        if not takes_control(compensator):
             rule = "must be a quell.Compensator(observer, ...)"
             raise ValueError(f"compensator = {compensator!r}: {rule}")
         if float(controller.dt) != compensator.dt:

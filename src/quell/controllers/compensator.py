@@ -405,16 +405,20 @@ class Compensator(StatefulController):
     def _design(self, observer: ESO) -> AdrcDesign:
         """Return the parameters with an observer: u_0 takes the place of the law."""
         nothing = np.zeros(observer.order)
-        gains = law_gains(observer.degree, self._learner_omega_c)
         return self._with_law(
             observer,
-            padded(gains, observer.order),
+            self.gains,
             law=nothing,
             cancel=nothing,
             feedback=LinearFeedback(),
             feedforward=ControlGiven(observer.b0),
             fade=math.exp(-self._learner_omega_c * observer.dt),
         )
+
+    @property
+    def gains(self) -> Vector:
+        """Gains k (n,) of the loop with which learner and guard reckon: of an ADRC its law's."""
+        return padded(law_gains(self.observer.degree, self.omega_c), self.observer.order)
 
     def _with_law(self, observer: ESO, gains: Vector, **law: Any) -> AdrcDesign:
         """Return the parameters with a law; ``gains`` k (n,) are those of the closed loop."""
