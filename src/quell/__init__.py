@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from quell.controllers.compensator import Compensator, Estimate
     from quell.controllers.feedforward import Feedforward
     from quell.controllers.safe_set import SafeSet
+    from quell.controllers.schedule import Schedule
     from quell.guard import Guard, Reason
     from quell.identification.identify import identify
     from quell.lti.canonical import canonical
@@ -70,6 +71,7 @@ _HOMES = {
     "Guard": "guard",
     "Reason": "guard",
     "SafeSet": "controllers.safe_set",
+    "Schedule": "controllers.schedule",
     "Scenario": "simulation.driver",
     "Status": "types",
     "Trajectory": "records.trajectory",
@@ -90,8 +92,8 @@ _MODULES = (
 
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning", "Estimate",
-    "Feedforward", "Guard", "Reason", "SafeSet", "Scenario", "Status", "Trajectory", "Tuned",
-    "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
+    "Feedforward", "Guard", "Reason", "SafeSet", "Scenario", "Schedule", "Status", "Trajectory",
+    "Tuned", "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
     "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
     "plants", "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
     "tuning",

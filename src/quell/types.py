@@ -43,6 +43,7 @@ class Status(IntFlag):
     CONTROL_HELD = 1024
     SAFE_SET_ACTED = 2048
     UNSAFE = 4096
+    SCHEDULE_HELD = 8192
 
     @property
     def message(self) -> str:
@@ -102,6 +103,10 @@ _MESSAGES = {
     Status.UNSAFE: (
         "The limits of u did not allow what the safe set needs: y or its rate may leave its band; "
         "raise u_max or rate_limit, or lower alpha or omega_c."
+    ),
+    Status.SCHEDULE_HELD: (
+        "A signal of the schedule was not finite or not given; the last good one was used, or the "
+        "gains without a schedule: check its source."
     ),
 }
 _NOTHING = "No step reported a problem."

@@ -70,7 +70,29 @@ CONTROLLERS: dict[str, Any] = {
     "ADRC with a safe set": ql.ADRC(
         ESO, 1.5, safe_set=ql.SafeSet(-0.9, 0.9, -3.0, 3.0, alpha=4.0, f_rate=0.1), **LIMITS
     ),
+    "ADRC with a schedule": ql.ADRC(
+        ESO,
+        1.5,
+        schedule=ql.Schedule(
+            (-0.5, 0.0, 0.7), "reference", (0.7, 1.5, 3.0), (1.0, 1.5, 3.0), (9, 12, 20)
+        ),
+        **LIMITS,
+    ),
+    "Prefiltered ADRC with a schedule over two signals": room.Prefiltered(
+        ql.ADRC(
+            ESO,
+            1.5,
+            schedule=ql.Schedule(
+                ((-0.2, 0.4), (-1.0, 0.0, 1.0)), ("y", "speed"), ((0.7, 1.5, 3.0), (1.0, 1.5, 2.0))
+            ),
+            **LIMITS,
+        ),
+        baseline_room.ZV(3.0),
+    ),
     "Compensator": ql.Compensator(ESO, **LIMITS),
+    "Compensator with a schedule": ql.Compensator(
+        ESO, schedule=ql.Schedule((-0.5, 0.7), "y", (0.7, 2.0), omega_o=(9.0, 20.0)), **LIMITS
+    ),
     "Compensated": room.Compensated(PID, ql.Compensator(ESO, **LIMITS)),
     "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
 }
@@ -137,12 +159,16 @@ def test_a_step_at_a_time_is_the_simulated_run_and_interpreted(name: str) -> Non
 
 
 # Those that are no linear law with limits.
-NOT_LINEAR = {name for name in CONTROLLERS if name.startswith("Prefiltered") or "Han" in name}
+NOT_LINEAR = {
+    name
+    for name in CONTROLLERS
+    if name.startswith("Prefiltered") or "Han" in name or "schedule" in name
+}
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_the_closed_form_of_a_law_is_the_measured_one(name: str) -> None:
-    """The responses of u to pulses of r, y and u agree; what is not linear is refused."""
+    """The responses of u to pulses of r, y and u agree; what is not linear, or changes, is refused."""
     controller = CONTROLLERS[name]
     if name in NOT_LINEAR:
         with pytest.raises(ValueError, match="must be linear"):

@@ -25,6 +25,7 @@ OTHERS: dict[str, Any] = {
     "PlantBatch": ql.plants.batch(ql.plants.two_mass_spring, m1=[1.0, 1.25]),
     "DeadTimeTuning": _DEAD_TIME,
     "SafeSet": ql.SafeSet(y_max=1.5, alpha=4.0),
+    "Schedule": ql.Schedule((0.0, 1.0), b0=(5.0, 0.5)),
     "Feedforward": ql.Feedforward.rigid(2.25, viscous=0.75),
     "LinearLaw": CONTROLLERS["LinearController"].law,
     "NonlinearFeedback": controller_room.NonlinearFeedback((0.75, 1.25), 0.05),

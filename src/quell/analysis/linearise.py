@@ -78,6 +78,7 @@ from quell.controllers.compensated import (
 from quell.controllers.compensator import Compensator
 from quell.controllers.law import AdrcState, without_forces
 from quell.controllers.linear import LinearLaw
+from quell.controllers.schedule import is_scheduled
 from quell.controllers.stateful import named_arrays
 from quell.guard import UnguardedDesign, UnguardedMemory
 from quell.kernels.dispatch import kernel
@@ -545,6 +546,11 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     if not isinstance(controller, Compensator | Compensated):
         raise ValueError(
             f"controller = {controller!r}: must be an ADRC, a compensator or a linear controller"
+        )
+    if is_scheduled(controller):
+        raise ValueError(
+            f"controller = {controller!r}: its gains follow a schedule; take it at fixed signals, "
+            "controller.at(…)"
         )
     learner = at if isinstance(at, Frozen | Adapting) else adapting(controller, at)
     design, state = _linear_part(controller, learner)

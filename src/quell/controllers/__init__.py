@@ -25,6 +25,7 @@ from quell.controllers.prefilters import (
     TrackingDifferentiator,
 )
 from quell.controllers.safe_set import SafeSet
+from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
 
@@ -44,6 +45,7 @@ __all__ = [
     "ProfileGenerator",
     "ReferenceModel",
     "SafeSet",
+    "Schedule",
     "TrackingDifferentiator",
     "adrc_for_dead_time",
     "baselines",

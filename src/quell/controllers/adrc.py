@@ -43,6 +43,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +72,7 @@ from quell.controllers.law import (
     law_gains,
 )
 from quell.controllers.safe_set import SafeSet
+from quell.controllers.schedule import NoSchedule, Schedule
 from quell.guard import Guard
 from quell.learners.base import Learner
 from quell.lti.canonical import format_roots
@@ -210,12 +213,17 @@ class ADRC(Compensator):
         pairs (real, imaginary) for two conjugate ones; as many as the relative degree.
     safe_set
         bands that y and its rate do not leave, whatever r and the learner ask for; none by default.
+    schedule
+        tables of b0, omega_c and omega_o over one or two signals, which the gains follow; none by
+        default. With ``feedforward=True`` r^(m)/b0 follows b0.
 
     Raises
     ------
     ValueError
         for a bandwidth or rate limit that is not positive, limits in the wrong order, an
-        observer of a plant with zeros outside of the left half plane.
+        observer of a plant with zeros outside of the left half plane; for a schedule of b0 or
+        omega_o with a learner, of b0 with a safe set, of b0 with the feedforward of a model, or of
+        omega_c with a nonlinear feedback.
 
     Examples
     --------
@@ -246,8 +254,9 @@ class ADRC(Compensator):
         feedback: NonlinearFeedback | None = None,
         law_poles: Sequence[float | tuple[float, float]] | None = None,
         safe_set: SafeSet | None = None,
+        schedule: Schedule | None = None,
     ) -> None:
-        self._take_parts(observer, learner, guard, safe_set)
+        self._take_parts(observer, learner, guard, safe_set, schedule)
         check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
         self.feedforward = checked_feedforward(feedforward)
@@ -256,15 +265,15 @@ class ADRC(Compensator):
         self.law_poles = law_poles
         self._learner_omega_c = self.omega_c  # the learner keeps its scales when omega_c is retuned
         self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
+        self._check_law_of_schedule()
         self._initialise()
-        warn_if_unwise(observer, self.omega_c)
+        self._warn_of_design()
         self._warn_of_idle_guard()
 
     def _design(self, observer: ESO, omega_c: float | None = None) -> AdrcDesign:
         """Return the parameters with an observer and a bandwidth, by default the present one."""
         omega_c = omega_c or self.omega_c
-        gains = law_gains(observer.degree, omega_c, self.law_poles)
-        law = padded(gains * (0.5 if self.half_gain else 1.0), observer.order)
+        law = padded(self._law(omega_c, observer.degree), observer.order)
         return self._with_law(
             observer,
             law,
@@ -274,6 +283,41 @@ class ADRC(Compensator):
             feedforward=feedforward_design(self.feedforward, observer),
             fade=math.exp(-omega_c * observer.dt),
         )
+
+    def _law(self, omega_c: float, degree: int) -> Vector:
+        """Return the gains of the law (m,) for a bandwidth."""
+        gains = law_gains(degree, omega_c, self.law_poles)
+        return gains * (0.5 if self.half_gain else 1.0)
+
+    def _schedule_design(self, observer: ESO) -> Any:
+        if self.schedule is None:
+            return NoSchedule()
+        law = partial(self._law, degree=observer.degree)
+        return self.schedule.design(observer, self.omega_c, law)
+
+    def _check_law_of_schedule(self) -> None:
+        """Raise a ``ValueError`` for parts of the law that a schedule does not reach."""
+        if self.schedule is None:
+            return
+        if self.schedule.b0 is not None and isinstance(self.feedforward, Feedforward):
+            raise ValueError(
+                "schedule.b0 with the feedforward of a model: the model has one inertia, and the "
+                "table has others; take feedforward = true, which follows b0"
+            )
+        if self.schedule.omega_c is not None and self.feedback is not None:
+            raise ValueError(
+                "schedule.omega_c with feedback: the nonlinear law is made for one omega_c; "
+                "schedule b0 and omega_o, or leave feedback out"
+            )
+
+    def _warn_of_design(self) -> None:
+        """Issue the warnings of the design, with a schedule those at its fastest point."""
+        observer, omega_c = self.observer, self.omega_c
+        if self.schedule is not None:
+            omega_c = float(np.max(self.schedule.omega_c or omega_c))
+            fastest = float(np.max(self.schedule.omega_o or observer.omega_o))
+            observer = replace(observer, omega_o=fastest)
+        warn_if_unwise(observer, omega_c)
 
     @property
     def gains(self) -> Vector:
@@ -344,11 +388,13 @@ class ADRC(Compensator):
         omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:
             check_replacement(self.observer, observer, self._learns)
+        if self.schedule is not None:
+            self.schedule.check_retuning(self.observer, observer, omega_c != self.omega_c)
         observer = observer or self.observer
         old, new = self.parameters, self._design(observer, omega_c)
         check_structure(old, new)
         self.observer, self.omega_c, self.parameters = observer, omega_c, new
-        warn_if_unwise(observer, omega_c)
+        self._warn_of_design()
         change_design(old, new, self._state)
         self._pack_again()
 

@@ -66,6 +66,14 @@ def set_reference_derivatives(controller: Any, state: Any, derivatives: Vector) 
     """Set r', r'', … for the next sample; ignored by a controller that does not use them."""
 
 
+@generic_with_default
+def set_schedule_signals(controller: Any, state: Any, values: Vector) -> None:
+    """Set the external signals of a schedule for the next sample; ignored if there is none.
+
+    The simulation hands them over behind the derivatives of the reference.
+    """
+
+
 @generic
 def write_row(controller: Any, state: Any, row: Vector) -> None:
     """Write the controller's ``channels`` into ``row``."""

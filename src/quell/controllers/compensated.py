@@ -38,16 +38,18 @@ from quell.controllers.base import (
     reset_loop,
     set_applied_control,
     set_reference_derivatives,
+    set_schedule_signals,
     status_flags,
     write_row,
 )
 from quell.controllers.compensator import Compensator, manual_operation
-from quell.controllers.law import AdrcDesign, AdrcState, unlimited_control
+from quell.controllers.law import AdrcDesign, AdrcState, known_now, unlimited_control
 from quell.controllers.prefilters import Wrapper, without_prefilters
+from quell.controllers.schedule import control_as_observed
 from quell.controllers.stateful import StatefulController
 from quell.kernels.sized import Scalars, clear
 from quell.observers.eso import ESO
-from quell.observers.forms import expected_measurement
+from quell.observers.forms import acting_control, expected_measurement
 from quell.types import Channels, Status, Vector
 
 _CUT = int(Status.SATURATED | Status.RATE_LIMITED | Status.SAFE_SET_ACTED)
@@ -79,9 +81,13 @@ def _control(design: CompensatedDesign, state: CompensatedState, r: float, y: fl
     loop, inner = state.loop[0], state.compensator.loop[0]
     measured = y
     if not is_usable(y) and inner.started != 0.0:
-        known = inner.f_learned + inner.f_known
         eso, z = design.compensator.eso, state.compensator.z
-        measured = expected_measurement(eso, z, inner.u, known)
+        acting = acting_control(eso, z, inner.u)
+        known = known_now(design.compensator, state.compensator, acting)
+        observed = control_as_observed(
+            design.compensator.schedule, state.compensator.schedule, inner.u
+        )
+        measured = expected_measurement(eso, z, observed, known)
     given = control(design.controller, state.controller, r, measured)
     u = control(design.compensator, state.compensator, given, y)
     loop.u_given = given
@@ -99,6 +105,14 @@ def _set_reference_derivatives(
     design: CompensatedDesign, state: CompensatedState, derivatives: Vector
 ) -> None:
     set_reference_derivatives(design.controller, state.controller, derivatives)
+    set_schedule_signals(design.compensator, state.compensator, derivatives)
+
+
+@set_schedule_signals.register(CompensatedDesign)
+def _set_schedule_signals(
+    design: CompensatedDesign, state: CompensatedState, values: Vector
+) -> None:
+    set_schedule_signals(design.compensator, state.compensator, values)
 
 
 @write_row.register(CompensatedDesign)
@@ -245,6 +259,18 @@ class Compensated(Wrapper):
     @property
     def _inner(self) -> Compensator:
         return self.compensator
+
+    @property
+    def external_signals(self) -> int:
+        """Number of external signals that the compensator's schedule follows."""
+        return self.compensator.external_signals
+
+    def at(self, *signals: float) -> Any:
+        """Return the controller without schedule at fixed signals, see ``ADRC.at``."""
+        made = copy.copy(self)
+        made.compensator = self.compensator.at(*signals)
+        made._initialise()
+        return made
 
     @property
     def observer(self) -> ESO:

@@ -64,6 +64,15 @@ from quell.controllers.safe_set import (
     settle_safe_set,
     shift_f,
 )
+from quell.controllers.schedule import (
+    NoSchedule,
+    NoScheduleMemory,
+    Point,
+    Schedule,
+    checked_schedule,
+    gain_in_use,
+    with_gains,
+)
 from quell.controllers.stateful import StatefulController
 from quell.guard import (
     GUARD_CHANNELS,
@@ -252,7 +261,9 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
     # Its derivatives, if the observer has them, stay: how u moves from now on is not known.
     acting = acting_control(old.eso, state.z, float(loop.u))
-    change = (old.b0 - new.b0) * acting
+    memory = state.schedule  # a b0 of a table changes with the next sample
+    change = gain_in_use(old.schedule, memory, old.b0) - gain_in_use(new.schedule, memory, new.b0)
+    change *= acting
     for i in range(size):
         change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
     shift_f(new.safe_set, state.safe_set, change)
@@ -338,6 +349,8 @@ class Compensator(StatefulController):
     safe_set
         bands that y and its rate do not leave, whatever u_0 and the learner ask for; none by
         default.
+    schedule
+        tables of b0 and omega_o over one or two signals, which the gains follow; none by default.
 
     Raises
     ------
@@ -370,8 +383,9 @@ class Compensator(StatefulController):
         u_max: float = math.inf,
         rate_limit: RateLimit = math.inf,
         safe_set: SafeSet | None = None,
+        schedule: Schedule | None = None,
     ) -> None:
-        self._take_parts(observer, learner, guard, safe_set)
+        self._take_parts(observer, learner, guard, safe_set, schedule)
         if observer.cancel_f == 0.0:
             raise ValueError(
                 "observer: f does not enter the plant where u does, so adding −f̂/b0 to u does not "
@@ -389,8 +403,10 @@ class Compensator(StatefulController):
         self._initialise()
         self._warn_of_idle_guard()
 
-    def _take_parts(self, observer: Any, learner: Any, guard: Any, safe_set: Any) -> None:
-        """Check and keep observer, learner, guard and safe set."""
+    def _take_parts(
+        self, observer: Any, learner: Any, guard: Any, safe_set: Any, schedule: Any
+    ) -> None:
+        """Check and keep observer, learner, guard, safe set and schedule."""
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
         self.observer = observer
@@ -406,6 +422,8 @@ class Compensator(StatefulController):
         if safe_set is not None and not isinstance(safe_set, SafeSet):
             raise ValueError(f"safe_set = {safe_set!r}: must be a quell.SafeSet(), or None")
         self.safe_set = safe_set
+        self.schedule = checked_schedule(schedule)
+        self._check_schedule()
 
     def _warn_of_idle_guard(self) -> None:
         if self.guard is not None and not self._learns:
@@ -447,6 +465,7 @@ class Compensator(StatefulController):
             b0=observer.b0,
             limits=self._limits,
             safe_set=self._safe_set_design(observer),
+            schedule=self._schedule_design(observer),
             learner=learner,
             lag=lag_of(observer) if self._learns else NO_LAG,
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, gains),
@@ -461,6 +480,68 @@ class Compensator(StatefulController):
         if self.safe_set is None:
             return NoSafeSet()
         return self.safe_set.design(observer, self._limits)
+
+    def _check_schedule(self) -> None:
+        """Raise a ``ValueError`` for parts that are made for one b0 or one omega_o."""
+        if self.schedule is None:
+            return
+        if self.schedule.b0 is not None and (self._learns or self.safe_set is not None):
+            part = "learner" if self._learns else "safe_set"
+            raise ValueError(
+                f"schedule.b0 with {part}: what the {part.replace('_', ' ')} knows refers to one "
+                "b0, in whose units f is; schedule omega_c only, or leave one of them out"
+            )
+        if self.schedule.omega_o is not None and self._learns:
+            raise ValueError(
+                "schedule.omega_o with learner: a learner and its guard reckon with the lag of one "
+                "omega_o; schedule omega_c only, or leave one of them out"
+            )
+
+    def _schedule_design(self, observer: ESO) -> Any:
+        if self.schedule is None:
+            return NoSchedule()
+        return self.schedule.design(observer, self.omega_c, None)
+
+    @property
+    def external_signals(self) -> int:
+        """Number of external signals that the schedule follows."""
+        return 0 if self.schedule is None else self.schedule.external
+
+    def set_signals(self, *values: float) -> None:
+        """Set the external signals of the schedule for the next steps, until they are set again.
+
+        One that is not finite is ignored: the last one stays, and ``status`` reports it. Before the
+        first one the gains are those of observer and omega_c.
+        """
+        if len(values) != self.external_signals:
+            raise ValueError(
+                f"set_signals was given {len(values)} signals: the schedule follows "
+                f"{self.external_signals} external ones"
+            )
+        self._state.schedule.given[:] = [float(value) for value in values]
+
+    def at(self, *signals: float) -> Any:
+        """Return the controller without schedule that this one is at fixed signals.
+
+        ``analyse`` it to see poles and margins there. It is new, and shares no state.
+
+        Parameters
+        ----------
+        signals
+            value of each signal of the schedule; one outside of its table is at its end.
+        """
+        if self.schedule is None:
+            raise ValueError("at: the controller has no schedule; analyse it itself")
+        if len(signals) != len(self.schedule.signals):
+            raise ValueError(f"at{signals!r}: must be a value for each of {self.schedule.signals}")
+        values = [checks.finite("signal", value) for value in signals]
+        base = Point(self.observer.b0, self.omega_c, self.observer.omega_o)
+        found = self.schedule.at(values, base)
+        made = type(self).__new__(type(self))
+        vars(made).update(vars(self), schedule=None, omega_c=found.omega_c)
+        made.observer = with_gains(self.observer, found.b0, found.omega_o)
+        made._initialise()
+        return made
 
     def set_limits(
         self,
@@ -523,6 +604,11 @@ class Compensator(StatefulController):
                 NoSafeSetMemory(np.zeros(0))
                 if self.safe_set is None
                 else self.safe_set.memory(design.safe_set)
+            ),
+            schedule=(
+                NoScheduleMemory(np.zeros(0))
+                if self.schedule is None
+                else self.schedule.memory(design.schedule)
             ),
         )
         state.loop[0].has_reference = has_reference_at_start(design.feedforward)
@@ -640,6 +726,8 @@ class Compensator(StatefulController):
             new observer of the same order, form, structure and sample time.
         """
         check_replacement(self.observer, observer, self._learns)
+        if self.schedule is not None:
+            self.schedule.check_retuning(self.observer, observer, False)
         old, new = self.parameters, self._design(observer)
         check_structure(old, new)
         self.observer, self.parameters = observer, new

@@ -55,10 +55,21 @@ from quell.controllers.base import (
     reset_loop,
     set_applied_control,
     set_reference_derivatives,
+    set_schedule_signals,
     status_flags,
     write_row,
 )
 from quell.controllers.safe_set import flags_of_applied, forget_motion, nearest_safe, see
+from quell.controllers.schedule import (
+    control_as_observed,
+    follow,
+    forget_signals,
+    gain_in_use,
+    known_with_schedule,
+    scheduled_correction,
+    scheduled_law,
+    set_signals,
+)
 from quell.guard import (
     assess,
     limit,
@@ -373,6 +384,7 @@ class AdrcDesign(NamedTuple):
     feedback: Any  # linear or nonlinear law of the errors, see ``feedback``
     feedforward: Any  # with or without a model, see ``feedforward``
     safe_set: Any  # bands for y and its rate, or none
+    schedule: Any  # tables of gains, or none
     fade: float  # factor of the offset from one sample to the next
     b0: float
     limits: Limits
@@ -396,6 +408,7 @@ class AdrcState(NamedTuple):
     guard: Any
     watch: NDArray[LearnerWatch]  # (1,)
     safe_set: Any
+    schedule: Any
 
 
 @control.register(AdrcDesign)
@@ -403,7 +416,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop[0], state.seen
     status = hold_last_good(loop, r, y)
     see(design.safe_set, state.safe_set, y, loop.u)
-    f_plain = 0.0
+    f_plain, continues = 0.0, loop.started != 0.0
     u_acting = acting_control(design.eso, state.z, loop.u)
     if loop.started == 0.0:
         begin(design.eso, state.z, seen, loop.y)
@@ -415,18 +428,26 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         loop.started = 1.0
     else:
         _finish_sample(design, state, u_acting)
+        known = known_now(design, state, u_acting)
+        u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
         if status & _MEASUREMENT_HELD != 0:
             # The last y would look like a disturbance while the plant moves; the expected y does
             # not change the estimates.
-            y = expected_measurement(design.eso, state.z, loop.u, loop.f_learned + loop.f_known)
+            y = expected_measurement(design.eso, state.z, u_observed, known)
             if is_usable(y):
                 loop.y = y
-        observe(design.eso, state.z, seen, loop.y, loop.u, loop.f_learned + loop.f_known)
+        observe(design.eso, state.z, seen, loop.y, u_observed, known)
+        scheduled_correction(design.schedule, state.schedule, design.eso, state.z, seen, loop.y)
         f_plain = seen[design.law.size] + loop.f_learned_shown
         assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
             status |= learner_flags(design.learner, state.learner)
+    order = design.law.size
+    status |= follow(
+        design.schedule, state.schedule, loop, state.z, seen, state.reference, order,
+        u_acting, continues,
+    )  # fmt: skip
     loop.f_known = known_share(design.feedforward, loop.r, state.reference)
     constant, slope = predict(design.learner, state.learner, seen, u_acting)
     output = constant + slope * u_acting
@@ -546,7 +567,16 @@ def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slo
         unlimited += (design.cancel[i] - design.law[i]) * seen[i]
     unlimited -= design.cancel_f * (seen[order] + constant)
     unlimited = nonlinear_part(design.feedback, design.law, seen, r, reference, unlimited)
-    return unlimited / (design.b0 + design.cancel_f * slope)
+    schedule, memory = design.schedule, state.schedule
+    unlimited = scheduled_law(schedule, memory, seen, r, reference, design.b0, unlimited)
+    return unlimited / (gain_in_use(schedule, memory, design.b0) + design.cancel_f * slope)
+
+
+@kernel
+def known_now(design: AdrcDesign, state: AdrcState, u: float) -> float:
+    """Return what is known of f while u acts: from learner, feedforward and schedule."""
+    known = state.loop[0].f_learned + state.loop[0].f_known
+    return known_with_schedule(design.schedule, state.schedule, known, design.b0, u)
 
 
 @set_reference_derivatives.register(AdrcDesign)
@@ -555,6 +585,12 @@ def _set_reference_derivatives(design: AdrcDesign, state: AdrcState, derivatives
         state.reference[i] = derivatives[i] if i < derivatives.size else 0.0
         if not is_usable(state.reference[i]):
             state.reference[i] = 0.0
+    set_signals(design.schedule, state.schedule, derivatives, state.reference.size)
+
+
+@set_schedule_signals.register(AdrcDesign)
+def _set_schedule_signals(design: AdrcDesign, state: AdrcState, values: Vector) -> None:
+    set_signals(design.schedule, state.schedule, values, -1)
 
 
 @write_row.register(AdrcDesign)
@@ -586,6 +622,7 @@ def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
         state.reference[i] = 0.0
     reset_lag_filters(design, state)
     forget_motion(design.safe_set, state.safe_set)
+    forget_signals(design.schedule, state.schedule, design.b0)
     restart(design.learner, state.learner)
 
 

@@ -56,6 +56,7 @@ from quell.controllers.base import (
     reset_loop,
     set_applied_control,
     set_reference_derivatives,
+    set_schedule_signals,
     status_flags,
     write_row,
 )
@@ -117,6 +118,22 @@ class Wrapper(StatefulController):
         """Limits of the control signal."""
         limits: Limits = self.controller.limits
         return limits
+
+    @property
+    def external_signals(self) -> int:
+        """Number of external signals that a schedule in it follows."""
+        return int(getattr(self.controller, "external_signals", 0))
+
+    def set_signals(self, *values: float) -> None:
+        """Set the external signals of a schedule, see ``ADRC.set_signals``."""
+        self._inner.set_signals(*values)
+
+    def at(self, *signals: float) -> Any:
+        """Return the controller without schedule at fixed signals, see ``ADRC.at``."""
+        made = copy.copy(self)
+        made.controller = self.controller.at(*signals)
+        made._initialise()
+        return made
 
     def set_limits(
         self,
@@ -264,6 +281,18 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
             set_reference_derivatives(design.controller, state.controller, state.derivatives)
     loop.r_shaped = shaped if is_finite(shaped) else y
     return control(design.controller, state.controller, shaped, y)
+
+
+@set_reference_derivatives.register(PrefilteredDesign)
+def _set_signals(design: PrefilteredDesign, state: PrefilteredState, derivatives: Vector) -> None:
+    set_schedule_signals(design.controller, state.controller, derivatives)
+
+
+@set_schedule_signals.register(PrefilteredDesign)
+def _set_schedule_signals(
+    design: PrefilteredDesign, state: PrefilteredState, values: Vector
+) -> None:
+    set_schedule_signals(design.controller, state.controller, values)
 
 
 @write_row.register(PrefilteredDesign)

@@ -26,6 +26,7 @@ from quell.controllers.base import (
     reset_loop,
     set_applied_control,
     set_reference_derivatives,
+    set_schedule_signals,
     status_flags,
     write_row,
 )
@@ -169,6 +170,12 @@ def _control(design: SingleDesign, state: Any, r: float, y: float) -> float:
 @in_both_precisions
 def _set_reference_derivatives(design: SingleDesign, state: Any, derivatives: Vector) -> None:
     set_reference_derivatives(design.controller, state, derivatives)
+
+
+@set_schedule_signals.register(SingleDesign)
+@in_both_precisions
+def _set_schedule_signals(design: SingleDesign, state: Any, values: Vector) -> None:
+    set_schedule_signals(design.controller, state, values)
 
 
 @write_row.register(SingleDesign)

@@ -98,6 +98,8 @@ class CSource:
         number of derivatives of the reference that ``step`` takes as its last arguments.
     externals
         names of functions in C that the user has to link.
+    signals
+        number of signals of a schedule, which ``step`` takes behind the derivatives.
     """
 
     name: str
@@ -108,6 +110,13 @@ class CSource:
     operations: tuple[str, ...]
     derivatives: int = 0
     externals: tuple[str, ...] = ()
+    signals: int = 0
+
+    @property
+    def further(self) -> tuple[str, ...]:
+        """Names of the last arguments of ``step``, behind r and y."""
+        derivatives = (f"r{i + 1}" for i in range(self.derivatives))
+        return (*derivatives, *(f"signal_{i + 1}" for i in range(self.signals)))
 
     @property
     def real(self) -> str:
@@ -184,6 +193,7 @@ class CFiles:
         channels: tuple[tuple[str, int], ...],
         defines: list[str],
         derivatives: int = 0,
+        signals: int = 0,
     ) -> CSource:
         """Return the files."""
         source = self._source()
@@ -191,7 +201,8 @@ class CFiles:
         precision = "single" if self.single else "double"
         operations, externals = tuple(self.operations), tuple(self.program.externals)
         return CSource(
-            self.name, header, source, precision, channels, operations, derivatives, externals
+            *(self.name, header, source, precision, channels, operations),
+            *(derivatives, externals, signals),
         )
 
     def _header(self, title: list[str], defines: list[str]) -> str:

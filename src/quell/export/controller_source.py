@@ -193,8 +193,10 @@ class _Writer:
         design = self.described.parameters
         self.moves = has_own and type(design.prefilter) in stopping_point.implementations
         self.derivatives = 0 if has_own else int(getattr(self.described, "derivatives", 0))
+        self.signals = int(getattr(self.described, "external_signals", 0))
         # They are arguments of each step: whoever forgets them gets an error of the compiler.
         self.names = [f"r{i + 1}" for i in range(self.derivatives)]
+        self.names += [f"signal_{i + 1}" for i in range(self.signals)]
         # What a step takes beside y: of a compensator alone the control signal u_0.
         self.given = "u_0" if takes_control(self.described) else "r"
         self.arguments = "".join(f", {self.real} {each}" for each in self.names)
@@ -229,7 +231,7 @@ class _Writer:
             defines.append(f"#define {upper}_ORDER {observing.observer.order}")
         self.files.enums += self._enums(channels)
         self.files.structs += self._estimate_struct(channels)
-        return self.files.write(title, channels, defines, self.derivatives)
+        return self.files.write(title, channels, defines, self.derivatives, self.signals)
 
     def _add_step(self) -> None:
         files, real, both = self.files, self.real, self.files.both
@@ -265,21 +267,26 @@ class _Writer:
 
     def _about_derivatives(self) -> str:
         """Return the sentence on the last arguments of a step."""
-        if not self.names:
-            return ""
-        verb = "are the derivatives" if self.derivatives > 1 else "is the derivative"
-        primes = ", ".join("r" + "'" * (i + 1) for i in range(self.derivatives))
-        return f"{', '.join(self.names)} {verb} {primes} at this sample, fed forward.\n"
+        text, names = "", self.names[: self.derivatives]
+        if names:
+            verb = "are the derivatives" if self.derivatives > 1 else "is the derivative"
+            primes = ", ".join("r" + "'" * (i + 1) for i in range(self.derivatives))
+            text = f"{', '.join(names)} {verb} {primes} at this sample, fed forward.\n"
+        if self.signals:
+            verb = "are the signals" if self.signals > 1 else "is the signal"
+            text += f"{', '.join(self.names[self.derivatives :])} {verb} that the gains follow.\n"
+        return text
 
     def _derivatives(self) -> list[str]:
         """Return the lines that hand the last arguments of a step over."""
         if not self.names:
             return []
-        given = Value(Array((self.derivatives,), Number.REAL), "derivatives", root="derivatives")
+        count = len(self.names)
+        given = Value(Array((count,), Number.REAL), "derivatives", root="derivatives")
         set_them = self.files.call(set_reference_derivatives, *self.files.both, given)
         values = ", ".join(self.names)
         return [
-            f"    const {self.real} derivatives[{self.derivatives}] = {{{values}}};",
+            f"    const {self.real} derivatives[{count}] = {{{values}}};",
             f"    {set_them};",
         ]
 

@@ -387,7 +387,7 @@ def proof_files(controller: Any, source: CSource) -> dict[str, str]:
 def _contract(source: CSource, path: str) -> str:
     """Return the declarations of the functions that return u, with what they promise."""
     name, upper = source.name, source.name.upper()
-    more = "".join(f", {source.real} r{i + 1}" for i in range(source.derivatives))
+    more = "".join(f", {source.real} {each}" for each in source.further)
     limits = f"state->parameters->{path}"
     promises = ["ensures a_number: \\is_finite(\\result);"]
     if path:
@@ -417,7 +417,7 @@ def _contract(source: CSource, path: str) -> str:
 def _program(controller: Any, source: CSource, path: str) -> str:
     """Return the program that calls all functions in any order, with any numbers."""
     name, real = source.name, source.real
-    more = ", any_real" * source.derivatives
+    more = ", any_real" * len(source.further)
     cases: list[str] = []
     for i, (operation, given) in enumerate(CALLS.items()):
         if operation in source.operations:

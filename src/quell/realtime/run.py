@@ -324,6 +324,11 @@ def run_rig(
             )
         scenario = as_scenario(scenario, duration)
         rules = (Safety() if safety is None else safety).rules(controller, scenario)
+        if getattr(controller, "external_signals", 0):
+            raise ValueError(
+                "controller has a schedule with signal = 'external': a device gives y only; follow "
+                "'reference', 'y' or 'speed', or take the controller at one point, controller.at(…)"
+            )
         derivatives = getattr(controller, "derivatives", 0)
         reference = reference_samples(scenario, dt, derivatives, approach)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)

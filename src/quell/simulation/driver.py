@@ -88,6 +88,9 @@ class Scenario:
     rest_at
         times [s] at which the plant is put back to ``x0`` and the controller starts from rest; it
         keeps what it has learned.
+    schedule
+        external signals that the controller's ``Schedule`` follows, in its order; as many as it
+        has.
     seed
         seed of all random signals; the same seed gives the same bits.
 
@@ -105,18 +108,19 @@ class Scenario:
     x0: ArrayLike | None = None
     rest_at: Sequence[float] = field(default=())
     seed: int = 0
+    schedule: Sequence[Signal | float] = ()
 
     def __post_init__(self) -> None:
         checks.positive("duration", self.duration, "s")
         checks.whole("seed", self.seed, 0)
         as_signal(self.reference, "reference")
         as_signal(self.noise, "noise")
-        if not checks.is_sequence(self.disturbances):
-            raise ValueError(
-                f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers"
-            )
-        for i, disturbance in enumerate(self.disturbances):
-            as_signal(disturbance, f"disturbances[{i}]")
+        for name in ("disturbances", "schedule"):
+            given = getattr(self, name)
+            if not checks.is_sequence(given):
+                raise ValueError(f"{name} = {given!r}: must be a sequence of signals or numbers")
+            for i, signal in enumerate(given):
+                as_signal(signal, f"{name}[{i}]")
         times = np.array([0.0, *checks.vector("rest_at", self.rest_at), self.duration])
         if np.any(np.diff(times) <= 0.0):
             rule = f"must increase and lie within (0, duration = {self.duration!r})"
@@ -175,7 +179,7 @@ class SampledScenario:
     """A scenario for a plant and a controller."""
 
     signals: tuple[Signal, tuple[Signal, ...], Signal]
-    derivatives: tuple[Signal, ...]  # those of the reference that the controller uses
+    derivatives: tuple[Signal, ...]  # of the reference, as used, and signals of a schedule
     samples: int
     dt: float
     x0: Vector
@@ -207,6 +211,7 @@ class SampledScenario:
             check_derivative(derivative)
             derivative = derivative.derivative()
             derivatives.append(derivative)
+        derivatives += _schedule_signals(scenario, controller)
         usual = _UNUSUAL * size
         return cls(signals, tuple(derivatives), samples, dt, x0, limit, usual, rests)
 
@@ -218,6 +223,21 @@ class SampledScenario:
         derivatives, w = _columns(self.derivatives, t), _columns(disturbances, t)
         r, added = (np.ascontiguousarray(s(t), np.float64) for s in (reference, noise))
         return Segment(first, self.dt, first in self.rest_samples, r, derivatives, w, added)
+
+
+def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal]:
+    """Return the external signals of a controller's schedule, seeded."""
+    given, used = len(scenario.schedule), int(getattr(controller, "external_signals", 0))
+    if given != used:
+        raise ValueError(
+            f"scenario.schedule has {given} signals, and the schedule of the controller follows "
+            f"{used} external ones: must be as many"
+        )
+    if not given:
+        return []
+    before = (scenario.reference, *scenario.disturbances)  # which have the first seeds
+    signals = [as_signal(each) for each in (*before, *scenario.schedule)]
+    return list(seeded_apart(signals, scenario.seed)[len(before) :])
 
 
 def segments(scenario: SampledScenario) -> Iterator[Segment]:

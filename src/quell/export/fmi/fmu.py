@@ -359,6 +359,8 @@ class Model:
             given = [state, f"{cast}m->real[AT_R]", y]
             for i in range(source.derivatives):
                 given.append(f"{cast}m->real[AT_R_DERIVATIVE_{i + 1}]")
+            for i in range(source.signals):
+                given.append(f"{cast}m->real[AT_SIGNAL_{i + 1}]")
             lines.append(f"m->real[AT_U] = {source.name}_step({', '.join(given)});")
         if self.plant:
             w = ", &m->real[AT_W_1]" if self.plant.disturbances else ""

@@ -272,6 +272,7 @@ class ControllerPart:
         return [
             Variable("r", INPUT, "reference"),
             *several("r_derivative", self.source.derivatives, INPUT, described),
+            *several("signal", self.source.signals, INPUT, "signal {i} that the gains follow"),
         ]
 
     @property

@@ -124,7 +124,7 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
     """
     name, single = source.name, source.precision == "single"
     one = "1.0f" if single else "1.0"
-    given = "".join(f", r{i + 1}" for i in range(source.derivatives))
+    given = "".join(f", {each}" for each in source.further)
     rows = (
         f"| `{name}_{call.replace('DERIVATIVES', given)}` | {when} |"
         for operation, (call, when) in _OPERATIONS.items()

@@ -122,7 +122,7 @@ def c_code(plant: Plant, write: Callable[[Any], str], real: str, source: CSource
         "REAL": real, "NAME": source.name, "ORDER": len(plant.gains), "GAINS": gains,
         "B0": write(plant.b0), "DT": write(plant.dt), "AMPLITUDE": write(plant.amplitude),
         "NOISE": write(plant.noise), "HALF": plant.samples // 4, "BLOCK": BLOCK,
-        "DERIVATIVES": f", {write(0.5)} * r" * source.derivatives,
+        "DERIVATIVES": f", {write(0.5)} * r" * len(source.further),
         "MULTIPLIER": _MULTIPLIER, "INCREMENT": _INCREMENT, "ZERO": write(0.0),
     })  # fmt: skip
 
@@ -232,7 +232,8 @@ class Player:
         self.design, self.state = self.default, controller.initial_state()
         self.limited = self.default
         self.real: Callable[[Any], Any] = np.float32 if single else float
-        self.derivatives = int(getattr(controller, "derivatives", 0))
+        numbers = ("derivatives", "external_signals")
+        self.further = sum(int(getattr(controller, name, 0)) for name in numbers)
         self.described = in_double_precision(controller)
         self.rows: list[Row] = []
         self.loop: Loop | None = None
@@ -278,9 +279,9 @@ class Player:
         return u
 
     def _set_derivatives(self, r: Any) -> None:
-        """Set each derivative of the reference to half the reference."""
-        if self.derivatives:
-            half = np.full(self.derivatives, self.real(0.5) * r, dtype=type(self.real(0.0)))
+        """Set each derivative of the reference, and each signal, to half the reference."""
+        if self.further:
+            half = np.full(self.further, self.real(0.5) * r, dtype=type(self.real(0.0)))
             set_reference_derivatives(self.design, self.state, half)
 
     def limit_at(self, path: str, high: Any) -> None:
@@ -450,8 +451,8 @@ def test_program(source: CSource, vectors: Vectors) -> str:
     """Return the text of ``test_NAME.c``."""
     single = source.precision == "single"
     write = Literals(single).write_real
-    # In each step the derivatives of the reference are half the reference.
-    derivatives = f", {write(0.5)} * now->r" * source.derivatives
+    # In each step its last arguments are half the reference.
+    derivatives = f", {write(0.5)} * now->r" * len(source.further)
     used = [action for action in Action if any(row.action == action for row in vectors.rows)]
     limits = Action.LIMIT in used
     cases: list[str] = []

@@ -44,6 +44,7 @@ from quell.controllers.base import Controller
 from quell.controllers.compensated import CompensatedDesign
 from quell.controllers.law import AdrcDesign, LinearFeedback, ModelFeedforward, reference_part
 from quell.controllers.linear import LinearDesign, LinearLaw
+from quell.controllers.schedule import NoSchedule
 from quell.guard import UnguardedDesign
 from quell.learners.base import NoLearnerDesign
 from quell.lti.models import System
@@ -359,6 +360,8 @@ def _of_adrc(design: AdrcDesign) -> LinearLaw | None:
         return None  # it acts on the observer with derivatives of r, and friction is not linear
     if found is None or kinds != (NoLearnerDesign, UnguardedDesign, LinearFeedback):
         return None
+    if not isinstance(design.schedule, NoSchedule):
+        return None  # analyse(plant, controller.at(…)) is for one point
     order = design.law.size
     gains = np.zeros(found.D.size)
     gains[: order + 1] = np.append(design.cancel - design.law, -design.cancel_f) / design.b0
