@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from quell.simulation.driver import Scenario
     from quell.simulation.simulate import simulate
     from quell.sweeping.sweep import sweep
+    from quell.tuning.schedules import tune_schedule
     from quell.tuning.tune import tune
     from quell.tuning.tuned import Tuned
     from quell.types import DesignWarning, Status
@@ -83,6 +84,7 @@ _HOMES = {
     "style": "records.plotting",
     "sweep": "sweeping.sweep",
     "tune": "tuning.tune",
+    "tune_schedule": "tuning.schedules",
 }
 _MODULES = (
     "analysis", "controllers", "controllers.baselines", "envs", "experiments", "export", "features",
@@ -96,7 +98,7 @@ __all__ = [
     "Tuned", "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
     "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
     "plants", "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
-    "tuning",
+    "tune_schedule", "tuning",
 ]  # fmt: skip
 
 

@@ -17,8 +17,10 @@ from quell import controllers as room
 from quell.analysis.linearise import linear_law
 from quell.controllers import baselines as baseline_room
 from quell.controllers.base import bumpless_transfer
+from quell.controllers.law import known_now
+from quell.controllers.schedule import control_as_observed
 from quell.controllers.stateful import named_arrays
-from quell.observers.forms import expected_measurement
+from quell.observers.forms import acting_control, expected_measurement
 from quell.tuning.optimiser.loops import law_of
 
 from .test_contracts import CHAIN, SCENARIO, check_run
@@ -193,9 +195,10 @@ def awaited(controller: Any, y: float) -> float:
     law = getattr(controller, "compensator", getattr(controller, "controller", controller))
     if not isinstance(law, ql.Compensator):
         return y
-    loop = law._state.loop[0]
-    known = loop.f_learned + loop.f_known
-    return expected_measurement(law.parameters.eso, law._state.z, loop.u, known)
+    design, state, u = law.parameters, law._state, law._state.loop[0].u
+    observed = control_as_observed(design.schedule, state.schedule, u)
+    known = known_now(design, state, acting_control(design.eso, state.z, u))
+    return expected_measurement(design.eso, state.z, observed, known)
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

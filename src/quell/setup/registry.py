@@ -16,6 +16,7 @@ from quell.controllers import (
     NonlinearFeedback,
     ProfileGenerator,
     ReferenceModel,
+    Schedule,
     TrackingDifferentiator,
     adrc_for_dead_time,
 )
@@ -252,7 +253,9 @@ _SERIES: Mapping[str, Callable[..., Any]] = {
     "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
+Scheduled = call_table("schedule", Schedule, only=True)
 _LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True)}
+_LAW["schedule"] = Scheduled | None
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
 _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)
 _CONTROLLERS = (
@@ -276,6 +279,7 @@ Controller = one_of(CONTROLLERS, default="adrc")
 _CERTIFIED = {"certified_for": one_of(PLANTS, many=Plant) | None}
 Guard = call_table("guard", guard.Guard, only=True, types=_CERTIFIED)
 _SIGNALS = {"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)}
+_SIGNALS["schedule"] = list_of(Signal)
 Scenario = call_table("scenario", SimulationScenario, only=True, types=_SIGNALS)
 Metrics = call_table("metrics", Trajectory.metrics, only=True)
 _Y_AND_U = {"y": str, "u": str}

@@ -8,8 +8,17 @@ and returns a ``Tuned``.
 
 from quell.tuning.constraints import Constraints
 from quell.tuning.plants import identified_plants
+from quell.tuning.schedules import TunedSchedule, tune_schedule
 from quell.tuning.structures import STRUCTURES
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 
-__all__ = ["STRUCTURES", "Constraints", "Tuned", "identified_plants", "tune"]
+__all__ = [
+    "STRUCTURES",
+    "Constraints",
+    "Tuned",
+    "TunedSchedule",
+    "identified_plants",
+    "tune",
+    "tune_schedule",
+]

@@ -1,0 +1,358 @@
+"""``tune_schedule``: one controller for a set of operating points, with gains that follow them.
+
+The plant at a point is known: a function of the signals, or a plant for each point. Where the
+points differ by the gain b most of all, as an axis with a changing inertia, one pair of bandwidths
+serves all of them: the plants are scaled to the same b, one ADRC is tuned for them all, and its
+schedule has
+
+    b0_i = b0 b_i / b
+
+so that each loop keeps the constraints. With ``tables="all"`` each point has bandwidths of its own
+tuning, which may lie far apart: the optimum of an ADRC often has two places, one with the fast
+poles in the law and one with them in the observer.
+
+The result is judged at the points, and between them where the plant is a function: M_s and M_t of
+the frozen loop, and the integral of |y| after a step of the load over that of a controller that is
+tuned for this very point, with the same structure and constraints.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.analysis.loop import LoopAnalysis, analyse
+from quell.controllers.adrc import ADRC
+from quell.controllers.schedule import Schedule, with_gains
+from quell.files import written_atomically
+from quell.parallel import one_blas_thread
+from quell.plants.linear import LinearPlant
+from quell.tuning.plants import given_plants
+from quell.tuning.report import toml_text
+from quell.tuning.tune import tune
+from quell.tuning.tuned import Tuned
+
+_STRUCTURES = ("bandwidths", "half-gain", "half-gain-law")
+_TABLES = ("b0", "all")
+# Options of ``tune`` that are for sets of plants, or for other results.
+_NOT_HERE = ("uncertain", "scenario", "search", "setup", "rest", "compare", "feedforward")
+# Where the response to a step of the load ends, in time constants of the slowest pole, and the most
+# samples of it; what is left is a share of e⁻²⁰ of y.
+_TIME_CONSTANTS, _MOST_SAMPLES = 20.0, 2_000_000
+
+
+class PointResult(NamedTuple):
+    """The frozen loop at one value of the signals."""
+
+    signals: tuple[float, ...]
+    of_table: bool  #: whether it is a point of the table
+    b0: float
+    m_s: float
+    m_t: float
+    iae: float  #: integral of ``|y|`` after a unit step of the load; infinite if unstable
+    own_iae: float  #: the same of a controller tuned for this point; nan where none was found
+
+    @property
+    def ratio(self) -> float:
+        """The integral over that of the own tuning."""
+        return self.iae / self.own_iae
+
+
+@dataclass(frozen=True, eq=False)
+class TunedSchedule:
+    """A controller with a schedule, tuned at its points; from ``tune_schedule``.
+
+    Attributes
+    ----------
+    controller : ADRC
+        with the schedule.
+    results : tuple of PointResult
+        the frozen loops at the points, and between them where the plant is known.
+    own : Mapping
+        the tuning of each point by itself, by signals.
+    joint : Tuned or None
+        the tuning for all points at once, of plants with the same b; None with ``tables="all"``.
+    """
+
+    controller: ADRC
+    results: tuple[PointResult, ...]
+    own: Mapping[tuple[float, ...], Tuned]
+    joint: Tuned | None
+    knows_between: bool
+
+    @property
+    def schedule(self) -> Schedule:
+        """The schedule."""
+        found = self.controller.schedule
+        assert found is not None
+        return found
+
+    @property
+    def m_s(self) -> float:
+        """The largest M_s of all frozen loops; infinite if one is unstable."""
+        return max(each.m_s for each in self.results)
+
+    @property
+    def worst_ratio(self) -> float:
+        """The largest integral of ``|y|`` over that of the point's own tuning."""
+        return max(each.ratio for each in self.results if not math.isnan(each.ratio))
+
+    def summary(self) -> str:
+        """Return the frozen loops as lines, and what is not known."""
+        lines = [repr(self.controller)]
+        for each in self.results:
+            where = ", ".join(f"{value:.4g}" for value in each.signals)
+            lines.append(
+                f"{'at' if each.of_table else 'between, at'} {where}: b0 {each.b0:.4g}, M_s "
+                f"{each.m_s:.3f}, M_t {each.m_t:.3f}, ∫|y| {each.iae:.4g}, "
+                f"{each.ratio:.3f} of the own tuning's"
+            )
+        lines.append(f"largest M_s {self.m_s:.3f}, largest ratio of ∫|y| {self.worst_ratio:.3f}")
+        if not self.knows_between:
+            lines.append(
+                "NOT known between the points: the plant is given there only; give a function of "
+                "the signal, or more points"
+            )
+        lines.append(
+            "NOT proved for signals that change quickly: margins are those of fixed signals; "
+            "simulate the fastest change"
+        )
+        return "\n".join(lines)
+
+    def toml(self) -> str:
+        """Return a setup file with the plant of the middle point, for ``quell run``."""
+        keys = list(self.own)
+        middle = keys[len(keys) // 2]
+        tuned = self.own[middle]
+        replaced = ("observer", "controller")
+        tables = {key: value for key, value in tuned.setup.items() if key not in replaced}
+        schedule, observer = self.schedule, self.controller.observer
+        table: dict[str, Any] = {"signal": _listed(schedule.signal)}
+        for name in ("points", "b0", "omega_c", "omega_o"):
+            if getattr(schedule, name) is not None:
+                table[name] = _listed(getattr(schedule, name))
+        own = (self.joint or tuned).design.tables
+        given = {"b0": observer.b0, "omega_o": observer.omega_o}
+        tables["observer"] = {**own["observer"], **given}
+        tables["controller"] = {
+            **own["controller"],
+            "omega_c": self.controller.omega_c,
+            "schedule": table,
+        }
+        if schedule.external:
+            scenario = dict(tables["scenario"])
+            fixed = zip(schedule.signals, middle, strict=True)
+            scenario["schedule"] = [value for name, value in fixed if name == "external"]
+            tables["scenario"] = scenario
+        return toml_text(tables, f"{tuned.design.name} with a schedule, tuned by quell\n")
+
+    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
+        with written_atomically(Path(path), overwrite) as part:
+            part.write_text(self.toml(), encoding="utf-8")
+
+
+def _listed(value: Any) -> Any:
+    if isinstance(value, str):
+        return value
+    return [_listed(each) for each in value] if np.ndim(value) or not _is_number(value) else value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number)
+
+
+def tune_schedule(
+    plant: Callable[..., Any] | Mapping[Any, Any],
+    dt: float,
+    *,
+    points: Any = None,
+    signal: str | Sequence[str] = "external",
+    tables: str = "b0",
+    structure: str = "bandwidths",
+    order: int | None = None,
+    between: int = 1,
+    delay: float = 0.0,
+    actuator_lag: float = 0.0,
+    **options: Any,
+) -> TunedSchedule:
+    """Return the best ADRC with a schedule for a plant that changes with one or two signals.
+
+    Parameters
+    ----------
+    plant
+        a function of the signals that returns a plant, of any kind that ``tune`` accepts; or the
+        plants by point, ``{0.0: plant, 1.0: plant, …}``, with pairs as keys for two signals.
+    dt
+        sample time [s].
+    points
+        points of the tables, for a function: increasing numbers; a pair of lists for two signals.
+    signal
+        what the schedule follows, as for ``Schedule``.
+    tables
+        ``"b0"``: one pair of bandwidths and a table of b0; ``"all"``: three tables, each point with
+        its own tuning.
+    structure
+        ``"bandwidths"``, ``"half-gain"`` or ``"half-gain-law"``.
+    order
+        order of the ADRC; by default the relative degree of the plant.
+    between
+        number of values in each cell at which the result is judged, too, for a function.
+    delay, actuator_lag
+        as for ``tune``.
+    **options
+        of ``tune``: ``objective``, ``constraints``, ``b_range``, ``u_min``, ``u_max``,
+        ``rate_limit``, …
+
+    Raises
+    ------
+    ValueError
+        as ``tune``; for points that are missing or do not form a grid, and for plants of different
+        relative degree.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> def axis(inertia):
+    ...     return ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0 / inertia], [1.0, 0.0])
+    >>> tuned = ql.tune_schedule(axis, 1e-3, points=(2e-4, 2e-3))
+    >>> [round(b0 / tuned.schedule.b0[-1], 3) for b0 in tuned.schedule.b0], round(tuned.m_s, 2)
+    ([10.0, 1.0], 1.6)
+    """
+    checks.one_of("tables", tables, _TABLES)
+    checks.one_of("structure", structure, _STRUCTURES)
+    for name in _NOT_HERE:
+        if name in options:
+            raise ValueError(f"{name}: tune_schedule has no such argument; tune each point for it")
+    axes, plant_at, is_function = _points(plant, points)
+    grid = list(product(*axes))
+    late = {"delay": delay, "actuator_lag": actuator_lag}
+    given = [given_plants(plant_at(at), dt, **late) for at in grid]
+    degree = given[0].degree
+    for at, each in zip(grid, given, strict=True):
+        if each.degree != degree:
+            raise ValueError(
+                f"plant at {at} has the relative degree {each.degree}, the first one {degree}: "
+                "one ADRC can not serve both; leave the far zeros out of the models"
+            )
+    order = degree if order is None else checks.whole("order", order, 1, 8)
+    how: dict[str, Any] = {"structure": structure, "order": order, "compare": (), **late, **options}
+    own = {at: tune(plant_at(at), dt, **how) for at in grid}
+    joint = None
+    shape = tuple(len(axis) for axis in axes)
+    found: dict[str, Any] = {}
+    if tables == "b0":
+        b = np.array([each.b for each in given])
+        # The least b: bounds on u, as M_ks, are those of the point with the largest gains.
+        base = b[int(np.argmin(np.abs(b)))]
+        same = [_scaled(plant_at(at), base / own_b, dt) for at, own_b in zip(grid, b, strict=True)]
+        joint = tune(same, dt, **how)
+        tuned: Any = joint.controller
+        found["b0"] = tuned.observer.b0 * b / base
+    else:
+        tuned = own[grid[0]].controller
+        parts: list[Any] = [each.controller for each in own.values()]
+        found["b0"] = np.array([each.observer.b0 for each in parts])
+        found["omega_c"] = np.array([each.omega_c for each in parts])
+        found["omega_o"] = np.array([each.observer.omega_o for each in parts])
+    lists = {name: value.reshape(shape).tolist() for name, value in found.items()}
+    schedule = Schedule(axes[0] if len(axes) == 1 else axes, signal, **lists)
+    middle = found["b0"][len(grid) // 2]
+    observer = with_gains(tuned.observer, float(middle), tuned.observer.omega_o)
+    limits = {k: v for k, v in options.items() if k in ("u_min", "u_max", "rate_limit")}
+    half = {"half_gain": tuned.half_gain}
+    controller = ADRC(observer, tuned.omega_c, schedule=schedule, **half, **limits)
+    judged = [(at, True) for at in grid]
+    if is_function:
+        fine = list(product(*(_finer(axis, checks.whole("between", between, 0)) for axis in axes)))
+        judged += [(at, False) for at in fine if at not in own]
+    results = []
+    for at, of_table in sorted(judged):
+        alone = own[at] if of_table else tune(plant_at(at), dt, **how)
+        results.append(_result(at, of_table, plant_at(at), controller, alone.controller, late))
+    return TunedSchedule(controller, tuple(results), own, joint, is_function and between > 0)
+
+
+def _points(
+    plant: Any, points: Any
+) -> tuple[list[list[float]], Callable[[tuple[float, ...]], Any], bool]:
+    """Return the axes, the plant at signals, and whether it is a function."""
+    if isinstance(plant, Mapping):
+        if points is not None:
+            raise ValueError("points: the plants have them, as keys; leave it out")
+        known = {(key if isinstance(key, tuple) else (key,)): value for key, value in plant.items()}
+        keys = [tuple(checks.finite("key of plant", each) for each in key) for key in known]
+        if not keys or {len(key) for key in keys} not in ({1}, {2}):
+            raise ValueError("plant = {...}: keys must be numbers, or pairs of two numbers")
+        axes = [sorted(set(column)) for column in zip(*keys, strict=True)]
+        if len(keys) != math.prod(map(len, axes)):
+            raise ValueError("plant = {...}: needs one for each pair of points, a full grid")
+        return axes, lambda at: known[at], False
+    if not callable(plant):
+        raise ValueError(
+            f"plant = {plant!r}: must be a function of the signal that returns a plant, or a "
+            "mapping from points to plants"
+        )
+    if points is None:
+        raise ValueError("points = None: a plant that is a function needs the points of the tables")
+    lists = points if np.ndim(points[0]) else [points]
+    axes = [checks.vector("points", each).tolist() for each in lists]
+    return axes, lambda at: plant(*at), True
+
+
+def _scaled(plant: Any, factor: float, dt: float) -> LinearPlant:
+    """Return a linear plant with another gain from u, and from a load beside it."""
+    linear = LinearPlant.of(given_plants(plant, dt).linear[0])
+    return LinearPlant(linear.A, factor * linear.B, linear.C, factor * linear.E)
+
+
+def _finer(axis: list[float], between: int) -> list[float]:
+    """Return the points of an axis with ``between`` values in each cell."""
+    inner = [np.linspace(*cell, between + 2)[:-1].tolist() for cell in pairwise(axis)]
+    return [value for cell in inner for value in cell] + [axis[-1]]
+
+
+def _result(
+    at: tuple[float, ...],
+    of_table: bool,
+    plant: Any,
+    controller: ADRC,
+    alone: Any,
+    late: Mapping[str, Any],
+) -> PointResult:
+    frozen = controller.at(*at)
+    with one_blas_thread():
+        loop, own = (analyse(plant, each, **late) for each in (frozen, alone))
+        m_t = loop.response("T", loop.omega) if loop.stable else np.array([math.inf])
+        return PointResult(
+            signals=at,
+            of_table=of_table,
+            b0=frozen.observer.b0,
+            m_s=1.0 / loop.margins.modulus if loop.stable else math.inf,
+            m_t=float(np.max(np.abs(m_t))),
+            iae=load_iae(loop),
+            own_iae=load_iae(own),
+        )
+
+
+def load_iae(loop: LoopAnalysis) -> float:
+    """Return the integral of ``|y|`` after a unit step of the load at the plant's input."""
+    if not loop.stable:
+        return math.inf
+    system = loop.closed_loop("d", "y")
+    pole, steps = system.largest_pole, _MOST_SAMPLES
+    if pole < 1.0:
+        steps = min(math.ceil(_TIME_CONSTANTS / -math.log(max(pole, 1e-9))) + 1, steps)
+    A, x, total = np.eye(system.B.size) + system.N, np.zeros(system.B.size), 0.0
+    for _ in range(steps):
+        total += abs(float(system.C @ x) + system.D)
+        x = A @ x + system.B
+    return total * float(loop.dt)
