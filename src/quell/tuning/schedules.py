@@ -47,6 +47,9 @@ _NOT_HERE = ("uncertain", "scenario", "search", "setup", "rest", "compare", "fee
 # Where the response to a step of the load ends, in time constants of the slowest pole, and the most
 # samples of it; what is left is a share of e⁻²⁰ of y.
 _TIME_CONSTANTS, _MOST_SAMPLES = 20.0, 2_000_000
+# Bandwidths that differ by less are those of one optimum; and the ratio of the integrals of |y| from
+# which on the summary advises other tables.
+_SAME, _MUCH = 1e-6, 1.15
 
 
 class PointResult(NamedTuple):
@@ -116,6 +119,11 @@ class TunedSchedule:
                 f"{each.ratio:.3f} of the own tuning's"
             )
         lines.append(f"largest M_s {self.m_s:.3f}, largest ratio of ∫|y| {self.worst_ratio:.3f}")
+        if self.joint is not None and self.worst_ratio > _MUCH:
+            lines.append(
+                "NOT as good as the own tuning at each point, which needs other bandwidths there, "
+                'too: tables="all" has them'
+            )
         if not self.knows_between:
             lines.append(
                 "NOT known between the points: the plant is given there only; give a function of "
@@ -263,6 +271,12 @@ def tune_schedule(
         found["b0"] = np.array([each.observer.b0 for each in parts])
         found["omega_c"] = np.array([each.omega_c for each in parts])
         found["omega_o"] = np.array([each.observer.omega_o for each in parts])
+        # What is the same at all points, as an omega_o at the limit of the sample time, is no table.
+        found = {
+            name: values
+            for name, values in found.items()
+            if name == "b0" or np.ptp(values) > _SAME * np.max(values)
+        }
     lists = {name: value.reshape(shape).tolist() for name, value in found.items()}
     schedule = Schedule(axes[0] if len(axes) == 1 else axes, signal, **lists)
     middle = found["b0"][len(grid) // 2]
