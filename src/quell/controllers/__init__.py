@@ -18,6 +18,7 @@ from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
 from quell.controllers.law import NonlinearFeedback
 from quell.controllers.linear import LinearController, LinearLaw
+from quell.controllers.online_gain import GainEstimate, OnlineGain
 from quell.controllers.prefilters import (
     Prefilter,
     Prefiltered,
@@ -37,9 +38,11 @@ __all__ = [
     "DeadTimeTuning",
     "Estimate",
     "Feedforward",
+    "GainEstimate",
     "LinearController",
     "LinearLaw",
     "NonlinearFeedback",
+    "OnlineGain",
     "Prefilter",
     "Prefiltered",
     "ProfileGenerator",

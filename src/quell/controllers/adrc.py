@@ -71,6 +71,7 @@ from quell.controllers.law import (
     feedback_design,
     law_gains,
 )
+from quell.controllers.online_gain import OnlineGain
 from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import NoSchedule, Schedule
 from quell.guard import Guard
@@ -214,8 +215,9 @@ class ADRC(Compensator):
     safe_set
         bands that y and its rate do not leave, whatever r and the learner ask for; none by default.
     schedule
-        tables of b0, omega_c and omega_o over one or two signals, which the gains follow; none by
-        default. With ``feedforward=True`` r^(m)/b0 follows b0.
+        tables of b0, omega_c and omega_o over one or two signals, which the gains follow, or an
+        ``OnlineGain``, which estimates b0; none by default. With ``feedforward=True`` r^(m)/b0
+        follows b0.
 
     Raises
     ------
@@ -254,7 +256,7 @@ class ADRC(Compensator):
         feedback: NonlinearFeedback | None = None,
         law_poles: Sequence[float | tuple[float, float]] | None = None,
         safe_set: SafeSet | None = None,
-        schedule: Schedule | None = None,
+        schedule: Schedule | OnlineGain | None = None,
     ) -> None:
         self._take_parts(observer, learner, guard, safe_set, schedule)
         check_zeros(observer)

@@ -422,7 +422,7 @@ class Compensator(StatefulController):
         if safe_set is not None and not isinstance(safe_set, SafeSet):
             raise ValueError(f"safe_set = {safe_set!r}: must be a quell.SafeSet(), or None")
         self.safe_set = safe_set
-        self.schedule = checked_schedule(schedule)
+        self.schedule: Any = checked_schedule(schedule)
         self._check_schedule()
 
     def _warn_of_idle_guard(self) -> None:
@@ -503,6 +503,13 @@ class Compensator(StatefulController):
         return self.schedule.design(observer, self.omega_c, None)
 
     @property
+    def gain_estimate(self) -> Any:
+        """What an ``OnlineGain`` knows of b; a ``ValueError`` if b0 is not estimated."""
+        if not hasattr(self.schedule, "read"):
+            raise ValueError("gain_estimate: give schedule=quell.OnlineGain(low, high) for one")
+        return self.schedule.read(self._state.schedule)
+
+    @property
     def external_signals(self) -> int:
         """Number of external signals that the schedule follows."""
         return 0 if self.schedule is None else self.schedule.external
@@ -518,7 +525,8 @@ class Compensator(StatefulController):
                 f"set_signals was given {len(values)} signals: the schedule follows "
                 f"{self.external_signals} external ones"
             )
-        self._state.schedule.given[:] = [float(value) for value in values]
+        for i, value in enumerate(values):
+            self._state.schedule.given[i] = float(value)
 
     def at(self, *signals: float) -> Any:
         """Return the controller without schedule that this one is at fixed signals.

@@ -620,11 +620,7 @@ class Schedule:
             raise ValueError("schedule.omega_c: a compensator has no law; give b0 and omega_o")
         if self.b0 is None:
             return
-        if observer.plant.zeros.size or not observer.plant.matched:
-            raise ValueError(
-                "schedule.b0: for a plant with zeros, or with an f that enters elsewhere than u, "
-                "b0 changes the meaning of the states; schedule omega_c and omega_o only"
-            )
+        check_b0_of(observer)
         if np.ravel(self.b0)[0] * observer.b0 < 0.0:
             raise ValueError(
                 f"schedule.b0 = {self.b0!r}: must have the sign of the observer's {observer.b0!r}"
@@ -689,9 +685,20 @@ def with_gains(observer: ESO, b0: float, omega_o: float) -> ESO:
     return replace(observer, b0=b0, omega_o=omega_o, model=made)
 
 
-def checked_schedule(schedule: Any) -> Schedule | None:
-    """Return ``schedule`` if it is one, or None."""
-    if schedule is None or isinstance(schedule, Schedule):
+def check_b0_of(observer: ESO) -> None:
+    """Raise a ``ValueError`` for an observer whose b0 can not change while it runs."""
+    if observer.plant.zeros.size or not observer.plant.matched:
+        raise ValueError(
+            "schedule.b0: for a plant with zeros, or with an f that enters elsewhere than u, "
+            "b0 changes the meaning of the states; schedule omega_c and omega_o only"
+        )
+
+
+def checked_schedule(schedule: Any) -> Any:
+    """Return ``schedule`` if it is a ``Schedule``, an ``OnlineGain``, or None."""
+    needed = ("design", "memory", "at", "check_retuning")
+    is_one = not isinstance(schedule, type) and all(hasattr(schedule, name) for name in needed)
+    if schedule is None or is_one:
         return schedule
     example = "quell.Schedule((0.0, 1.0), 'external', b0=(5000.0, 500.0))"
     raise ValueError(f"schedule = {schedule!r}: must be {example}, or None")

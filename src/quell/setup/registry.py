@@ -14,6 +14,7 @@ from quell.controllers import (
     Feedforward,
     LinearController,
     NonlinearFeedback,
+    OnlineGain,
     ProfileGenerator,
     ReferenceModel,
     Schedule,
@@ -253,7 +254,7 @@ _SERIES: Mapping[str, Callable[..., Any]] = {
     "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
-Scheduled = call_table("schedule", Schedule, only=True)
+Scheduled = one_of(_call_tables({"table": Schedule, "online-gain": OnlineGain}), default="table")
 _LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True)}
 _LAW["schedule"] = Scheduled | None
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"

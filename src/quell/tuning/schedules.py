@@ -47,8 +47,8 @@ _NOT_HERE = ("uncertain", "scenario", "search", "setup", "rest", "compare", "fee
 # Where the response to a step of the load ends, in time constants of the slowest pole, and the most
 # samples of it; what is left is a share of e⁻²⁰ of y.
 _TIME_CONSTANTS, _MOST_SAMPLES = 20.0, 2_000_000
-# Bandwidths that differ by less are those of one optimum; and the ratio of the integrals of |y| from
-# which on the summary advises other tables.
+# Bandwidths that differ by less are those of one optimum; and the ratio of the integrals of |y|
+# from which on the summary advises other tables.
 _SAME, _MUCH = 1e-6, 1.15
 
 
@@ -271,7 +271,7 @@ def tune_schedule(
         found["b0"] = np.array([each.observer.b0 for each in parts])
         found["omega_c"] = np.array([each.omega_c for each in parts])
         found["omega_o"] = np.array([each.observer.omega_o for each in parts])
-        # What is the same at all points, as an omega_o at the limit of the sample time, is no table.
+        # What is the same at all points, as omega_o at the limit of the sample time, is no table.
         found = {
             name: values
             for name, values in found.items()
