@@ -8,6 +8,7 @@ from quell.analysis.certificate import Certificate, certify, observer_error
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
+from quell.analysis.online import OnlineCertificate, certify_online
 from quell.analysis.plots import (
     loops_over_omega_o,
     loops_over_time,
@@ -27,10 +28,12 @@ __all__ = [
     "Frozen",
     "LoopAnalysis",
     "Margins",
+    "OnlineCertificate",
     "adapting",
     "advise",
     "analyse",
     "certify",
+    "certify_online",
     "frozen",
     "linear_law",
     "loops_over_omega_o",

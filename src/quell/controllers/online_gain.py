@@ -65,6 +65,8 @@ from quell.types import Vector
 _HIGH_PASS, _PEAK_TIME, _NOTHING = 0.2, 10.0, 1e-4
 # Least number of independent samples: with 10, σ is known within a fourth.
 _LEAST_SAMPLES = 10.0
+# Time in which samples are correlated, and the usual memory, in units of 1/ω_f.
+_CORRELATED, _MEMORY = 4.0, 300.0
 
 
 class OnlineDesign(NamedTuple):
@@ -254,7 +256,8 @@ class OnlineGain:
     low, high
         limits of b0 [y-unit/u-unit/s^n], which the observer's lies within; both of its sign.
     memory_time
-        T, the seconds of motion after which a sample has the weight 1/e.
+        T, the seconds of motion after which a sample has the weight 1/e; ``300/bandwidth`` by
+        default, and at least ``80/bandwidth``, or there would never be samples enough.
     tolerance
         largest σ, as a share of b̂, with which b0 follows.
     bandwidth
@@ -277,7 +280,7 @@ class OnlineGain:
 
     low: float
     high: float
-    memory_time: float = 5.0
+    memory_time: float | None = None
     tolerance: float = 0.1
     bandwidth: float | None = None
 
@@ -285,7 +288,7 @@ class OnlineGain:
         low, high = checks.finite("low", self.low), checks.finite("high", self.high)
         if not (low < high and low * high > 0.0):
             raise ValueError(f"low = {low!r}, high = {high!r}: must increase and have one sign")
-        checks.positive("memory_time", self.memory_time, "s")
+        checks.optional(checks.positive, "memory_time", self.memory_time, "s")
         if not checks.positive("tolerance", self.tolerance) < 1.0:
             raise ValueError(f"tolerance = {self.tolerance!r}: must be below 1, a share of b")
         checks.optional(checks.positive, "bandwidth", self.bandwidth, "rad/s")
@@ -333,13 +336,20 @@ class OnlineGain:
                 "whose motion b is estimated; give it to an ADRC, or take a table (Schedule)"
             )
         omega = omega_c if self.bandwidth is None else float(self.bandwidth)
+        memory_time = _MEMORY / omega if self.memory_time is None else float(self.memory_time)
+        least = 2.0 * _LEAST_SAMPLES * _CORRELATED / omega
+        if memory_time < least:
+            raise ValueError(
+                f"memory_time = {memory_time!r} s: must be at least {least:.3g} s with a bandwidth "
+                f"of {omega:.4g} rad/s, or there would never be samples enough"
+            )
         return OnlineDesign(
             low=float(self.low),
             high=float(self.high),
             tolerance=float(self.tolerance),
-            forget=math.exp(-dt / self.memory_time),
-            forget_peak=math.exp(-dt / (_PEAK_TIME * self.memory_time)),
-            correlated=4.0 / (omega * dt) + 1.0,
+            forget=math.exp(-dt / memory_time),
+            forget_peak=math.exp(-dt / (_PEAK_TIME * memory_time)),
+            correlated=_CORRELATED / (omega * dt) + 1.0,
             lag=math.exp(-omega * dt),
             edge=math.exp(-_HIGH_PASS * omega * dt),
             response=math.exp(-omega_c * dt),
