@@ -64,6 +64,16 @@ def cases() -> list[Case]:
     mf = ql.ADRC(observer, omega_c=10.0, **limits)
     ramps = ql.ESO.model_free(2, b0=5.0, omega_o=50.0, dt=1e-3, disturbance_order=2)
     mf_2 = ql.ADRC(ramps, omega_c=10.0, **limits)
+    # Tables over the reference, which moves through all cells; 60 instructions more are the bar.
+    points, b0 = (-1.0, -0.5, 0.0, 0.5, 1.0), (2.0, 3.0, 4.0, 5.0, 20.0)
+    bandwidths = (10.0, 11.0, 12.0, 13.0, 14.0), (50.0, 51.0, 52.0, 53.0, 54.0)
+
+    def scheduled(schedule: Any) -> ql.ADRC:
+        return ql.ADRC(observer, omega_c=10.0, schedule=schedule, **limits)
+
+    of_b0 = scheduled(ql.Schedule(points, "reference", b0))
+    of_all = scheduled(ql.Schedule(points, "reference", b0, *bandwidths))
+    online = scheduled(ql.OnlineGain(2.0, 20.0))
     # The reference of the runs gives a new target in each sample: each step plans a move.
     moves = "MF-ESO, order 2, feedforward, moves"
     fed = ql.ADRC(observer, omega_c=10.0, feedforward=ql.Feedforward.of(DRIVE), **limits)
@@ -78,6 +88,9 @@ def cases() -> list[Case]:
     return [
         Case("PID", m4, "single", DRIVE, pid),
         Case("MF-ESO, order 2", m4, "single", DRIVE, mf, small),
+        Case("MF-ESO, order 2, table of b0", m4, "single", DRIVE, of_b0, {"instructions": 224.0}),
+        Case("MF-ESO, order 2, three tables", m4, "single", DRIVE, of_all),
+        Case("MF-ESO, order 2, b0 online", m4, "single", DRIVE, online),
         Case("MF-ESO, order 2", m7, "double", DRIVE, mf),
         Case("MF-ESO, order 2, f and f'", m4, "single", DRIVE, mf_2),
         Case(moves, m4, "single", DRIVE, moving),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from scipy.linalg import expm
 
 import quell as ql
 from quell.controllers.baselines import PID
-from quell.identification import InputGain, identify_b0
+from quell.identification import InputGain, identify_b0, identify_b0_by
 from quell.identification.input_gain import Candidate, MarginError, bandwidth
 from quell.identification.running_loop import Form, linear_columns, placed, predicted
 
@@ -352,3 +353,30 @@ def test_the_command_succeeds_where_no_bandwidth_keeps_the_margin(
     assert f"omega_o = {told['ratio']:.3g} omega_c" in shown.out
     assert told["ratio"] > 20.0
     assert told["omega_c"] > 0.0
+
+
+def test_b0_by_a_signal_is_that_of_each_bin(tmp_path: Path) -> None:
+    """On a loop whose gain changes with a signal; a bin without samples is NOT known, and says what to do."""
+    t = np.arange(6000) * 0.01
+    signal = np.where(t < 20.0, 0.0, np.where(t < 40.0, 1.0, 3.0))
+    gain = np.where(t < 20.0, 4.0, np.where(t < 40.0, 2.0, 1.0))
+    observer = ql.ESO.model_free(order=1, b0=2.0, omega_o=20.0, dt=0.01)
+    controller, y, u = ql.ADRC(observer, omega_c=4.0), np.zeros(t.size), np.zeros(t.size)
+    noise = 1e-3 * np.random.default_rng(5).standard_normal(t.size)
+    for k in range(t.size - 1):
+        u[k] = controller.step(math.sin(0.2 * (t[k] % 20.0) ** 1.7), y[k] + noise[k])
+        y[k + 1] = y[k] + 0.01 * (gain[k] * u[k] + 0.3)
+    found = identify_b0_by(u, y + noise, signal, 0.01, 1, bins=3)
+    assert [each.is_known for each in found] == [True, True, True]
+    for each, true in zip(found, (4.0, 2.0, 1.0), strict=True):
+        low, high = each.interval
+        assert low < true < high
+        assert high - low < 0.3 * true
+    wide = identify_b0_by(u[:2500], y[:2500], signal[:2500], 0.01, 1, bins=(-0.5, 0.5, 0.8, 2.0))
+    assert not wide[1].is_known
+    assert str(wide[1]).startswith("NOT known at 0.5 … 0.8")
+    for bins, rule in (((1.0, 0.0), "increasing"), (0, "bins")):
+        with pytest.raises(ValueError, match=rule):
+            identify_b0_by(u, y, signal, 0.01, 1, bins=bins)
+    with pytest.raises(ValueError, match="nothing to divide"):
+        identify_b0_by(u, y, np.ones(u.size), 0.01, 1)

@@ -91,6 +91,9 @@ CONTROLLERS: dict[str, Any] = {
         ),
         baseline_room.ZV(3.0),
     ),
+    "ADRC with a schedule from online b0": ql.ADRC(
+        ESO, 1.5, schedule=ql.OnlineGain(0.7, 3.0, bandwidth=30.0), **LIMITS
+    ),
     "Compensator": ql.Compensator(ESO, **LIMITS),
     "Compensator with a schedule": ql.Compensator(
         ESO, schedule=ql.Schedule((-0.5, 0.7), "y", (0.7, 2.0), omega_o=(9.0, 20.0)), **LIMITS

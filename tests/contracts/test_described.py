@@ -25,6 +25,7 @@ OTHERS: dict[str, Any] = {
     "PlantBatch": ql.plants.batch(ql.plants.two_mass_spring, m1=[1.0, 1.25]),
     "DeadTimeTuning": _DEAD_TIME,
     "SafeSet": ql.SafeSet(y_max=1.5, alpha=4.0),
+    "OnlineGain": ql.OnlineGain(0.5, 5.0),
     "Schedule": ql.Schedule((0.0, 1.0), b0=(5.0, 0.5)),
     "Feedforward": ql.Feedforward.rigid(2.25, viscous=0.75),
     "LinearLaw": CONTROLLERS["LinearController"].law,
@@ -47,7 +48,7 @@ EXAMPLES: dict[str, Any] = {
 ROOMS = (controller_room, baseline_room, observer_room, plant_room, learner_room)
 # Interfaces; an estimate belongs to a running loop, and an FMU and models of other libraries to
 # files and packages that are not here.
-_WITHOUT = {"Estimate", "FMU", "JaxModel", "TorchModel"}
+_WITHOUT = {"Estimate", "FMU", "GainEstimate", "JaxModel", "TorchModel"}
 
 
 def public_classes() -> set[str]:

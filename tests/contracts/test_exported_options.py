@@ -182,7 +182,7 @@ PARTS: dict[str, Part] = {
     "ADRC": Part(ql.ADRC, _itself, {"observer": OBSERVER, "omega_c": 1.5, **LIMITS}, {
         "observer": ql.ESO.model_free(order=3, b0=1.5, omega_o=12.0, dt=DT), "omega_c": 2.0, "learner": ql.learners.Kalman(),
         "guard": With(ql.Guard(), {"learner": ql.learners.Kalman()}), "feedforward": Several((True, ql.Feedforward((0.3, 0.1, 0.7)))),
-        **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "schedule": ql.Schedule((0.0, 0.5), "y", (0.8, 2.0)), "half_gain": True, "feedback": room.NonlinearFeedback((0.75, 1.25), 0.05), "law_poles": [-1.0, -2.0],
+        **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "schedule": Several((ql.Schedule((0.0, 0.5), "y", (0.8, 2.0)), ql.OnlineGain(0.8, 3.0, bandwidth=30.0))), "half_gain": True, "feedback": room.NonlinearFeedback((0.75, 1.25), 0.05), "law_poles": [-1.0, -2.0],
     }),
     "Compensator": Part(ql.Compensator, _itself, {"observer": OBSERVER, **LIMITS}, {
         "observer": Several((ql.ESO.model_free(order=3, b0=1.5, omega_o=12.0, dt=DT), ql.ESO.model_based(([2.0, 0.3], 1.5), 12.0, DT))),
@@ -200,6 +200,9 @@ PARTS: dict[str, Part] = {
     "Schedule": Part(ql.Schedule, lambda schedule: ql.ADRC(OBSERVER, 1.5, schedule=schedule, **LIMITS), {"points": (-0.5, 0.5), "signal": "reference", "b0": (0.8, 2.0)}, {
         "points": (-0.3, 0.2), "signal": Several(("y", "speed", "external")), "b0": (1.0, 3.0),
         "omega_c": (1.0, 2.0), "omega_o": (9.0, 15.0),
+    }),
+    "OnlineGain": Part(ql.OnlineGain, lambda online: ql.ADRC(OBSERVER, 1.5, schedule=online, **LIMITS), {"low": 0.8, "high": 3.0, "bandwidth": 30.0}, {
+        "low": 1.0, "high": 2.0, "memory_time": 20.0, "tolerance": 0.2, "bandwidth": 20.0,
     }),
     "NonlinearFeedback": Part(room.NonlinearFeedback, lambda law: ql.ADRC(OBSERVER, 1.5, feedback=law, **LIMITS), {"alpha": (0.75, 1.25), "delta": 0.05}, {
         "alpha": Several(((0.5, 1.0),)), "delta": Several(((0.05, 0.1),)),
@@ -258,6 +261,7 @@ NO_PARTS = {
     "DeadTimeTuning",
     "Estimate",
     "Features",
+    "GainEstimate",
     "Joined",
     "Learner",
     "LinearLaw",

@@ -52,7 +52,7 @@ WORK = {
         "quell.tuning.plants.record_model",
         "quell.commissioning.experiment",
     ),
-    "b0": ("quell.identification.identify_b0",),
+    "b0": ("quell.identification.identify_b0", "quell.identification.identify_b0_by"),
 }
 BASES: dict[str, tuple[str, ...]] = {
     "reproduce two-mass": _FIGURES,
@@ -117,6 +117,7 @@ CASES: dict[str, dict[str, Case]] = {
     "b0": {
         "RECORD": ("--columns", "t,y,u"), "--loop": (("record.csv",), ("record.csv", "--loop", "setup.toml")), "--order": ("--order", "2"), "--dt": ("--dt", "0.04"), "--max-delay": ("--max-delay", "0.3"),
         "--phase-margin": (("real",), ("--phase-margin", "50")), "--ratio": (("real",), ("--ratio", "7")), "--columns": ("--columns", "t,y,u"), "--time-unit": ("--time-unit", "ms"),
+        "--by": ("--by", "y"), "--bins": (("record.csv", "--order", "1", "--by", "y"), ("record.csv", "--order", "1", "--by", "y", "--bins", "3")),
     },
     "excite": {
         "OUT": ("other.csv",), "--kind": ("--kind", "multisine"), "--low": ("--low", "2"), "--high": ("--high", "30"), "--duration": ("--duration", "40"), "--dt": ("--dt", "0.002"),

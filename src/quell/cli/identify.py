@@ -178,6 +178,8 @@ def b0(
     max_delay: float | None = None,
     phase_margin: float = 60.0,
     ratio: float | None = None,
+    by: str | None = None,
+    bins: int | None = None,
     read: ReadOptions = READ_OPTIONS,
     json: Path | None = None,
     trust: Trust = False,
@@ -204,6 +206,11 @@ def b0(
     ratio
         omega_o over omega_c; that of the loop by default, or without one the ratio from 3 to 100
         that allows the largest omega_c, nearly.
+    by
+        Column of a signal by which b0 changes, such as speed or extension: name or number in a
+        table in text. b0 is then found in each bin of it, and no omega_c.
+    bins
+        Number of bins between the least and the largest value of `--by`; 5 by default.
     json
         Write the results to this file, for programs.
     """
@@ -220,8 +227,16 @@ def b0(
         raise ValueError(
             "order: missing; give --order, or with --loop the setup of an ADRC, which has one"
         )
-    ratio = ran.get("ratio") if ratio is None else ratio
     console = Console()
+    if by is not None:
+        if ratio is not None or phase_margin != 60.0:
+            raise ValueError("ratio, phase_margin: have no effect with --by; leave them out")
+        signal = _column(record, by, read, dt, samples.y.size)
+        _print_bins(console, record, samples, signal, by, order, bins, max_delay, json, overwrite)
+        return
+    if bins is not None:
+        raise ValueError(f"bins = {bins!r}: has no effect without --by; give the column, too")
+    ratio = ran.get("ratio") if ratio is None else ratio
     with console.status("Searching; the first time, code is compiled for some seconds."):
         found = identify_b0(samples.u, samples.y, samples.dt, order, max_delay=max_delay)
     count = f"{samples.y.size} samples, dt = {samples.dt:g} s"
@@ -237,6 +252,70 @@ def b0(
     results |= _print_bandwidth(console, found, phase_margin, ratio)
     if json is not None:
         write_json(json, results, overwrite)
+        print_line(console, f"Results: {json}")
+
+
+def _column(record: Path, by: str, read: ReadOptions, dt: float | None, size: int) -> Any:
+    """Return a further column of a table in text."""
+    from quell.commissioning import measured
+
+    if record.suffix.lower() in (".nc", ".mcap"):
+        raise ValueError(
+            f"by = {by!r}: {record.name} is no table in text; write the recording as CSV "
+            "(quell run-rig --csv), or give u, y and the signal as columns of a table"
+        )
+    columns = [name.strip() for name in (read.columns or ("u,y" if dt else "t,u,y")).split(",")]
+    names = ",".join([*columns[:-1], by])
+    found = measured(record, names, dt, read.time_unit, read.max_size).y
+    if found.size != size:
+        raise ValueError(
+            f"by = {by!r}: the column has {found.size} samples, u and y have {size}; give "
+            "--columns, so that all are read from the same rows"
+        )
+    return found
+
+
+def _print_bins(
+    console: Console,
+    record: Path,
+    samples: Any,
+    signal: Any,
+    by: str,
+    order: int,
+    bins: int | None,
+    max_delay: float | None,
+    json: Path | None,
+    overwrite: bool,
+) -> None:
+    """Find, print and write b0 in each bin of a signal."""
+    from quell.files import nonfinite_to_none, write_json
+    from quell.identification import identify_b0_by
+
+    with console.status("Searching; the first time, code is compiled for some seconds."):
+        found = identify_b0_by(
+            samples.u,
+            samples.y,
+            signal,
+            samples.dt,
+            order,
+            bins=5 if bins is None else bins,
+            max_delay=max_delay,
+        )
+    count = f"{samples.y.size} samples, dt = {samples.dt:g} s"
+    print_line(console, f"{record.name}: {count}, order {order}, by {by}")
+    for each in found:
+        print_line(console, str(each))
+    known = [each for each in found if each.is_known]
+    if len(known) > 1:
+        points, gains = (
+            [f"{x:.4g}" for x in column]
+            for column in zip(*((each.mean, each.b0) for each in known), strict=True)
+        )
+        table = f"points = [{', '.join(points)}], b0 = [{', '.join(gains)}]"
+        print_line(console, f"schedule = {{ {table} }}  # of [controller]")
+    if json is not None:
+        rows = [each._asdict() | {"interval": each.interval} for each in found]
+        write_json(json, nonfinite_to_none({"order": order, "by": by, "bins": rows}), overwrite)
         print_line(console, f"Results: {json}")
 
 

@@ -13,6 +13,7 @@ from quell.identification.excitation import (
     excitation,
     frequency_response,
 )
+from quell.identification.gain_by_signal import GainBin, identify_b0_by
 from quell.identification.identify import (
     Alternative,
     alternatives,
@@ -30,6 +31,7 @@ __all__ = [
     "Bandwidth",
     "Excitation",
     "FrequencyResponse",
+    "GainBin",
     "Identified",
     "InputGain",
     "MarginError",
@@ -43,6 +45,7 @@ __all__ = [
     "frequency_response",
     "identify",
     "identify_b0",
+    "identify_b0_by",
     "not_told_apart",
     "read_record",
     "simulated_plant",

@@ -703,7 +703,7 @@ def identify_b0(
     u, y = checks.vector("u", u), checks.vector("y", y)
     checks.vector("y", y, u.size)
     dt, order = checks.positive("dt", dt, "s"), checks.whole("order", order, 1, 4)
-    least = _SAMPLES_PER_PARAMETER * (3 * order + 6)
+    least = least_samples(order)
     if u.size < least:
         rule = f"must have at least {least} for order {order}; record longer"
         raise ValueError(f"u has {u.size} samples: {rule}")
@@ -733,6 +733,11 @@ def identify_b0(
             f"order = {order}: no model was found; check the order, and that u belongs to y"
         )
     return _result(usable, u, y[before:], dt, scale_u, scale_y)
+
+
+def least_samples(order: int) -> int:
+    """Return how many samples a record needs for a plant of an order."""
+    return _SAMPLES_PER_PARAMETER * (3 * order + 6)
 
 
 def _is_usable(one: LoopFit) -> bool:
