@@ -329,10 +329,13 @@ def test_a_tuned_schedule_keeps_the_constraints_at_and_between_its_points(tmp_pa
 
 
 def test_of_plants_that_are_known_at_points_only_the_summary_says_so() -> None:
-    """They are given as a mapping."""
+    """They are given as a mapping. Where they are a function, it tells where M_s is above its bound between them."""
     tuned = ql.tune_schedule({0.0: axis(1e-3), 1.0: axis(2e-3)}, DT)
     assert "NOT known between the points" in tuned.summary()
     assert len(tuned.results) == 2
+    few = ql.tune_schedule(lambda e: axis(2e-4 + 1.8e-3 * e**2), DT, points=(0.0, 1.0))
+    assert few.results[1].m_s > 1.9
+    assert f"NOT within M_s = 1.6: {few.results[1].m_s:.3f} at 0.5" in few.summary()
 
 
 # ---- b0 online ----

@@ -363,8 +363,8 @@ class OnlineGain:
         """Return the state before the first sample."""
         loop = OnlineLoop.zeros()
         loop[0].b0 = 1.0 / design.inverse_b0
-        filters = (np.zeros(4) for _ in range(3))
-        return OnlineMemory(*filters, np.zeros(design.order), loop)
+        response = np.zeros(design.order)
+        return OnlineMemory(np.zeros(4), np.zeros(4), np.zeros(4), response, loop)
 
     def read(self, memory: OnlineMemory) -> GainEstimate:
         """Return what is known of b."""

@@ -50,6 +50,8 @@ _TIME_CONSTANTS, _MOST_SAMPLES = 20.0, 2_000_000
 # Bandwidths that differ by less are those of one optimum; and the ratio of the integrals of |y|
 # from which on the summary advises other tables.
 _SAME, _MUCH = 1e-6, 1.15
+# Times the bound of M_s from which on the summary tells of it between the points.
+_MORE = 1.05
 
 
 class PointResult(NamedTuple):
@@ -119,6 +121,15 @@ class TunedSchedule:
                 f"{each.ratio:.3f} of the own tuning's"
             )
         lines.append(f"largest M_s {self.m_s:.3f}, largest ratio of ∫|y| {self.worst_ratio:.3f}")
+        bound = (self.joint or next(iter(self.own.values()))).constraints.m_s
+        above = [each for each in self.results if bound and each.m_s > _MORE * bound]
+        if above:
+            worst = max(above, key=lambda each: each.m_s)
+            where = ", ".join(f"{value:.4g}" for value in worst.signals)
+            lines.append(
+                f"NOT within M_s = {bound:g}: {worst.m_s:.3f} at {where}, where the plant is not "
+                "that of the interpolated gains; give more points around it"
+            )
         if self.joint is not None and self.worst_ratio > _MUCH:
             lines.append(
                 "NOT as good as the own tuning at each point, which needs other bandwidths there, "
@@ -242,7 +253,7 @@ def tune_schedule(
             raise ValueError(f"{name}: tune_schedule has no such argument; tune each point for it")
     axes, plant_at, is_function = _points(plant, points)
     grid = list(product(*axes))
-    late = {"delay": delay, "actuator_lag": actuator_lag}
+    late: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
     given = [given_plants(plant_at(at), dt, **late) for at in grid]
     degree = given[0].degree
     for at, each in zip(grid, given, strict=True):
