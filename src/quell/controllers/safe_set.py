@@ -39,7 +39,9 @@ all ψ_i ≥ 0, and an observer that has settled (some lags after a start), ψ_{
 and y and y' stay in their bands: for orders 1 and 2 at all times but for f' dt²/8 of a curve within
 a sample, of higher order up to (α dt)² of the band. From a start outside, ψ_{n−1} grows towards
 zero as exp(−α t). All of that as long as the limits of u allow what (1) asks for: else u is at the
-limit that comes nearest, and the flag ``UNSAFE`` says so. In a band of width H that takes
+limit that comes nearest, and the flag ``UNSAFE`` says so. It also says that a measurement was
+farther from the expected one than signals within the bounds allow: then a bound does not hold, and
+nothing is guaranteed. In a band of width H that takes
 
     |b0 u + f| ≤ α² H for n = 2,      3 α³ H for n = 3
 
@@ -71,6 +73,10 @@ _UNSAFE = int(Status.UNSAFE)
 # between the nodes may add.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 _BETWEEN_NODES = 1.01
+# An observer has forgotten its start after so many lags: exp(−20) = 2e-9.
+_SETTLED_LAGS = 20.0
+# Rounding of a measurement and of its prediction, as a share of y; of single precision, too.
+_ROUNDING = 1e-6
 
 
 class NoSafeSet(NamedTuple):
@@ -100,6 +106,8 @@ class SafeSetDesign(NamedTuple):
     eso: EsoModel  # the observer without learner
     position: Band
     rate: Band
+    surprise: float  # largest error of an expected measurement with all signals in their bounds
+    settled: float  # samples after which that holds
 
 
 class SafeSetLoop(Scalars):
@@ -108,6 +116,8 @@ class SafeSetLoop(Scalars):
     started: float  # 1 after the first finite measurement, else 0
     low: float  # lowest u that keeps the loop in the set
     high: float  # highest u that does
+    samples: float  # since the start, up to ``settled``
+    surprised: float  # 1 if a measurement was farther from the expected one than bounds allow
 
 
 class SafeSetMemory(NamedTuple):
@@ -148,11 +158,17 @@ def _see(design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float) -> No
             begin(design.eso, memory.z, memory.seen, y)
             loop.started = 1.0
         return
+    expected = expected_measurement(design.eso, memory.z, u, 0.0)
+    loop.surprised = 0.0
     if not is_usable(y):
-        y = expected_measurement(design.eso, memory.z, u, 0.0)
+        y = expected
+    elif loop.samples < design.settled:
+        loop.samples += 1.0
+    elif not abs(y - expected) <= design.surprise + _ROUNDING * abs(y):
+        loop.surprised = 1.0
     observe(design.eso, memory.z, memory.seen, y, u, 0.0)
     if not is_finite(memory.seen[memory.seen.size - 1]):
-        loop.started = 0.0
+        loop.started = loop.samples = 0.0
 
 
 @kernel
@@ -185,7 +201,7 @@ def _nearest_safe(design: SafeSetDesign, memory: SafeSetMemory, u: float) -> tup
 @flags_of_applied.register(SafeSetDesign)
 def _flags_of_applied(design: SafeSetDesign, memory: SafeSetMemory, u: float) -> int:
     loop = memory.loop[0]
-    if loop.started == 0.0 or loop.low <= u <= loop.high:
+    if loop.started == 0.0 or (loop.low <= u <= loop.high and loop.surprised == 0.0):
         return 0
     return _UNSAFE
 
@@ -307,7 +323,11 @@ class SafeSet:
             )
         position = self._band(observer, model, n, (self.y_min, self.y_max), largest)
         rate = self._band(observer, model, n - 1, (self.rate_min, self.rate_max), largest)
-        return SafeSetDesign(model, position, rate)
+        # The expected measurement is wrong by C (Φ e + w) + v: the same with c = C, λ = 0 and v.
+        first = np.eye(n)[0]
+        surprise = self._largest_error(observer, model, first, 0.0, largest) + self.noise
+        settled = float(round(_SETTLED_LAGS * observer.lag_time / observer.dt))
+        return SafeSetDesign(model, position, rate, surprise, settled)
 
     def memory(self, design: SafeSetDesign) -> SafeSetMemory:
         """Return the state before the first sample."""
