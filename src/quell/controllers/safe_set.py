@@ -11,7 +11,8 @@ linear in the state::
 
     ψ_{n−1} = α^(n−1) y_max − c · x,      c_i = C(n − 1, i − 1) α^(n−i)
 
-and one sample later, with u held, it is known exactly: ``x⁺ = Φ x + Γ_u u + Γ_f f``. The condition is::
+and one sample later, with u held, it is known exactly: ``x⁺ = Φ x + Γ_u u + Γ_f f``. The condition
+is::
 
     ψ_{n−1}⁺ ≥ λ ψ_{n−1},      λ = exp(−α dt)
 

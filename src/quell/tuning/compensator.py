@@ -13,8 +13,8 @@ on a grid of logarithms, then between its points; a loop is sampled exactly, its
 ``analyse``.
 
 With a load d at the plant's input, the controller C, the plant P and the observer's response Q from
-f to f̂, a nominal model gives ``y = P (1 − Q)/(1 + P C) d``: the compensator removes what lies within
-the bandwidth of Q, whatever C does.
+f to f̂, a nominal model gives ``y = P (1 − Q)/(1 + P C) d``: the compensator removes what lies
+within the bandwidth of Q, whatever C does.
 """
 
 from __future__ import annotations
