@@ -75,7 +75,8 @@ def studies() -> dict[str, Case]:
     springs = {spring: {"MF-ESO": judged} for spring in acc.SPRINGS}
     masses = acc.Result(acc.generated(2), "drawn", springs, {}, 1.0, 1.0)
     loop = stress.draw_loops(1, np.random.default_rng(0))[0]
-    one = stress.Outcome("honest", loop, "rls", False, False, 1.0, 0.9, 0.8)
+    ratios = stress.Errors(1.0, 0.9, 0.8), stress.Errors(1.0, 1.0, 1.0)
+    one = stress.Outcome("honest", loop, "rls", *ratios)
     trial_of_guard = stress.Result({}, [one])
     rates = {spring: {"MF-ESO": [(0.1, 0.0, 0.2)] * 7} for spring in acc.SPRINGS}
 
