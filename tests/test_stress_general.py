@@ -241,7 +241,10 @@ def test_a_perfect_learner_removes_the_load(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of 80 lags in place of the trial's 250."""
+    """Runs of 80 lags in place of the trial's 250, with one draw of the noise in place of four."""
+    for module in (general, study):
+        monkeypatch.setattr(module, "USUAL", range(1))
+        monkeypatch.setattr(module, "OTHERS", range(1, 2))
     monkeypatch.setattr("quell.experiments.stress.loops.RUN_LAGS", 80.0)
     monkeypatch.setattr("quell.experiments.stress.loops._LEAST_DURATION", 0.0)
 
@@ -278,11 +281,8 @@ def test_another_draw_changes_the_noise_only() -> None:
 
 
 @pytest.mark.usefixtures("short_runs")
-def test_other_noise_moves_the_ratios_of_mf_eso_a_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a loop without friction; here with two draws of the noise."""
-    for module in (general, study):
-        monkeypatch.setattr(module, "USUAL", range(2))
-        monkeypatch.setattr(module, "OTHERS", range(2, 4))
+def test_other_noise_moves_the_ratios_of_mf_eso_a_little() -> None:
+    """In a loop without friction."""
     found = general.run_one(8, 1, "Kalman", None, honest=True)
     assert 0.0 < abs(found.chance.rms - 1.0) < 0.05
 
