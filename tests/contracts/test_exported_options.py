@@ -184,6 +184,15 @@ PARTS: dict[str, Part] = {
         "guard": With(ql.Guard(), {"learner": ql.learners.Kalman()}), "feedforward": Several((True, ql.Feedforward((0.3, 0.1, 0.7)))),
         **_RANGE, "half_gain": True, "feedback": room.NonlinearFeedback((0.75, 1.25), 0.05), "law_poles": [-1.0, -2.0],
     }),
+    "Compensator": Part(ql.Compensator, _itself, {"observer": OBSERVER, **LIMITS}, {
+        "observer": Several((ql.ESO.model_free(order=3, b0=1.5, omega_o=12.0, dt=DT), ql.ESO.model_based(([2.0, 0.3], 1.5), 12.0, DT))),
+        "omega_c": With(2.0, {"learner": ql.learners.Kalman()}), "learner": With(ql.learners.Kalman(), {"omega_c": 1.5}),
+        "guard": With(ql.Guard(), {"learner": ql.learners.Kalman(), "omega_c": 1.5}), **_RANGE,
+    }),
+    "Compensated": Part(room.Compensated, _itself, {"controller": PID, "compensator": ql.Compensator(OBSERVER, **LIMITS)}, {
+        "controller": baseline_room.LQG(PLANT, omega_c=3.0, omega_o=12.0, dt=DT),
+        "compensator": ql.Compensator(OBSERVER, omega_c=1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), **LIMITS),
+    }),
     "NonlinearFeedback": Part(room.NonlinearFeedback, lambda law: ql.ADRC(OBSERVER, 1.5, feedback=law, **LIMITS), {"alpha": (0.75, 1.25), "delta": 0.05}, {
         "alpha": Several(((0.5, 1.0),)), "delta": Several(((0.05, 0.1),)),
     }),
