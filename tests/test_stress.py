@@ -38,14 +38,16 @@ def test_without_a_guard_the_other_kinds_wreck_a_loop_too(kind: str) -> None:
 @pytest.mark.compiled
 def test_the_same_seed_gives_the_same_trial() -> None:
     """All that is random is drawn from it."""
-    one, again, other = (stress.run(2, 1, seed, guard=ql.Guard()) for seed in (1, 1, 2))
+    one, again, other = (stress.run(1, 1, seed, guard=ql.Guard()) for seed in (1, 1, 2))
     assert [o.guarded for o in one.outcomes] == [o.guarded for o in again.outcomes]
     assert [o.guarded for o in one.outcomes] != [o.guarded for o in other.outcomes]
 
 
 @pytest.mark.compiled
-def test_results_are_plain_data() -> None:
-    """For ``json.dump``, with counts for each kind, quantiles of the ratios and of what chance does."""
+def test_results_are_plain_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For ``json.dump``, with counts for each kind, quantiles of the ratios and of what chance does; here with one draw of the noise."""
+    monkeypatch.setattr(study, "USUAL", range(1))
+    monkeypatch.setattr(study, "OTHERS", range(1, 2))
     shares: list[float] = []
     result = stress.run(12, 1, seed=5, guard=ql.Guard(), progress=shares.append)
     assert result.kinds == [*stress.KINDS, stress.HONEST]

@@ -230,6 +230,7 @@ def test_exact_weights_are_those_of_f() -> None:
     assert weights["load"] == 1.0
 
 
+@pytest.mark.usefixtures("one_draw")
 def test_a_perfect_learner_removes_the_load(monkeypatch: pytest.MonkeyPatch) -> None:
     """All but a thousandth without guard; with it, more than half; from 50 to 80 of the trial's 100 to 300 lags."""
     monkeypatch.setattr(general, "PERFECT_FROM_LAGS", 50.0)
@@ -237,14 +238,20 @@ def test_a_perfect_learner_removes_the_load(monkeypatch: pytest.MonkeyPatch) -> 
     case = perfect_case(1, "sine", ql.Guard(), 0)
     assert case.unguarded < 1e-3 * case.plain
     assert case.lost_share < 0.5
+    assert 0.0 < abs(case.of_other_noise.lost_share) < 1e-3
 
 
 @pytest.fixture
-def short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of 80 lags in place of the trial's 250, with one draw of the noise in place of four."""
+def one_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One draw of the noise in place of the trial's four."""
     for module in (general, study):
         monkeypatch.setattr(module, "USUAL", range(1))
         monkeypatch.setattr(module, "OTHERS", range(1, 2))
+
+
+@pytest.fixture
+def short_runs(monkeypatch: pytest.MonkeyPatch, one_draw: None) -> None:
+    """Runs of 80 lags in place of the trial's 250, with one draw of the noise."""
     monkeypatch.setattr("quell.experiments.stress.loops.RUN_LAGS", 80.0)
     monkeypatch.setattr("quell.experiments.stress.loops._LEAST_DURATION", 0.0)
 
