@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from quell.controllers.compensated import Compensated
     from quell.controllers.compensator import Compensator, Estimate
     from quell.controllers.feedforward import Feedforward
+    from quell.controllers.safe_set import SafeSet
     from quell.guard import Guard, Reason
     from quell.identification.identify import identify
     from quell.lti.canonical import canonical
@@ -68,6 +69,7 @@ _HOMES = {
     "Feedforward": "controllers.feedforward",
     "Guard": "guard",
     "Reason": "guard",
+    "SafeSet": "controllers.safe_set",
     "Scenario": "simulation.driver",
     "Status": "types",
     "Trajectory": "records.trajectory",
@@ -88,10 +90,11 @@ _MODULES = (
 
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning", "Estimate",
-    "Feedforward", "Guard", "Reason", "Scenario", "Status", "Trajectory", "Tuned", "analysis",
-    "baselines", "canonical", "controllers", "envs", "experiments", "export", "features",
-    "identification", "identify", "learners", "metrics", "observers", "omega_c_for", "plants",
-    "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune", "tuning",
+    "Feedforward", "Guard", "Reason", "SafeSet", "Scenario", "Status", "Trajectory", "Tuned",
+    "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
+    "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
+    "plants", "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
+    "tuning",
 ]  # fmt: skip
 
 

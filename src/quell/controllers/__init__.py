@@ -24,6 +24,7 @@ from quell.controllers.prefilters import (
     ReferenceModel,
     TrackingDifferentiator,
 )
+from quell.controllers.safe_set import SafeSet
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
 
@@ -42,6 +43,7 @@ __all__ = [
     "Prefiltered",
     "ProfileGenerator",
     "ReferenceModel",
+    "SafeSet",
     "TrackingDifferentiator",
     "adrc_for_dead_time",
     "baselines",

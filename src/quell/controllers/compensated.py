@@ -50,7 +50,7 @@ from quell.observers.eso import ESO
 from quell.observers.forms import expected_measurement
 from quell.types import Channels, Status, Vector
 
-_CUT = int(Status.SATURATED | Status.RATE_LIMITED)
+_CUT = int(Status.SATURATED | Status.RATE_LIMITED | Status.SAFE_SET_ACTED)
 
 
 class CompensatedDesign(NamedTuple):

@@ -34,6 +34,7 @@ from quell.controllers.compensator import change_design, manual_operation
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper
+from quell.controllers.safe_set import SafeSetDesign
 from quell.features.base import CustomDesign
 from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels import dispatch
@@ -125,6 +126,9 @@ def _with_carries(design: Any, state: Any) -> Any:
         return state._replace(controller=given, compensator=inner)
     if isinstance(design, AdrcDesign):
         state = state._replace(z=np.zeros(design.eso.states))
+        if isinstance(design.safe_set, SafeSetDesign):
+            wide = state.safe_set._replace(z=np.zeros(design.safe_set.eso.states))
+            state = state._replace(safe_set=wide)
         learner = state.learner
         if isinstance(design.learner, KalmanDesign) and needs_carries(design.learner):
             wide = np.hstack([learner.covariance, np.zeros((learner.theta.size, 1))])

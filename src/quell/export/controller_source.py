@@ -19,6 +19,7 @@ from quell.controllers.base import (
 from quell.controllers.compensated import compensating_part, takes_control
 from quell.controllers.compensator import samples_to_settle
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
+from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
 from quell.export.c_files import CFiles, CSource, translated
@@ -100,10 +101,11 @@ def check_counts(controller: Any, resolution: float) -> None:
             origin = y
             u[k, 1] = control(design, moved, r - y, 0.0)
     same = np.max(np.abs(u[:, 1] - u[:, 0])) <= _ROUNDING * np.max(np.abs(u[:, 0]))
-    if design.learns or not same:  # what is learned acts much later than in this trial
+    banded = isinstance(getattr(design, "safe_set", None), SafeSetDesign)
+    if design.learns or banded or not same:  # what is learned acts much later than in this trial
         raise TranslationError(
             f"resolution = {resolution!r}: this controller needs the position itself, for a model "
-            "with a spring or for a learner; hand over y in its unit (NAME_step)"
+            "with a spring, a learner or a safe set; hand over y in its unit (NAME_step)"
         )
 
 
