@@ -2,7 +2,8 @@
 
 A compensator changes the loop, so it is tuned as a controller is: the largest |S|, |T| and |K S| of
 the whole loop, with the controller in it, are bounded, and of all observers within the bounds the
-one is taken that leaves the least ``∫|y|`` after a step of the load at the plant's input.
+one is taken that leaves the least ``∫|y|`` after a step of the load at the plant's input. The
+bounds hold, 1.5 times as wide, where all poles and zeros of the plant are slower or faster, too.
 
 Two families of observers are tried: model-free ones of the orders up to the plant's relative
 degree, whose b0 is a factor times the plant's gain (a larger b0 compensates less, and costs less
@@ -35,9 +36,10 @@ from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
+from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import Inputs, PlantSet, law_of, load_step, response
-from quell.tuning.plants import given_plants, model_of, plant_set
+from quell.tuning.plants import Given, given_plants, model_of, plant_set
 from quell.tuning.report import toml_text
 from quell.tuning.structures.adrc import matrices
 from quell.types import DesignWarning, Vector
@@ -50,6 +52,8 @@ _PEAKS, _NOISE = 2.0, 3.0
 _BANDWIDTHS, _FACTORS = 14, (0.7, 1.0, 1.4, 2.0, 3.0, 5.0)
 # Steps of the search between points of the grid, each half as wide as the one before.
 _HALVINGS = 5
+# What the peaks may be, over their bounds, where all poles and zeros of the plant are elsewhere.
+_ELSEWHERE = 1.5
 # Less than this share of the load's effect is not worth a second observer.
 _WORTH = 0.05
 
@@ -61,11 +65,12 @@ class Measures(NamedTuple):
     m_t: float  #: largest |T|
     m_ks: float  #: largest |K S| [u-unit/y-unit]
     iae: float  #: ∫|y| after a unit step of the load [y-unit s/u-unit]
+    m_s_elsewhere: float  #: largest |S| with the poles and zeros of ``speeds``
 
     def __str__(self) -> str:
         return (
-            f"M_s {self.m_s:.3g}, M_t {self.m_t:.3g}, M_ks {self.m_ks:.3g}, "
-            f"∫|y| {self.iae:.4g} per unit of the load"
+            f"M_s {self.m_s:.3g} ({self.m_s_elsewhere:.3g} at other speeds of the plant), "
+            f"M_t {self.m_t:.3g}, M_ks {self.m_ks:.3g}, ∫|y| {self.iae:.4g} per unit of the load"
         )
 
 
@@ -150,6 +155,7 @@ def tune_compensator(
     *,
     constraints: Constraints | None = None,
     b_range: tuple[float, float] = (1.0, 1.0),
+    speeds: tuple[float, float] = (0.88, 1.2),
     delay: float = 0.0,
     actuator_lag: float = 0.0,
     operating_point: Any = None,
@@ -171,6 +177,10 @@ def tune_compensator(
         and three times the controller's M_ks.
     b_range
         lowest and highest gain of the plant over that of the model.
+    speeds
+        lowest and highest factor of the poles and zeros of the first plant, for which 1.5 times
+        the bounds hold: an observer with a model of a resonance would else rely on its frequency.
+        By default (0.88, 1.2): inertias that are 30 % larger and smaller. (1, 1) for none.
     delay, actuator_lag, operating_point
         as for ``analyse``.
     load
@@ -196,8 +206,10 @@ def tune_compensator(
     dt = float(controller.dt)
     how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag, "b_range": b_range}
     given = given_plants(plant, dt, operating_point=operating_point, **how)
-    plants = plant_set(given, dt)
-    inputs = load_step(plants, checks.nonzero("load", load, "or nothing is rejected"))
+    count = len(given.linear)
+    given = _with_speeds(given, speeds)
+    plants = _Plants(plant_set(given, dt), count, len(given.linear))
+    inputs = load_step(plants.all, checks.nonzero("load", load, "or nothing is rejected"))
     before = _measured(controller, plants, inputs)
     if not math.isfinite(before.m_s):
         raise ValueError(
@@ -207,7 +219,7 @@ def tune_compensator(
     bounds = constraints or Constraints(m_s=_PEAKS, m_t=_PEAKS, damping=None)
     if bounds.m_ks is None:
         bounds = replace(bounds, m_ks=_NOISE * before.m_ks)
-    model = model_of(given, plants, bounds)
+    model = model_of(given, plants.all, bounds)
     alone = _excess(before, bounds)
     if alone > 0.0:
         raise ValueError(
@@ -231,12 +243,37 @@ def tune_compensator(
     both = Compensated(controller, compensator)
     both_alone = Compensated(controller, Compensator(best.observer))  # without learner
     tables = {"observer": best.table, "compensator": numbers}
-    first = plants.scaled()[0]
+    first = plants.all.scaled()[0]
     ways = (response(first, law_of(each), inputs) for each in (controller, both_alone))
     y = tuple(ways)
     return TunedCompensator(
         both, best.name, before, best.measures, bounds, tables, dt, (y[0], y[1])
     )
+
+
+def _with_speeds(given: Given, speeds: tuple[float, float]) -> Given:
+    """Return the plants, and the first one with all poles and zeros at other frequencies."""
+    low, high = checks.positive_vector("speeds", speeds).tolist()
+    if not low <= 1.0 <= high:
+        raise ValueError(f"speeds = {speeds!r}: must be a factor up to 1 and one from 1 on")
+    first, more = LinearPlant.of(given.linear[0]), []
+    for factor in {low, high} - {1.0}:
+        parts = factor * first.A, factor * first.B, first.C
+        more.append(LinearPlant(*parts, E=factor * first.E))
+    delays = np.append(given.delays, np.full(len(more), given.delays[0]))
+    return given._replace(linear=(*given.linear, *more), delays=delays)
+
+
+class _Plants(NamedTuple):
+    """The plants of a set, of which some are the first one at other speeds."""
+
+    all: PlantSet
+    given: int  # number of those that were given
+    distinct: int  # number of all, without the factors of their gain
+
+    def elsewhere(self, j: int) -> bool:
+        """Return whether plant j is the first one at another speed."""
+        return j % self.distinct >= self.given
 
 
 class _Family(NamedTuple):
@@ -280,13 +317,13 @@ def _families(model: Any, dt: float) -> Iterator[_Family]:
 def _searched(
     family: _Family,
     controller: Controller,
-    plants: PlantSet,
+    plants: _Plants,
     inputs: Inputs,
     bounds: Constraints,
     model: Any,
 ) -> _Candidate | None:
     """Return the best observer of a family, or None if none keeps the bounds."""
-    fastest = bounds.omega_o_dt / plants.dt
+    fastest = bounds.omega_o_dt / plants.all.dt
     grid = np.geomspace(min(0.1 * model.omega, 0.01 * fastest), fastest, _BANDWIDTHS)
     tried: dict[tuple[float, float], tuple[float, _Candidate] | None] = {}
 
@@ -317,7 +354,7 @@ def _tried(
     family: _Family,
     key: tuple[float, float],
     controller: Controller,
-    plants: PlantSet,
+    plants: _Plants,
     inputs: Inputs,
     bounds: Constraints,
 ) -> tuple[float, _Candidate] | None:
@@ -334,29 +371,31 @@ def _tried(
 
 
 def _measured(
-    controller: Controller, plants: PlantSet, inputs: Inputs, bounds: Constraints | None = None
+    controller: Controller, plants: _Plants, inputs: Inputs, bounds: Constraints | None = None
 ) -> Measures:
     """Return the largest figures over all plants; infinite for an unstable loop."""
-    law, worst = law_of(controller), Measures(0.0, 0.0, 0.0, 0.0)
-    unstable = Measures(math.inf, math.inf, math.inf, math.inf)
-    C = Response(subsystem(plants.plants[0], law, "C_y"))(plants.omega, plants.dt)
-
-    def kinds(P: Any, C: Any) -> tuple[Any, Any, Any]:
-        S = 1.0 / (1.0 + P * C)
-        return np.abs(S), np.abs(P * C * S), np.abs(C * S)
-
-    for plant, P in zip(plants.scaled(), plants.P, strict=True):
-        loop = LoopAnalysis(plant, law, plants.dt)
+    law, of = law_of(controller), plants.all
+    worst, unstable = Measures(0.0, 0.0, 0.0, 0.0, 0.0), Measures(*5 * [math.inf])
+    C = Response(subsystem(of.plants[0], law, "C_y"))(of.omega, of.dt)
+    for j, (plant, P) in enumerate(zip(of.scaled(), of.P, strict=True)):
+        loop = LoopAnalysis(plant, law, of.dt)
         if not loop.stable:
             return unstable
-        m_s, m_t, m_ks = (float(np.max(each)) for each in kinds(P, C))
-        found = Measures(m_s, m_t, m_ks, math.inf)
-        if bounds is None or _excess(found, bounds) <= 0.0:  # responses over time are slow
-            found = found._replace(iae=_iae(response(plant, law, inputs), plants.dt, inputs))
+        S = 1.0 / (1.0 + P * C)
+        m_s, m_t, m_ks = (float(np.max(np.abs(each))) for each in (S, P * C * S, C * S))
+        if plants.elsewhere(j):
+            share = 1.0 / _ELSEWHERE
+            found = Measures(0.0, share * m_t, share * m_ks, 0.0, m_s)
+        else:
+            found = Measures(m_s, m_t, m_ks, 0.0, 0.0)
             least = None if bounds is None else bounds.delay_margin
             if least is not None and loop.margins.delay < least:
                 return unstable
         worst = Measures(*map(max, worst, found))
+    if bounds is None or _excess(worst, bounds) <= 0.0:  # responses over time are slow
+        known = [plant for j, plant in enumerate(of.scaled()) if not plants.elsewhere(j)]
+        iae = max(_iae(response(plant, law, inputs), of.dt, inputs) for plant in known)
+        worst = worst._replace(iae=iae)
     return worst
 
 
@@ -367,6 +406,7 @@ def _iae(y: Vector, dt: float, inputs: Inputs) -> float:
 def _excess(measures: Measures, bounds: Constraints) -> float:
     """Return by how much the worst bound is exceeded, as a share."""
     limits = (bounds.m_s, bounds.m_t, bounds.m_ks)
-    sizes = (measures.m_s, measures.m_t, measures.m_ks)
+    largest = max(measures.m_s, measures.m_s_elsewhere / _ELSEWHERE)
+    sizes = (largest, measures.m_t, measures.m_ks)
     known = [size / limit - 1.0 for size, limit in zip(sizes, limits, strict=True) if limit]
     return max(known) - 1e-9
