@@ -15,7 +15,8 @@ Each training is done once with the guard and once without, with its own seed of
 episodes. All costs that are printed are those of 64 episodes that no training has seen. *None* is
 the controller without policy. *Design* is the response that the controller is designed for,
 ``(omega_c/(s + omega_c))^4 r``: a policy that costs less has become a part of the control law,
-because no knowledge of the disturbance makes the loop better than its design.
+because no knowledge of the disturbance makes the loop better than its design. ``feedforward=True``
+is the way to remove the design's lag, without any policy.
 The last row runs the policies that were trained without guard behind the guard: it tells what the
 guard forbids from what CMA-ES has not found.
 """
@@ -55,10 +56,19 @@ def episode(seconds: float) -> Any:
 class Loops:
     """Many loops of the environment, with the guard or without."""
 
-    def __init__(self, count: int, guard: ql.Guard | None, seconds: float) -> None:
+    def __init__(
+        self, count: int, guard: ql.Guard | None, seconds: float, feedforward: bool = False
+    ) -> None:
         own = arguments(NAME, {})["controller"]
-        limits = {"u_min": own.limits.low, "u_max": own.limits.high}
-        controller = ql.ADRC(own.observer, own.omega_c, learner=Policy(), guard=guard, **limits)
+        controller = ql.ADRC(
+            own.observer,
+            own.omega_c,
+            learner=Policy(),
+            guard=guard,
+            feedforward=feedforward,
+            u_min=own.limits.low,
+            u_max=own.limits.high,
+        )
         given = {"controller": controller, "observe": OBSERVED, "scenario": episode(seconds)}
         self.env: Any = gymnasium.make_vec(f"quell/{NAME}-v0", num_envs=count, **given)
         self.most = 0.5 * own.observer.b0 * (own.limits.high - own.limits.low)
@@ -170,6 +180,8 @@ def main() -> None:
     design = design_cost(seconds)
     table.add_row("none", f"{none:.4g}", "1", "0", "")
     table.add_row("(design)", f"{design:.4g}", f"{design / none:.3f}", "", "")
+    forward = float(Loops(UNSEEN, None, seconds, feedforward=True).run(idle, unseen())[0].mean())
+    table.add_row("none, feedforward=True", f"{forward:.4g}", f"{forward / none:.3f}", "", "")
     for name, found in rows.items():
         costs, gone = np.array([cost for cost, _ in found]), sum(count for _, count in found)
         table.add_row(
