@@ -216,7 +216,7 @@ def proxy(
     with (
         closing(CompensatedDrive(open_device(url, dt, trust), compensator)) as drive,
         closing(listen(host)) as listener,
-        Rig(drive, dt, listener, **limits) as server,
+        Rig(drive, dt, listener=listener, **limits) as server,
     ):
         with exit_on_signal(listener.close):
             server.prepare()

@@ -111,6 +111,10 @@ class CompensatedDrive:
             )
         self._state = compensator.initial_state()
 
+    def __repr__(self) -> str:
+        place = getattr(self.device, "url", type(self.device).__name__)
+        return f"CompensatedDrive({place!r}, {self.compensator!r})"
+
     @property
     def compiled(self) -> bool:
         """Whether it can run compiled: always."""

@@ -119,7 +119,7 @@ class TunedCompensator:
         ax = plt.subplots(layout="constrained")[1] if ax is None else ax
         for y, label in zip(self.loads, ("controller alone", "with compensator"), strict=True):
             size = np.abs(y)
-            shown = int(np.flatnonzero(size > 0.02 * np.max(size))[-1]) + 2
+            shown = min(int(np.flatnonzero(size > 0.02 * np.max(size))[-1]) + 2, y.size)
             ax.plot(np.arange(shown) * self.dt, y[:shown], label=label)
         ax.set(xlabel="t [s]", ylabel="y [y-unit]", title="Step of the load")
         ax.legend()
