@@ -6,6 +6,7 @@ the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` p
 and returns a ``Tuned``.
 """
 
+from quell.tuning.compensator import TunedCompensator, tune_compensator
 from quell.tuning.constraints import Constraints
 from quell.tuning.plants import identified_plants
 from quell.tuning.schedules import TunedSchedule, tune_schedule
@@ -17,8 +18,10 @@ __all__ = [
     "STRUCTURES",
     "Constraints",
     "Tuned",
+    "TunedCompensator",
     "TunedSchedule",
     "identified_plants",
     "tune",
+    "tune_compensator",
     "tune_schedule",
 ]
