@@ -95,6 +95,11 @@ class CompensatedDrive:
                 f"compensator = {type(compensator).__name__}: must be a quell.Compensator; the "
                 "host has the controller"
             )
+        if getattr(compensator, "external_signals", 0):
+            raise ValueError(
+                "compensator has a schedule with signal = 'external': the host gives a command and "
+                "the drive y only; follow 'reference', 'y' or 'speed'"
+            )
         if not np.all(np.isfinite(limits_of(compensator))):
             raise ValueError("compensator: give it u_min and u_max, finite limits for the drive")
         own = float(getattr(device, "dt", compensator.dt))
