@@ -19,7 +19,8 @@ plant with its encoder:
 
 With ``--online`` instead: an ``OnlineGain`` before and after the inertia doubles, with other seeds
 than those it was made with, under steps of the load at random and point-to-point moves. "wrong" is
-an estimate that passes its test and is more than 4 of its deviations off.
+an estimate that passes its test and is more than 4 of its deviations off. Before that, what the
+coefficients of u of two learners make of b/b0.
 """
 
 from __future__ import annotations
@@ -153,6 +154,37 @@ def show_online(seeds: range) -> dict[str, Any]:
     return found
 
 
+def show_learners() -> dict[str, Any]:
+    """Print what the coefficient of u of learners, which loads bias, makes of b/b0."""
+    J, found = 6e-4, {}
+    t = np.arange(0.0, 40.0, DT)
+    true = np.where(t < 10.0, 1.0, np.where(t < 25.0, 2.0, 0.55))
+    times = np.arange(0.0, 40.0, 1.3)
+    loads = np.random.default_rng(3).uniform(-0.3, 0.3, times.size)
+    load = ql.signals.Samples(times, loads, hold="previous")
+    move = ql.signals.SmoothMove(distance=1.0, duration=0.2)
+    back = ql.signals.SmoothMove(start=0.5, distance=1.0, duration=0.2)
+    scenario = ql.Scenario(
+        ql.signals.Repeated(move - 1.0 * back, 1.0),
+        39.0,
+        (load, ql.signals.Samples(t, J * true), 0.0),
+    )
+    observer = ql.ESO.model_free(2, b0=1.0 / J, omega_o=400.0, dt=DT, delay=LATE)
+    parts = ql.features
+    learners = {
+        "Kalman(u=True)": ql.learners.Kalman(u=True),
+        "RLS": ql.learners.RLS(parts.State() + parts.Bias() + parts.Input()),
+    }
+    for name, learner in learners.items():
+        law = ql.ADRC(observer, 60.0, learner=learner, u_min=-2.0, u_max=2.0)
+        run = ql.simulate(machine(2e-3), law, scenario)
+        ends = [round(at / DT) for at in (9.9, 24.9, 38.0)]
+        found[name] = [1.0 + float(run["theta"][k, -1]) / observer.b0 for k in ends]
+        figures = ", ".join(f"{value:.2f}" for value in found[name])
+        print(f"  {name}: b/b0 {figures}; true: 1, 0.5, 1.82")
+    return found
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -161,6 +193,7 @@ def main() -> None:
     arguments = parser.parse_args()
     results: dict[str, Any] = {}
     if arguments.online:
+        results["learners"] = show_learners()
         results["online"] = show_online(range(100, 108))
     for viscous in () if arguments.online else VISCOUS:
         at, plant = linear(viscous), machine(viscous)

@@ -266,6 +266,33 @@ def test_what_can_not_be_scheduled_is_refused(make: Any) -> None:
         make()
 
 
+@pytest.mark.parametrize("signal", ["external", "y"])
+def test_a_start_under_load_continues_from_u_at_any_b0(signal: str) -> None:
+    """The observer settles with its own b0, and the first sample converts its estimate to that of the table."""
+    tables = {"b0": B0, "omega_c": (30.0, 40.0, 60.0), "omega_o": (150.0, 200.0, 300.0)}
+    law = ql.ADRC(OBSERVER, 40.0, schedule=ql.Schedule(POINTS, signal, **tables))
+    if signal == "external":
+        law.set_signals(0.9)
+    law.start(y=0.9, u=0.4)
+    u = [law.step(0.9, 0.9) for _ in range(100)]
+    np.testing.assert_allclose(u, 0.4, atol=1e-9)
+    assert law.estimate.f == pytest.approx(-0.4 * law.at(0.9).observer.b0)
+
+
+def test_wrong_bits_of_a_restored_state_stay_within_the_table() -> None:
+    """A cell far outside, as a broken file may have it, is the last one."""
+    law = controller(b0=B0)
+    law.set_signals(0.5)
+    law.step(0.0, 0.0)
+    state = law.state
+    for cell in (-1e9, 1e9):
+        state["schedule.first"] = np.array([0.5, cell])
+        law.state = state
+        for _ in range(3):
+            assert math.isfinite(law.step(0.1, 0.0))
+        assert law._state.schedule.loop[0].b0 == pytest.approx(law.at(0.5).observer.b0)
+
+
 def test_other_bandwidths_than_those_of_the_tables_may_be_retuned_while_running() -> None:
     """Without a jump of u."""
     law = controller(b0=B0)
