@@ -51,7 +51,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -65,6 +65,7 @@ from quell.controllers.feedforward import (
     derivatives_used,
     feedforward_design,
 )
+from quell.controllers.from_pid import equal_to_pid
 from quell.controllers.law import (
     AdrcDesign,
     AdrcLoop,
@@ -504,6 +505,35 @@ class ADRC(StatefulController):
             message = f"guard = {guard!r} has no effect without a learner; give one, or no guard"
             warn(message)
 
+    @classmethod
+    def from_pid(
+        cls,
+        kp: float,
+        ki: float,
+        kd: float = 0.0,
+        *,
+        tf: float | tuple[float, float] = 0.0,
+        dt: float,
+        b0: float | None = None,
+        **options: Any,
+    ) -> ADRC:
+        """Return the ADRC that is equal, from y to u, to a PID controller that is sampled.
+
+        ``controllers.equal_to_pid`` has the parameters, the errors, and a report: what differs and
+        where to go from there. ``options`` are those of ``ADRC`` that leave the law linear and its
+        poles where they are: limits, ``learner``, ``guard``, ``feedforward``.
+
+        Examples
+        --------
+        >>> controller = ADRC.from_pid(2.0, 1.0, dt=0.01, u_min=-5.0, u_max=5.0)
+        >>> round(controller.omega_c, 3), controller.observer.form
+        (0.926, 'reduced')
+        """
+        for name in {"half_gain", "feedback", "law_poles"} & options.keys():
+            raise ValueError(f"{name} = {options[name]!r}: the PID controller decides it; leave it")
+        equal = equal_to_pid(kp, ki, kd, tf=tf, dt=dt, b0=b0)
+        return cls(equal.observer, equal.omega_c, law_poles=equal.law_poles, **options)
+
     def _update_parameters(self) -> None:
         self.parameters = self._design(self.observer, self.omega_c)
         self.features = self.learner.feature_names(self.observer.order)
@@ -694,9 +724,10 @@ class ADRC(StatefulController):
         The control signal continues from where the old gains would have it, and the difference
         decays with the new ``omega_c``. A faster observer still moves it in the middle of a motion,
         by its own better estimate. What was learned is kept. A call takes some milliseconds,
-        because the designs are sampled again. Raises ``ValueError`` for an observer of another
-        kind, for a change of b0 or model that a learner's coefficients or the state do not allow;
-        the controller is then unchanged.
+        because the designs are sampled again: ``prepare_retune`` does that beforehand, for a loop
+        that has no such time. Raises ``ValueError`` for an observer of another kind, for a change
+        of b0 or model that a learner's coefficients or the state do not allow; the controller is
+        then unchanged.
 
         Parameters
         ----------
@@ -707,16 +738,32 @@ class ADRC(StatefulController):
             ``omega_o``, ``b0`` or model; unchanged by default. For a plant with zeros, or with a
             separate input for f, only ``omega_o`` may change.
         """
+        self.prepare_retune(omega_c=omega_c, observer=observer)()
+
+    def prepare_retune(
+        self, *, omega_c: float | None = None, observer: ESO | None = None
+    ) -> Callable[[], None]:
+        """Design what ``retune`` changes to; the function returned applies it, in a step's time.
+
+        It may be called at any later sample, any number of times, to switch between designs. The
+        parameters, the rules and the errors are those of ``retune``.
+        """
         omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:
             check_replacement(self.observer, observer, not isinstance(self.learner, NoLearner))
         observer = observer or self.observer
-        old, new = self.parameters, self._design(observer, omega_c)
-        check_structure(old, new)
-        self.observer, self.omega_c, self.parameters = observer, omega_c, new
+        new = self._design(observer, omega_c)
+        check_structure(self.parameters, new)
         warn_if_unwise(observer, omega_c)
-        change_design(old, new, self._state)
-        self._pack_again()
+
+        def apply() -> None:
+            old, limits = self.parameters, self._limits
+            self.parameters = new if new.limits is limits else new._replace(limits=limits)
+            self.observer, self.omega_c = observer, omega_c
+            change_design(old, self.parameters, self._state)
+            self._pack_again()
+
+        return apply
 
     @property
     def _external_fields(self) -> tuple[str, ...]:
