@@ -36,8 +36,9 @@ if TYPE_CHECKING:
         tuning,
     )
     from quell.controllers import baselines
-    from quell.controllers.adrc import ADRC, Estimate
+    from quell.controllers.adrc import ADRC
     from quell.controllers.base import omega_c_for
+    from quell.controllers.compensator import Compensator, Estimate
     from quell.controllers.feedforward import Feedforward
     from quell.guard import Guard, Reason
     from quell.identification.identify import identify
@@ -57,10 +58,11 @@ __version__ = "0.2.0"
 
 _HOMES = {
     "ADRC": "controllers.adrc",
+    "Compensator": "controllers.compensator",
     "DesignWarning": "types",
     "BatchTrajectory": "records.trajectory",
     "ESO": "observers.eso",
-    "Estimate": "controllers.adrc",
+    "Estimate": "controllers.compensator",
     "Feedforward": "controllers.feedforward",
     "Guard": "guard",
     "Reason": "guard",
@@ -83,9 +85,9 @@ _MODULES = (
 )  # fmt: skip
 
 __all__ = [
-    "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Feedforward", "Guard",
-    "Reason", "Scenario", "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical",
-    "controllers", "envs", "experiments", "export", "features", "identification", "identify",
+    "ADRC", "ESO", "BatchTrajectory", "Compensator", "DesignWarning", "Estimate", "Feedforward",
+    "Guard", "Reason", "Scenario", "Status", "Trajectory", "Tuned", "analysis", "baselines",
+    "canonical", "controllers", "envs", "experiments", "export", "features", "identification", "identify",
     "learners", "metrics", "observers", "omega_c_for", "plants", "realtime", "setup", "signals",
     "simulate", "style", "sweep", "sweeping", "tune", "tuning",
 ]  # fmt: skip

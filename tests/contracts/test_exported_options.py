@@ -246,6 +246,7 @@ NO_PARTS = {
     "LinearLaw",
     "Model",
     "Notch",
+    "PidEqual",
     "Prefilter",
 }
 IN_PYTHON = {"JaxModel", "PythonModel", "RiverModel", "SklearnModel", "TorchModel"}

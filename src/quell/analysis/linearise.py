@@ -68,8 +68,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.adrc import ADRC
 from quell.controllers.base import NO_LIMITS, Controller, control
+from quell.controllers.compensator import Compensator
 from quell.controllers.law import AdrcState, without_forces
 from quell.controllers.linear import LinearLaw
 from quell.controllers.stateful import named_arrays
@@ -151,8 +151,8 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
         so the learner's features must be states, u, a constant and sinusoids. Freeze any other
         learner at the end of a run that ends at that time.
     """
-    if not isinstance(controller, ADRC):
-        raise ValueError(f"controller = {controller!r}: must be an ADRC")
+    if not isinstance(controller, Compensator):
+        raise ValueError(f"controller = {controller!r}: must be an ADRC or a compensator")
     if run is None:
         return _from_state(controller, controller._state)
     if isinstance(run, AdrcState):
@@ -164,7 +164,7 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
     return _from_record(controller, run, run.ended if t is None else checks.finite("t", t))
 
 
-def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
+def _from_record(controller: Compensator, run: Trajectory, t: float) -> Frozen:
     row = first_sample_at(t, run.every * run.dt, len(run))
     if not (t >= 0.0 and row < len(run)):
         raise ValueError(f"t = {t!r}: must be a time of the record, from 0 to {run.t[-1]:g} s")
@@ -188,7 +188,7 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
     return _with_authority(controller, gain, 0.0, slope, authority)
 
 
-def _from_state(controller: ADRC, state: Any) -> Frozen:
+def _from_state(controller: Compensator, state: Any) -> Frozen:
     if hasattr(controller.learner, "external_fields"):
         raise ValueError(
             f"learner = {type(controller.learner).__name__}: a Python model is called once a "
@@ -219,7 +219,7 @@ def _from_state(controller: ADRC, state: Any) -> Frozen:
 
 
 def _with_authority(
-    controller: ADRC, gain: Vector, before: float, slope: float, authority: float
+    controller: Compensator, gain: Vector, before: float, slope: float, authority: float
 ) -> Frozen:
     """Return β times all of it; a slope outside of the guard's interval acts on the u before."""
     if not (np.all(np.isfinite(gain)) and math.isfinite(before) and math.isfinite(slope)):
@@ -232,7 +232,7 @@ def _with_authority(
     return Frozen(gain, float(before), float(slope), authority)
 
 
-def _signal_sizes(controller: ADRC, memory: Any, seen: Vector, u: float) -> Vector:
+def _signal_sizes(controller: Compensator, memory: Any, seen: Vector, u: float) -> Vector:
     """Return the sizes of x̂_1 … x̂_n, Δf̂ and u: the learner's scales, or from present values."""
     scale = np.asarray(getattr(memory, "scale", ()))
     # A scale is at its floor, 1e-100 (``features.scaling``), until its signal was seen.
@@ -378,7 +378,7 @@ def adapting(controller: Controller, run: Any = None, t: float | None = None) ->
         controller's own.
     """
     known = frozen(controller, run, t)
-    assert isinstance(controller, ADRC)
+    assert isinstance(controller, Compensator)
     design = controller.parameters.learner
     state = controller._state if run is None else getattr(run, "final_state", run)
     memory = controller.initial_state().learner if state is None else state.learner
@@ -525,8 +525,10 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     if hasattr(controller, "law"):
         given: LinearLaw = controller.law
         return given
-    if not isinstance(controller, ADRC):
-        raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
+    if not isinstance(controller, Compensator):
+        raise ValueError(
+            f"controller = {controller!r}: must be an ADRC, a compensator or a linear controller"
+        )
     learner = at if isinstance(at, Frozen | Adapting) else adapting(controller, at)
     design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
     forward = without_forces(design.feedforward)

@@ -34,6 +34,7 @@ from quell.analysis.margins import (
 from quell.checks import import_extra
 from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller
+from quell.controllers.compensator import Compensator
 from quell.controllers.linear import LinearLaw
 from quell.controllers.prefilters import without_prefilters
 from quell.learners.base import NoLearner
@@ -196,7 +197,9 @@ def analyse(
     """
     controller = without_prefilters(controller)
     if not (hasattr(controller, "law") or hasattr(controller, "observer")):
-        raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
+        raise ValueError(
+            f"controller = {controller!r}: must be an ADRC, a compensator or a linear controller"
+        )
     dt = float(controller.dt)
     linear, own_delay = linear_part(plant, dt, operating_point)
     sampled = sampled_plant(linear, dt, own_delay + delay, actuator_lag)
@@ -209,7 +212,7 @@ def analyse(
         how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
         certificate = partial(certify, plant, controller, operating_point=operating_point, **how)
     law, note = linear_law(controller, at), ""
-    if isinstance(controller, ADRC) and not isinstance(at, Frozen):
+    if isinstance(controller, Compensator) and not isinstance(at, Frozen):
         design = controller.parameters.learner
         if not is_known(design):
             name = type(controller.learner).__name__

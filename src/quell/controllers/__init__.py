@@ -8,13 +8,14 @@ from quell.controllers import baselines
 from quell.controllers.adrc import (
     ADRC,
     DeadTimeTuning,
-    Estimate,
     adrc_for_dead_time,
     dead_time_tuning,
     warn_if_unwise,
 )
 from quell.controllers.base import Controller, omega_c_for
+from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
+from quell.controllers.from_pid import PidEqual, equal_to_pid
 from quell.controllers.law import NonlinearFeedback
 from quell.controllers.linear import LinearController, LinearLaw
 from quell.controllers.prefilters import (
@@ -28,6 +29,7 @@ from quell.controllers.single import in_single_precision
 
 __all__ = [
     "ADRC",
+    "Compensator",
     "Controller",
     "DeadTimeTuning",
     "Estimate",
@@ -35,6 +37,7 @@ __all__ = [
     "LinearController",
     "LinearLaw",
     "NonlinearFeedback",
+    "PidEqual",
     "Prefilter",
     "Prefiltered",
     "ProfileGenerator",
@@ -43,6 +46,7 @@ __all__ = [
     "adrc_for_dead_time",
     "baselines",
     "dead_time_tuning",
+    "equal_to_pid",
     "in_single_precision",
     "omega_c_for",
     "warn_if_unwise",

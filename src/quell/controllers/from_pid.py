@@ -62,14 +62,15 @@ _ONE_PLACE = 1e-4
 _FREQUENCIES = 2000
 
 Complex = NDArray[np.complex128]
+Pattern = tuple[float | tuple[float, float], ...]
 
 
 class PidEqual(NamedTuple):
-    """The ADRC that is equal to a PID controller, and what differs; printed, it is a report."""
+    """The ADRC that is equal to a PID controller, and what differs."""
 
     observer: ESO  #: with b0, omega_o and poles
     omega_c: float  #: geometric mean of the law's poles [rad/s]
-    law_poles: tuple[float | tuple[float, float], ...]  #: in units of omega_c, as ``ADRC`` has them
+    law_poles: Pattern  #: in units of omega_c, as ``ADRC`` has them
     kp: float  #: [u-unit/y-unit]
     ki: float  #: [u-unit/(y-unit s)]
     kd: float  #: [u-unit s/y-unit]
@@ -89,7 +90,7 @@ class PidEqual(NamedTuple):
 
     @property
     def in_one_place(self) -> bool:
-        """Whether b0, omega_c and omega_o are all: law and observer have one place of poles each."""
+        """Whether all poles of the law lie at −omega_c and all of the observer at −omega_o."""
         law = _complex(self.law_poles)
         return self.observer.poles is None and bool(np.max(np.abs(law + 1.0)) < _ONE_PLACE)
 
@@ -164,8 +165,8 @@ class PidEqual(NamedTuple):
         C, other = self.response(omega), self.pid_response(omega, sampled)
         return float(np.max(np.abs(P * (C - other) / (1.0 + P * C))))
 
-    def __str__(self) -> str:
-        """Return the report."""
+    def describe(self) -> str:
+        """Return what is equal, what is not and what comes next, as text."""
         observer, dt = self.observer, self.observer.dt
         top = min(max(self.omega_c, self.omega_o), 0.5 * math.pi / dt)
         band = _grid(1e-3 * min(self.omega_c, self.omega_o), top, 60)
@@ -193,10 +194,16 @@ class PidEqual(NamedTuple):
             "NOT equal at limits of u: there the observer gets the u that was applied, and the PID "
             "has its own anti-windup",
         ]
+        if observer.form == "reduced":
+            lines.append(
+                "NOT for most learners: the observer of reduced form takes y for x_1 and sees no "
+                "noise; give the PID a filter of the whole, or go on as in the next line"
+            )
         if self.b0_given:
             lines.append(
-                f"next: the ADRC of the same speeds, ESO.model_free({observer.order}, b0={self.b0:.5g}, "
-                f"omega_o={self.omega_o:.5g}, dt={dt:g}) with omega_c={self.omega_c:.5g}, then a "
+                f"next: the ADRC of the same speeds, ESO.model_free({observer.order}, "
+                f"b0={self.b0:.5g}, omega_o={self.omega_o:.5g}, dt={dt:g}) with "
+                f"omega_c={self.omega_c:.5g}, then a "
                 "learner; with b0 that of the plant both bandwidths may be raised"
             )
         else:
@@ -261,10 +268,14 @@ def equal_to_pid(
 
     Examples
     --------
-    >>> print(str(equal_to_pid(2.0, 1.0, tf=0.1, dt=1e-3)).splitlines()[0])
-    ADRC of order 1: b0 = 4.4764, omega_c = 0.56108 rad/s, omega_o = 4.6916 rad/s, dt = 0.001 s
+    >>> print(equal_to_pid(2.0, 1.0, tf=0.1, dt=1e-3).describe().splitlines()[0])
+    ADRC of order 1: b0 = 1.3873, omega_c = 0.63632 rad/s, omega_o = 4.6569 rad/s, dt = 0.001 s
     """
-    gains = checks.finite("kp", kp), checks.nonzero("ki", ki, "an ADRC integrates"), checks.finite("kd", kd)
+    gains = (
+        checks.finite("kp", kp),
+        checks.nonzero("ki", ki, "an ADRC integrates"),
+        checks.finite("kd", kd),
+    )
     kp, ki, kd = gains
     if kp * ki <= 0.0 or kd * ki < 0.0:
         raise ValueError(
@@ -298,8 +309,8 @@ def _polynomials(
         raise ValueError(f"tf = {tf!r}: f1 and f2 must not be negative, or the filter is unstable")
     if kd == 0.0 and f2 > 0.0:
         raise ValueError(
-            f"tf = {tf!r} with kd = 0: an ADRC of order 1 is a PI controller with a filter of first "
-            f"order; give tf = {f1:g}, whose lag at low frequencies is the same"
+            f"tf = {tf!r} with kd = 0: an ADRC of order 1 is a PI controller with a filter of "
+            f"first order; give tf = {f1:g}, whose lag at low frequencies is the same"
         )
     return (kd, kp, ki), (f1, f2)
 
@@ -349,6 +360,17 @@ class _Problem:
             self.plant = np.array([0.5 * h, 1.0])
         self.top = np.polymul(top, self.plant)
         self.bottom = np.append(bottom, np.zeros(order + 1))
+
+    def stable(self, b0: Vector) -> NDArray[np.bool_]:
+        """Return for which b0 (k,) the loop is stable."""
+        size = max(self.top.size, self.bottom.size)
+        top, bottom = (np.pad(p, (size - p.size, 0)) for p in (self.top, self.bottom))
+        polynomials = bottom + (b0 * self.unit**self.order)[:, None] * top
+        companions = np.zeros((b0.size, size - 1, size - 1))
+        companions[:, 1:, :-1] = np.eye(size - 2)
+        companions[:, 0, :] = -polynomials[:, 1:] / polynomials[:, :1]
+        inside = np.abs(1.0 + self.h * np.linalg.eigvals(companions)) < 1.0
+        return np.all(inside, axis=1)
 
     def at(self, b0: float) -> _Poles | None:
         """Return the poles for a b0, those of the law the slower ones; None if there are none."""
@@ -404,7 +426,8 @@ class _Problem:
         size = abs(p) if self.order == 1 else abs(d)
         trials = np.geomspace(1e-2 / T / size, 1e1 / dt / size, _TRIALS)
         sign = math.copysign(1.0, p)
-        spreads = [(one.spread, k) for k, b0 in enumerate(trials) if (one := self.at(sign * b0))]
+        stable = np.flatnonzero(self.stable(sign * trials))
+        spreads = [(one.spread, k) for k in stable if (one := self.at(sign * float(trials[k])))]
         if not spreads:
             return None
         k = min(spreads)[1]
@@ -430,17 +453,17 @@ def _made(
     of_law = np.roots(np.append(1.0, problem.law_coefficients(found.law))) / T
     of_observer = np.log1p(problem.h * found.observer) / problem.dt
     omega_c, law_poles = _pattern(of_law)
-    omega_o, poles = _pattern(of_observer)
+    omega_o, pattern = _pattern(of_observer)
     form = "reduced" if problem.reduced else "current"
     # Poles in one place to rounding are in one place: the observer then has the formulas for it.
-    poles = None if np.max(np.abs(_complex(poles) + 1.0)) < _ONE_PLACE else poles
+    poles = None if np.max(np.abs(_complex(pattern) + 1.0)) < _ONE_PLACE else pattern
     observer = ESO.model_free(n, found.b0, omega_o, problem.dt, form=form, poles=poles)
     return PidEqual(
         observer, omega_c, law_poles, *gains, problem.lags, problem.numerator, b0_given=given
     )
 
 
-def _pattern(poles: Complex) -> tuple[float, tuple[float | tuple[float, float], ...]]:
+def _pattern(poles: NDArray[Any]) -> tuple[float, Pattern]:
     """Return a bandwidth, the geometric mean, and the poles in units of it."""
     omega = math.exp(float(np.mean(np.log(np.abs(poles)))))
     found: list[float | tuple[float, float]] = []
@@ -481,14 +504,16 @@ def _not_possible(
                 f"b0 = {other.b0:.4g} is possible; or design an ADRC for your b0 instead"
             )
     low, high = 0.0, 1.0
-    for _ in range(20):
+    for _ in range(14):
         middle = 0.5 * (low + high)
         scaled = middle * tf if np.ndim(tf) == 0 else (middle * tf[0], middle**2 * tf[1])
         trial = _Problem(problem.order, *_polynomials(kp, ki, kd, scaled), problem.dt)
         low, high = (middle, high) if trial.search() is not None else (low, middle)
     text = f"{given}: no ADRC is equal to this PID"
     if low > 0.0:
-        size = f"{low * tf:.4g}" if np.ndim(tf) == 0 else f"({low * tf[0]:.4g}, {low**2 * tf[1]:.4g})"
+        size = (
+            f"{low * tf:.4g}" if np.ndim(tf) == 0 else f"({low * tf[0]:.4g}, {low**2 * tf[1]:.4g})"
+        )
         return (
             f"{text}: its loop around b0/s^{problem.order} is stable and damped by "
             f"{_LEAST_DAMPING:g} for no b0; possible from tf = {size} s on downwards"

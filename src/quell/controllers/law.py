@@ -112,6 +112,12 @@ class ModelFeedforward(NamedTuple):
     lead_acting: float  # the same from the u that the observer receives in this sample
 
 
+class ControlGiven(NamedTuple):
+    """A control signal u_0 from elsewhere in the place of a law: the reference is u_0."""
+
+    b0: float
+
+
 @generic_with_default
 def reference_part(feedforward: Any, law: Vector, r: float, reference: Vector) -> float:
     """Return what the numerator of the law takes from the reference and its derivatives."""
@@ -121,6 +127,22 @@ def reference_part(feedforward: Any, law: Vector, r: float, reference: Vector) -
             total += law[i] * reference[i - 1]
         total += reference[reference.size - 1]
     return total
+
+
+@reference_part.register(ControlGiven)
+def _given(feedforward: ControlGiven, law: Vector, r: float, reference: Vector) -> float:
+    return feedforward.b0 * r
+
+
+@generic_with_default
+def has_reference_at_start(feedforward: Any) -> float:
+    """Return 1 if the reference is zero before the first usable one, 0 if it is the last y."""
+    return 0.0
+
+
+@has_reference_at_start.register(ControlGiven)
+def _zero_at_start(feedforward: ControlGiven) -> float:
+    return 1.0
 
 
 @reference_part.register(ModelFeedforward)
@@ -552,6 +574,7 @@ def _status_flags(design: AdrcDesign, state: AdrcState) -> int:
 @reset_loop.register(AdrcDesign)
 def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
     clear(state.loop)
+    state.loop[0].has_reference = has_reference_at_start(design.feedforward)
     for i in range(state.reference.size):
         state.reference[i] = 0.0
     reset_lag_filters(design, state)

@@ -18,7 +18,6 @@ import numba
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc import change_design, manual_operation
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
@@ -30,6 +29,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensator import change_design, manual_operation
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc import change_design, start_at_rest
 from quell.controllers.base import control, is_usable, set_applied_control
+from quell.controllers.compensator import change_design, start_at_rest
 from quell.controllers.law import AdrcDesign, AdrcState
 from quell.controllers.linear import LinearDesign, LinearState
 from quell.controllers.prefilters import PrefilteredDesign, PrefilteredState, settle, stopping_point

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc import ADRC, samples_to_settle
 from quell.controllers.base import (
     Limits,
     check_controller,
@@ -17,6 +16,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensator import Compensator, samples_to_settle
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
@@ -200,7 +200,7 @@ class _Writer:
         self._add_step()
         if self.resolution is not None:
             self._add_counts(self.resolution)
-        if isinstance(inner, ADRC):
+        if isinstance(inner, Compensator):
             self._add_start(2 * samples_to_settle(inner.observer))
             self._add_manual_operation()
         self._add_retune()
@@ -219,7 +219,7 @@ class _Writer:
             "quell from the kernels that simulate it.",
         ]
         defines = [f"#define {upper}_SAMPLE_TIME {dt} /* [s] */"]
-        if isinstance(inner, ADRC):
+        if isinstance(inner, Compensator):
             defines.append(f"#define {upper}_ORDER {inner.observer.order}")
         self.files.enums += self._enums(channels)
         self.files.structs += self._estimate_struct(channels)

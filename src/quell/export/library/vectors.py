@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.adrc import ADRC, samples_to_settle
 from quell.controllers.base import (
     control,
     reset_loop,
@@ -26,6 +25,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensator import Compensator, samples_to_settle
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
@@ -70,7 +70,7 @@ class Plant(NamedTuple):
 def plant_for(controller: Any, amplitude: float, real: Callable[[Any], Any]) -> Plant | None:
     """Return the plant for a controller; None for one that does not learn."""
     inner = without_prefilters(controller)
-    if not isinstance(inner, ADRC) or not inner.parameters.learns:
+    if not isinstance(inner, Compensator) or not inner.parameters.learns:
         return None
     observer = inner.observer
     law = inner.parameters.law
@@ -417,7 +417,7 @@ def _amplitude(controller: Any, path: str) -> float:
 
 def _samples(controller: Any) -> int:
     inner = without_prefilters(controller)
-    return samples_to_settle(inner.observer) if isinstance(inner, ADRC) else 0
+    return samples_to_settle(inner.observer) if isinstance(inner, Compensator) else 0
 
 
 # ---- The C program that compares a controller with golden vectors ----
