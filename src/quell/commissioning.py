@@ -136,12 +136,15 @@ def measured(
     dt: float | None = None,
     time_unit: str | None = None,
     max_size: float = MAX_SIZE,
+    *,
+    reference: bool = False,
 ) -> Measured:
     """Read input and output from a file of any kind that quell knows.
 
     A NetCDF file is a run that ``Trajectory.save`` wrote; a MCAP file, or a CSV file with the
     header of a recording beside it, is a recording of ``quell run-rig``; another file is a table
-    in text, for which ``columns``, ``dt`` and ``time_unit`` are those of ``read_record``.
+    in text, for which ``columns``, ``dt`` and ``time_unit`` are those of ``read_record``; with
+    ``reference`` a column r belongs to the usual ones.
 
     Raises
     ------
@@ -158,7 +161,7 @@ def measured(
     header = path.with_name(path.name + ".json")
     if not plain and (path.suffix.lower() == ".mcap" or header.is_file()):
         return _of_run(load(path, max_size))
-    default = ("u", "y") if dt is not None else ("t", "u", "y")
+    default = (*(() if dt is not None else ("t",)), "u", "y", *(("r",) if reference else ()))
     names = tuple(name.strip() for name in columns.split(",")) if columns else default
     return read_record(path, names, dt, time_unit=time_unit, max_size=max_size)
 
