@@ -12,7 +12,7 @@ from quell import __version__
 from quell.cli.compare import compare
 from quell.cli.exit_codes import HELP, ExitCode
 from quell.cli.identify import b0, excite, identify
-from quell.cli.monitor import rank
+from quell.cli.monitor import rank, watch
 from quell.cli.reproduce import acc, torsional, two_mass
 from quell.cli.rig import replay, rig, run_rig
 from quell.cli.run import export, run, studio, sweep
@@ -47,6 +47,7 @@ for _each in (
     b0,
     excite,
     rank,
+    watch,
     rig,
     run,
     run_rig,

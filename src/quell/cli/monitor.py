@@ -1,17 +1,21 @@
-"""``quell rank``: what the logs of running machines say."""
+"""``quell rank`` and ``quell watch``: what the records of running machines say."""
 
 from __future__ import annotations
 
+import hashlib
 import re
+import statistics
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from quell.cli.options import READ_OPTIONS, Overwrite, ReadOptions
+from quell.cli.exit_codes import ExitCode
+from quell.cli.options import READ_OPTIONS, Overwrite, ReadOptions, WholeOrNone
 from quell.cli.output import Console, number, print_line, table
 
 if TYPE_CHECKING:
     from quell.identification import Measured
-    from quell.monitoring import Ranking
+    from quell.monitoring import Machine, Ranking
 
 # ---- quell rank ----
 
@@ -122,3 +126,128 @@ def _print_scores(console: Console, found: Ranking) -> None:
         cells += [number(beyond, ".3g", 100.0), number(scores.duration, ".4g"), str(scores.batches)]
         rows.add_row(name, *cells)
     console.print(rows)
+
+
+# ---- quell watch ----
+
+# Settings of a new state.
+_WINDOW, _ORDER, _ALPHA = 60.0, 2, 0.01
+
+
+def watch(
+    records: list[Path],
+    *,
+    state: Path | None = None,
+    window: float | None = None,
+    order: WholeOrNone = None,
+    band: float | None = None,
+    alpha: float | None = None,
+    dt: float | None = None,
+    read: ReadOptions = READ_OPTIONS,
+    json: Path | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Watch the numbers of a machine over its records, and raise an alarm when one has changed.
+
+    b0, friction, stiffness, a resonance, noise, load, and f of recorded runs, in each window. The
+    probability of a false alarm, over all time, is --alpha at most, as long as windows differ by
+    chance only. The exit code is 6 where there is an alarm.
+
+    Parameters
+    ----------
+    records
+        Records in the order of time: recordings of `quell run-rig`, saved runs (.nc), or tables of
+        t,u,y in text; with --columns t,u,y,r the error is watched, too.
+    state
+        File, in JSON, that is continued, or begun: run the command each day on the day's records.
+        Records that are in it already are left out.
+    window
+        Length of a window [s], 60 by default: an hour, a shift or a day where minutes are alike.
+    order
+        1 or 2, by default 2: u acts on this derivative of y.
+    band
+        Band [rad/s] of the regression for b0 and friction, above that of the moves; 0.03/dt by
+        default.
+    alpha
+        Probability of a false alarm over all time and all numbers, 0.01 by default.
+    dt
+        Sample time [s] of tables without times; columns are then u,y by default.
+    json
+        Write alarms and evidence to this file, for programs.
+    """
+    from quell.files import check_writable, write_json
+    from quell.monitoring import Machine
+    from quell.monitoring.windows import signals_of
+
+    if json is not None:
+        check_writable(json, overwrite)
+    settings = {"window": window, "order": order, "band": band, "alpha": alpha}
+    given = {name: value for name, value in settings.items() if value is not None}
+    console = Console()
+    if state is not None and state.exists():
+        machine = Machine.load(state, read.max_size)
+        _check_settings(state, machine, given)
+    else:
+        new: dict[str, Any] = {"window": _WINDOW, "order": _ORDER, "alpha": _ALPHA} | given
+        machine = Machine(**new)
+        if state is not None:
+            check_writable(state)
+    for path in records:
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        if digest in machine.records:
+            print_line(console, f"{path.name}: is in the state already, left out")
+            continue
+        signals = signals_of(path, read.columns, dt, read.time_unit, read.max_size)
+        before = len(machine.watch.labels)
+        machine.take(signals, path.name)
+        machine.records.append(digest)
+        print_line(console, f"{path.name}: {len(machine.watch.labels) - before} windows")
+    _print_features(console, machine)
+    print_line(console, machine.watch.describe())
+    if state is not None:
+        machine.save(state)
+        print_line(console, f"State: {state}")
+    if json is not None:
+        write_json(json, _results(machine), overwrite)
+        print_line(console, f"Results: {json}")
+    if machine.watch.alarms:
+        sys.exit(ExitCode.ALARM)
+
+
+def _check_settings(state: Path, machine: Machine, given: dict[str, Any]) -> None:
+    """Check that a state has the settings that are asked for."""
+    for name, value in given.items():
+        if machine.settings[name] != value:
+            raise ValueError(
+                f"--{name} {value:g}: the state {str(state)!r} has {machine.settings[name]!r}, and "
+                "its windows can be compared with no others; leave it, or begin a new state"
+            )
+
+
+def _print_features(console: Console, machine: Machine) -> None:
+    rows = table("Numbers of the machine", "", "windows", "median", "latest", "evidence\n[%]")
+    for name in machine.watch.features:
+        values, evidence = machine.watch.values(name), machine.watch.evidence(name)
+        share = 100.0 * max(evidence, 0.0) / machine.watch.threshold
+        middle, last = (
+            (statistics.median(values), float(values[-1])) if values.size else (None, None)
+        )
+        cells = number(middle, ".4g"), number(last, ".4g"), number(share, ".0f")
+        rows.add_row(name, str(values.size), *cells)
+    console.print(rows)
+
+
+def _results(machine: Machine) -> dict[str, Any]:
+    from quell.files import nonfinite_to_none
+
+    watched = machine.watch
+    found = {
+        "settings": machine.settings,
+        "windows": len(watched.labels),
+        "alarms": [alarm._asdict() for alarm in watched.alarms],
+        "evidence": {name: watched.evidence(name) for name in watched.features},
+        "threshold": watched.threshold,
+        "report": watched.describe().splitlines(),
+    }
+    return dict(nonfinite_to_none(found))

@@ -123,10 +123,11 @@ class Ranking(NamedTuple):
         mine = [each for each in self.comparisons if first in (each.better, each.worse)]
         others = [each for each in self.comparisons if each not in mine]
         lines = [each.describe(self.criterion) for each in mine + others]
+        level = f"at {100.0 * self.confidence:g} % for all together"
         if self.best is not None:
-            lines.insert(0, f"best: {self.best}, at {100.0 * self.confidence:g} % for all together")
+            lines.insert(0, f"best: {self.best}, {level}")
         else:
-            lines.insert(0, f"NOT decided which is best; lowest so far: {first}")
+            lines.insert(0, f"NOT decided which is best, {level}; lowest so far: {first}")
         return "\n".join([*lines, *self.notes])
 
     def to_json(self) -> dict[str, Any]:
