@@ -13,6 +13,7 @@ from quell.controllers.adrc import (
     warn_if_unwise,
 )
 from quell.controllers.base import Controller, omega_c_for
+from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
 from quell.controllers.from_pid import PidEqual, equal_to_pid
@@ -24,11 +25,13 @@ from quell.controllers.prefilters import (
     ReferenceModel,
     TrackingDifferentiator,
 )
+from quell.controllers.safe_set import SafeSet
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
 
 __all__ = [
     "ADRC",
+    "Compensated",
     "Compensator",
     "Controller",
     "DeadTimeTuning",
@@ -42,6 +45,7 @@ __all__ = [
     "Prefiltered",
     "ProfileGenerator",
     "ReferenceModel",
+    "SafeSet",
     "TrackingDifferentiator",
     "adrc_for_dead_time",
     "baselines",

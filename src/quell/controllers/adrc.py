@@ -68,11 +68,12 @@ from quell.controllers.law import (
     feedback_design,
     law_gains,
 )
+from quell.controllers.safe_set import SafeSet
 from quell.guard import Guard
 from quell.learners.base import Learner
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
-from quell.types import Channels, DesignWarning, warn
+from quell.types import Channels, DesignWarning, Vector, warn
 
 # ---- Design rules for the sample time and a known delay, judged from the design alone ----
 
@@ -206,6 +207,8 @@ class ADRC(Compensator):
     law_poles
         poles of the ideal loop in units of omega_c, instead of all at −1: negative numbers, and
         pairs (real, imaginary) for two conjugate ones; as many as the relative degree.
+    safe_set
+        bands that y and its rate do not leave, whatever r and the learner ask for; none by default.
 
     Raises
     ------
@@ -241,8 +244,9 @@ class ADRC(Compensator):
         half_gain: bool = False,
         feedback: NonlinearFeedback | None = None,
         law_poles: Sequence[float | tuple[float, float]] | None = None,
+        safe_set: SafeSet | None = None,
     ) -> None:
-        self._take_parts(observer, learner, guard)
+        self._take_parts(observer, learner, guard, safe_set)
         check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
         self.feedforward = checked_feedforward(feedforward)
@@ -298,6 +302,12 @@ class ADRC(Compensator):
             feedforward=feedforward_design(self.feedforward, observer),
             fade=math.exp(-omega_c * observer.dt),
         )
+
+    @property
+    def gains(self) -> Vector:
+        """Gains k (n,) of the law."""
+        law: Vector = self.parameters.law
+        return law
 
     @property
     def derivatives(self) -> int:

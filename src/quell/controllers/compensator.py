@@ -56,6 +56,14 @@ from quell.controllers.law import (
     law_gains,
     unlimited_control,
 )
+from quell.controllers.safe_set import (
+    NoSafeSet,
+    NoSafeSetMemory,
+    SafeSet,
+    settle_at_rest,
+    settle_safe_set,
+    shift_f,
+)
 from quell.controllers.stateful import PackedController, StatefulController, unpacked
 from quell.guard import (
     GUARD_CHANNELS,
@@ -173,6 +181,7 @@ def start_at_rest(
     """
     _start_loop(design, state, y, u, r)
     begin(design.eso, state.z, state.seen, y)
+    settle_at_rest(design.safe_set, state.safe_set, y, u, samples)
     loop = state.loop[0]
     model, z, seen = design.eso, state.z, state.seen
     known = loop.f_learned + loop.f_known
@@ -192,6 +201,7 @@ def start_in_motion(
     _feed_forward(design, state, u)
     state.seen[x.size] -= state.loop[0].f_learned + state.loop[0].f_known
     state.z[:] = state_for(design.eso, x, state.seen[x.size :], u)
+    settle_safe_set(design.safe_set, state.safe_set, x, float(f[0]))
 
 
 def _start_loop(design: AdrcDesign, state: AdrcState, y: float, u: float, r: float) -> None:
@@ -254,6 +264,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     change = (old.b0 - new.b0) * acting
     for i in range(size):
         change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
+    shift_f(new.safe_set, state.safe_set, change)
     # The model's share of f depends on them, too, and is not in the estimate.
     known = known_share(new.feedforward, loop.r, state.reference)
     change -= known - loop.f_known
@@ -349,6 +360,9 @@ class Compensator(StatefulController):
         limits of the control signal [u-unit].
     rate_limit
         largest rate of the control signal, in both directions, or (lowest, highest) [u-unit/s].
+    safe_set
+        bands that y and its rate do not leave, whatever u_0 and the learner ask for; none by
+        default.
 
     Raises
     ------
@@ -380,8 +394,9 @@ class Compensator(StatefulController):
         u_min: float = -math.inf,
         u_max: float = math.inf,
         rate_limit: RateLimit = math.inf,
+        safe_set: SafeSet | None = None,
     ) -> None:
-        self._take_parts(observer, learner, guard)
+        self._take_parts(observer, learner, guard, safe_set)
         if observer.cancel_f == 0.0:
             raise ValueError(
                 "observer: f does not enter the plant where u does, so adding −f̂/b0 to u does not "
@@ -399,8 +414,8 @@ class Compensator(StatefulController):
         self._initialise()
         self._warn_of_idle_guard()
 
-    def _take_parts(self, observer: Any, learner: Any, guard: Any) -> None:
-        """Check and keep observer, learner and guard."""
+    def _take_parts(self, observer: Any, learner: Any, guard: Any, safe_set: Any) -> None:
+        """Check and keep observer, learner, guard and safe set."""
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
         self.observer = observer
@@ -413,6 +428,9 @@ class Compensator(StatefulController):
             raise ValueError(f"learner = {learner!r}: must be a learner, {example}, or None")
         if guard is not None and not isinstance(guard, Guard):
             raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
+        if safe_set is not None and not isinstance(safe_set, SafeSet):
+            raise ValueError(f"safe_set = {safe_set!r}: must be a quell.SafeSet(), or None")
+        self.safe_set = safe_set
 
     def _warn_of_idle_guard(self) -> None:
         if self.guard is not None and not self._learns:
@@ -430,16 +448,20 @@ class Compensator(StatefulController):
     def _design(self, observer: ESO) -> AdrcDesign:
         """Return the parameters with an observer: u_0 takes the place of the law."""
         nothing = np.zeros(observer.order)
-        gains = law_gains(observer.degree, self._learner_omega_c)
         return self._with_law(
             observer,
-            padded(gains, observer.order),
+            self.gains,
             law=nothing,
             cancel=nothing,
             feedback=LinearFeedback(),
             feedforward=ControlGiven(observer.b0),
             fade=math.exp(-self._learner_omega_c * observer.dt),
         )
+
+    @property
+    def gains(self) -> Vector:
+        """Gains k (n,) of the loop with which learner and guard reckon: of an ADRC its law's."""
+        return padded(law_gains(self.observer.degree, self.omega_c), self.observer.order)
 
     def _with_law(self, observer: ESO, gains: Vector, **law: Any) -> AdrcDesign:
         """Return the parameters with a law; ``gains`` k (n,) are those of the closed loop."""
@@ -449,6 +471,7 @@ class Compensator(StatefulController):
             cancel_f=observer.cancel_f,
             b0=observer.b0,
             limits=self._limits,
+            safe_set=self._safe_set_design(observer),
             learner=learner,
             lag=lag_of(observer) if self._learns else NO_LAG,
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, gains),
@@ -458,6 +481,25 @@ class Compensator(StatefulController):
             window=window_samples(observer) if self._learns else 0,
             **law,
         )
+
+    def _safe_set_design(self, observer: ESO) -> Any:
+        if self.safe_set is None:
+            return NoSafeSet()
+        return self.safe_set.design(observer, self._limits)
+
+    def set_limits(
+        self,
+        *,
+        u_min: float | None = None,
+        u_max: float | None = None,
+        rate_limit: RateLimit | None = None,
+    ) -> None:
+        """Change limits of the control signal while running; see ``StatefulController``."""
+        super().set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
+        if self.safe_set is not None and self.safe_set.gain_error > 0.0:
+            safe_set = self._safe_set_design(self.observer)
+            self.parameters = self.parameters._replace(safe_set=safe_set)
+            self._pack_again()
 
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints; no learner is none."""
@@ -502,6 +544,11 @@ class Compensator(StatefulController):
             shadow=lag_memory(design.lag, 1),
             guard=guard if self.guard is None else self.guard.memory(design.guard),
             watch=LearnerWatch.zeros(),
+            safe_set=(
+                NoSafeSetMemory(np.zeros(0))
+                if self.safe_set is None
+                else self.safe_set.memory(design.safe_set)
+            ),
         )
         state.loop[0].has_reference = has_reference_at_start(design.feedforward)
         return state

@@ -58,6 +58,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.safe_set import flags_of_applied, forget_motion, nearest_safe, see
 from quell.guard import (
     assess,
     limit,
@@ -371,6 +372,7 @@ class AdrcDesign(NamedTuple):
     cancel_f: float  # 1 if f enters where u enters, else 0
     feedback: Any  # linear or nonlinear law of the errors, see ``feedback``
     feedforward: Any  # with or without a model, see ``feedforward``
+    safe_set: Any  # bands for y and its rate, or none
     fade: float  # factor of the offset from one sample to the next
     b0: float
     limits: Limits
@@ -393,12 +395,14 @@ class AdrcState(NamedTuple):
     shadow: Matrix  # lag filter of f_L (1, …)
     guard: Any
     watch: NDArray[LearnerWatch]  # (1,)
+    safe_set: Any
 
 
 @control.register(AdrcDesign)
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop[0], state.seen
     status = hold_last_good(loop, r, y)
+    see(design.safe_set, state.safe_set, y, loop.u)
     f_plain = 0.0
     u_acting = acting_control(design.eso, state.z, loop.u)
     if loop.started == 0.0:
@@ -457,13 +461,16 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             loop.offset = 0.0
         unlimited += loop.offset
         loop.offset = loop.offset * design.fade if abs(loop.offset) > smallest else 0.0
-    u, cut = apply_limits(design.limits, unlimited, loop.u)
+    safe, changed = nearest_safe(design.safe_set, state.safe_set, unlimited)
+    u, cut = apply_limits(design.limits, safe, loop.u)
+    cut |= changed
     loop.u_limited = u
     if loop.manual == 0.0:
         status |= cut
     else:
         u = loop.u_manual
     loop.u = u
+    status |= flags_of_applied(design.safe_set, state.safe_set, u)
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
     if design.learns and status & _MEASUREMENT_HELD == 0:
@@ -578,6 +585,7 @@ def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
     for i in range(state.reference.size):
         state.reference[i] = 0.0
     reset_lag_filters(design, state)
+    forget_motion(design.safe_set, state.safe_set)
     restart(design.learner, state.learner)
 
 

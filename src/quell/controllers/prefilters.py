@@ -325,6 +325,11 @@ class Prefiltered(Wrapper):
 
     def __init__(self, controller: Controller, prefilter: Prefilter) -> None:
         check_controller(controller)
+        if getattr(controller, "_u_is_given", False):
+            raise ValueError(
+                "controller = Compensator: takes u_0, and a prefilter shapes a reference; put the "
+                "prefilter in front of the controller of u_0"
+            )
         complete = hasattr(prefilter, "design") and hasattr(prefilter, "memory")
         if isinstance(prefilter, type) or not complete:
             rule = "must be a prefilter, for example quell.baselines.ZV(omega=1.4)"
