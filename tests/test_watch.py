@@ -286,6 +286,23 @@ def test_a_damaged_state_is_refused_and_named(tmp_path: Path, damage: Any) -> No
         Machine.load(path)
 
 
+def test_a_few_missing_samples_are_interpolated_and_many_leave_a_window_out() -> None:
+    """One in a thousand at most; the numbers hardly move."""
+    whole = driven(1)
+    few, many = whole.y.copy(), whole.y.copy()
+    few[[100, 7000, 7001]] = math.nan
+    many[5000:5100] = math.nan
+    names = ("b0", "coulomb", "noise")
+    machine = Machine(window=20.0)
+    for y in (whole.y, few, many):
+        machine.take(whole._replace(y=y), "day")
+    assert machine.left_out == 1
+    for name in names:
+        first, second = machine.watch.values(name)
+        assert second == pytest.approx(first, rel=0.02)
+    assert "NOT watched: 1 windows" in machine.describe()
+
+
 def written(path: Path, signals: list[Signals]) -> str:
     """Write records, one behind the other, as a table."""
     u, y, r = (np.concatenate([getattr(s, name) for s in signals]) for name in "uyr")
@@ -355,7 +372,7 @@ def test_the_sink_leaves_out_windows_with_gaps_and_goes_on_with_a_state(tmp_path
     rows_in_all, state = rows_of(run, design), tmp_path / "watch.json"
     broken = rows_in_all.copy()
     broken[500:, 0] += 1.0  # a deadline was skipped
-    broken[900, 7] = math.nan
+    broken[900, 7] = math.nan  # one in 200 samples is too many
     for given, taken, left_out in ((rows_in_all, 6, 0), (broken, 4, 2)):
         sink = WatchSink(state, Machine(window=2.0))
         sink.open(header_of(run, design))
@@ -364,8 +381,8 @@ def test_the_sink_leaves_out_windows_with_gaps_and_goes_on_with_a_state(tmp_path
         sink.write(waiting)
         sink.write(given)
         sink.close()
-        assert (sink.windows, sink.left_out) == (taken, left_out)
-    assert "NOT watched: 2 windows with skipped or missing samples" in sink.describe()
+        assert (sink.windows, sink.machine.left_out) == (taken, left_out)
+    assert "NOT watched: 2 windows in which more than 0.1% of the samples" in sink.describe()
     assert len(Machine.load(state).watch.labels) == 10
     short = WatchSink(tmp_path / "short.json", Machine(window=1.0))
     with pytest.raises(ValueError, match="a window of 100 samples: must have 200"):

@@ -204,7 +204,7 @@ def watch(
         machine.records.append(digest)
         print_line(console, f"{path.name}: {len(machine.watch.labels) - before} windows")
     _print_features(console, machine)
-    print_line(console, machine.watch.describe())
+    print_line(console, machine.describe())
     if state is not None:
         machine.save(state)
         print_line(console, f"State: {state}")
@@ -248,6 +248,6 @@ def _results(machine: Machine) -> dict[str, Any]:
         "alarms": [alarm._asdict() for alarm in watched.alarms],
         "evidence": {name: watched.evidence(name) for name in watched.features},
         "threshold": watched.threshold,
-        "report": watched.describe().splitlines(),
+        "report": machine.describe().splitlines(),
     }
     return dict(nonfinite_to_none(found))

@@ -522,8 +522,9 @@ def _slow(logs: list[Measured], window: int, length: int) -> tuple[Vector, Vecto
     """Return means and deviations of the slow part of u, by batch."""
     means, swings = [], []
     for log in logs:
-        slow = np.convolve(log.u, np.full(window, 1.0 / window), mode="same")
-        count = log.u.size // length
+        total = np.cumsum(np.append(0.0, log.u - np.mean(log.u)))
+        slow = np.mean(log.u) + (total[window:] - total[:-window]) / window
+        count = slow.size // length
         parts = slow[: count * length].reshape(count, length)
         means.append(np.mean(parts, axis=1))
         swings.append(np.std(parts, axis=1))

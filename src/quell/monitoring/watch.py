@@ -50,7 +50,14 @@ import numpy as np
 
 from quell import checks
 from quell.files import MAX_SIZE, bytes_of, check_size, write_json
-from quell.monitoring.windows import Signals, check_window, features_of, windows_of
+from quell.monitoring.windows import (
+    MOST_MISSING,
+    Signals,
+    check_window,
+    features_of,
+    windows_of,
+    without_gaps,
+)
 from quell.types import Vector
 
 # Shifts that are bet on, in deviations of the windows, in both directions with equal weights.
@@ -320,8 +327,9 @@ class Watch:
         if unseen:
             lines.append(f"NOT watched well: {', '.join(unseen)}: the windows do not show them")
         if unable:
+            names = "all numbers" if len(unable) == len(self._tracks) else ", ".join(unable)
             lines.append(
-                f"NOT enough windows yet: {', '.join(unable)}: a change now may never alarm; "
+                f"NOT enough windows yet: {names}: a change now may never alarm; "
                 f"{self._needed()} are needed before it"
             )
         if correlated:
@@ -468,6 +476,7 @@ class Machine:
         self.band = checks.optional(checks.positive, "band", band, "rad/s")
         self.watch = Watch(alpha=alpha)
         self.records: list[str] = []
+        self.left_out = 0  #: windows with too many missing samples, since it was made or loaded
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -483,7 +492,11 @@ class Machine:
         new: list[Alarm] = []
         count = 0
         for count, part in enumerate(windows_of(signals, self.window), start=1):
-            row = features_of(part, self.order, self.band)
+            whole = without_gaps(part)
+            if whole is None:
+                self.left_out += 1
+                continue
+            row = features_of(whole, self.order, self.band)
             new += self.watch.update(row, f"{label}, {(count - 1) * self.window:g} s")
         if count == 0:
             duration = signals.y.size * signals.dt
@@ -492,6 +505,16 @@ class Machine:
                 "record longer, or take shorter windows in a new state"
             )
         return new
+
+    def describe(self) -> str:
+        """Return alarms, and in lines with NOT what can not be said."""
+        lines = [self.watch.describe()] if self.watch.labels else []
+        if self.left_out:
+            lines.append(
+                f"NOT watched: {self.left_out} windows in which more than {MOST_MISSING:.1%} of "
+                "the samples were skipped or missing"
+            )
+        return "\n".join(lines)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to a JSON file, whole or not at all; replace the one before."""
@@ -516,8 +539,8 @@ class Machine:
 class WatchSink:
     """A sink of a real-time loop's telemetry that watches the machine while it runs.
 
-    It works on the telemetry's own thread: the loop does not wait for it. Windows with a skipped
-    deadline or a missing measurement are left out. The state is written after each window.
+    It works on the telemetry's own thread: the loop does not wait for it. Windows with many skipped
+    deadlines or missing measurements are left out. The state is written after each window.
 
     Parameters
     ----------
@@ -540,7 +563,7 @@ class WatchSink:
         self.path = Path(path)
         exists = self.path.exists()
         self.machine = Machine.load(path) if exists else (machine or Machine())
-        self.left_out = self.windows = 0
+        self.windows = 0
         self._on_alarm = on_alarm or (lambda alarm: None)
         self._rows: list[Any] = []
         self._columns: dict[str, int] = {}
@@ -575,9 +598,10 @@ class WatchSink:
     def _take(self, rows: Any) -> None:
         """Take the rows of a window."""
         at = self._columns
-        k, y = rows[:, at["k"]], rows[:, at["y_measured"]]
-        if np.any(np.diff(k) != 1.0) or not np.all(np.isfinite(y)):
-            self.left_out += 1
+        k, y = rows[:, at["k"]], rows[:, at["y_measured"]].copy()
+        skipped = np.sum(np.diff(k) - 1.0)
+        if skipped > MOST_MISSING * k.size:
+            self.machine.left_out += 1
             return
         f = None
         if "f_residual" in at:
@@ -588,7 +612,10 @@ class WatchSink:
             for of, name in zip(self._features, names, strict=True)
             if name in at
         }
-        signals = Signals(rows[:, at["u"]], y, rows[:, at["r"]], f, theta, self._dt)
+        signals = without_gaps(Signals(rows[:, at["u"]], y, rows[:, at["r"]], f, theta, self._dt))
+        if signals is None:
+            self.machine.left_out += 1
+            return
         row = features_of(signals, self.machine.order, self.machine.band)
         label = f"{self._label} + {k[0] * self._dt:g} s"
         for alarm in self.machine.watch.update(row, label):
@@ -599,12 +626,9 @@ class WatchSink:
     def describe(self) -> str:
         """Return what the watch says, and which windows this record had."""
         lines = [f"watched: {self.windows} windows of {self.machine.window:g} s, in {self.path}"]
-        if self.left_out:
-            lines.append(f"NOT watched: {self.left_out} windows with skipped or missing samples")
-        if self.windows == 0:
+        if self.windows + self.machine.left_out == 0:
             lines.append(f"NOT watched: no whole window of {self.machine.window:g} s; run longer")
-            return "\n".join(lines)
-        return "\n".join([*lines, self.machine.watch.describe()])
+        return "\n".join([*lines, self.machine.describe()])
 
     def flush(self) -> None:
         """Do nothing: the state is written after each window."""

@@ -29,6 +29,7 @@ import numpy as np
 from quell import checks
 from quell.commissioning import controlled, measured, measured_run, recorded_run
 from quell.files import MAX_SIZE
+from quell.realtime.recordings import Event
 from quell.types import Vector
 
 # A gain whose standard error is above this share of it is not known. Chosen by hand.
@@ -44,13 +45,15 @@ _BAND = 0.03
 _SEGMENTS, _FIRST, _AROUND, _HIGH, _LINES = 24, 4, 1.6, 2.0, 8
 # Least samples of a window: the regression, and a spectrum of a few lines. Chosen by hand.
 LEAST_SAMPLES = 200
+# Share of samples that a window may lack. Chosen by hand: it hardly moves the numbers.
+MOST_MISSING = 1e-3
 
 
 class Signals(NamedTuple):
     """The samples of a window, or of a record."""
 
     u: Vector
-    y: Vector
+    y: Vector  # NaN where nothing was measured
     r: Vector | None
     f: Vector | None  # total disturbance as the controller estimated it
     theta: Mapping[str, Vector]  # the learner's coefficients by name
@@ -88,12 +91,16 @@ def signals_of(
         found = measured(path, columns, dt, time_unit, max_size)
         return Signals(found.u, found.y, found.reference, None, {}, found.dt)
     part, known = controlled(run), measured_run(run)
+    # As received: NaN where nothing was, or where the loop skipped the deadline.
+    y = run["y_measured"][part].copy()
+    if "events" in run.names:
+        y[(run["events"][part].astype(np.int64) & int(Event.GAP)) != 0] = math.nan
     f = run["f_hat"][part] if "f_hat" in run.names else None
     theta: dict[str, Vector] = {}
     if "theta" in run.names:
         table = run["theta"][part].reshape(known.y.size, -1)
         theta = {name: table[:, i] for i, name in enumerate(run.features)}
-    return Signals(known.u, known.y, known.reference, f, theta, known.dt)
+    return Signals(known.u, y, known.reference, f, theta, known.dt)
 
 
 def windows_of(signals: Signals, length: float) -> Iterator[Signals]:
@@ -140,6 +147,19 @@ def features_of(signals: Signals, order: int, band: float | None = None) -> dict
     for name, value in signals.theta.items():
         found[f"theta {name}"] = float(np.mean(value))
     return found
+
+
+def without_gaps(signals: Signals) -> Signals | None:
+    """Return a window with its missing measurements interpolated; None if they are too many."""
+    missing = ~np.isfinite(signals.y)
+    if not np.any(missing):
+        return signals
+    if np.mean(missing) > MOST_MISSING:
+        return None
+    places = np.arange(signals.y.size)
+    y = signals.y.copy()
+    y[missing] = np.interp(places[missing], places[~missing], y[~missing])
+    return signals._replace(y=y)
 
 
 def check_window(samples: int) -> None:
