@@ -44,10 +44,10 @@ CRITERIA = {"rms": "RMS error", "iae": "mean |error|", "effort": "mean |du/dt|"}
 _LENGTH, _LEAST, _MOST = 10.0, 10, 32
 # Level of the tests of reference and load, and the differences that matter: of the level of r, and
 # of the size and rate of r, as shares; of the mean of the slow u in its own deviations, and as a
-# share; of the size of the slow u as a factor;
-# and the batches that they need: which two good tunings do not reach. Chosen by hand.
+# share; of the size of the slow u as a factor, which two good tunings do not reach. Batches that
+# the tests of the load need, and their length in correlation times. Chosen by hand.
 _LEVEL, _SAME_LEVEL, _SAME_SIZE = 1e-3, 0.01, 0.1
-_SAME_LOAD, _SAME_MEAN, _SAME_SWING, _LEAST_OF_LOAD = 1.0, 0.05, 1.5, 4
+_SAME_LOAD, _SAME_MEAN, _SAME_SWING, _LEAST_OF_LOAD, _LENGTH_OF_LOAD = 1.0, 0.05, 1.5, 4, 5.0
 # Two references are the same, or a reference repeats, if the RMS difference is below this share of
 # its deviation: steps may be a sample late. Chosen by hand.
 _REPEATS = 0.02
@@ -491,26 +491,29 @@ def _different_task(a: list[Measured], b: list[Measured], shared: _Batches) -> t
 def _different_load(a: list[Measured], b: list[Measured], length: int) -> list[str]:
     """Return in what the slow part of u differs, if the logs are long enough to tell.
 
-    A load that is slower than a fortieth of the logs is by chance another one in each of them; that
-    is in the intervals, as far as it moves the error.
+    A load that is slower than a twentieth of the logs is by chance another one in each of them;
+    that is in the intervals, as far as it moves the error.
     """
-    every = (*a, *b)
-    length = max(length, math.ceil(_LENGTH * max(correlation_time(log.u) for log in every)))
-    window = round(3.0 * max(correlation_time(_error(log)) for log in every))
-    window = min(max(window, 1), max(length // 4, 1))
-    (mean_a, swing_a), (mean_b, swing_b) = (_slow(logs, window, length) for logs in (a, b))
+    window = max(round(3.0 * max(correlation_time(_error(log)) for log in (*a, *b))), 1)
+    window = min(window, max(length // 4, 1))
+    slow_a, slow_b = ([_moving_mean(log.u, window) for log in logs] for logs in (a, b))
     reasons: list[str] = []
-    if min(mean_a.size, mean_b.size) < _LEAST_OF_LOAD:
-        return reasons
-    middle_a, middle_b = float(np.mean(mean_a)), float(np.mean(mean_b))
-    unit = math.sqrt(0.5 * float(np.var(mean_a) + np.var(mean_b)))
-    most = max(_SAME_LOAD * unit, _SAME_MEAN * max(abs(middle_a), abs(middle_b)))
-    if abs(middle_a - middle_b) > most and _differ(mean_a, mean_b):
-        reasons.append(f"the mean of u is {middle_a:.4g} and {middle_b:.4g}: another load")
-    if np.all(swing_a > 0.0) and np.all(swing_b > 0.0):
-        logs_a, logs_b = np.log(swing_a), np.log(swing_b)
-        ratio = float(np.mean(logs_b) - np.mean(logs_a))
-        if abs(ratio) > math.log(_SAME_SWING) and _differ(logs_a, logs_b):
+    means = _own_batches(slow_a, slow_b, length)
+    if means is not None:
+        middle_a, middle_b = (float(np.mean(each)) for each in means)
+        unit = math.sqrt(0.5 * float(np.var(means[0]) + np.var(means[1])))
+        most = max(_SAME_LOAD * unit, _SAME_MEAN * max(abs(middle_a), abs(middle_b)))
+        if abs(middle_a - middle_b) > most and _differ(*means):
+            reasons.append(f"the mean of u is {middle_a:.4g} and {middle_b:.4g}: another load")
+    squares_a, squares_b = (
+        [(each - np.mean(each)) ** 2 for each in slow] for slow in (slow_a, slow_b)
+    )
+    swings = _own_batches(squares_a, squares_b, length)
+    if swings is not None and min(float(np.mean(each)) for each in swings) > 0.0:
+        relative = [each / np.mean(each) for each in swings]
+        ratio = 0.5 * math.log(float(np.mean(swings[1]) / np.mean(swings[0])))
+        shifted = relative[0], relative[1] + 2.0 * ratio  # to first order, the logarithms
+        if abs(ratio) > math.log(_SAME_SWING) and _differ(*shifted):
             reasons.append(
                 f"the slow part of u swings {math.exp(abs(ratio)):.2g} times as much in one: "
                 "another load"
@@ -518,17 +521,19 @@ def _different_load(a: list[Measured], b: list[Measured], length: int) -> list[s
     return reasons
 
 
-def _slow(logs: list[Measured], window: int, length: int) -> tuple[Vector, Vector]:
-    """Return means and deviations of the slow part of u, by batch."""
-    means, swings = [], []
-    for log in logs:
-        total = np.cumsum(np.append(0.0, log.u - np.mean(log.u)))
-        slow = np.mean(log.u) + (total[window:] - total[:-window]) / window
-        count = slow.size // length
-        parts = slow[: count * length].reshape(count, length)
-        means.append(np.mean(parts, axis=1))
-        swings.append(np.std(parts, axis=1))
-    return np.concatenate(means), np.concatenate(swings)
+def _moving_mean(values: Vector, window: int) -> Vector:
+    middle = float(np.mean(values))
+    total = np.cumsum(np.append(0.0, values - middle))
+    found: Vector = middle + (total[window:] - total[:-window]) / window
+    return found
+
+
+def _own_batches(a: list[Vector], b: list[Vector], least: int) -> tuple[Vector, Vector] | None:
+    """Return the batch means of two groups of values; None if they are too few."""
+    length = math.ceil(_LENGTH_OF_LOAD * max(correlation_time(each) for each in (*a, *b)))
+    length = max(length, least)
+    of_a, of_b = (np.concatenate([batch_means(each, length) for each in group]) for group in (a, b))
+    return (of_a, of_b) if min(of_a.size, of_b.size) >= _LEAST_OF_LOAD else None
 
 
 def _different_reference(r: Vector, other: Vector, shared: _Batches) -> list[str]:
