@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.analysis.linearise import linear_law
 from quell.controllers import PidEqual, equal_to_pid
+from quell.setup import made as made_setup
 
 # kp, ki, kd, tf and dt: a plain PI, PI with a filter, an oven at 1 Hz, PIDs of a servo of
 # 2e-4 kg m² with a filter of the derivative, of the whole, and none.
@@ -291,3 +292,17 @@ def test_bad_arguments_are_named(gains: tuple[float, ...], options: Any, message
     """With their value and the rule."""
     with pytest.raises(ValueError, match=re.escape(message)):
         ql.ADRC.from_pid(*gains, **({"dt": 0.01} | options))
+
+
+def test_a_setup_file_has_it_as_a_kind_of_controller() -> None:
+    """``adrc-pid``, with a learner and limits; options that the PID decides are unknown there."""
+    table = {"kind": "adrc-pid", "kp": 2.0, "ki": 1.0, "tf": 0.1, "u_max": 4.0}
+    data = {"dt": 0.01, "controller": table, "learner": {"kind": "kalman"}}
+    found = made_setup("pid.toml", data).controller
+    equal = equal_to_pid(2.0, 1.0, tf=0.1, dt=0.01)
+    assert isinstance(found, ql.ADRC)
+    assert (found.observer.b0, found.omega_c) == (equal.b0, equal.omega_c)
+    assert isinstance(found.learner, ql.learners.Kalman)
+    assert found.limits.high == 4.0
+    with pytest.raises(ValueError, match="half_gain: unknown"):
+        made_setup("pid.toml", data | {"controller": table | {"half_gain": True}})

@@ -269,13 +269,21 @@ class ADRC(Compensator):
         tf: float | tuple[float, float] = 0.0,
         dt: float,
         b0: float | None = None,
+        learner: Learner | None = None,
+        guard: Guard | None = None,
         **options: Any,
     ) -> ADRC:
         """Return the ADRC that is equal, from y to u, to a PID controller that is sampled.
 
-        ``controllers.equal_to_pid`` has the parameters, the errors, and a report: what differs and
-        where to go from there. ``options`` are those of ``ADRC`` that leave the law linear and its
-        poles where they are: limits, ``learner``, ``guard``, ``feedforward``.
+        ``controllers.equal_to_pid`` has a report: what differs and where to go from there.
+
+        Parameters
+        ----------
+        kp, ki, kd, tf, dt, b0
+            as for ``equal_to_pid``, with the same errors.
+        learner, guard, **options
+            of ``ADRC``, those that leave the law linear and its poles where they are: limits,
+            ``feedforward``, ``safe_set``.
 
         Examples
         --------
@@ -286,7 +294,8 @@ class ADRC(Compensator):
         for name in {"half_gain", "feedback", "law_poles"} & options.keys():
             raise ValueError(f"{name} = {options[name]!r}: the PID controller decides it; leave it")
         equal = equal_to_pid(kp, ki, kd, tf=tf, dt=dt, b0=b0)
-        return cls(equal.observer, equal.omega_c, law_poles=equal.law_poles, **options)
+        parts: dict[str, Any] = {"learner": learner, "guard": guard, **options}
+        return cls(equal.observer, equal.omega_c, law_poles=equal.law_poles, **parts)
 
     def _design(self, observer: ESO, omega_c: float | None = None) -> AdrcDesign:
         """Return the parameters with an observer and a bandwidth, by default the present one."""
