@@ -47,7 +47,7 @@ _LENGTH, _LEAST, _MOST = 10.0, 10, 32
 # share; of the size of the slow u as a factor, which two good tunings do not reach. Batches that
 # the tests of the load need, and their length in correlation times. Chosen by hand.
 _LEVEL, _SAME_LEVEL, _SAME_SIZE = 1e-3, 0.01, 0.1
-_SAME_LOAD, _SAME_MEAN, _SAME_SWING, _LEAST_OF_LOAD, _LENGTH_OF_LOAD = 1.0, 0.05, 1.5, 4, 5.0
+_SAME_LOAD, _SAME_MEAN, _SAME_SWING, _LEAST_OF_LOAD, _LENGTH_OF_LOAD = 1.0, 0.05, 1.4, 4, 5.0
 # Two references are the same, or a reference repeats, if the RMS difference is below this share of
 # its deviation: steps may be a sample late. Chosen by hand.
 _REPEATS = 0.02
@@ -494,7 +494,7 @@ def _different_load(a: list[Measured], b: list[Measured], length: int) -> list[s
     A load that is slower than a twentieth of the logs is by chance another one in each of them;
     that is in the intervals, as far as it moves the error.
     """
-    window = max(round(3.0 * max(correlation_time(_error(log)) for log in (*a, *b))), 1)
+    window = round(max(correlation_time(_error(log)) for log in (*a, *b)))
     window = min(window, max(length // 4, 1))
     slow_a, slow_b = ([_moving_mean(log.u, window) for log in logs] for logs in (a, b))
     reasons: list[str] = []
