@@ -7,11 +7,12 @@ independent (batch means; Ibragimov & Müller, *J. Business & Economic Statistic
 that Student's t holds for few and uneven batches). A batch is ten correlation times of the loss or
 longer, ``τ = 1 + 2 Σ ρ_k`` over the initial positive sequence (Geyer, *Statistical Science* 7,
 1992); where the reference repeats, it is a whole number of its periods. With the means m of the
-losses and the variances s² of q batches, the ratio of two criteria is
+losses and the variances s² of q batches, the ratio of two criteria is ::
 
     d = ln m_A − ln m_B,    var d = s_A²/(q_A m_A²) + s_B²/(q_B m_B²)
 
-with the degrees of freedom of Welch. Where both logs have the same reference at the same times,
+with min(q_A, q_B) − 1 degrees of freedom, which is safe for any variances (Ibragimov & Müller,
+*Review of Economics and Statistics* 98, 2016). Where both logs have the same reference at the same times,
 batches are compared in pairs, so that what the reference makes of the loss cancels: ``var d`` is
 that of the mean of ``B_A,i/m_A − B_B,i/m_B``. The level is shared by all pairs of tunings
 (Bonferroni), so that in 95 % of all cases no tuning is called better that is not.
@@ -440,8 +441,7 @@ def _compared(
     else:
         parts = [np.var(each, ddof=1) / (np.mean(each) ** 2 * each.size) for each in (a, b)]
         spread = math.sqrt(float(sum(parts)))
-        squares = sum(part**2 / (each.size - 1) for part, each in zip(parts, (a, b), strict=True))
-        freedom = float(sum(parts) ** 2 / squares) if squares > 0.0 else 1.0
+        freedom = min(a.size, b.size) - 1.0
     # Of neighbours: the variance of batch means lacks half a correlation time, and the correlation
     # time of a short record is found too short by more.
     spread *= math.sqrt(1.0 + 2.0 * shared.share)
