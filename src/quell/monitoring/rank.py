@@ -12,10 +12,10 @@ losses and the variances s² of q batches, the ratio of two criteria is ::
     d = ln m_A − ln m_B,    var d = s_A²/(q_A m_A²) + s_B²/(q_B m_B²)
 
 with min(q_A, q_B) − 1 degrees of freedom, which is safe for any variances (Ibragimov & Müller,
-*Review of Economics and Statistics* 98, 2016). Where both logs have the same reference at the same times,
-batches are compared in pairs, so that what the reference makes of the loss cancels: ``var d`` is
-that of the mean of ``B_A,i/m_A − B_B,i/m_B``. The level is shared by all pairs of tunings
-(Bonferroni), so that in 95 % of all cases no tuning is called better that is not.
+*Review of Economics and Statistics* 98, 2016). Where both logs have the same reference at the same
+times, batches are compared in pairs, so that what the reference makes of the loss cancels:
+``var d`` is that of the mean of ``B_A,i/m_A − B_B,i/m_B``. The level is shared by all pairs of
+tunings (Bonferroni), so that in 95 % of all cases no tuning is called better that is not.
 
 That the machine had the same task is a condition, and it is looked at: the reference by its level,
 its size and its rate, the load by the slow part of u. What a loop rejects is in u below its
