@@ -14,7 +14,7 @@ from quell.cli.exit_codes import HELP, ExitCode
 from quell.cli.identify import b0, excite, identify
 from quell.cli.monitor import rank, watch
 from quell.cli.reproduce import acc, torsional, two_mass
-from quell.cli.rig import replay, rig, run_rig
+from quell.cli.rig import proxy, replay, rig, run_rig
 from quell.cli.run import export, run, studio, sweep
 from quell.cli.stress import stress
 from quell.cli.tune import tune
@@ -49,6 +49,7 @@ for _each in (
     rank,
     watch,
     rig,
+    proxy,
     run,
     run_rig,
     replay,

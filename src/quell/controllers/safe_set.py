@@ -1,22 +1,23 @@
 """A safe set: bands for y and its rate that no reference, u_0 or learner makes the loop leave.
 
-**The barrier.** For a border y_max of an order-n plant ``y^(n) = b0 u + f − a · x``, let
+**The barrier.** For a border y_max of an order-n plant ``y^(n) = b0 u + f − a · x``, let::
 
     ψ_0 = y_max − y,      ψ_i = (d/dt + α) ψ_{i−1},      i = 1 … n − 1
 
 If ψ_{n−1} never becomes negative, no ψ_i does that begins above zero: each is ψ_{i+1} through a lag
 of 1/α. So y does not exceed y_max (exponential control barrier functions: Nguyen & Sreenath,
 *American Control Conference* 2016; Ames et al., *European Control Conference* 2019). ψ_{n−1} is
-linear in the state,
+linear in the state::
 
     ψ_{n−1} = α^(n−1) y_max − c · x,      c_i = C(n − 1, i − 1) α^(n−i)
 
 and one sample later, with u held, it is known exactly: ``x⁺ = Φ x + Γ_u u + Γ_f f``. The condition
+is::
 
     ψ_{n−1}⁺ ≥ λ ψ_{n−1},      λ = exp(−α dt)
 
-is therefore one bound of u, in closed form, and its limit for dt → 0 is the law of ADRC with the
-bandwidth α and the reference y_max:
+It is one bound of u, in closed form, and its limit for dt → 0 is the law of ADRC with the
+bandwidth α and the reference y_max::
 
     c·Γ_u u ≤ (1 − λ) α^(n−1) y_max − c·(Φ − λ I) x̂ − c·Γ_f f̂ − δ                              (1)
 
@@ -25,12 +26,12 @@ as little as these bounds allow; where the two bands contradict each other, that
 
 **The margin** δ pays for what is not known (arXiv 2308.13943, 2512.05292: robust barriers with an
 estimate of the disturbance). The set has an observer of its own, which receives y and the applied u
-and nothing of a learner, so its errors do not depend on what a learner does. They obey
+and nothing of a learner, so its errors do not depend on what a learner does. They obey::
 
     e⁺ = (I − L C)(Φ e + w) − L v,      w = ∫ exp(A s) E f'(t − s) ds over a sample
 
-and what they do to (1) is ``q = c·(Φ e + w) − λ c·e``. With the sum of the absolute values of the
-impulse response of q, δ is the largest |q| for all signals within the bounds
+What they do to (1) is ``q = c·(Φ e + w) − λ c·e``. With the sum of the absolute values of the
+impulse response of q, δ is the largest ``|q|`` for all signals within the bounds::
 
     |f'| ≤ f_rate,      |v| ≤ noise,      |b/b0 − 1| ≤ gain_error with |u| ≤ max(|u_min|, |u_max|)
 
@@ -41,11 +42,11 @@ a sample, of higher order up to (α dt)² of the band. From a start outside, ψ_
 zero as exp(−α t). All of that as long as the limits of u allow what (1) asks for: else u is at the
 limit that comes nearest, and the flag ``UNSAFE`` says so. It also says that a measurement was
 farther from the expected one than signals within the bounds allow: then a bound does not hold, and
-nothing is guaranteed. In a band of width H that takes
+nothing is guaranteed. In a band of width H that takes::
 
     |b0 u + f| ≤ α² H for n = 2,      3 α³ H for n = 3
 
-so α follows from what the actuator has.
+So α follows from what the actuator has.
 """
 
 from __future__ import annotations
@@ -218,7 +219,7 @@ def shift_f(design: Any, memory: Any, change: float) -> None:
 
 @shift_f.register(SafeSetDesign)
 def _shift_f(design: SafeSetDesign, memory: SafeSetMemory, change: float) -> None:
-    last = memory.z.size - 1
+    last = memory.seen.size - 1
     memory.z[last] += change
     memory.seen[last] += change
 
@@ -241,8 +242,9 @@ def _settle_at_rest(
 def settle_safe_set(design: Any, memory: Any, x: Vector, f: float) -> None:
     """Set the observer of a safe set to given estimates, for a plant that is known there."""
     if isinstance(design, SafeSetDesign):
-        memory.z[:-1] = memory.seen[:-1] = x
-        memory.z[-1] = memory.seen[-1] = f
+        size = memory.seen.size
+        memory.seen[:] = np.append(x, f)
+        memory.z[:size], memory.z[size:] = memory.seen, 0.0
         memory.loop[0].started = 1.0
 
 

@@ -189,11 +189,6 @@ class Watch:
     seed
         of the draws that break ties; any number that was not chosen with a look at the data.
 
-    Attributes
-    ----------
-    alarms : list of Alarm
-        those raised so far, one for a feature at most.
-
     Raises
     ------
     ValueError
@@ -210,6 +205,8 @@ class Watch:
     b0 since day 150 seen at day 154
     """
 
+    alarms: list[Alarm]  #: those raised so far, one for a feature at most
+
     def __init__(
         self, features: tuple[str, ...] | None = None, *, alpha: float = 0.01, seed: int = 0
     ) -> None:
@@ -218,7 +215,7 @@ class Watch:
             raise ValueError(f"alpha = {alpha!r}: must be below 1, such as 0.01")
         self.seed = checks.whole("seed", seed, 0)
         self.labels: list[str] = []
-        self.alarms: list[Alarm] = []
+        self.alarms = []
         self.left_out: set[str] = set()
         self._tracks: dict[str, _Track] = {}
         if features is not None:

@@ -1,7 +1,7 @@
 """Tuning of a compensator on top of a controller that stays as it is.
 
-A compensator changes the loop, so it is tuned as a controller is: the largest |S|, |T| and |K S| of
-the whole loop, with the controller in it, are bounded, and of all observers within the bounds the
+A compensator changes the loop, so it is tuned as a controller is: M_s, M_t and M_ks of the whole
+loop, with the controller in it, are bounded, and of all observers within the bounds the
 one is taken that leaves the least ``∫|y|`` after a step of the load at the plant's input. The
 bounds hold, 1.5 times as wide, where all poles and zeros of the plant are slower or faster, too.
 
@@ -12,9 +12,9 @@ the plant, whole and reduced. Each has its bandwidth ω_o as the second paramete
 on a grid of logarithms, then between its points; a loop is sampled exactly, its peaks are those of
 ``analyse``.
 
-With a load f = b0 d at the plant's input, and C the controller, P the plant and Q the observer's
-response from f to f̂, a nominal model gives ``y = P (1 − Q)/(1 + P C) d``: the compensator removes
-what lies within the bandwidth of Q, whatever C does.
+With a load d at the plant's input, the controller C, the plant P and the observer's response Q from
+f to f̂, a nominal model gives ``y = P (1 − Q)/(1 + P C) d``: the compensator removes what lies
+within the bandwidth of Q, whatever C does.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class TunedCompensator:
         ax = plt.subplots(layout="constrained")[1] if ax is None else ax
         for y, label in zip(self.loads, ("controller alone", "with compensator"), strict=True):
             size = np.abs(y)
-            shown = int(np.flatnonzero(size > 0.02 * np.max(size))[-1]) + 2
+            shown = min(int(np.flatnonzero(size > 0.02 * np.max(size))[-1]) + 2, y.size)
             ax.plot(np.arange(shown) * self.dt, y[:shown], label=label)
         ax.set(xlabel="t [s]", ylabel="y [y-unit]", title="Step of the load")
         ax.legend()
