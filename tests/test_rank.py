@@ -145,6 +145,18 @@ def test_another_task_is_named_as_the_reason(change: dict[str, Any], reason: str
     assert reason in line
 
 
+def test_a_load_behind_moves_that_repeat_is_seen() -> None:
+    """What the moves make of u is the same in each period, and is taken out."""
+    r = np.tile(np.repeat([0.0, 1.0], 150), 30)
+    logs = {}
+    for seed, (name, load) in enumerate({"A": 0.3, "B": 0.9}.items()):
+        one = log(seed, samples=9000, r=r, load=load)
+        logs[name] = one._replace(u=one.u + 20.0 * np.gradient(r))
+    assert "the slow part of u swings" in rank(logs).comparisons[0].describe()
+    same = {name: one._replace(u=logs["A"].u) for name, one in logs.items()}
+    assert rank(same).comparisons[0].reasons == ()
+
+
 def test_the_same_load_under_another_tuning_is_comparable() -> None:
     """False alarms of the tests of reference and load: one in 100 at most."""
     alarms = 0

@@ -485,30 +485,35 @@ def _different_task(a: list[Measured], b: list[Measured], shared: _Batches) -> t
         reasons = _different_reference(r, other, shared)
     else:
         reasons = []
-    return (*reasons, *_different_load(a, b, shared.length))
+    return (*reasons, *_different_load(a, b, shared))
 
 
-def _different_load(a: list[Measured], b: list[Measured], length: int) -> list[str]:
+def _different_load(a: list[Measured], b: list[Measured], shared: _Batches) -> list[str]:
     """Return in what the slow part of u differs, if the logs are long enough to tell.
 
     A load that is slower than a twentieth of the logs is by chance another one in each of them;
     that is in the intervals, as far as it moves the error.
     """
-    window = round(max(correlation_time(_error(log)) for log in (*a, *b)))
-    window = min(window, max(length // 4, 1))
+    period = shared.period
+
+    def less_moves(values: Vector) -> Vector:
+        return _without_cycle(values, period) if period else values
+
+    window = round(max(correlation_time(less_moves(_error(log))) for log in (*a, *b)))
+    window = min(window, max(shared.length // 4, 1))
     slow_a, slow_b = ([_moving_mean(log.u, window) for log in logs] for logs in (a, b))
     reasons: list[str] = []
-    means = _own_batches(slow_a, slow_b, length)
+    means = _own_batches(slow_a, slow_b, shared.length)
     if means is not None:
         middle_a, middle_b = (float(np.mean(each)) for each in means)
         unit = math.sqrt(0.5 * float(np.var(means[0]) + np.var(means[1])))
         most = max(_SAME_LOAD * unit, _SAME_MEAN * max(abs(middle_a), abs(middle_b)))
         if abs(middle_a - middle_b) > most and _differ(*means):
             reasons.append(f"the mean of u is {middle_a:.4g} and {middle_b:.4g}: another load")
-    squares_a, squares_b = (
-        [(each - np.mean(each)) ** 2 for each in slow] for slow in (slow_a, slow_b)
-    )
-    swings = _own_batches(squares_a, squares_b, length)
+    # What a reference that repeats makes of u is no load.
+    rest = ([less_moves(each) for each in slow] for slow in (slow_a, slow_b))
+    squares_a, squares_b = ([(each - np.mean(each)) ** 2 for each in part] for part in rest)
+    swings = _own_batches(squares_a, squares_b, shared.length)
     if swings is not None and min(float(np.mean(each)) for each in swings) > 0.0:
         relative = [each / np.mean(each) for each in swings]
         ratio = 0.5 * math.log(float(np.mean(swings[1]) / np.mean(swings[0])))
