@@ -1,6 +1,6 @@
 """``quell watch`` on simulated machines: false alarms in months, and the delay of true ones.
 
-    python benchmarks/watch.py                 # 1000 months, some twelve minutes
+    python benchmarks/watch.py                 # 1000 months, half an hour
     python benchmarks/watch.py --months 50     # a look
 
 Two machines at 1 kHz under an ADRC: a *servo* (``dc_motor``: 2e-4 kg m², encoder of 8192 counts,
