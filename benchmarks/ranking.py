@@ -5,9 +5,9 @@
 
 Each log is a simulated loop: an oven at 1 Hz (600 s, 0.8 K/W) under a drifting load, or a servo of
 2e-4 kg m² at 1 kHz with moves that repeat, or a servo with moves that do not. *Alike* are two logs
-of one tuning with other draws of load and noise: they must not be decided, in 95 % of the draws at least.
-*Better* are bandwidths that are higher: by so much that the RMS error over a long log is lower by
-the share that is shown. *Another load* are logs of one tuning under twice the load.
+of one tuning with other draws of load and noise: in 95 % of the draws at least they must not be
+decided. *Better* are bandwidths that are higher: by so much that the RMS error over a long log is
+lower by the share that is shown. *Another load* are logs of one tuning under twice the load.
 """
 
 from __future__ import annotations

@@ -289,7 +289,7 @@ class ADRC(Compensator):
         --------
         >>> controller = ADRC.from_pid(2.0, 1.0, dt=0.01, u_min=-5.0, u_max=5.0)
         >>> round(controller.omega_c, 3), controller.observer.form
-        (0.926, 'reduced')
+        (0.868, 'reduced')
         """
         for name in {"half_gain", "feedback", "law_poles"} & options.keys():
             raise ValueError(f"{name} = {options[name]!r}: the PID controller decides it; leave it")
@@ -457,7 +457,7 @@ def dead_time_tuning(
     Examples
     --------
     >>> [round(number, 3) for number in dead_time_tuning(2.0, time_constant=4.0, dead_time=1.0)]
-    [2.571, 0.284, 4.858]
+    [2.634, 0.279, 4.861]
     """
     K = checks.nonzero("gain", gain, "or u does not reach y")
     T = checks.positive("time_constant", time_constant, "s")

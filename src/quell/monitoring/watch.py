@@ -202,7 +202,7 @@ class Watch:
     ...     row = {"b0": (500.0 if day < 150 else 450.0) + 10.0 * rng.normal()}
     ...     for alarm in watch.update(row, f"day {day}"):
     ...         print(alarm.feature, "since", alarm.since_at, "seen at", alarm.at)
-    b0 since day 150 seen at day 154
+    b0 since day 149 seen at day 154
     """
 
     alarms: list[Alarm]  #: those raised so far, one for a feature at most
