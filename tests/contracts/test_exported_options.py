@@ -258,6 +258,7 @@ NO_PARTS = {
     "LinearLaw",
     "Model",
     "Notch",
+    "PidEqual",
     "Prefilter",
 }
 IN_PYTHON = {"JaxModel", "PythonModel", "RiverModel", "SklearnModel", "TorchModel"}
