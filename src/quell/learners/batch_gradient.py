@@ -63,6 +63,7 @@ from quell.learners.base import (
     coefficients,
     commit,
     forget,
+    meaning,
     predict,
     restart,
     startup_samples,
@@ -225,6 +226,11 @@ def _rescale(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float
         memory.units[i] = current[i]
     memory.loop[0].has_scale = 1.0
     clear_buffers(memory.buffers)
+
+
+@meaning.register(ScaledDesign)
+def _meaning(learner: ScaledDesign) -> Any:
+    return learner.features, learner.unscaled, learner.batch
 
 
 @kernel

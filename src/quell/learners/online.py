@@ -60,6 +60,7 @@ from quell.learners.base import (
     features_first,
     forget,
     group_delay,
+    meaning,
     no_coefficients,
     noise_gate_memory,
     predict,
@@ -265,6 +266,11 @@ def _forget(learner: OnlineDesign, memory: OnlineMemory) -> None:
 coefficients.register(OnlineDesign)(no_coefficients)
 
 
+@meaning.register(OnlineDesign)
+def _meaning(learner: OnlineDesign) -> Any:
+    return meaning(learner.inputs), type(learner.model).__name__, meaning(learner.model)
+
+
 class Online(FeatureLearner):
     """A learner made of a model and features.
 
@@ -463,6 +469,11 @@ class Network:
         covariance = parameters.rule.prior * np.eye(theta.size)
         gradient, gain = np.zeros((2, theta.size))
         return NetworkMemory(theta, covariance, gradient, gain, np.zeros(1))
+
+
+@meaning.register(NetworkDesign)
+def _meaning_of_network(model: NetworkDesign) -> Any:
+    return model.inputs, model.hidden
 
 
 class MLP(Online):

@@ -62,6 +62,7 @@ from quell.learners.base import (
     lag_memory,
     lag_of,
     lag_push,
+    meaning,
     noise_gate_memory,
     predict,
     reset_gate,
@@ -317,6 +318,11 @@ def _coefficients(learner: LinearDesign, memory: LinearMemory, theta: Vector) ->
         theta[i] = memory.theta[i] * memory.units[i] * f_scale if scaled else 0.0
     if learner.constant >= 0:
         theta[learner.constant] += memory.loop[0].bias
+
+
+@meaning.register(LinearDesign)
+def _meaning(learner: LinearDesign) -> Any:
+    return meaning(learner.inputs), learner.constant, learner.with_u, type(learner.rule).__name__
 
 
 # ---- The base class of the learners that are linear in θ ----

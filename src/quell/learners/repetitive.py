@@ -49,6 +49,7 @@ from quell.learners.base import (
     lag_memory,
     lag_of,
     lag_push,
+    meaning,
     no_coefficients,
     predict,
     reset_lag,
@@ -204,6 +205,11 @@ def _clear_tables(memory: RepetitiveMemory) -> None:
 
 
 coefficients.register(RepetitiveDesign)(no_coefficients)
+
+
+@meaning.register(RepetitiveDesign)
+def _meaning(learner: RepetitiveDesign) -> Any:
+    return learner.samples
 
 
 # ---- The learner of what repeats with a known period ----

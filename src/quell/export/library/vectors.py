@@ -26,6 +26,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.memory import learned_state
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
@@ -229,7 +230,7 @@ class Player:
     def __init__(self, controller: Any) -> None:
         single = isinstance(controller, SinglePrecision)
         self.default = parameters_of(controller)
-        self.design, self.state = self.default, controller.initial_state()
+        self.design, self.state = self.default, learned_state(controller)
         self.limited = self.default
         self.real: Callable[[Any], Any] = np.float32 if single else float
         self.derivatives = int(getattr(controller, "derivatives", 0))
