@@ -79,12 +79,15 @@ class Layout(NamedTuple):
         bytes of a number.
     layout, design
         the two hashes.
+    zeros
+        numbers of the image that are zero in any image: flags that are set during a call alone.
     """
 
     arrays: dict[str, NDArray[Any]]
     width: int
     layout: int
     design: int
+    zeros: tuple[int, ...]
 
     @property
     def numbers(self) -> int:
@@ -150,8 +153,14 @@ def images_of(parameters: Any, state: Any, dt: float) -> Layout:
         what += (type(learner).__name__, meaning(learner), type(adrc.guard).__name__)
         what += (adrc.b0, adrc.cancel, adrc.cancel_f)
     everything = (what, parameters)
-    width = 4 if single else 8
-    return Layout(arrays, width, _hash(what, digits), _hash(everything, digits))
+    width, zeros = 4 if single else 8, []
+    found = _adrc_state(state)
+    if found is not None:
+        names = list(arrays)
+        at = next(i for i, name in enumerate(names) if np.shares_memory(arrays[name], found.loop))
+        before = sum(arrays[name].size for name in names[:at])
+        zeros = [before + list(found.loop.dtype.names).index("manual")]
+    return Layout(arrays, width, _hash(what, digits), _hash(everything, digits), tuple(zeros))
 
 
 def _hash(value: Any, digits: int) -> int:
@@ -257,6 +266,8 @@ def read_image(known: Layout, image: Any, *, running: bool) -> dict[str, NDArray
     numbers = np.frombuffer(data, kind, known.numbers, HEADER.size)
     if not np.all(np.isfinite(numbers)):
         raise ValueError("image has numbers that are not finite; let the controller learn anew")
+    if any(numbers[place] != 0.0 for place in known.zeros):
+        raise ValueError("image was saved in the middle of a sample; let the controller learn anew")
     found, at = {}, 0
     for name, array in known.arrays.items():
         found[name] = numbers[at : at + array.size].reshape(array.shape)
@@ -289,14 +300,18 @@ def learned_state(controller: Any) -> Any:
     return state
 
 
+def _adrc_state(state: Any) -> AdrcState | None:
+    """Return the state of the ADRC behind all wrappers; None of others."""
+    while not isinstance(state, AdrcState) and state is not None:
+        state = getattr(state, "controller", None)
+    return state
+
+
 def _learned_arrays(state: Any) -> dict[str, NDArray[Any]]:
     """Return what the ADRC behind all wrappers has learned, by name; nothing of others."""
-    while not isinstance(state, AdrcState):
-        if not hasattr(state, "controller"):
-            return {}
-        state = state.controller
-    return {
+    found = _adrc_state(state)
+    return {} if found is None else {
         name: array
-        for name, array in named_arrays(state).items()
+        for name, array in named_arrays(found).items()
         if name.split(".")[0] in _LEARNED and array.dtype.kind == "f"
     }

@@ -62,14 +62,27 @@ static void memory_put(unsigned char *image, int k, REAL x)
 PUT
 }
 
-/* Read number k. */
-static REAL memory_get(const unsigned char *image, int k)
+/* Read number k, whatever it is. */
+static REAL memory_get_any(const unsigned char *image, int k)
 {
     const BITS bits = GET;
     REAL x;
 
     (void)memcpy(&x, &bits, sizeof x);
     return x;
+}
+
+/* Read number k; what is not finite, which memory_fits refuses, is 0. */
+static REAL memory_get(const unsigned char *image, int k)
+{
+    const REAL x = memory_get_any(image, k);
+    return x == x && x >= -REAL_MAX && x <= REAL_MAX ? x : ZERO;
+}
+
+/* Return the integer nearest to x towards zero; 0 for one that no state has. */
+static int memory_whole(REAL x)
+{
+    return x > -BEYOND && x < BEYOND ? (int)x : 0;
 }
 
 /* Write the numbers from k on. */
@@ -91,10 +104,10 @@ static void memory_get_all(const unsigned char *image, int k, REAL *x, int count
 /* Return the check of an image: FNV-1a with 64 bits over words of 32 bits. */
 static uint64_t memory_check(const unsigned char *image)
 {
-    uint64_t check = UINT64_C(BEGIN);
+    uint64_t check = BEGINULL;
 
     for (int at = 0; at < CHECKED; at += 4) {
-        check = (check ^ memory_get_word(image, at)) * UINT64_C(FACTOR);
+        check = (check ^ memory_get_word(image, at)) * FACTORULL;
     }
     return check;
 }
@@ -104,15 +117,15 @@ static bool memory_fits(const unsigned char *image, size_t length, bool resume)
 {
     if (length != SIZEU || memory_get_word(image, 0) != MAGICU
         || memory_get_word(image, 4) != KINDU || memory_get_word(image, 8) != SIZEU
-        || memory_get_long(image, 16) != UINT64_C(LAYOUT)
+        || memory_get_long(image, 16) != LAYOUTULL
         || memory_get_long(image, CHECKED) != memory_check(image)) {
         return false;
     }
-    if (resume && (ORIGINmemory_get_long(image, 24) != UINT64_C(DESIGN))) {
+    if (resume && (ORIGINmemory_get_long(image, 24) != DESIGNULL)) {
         return false;
     }
     for (int k = 0; k < NUMBERS; k++) {
-        if (!(FABS(memory_get(image, k)) <= REAL_MAX)) {
+        if (!(FABS(memory_get_any(image, k)) <= REAL_MAX)) {
             return false;
         }
     }
@@ -131,11 +144,14 @@ _TEST = """    for (int i = 0; i < COUNT; i++) {
         const REAL x = memory_get(image, memory_ranges[i].place);
         const REAL low = memory_ranges[i].low, high = memory_ranges[i].high;
 
-        if (!(x >= low && x <= high) || (low < high && x != (REAL)(int)x)) {
+        if (!(x >= low && x <= high) || (low < high && x != (REAL)memory_whole(x))) {
             return false;
         }
     }
     """
+
+
+_WHOLE = _CODE[_CODE.index("/* Return the integer") : _CODE.index("/* Write the numbers")]
 
 
 class _Part(NamedTuple):
@@ -179,6 +195,9 @@ class ImageCode:
     def _add(self, at: int, part: _Part) -> None:
         """Add the lines for the numbers from ``at`` on."""
         value, size = part.value, part.values.size
+        if at in self.known.zeros and value is not None:
+            value = Value(value.kind, value.code, constant=0.0)
+            self.load.append(f"    {value.code} = {'false' if value.kind is Number.BOOL else 0};")
         if value is not None and isinstance(value.kind, Array):
             if value.kind.element is not Number.REAL:
                 raise AssertionError
@@ -195,7 +214,7 @@ class ImageCode:
             self.load.append(f"    {value.code} = memory_get(image, {at});")
         else:
             real, zero = self.structs.literals.real, self.write(0.0)
-            found, low, high = f"(int)memory_get(image, {at})", -_LARGEST_INTEGER, _LARGEST_INTEGER
+            found, low, high = f"memory_whole(memory_get(image, {at}))", -_LARGEST_INTEGER, _LARGEST_INTEGER
             shown = f"({real}){value.code}"
             if value.kind is Number.BOOL:
                 found, low, high = f"memory_get(image, {at}) != {zero}", 0, 1
@@ -256,8 +275,11 @@ class ImageCode:
             get = "memory_get_long(image, 32 + 8 * k)"
         origin = "" if self.has_origin else "memory_get_word(image, 12) != 0U || "
         text = _CODE
+        if not count:
+            text = text.replace(_WHOLE, "")
         for word, code in {
             "RANGES\n": ranges, "TEST": test, "PUT": put, "GET": get, "ORIGIN": origin,
+            "ZERO": self.write(0.0), "BEYOND": self.write(_LARGEST_INTEGER + 2),
             "REAL_MAX": "FLT_MAX" if single else "DBL_MAX", "FABS": literals.math_function("fabs"),
             "BITS": "uint32_t" if single else "uint64_t", "REAL": literals.real,
             "CHECKED": str(known.size - CHECK.size), "SIZE": str(known.size),

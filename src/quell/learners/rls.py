@@ -279,6 +279,12 @@ def selection_memory(rule: SelectionRule, count: int, features: int) -> Selectio
     )
 
 
+@kernel
+def _active(memory: SelectionMemory, k: int) -> int:
+    """Return the index of active feature ``k``; it is that of a feature whatever the state has."""
+    return min(max(int(memory.active[k]), 0), memory.weak.size - 1)
+
+
 @update_theta.register(SelectionRule)
 def _update_theta_selection(
     rule: SelectionRule,
@@ -297,11 +303,11 @@ def _update_theta_selection(
     for i in range(theta.size):
         memory.weak[i] += step * memory.inactive[i] * features[i]
     for k in range(chosen.size):
-        chosen[k] = features[int(memory.active[k])]
+        chosen[k] = features[_active(memory, k)]
     noise = rule.rls.noise / confidence
     inverse = least_squares_gain(rule.rls, memory.covariance, gain, chosen, noise)
     for k in range(chosen.size):
-        theta[int(memory.active[k])] += gain[k] * inverse * error
+        theta[_active(memory, k)] += gain[k] * inverse * error
     memory.loop[0].samples += 1.0
     if memory.loop[0].samples >= rule.interval:
         memory.loop[0].samples = 0.0
@@ -313,12 +319,12 @@ def _exchange(rule: SelectionRule, memory: SelectionMemory, theta: Vector) -> No
     """Let the strongest inactive feature take the place of the weakest active one."""
     place = enters = 0
     for k in range(memory.active.size):
-        if abs(theta[int(memory.active[k])]) < abs(theta[int(memory.active[place])]):
+        if abs(theta[_active(memory, k)]) < abs(theta[_active(memory, place)]):
             place = k
     for i in range(theta.size):
         if abs(memory.weak[i]) > abs(memory.weak[enters]):
             enters = i
-    leaves = int(memory.active[place])
+    leaves = _active(memory, place)
     if not abs(memory.weak[enters]) > _STRONGER * abs(theta[leaves]):
         return
     memory.active[place] = enters
@@ -344,10 +350,10 @@ def _share_excess_selection(
     rule: SelectionRule, memory: SelectionMemory, theta: Vector, i: int, excess: float
 ) -> None:
     for k in range(memory.active.size):
-        if int(memory.active[k]) == i and memory.covariance[k, k] > 0.0:
+        if _active(memory, k) == i and memory.covariance[k, k] > 0.0:
             for j in range(memory.active.size):
                 share = excess_share(memory.covariance, k, j)
-                theta[int(memory.active[j])] -= share * excess
+                theta[_active(memory, j)] -= share * excess
 
 
 # ---- Recursive least squares as a rule of linear learners ----

@@ -474,6 +474,7 @@ def test_program(source: CSource, vectors: Vectors) -> str:
     blocks = sum(row.action is Action.LEARN for row in vectors.rows)
     return filled("test.c", {
         "name": source.name,
+        "NAME": source.name.upper(),
         "precision": source.precision,
         "real": source.real,
         "epsilon": "FLT_EPSILON" if single else "DBL_EPSILON",
