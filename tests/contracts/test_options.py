@@ -129,7 +129,7 @@ CASES: dict[str, dict[str, Case]] = {
     "run": {"SETUP": ("--no-figures",), "--example": (("--example",), _SETUP), "--save": ("--save", "run.nc")},
     "run-rig": {
         "SETUP": (_OF_SETUP, ("other.toml", *_FIGURES)), "--example": ("--example",), "--device": ("--device", "twin:torsional"), "--seconds": ("--seconds", "2"), "--omega-c": ("--omega-c", "3"),
-        "--omega-o": ("--omega-o", "9"), "--spin": ("--spin", "0.001"), "--priority": ("--priority", "0"), "--mcap": ("--mcap", "new.mcap"), "--csv": ("--csv", "new.csv"),
+        "--omega-o": ("--omega-o", "9"), "--spin": ("--spin", "0.001"), "--priority": ("--priority", "0"), "--mcap": ("--mcap", "new.mcap"), "--csv": ("--csv", "new.csv"), "--memory": ("--memory", "servo.qllm"),
         "--live": ("--live", "0"), "--live-origin": ("--live-origin", "https://a.org"), "--save": ("--save", "taken.json"),
     },
     "replay": {"RECORD": ("other.csv",), "--setup": ("--setup", "other.toml"), "--save": ("--save", "taken.json")},

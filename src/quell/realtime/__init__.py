@@ -21,6 +21,7 @@ from quell.lazy import imported_on_use
 if TYPE_CHECKING:
     from quell.realtime.devices import Device, TwinDevice
     from quell.realtime.live import LiveSink
+    from quell.realtime.memory_file import MemoryFile
     from quell.realtime.recordings import CsvSink, McapSink, load
     from quell.realtime.registry import open_device
     from quell.realtime.rig import Rig
@@ -33,6 +34,7 @@ _HOMES = {
     "Device": "devices",
     "LiveSink": "live",
     "McapSink": "recordings",
+    "MemoryFile": "memory_file",
     "Rig": "rig",
     "RigRun": "run",
     "Safety": "supervisor",
@@ -45,7 +47,7 @@ _HOMES = {
 }
 
 __all__ = [
-    "CsvSink", "Device", "LiveSink", "McapSink", "Rig", "RigRun", "Safety", "TwinDevice",
+    "CsvSink", "Device", "LiveSink", "McapSink", "MemoryFile", "Rig", "RigRun", "Safety", "TwinDevice",
     "load", "open_device", "record_target", "replay", "run_rig",
 ]  # fmt: skip
 
