@@ -139,7 +139,7 @@ CASES: dict[str, dict[str, Case]] = {
     },
     "export": {
         "SETUP": ("other.toml",), "--to": ("--to", "fmu"), "--out": ("--out", "d"), "--name": ("--name", "servo"), "--precision": ("--precision", "single"), "--what": ("--what", "loop"),
-        "--resolution": ("--resolution", "0.01"), "--accept": ("--accept",),
+        "--resolution": ("--resolution", "0.01"), "--memory": ("--memory", "servo.qllm"), "--accept": ("--accept",),
         "--prove": ("--prove",),
     },
     "studio": {"SETUP": (("--no-browser",), ("setup.toml", "--no-browser")), "--port": ("--port", "0"), "--browser": (_SETUP, (*_SETUP, "--no-browser"))},

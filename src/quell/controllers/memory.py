@@ -45,7 +45,9 @@ The running state is for a process that is replaced between two samples.
 from __future__ import annotations
 
 import hashlib
+import os
 import struct
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -206,6 +208,21 @@ def written_image(known: Layout, origin: int = 0) -> bytes:
     parts = [np.ascontiguousarray(array, dtype=kind).tobytes() for array in known.arrays.values()]
     data = b"".join([head, *parts])
     return data + CHECK.pack(check_of(data))
+
+
+# An image is tens of kilobytes, seldom megabytes. A file beyond that is something else.
+_MOST_BYTES = 100_000_000
+
+
+def file_content(path: str | os.PathLike[str]) -> bytes:
+    """Return the bytes of a file that may be an image; a ``ValueError`` says why there are none."""
+    try:
+        size = os.stat(path).st_size
+        if size > _MOST_BYTES:
+            raise ValueError(f"the file has {size} bytes: it is no memory image of quell")
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"the file can't be read ({error.strerror or error})") from None
 
 
 _AS_SAVED = "use the file as it was saved"

@@ -258,7 +258,7 @@ def _adopt(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
     for j in range(_count(memory)):
         if not _is_resolved(loop, fit, j):
             continue
-        i = _oscillator_for(search, memory, omega, taken, fit.omega[j])
+        i = max(_oscillator_for(search, memory, omega, taken, fit.omega[j]), 0)
         taken[i] = 1.0
         is_new = abs(omega[i] * search.step - fit.omega[j]) * loop.window > _DOUBT
         if is_new or adopted[i] == 0.0 or fit.deviation[j] < _WORSE * adopted[i]:

@@ -23,12 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.controllers.memory import file_content
 from quell.controllers.stateful import StatefulController
 from quell.files import check_writable, written_atomically
 from quell.realtime.system import load_acquire
 
-# An image is tens of kilobytes, seldom megabytes. A file beyond that is something else.
-_MOST_BYTES = 100_000_000
 # Looks for a pause of the loop, and time between two [s]: a step takes a part of a sample, so that
 # the first look finds one nearly always.
 _LOOKS, _BETWEEN = 10_000, 1e-4
@@ -85,10 +84,8 @@ class MemoryFile:
         if not self.path.exists():
             return own._state, f"memory: {self.path} does not exist yet: nothing is learned"
         try:
-            if self.path.stat().st_size > _MOST_BYTES:
-                raise ValueError(f"has more than {_MOST_BYTES} bytes: it is no memory image")
-            own.restore(self.path.read_bytes())
-        except (ValueError, OSError) as error:
+            own.restore(file_content(self.path))
+        except ValueError as error:
             raise ValueError(
                 f"memory = {str(self.path)!r}: {error} (nothing has moved; another file, or none "
                 "there, lets the controller learn anew)"
