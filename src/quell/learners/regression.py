@@ -112,6 +112,22 @@ def share_excess(rule: Any, memory: Any, theta: Vector, i: int, excess: float) -
     """
 
 
+@generic_with_default
+def restart_rule(rule: Any, memory: Any, theta: Vector) -> None:
+    """Start from rest: the position may have another origin now. By default nothing changes."""
+
+
+@generic_with_default
+def forget_rule(rule: Any, memory: Any) -> None:
+    """Forget what the rule keeps besides θ; by default only ``reset_uncertainty``."""
+    reset_uncertainty(rule, memory)
+
+
+@generic_with_default
+def convert_rule(rule: Any, memory: Any, ratio: float) -> None:
+    """Convert what the rule keeps in units of the scaled f, which is now ``ratio`` of before."""
+
+
 @kernel
 def keep_within(
     rule: Any, memory: Any, theta: Vector, i: int, lowest: float, highest: float
@@ -215,6 +231,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
     if scale[last] != old[last]:
         for i in range(theta.size):
             theta[i] *= old[last] / scale[last]
+        convert_rule(learner.rule, memory.rule, old[last] / scale[last])
     for j in range(last):
         grown = grown or scale[j] != old[j]
     if not grown:
@@ -288,7 +305,9 @@ def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
     finite = True
     for i in range(memory.theta.size):
         finite = finite and is_finite(memory.theta[i])
-    if not finite:
+    if finite:
+        restart_rule(learner.rule, memory.rule, memory.theta)
+    else:
         _forget_theta(learner, memory)
 
 
@@ -296,7 +315,7 @@ def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
 def _forget_theta(learner: LinearDesign, memory: LinearMemory) -> None:
     for i in range(memory.theta.size):
         memory.theta[i] = 0.0
-    reset_uncertainty(learner.rule, memory.rule)
+    forget_rule(learner.rule, memory.rule)
 
 
 @forget.register(LinearDesign)

@@ -51,11 +51,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.features import Features
+from quell.features import Features, Joined, Periodic
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
 from quell.kernels.single import add_symmetrically
 from quell.kernels.sized import Scalars, clear
+from quell.learners.recall import RecallMemory, RecallRule, recall_memory, recall_rule
 from quell.learners.regression import Linear, reset_uncertainty, share_excess, update_theta
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -400,6 +401,25 @@ def _share_excess_rls(
             theta[j] -= excess_share(memory.covariance, i, j) * excess
 
 
+def _periodic_blocks(features: Features) -> list[tuple[list[Features], Periodic]]:
+    """Return the blocks that are periodic in position, each with the blocks before it."""
+    blocks: list[Features] = []
+    waiting = [features]
+    while waiting:
+        block = waiting.pop(0)
+        if isinstance(block, Joined):
+            waiting = [block.first, block.second, *waiting]
+        else:
+            blocks.append(block)
+    found = enumerate(blocks)
+    return [(blocks[:i], block) for i, block in found if isinstance(block, Periodic)]
+
+
+def _finite_or(time: float | None, default: float) -> float:
+    """Return a time that is given and finite, or the default [s]."""
+    return default if time is None or not math.isfinite(time) else time
+
+
 class RLS(Linear):
     """Recursive least squares on any features, with a memory of limited length.
 
@@ -418,6 +438,11 @@ class RLS(Linear):
         ratio of the RMS error to its usual size from which the plant counts as changed: then θ is
         learned again as quickly as at the start, for example 4; by default
         never.
+    recall
+        whether the position has another origin after each start from rest, as that of an encoder
+        without index pulse. The map of the ``Periodic`` features, of which there must be one block,
+        is then looked for at all shifts and is used again within half a period, if it fits
+        (``learners/recall.py``); else it is learned anew.
 
     The other parameters are described in the base classes ``Linear`` and ``FeatureLearner``.
 
@@ -441,6 +466,7 @@ class RLS(Linear):
         prior: float = 10.0,
         strongest: int | None = None,
         relearn: float | None = None,
+        recall: bool = False,
         frequency: float | None = None,
         scale: Any = None,
         gain_interval: tuple[float, float] = (0.5, 2.0),
@@ -453,6 +479,17 @@ class RLS(Linear):
         self.relearn = checks.optional(checks.positive, "relearn", relearn)
         if self.relearn is not None and self.relearn <= 1.0:
             raise ValueError(f"relearn = {relearn!r}: must be greater than 1, the usual error")
+        self.recall = checks.flag("recall", recall)
+        if self.recall and self.strongest is not None:
+            raise ValueError(
+                f"recall = True, strongest = {strongest!r}: a map is recalled as a whole; leave one "
+                "of them out, or name the map's orders, Periodic(orders=...)"
+            )
+        if self.recall and len(_periodic_blocks(self.features)) != 1:
+            raise ValueError(
+                "recall = True: the features must have one block Periodic, whose map is looked for; "
+                "for example features=Periodic(orders=(7, 28)) + Bias()"
+            )
 
     def rule(self, observer: ESO, omega_c: float, features: int) -> Any:
         """Return noise, forgetting and prior, and how features are selected and learned again."""
@@ -462,14 +499,22 @@ class RLS(Linear):
         if self.strongest is not None and self.strongest < features:
             interval = round(EXCHANGE_LAGS * lag_time / dt)
             rule = SelectionRule(rule, min(omega_c * dt, 1.0), max(interval, 1))
-        if self.relearn is None:
+        if self.relearn is not None:
+            rule = relearning_rule(rule, self.relearn, dt, lag_time, omega_c)
+        if not self.recall:
             return rule
-        return relearning_rule(rule, self.relearn, dt, lag_time, omega_c)
+        (before, block), order = _periodic_blocks(self.features)[0], observer.order
+        first = sum(len(each.names(order)) for each in before)
+        constant, orders = self.features.constant(order), block.design(order).orders
+        follow = -math.expm1(-dt / _finite_or(self.memory_time, _MEMORY / omega_c))
+        return recall_rule(rule, first, constant, orders, follow)
 
     def rule_memory(
         self, rule: Any, features: int
-    ) -> RlsMemory | SelectionMemory | RelearningMemory:
+    ) -> RlsMemory | SelectionMemory | RelearningMemory | RecallMemory:
         """Return the prior covariance and work space."""
+        if isinstance(rule, RecallRule):
+            return recall_memory(self.rule_memory(rule.inner, features), rule, features)
         if isinstance(rule, RelearningRule):
             inner = self.rule_memory(rule.inner, features)
             return RelearningMemory(inner, RelearningLoop.zeros())
