@@ -37,6 +37,10 @@ A step is one-to-one in h and in w, so damage within one word is always found; o
 with a chance of about 2⁻⁶⁴. A CRC of 32 bits would let one of 4·10⁹ damaged images pass, and takes
 ten times as long on a Cortex-M4 without a large table.
 
+*Numbers* are finite. What is not finite in a state is saved as zero: in a loop that works it is in
+places that are written again before they are read, such as features before their scale is known.
+Work space (``Scratch``, ``Work``) is not in an image.
+
 *Meaning of a start*. After the power was off, the plant is not where the state says: the loop
 starts from rest, with all that was learned (θ, covariance, maps, frequencies, the guard's account).
 The running state is for a process that is replaced between two samples.
@@ -56,7 +60,7 @@ from numpy.typing import NDArray
 from quell.controllers.base import Limits, reset_loop
 from quell.controllers.law import AdrcDesign, AdrcState
 from quell.kernels.dispatch import as_python
-from quell.kernels.sized import scratch_fields
+from quell.kernels.sized import work_fields
 from quell.kernels.user_functions import origin_of
 from quell.learners.base import meaning
 
@@ -117,23 +121,23 @@ def named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
 def kept_arrays(state: Any) -> dict[str, NDArray[Any]]:
     """Return the arrays of an image: without work space, and each place in memory once."""
     kept: dict[str, NDArray[Any]] = {}
-    scratch = _scratch_of(state, "")
+    work = _work_of(state, "")
     taken: list[tuple[int, int]] = []
     for name, array in named_arrays(state).items():
         begin = array.__array_interface__["data"][0]
         end = begin + array.nbytes
-        if name not in scratch and all(end <= low or begin >= high for low, high in taken):
+        if name not in work and all(end <= low or begin >= high for low, high in taken):
             kept[name] = array
             if array.size:
                 taken.append((begin, end))
     return kept
 
 
-def _scratch_of(state: Any, prefix: str) -> set[str]:
-    found = {prefix + name for name in scratch_fields(type(state))}
+def _work_of(state: Any, prefix: str) -> set[str]:
+    found = {prefix + name for name in work_fields(type(state))}
     for name, value in state._asdict().items():
         if isinstance(value, tuple):
-            found |= _scratch_of(value, f"{prefix}{name}.")
+            found |= _work_of(value, f"{prefix}{name}.")
     return found
 
 
@@ -205,8 +209,9 @@ def written_image(known: Layout, origin: int = 0) -> bytes:
         MAGIC, VERSION, known.width, known.size, origin, known.layout, known.design
     )
     kind = "<f4" if known.width == 4 else "<f8"
-    parts = [np.ascontiguousarray(array, dtype=kind).tobytes() for array in known.arrays.values()]
-    data = b"".join([head, *parts])
+    parts = [np.asarray(array, dtype=kind) for array in known.arrays.values()]
+    finite = (np.where(np.isfinite(part), part, 0.0).astype(kind) for part in parts)
+    data = b"".join([head, *(part.tobytes() for part in finite)])
     return data + CHECK.pack(check_of(data))
 
 

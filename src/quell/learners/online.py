@@ -48,7 +48,7 @@ from quell.features.base import reset_scale, reset_sizes, update_scale
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.functions import is_single, tanh
-from quell.kernels.sized import Buffer, Scalars, Size, clear
+from quell.kernels.sized import Buffer, Scalars, Size, Work, clear
 from quell.learners.base import (
     FeatureLearner,
     Inputs,
@@ -167,8 +167,8 @@ class OnlineMemory(NamedTuple):
 
     scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
     sizes: Vector  # (k,): what features of unknown size are divided by
-    scaled: Vector  # work space for the scaled state (n,)
-    features: Vector  # work space for the features of a prediction (p,)
+    scaled: Work  # work space for the scaled state (n,)
+    features: Work  # work space for the features of a prediction (p,)
     ring: Buffer  # the last features (D + 1, p)
     loop: NDArray[OnlineLoop]
     gate: NoiseGateMemory

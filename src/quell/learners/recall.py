@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import cos, sin
-from quell.kernels.sized import Scalars, Size, clear
+from quell.kernels.sized import Scalars, Size, Work, clear
 from quell.learners.regression import (
     convert_rule,
     forget_rule,
@@ -96,9 +96,9 @@ class RecallMemory(NamedTuple):
 
     inner: Any
     stored: Vector  # θ before the start (p,)
-    shifted: Vector  # work space for the pairs of a shifted map (2k,)
+    shifted: Work  # work space for the pairs of a shifted map (2k,)
     means: Vector  # of the filtered pairs (2k,)
-    away: Vector  # work space (2k,)
+    away: Work  # work space (2k,)
     products: Vector  # S_ψz (2k,)
     moments: Matrix  # S_ψψ, the lower triangle (2k, 2k)
     loop: NDArray[RecallLoop]  # (1,)
@@ -244,6 +244,8 @@ def _decide(rule: RecallRule, memory: RecallMemory, theta: Vector) -> None:
         if rule.constant >= 0:
             theta[rule.constant] = constant
         loop.searching = 0.0
+        # What was learned anew began in the transient of the start.
+        reset_uncertainty(rule.inner, memory.inner)
     elif span >= _MOST:
         loop.searching = loop.usual = 0.0
     _begin_passes(loop)

@@ -48,7 +48,7 @@ from quell import checks
 from quell.features import Features
 from quell.features.base import reset_scale, reset_sizes, update_scale, write, write_units
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
-from quell.kernels.sized import Flag, Scalars, Size, clear
+from quell.kernels.sized import Flag, Scalars, Size, Work, clear
 from quell.learners.base import (
     FeatureLearner,
     Inputs,
@@ -168,9 +168,9 @@ class LinearMemory(NamedTuple):
     theta: Vector  # (p,), scaled
     scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
     sizes: Vector  # (k,): what features of unknown size are divided by
-    old_scale: Vector  # work space (n + 2,)
-    scaled: Vector  # work space for the scaled state (n,)
-    features: Vector  # work space (p,)
+    old_scale: Work  # work space (n + 2,)
+    scaled: Work  # work space for the scaled state (n,)
+    features: Work  # work space (p,)
     units: Vector  # (p,): ``unit`` of the features for ``scale``
     chain: Matrix  # (p, N): the lag filters of the features
     filtered: Vector  # (p,): their outputs

@@ -55,7 +55,7 @@ from quell.features import Features, Joined, Periodic
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
 from quell.kernels.single import add_symmetrically
-from quell.kernels.sized import Scalars, clear
+from quell.kernels.sized import Scalars, Work, clear
 from quell.learners.recall import RecallMemory, RecallRule, recall_memory, recall_rule
 from quell.learners.regression import Linear, reset_uncertainty, share_excess, update_theta
 from quell.observers.eso import ESO
@@ -259,9 +259,9 @@ class SelectionMemory(NamedTuple):
     active: Vector  # indices of the active features (k,)
     inactive: Vector  # (p,): 1 if a feature is inactive, else 0
     weak: Vector  # ψ (p,)
-    chosen: Vector  # work space for the active features (k,)
+    chosen: Work  # work space for the active features (k,)
     covariance: Matrix  # P (k, k)
-    gain: Vector  # work space (k,)
+    gain: Work  # work space (k,)
     loop: NDArray[SelectionLoop]
 
 
@@ -367,7 +367,7 @@ class RlsMemory(NamedTuple):
     """State besides θ."""
 
     covariance: Matrix  # P (p, p)
-    gain: Vector  # work space for Pφ (p,)
+    gain: Work  # work space for Pφ (p,)
 
 
 @update_theta.register(RlsRule)
