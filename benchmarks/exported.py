@@ -40,8 +40,8 @@ from rich.table import Table
 
 import quell as ql
 from quell.controllers import in_single_precision
-from quell.controllers.adrc import samples_to_settle
 from quell.controllers.base import reset_loop
+from quell.controllers.compensator import samples_to_settle
 from quell.experiments import two_mass_spring as study
 from quell.export import TranslationError
 from quell.export.controller_source import limits_path

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.adrc import samples_to_settle
 from quell.controllers.base import control
+from quell.controllers.compensator import samples_to_settle
 from quell.controllers.law import unlimited_control
 from quell.observers.eso import ESO
 from quell.observers.forms import expected_measurement

@@ -36,9 +36,12 @@ if TYPE_CHECKING:
         tuning,
     )
     from quell.controllers import baselines
-    from quell.controllers.adrc import ADRC, Estimate
+    from quell.controllers.adrc import ADRC
     from quell.controllers.base import omega_c_for
+    from quell.controllers.compensated import Compensated
+    from quell.controllers.compensator import Compensator, Estimate
     from quell.controllers.feedforward import Feedforward
+    from quell.controllers.safe_set import SafeSet
     from quell.guard import Guard, Reason
     from quell.identification.identify import identify
     from quell.lti.canonical import canonical
@@ -57,13 +60,16 @@ __version__ = "0.2.0"
 
 _HOMES = {
     "ADRC": "controllers.adrc",
+    "Compensated": "controllers.compensated",
+    "Compensator": "controllers.compensator",
     "DesignWarning": "types",
     "BatchTrajectory": "records.trajectory",
     "ESO": "observers.eso",
-    "Estimate": "controllers.adrc",
+    "Estimate": "controllers.compensator",
     "Feedforward": "controllers.feedforward",
     "Guard": "guard",
     "Reason": "guard",
+    "SafeSet": "controllers.safe_set",
     "Scenario": "simulation.driver",
     "Status": "types",
     "Trajectory": "records.trajectory",
@@ -83,11 +89,12 @@ _MODULES = (
 )  # fmt: skip
 
 __all__ = [
-    "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Feedforward", "Guard",
-    "Reason", "Scenario", "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical",
-    "controllers", "envs", "experiments", "export", "features", "identification", "identify",
-    "learners", "metrics", "observers", "omega_c_for", "plants", "realtime", "setup", "signals",
-    "simulate", "style", "sweep", "sweeping", "tune", "tuning",
+    "ADRC", "ESO", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning", "Estimate",
+    "Feedforward", "Guard", "Reason", "SafeSet", "Scenario", "Status", "Trajectory", "Tuned",
+    "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
+    "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
+    "plants", "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
+    "tuning",
 ]  # fmt: skip
 
 

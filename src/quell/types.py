@@ -41,6 +41,8 @@ class Status(IntFlag):
     LEARNER_FAILED = 256
     POORLY_INTEGRATED = 512
     CONTROL_HELD = 1024
+    SAFE_SET_ACTED = 2048
+    UNSAFE = 4096
 
     @property
     def message(self) -> str:
@@ -93,6 +95,13 @@ _MESSAGES = {
     Status.CONTROL_HELD: (
         "The applied control signal that was given was not finite; the one before stands: check "
         "what reads it back."
+    ),
+    Status.SAFE_SET_ACTED: (
+        "The safe set changed the control signal to keep y and its rate in their bands."
+    ),
+    Status.UNSAFE: (
+        "NOT safe: limits of u did not allow what the safe set needs (raise u_max or rate_limit, "
+        "or lower alpha), or y moved as f_rate, noise and gain_error do not allow (raise them)."
     ),
 }
 _NOTHING = "No step reported a problem."

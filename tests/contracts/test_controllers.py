@@ -67,6 +67,11 @@ CONTROLLERS: dict[str, Any] = {
     "Prefiltered, moves": room.Prefiltered(
         ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.ProfileGenerator(0.5, 2.0, 5.0)
     ),
+    "ADRC with a safe set": ql.ADRC(
+        ESO, 1.5, safe_set=ql.SafeSet(-0.9, 0.9, -3.0, 3.0, alpha=4.0, f_rate=0.1), **LIMITS
+    ),
+    "Compensator": ql.Compensator(ESO, **LIMITS),
+    "Compensated": room.Compensated(PID, ql.Compensator(ESO, **LIMITS)),
     "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
 }
 PLANTS = {"ResonanceRatio": ql.plants.two_mass_spring()}
@@ -159,8 +164,8 @@ def _pulses(law: Any) -> Any:
 
 def awaited(controller: Any, y: float) -> float:
     """Return the next measurement as its observer expects it; the last one, ``y``, where it has no observer."""
-    law = getattr(controller, "controller", controller)
-    if not isinstance(law, ql.ADRC):
+    law = getattr(controller, "compensator", getattr(controller, "controller", controller))
+    if not isinstance(law, ql.Compensator):
         return y
     loop = law._state.loop[0]
     known = loop.f_learned + loop.f_known
@@ -204,6 +209,7 @@ def test_a_controller_that_is_told_of_limits_is_one_that_has_them(name: str) -> 
 def _narrow(controller: Any, low: float, high: float) -> None:
     """Give a controller, or the one behind its prefilter, other limits."""
     inner = controller.controller if isinstance(controller, room.Prefiltered) else controller
+    inner = getattr(controller, "compensator", inner)
     inner._limits = controller.limits._replace(low=low, high=high)
     inner._initialise()
     if inner is not controller:

@@ -68,8 +68,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.adrc import ADRC
 from quell.controllers.base import NO_LIMITS, Controller, control
+from quell.controllers.compensated import (
+    Compensated,
+    CompensatedDesign,
+    CompensatedState,
+    compensating_part,
+)
+from quell.controllers.compensator import Compensator
 from quell.controllers.law import AdrcState, without_forces
 from quell.controllers.linear import LinearLaw
 from quell.controllers.stateful import named_arrays
@@ -151,20 +157,28 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
         so the learner's features must be states, u, a constant and sinusoids. Freeze any other
         learner at the end of a run that ends at that time.
     """
-    if not isinstance(controller, ADRC):
-        raise ValueError(f"controller = {controller!r}: must be an ADRC")
+    part = compensating_part(controller)
+    if part is None:
+        raise ValueError(f"controller = {controller!r}: must be an ADRC or a compensator")
+    controller = part
     if run is None:
         return _from_state(controller, controller._state)
-    if isinstance(run, AdrcState):
-        return _from_state(controller, run)
+    if isinstance(run, AdrcState | CompensatedState):
+        return _from_state(controller, _learning_state(run))
     if not isinstance(run, Trajectory):
         raise ValueError(f"run = {run!r}: must be a run of the controller, or a state of it")
     if t is None and run.final_state is not None:
-        return _from_state(controller, run.final_state)
+        return _from_state(controller, _learning_state(run.final_state))
     return _from_record(controller, run, run.ended if t is None else checks.finite("t", t))
 
 
-def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
+def _learning_state(state: Any) -> AdrcState:
+    """Return the state of observer, learner and guard within that of a controller."""
+    inner: AdrcState = state.compensator if isinstance(state, CompensatedState) else state
+    return inner
+
+
+def _from_record(controller: Compensator, run: Trajectory, t: float) -> Frozen:
     row = first_sample_at(t, run.every * run.dt, len(run))
     if not (t >= 0.0 and row < len(run)):
         raise ValueError(f"t = {t!r}: must be a time of the record, from 0 to {run.t[-1]:g} s")
@@ -188,7 +202,7 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
     return _with_authority(controller, gain, 0.0, slope, authority)
 
 
-def _from_state(controller: ADRC, state: Any) -> Frozen:
+def _from_state(controller: Compensator, state: Any) -> Frozen:
     if hasattr(controller.learner, "external_fields"):
         raise ValueError(
             f"learner = {type(controller.learner).__name__}: a Python model is called once a "
@@ -219,7 +233,7 @@ def _from_state(controller: ADRC, state: Any) -> Frozen:
 
 
 def _with_authority(
-    controller: ADRC, gain: Vector, before: float, slope: float, authority: float
+    controller: Compensator, gain: Vector, before: float, slope: float, authority: float
 ) -> Frozen:
     """Return β times all of it; a slope outside of the guard's interval acts on the u before."""
     if not (np.all(np.isfinite(gain)) and math.isfinite(before) and math.isfinite(slope)):
@@ -232,7 +246,7 @@ def _with_authority(
     return Frozen(gain, float(before), float(slope), authority)
 
 
-def _signal_sizes(controller: ADRC, memory: Any, seen: Vector, u: float) -> Vector:
+def _signal_sizes(controller: Compensator, memory: Any, seen: Vector, u: float) -> Vector:
     """Return the sizes of x̂_1 … x̂_n, Δf̂ and u: the learner's scales, or from present values."""
     scale = np.asarray(getattr(memory, "scale", ()))
     # A scale is at its floor, 1e-100 (``features.scaling``), until its signal was seen.
@@ -378,10 +392,12 @@ def adapting(controller: Controller, run: Any = None, t: float | None = None) ->
         controller's own.
     """
     known = frozen(controller, run, t)
-    assert isinstance(controller, ADRC)
+    part = compensating_part(controller)
+    assert part is not None
+    controller = part
     design = controller.parameters.learner
     state = controller._state if run is None else getattr(run, "final_state", run)
-    memory = controller.initial_state().learner if state is None else state.learner
+    memory = (controller.initial_state() if state is None else _learning_state(state)).learner
     rates = adaptation_of(design, memory)
     lag: Any = getattr(design, "lag", controller.parameters.lag)
     angles = rates.omega * controller.dt
@@ -517,7 +533,8 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     Parameters
     ----------
     controller
-        an ``ADRC``, or a linear controller, whose own law is returned.
+        an ``ADRC``, a ``Compensator`` (r is then u_0), a ``Compensated`` controller, or a linear
+        controller, whose own law is returned.
     at
         instant at which the learner is looked at: an ``Adapting`` or a ``Frozen``, a run or a state
         of the controller (its end); by default the present state.
@@ -525,17 +542,12 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     if hasattr(controller, "law"):
         given: LinearLaw = controller.law
         return given
-    if not isinstance(controller, ADRC):
-        raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
+    if not isinstance(controller, Compensator | Compensated):
+        raise ValueError(
+            f"controller = {controller!r}: must be an ADRC, a compensator or a linear controller"
+        )
     learner = at if isinstance(at, Frozen | Adapting) else adapting(controller, at)
-    design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
-    forward = without_forces(design.feedforward)
-    design, nothing = design._replace(limits=NO_LIMITS, feedforward=forward), np.zeros(0)
-    nothing_learned: Any = NoLearnerMemory(nothing)
-    if isinstance(learner, Adapting):
-        nothing_learned = adaptation_memory(learner)
-    unguarded = UnguardedMemory(nothing)
-    state = controller.initial_state()._replace(learner=nothing_learned, guard=unguarded)
+    design, state = _linear_part(controller, learner)
     control(design, state, 0.0, 0.0)
     measured = _measured(_Sample(design, state))
     law = measured.law()
@@ -545,6 +557,30 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     if not measured.predicts(_Sample(design, state)):
         raise ValueError(f"controller = {controller!r}: its law changes from sample to sample")
     return law
+
+
+def _linear_part(controller: Compensator | Compensated, learner: Any) -> tuple[Any, Any]:
+    """Return parameters and state of a controller without limits and guard, with ``learner``."""
+    nothing = np.zeros(0)
+    if isinstance(controller, Compensated):
+        inner = _linear_part(controller.compensator, learner)
+        parameters, before = controller.parameters, controller.initial_state()
+        return parameters._replace(compensator=inner[0]), before._replace(compensator=inner[1])
+    design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
+    design = design._replace(limits=NO_LIMITS, feedforward=without_forces(design.feedforward))
+    learned: Any = NoLearnerMemory(nothing)
+    if isinstance(learner, Adapting):
+        learned = adaptation_memory(learner)
+    state = controller.initial_state()._replace(learner=learned, guard=UnguardedMemory(nothing))
+    return design, state
+
+
+def _between(design: Any, u: float) -> Any:
+    """Return parameters whose limits leave only ``u``."""
+    limits = NO_LIMITS._replace(low=u, high=u)
+    if isinstance(design, CompensatedDesign):
+        return design._replace(compensator=design.compensator._replace(limits=limits))
+    return design._replace(limits=limits)
 
 
 class _Sample:
@@ -572,7 +608,7 @@ class _Sample:
             self._arrays[name][at] = value * _UNIT
         design = self._design
         if u is not None:
-            design = design._replace(limits=NO_LIMITS._replace(low=u * _UNIT, high=u * _UNIT))
+            design = _between(design, u * _UNIT)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             u = control(design, self._state, r * _UNIT, y * _UNIT)
         moved = np.concatenate([self._arrays[name][free] for name, free in self._free.items()])

@@ -34,6 +34,7 @@ from quell.analysis.margins import (
 from quell.checks import import_extra
 from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller
+from quell.controllers.compensated import compensating_part
 from quell.controllers.linear import LinearLaw
 from quell.controllers.prefilters import without_prefilters
 from quell.learners.base import NoLearner
@@ -180,7 +181,8 @@ def analyse(
         of them delayed or encoded (an encoder is left out); or a ``NonlinearPlant``, with its
         operating point.
     controller
-        an ``ADRC`` or a linear controller; a prefilter in front of it is left out.
+        an ``ADRC``, a linear controller, either with a compensator, or a ``Compensator`` alone,
+        whose loop is closed around the plant that it sees; a prefilter in front is left out.
     at
         instant at which its learner is looked at: a run or state of the controller (its end), or
         an ``Adapting`` from ``adapting(controller, run, t)``; by default the present state, which
@@ -196,7 +198,9 @@ def analyse(
     """
     controller = without_prefilters(controller)
     if not (hasattr(controller, "law") or hasattr(controller, "observer")):
-        raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
+        raise ValueError(
+            f"controller = {controller!r}: must be an ADRC, a compensator or a linear controller"
+        )
     dt = float(controller.dt)
     linear, own_delay = linear_part(plant, dt, operating_point)
     sampled = sampled_plant(linear, dt, own_delay + delay, actuator_lag)
@@ -209,10 +213,11 @@ def analyse(
         how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
         certificate = partial(certify, plant, controller, operating_point=operating_point, **how)
     law, note = linear_law(controller, at), ""
-    if isinstance(controller, ADRC) and not isinstance(at, Frozen):
-        design = controller.parameters.learner
+    part = compensating_part(controller)
+    if part is not None and not isinstance(at, Frozen):
+        design = part.parameters.learner
         if not is_known(design):
-            name = type(controller.learner).__name__
+            name = type(part.learner).__name__
             note = f"NOT in these margins: how {name} adapts; measure it (docs/analysis)"
     return LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note)
 

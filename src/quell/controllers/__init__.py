@@ -8,12 +8,13 @@ from quell.controllers import baselines
 from quell.controllers.adrc import (
     ADRC,
     DeadTimeTuning,
-    Estimate,
     adrc_for_dead_time,
     dead_time_tuning,
     warn_if_unwise,
 )
 from quell.controllers.base import Controller, omega_c_for
+from quell.controllers.compensated import Compensated
+from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
 from quell.controllers.law import NonlinearFeedback
 from quell.controllers.linear import LinearController, LinearLaw
@@ -23,11 +24,14 @@ from quell.controllers.prefilters import (
     ReferenceModel,
     TrackingDifferentiator,
 )
+from quell.controllers.safe_set import SafeSet
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
 
 __all__ = [
     "ADRC",
+    "Compensated",
+    "Compensator",
     "Controller",
     "DeadTimeTuning",
     "Estimate",
@@ -39,6 +43,7 @@ __all__ = [
     "Prefiltered",
     "ProfileGenerator",
     "ReferenceModel",
+    "SafeSet",
     "TrackingDifferentiator",
     "adrc_for_dead_time",
     "baselines",

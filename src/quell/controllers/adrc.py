@@ -1,14 +1,5 @@
 """The ADRC controller: an ESO, its law, optional learner and guard.
 
-Start under load, manual operation and retuning of an ADRC: functions of parameters and state.
-
-A controller starts under load, or follows manual operation, by its observer: the observer receives
-y and the applied u and estimates f (Herbst, "Practical Active Disturbance Rejection Control:
-Bumpless Transfer, Rate Limitation, and Incremental Algorithm", arXiv 1908.04610). At rest at the
-reference the law then returns exactly that u. Otherwise, with another reference or new gains, the
-difference is added to u and decays as ``exp(−omega_c t)``. The observer receives the sum, so the
-offset does not disturb its estimate.
-
 Design rules for the sample time and a known delay, judged from the design alone.
 
 An observer places its poles in the z-plane, so it is stable at any sample time, but slow sampling
@@ -51,14 +42,20 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import RateLimit, checked_limits, reset_loop, set_reference_derivatives
+from quell.controllers.base import RateLimit, checked_limits, set_reference_derivatives
+from quell.controllers.compensator import (
+    Compensator,
+    change_design,
+    check_replacement,
+    check_structure,
+    padded,
+)
 from quell.controllers.feedforward import (
     Feedforward,
     checked_feedforward,
@@ -67,251 +64,17 @@ from quell.controllers.feedforward import (
 )
 from quell.controllers.law import (
     AdrcDesign,
-    AdrcLoop,
-    AdrcState,
     NonlinearFeedback,
     checked_feedback,
     feedback_design,
-    known_share,
     law_gains,
-    unlimited_control,
 )
-from quell.controllers.stateful import StatefulController
-from quell.guard import (
-    GUARD_CHANNELS,
-    Guard,
-    Reason,
-    UnguardedDesign,
-    UnguardedMemory,
-    limit,
-    write_channels,
-)
-from quell.kernels.dispatch import call_specialised, compiled
-from quell.learners.base import (
-    NO_LAG,
-    Learner,
-    LearnerWatch,
-    NoLearner,
-    checked_learner_design,
-    coefficients,
-    forget,
-    lag_memory,
-    lag_of,
-    predict,
-    window_samples,
-)
+from quell.controllers.safe_set import SafeSet
+from quell.guard import Guard
+from quell.learners.base import Learner
 from quell.lti.canonical import format_roots
-from quell.observers.design import scaled_response
 from quell.observers.eso import ESO
-from quell.observers.forms import (
-    NonlinearModel,
-    acting_control,
-    begin,
-    observe,
-    state_for,
-    without_delay,
-)
-from quell.types import Channels, DesignWarning, Status, Vector, warn
-
-# ---- The estimates of an ADRC controller after a step ----
-
-
-class Estimate(NamedTuple):
-    """Estimates and status of an ADRC controller after a step."""
-
-    x: Vector
-    """(n,): y and its derivatives; if the plant has zeros, see ``observer.states_of``."""
-    f: float
-    """Total disturbance ``f_learned + f_residual`` [y-unit/s^n; y-unit/s^f_degree with zeros]."""
-    f_learned: float
-    """The learner's share, f_L; with a guard its constant part is free, and ``f`` is right."""
-    f_residual: float
-    """The observer's share, Δf̂."""
-    theta: dict[str, float]
-    """The learner's coefficients by feature."""
-    u: float
-    """The applied control signal."""
-    status: Status
-    """Status flags of the step."""
-    authority: float = 1.0
-    """Share of its output that the guard allows the learner."""
-    error_plain: float = math.nan
-    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n]."""
-    error_learned: float = math.nan
-    """The same for the learner with full authority."""
-    reason: Reason = Reason.TRUSTED
-    """Reason for the authority."""
-    f_derivatives: Vector = np.zeros(0)
-    """(m − 1,): derivatives of Δf̂, of an observer with m extended states [y-unit/s^(n+j)]."""
-
-
-def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...]) -> Estimate:
-    """Return the estimates in ``state``, with the learner's coefficients named by ``features``."""
-    order = design.law.size
-    theta = np.zeros(len(features))
-    coefficients(design.learner, state.learner, theta)
-    learned, residual = float(state.loop[0].f_learned), float(state.seen[order])
-    guarded: dict[str, Any] = {}
-    row = np.zeros(len(GUARD_CHANNELS))
-    if write_channels(design.guard, state.guard, row):
-        guarded = dict(zip((name for name, _ in GUARD_CHANNELS), row.tolist(), strict=True))
-        guarded["reason"] = Reason(int(guarded["reason"]))
-    return Estimate(
-        x=state.seen[:order].copy(),
-        f=learned + residual,
-        f_learned=learned,
-        f_residual=residual,
-        theta=dict(zip(features, theta.tolist(), strict=True)),
-        u=float(state.loop[0].u),
-        status=Status(int(state.loop[0].status)),
-        **guarded,
-        f_derivatives=state.seen[order + 1 :].copy(),
-    )
-
-
-# ---- Start under load, manual operation and retuning of an ADRC ----
-
-# Time constants after which an initial error is below the unit roundoff: exp(−40) = 4e-18.
-_TIME_CONSTANTS = 40.0
-# Bound on the time that ``start`` takes: some seconds of calculation. Chosen by hand.
-_MOST_SAMPLES = 100_000_000
-
-
-def start_at_rest(
-    design: AdrcDesign, state: AdrcState, samples: int, y: float, u: float, r: float
-) -> None:
-    """Set the state to rest at y under u, with the reference r; see ``samples_to_settle``.
-
-    The numbers are in the precision of the state.
-    """
-    _start_loop(design, state, y, u, r)
-    begin(design.eso, state.z, state.seen, y)
-    loop = state.loop[0]
-    model, z, seen = design.eso, state.z, state.seen
-    known = loop.f_learned + loop.f_known
-    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
-    _feed_forward(design, state, u)
-    known = loop.f_learned + loop.f_known
-    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
-    loop.bumpless = 1.0
-
-
-def start_in_motion(
-    design: AdrcDesign, state: AdrcState, x: Vector, f: Vector, u: float, r: float
-) -> None:
-    """Set the state to the estimates ``x`` (n,) and ``f`` (m,) under u, with the reference r."""
-    _start_loop(design, state, float(x[0]), u, r)
-    state.seen[:] = np.append(x, f)
-    _feed_forward(design, state, u)
-    state.seen[x.size] -= state.loop[0].f_learned + state.loop[0].f_known
-    state.z[:] = state_for(design.eso, x, state.seen[x.size :], u)
-
-
-def _start_loop(design: AdrcDesign, state: AdrcState, y: float, u: float, r: float) -> None:
-    reset_loop(design, state)
-    loop = state.loop[0]
-    loop.y, loop.r, loop.u = y, r, u
-    loop.started = loop.has_reference = 1.0
-    loop.f_known = known_share(design.feedforward, r, state.reference)
-
-
-def _feed_forward(design: AdrcDesign, state: AdrcState, u: float) -> None:
-    """Set the learner's share of f for the estimates in ``state`` under u."""
-    loop = state.loop[0]
-    constant, slope = predict(design.learner, state.learner, state.seen, u)
-    constant, slope, _ = limit(design.guard, state.guard, 0.0, 0.0, constant, slope, u)
-    loop.constant, loop.slope = constant, slope
-    loop.f_learned = constant + slope * u
-
-
-def samples_to_settle(observer: ESO) -> int:
-    """Return after how many samples an observer has forgotten its initial state."""
-    samples = _TIME_CONSTANTS * observer.lag_time / observer.dt
-    if not isinstance(without_delay(observer.model), NonlinearModel):
-        transition = scaled_response(observer.model, observer.units, observer.order).transition
-        slowest = float(np.max(np.abs(np.linalg.eigvals(transition))))
-        if 0.0 < slowest < 1.0:
-            samples = max(samples, _TIME_CONSTANTS / -math.log(slowest))
-    return min(round(samples), _MOST_SAMPLES) + observer.states
-
-
-@compiled
-def _observe_at_rest(
-    model: Any, z: Vector, seen: Vector, y: float, u: float, f_learned: float, samples: int
-) -> None:
-    """Update the observer with constant y, u and f_L."""
-    for _ in range(samples):
-        observe(model, z, seen, y, u, f_learned)
-
-
-@contextmanager
-def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
-    """Apply ``u`` instead of the law's own control signal inside the ``with`` block."""
-    state.loop[0].manual, state.loop[0].u_manual = 1.0, u
-    try:
-        yield
-    finally:
-        state.loop[0].manual = 0.0
-
-
-def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
-    """Convert a running state to new parameters, without a jump of u."""
-    loop, size = state.loop[0], new.law.size
-    if loop.started == 0.0:
-        return
-    before = unlimited_control(old, state, loop.constant, loop.slope)
-    # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
-    # Its derivatives, if the observer has them, stay: how u moves from now on is not known.
-    acting = acting_control(old.eso, state.z, float(loop.u))
-    change = (old.b0 - new.b0) * acting
-    for i in range(size):
-        change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
-    # The model's share of f depends on them, too, and is not in the estimate.
-    known = known_share(new.feedforward, loop.r, state.reference)
-    change -= known - loop.f_known
-    loop.f_known = known
-    state.z[size] += change
-    state.seen[size] += change
-    loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)
-
-
-def check_replacement(old: ESO, new: Any, learns: bool) -> None:
-    """Check that ``new`` can replace ``old`` in a running controller; ``learns`` with a learner."""
-    if not isinstance(new, ESO):
-        raise ValueError(f"observer = {new!r}: must be an ESO")
-    names = ("order", "disturbance_order", "degree", "f_degree", "dt", "form", "states")
-    for name in names:
-        if getattr(new, name) != getattr(old, name):
-            rule = f"the present one {getattr(old, name)!r}: must be the same"
-            raise ValueError(f"observer has {name} = {getattr(new, name)!r}, {rule}")
-    same_gain = new.b0 == old.b0
-    plants = [(getattr(new.plant, name), getattr(old.plant, name)) for name in "aBE"]
-    if same_gain and all(np.array_equal(*pair) for pair in plants):
-        return
-    if any(observer.plant.zeros.size or not observer.plant.matched for observer in (old, new)):
-        raise ValueError(
-            "observer has another model or b0, which changes the meaning of its states for a plant "
-            "with zeros; change omega_o only"
-        )
-    if learns and not (same_gain and np.array_equal(new.cancel, old.cancel)):
-        raise ValueError(
-            f"observer has b0 = {new.b0!r} and a = {new.cancel.tolist()}, not those of the present "
-            "one: what was learned refers to that; change omega_o only, or make a new controller"
-        )
-
-
-def check_structure(old: AdrcDesign, new: AdrcDesign) -> None:
-    """Raise a ``ValueError`` if compiled code and state arrays for ``old`` do not fit ``new``."""
-    if _structure(new) != _structure(old):
-        raise ValueError("observer is of another structure than the present one: make a new ADRC")
-
-
-def _structure(value: Any) -> Any:
-    """Return types and array shapes of a nested NamedTuple."""
-    if isinstance(value, tuple):
-        return type(value), tuple(map(_structure, value))
-    return value.shape if isinstance(value, np.ndarray) else type(value)
-
+from quell.types import Channels, DesignWarning, Vector, warn
 
 # ---- Design rules for the sample time and a known delay, judged from the design alone ----
 
@@ -409,7 +172,7 @@ def check_zeros(observer: ESO) -> None:
 # ---- The ADRC controller ----
 
 
-class ADRC(StatefulController):
+class ADRC(Compensator):
     """Active disturbance rejection control around an ESO, with or without a learner.
 
     All but the running state is immutable, except through ``retune``. ``step`` advances the running
@@ -445,6 +208,8 @@ class ADRC(StatefulController):
     law_poles
         poles of the ideal loop in units of omega_c, instead of all at −1: negative numbers, and
         pairs (real, imaginary) for two conjugate ones; as many as the relative degree.
+    safe_set
+        bands that y and its rate do not leave, whatever r and the learner ask for; none by default.
 
     Raises
     ------
@@ -463,6 +228,9 @@ class ADRC(StatefulController):
     <Status.SATURATED: 4>
     """
 
+    omega_c: float
+    _u_is_given = False
+
     def __init__(
         self,
         observer: ESO,
@@ -477,21 +245,11 @@ class ADRC(StatefulController):
         half_gain: bool = False,
         feedback: NonlinearFeedback | None = None,
         law_poles: Sequence[float | tuple[float, float]] | None = None,
+        safe_set: SafeSet | None = None,
     ) -> None:
-        if not isinstance(observer, ESO):
-            raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
-        self.observer = observer
+        self._take_parts(observer, learner, guard, safe_set)
         check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
-        self.guard = guard
-        self.learner: Learner = NoLearner() if learner is None else learner
-        if isinstance(self.learner, type) or not all(
-            hasattr(self.learner, name) for name in ("design", "memory", "feature_names")
-        ):
-            example = "for example quell.learners.Kalman()"
-            raise ValueError(f"learner = {learner!r}: must be a learner, {example}, or None")
-        if guard is not None and not isinstance(guard, Guard):
-            raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
         self.feedforward = checked_feedforward(feedforward)
         self.half_gain = checks.flag("half_gain", half_gain)
         self.feedback = checked_feedback(feedback)
@@ -500,50 +258,28 @@ class ADRC(StatefulController):
         self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
         self._initialise()
         warn_if_unwise(observer, self.omega_c)
-        if guard is not None and isinstance(self.learner, NoLearner):
-            message = f"guard = {guard!r} has no effect without a learner; give one, or no guard"
-            warn(message)
+        self._warn_of_idle_guard()
 
-    def _update_parameters(self) -> None:
-        self.parameters = self._design(self.observer, self.omega_c)
-        self.features = self.learner.feature_names(self.observer.order)
-
-    def _design(self, observer: ESO, omega_c: float) -> AdrcDesign:
-        learns = not isinstance(self.learner, NoLearner)
+    def _design(self, observer: ESO, omega_c: float | None = None) -> AdrcDesign:
+        """Return the parameters with an observer and a bandwidth, by default the present one."""
+        omega_c = omega_c or self.omega_c
         gains = law_gains(observer.degree, omega_c, self.law_poles)
-        gains = gains * (0.5 if self.half_gain else 1.0)
-        law = np.append(gains, np.zeros(observer.order - observer.degree))
-        learner = checked_learner_design(self.learner, observer, self._learner_omega_c)
-        return AdrcDesign(
-            eso=observer.model,
+        law = padded(gains * (0.5 if self.half_gain else 1.0), observer.order)
+        return self._with_law(
+            observer,
+            law,
             law=law,
             cancel=observer.cancel,
-            cancel_f=observer.cancel_f,
             feedback=feedback_design(self.feedback, observer.degree, omega_c),
             feedforward=feedforward_design(self.feedforward, observer),
             fade=math.exp(-omega_c * observer.dt),
-            b0=observer.b0,
-            limits=self._limits,
-            learner=learner,
-            lag=lag_of(observer) if learns else NO_LAG,
-            guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, law),
-            learns=learns,
-            # A guard judges the output itself; an output set from outside is kept in any case.
-            forgets=self.guard is None and type(learner) in forget.implementations,
-            window=window_samples(observer) if learns else 0,
         )
 
-    def described(self) -> dict[str, Any]:
-        """Return what ``repr`` prints; no learner is none."""
-        found = super().described()
-        if isinstance(self.learner, NoLearner):
-            del found["learner"]
-        return found
-
     @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.observer.dt
+    def gains(self) -> Vector:
+        """Gains k (n,) of the law."""
+        law: Vector = self.parameters.law
+        return law
 
     @property
     def derivatives(self) -> int:
@@ -551,29 +287,8 @@ class ADRC(StatefulController):
         return derivatives_used(self.feedforward, self.observer.degree)
 
     @property
-    def channels(self) -> Channels:
-        """Name and width of each recorded channel, in order."""
-        estimates = (("x_hat", self.observer.order), ("f_residual", 1), ("f_learned", 1))
-        by_model = isinstance(self.feedforward, Feedforward)
-        forward = (("u_feedforward", 1),) if by_model else ()
-        guard = () if self.guard is None else GUARD_CHANNELS
-        rates = self.observer.disturbance_order - 1
-        of_f = (("f_derivatives", rates),) if rates else ()
-        return (*estimates, ("status", 1), *of_f, *forward, *guard, ("theta", len(self.features)))
-
-    def initial_state(self) -> AdrcState:
-        """Return a state before the first sample, with nothing learned."""
-        design, guard = self.parameters, UnguardedMemory(np.zeros(0))
-        return AdrcState(
-            z=np.zeros(self.observer.states),
-            seen=np.zeros(self.observer.estimates),
-            reference=np.zeros(self.derivatives),
-            loop=AdrcLoop.zeros(),
-            learner=self.learner.memory(design.learner),
-            shadow=lag_memory(design.lag, 1),
-            guard=guard if self.guard is None else self.guard.memory(design.guard),
-            watch=LearnerWatch.zeros(),
-        )
+    def _channels_of_law(self) -> Channels:
+        return (("u_feedforward", 1),) if isinstance(self.feedforward, Feedforward) else ()
 
     def step(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the control signal [u-unit] for reference and measurement.
@@ -607,87 +322,6 @@ class ADRC(StatefulController):
         values = np.array(derivatives, dtype=np.float64)
         set_reference_derivatives(self.parameters, self._state, values)
 
-    def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
-        """Start at a plant that rests at ``y`` under ``u``: the next ``step`` continues from ``u``.
-
-        What was learned is kept. A controller that is not started begins at its first sample with
-        f̂ = 0, which is right for a plant at rest without load and makes a bump under load.
-
-        Parameters
-        ----------
-        y
-            measurement [y-unit].
-        u
-            control signal that holds the plant there [u-unit]; should be within the limits.
-        r
-            reference of the next step [y-unit]; ``y`` by default. With another one u still
-            continues without a jump, and the move begins with the observer's own dynamics.
-        """
-        y, u = checks.signal("y", y), checks.signal("u", u)
-        goal = y if r is None else checks.signal("r", r)
-        number = self._state.z.dtype.type  # of the precision of the state
-        signals = map(number, (y, u, goal))
-        start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), *signals)
-
-    def start_at(self, x: Any, f: Any = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
-        """Start with given estimates, for a plant in motion; what was learned is kept.
-
-        They are those of the sample before the next ``step``, which takes u for the control signal
-        applied since then. Unlike after ``start``, the next u is the law's own; call ``hand_over``
-        next for one that continues from ``u``.
-
-        Parameters
-        ----------
-        x
-            estimates x̂ (n,), y and its derivatives; see ``observer.states_of`` if there are zeros.
-        f
-            total disturbance [y-unit/s^n]; for an observer with more extended states also a list
-            of f, f', … [y-unit/s^(n+j)], the missing ones zero.
-        u
-            control signal applied until the next step [u-unit]; a delayed one has the same past.
-        r
-            reference until the next one that is finite [y-unit]; ``x[0]`` by default.
-        """
-        estimates = checks.vector("x", x, self.observer.order)
-        u = checks.signal("u", u)
-        most = self.observer.disturbance_order
-        given = checks.vector("f", checks.finite("f", f) if np.ndim(f) == 0 else f)
-        if given.size > most:
-            raise ValueError(f"f = {f!r}: the observer estimates {most} of f, f', …: give as many")
-        of_f = np.append(given, np.zeros(most - given.size))
-        goal = float(estimates[0]) if r is None else checks.signal("r", r)
-        start_in_motion(self.parameters, self._state, estimates, of_f, u, goal)
-
-    def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
-        """Take one sample in manual operation: ``u`` is applied, unlimited, until the next sample.
-
-        Return the control signal that the controller would have applied [u-unit]; ``r``, ``y`` and
-        ``derivatives`` are as for ``step``.
-        """
-        with manual_operation(self._state, checks.signal("u", u)):
-            self.step(r, y, *derivatives)
-        return float(self._state.loop[0].u_limited)
-
-    def hand_over(self) -> None:
-        """End manual operation: the next ``step`` continues from the u of the last ``track``.
-
-        Raises ``ValueError`` before the first sample.
-        """
-        if self._state.loop[0].started == 0.0:
-            raise ValueError("hand_over: there was no sample yet; call track or start before")
-        self._state.loop[0].bumpless = 1.0
-
-    def increment(self, r: float, y: float, *derivatives: float) -> float:
-        """Take one sample: return the change of the control signal [u-unit], within the limits.
-
-        For actuators that take increments (steppers, valves, a drive that holds its set point). The
-        law is that of ``step`` (Herbst, arXiv 1908.04610, section IV, shows that the two are one).
-        If the actuator's position is not known, ``start(y)`` takes it as zero, f̂ includes the
-        difference, and limits of magnitude refer to that zero.
-        """
-        before = float(self._state.loop[0].u)
-        return self.step(r, y, *derivatives) - before
-
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, without a bump; allowed in every sample.
 
@@ -709,7 +343,7 @@ class ADRC(StatefulController):
         """
         omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:
-            check_replacement(self.observer, observer, not isinstance(self.learner, NoLearner))
+            check_replacement(self.observer, observer, self._learns)
         observer = observer or self.observer
         old, new = self.parameters, self._design(observer, omega_c)
         check_structure(old, new)
@@ -717,29 +351,6 @@ class ADRC(StatefulController):
         warn_if_unwise(observer, omega_c)
         change_design(old, new, self._state)
         self._pack_again()
-
-    @property
-    def _external_fields(self) -> tuple[str, ...]:
-        return tuple(f"learner.{name}" for name in getattr(self.learner, "external_fields", ()))
-
-    def _external_snapshots(self, state: AdrcState) -> dict[str, Any]:
-        if not self._external_fields:
-            return {}
-        snapshot = self.learner.snapshot(state.learner)  # type: ignore[attr-defined]
-        return {f"learner.{name}": value for name, value in snapshot.items()}
-
-    def _restore_external(self, state: AdrcState, snapshots: Mapping[str, Any]) -> None:
-        named = {name.removeprefix("learner."): value for name, value in snapshots.items()}
-        self.learner.recall(state.learner, named)  # type: ignore[attr-defined]
-
-    @property
-    def estimate(self) -> Estimate:
-        """Estimates and status after the last step."""
-        return self.read(self._state)
-
-    def read(self, state: AdrcState) -> Estimate:
-        """Return the estimates and the status in ``state``."""
-        return read_estimate(self.parameters, state, self.features)
 
 
 # ---- ADRC of order 1 for a first-order plant with dead time, K e^(−Ls)/(T s + 1) ----

@@ -58,6 +58,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.safe_set import flags_of_applied, forget_motion, nearest_safe, see
 from quell.guard import (
     assess,
     limit,
@@ -112,6 +113,12 @@ class ModelFeedforward(NamedTuple):
     lead_acting: float  # the same from the u that the observer receives in this sample
 
 
+class ControlGiven(NamedTuple):
+    """A control signal u_0 from elsewhere in the place of a law: the reference is u_0."""
+
+    b0: float
+
+
 @generic_with_default
 def reference_part(feedforward: Any, law: Vector, r: float, reference: Vector) -> float:
     """Return what the numerator of the law takes from the reference and its derivatives."""
@@ -121,6 +128,22 @@ def reference_part(feedforward: Any, law: Vector, r: float, reference: Vector) -
             total += law[i] * reference[i - 1]
         total += reference[reference.size - 1]
     return total
+
+
+@reference_part.register(ControlGiven)
+def _given(feedforward: ControlGiven, law: Vector, r: float, reference: Vector) -> float:
+    return feedforward.b0 * r
+
+
+@generic_with_default
+def has_reference_at_start(feedforward: Any) -> float:
+    """Return 1 if the reference is zero before the first usable one, 0 if it is the last y."""
+    return 0.0
+
+
+@has_reference_at_start.register(ControlGiven)
+def _zero_at_start(feedforward: ControlGiven) -> float:
+    return 1.0
 
 
 @reference_part.register(ModelFeedforward)
@@ -349,6 +372,7 @@ class AdrcDesign(NamedTuple):
     cancel_f: float  # 1 if f enters where u enters, else 0
     feedback: Any  # linear or nonlinear law of the errors, see ``feedback``
     feedforward: Any  # with or without a model, see ``feedforward``
+    safe_set: Any  # bands for y and its rate, or none
     fade: float  # factor of the offset from one sample to the next
     b0: float
     limits: Limits
@@ -371,12 +395,14 @@ class AdrcState(NamedTuple):
     shadow: Matrix  # lag filter of f_L (1, …)
     guard: Any
     watch: NDArray[LearnerWatch]  # (1,)
+    safe_set: Any
 
 
 @control.register(AdrcDesign)
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop[0], state.seen
     status = hold_last_good(loop, r, y)
+    see(design.safe_set, state.safe_set, y, loop.u)
     f_plain = 0.0
     u_acting = acting_control(design.eso, state.z, loop.u)
     if loop.started == 0.0:
@@ -435,13 +461,16 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             loop.offset = 0.0
         unlimited += loop.offset
         loop.offset = loop.offset * design.fade if abs(loop.offset) > smallest else 0.0
-    u, cut = apply_limits(design.limits, unlimited, loop.u)
+    safe, changed = nearest_safe(design.safe_set, state.safe_set, unlimited)
+    u, cut = apply_limits(design.limits, safe, loop.u)
+    cut |= changed
     loop.u_limited = u
     if loop.manual == 0.0:
         status |= cut
     else:
         u = loop.u_manual
     loop.u = u
+    status |= flags_of_applied(design.safe_set, state.safe_set, u)
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
     if design.learns and status & _MEASUREMENT_HELD == 0:
@@ -552,9 +581,11 @@ def _status_flags(design: AdrcDesign, state: AdrcState) -> int:
 @reset_loop.register(AdrcDesign)
 def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
     clear(state.loop)
+    state.loop[0].has_reference = has_reference_at_start(design.feedforward)
     for i in range(state.reference.size):
         state.reference[i] = 0.0
     reset_lag_filters(design, state)
+    forget_motion(design.safe_set, state.safe_set)
     restart(design.learner, state.learner)
 
 

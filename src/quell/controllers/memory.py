@@ -146,27 +146,44 @@ def images_of(parameters: Any, state: Any, dt: float) -> Layout:
     arrays = kept_arrays(state)
     single = any(array.dtype == np.float32 for array in arrays.values())
     shapes = tuple((name, array.shape) for name, array in arrays.items())
-    digits = 6 if single else 9
-    adrc: Any = parameters
-    kinds = [type(adrc).__name__]
-    while not isinstance(adrc, AdrcDesign) and hasattr(adrc, "controller"):
-        kinds.append(type(getattr(adrc, "prefilter", None)).__name__)
-        adrc = adrc.controller
-        kinds.append(type(adrc).__name__)
-    what: tuple[Any, ...] = (tuple(kinds), float(dt), shapes)
-    if isinstance(adrc, AdrcDesign):
-        learner = adrc.learner
-        what += (type(learner).__name__, meaning(learner), type(adrc.guard).__name__)
-        what += (adrc.b0, adrc.cancel, adrc.cancel_f)
-    everything = (what, parameters)
-    width, zeros = 4 if single else 8, []
-    found = _adrc_state(state)
-    if found is not None:
-        names = list(arrays)
-        at = next(i for i, name in enumerate(names) if np.shares_memory(arrays[name], found.loop))
-        before = sum(arrays[name].size for name in names[:at])
-        zeros = [before + list(found.loop.dtype.names).index("manual")]
-    return Layout(arrays, width, _hash(what, digits), _hash(everything, digits), tuple(zeros))
+    digits, width = (6, 4) if single else (9, 8)
+    what = _what(parameters), float(dt), shapes
+    layout, design = _hash(what, digits), _hash((what, parameters), digits)
+    return Layout(arrays, width, layout, design, _zero_places(state, arrays))
+
+
+def _what(design: Any) -> Any:
+    """Return kinds and parameters without which the numbers of a state mean something else."""
+    if isinstance(design, AdrcDesign):
+        kinds = (type(design.learner).__name__, type(design.guard).__name__)
+        return kinds, meaning(design.learner), design.b0, design.cancel, design.cancel_f
+    inner = tuple(_what(each) for each in _inside(design))
+    return type(design).__name__, type(getattr(design, "prefilter", None)).__name__, inner
+
+
+def _inside(whole: Any) -> tuple[Any, ...]:
+    """Return the controllers inside of a wrapper, by their parameters or by their states."""
+    names = ("controller", "compensator")
+    return tuple(getattr(whole, name) for name in names if hasattr(whole, name))
+
+
+def _adrc_states(state: Any) -> list[AdrcState]:
+    """Return the states of the ADRCs and compensators in a state."""
+    if isinstance(state, AdrcState):
+        return [state]
+    return [found for each in _inside(state) for found in _adrc_states(each)]
+
+
+def _zero_places(state: Any, arrays: dict[str, NDArray[Any]]) -> tuple[int, ...]:
+    """Return the numbers of the image that are flags of manual operation."""
+    found, at = [], 0
+    loops = [each.loop for each in _adrc_states(state)]
+    for array in arrays.values():
+        for loop in loops:
+            if np.shares_memory(array, loop):
+                found.append(at + list(loop.dtype.names).index("manual"))
+        at += array.size
+    return tuple(found)
 
 
 def _hash(value: Any, digits: int) -> int:
@@ -308,6 +325,12 @@ def start_from_rest(parameters: Any, state: Any) -> None:
 _LEARNED = ("learner", "guard", "watch")
 
 
+class _Part(NamedTuple):
+    """A part of a state."""
+
+    part: Any
+
+
 def learned_state(controller: Any) -> Any:
     """Return a state at rest before the first sample, with what a controller has learned.
 
@@ -315,25 +338,20 @@ def learned_state(controller: Any) -> Any:
     """
     state = controller.initial_state()
     fresh, running = _learned_arrays(state), _learned_arrays(getattr(controller, "_state", None))
-    if any(not np.array_equal(array, running.get(name, array)) for name, array in fresh.items()):
-        for name, array in fresh.items():
-            array[...] = running[name]
+    pairs = [*zip(fresh, running, strict=False)]
+    if any(not np.array_equal(*pair) for pair in pairs):
+        for array, learned in pairs:
+            array[...] = learned
         start_from_rest(controller.parameters, state)
     return state
 
 
-def _adrc_state(state: Any) -> AdrcState | None:
-    """Return the state of the ADRC behind all wrappers; None of others."""
-    while not isinstance(state, AdrcState) and state is not None:
-        state = getattr(state, "controller", None)
-    return state
-
-
-def _learned_arrays(state: Any) -> dict[str, NDArray[Any]]:
-    """Return what the ADRC behind all wrappers has learned, by name; nothing of others."""
-    found = _adrc_state(state)
-    return {} if found is None else {
-        name: array
-        for name, array in named_arrays(found).items()
-        if name.split(".")[0] in _LEARNED and array.dtype.kind == "f"
-    }
+def _learned_arrays(state: Any) -> list[NDArray[Any]]:
+    """Return what the ADRCs and compensators in a state have learned, in order."""
+    return [
+        array
+        for each in _adrc_states(state)
+        for part in _LEARNED
+        for array in named_arrays(_Part(getattr(each, part))).values()
+        if array.dtype.kind == "f"
+    ]

@@ -45,7 +45,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.adrc import ADRC, manual_operation
 from quell.controllers.base import (
     Controller,
     Limits,
@@ -60,6 +59,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensator import Compensator, manual_operation
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.functions import copysign, sqrt
@@ -94,7 +94,7 @@ class Wrapper(StatefulController):
     @property
     def _inner(self) -> Any:
         """The controller, acting on this state; an error if it has no methods for hand-over."""
-        if isinstance(self.controller, ADRC | Wrapper):
+        if isinstance(self.controller, Compensator | Wrapper):
             return self.controller
         raise ValueError(
             f"controller = {type(self.controller).__name__}: must be an ADRC to start under load, "
@@ -102,10 +102,10 @@ class Wrapper(StatefulController):
         )
 
     @property
-    def _adrc(self) -> ADRC:
+    def _adrc(self) -> Compensator:
         """The ADRC behind all wrappers, acting on this state."""
         inner = self._inner
-        return inner if isinstance(inner, ADRC) else inner._adrc
+        return inner if isinstance(inner, Compensator) else inner._adrc
 
     @property
     def dt(self) -> float:
@@ -159,7 +159,8 @@ class Wrapper(StatefulController):
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, see ``ADRC.retune``."""
-        self._inner.retune(omega_c=omega_c, observer=observer)
+        given = {"omega_c": omega_c, "observer": observer}
+        self._inner.retune(**{name: value for name, value in given.items() if value is not None})
         self._take_parameters()
 
     @property
@@ -324,6 +325,11 @@ class Prefiltered(Wrapper):
 
     def __init__(self, controller: Controller, prefilter: Prefilter) -> None:
         check_controller(controller)
+        if getattr(controller, "_u_is_given", False):
+            raise ValueError(
+                "controller = Compensator: takes u_0, and a prefilter shapes a reference; put the "
+                "prefilter in front of the controller of u_0"
+            )
         complete = hasattr(prefilter, "design") and hasattr(prefilter, "memory")
         if isinstance(prefilter, type) or not complete:
             rule = "must be a prefilter, for example quell.baselines.ZV(omega=1.4)"

@@ -18,7 +18,6 @@ import numba
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc import change_design, manual_operation
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
@@ -30,10 +29,13 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensated import Compensated, CompensatedDesign
+from quell.controllers.compensator import change_design, manual_operation
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
 from quell.controllers.memory import Layout, images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper
+from quell.controllers.safe_set import SafeSetDesign
 from quell.features.base import CustomDesign
 from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels import dispatch
@@ -119,8 +121,15 @@ def _with_carries(design: Any, state: Any) -> Any:
     """Return the state with room for the carries of compensated sums."""
     if isinstance(design, PrefilteredDesign):
         return state._replace(controller=_with_carries(design.controller, state.controller))
+    if isinstance(design, CompensatedDesign):
+        inner = _with_carries(design.compensator, state.compensator)
+        given = _with_carries(design.controller, state.controller)
+        return state._replace(controller=given, compensator=inner)
     if isinstance(design, AdrcDesign):
         state = state._replace(z=np.zeros(design.eso.states))
+        if isinstance(design.safe_set, SafeSetDesign):
+            wide = state.safe_set._replace(z=np.zeros(design.safe_set.eso.states))
+            state = state._replace(safe_set=wide)
         learner = state.learner
         if isinstance(design.learner, KalmanDesign) and needs_carries(design.learner):
             # Only the lower triangle; what is above has the carries.
@@ -299,6 +308,9 @@ def _acting_on(controller: Any, design: Any, state: Any) -> Any:
     vars(acting).update(vars(controller), parameters=design, _state=state, _packed=None)
     if isinstance(controller, Prefiltered):
         acting.controller = _acting_on(controller.controller, design.controller, state.controller)
+    elif isinstance(controller, Compensated):
+        parts = design.compensator, state.compensator
+        acting.compensator = _acting_on(controller.compensator, *parts)
     return acting
 
 

@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc import change_design, start_at_rest
-from quell.controllers.base import control, is_usable, set_applied_control
-from quell.controllers.law import AdrcDesign, AdrcState
+from quell.controllers.base import control, is_usable, reset_loop, set_applied_control
+from quell.controllers.compensated import CompensatedDesign, CompensatedState
+from quell.controllers.compensator import change_design, start_at_rest
+from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
 from quell.controllers.linear import LinearDesign, LinearState
 from quell.controllers.memory import Layout
 from quell.controllers.prefilters import PrefilteredDesign, PrefilteredState, settle, stopping_point
@@ -39,7 +40,7 @@ from quell.export.translate.text import (
     words,
     wrapped,
 )
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, generic_with_default
 from quell.plants.base import Plant, advance, check_plant, measure
 from quell.plants.fmu import FMU
 from quell.types import Status, Vector
@@ -448,6 +449,11 @@ def _add_flag_inside(design: PrefilteredDesign, state: PrefilteredState, flag: i
     add_flag(design.controller, state.controller, flag)
 
 
+@add_flag.register(CompensatedDesign)
+def _add_flag_to_compensator(design: CompensatedDesign, state: CompensatedState, flag: int) -> None:
+    add_flag(design.compensator, state.compensator, flag)
+
+
 def set_applied(design: Any, state: Any, u: float) -> None:
     """Set the control signal that was really applied; what is no number is ignored."""
     if is_usable(u):
@@ -466,8 +472,19 @@ def start_from(design: Any, state: Any, samples: int, y: float, u: float, r: flo
     elif is_usable(r):
         start(design, state, samples, y, u, r)
     else:
-        start(design, state, samples, y, u, y)
+        start(design, state, samples, y, u, usual_reference(design, y, u))
         add_flag(design, state, _REFERENCE_HELD)
+
+
+@generic_with_default
+def usual_reference(design: Any, y: float, u: float) -> float:
+    """Return the reference of a controller that rests at y under u; u_0 of a compensator."""
+    return y
+
+
+@usual_reference.register(AdrcDesign)
+def _usual_reference(design: AdrcDesign, y: float, u: float) -> float:
+    return u if has_reference_at_start(design.feedforward) != 0.0 else y
 
 
 @generic
@@ -498,6 +515,14 @@ def _start_prefiltered(
     loop.r = r
 
 
+@start.register(CompensatedDesign)
+def _start_compensated(
+    design: CompensatedDesign, state: CompensatedState, samples: int, y: float, u: float, r: float
+) -> None:
+    reset_loop(design.controller, state.controller)
+    start(design.compensator, state.compensator, samples, y, u, 0.0)
+
+
 @generic
 def set_manual(design: Any, state: Any, manual: bool, u: float) -> None:
     """Begin manual operation, or end it. A u that is no number is the one before."""
@@ -518,6 +543,13 @@ def _set_manual_inside(
     set_manual(design.controller, state.controller, manual, u)
 
 
+@set_manual.register(CompensatedDesign)
+def _set_manual_of_both(
+    design: CompensatedDesign, state: CompensatedState, manual: bool, u: float
+) -> None:
+    set_manual(design.compensator, state.compensator, manual, u)
+
+
 @generic
 def control_of_law(design: Any, state: Any) -> float:
     """Return the control signal that the law would have applied in the last sample."""
@@ -532,6 +564,11 @@ def _control_of_law(design: AdrcDesign, state: AdrcState) -> float:
 @control_of_law.register(PrefilteredDesign)
 def _control_of_inner_law(design: PrefilteredDesign, state: PrefilteredState) -> float:
     return control_of_law(design.controller, state.controller)
+
+
+@control_of_law.register(CompensatedDesign)
+def _control_of_both(design: CompensatedDesign, state: CompensatedState) -> float:
+    return control_of_law(design.compensator, state.compensator)
 
 
 def track(design: Any, state: Any, r: float, y: float, u: float) -> float:
@@ -571,6 +608,11 @@ def _hand_over_inside(design: PrefilteredDesign, state: PrefilteredState) -> boo
     return hand_over(design.controller, state.controller)
 
 
+@hand_over.register(CompensatedDesign)
+def _hand_over_both(design: CompensatedDesign, state: CompensatedState) -> bool:
+    return hand_over(design.compensator, state.compensator)
+
+
 @generic
 def move_origin(design: Any, state: Any, distance: float) -> None:
     """Count y and r from a point that is ``distance`` further on."""
@@ -605,6 +647,12 @@ def _retune(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
 @retune.register(PrefilteredDesign)
 def _retune_inside(old: PrefilteredDesign, new: PrefilteredDesign, state: PrefilteredState) -> None:
     retune(old.controller, new.controller, state.controller)
+
+
+@retune.register(CompensatedDesign)
+def _retune_both(old: CompensatedDesign, new: CompensatedDesign, state: CompensatedState) -> None:
+    retune(old.controller, new.controller, state.controller)
+    retune(old.compensator, new.compensator, state.compensator)
 
 
 @retune.register(LinearDesign)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc import ADRC, samples_to_settle
 from quell.controllers.base import (
     Limits,
     check_controller,
@@ -17,8 +16,11 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensated import compensating_part, takes_control
+from quell.controllers.compensator import samples_to_settle
 from quell.controllers.memory import images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
+from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
 from quell.export.c_files import CFiles, CSource, translated
@@ -49,9 +51,10 @@ def limits_path(controller: Any) -> str:
         for name in fields:
             if isinstance(getattr(parameters, name), Limits):
                 return f"{path}{name}"
-        if "controller" not in fields:
+        part = next((name for name in ("compensator", "controller") if name in fields), None)
+        if part is None:
             return ""
-        parameters, path = parameters.controller, f"{path}controller."
+        parameters, path = getattr(parameters, part), f"{path}{part}."
 
 
 def at_path(parameters: Any, path: str) -> Any:
@@ -99,10 +102,11 @@ def check_counts(controller: Any, resolution: float) -> None:
             origin = y
             u[k, 1] = control(design, moved, r - y, 0.0)
     same = np.max(np.abs(u[:, 1] - u[:, 0])) <= _ROUNDING * np.max(np.abs(u[:, 0]))
-    if design.learns or not same:  # what is learned acts much later than in this trial
+    banded = isinstance(getattr(design, "safe_set", None), SafeSetDesign)
+    if design.learns or banded or not same:  # what is learned acts much later than in this trial
         raise TranslationError(
             f"resolution = {resolution!r}: this controller needs the position itself, for a model "
-            "with a spring or for a learner; hand over y in its unit (NAME_step)"
+            "with a spring, a learner or a safe set; hand over y in its unit (NAME_step)"
         )
 
 
@@ -194,17 +198,19 @@ class _Writer:
         self.derivatives = 0 if has_own else int(getattr(self.described, "derivatives", 0))
         # They are arguments of each step: whoever forgets them gets an error of the compiler.
         self.names = [f"r{i + 1}" for i in range(self.derivatives)]
+        # What a step takes beside y: of a compensator alone the control signal u_0.
+        self.given = "u_0" if takes_control(self.described) else "r"
         self.arguments = "".join(f", {self.real} {each}" for each in self.names)
 
     def write(self) -> CSource:
         """Return the files."""
-        inner = without_prefilters(self.described)
+        observing = compensating_part(without_prefilters(self.described))
         self.files.add_init()
         self._add_step()
         if self.resolution is not None:
             self._add_counts(self.resolution)
-        if isinstance(inner, ADRC):
-            self._add_start(2 * samples_to_settle(inner.observer))
+        if observing is not None:
+            self._add_start(2 * samples_to_settle(observing.observer))
             self._add_manual_operation()
         self._add_retune()
         self._add_reset()
@@ -224,19 +230,21 @@ class _Writer:
         ]
         defines = [f"#define {upper}_SAMPLE_TIME {dt} /* [s] */"]
         defines.append(f"#define {upper}_MEMORY_SIZE {self.images.size} /* [bytes] */")
-        if isinstance(inner, ADRC):
-            defines.append(f"#define {upper}_ORDER {inner.observer.order}")
+        if observing is not None:
+            defines.append(f"#define {upper}_ORDER {observing.observer.order}")
         self.files.enums += self._enums(channels)
         self.files.structs += self._estimate_struct(channels)
         return self.files.write(title, channels, defines, self.derivatives)
 
     def _add_step(self) -> None:
         files, real, both = self.files, self.real, self.files.both
-        r, y, u = map(files.number, "ryu")
+        given = self.given
+        r, y, u = map(files.number, (given, "y", "u"))
+        what = "reference r" if given == "r" else "the control signal u_0 of another controller"
         files.add(
             "step",
-            f"{real} NAME({self.state}, {real} r, {real} y{self.arguments})",
-            "Take one sample: return the control signal u for reference r and measurement y.\n\n"
+            f"{real} NAME({self.state}, {real} {given}, {real} y{self.arguments})",
+            f"Take one sample: return the control signal u for {what} and measurement y.\n\n"
             f"{self._about_target()}{self._about_derivatives()}"
             "A value that is not finite is replaced; the status says so. The controller assumes\n"
             "that u is applied until the next sample.",
@@ -304,24 +312,27 @@ class _Writer:
 
     def _add_start(self, samples: int) -> None:
         files, real = self.files, self.real
-        r, y, u = map(files.number, "ryu")
+        given = self.given
+        r, y, u = map(files.number, (given, "y", "u"))
+        what = "that" if given == "u_0" else "the reference"
+        usual = "u" if given == "u_0" else "y"
         count = Value(Number.INT, str(samples // 2))
         files.add(
             "start",
-            f"void NAME({self.state}, {real} y, {real} u, {real} r)",
-            "Start at a plant that rests at y under u: the next step continues from u.\n\nr is the "
-            "reference of the next step. What was learned is kept. The observer takes\n"
+            f"void NAME({self.state}, {real} y, {real} u, {real} {given})",
+            f"Start at a plant that rests at y under u: the next step continues from u.\n\n{given} "
+            f"is {what} of the next step. What was learned is kept. The observer takes\n"
             f"{samples} samples to settle: do not call this in an interrupt. If y or u is not\n"
-            "finite nothing changes but the status; an r that is not finite is y.",
+            f"finite nothing changes but the status; an {given} that is not finite is {usual}.",
             f"    {files.call(c_files.start_from, *files.both, count, y, u, r)};",
         )
 
     def _add_manual_operation(self) -> None:
         files, real = self.files, self.real
-        r, y, u = map(files.number, "ryu")
+        r, y, u = map(files.number, (self.given, "y", "u"))
         files.add(
             "track",
-            f"{real} NAME({self.state}, {real} r, {real} y, {real} u{self.arguments})",
+            f"{real} NAME({self.state}, {real} {self.given}, {real} y, {real} u{self.arguments})",
             "Take one sample in manual operation: u is applied, unlimited, until the next sample."
             "\n\nReturn the control signal that the controller would have applied. A u that is not"
             "\nfinite is the one before; the status says so.",

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.adrc import ADRC, samples_to_settle
 from quell.controllers.base import (
     control,
     reset_loop,
@@ -26,6 +25,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensated import compensating_part
+from quell.controllers.compensator import samples_to_settle
 from quell.controllers.memory import learned_state
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.single import SinglePrecision
@@ -70,11 +71,10 @@ class Plant(NamedTuple):
 
 def plant_for(controller: Any, amplitude: float, real: Callable[[Any], Any]) -> Plant | None:
     """Return the plant for a controller; None for one that does not learn."""
-    inner = without_prefilters(controller)
-    if not isinstance(inner, ADRC) or not inner.parameters.learns:
+    inner = compensating_part(without_prefilters(controller))
+    if inner is None or not inner.parameters.learns:
         return None
-    observer = inner.observer
-    law = inner.parameters.law
+    observer, law = inner.observer, inner.gains
     count = round(_LAGS * observer.lag_time / observer.dt / BLOCK) * BLOCK
     return Plant(
         real(observer.b0),
@@ -417,8 +417,8 @@ def _amplitude(controller: Any, path: str) -> float:
 
 
 def _samples(controller: Any) -> int:
-    inner = without_prefilters(controller)
-    return samples_to_settle(inner.observer) if isinstance(inner, ADRC) else 0
+    inner = compensating_part(without_prefilters(controller))
+    return 0 if inner is None else samples_to_settle(inner.observer)
 
 
 # ---- The C program that compares a controller with golden vectors ----

@@ -621,7 +621,8 @@ def _arrays(structs: Structs, owner: Value, state: Any) -> Iterator[tuple[Value,
 def _array_lines(structs: Structs, value: Value, array: Any, tables: list[str]) -> list[str]:
     write, flat = structs.literals.write, array.ravel()
     if array.dtype.names is None and array.shape == (1,) and not isinstance(value.kind, Array):
-        return [f"    {value.code} = {write(flat[0])};"]
+        number = bool(flat[0]) if value.kind is Number.BOOL else flat[0]
+        return [f"    {value.code} = {write(number)};"]
     if flat.size > _MOST_STATEMENTS and np.all(flat == flat[0]):
         return _loops(array.shape, value.code, write(flat[0]))
     if array.ndim == 2 and array.shape[0] == array.shape[1] > _MOST_STATEMENTS:

@@ -41,7 +41,8 @@ from numpy.typing import NDArray
 from quell.analysis.loop import closed_loop
 from quell.analysis.margins import Complex, Response, eigenvalues, frequencies, in_s_plane
 from quell.controllers.base import Controller
-from quell.controllers.law import AdrcDesign, LinearFeedback, ModelFeedforward
+from quell.controllers.compensated import CompensatedDesign
+from quell.controllers.law import AdrcDesign, LinearFeedback, ModelFeedforward, reference_part
 from quell.controllers.linear import LinearDesign, LinearLaw
 from quell.guard import UnguardedDesign
 from quell.learners.base import NoLearnerDesign
@@ -367,12 +368,33 @@ def _of_adrc(design: AdrcDesign) -> LinearLaw | None:
         B_y=found.F @ found.H,
         B_u=found.input,
         C=gains @ found.T,
-        D_r=design.law[0] / design.b0,
+        D_r=reference_part(design.feedforward, design.law, 1.0, np.zeros(0)) / design.b0,
         D_y=float(gains @ found.D),
     )
     first = np.eye(law.C.size)[0]  # e = y − z⁻_1
     law = law._replace(A=law.A - np.outer(law.B_y, first), C=law.C - law.D_y * first)
     return _delayed(law, design.eso.samples) if isinstance(design.eso, DelayedModel) else law
+
+
+@_law.register
+def _of_both(design: CompensatedDesign) -> LinearLaw | None:
+    first, then = _law(design.controller), _law(design.compensator)
+    if first is None or then is None:
+        return None
+    # The controller is told ``u_0 + u − u_wished = u − C x − D_y y`` of the compensator's x.
+    m, k = first.C.size, then.C.size
+    A = np.zeros((m + k, m + k))
+    A[:m, :m], A[:m, m:] = first.A, -np.outer(first.B_u, then.C)
+    A[m:, :m], A[m:, m:] = np.outer(then.B_r, first.C), then.A
+    return LinearLaw(
+        A=A,
+        B_r=np.append(first.B_r, then.B_r * first.D_r),
+        B_y=np.append(first.B_y - first.B_u * then.D_y, then.B_y + then.B_r * first.D_y),
+        B_u=np.append(first.B_u, then.B_u),
+        C=np.append(then.D_r * first.C, then.C),
+        D_r=then.D_r * first.D_r,
+        D_y=then.D_y + then.D_r * first.D_y,
+    )
 
 
 def _delayed(law: LinearLaw, samples: int) -> LinearLaw:

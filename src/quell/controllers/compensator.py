@@ -1,0 +1,692 @@
+"""A disturbance compensator: observer, learner and guard on top of any controller.
+
+A controller or drive that stays as it is asks for u_0. The compensator adds what cancels the total
+disturbance f, as an ESO of the plant between u and y estimates it and a learner predicts it::
+
+    u = sat( u_0 − (f_L + Δf̂) / b0 )
+
+and for a learner with ``f_L = h + s u`` (``controllers/law.py``) the u that solves it exactly,
+``(b0 u_0 − h − Δf̂)/(b0 + s)``. The plant may be a closed drive that takes commands of position or
+speed: then a known model (a, b) of it, or an order and a b0, is that of the closed drive, and f is
+what the model misses (arXiv 2512.05292; the Disturbance Compensator block of Simulink is of this
+form). With a model the drive keeps its dynamics, ``a · x̂`` is not cancelled.
+
+ADRC is this compensator with the law ``u_0 = (k_1 (r − x̂_1) + … + a · x̂)/b0``: both have one
+kernel, that of ``controllers/law.py``.
+
+A compensator changes the loop: between u_0 and y, the controller finds the plant of the observer,
+but with the observer's lag, and with the margins of a loop of its own. For an observer of order n
+with all poles at −ω_o and no model, the feedback that is added is::
+
+    u = u_0 − Q(s) (s^n y/b0 − u),     Q = ω_o^(n+1) / (s + ω_o)^(n+1),     n + 1 = N
+
+So it integrates below ω_o/N, and at the resonance of a flexible plant it is as strong as Q there.
+``analyse`` and ``tune`` judge that loop together with the controller's
+(``Compensated``).
+
+Start under load, manual operation and retuning are functions of parameters and state.
+
+A controller starts under load, or follows manual operation, by its observer: the observer receives
+y and the applied u and estimates f (Herbst, "Practical Active Disturbance Rejection Control:
+Bumpless Transfer, Rate Limitation, and Incremental Algorithm", arXiv 1908.04610). At rest at the
+reference the law then returns exactly that u. Otherwise, with another reference or new gains, the
+difference is added to u and decays as ``exp(−omega_c t)``. The observer receives the sum, so the
+offset does not disturb its estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.base import RateLimit, checked_limits, reset_loop
+from quell.controllers.law import (
+    AdrcDesign,
+    AdrcLoop,
+    AdrcState,
+    ControlGiven,
+    LinearFeedback,
+    has_reference_at_start,
+    known_share,
+    law_gains,
+    unlimited_control,
+)
+from quell.controllers.safe_set import (
+    NoSafeSet,
+    NoSafeSetMemory,
+    SafeSet,
+    settle_at_rest,
+    settle_safe_set,
+    shift_f,
+)
+from quell.controllers.stateful import StatefulController
+from quell.guard import (
+    GUARD_CHANNELS,
+    Guard,
+    Reason,
+    UnguardedDesign,
+    UnguardedMemory,
+    limit,
+    write_channels,
+)
+from quell.kernels.dispatch import call_specialised, compiled
+from quell.learners.base import (
+    NO_LAG,
+    Learner,
+    LearnerWatch,
+    NoLearner,
+    checked_learner_design,
+    coefficients,
+    forget,
+    lag_memory,
+    lag_of,
+    predict,
+    window_samples,
+)
+from quell.observers.design import scaled_response
+from quell.observers.eso import ESO
+from quell.observers.forms import (
+    NonlinearModel,
+    acting_control,
+    begin,
+    observe,
+    state_for,
+    without_delay,
+)
+from quell.types import Channels, Status, Vector, warn
+
+# ---- The estimates of a compensator or an ADRC after a step ----
+
+
+class Estimate(NamedTuple):
+    """Estimates and status of a compensator or an ADRC after a step."""
+
+    x: Vector
+    """(n,): y and its derivatives; if the plant has zeros, see ``observer.states_of``."""
+    f: float
+    """Total disturbance ``f_learned + f_residual`` [y-unit/s^n; y-unit/s^f_degree with zeros]."""
+    f_learned: float
+    """The learner's share, f_L; with a guard its constant part is free, and ``f`` is right."""
+    f_residual: float
+    """The observer's share, Δf̂."""
+    theta: dict[str, float]
+    """The learner's coefficients by feature."""
+    u: float
+    """The applied control signal."""
+    status: Status
+    """Status flags of the step."""
+    authority: float = 1.0
+    """Share of its output that the guard allows the learner."""
+    error_plain: float = math.nan
+    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n]."""
+    error_learned: float = math.nan
+    """The same for the learner with full authority."""
+    reason: Reason = Reason.TRUSTED
+    """Reason for the authority."""
+    f_derivatives: Vector = np.zeros(0)
+    """(m − 1,): derivatives of Δf̂, of an observer with m extended states [y-unit/s^(n+j)]."""
+
+
+def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...]) -> Estimate:
+    """Return the estimates in ``state``, with the learner's coefficients named by ``features``."""
+    order = design.law.size
+    theta = np.zeros(len(features))
+    coefficients(design.learner, state.learner, theta)
+    learned, residual = float(state.loop[0].f_learned), float(state.seen[order])
+    guarded: dict[str, Any] = {}
+    row = np.zeros(len(GUARD_CHANNELS))
+    if write_channels(design.guard, state.guard, row):
+        guarded = dict(zip((name for name, _ in GUARD_CHANNELS), row.tolist(), strict=True))
+        guarded["reason"] = Reason(int(guarded["reason"]))
+    return Estimate(
+        x=state.seen[:order].copy(),
+        f=learned + residual,
+        f_learned=learned,
+        f_residual=residual,
+        theta=dict(zip(features, theta.tolist(), strict=True)),
+        u=float(state.loop[0].u),
+        status=Status(int(state.loop[0].status)),
+        **guarded,
+        f_derivatives=state.seen[order + 1 :].copy(),
+    )
+
+
+# ---- Start under load, manual operation and retuning ----
+
+# Time constants after which an initial error is below the unit roundoff: exp(−40) = 4e-18.
+_TIME_CONSTANTS = 40.0
+# Bound on the time that ``start`` takes: some seconds of calculation. Chosen by hand.
+_MOST_SAMPLES = 100_000_000
+
+
+def start_at_rest(
+    design: AdrcDesign, state: AdrcState, samples: int, y: float, u: float, r: float
+) -> None:
+    """Set the state to rest at y under u, with the reference r; see ``samples_to_settle``.
+
+    The numbers are in the precision of the state.
+    """
+    _start_loop(design, state, y, u, r)
+    begin(design.eso, state.z, state.seen, y)
+    settle_at_rest(design.safe_set, state.safe_set, y, u, samples)
+    loop = state.loop[0]
+    model, z, seen = design.eso, state.z, state.seen
+    known = loop.f_learned + loop.f_known
+    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
+    _feed_forward(design, state, u)
+    known = loop.f_learned + loop.f_known
+    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
+    loop.bumpless = 1.0
+
+
+def start_in_motion(
+    design: AdrcDesign, state: AdrcState, x: Vector, f: Vector, u: float, r: float
+) -> None:
+    """Set the state to the estimates ``x`` (n,) and ``f`` (m,) under u, with the reference r."""
+    _start_loop(design, state, float(x[0]), u, r)
+    state.seen[:] = np.append(x, f)
+    _feed_forward(design, state, u)
+    state.seen[x.size] -= state.loop[0].f_learned + state.loop[0].f_known
+    state.z[:] = state_for(design.eso, x, state.seen[x.size :], u)
+    settle_safe_set(design.safe_set, state.safe_set, x, float(f[0]))
+
+
+def _start_loop(design: AdrcDesign, state: AdrcState, y: float, u: float, r: float) -> None:
+    reset_loop(design, state)
+    loop = state.loop[0]
+    loop.y, loop.r, loop.u = y, r, u
+    loop.started = loop.has_reference = 1.0
+    loop.f_known = known_share(design.feedforward, r, state.reference)
+
+
+def _feed_forward(design: AdrcDesign, state: AdrcState, u: float) -> None:
+    """Set the learner's share of f for the estimates in ``state`` under u."""
+    loop = state.loop[0]
+    constant, slope = predict(design.learner, state.learner, state.seen, u)
+    constant, slope, _ = limit(design.guard, state.guard, 0.0, 0.0, constant, slope, u)
+    loop.constant, loop.slope = constant, slope
+    loop.f_learned = constant + slope * u
+
+
+def samples_to_settle(observer: ESO) -> int:
+    """Return after how many samples an observer has forgotten its initial state."""
+    samples = _TIME_CONSTANTS * observer.lag_time / observer.dt
+    if not isinstance(without_delay(observer.model), NonlinearModel):
+        transition = scaled_response(observer.model, observer.units, observer.order).transition
+        slowest = float(np.max(np.abs(np.linalg.eigvals(transition))))
+        if 0.0 < slowest < 1.0:
+            samples = max(samples, _TIME_CONSTANTS / -math.log(slowest))
+    return min(round(samples), _MOST_SAMPLES) + observer.states
+
+
+@compiled
+def _observe_at_rest(
+    model: Any, z: Vector, seen: Vector, y: float, u: float, f_learned: float, samples: int
+) -> None:
+    """Update the observer with constant y, u and f_L."""
+    for _ in range(samples):
+        observe(model, z, seen, y, u, f_learned)
+
+
+@contextmanager
+def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
+    """Apply ``u`` instead of the law's own control signal inside the ``with`` block."""
+    state.loop[0].manual, state.loop[0].u_manual = 1.0, u
+    try:
+        yield
+    finally:
+        state.loop[0].manual = 0.0
+
+
+def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
+    """Convert a running state to new parameters, without a jump of u."""
+    loop, size = state.loop[0], new.law.size
+    if loop.started == 0.0:
+        return
+    before = unlimited_control(old, state, loop.constant, loop.slope)
+    # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
+    # Its derivatives, if the observer has them, stay: how u moves from now on is not known.
+    acting = acting_control(old.eso, state.z, float(loop.u))
+    change = (old.b0 - new.b0) * acting
+    for i in range(size):
+        change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
+    shift_f(new.safe_set, state.safe_set, change)
+    # The model's share of f depends on them, too, and is not in the estimate.
+    known = known_share(new.feedforward, loop.r, state.reference)
+    change -= known - loop.f_known
+    loop.f_known = known
+    state.z[size] += change
+    state.seen[size] += change
+    loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)
+
+
+def check_replacement(old: ESO, new: Any, learns: bool) -> None:
+    """Check that ``new`` can replace ``old`` in a running controller; ``learns`` with a learner."""
+    if not isinstance(new, ESO):
+        raise ValueError(f"observer = {new!r}: must be an ESO")
+    names = ("order", "disturbance_order", "degree", "f_degree", "dt", "form", "states")
+    for name in names:
+        if getattr(new, name) != getattr(old, name):
+            rule = f"the present one {getattr(old, name)!r}: must be the same"
+            raise ValueError(f"observer has {name} = {getattr(new, name)!r}, {rule}")
+    same_gain = new.b0 == old.b0
+    plants = [(getattr(new.plant, name), getattr(old.plant, name)) for name in "aBE"]
+    if same_gain and all(np.array_equal(*pair) for pair in plants):
+        return
+    if any(observer.plant.zeros.size or not observer.plant.matched for observer in (old, new)):
+        raise ValueError(
+            "observer has another model or b0, which changes the meaning of its states for a plant "
+            "with zeros; change omega_o only"
+        )
+    if learns and not (same_gain and np.array_equal(new.cancel, old.cancel)):
+        raise ValueError(
+            f"observer has b0 = {new.b0!r} and a = {new.cancel.tolist()}, not those of the present "
+            "one: what was learned refers to that; change omega_o only, or make a new controller"
+        )
+
+
+def check_structure(old: AdrcDesign, new: AdrcDesign) -> None:
+    """Raise a ``ValueError`` if compiled code and state arrays for ``old`` do not fit ``new``."""
+    if _structure(new) != _structure(old):
+        raise ValueError("observer is of another structure than the present one: make a new ADRC")
+
+
+def _structure(value: Any) -> Any:
+    """Return types and array shapes of a nested NamedTuple."""
+    if isinstance(value, tuple):
+        return type(value), tuple(map(_structure, value))
+    return value.shape if isinstance(value, np.ndarray) else type(value)
+
+
+# ---- The compensator ----
+
+# The bandwidth of a loop is told by the poles of a model that are slower than this share of the
+# fastest one; a model with slower poles integrates, and its loop is closed by others.
+_INTEGRATES = 1e-6
+
+
+class Compensator(StatefulController):
+    """Observer, learner and guard on top of any controller: ``u = u_0 − (f_L + Δf̂)/b0``.
+
+    ``step(u_0, y)`` takes one sample. In ``simulate``, in an exported program and in the real-time
+    loop the reference of a compensator is u_0, in units of u. ``Compensated(controller,
+    compensator)`` is both in one.
+
+    Parameters
+    ----------
+    observer
+        of the plant between u and y, which may be a closed drive that takes commands: model-free
+        with its order and b0, or model-based. It sets dt.
+    omega_c
+        bandwidth of the loop in which the compensator works [rad/s], from which a learner and a
+        guard take their scales, and with which a difference after ``hand_over`` decays. By default
+        with a learner that of the observer's model, and needed if there is no model of a stable
+        plant; without a learner that of the observer's lag.
+    learner
+        predicts f and feeds it forward; none by default.
+    guard
+        limits the learner to the authority that it has earned, which is full without a guard.
+    u_min, u_max
+        limits of the control signal [u-unit].
+    rate_limit
+        largest rate of the control signal, in both directions, or (lowest, highest) [u-unit/s].
+    safe_set
+        bands that y and its rate do not leave, whatever u_0 and the learner ask for; none by
+        default.
+
+    Raises
+    ------
+    ValueError
+        for an observer whose f does not enter the plant where u does, so that no u cancels it; a
+        learner without a bandwidth; a guard that is certified for plants, whose loop is not known
+        here; limits in the wrong order.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> observer = ql.ESO.model_free(order=1, b0=2.0, omega_o=20.0, dt=0.01)
+    >>> compensator = Compensator(observer, u_max=1.5)
+    >>> [round(compensator.step(1.0, y=0.0), 3) for _ in range(3)]
+    [1.0, 1.033, 1.088]
+
+    y does not move although u acts, so u grows.
+    """
+
+    _u_is_given = True
+
+    def __init__(
+        self,
+        observer: ESO,
+        *,
+        omega_c: float | None = None,
+        learner: Learner | None = None,
+        guard: Guard | None = None,
+        u_min: float = -math.inf,
+        u_max: float = math.inf,
+        rate_limit: RateLimit = math.inf,
+        safe_set: SafeSet | None = None,
+    ) -> None:
+        self._take_parts(observer, learner, guard, safe_set)
+        if observer.cancel_f == 0.0:
+            raise ValueError(
+                "observer: f does not enter the plant where u does, so adding −f̂/b0 to u does not "
+                "cancel it; take an observer with matched f (without E), or an ADRC"
+            )
+        if guard is not None and guard.certified_for is not None:
+            raise ValueError(
+                "guard: certified_for bounds the loop of an ADRC, with its law; that of a "
+                "compensator has another controller in it; use Guard() without it"
+            )
+        if omega_c is None:
+            omega_c = _bandwidth_of_model(observer) if self._learns else 1.0 / observer.lag_time
+        self.omega_c = self._learner_omega_c = checks.positive("omega_c", omega_c, "rad/s")
+        self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
+        self._initialise()
+        self._warn_of_idle_guard()
+
+    def _take_parts(self, observer: Any, learner: Any, guard: Any, safe_set: Any) -> None:
+        """Check and keep observer, learner, guard and safe set."""
+        if not isinstance(observer, ESO):
+            raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
+        self.observer = observer
+        self.guard = guard
+        self.learner: Learner = NoLearner() if learner is None else learner
+        if isinstance(self.learner, type) or not all(
+            hasattr(self.learner, name) for name in ("design", "memory", "feature_names")
+        ):
+            example = "for example quell.learners.Kalman()"
+            raise ValueError(f"learner = {learner!r}: must be a learner, {example}, or None")
+        if guard is not None and not isinstance(guard, Guard):
+            raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
+        if safe_set is not None and not isinstance(safe_set, SafeSet):
+            raise ValueError(f"safe_set = {safe_set!r}: must be a quell.SafeSet(), or None")
+        self.safe_set = safe_set
+
+    def _warn_of_idle_guard(self) -> None:
+        if self.guard is not None and not self._learns:
+            rule = "has no effect without a learner; give one, or no guard"
+            warn(f"guard = {self.guard!r} {rule}")
+
+    @property
+    def _learns(self) -> bool:
+        return not isinstance(self.learner, NoLearner)
+
+    def _update_parameters(self) -> None:
+        self.parameters = self._design(self.observer)
+        self.features = self.learner.feature_names(self.observer.order)
+
+    def _design(self, observer: ESO) -> AdrcDesign:
+        """Return the parameters with an observer: u_0 takes the place of the law."""
+        nothing = np.zeros(observer.order)
+        return self._with_law(
+            observer,
+            self.gains,
+            law=nothing,
+            cancel=nothing,
+            feedback=LinearFeedback(),
+            feedforward=ControlGiven(observer.b0),
+            fade=math.exp(-self._learner_omega_c * observer.dt),
+        )
+
+    @property
+    def gains(self) -> Vector:
+        """Gains k (n,) of the loop with which learner and guard reckon: of an ADRC its law's."""
+        return padded(law_gains(self.observer.degree, self.omega_c), self.observer.order)
+
+    def _with_law(self, observer: ESO, gains: Vector, **law: Any) -> AdrcDesign:
+        """Return the parameters with a law; ``gains`` k (n,) are those of the closed loop."""
+        learner = checked_learner_design(self.learner, observer, self._learner_omega_c)
+        return AdrcDesign(
+            eso=observer.model,
+            cancel_f=observer.cancel_f,
+            b0=observer.b0,
+            limits=self._limits,
+            safe_set=self._safe_set_design(observer),
+            learner=learner,
+            lag=lag_of(observer) if self._learns else NO_LAG,
+            guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, gains),
+            learns=self._learns,
+            # A guard judges the output itself; an output set from outside is kept in any case.
+            forgets=self.guard is None and type(learner) in forget.implementations,
+            window=window_samples(observer) if self._learns else 0,
+            **law,
+        )
+
+    def _safe_set_design(self, observer: ESO) -> Any:
+        if self.safe_set is None:
+            return NoSafeSet()
+        return self.safe_set.design(observer, self._limits)
+
+    def set_limits(
+        self,
+        *,
+        u_min: float | None = None,
+        u_max: float | None = None,
+        rate_limit: RateLimit | None = None,
+    ) -> None:
+        """Change limits of the control signal while running; see ``StatefulController``."""
+        super().set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
+        if self.safe_set is not None and self.safe_set.gain_error > 0.0:
+            safe_set = self._safe_set_design(self.observer)
+            self.parameters = self.parameters._replace(safe_set=safe_set)
+            self._pack_again()
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints; no learner is none."""
+        found = super().described()
+        if isinstance(self.learner, NoLearner):
+            del found["learner"]
+        return found
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.observer.dt
+
+    @property
+    def derivatives(self) -> int:
+        """Number of derivatives of the reference that are fed forward."""
+        return 0
+
+    @property
+    def channels(self) -> Channels:
+        """Name and width of each recorded channel, in order."""
+        estimates = (("x_hat", self.observer.order), ("f_residual", 1), ("f_learned", 1))
+        guard = () if self.guard is None else GUARD_CHANNELS
+        rates = self.observer.disturbance_order - 1
+        of_f = (("f_derivatives", rates),) if rates else ()
+        forward = self._channels_of_law
+        return (*estimates, ("status", 1), *of_f, *forward, *guard, ("theta", len(self.features)))
+
+    @property
+    def _channels_of_law(self) -> Channels:
+        return ()
+
+    def initial_state(self) -> AdrcState:
+        """Return a state before the first sample, with nothing learned."""
+        design, guard = self.parameters, UnguardedMemory(np.zeros(0))
+        state = AdrcState(
+            z=np.zeros(self.observer.states),
+            seen=np.zeros(self.observer.estimates),
+            reference=np.zeros(self.derivatives),
+            loop=AdrcLoop.zeros(),
+            learner=self.learner.memory(design.learner),
+            shadow=lag_memory(design.lag, 1),
+            guard=guard if self.guard is None else self.guard.memory(design.guard),
+            watch=LearnerWatch.zeros(),
+            safe_set=(
+                NoSafeSetMemory(np.zeros(0))
+                if self.safe_set is None
+                else self.safe_set.memory(design.safe_set)
+            ),
+        )
+        state.loop[0].has_reference = has_reference_at_start(design.feedforward)
+        return state
+
+    def step(self, u_0: float, y: float) -> float:
+        """Take one sample: return the control signal [u-unit] for u_0 and the measurement.
+
+        A u_0 that is not finite is replaced by the last finite one, zero before the first; a
+        measurement by the one that the observer expects; ``estimate.status`` reports it. The
+        observer assumes that the returned value is applied: set limits by ``u_min``, ``u_max`` and
+        ``rate_limit``, or call ``applied`` with what was applied.
+
+        The first call compiles, or loads from the disk cache; ``prepare`` does that beforehand.
+        """
+        if self._packed is None:
+            self.prepare()
+        try:
+            return self._step(self._packed, u_0, y)
+        except TypeError:
+            raise TypeError(f"u_0 = {u_0!r}, y = {y!r}: must be numbers") from None
+
+    def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
+        """Start at a plant that rests at ``y`` under ``u``: the next ``step`` continues from ``u``.
+
+        What was learned is kept. A controller that is not started begins at its first sample with
+        f̂ = 0, which is right for a plant at rest without load and makes a bump under load.
+
+        Parameters
+        ----------
+        y
+            measurement [y-unit].
+        u
+            control signal that holds the plant there [u-unit]; should be within the limits.
+        r
+            reference of the next step [y-unit]; ``y`` by default. With another one u still
+            continues without a jump, and the move begins with the observer's own dynamics. Of a
+            compensator u_0 of the next step [u-unit]; ``u`` by default.
+        """
+        y, u = checks.signal("y", y), checks.signal("u", u)
+        goal = (u if self._u_is_given else y) if r is None else checks.signal("r", r)
+        number = self._state.z.dtype.type  # of the precision of the state
+        signals = map(number, (y, u, goal))
+        start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), *signals)
+
+    def start_at(self, x: Any, f: Any = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
+        """Start with given estimates, for a plant in motion; what was learned is kept.
+
+        They are those of the sample before the next ``step``, which takes u for the control signal
+        applied since then. Unlike after ``start``, the next u is the law's own; call ``hand_over``
+        next for one that continues from ``u``.
+
+        Parameters
+        ----------
+        x
+            estimates x̂ (n,), y and its derivatives; see ``observer.states_of`` if there are zeros.
+        f
+            total disturbance [y-unit/s^n]; for an observer with more extended states also a list
+            of f, f', … [y-unit/s^(n+j)], the missing ones zero.
+        u
+            control signal applied until the next step [u-unit]; a delayed one has the same past.
+        r
+            reference until the next one that is finite [y-unit]; ``x[0]`` by default. Of a
+            compensator u_0 [u-unit]; ``u`` by default.
+        """
+        estimates = checks.vector("x", x, self.observer.order)
+        u = checks.signal("u", u)
+        most = self.observer.disturbance_order
+        given = checks.vector("f", checks.finite("f", f) if np.ndim(f) == 0 else f)
+        if given.size > most:
+            raise ValueError(f"f = {f!r}: the observer estimates {most} of f, f', …: give as many")
+        of_f = np.append(given, np.zeros(most - given.size))
+        usual = u if self._u_is_given else float(estimates[0])
+        goal = usual if r is None else checks.signal("r", r)
+        start_in_motion(self.parameters, self._state, estimates, of_f, u, goal)
+
+    def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
+        """Take one sample in manual operation: ``u`` is applied, unlimited, until the next sample.
+
+        Return the control signal that would have been applied [u-unit]; ``r`` (u_0 of a
+        compensator), ``y`` and ``derivatives`` are as for ``step``.
+        """
+        with manual_operation(self._state, checks.signal("u", u)):
+            self.step(r, y, *derivatives)
+        return float(self._state.loop[0].u_limited)
+
+    def hand_over(self) -> None:
+        """End manual operation: the next ``step`` continues from the u of the last ``track``.
+
+        Raises ``ValueError`` before the first sample.
+        """
+        if self._state.loop[0].started == 0.0:
+            raise ValueError("hand_over: there was no sample yet; call track or start before")
+        self._state.loop[0].bumpless = 1.0
+
+    def increment(self, r: float, y: float, *derivatives: float) -> float:
+        """Take one sample: return the change of the control signal [u-unit], within the limits.
+
+        For actuators that take increments (steppers, valves, a drive that holds its set point). The
+        law is that of ``step`` (Herbst, arXiv 1908.04610, section IV, shows that the two are one).
+        If the actuator's position is not known, ``start(y)`` takes it as zero, f̂ includes the
+        difference, and limits of magnitude refer to that zero.
+        """
+        before = float(self._state.loop[0].u)
+        return self.step(r, y, *derivatives) - before
+
+    def retune(self, *, observer: ESO) -> None:
+        """Change the observer while running, without a bump; allowed in every sample.
+
+        As ``ADRC.retune``, with the same errors.
+
+        Parameters
+        ----------
+        observer
+            new observer of the same order, form, structure and sample time.
+        """
+        check_replacement(self.observer, observer, self._learns)
+        old, new = self.parameters, self._design(observer)
+        check_structure(old, new)
+        self.observer, self.parameters = observer, new
+        change_design(old, new, self._state)
+        self._pack_again()
+
+    @property
+    def _external_fields(self) -> tuple[str, ...]:
+        return tuple(f"learner.{name}" for name in getattr(self.learner, "external_fields", ()))
+
+    def _external_snapshots(self, state: AdrcState) -> dict[str, Any]:
+        if not self._external_fields:
+            return {}
+        snapshot = self.learner.snapshot(state.learner)  # type: ignore[attr-defined]
+        return {f"learner.{name}": value for name, value in snapshot.items()}
+
+    def _restore_external(self, state: AdrcState, snapshots: Mapping[str, Any]) -> None:
+        named = {name.removeprefix("learner."): value for name, value in snapshots.items()}
+        self.learner.recall(state.learner, named)  # type: ignore[attr-defined]
+
+    @property
+    def estimate(self) -> Estimate:
+        """Estimates and status after the last step."""
+        return self.read(self._state)
+
+    def read(self, state: AdrcState) -> Estimate:
+        """Return the estimates and the status in ``state``."""
+        return read_estimate(self.parameters, state, self.features)
+
+
+def padded(gains: Vector, size: int) -> Vector:
+    """Return gains with zeros behind them up to a size."""
+    return np.append(gains, np.zeros(size - gains.size))
+
+
+def _bandwidth_of_model(observer: ESO) -> float:
+    """Return the geometric mean of the slowest poles of a model, as many as its relative degree.
+
+    Raises ``ValueError`` for a model that has none, integrates or is unstable.
+    """
+    poles = np.roots(np.append(1.0, observer.cancel[::-1]))
+    size = np.abs(poles)
+    slowest = poles[np.argsort(size)][: observer.degree]
+    if not (np.all(slowest.real < 0.0) and np.min(size) > _INTEGRATES * np.max(size)):
+        raise ValueError(
+            "omega_c = None: a learner takes its scales from the bandwidth of the loop, and the "
+            "observer has no model of a stable plant that tells it; give omega_c, the bandwidth "
+            "[rad/s] of the loop that u_0 closes"
+        )
+    return float(np.exp(np.mean(np.log(np.abs(slowest)))))
