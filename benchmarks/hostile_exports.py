@@ -11,7 +11,8 @@ conversions to integers, and the first report ends the row; ``--sanitizer memory
 for what is read before it is set. After each call u is looked at: that of
 the call if it returns one, else that of a step of a copy of the state. It must be a number within
 the limits in use. Memory images are saved and loaded between them: whole, cut, damaged, and with
-any numbers behind a right check; one that is refused must change nothing. Bits are compared to find NaN, which no option of a compiler can change.
+any numbers behind a right check; one that is refused must change nothing. Bits are compared to find
+NaN, which no option of a compiler can change.
 
 10^7 calls of all rows take some hours of a core: ``--results`` names a file to which each row is
 added when it is ready, and whose rows are not run again; ``--part I/N`` takes each N-th row.

@@ -3,12 +3,12 @@
     python benchmarks/lost_index.py FILE [--starts 12] [--seed 1] [--speed 0.1] [--only LEARNER]
 
 FILE is the record of ``cogging.py``, and so are motor and gains. A drive turns and learns for a
-minute, and its memory is saved. Then the power is off: another controller takes the memory over, and
-the encoder counts from an angle by chance, at which the axis stands. Judged is the RMS error of the
-position over that of MF-ESO in the same parts: the last revolution before the stop, the first one
-after the start, its second half, and the second one. ``anew`` is the same learner without recall.
-``another motor`` has the same amplitudes with other phases from the start on: the map must not be
-used. For it the figures are over MF-ESO's on that motor.
+minute, and its memory is saved. Then the power is off: another controller takes the memory over,
+and the encoder counts from an angle by chance, at which the axis stands. Judged is the RMS error of
+the position over that of MF-ESO in the same parts: the last revolution before the stop, the first
+one after the start, its second half, and the second one. ``anew`` is the same learner without
+recall. ``another`` motor has the same amplitudes with other phases from the start on: the map must
+not be used. For it the figures are over MF-ESO's on that motor.
 
 Before that, how often chance fits: maps with the same amplitudes and random phases, judged as the
 learner does, after a quarter and after half of a revolution.
@@ -146,7 +146,9 @@ def main() -> None:
     other = motor(other_phases(cogging, rng))
     first = motor(cogging)
     names = list(parts(np.ones(10**5), np.ones(10**5), 0.1))
-    table = Table("learner", "guard", "motor", *names, title="RMS error over MF-ESO's: median / worst")
+    table = Table(
+        "learner", "guard", "motor", *names, title="RMS error over MF-ESO's: median / worst"
+    )
     for motor_name, second in (("the same", first), ("another", other)):
         plain = restarted(first, second, None, None, starts, options.speed)
         for name, features in LEARNERS.items():

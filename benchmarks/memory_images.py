@@ -2,12 +2,12 @@
 
     python benchmarks/memory_images.py [--samples 10000] [--damaged 1e6]
 
-*Bits.* A controller with a learner and a guard runs in a loop in this process. Its image is loaded by
-another process, by exported C, and the image of that by a third process. Each continues for so many
-samples; u is compared bit by bit, in double and in single precision.
+*Bits.* A controller with a learner and a guard runs in a loop in this process. Its image is loaded
+by another process and by exported C, and the image of that by Python again. Each continues for so
+many samples; u is compared bit by bit, in double and in single precision.
 
-*Damage.* So many images are damaged in ways drawn by chance: a bit, some bytes, a run of equal bytes
-as of an erased page, two parts exchanged, a part of an older image, a cut, other bytes altogether.
+*Damage.* So many images are damaged in ways drawn by chance: a bit, some bytes, a run of equal
+bytes as of an erased page, a part moved, a part of an older image, a cut, other bytes altogether.
 Exported C must refuse each of them, and the state must be the same afterwards. A hundredth of them
 are given to Python, too. The script ends with 1 if a bit differs or a damaged image is taken.
 """
@@ -37,7 +37,13 @@ _CODE = r"""
 #include <stdlib.h>
 #include <stdint.h>
 static uint64_t seed = 88172645463325252ULL;
-static uint64_t bits(void) { seed ^= seed << 13; seed ^= seed >> 7; seed ^= seed << 17; return seed; }
+static uint64_t bits(void)
+{
+    seed ^= seed << 13;
+    seed ^= seed >> 7;
+    seed ^= seed << 17;
+    return seed;
+}
 /* Return how many damaged images were taken, or changed the state. */
 long damaged(servo_state *state, const unsigned char *good, const unsigned char *older, long count)
 {
@@ -120,7 +126,7 @@ def bits(single: bool, samples: int, folder: Path) -> list[str]:
     mine = stepped(law, samples, samples)
     other, later = in_another_process(folder, image, single, samples, samples)
     loaded = in_c.load(image)
-    # The compiled kernels use FMA, the exported code does not: C is compared with kernels in Python.
+    # Compiled kernels use FMA, the exported code does not: C is compared with kernels in Python.
     u_c = np.array([in_c.run("step", *row) for row in signals(samples, samples).tolist()])
     saved = in_c.save(len(image))
     plain = controller(single)
@@ -210,9 +216,16 @@ def main() -> None:
     if options.child:
         child(*json.loads(options.child))
         return
-    heads = ("precision", "image [B]", "Python → Python: other u, image", "→ C: loaded, other u, image")
+    heads = (
+        "precision",
+        "image [B]",
+        "Python → Python: other u, image",
+        "→ C: loaded, other u, image",
+    )
     table = Table(*heads, "→ Python: other u", title=f"{options.samples} samples each")
-    other = Table("precision", "damaged, C", "taken or changed", "Python", "taken", "unchanged", "[s]")
+    other = Table(
+        "precision", "damaged, C", "taken or changed", "Python", "taken", "unchanged", "[s]"
+    )
     right = True
     with tempfile.TemporaryDirectory() as place:
         for single in (False, True):

@@ -196,7 +196,9 @@ def main() -> None:
         sys.exit(f"{tool} is not installed; {emulator.INSTALL}")
     rows, runs = [], dict[str, ql.Trajectory]()
     heads = ("controller", "processor", "precision", "instructions, mean", "most", "code [B]")
-    table = Table(*heads, "constants [B]", "state [B]", "stack [B]", *_MEMORY, "u − double", "golden [ulp]")
+    table = Table(
+        *heads, "constants [B]", "state [B]", "stack [B]", *_MEMORY, "u − double", "golden [ulp]"
+    )
     table.title = f"arm-none-eabi-gcc {arguments.optimise}"
     for case in cases():
         if case.name not in runs:

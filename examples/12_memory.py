@@ -1,11 +1,11 @@
 """A servo on an emulated Cortex-M4F learns its cogging, loses its power, and knows it again.
 
 The motor has cogging of five orders, up to 0.08 N m, and an encoder without index pulse. The
-controller is exported in single precision. On the first day the axis turns and learns, and saves its
-memory to flash: here a file. The emulator is then ended, and started again: on the second day the
-program loads the image, the encoder counts from another angle, and the map is found again, shifted,
-within half a revolution. The same image then tells Python what was learned, and a new firmware is
-exported that begins with it.
+controller is exported in single precision. On the first day the axis turns and learns, and saves
+its memory to flash: here a file. The emulator is then ended, and started again: on the second day
+the program loads the image, the encoder counts from another angle, and the map is found again,
+shifted, within half a revolution. The same image then tells Python what was learned, and a new
+firmware is exported that begins with it.
 """
 
 import subprocess
@@ -48,7 +48,9 @@ def day(folder: Path, law: ql.ADRC, halves: int, start: float) -> tuple[str, lis
     board = emulator.BOARDS["Cortex-M4F"]
     emulator.build(board, folder / "servo.elf", parts, f"-I{folder}", *flags)
     command = emulator.emulated(board, folder / "servo.elf", "-serial", "none")
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=300, check=False
+    )
     if done.returncode:
         raise RuntimeError(done.stdout + done.stderr)
     first, *errors = done.stdout.split("\n")

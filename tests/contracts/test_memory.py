@@ -13,9 +13,9 @@ import pytest
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.controllers.memory import CHECK, HEADER, check_of
-from quell.export import TranslationError, c_source
+from quell.export import c_source
+from tests.in_c import InC, needs_gcc
 
-from ..in_c import InC, needs_gcc
 from .examples import LEARNERS, OBSERVERS, PYTHON_LEARNERS
 from .test_controllers import CONTROLLERS
 
@@ -98,7 +98,9 @@ def test_python_and_c_continue_each_others_loops(tmp_path: Path, name: str, sing
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", [f"learner: {each}" for each in ("Kalman", "RLS", "Harmonic", "Repetitive", "MLP")])
+@pytest.mark.parametrize(
+    "name", [f"learner: {each}" for each in ("Kalman", "RLS", "Harmonic", "Repetitive", "MLP")]
+)
 def test_what_was_learned_begins_from_rest(tmp_path: Path, name: str) -> None:
     """As an image without resume, and as an export of the controller: both are the same in C and Python."""
     controller, signals = made(name, False), Signals()
@@ -107,7 +109,9 @@ def test_what_was_learned_begins_from_rest(tmp_path: Path, name: str) -> None:
     image = controller.memory()
     rested = made(name, False)
     rested.restore(image)
-    plain, learned = (InC(c_source(each, "servo"), tmp_path) for each in (made(name, False), rested))
+    plain, learned = (
+        InC(c_source(each, "servo"), tmp_path) for each in (made(name, False), rested)
+    )
     assert loaded(plain, image, resume=False)
     for _ in range(_SAMPLES // 2):
         r, y = next(signals)

@@ -181,7 +181,7 @@ def _zero_places(state: Any, arrays: dict[str, NDArray[Any]]) -> tuple[int, ...]
     for array in arrays.values():
         for loop in loops:
             if np.shares_memory(array, loop):
-                found.append(at + list(loop.dtype.names).index("manual"))
+                found.append(at + [*(loop.dtype.names or ())].index("manual"))
         at += array.size
     return tuple(found)
 
@@ -222,9 +222,7 @@ def check_of(data: bytes) -> int:
 
 def written_image(known: Layout, origin: int = 0) -> bytes:
     """Return the image of a state, given by the layout of its controller."""
-    head = HEADER.pack(
-        MAGIC, VERSION, known.width, known.size, origin, known.layout, known.design
-    )
+    head = HEADER.pack(MAGIC, VERSION, known.width, known.size, origin, known.layout, known.design)
     kind = "<f4" if known.width == 4 else "<f8"
     parts = [np.asarray(array, dtype=kind) for array in known.arrays.values()]
     finite = (np.where(np.isfinite(part), part, 0.0).astype(kind) for part in parts)
@@ -239,7 +237,7 @@ _MOST_BYTES = 100_000_000
 def file_content(path: str | os.PathLike[str]) -> bytes:
     """Return the bytes of a file that may be an image; a ``ValueError`` says why there are none."""
     try:
-        size = os.stat(path).st_size
+        size = Path(path).stat().st_size
         if size > _MOST_BYTES:
             raise ValueError(f"the file has {size} bytes: it is no memory image of quell")
         return Path(path).read_bytes()
@@ -281,8 +279,8 @@ def read_image(known: Layout, image: Any, *, running: bool) -> dict[str, NDArray
     if width != known.width:
         names = {4: "single", 8: "double"}
         raise ValueError(
-            f"image is in {names.get(width, 'unknown')} precision: must be in {names[known.width]}, "
-            "as the controller is; restore it into a controller of its own precision"
+            f"image is in {names.get(width, 'unknown')} precision: must be in "
+            f"{names[known.width]}, as the controller is; restore it into one of its own precision"
         )
     if layout != known.layout or size != known.size:
         raise ValueError(

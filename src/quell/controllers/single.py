@@ -238,8 +238,8 @@ class SinglePrecision(Wrapper):
     """A controller in single precision; make it with ``in_single_precision``.
 
     The given controller is copied and not changed; what it has learned is kept.
-    ``parameters.controller`` and the state are single. If it is an ADRC, or one behind a prefilter, the methods for start, manual operation and
-    retuning are available here, too.
+    ``parameters.controller`` and the state are single. If it is an ADRC, or one behind a prefilter,
+    the methods for start, manual operation and retuning are available here, too.
     """
 
     def __init__(self, controller: Controller) -> None:

@@ -413,4 +413,3 @@ class StatefulController(Described):
             saved[name] = np.empty((), dtype=object)
             saved[name][()] = snapshot
         return saved
-

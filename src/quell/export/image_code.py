@@ -34,6 +34,15 @@ _LARGEST_INTEGER = 2**24
 _CODE = """
 /* ---- The memory image: little-endian, see NAME_save ---- */
 
+/* Called with constants: a copy for each call would be as large as the controller. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define MEMORY_RARE __attribute__((noinline, noclone))
+#elif defined(__GNUC__)
+#define MEMORY_RARE __attribute__((noinline))
+#else
+#define MEMORY_RARE
+#endif
+
 static void memory_put_word(unsigned char *image, int at, uint32_t word)
 {
     image[at] = (unsigned char)(word & 0xffU);
@@ -87,7 +96,7 @@ static int memory_whole(REAL x)
 }
 
 /* Write the numbers from k on. */
-static void memory_put_all(unsigned char *image, int k, const REAL *x, int count)
+static MEMORY_RARE void memory_put_all(unsigned char *image, int k, const REAL *x, int count)
 {
     for (int i = 0; i < count; i++) {
         memory_put(image, k + i, x[i]);
@@ -95,7 +104,7 @@ static void memory_put_all(unsigned char *image, int k, const REAL *x, int count
 }
 
 /* Read the numbers from k on. */
-static void memory_get_all(const unsigned char *image, int k, REAL *x, int count)
+static MEMORY_RARE void memory_get_all(const unsigned char *image, int k, REAL *x, int count)
 {
     for (int i = 0; i < count; i++) {
         x[i] = memory_get(image, k + i);
@@ -103,7 +112,7 @@ static void memory_get_all(const unsigned char *image, int k, REAL *x, int count
 }
 
 /* Return the check of an image: FNV-1a with 64 bits over words of 32 bits. */
-static uint64_t memory_check(const unsigned char *image)
+static MEMORY_RARE uint64_t memory_check(const unsigned char *image)
 {
     uint64_t check = BEGINULL;
 
@@ -114,7 +123,7 @@ static uint64_t memory_check(const unsigned char *image)
 }
 RANGES
 /* Return whether an image is whole and of this controller. */
-static bool memory_fits(const unsigned char *image, size_t length, bool resume)
+static MEMORY_RARE bool memory_fits(const unsigned char *image, size_t length, bool resume)
 {
     if (length != SIZEU || memory_get_word(image, 0) != MAGICU
         || memory_get_word(image, 4) != KINDU || memory_get_word(image, 8) != SIZEU
@@ -215,7 +224,11 @@ class ImageCode:
             self.load.append(f"    {value.code} = memory_get(image, {at});")
         else:
             real, zero = self.structs.literals.real, self.write(0.0)
-            found, low, high = f"memory_whole(memory_get(image, {at}))", -_LARGEST_INTEGER, _LARGEST_INTEGER
+            found, low, high = (
+                f"memory_whole(memory_get(image, {at}))",
+                -_LARGEST_INTEGER,
+                _LARGEST_INTEGER,
+            )
             shown = f"({real}){value.code}"
             if value.kind is Number.BOOL:
                 found, low, high = f"memory_get(image, {at}) != {zero}", 0, 1

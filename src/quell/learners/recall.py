@@ -77,7 +77,7 @@ class RecallLoop(Scalars):
     searching: float  # 1 while the map is set aside
     usual: float  # mean square of the error, in units of the scaled f
     count: float  # samples in the sums
-    mean: float  # of the target
+    average: float  # of the target
     squares: float  # of the target about its mean
     sine: float  # the first pair in the last sample
     cosine: float
@@ -157,9 +157,9 @@ def _add(rule: RecallRule, memory: RecallMemory, features: Vector, target: float
         if (i < rule.first or i >= rule.first + size) and i != rule.constant:
             target -= memory.stored[i] * features[i]
     loop.count += 1.0
-    before = target - loop.mean
-    loop.mean += before / loop.count
-    after = target - loop.mean
+    before = target - loop.average
+    loop.average += before / loop.count
+    after = target - loop.average
     loop.squares += before * after
     for i in range(size):
         away[i] = features[rule.first + i] - means[i]
@@ -234,7 +234,7 @@ def _decide(rule: RecallRule, memory: RecallMemory, theta: Vector) -> None:
     fits = loop.left <= min(most, _LARGEST * loop.squares)
     if span >= _LEAST and fits:
         _shift(rule, memory, loop.best)
-        constant = loop.mean
+        constant = loop.average
         for i in range(memory.shifted.size):
             constant -= memory.shifted[i] * memory.means[i]
         for i in range(theta.size):
@@ -260,7 +260,7 @@ def _begin_passes(loop: RecallLoop) -> None:
 @kernel
 def _clear_sums(memory: RecallMemory) -> None:
     loop = memory.loop[0]
-    loop.count = loop.mean = loop.squares = 0.0
+    loop.count = loop.average = loop.squares = 0.0
     loop.sine = loop.cosine = loop.turned = loop.low = loop.high = 0.0
     for i in range(memory.means.size):
         memory.means[i] = memory.products[i] = 0.0

@@ -482,13 +482,13 @@ class RLS(Linear):
         self.recall = checks.flag("recall", recall)
         if self.recall and self.strongest is not None:
             raise ValueError(
-                f"recall = True, strongest = {strongest!r}: a map is recalled as a whole; leave one "
-                "of them out, or name the map's orders, Periodic(orders=...)"
+                f"recall = True, strongest = {strongest!r}: a map is recalled as a whole; leave "
+                "one of them out, or name the map's orders, Periodic(orders=...)"
             )
         if self.recall and len(_periodic_blocks(self.features)) != 1:
             raise ValueError(
-                "recall = True: the features must have one block Periodic, whose map is looked for; "
-                "for example features=Periodic(orders=(7, 28)) + Bias()"
+                "recall = True: the features must have one block Periodic, whose map is looked "
+                "for, for example features=Periodic(orders=(7, 28)) + Bias()"
             )
 
     def rule(self, observer: ESO, omega_c: float, features: int) -> Any:
