@@ -186,3 +186,19 @@ def test_what_it_cannot_promise_is_refused(make: Any, message: str) -> None:
     """With the number that is needed, where there is one."""
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_in_single_precision_it_starts_retunes_and_keeps_the_band() -> None:
+    """From given estimates, with another omega_o in mid-run, as in double precision."""
+    observer = ql.ESO.model_free(2, 2.0, omega_o=150.0, dt=DT)
+    adrc = ql.ADRC(observer, omega_c=15.0, safe_set=ql.SafeSet(-1.0, 1.0, alpha=12.0))
+    for controller in (adrc, ql.controllers.in_single_precision(adrc)):
+        controller.start_at([0.9, 0.0], f=-0.5, u=0.25)
+        plant, most = Hostile(2, 2.0, 0.0), 0.0
+        plant.x[0], plant.f = 0.9, -0.5
+        for k in range(600):
+            if k == 300:
+                controller.retune(observer=ql.ESO.model_free(2, 2.0, omega_o=120.0, dt=DT))
+            plant.advance(controller.step(3.0, plant.x[0]), 0.0)
+            most = max(most, plant.x[0])
+        assert 0.99 < most <= 1.0 + 1e-6

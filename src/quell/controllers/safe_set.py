@@ -219,7 +219,7 @@ def shift_f(design: Any, memory: Any, change: float) -> None:
 
 @shift_f.register(SafeSetDesign)
 def _shift_f(design: SafeSetDesign, memory: SafeSetMemory, change: float) -> None:
-    last = memory.z.size - 1
+    last = memory.seen.size - 1
     memory.z[last] += change
     memory.seen[last] += change
 
@@ -242,8 +242,9 @@ def _settle_at_rest(
 def settle_safe_set(design: Any, memory: Any, x: Vector, f: float) -> None:
     """Set the observer of a safe set to given estimates, for a plant that is known there."""
     if isinstance(design, SafeSetDesign):
-        memory.z[:-1] = memory.seen[:-1] = x
-        memory.z[-1] = memory.seen[-1] = f
+        size = memory.seen.size
+        memory.seen[:] = np.append(x, f)
+        memory.z[:size], memory.z[size:] = memory.seen, 0.0
         memory.loop[0].started = 1.0
 
 
