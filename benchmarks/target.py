@@ -41,6 +41,8 @@ _COUNTING = ("-icount", "shift=10,sleep=off")
 _KNOWN = 1000.0
 DRIVE = ql.plants.LinearPlant(A=[[0.0, 1.0], [0.0, -0.6]], B=[0.0, 5.0], C=[1.0, 0.0])
 
+# The memory image, and instructions that it takes to save and to load it.
+_MEMORY = ("image [B]", "save", "load")
 OPTIMISE = "-O2 -fpeel-loops"
 TYPES = {"single": ("float", np.float32), "double": ("double", np.float64)}
 
@@ -157,6 +159,9 @@ def measured(
         "constants": constants,
         "state": found["state"],
         "stack": found["stack"],
+        "image": found["image"],
+        "save": found["save"],
+        "load": found["load"],
         "difference": found["difference"],
     }
 
@@ -182,7 +187,7 @@ def shown(case: Case, found: dict[str, float]) -> list[str]:
         over = "" if bar is None else f" ≤ {bar:.0f}" if found[name] <= bar else f" > {bar:.0f} (!)"
         return f"{found[name]:.0f}{over}"
 
-    names = ("instructions", "most", "code", "constants", "state", "stack")
+    names = ("instructions", "most", "code", "constants", "state", "stack", "image", "save", "load")
     last = (f"{found['difference']:.1e}", f"{found['golden']:.3g}")
     return [case.name, case.board, case.precision, *map(text, names), *last]
 
@@ -198,7 +203,9 @@ def main() -> None:
         sys.exit(f"{tool} is not installed; {emulator.INSTALL}")
     rows, runs = [], dict[str, ql.Trajectory]()
     heads = ("controller", "processor", "precision", "instructions, mean", "most", "code [B]")
-    table = Table(*heads, "constants [B]", "state [B]", "stack [B]", "u − double", "golden [ulp]")
+    table = Table(
+        *heads, "constants [B]", "state [B]", "stack [B]", *_MEMORY, "u − double", "golden [ulp]"
+    )
     table.title = f"arm-none-eabi-gcc {arguments.optimise}"
     for case in cases():
         if case.name not in runs:

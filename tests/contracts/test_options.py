@@ -150,7 +150,7 @@ CASES: dict[str, dict[str, Case]] = {
     "run": {"SETUP": ("--no-figures",), "--example": (("--example",), _SETUP), "--save": ("--save", "run.nc")},
     "run-rig": {
         "SETUP": (_OF_SETUP, ("other.toml", *_FIGURES)), "--example": ("--example",), "--device": ("--device", "twin:torsional"), "--seconds": ("--seconds", "2"), "--omega-c": ("--omega-c", "3"),
-        "--omega-o": ("--omega-o", "9"), "--spin": ("--spin", "0.001"), "--priority": ("--priority", "0"), "--mcap": ("--mcap", "new.mcap"), "--csv": ("--csv", "new.csv"),
+        "--omega-o": ("--omega-o", "9"), "--spin": ("--spin", "0.001"), "--priority": ("--priority", "0"), "--mcap": ("--mcap", "new.mcap"), "--csv": ("--csv", "new.csv"), "--memory": ("--memory", "servo.qllm"),
         "--live": ("--live", "0"), "--live-origin": ("--live-origin", "https://a.org"), "--watch": ("--watch", "new.json"), "--save": ("--save", "taken.json"),
     },
     "replay": {"RECORD": ("other.csv",), "--setup": ("--setup", "other.toml"), "--save": ("--save", "taken.json")},
@@ -160,7 +160,7 @@ CASES: dict[str, dict[str, Case]] = {
     },
     "export": {
         "SETUP": ("other.toml",), "--to": ("--to", "fmu"), "--out": ("--out", "d"), "--name": ("--name", "servo"), "--precision": ("--precision", "single"), "--what": ("--what", "loop"),
-        "--resolution": ("--resolution", "0.01"), "--accept": ("--accept",),
+        "--resolution": ("--resolution", "0.01"), "--memory": ("--memory", "servo.qllm"), "--accept": ("--accept",),
         "--prove": ("--prove",),
     },
     "studio": {"SETUP": (("--no-browser",), ("setup.toml", "--no-browser")), "--port": ("--port", "0"), "--browser": (_SETUP, (*_SETUP, "--no-browser"))},

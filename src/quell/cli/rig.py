@@ -252,6 +252,7 @@ def run_rig(
     priority: WholeOrNone = None,
     mcap: Path | None = None,
     csv: Path | None = None,
+    memory: Path | None = None,
     live: WholeOrNone = None,
     live_origin: list[str] | None = None,
     watch: Path | None = None,
@@ -285,6 +286,9 @@ def run_rig(
         PlotJuggler read it.
     csv
         The same, ending in .csv.
+    memory
+        File in which what the controller learns outlives the run: it begins with what is there, and
+        replaces it at the end, unless a fault has ended the run, and at SIGUSR1.
     live
         Port for Foxglove and PlotJuggler to watch at.
     live_origin
@@ -308,6 +312,7 @@ def run_rig(
         "priority": priority,
         "mcap": mcap,
         "csv": csv,
+        "memory": memory,
         "live": live,
         "watch": watch,
     }
@@ -323,6 +328,7 @@ def run_rig(
         ("rig", "device"): device,
         ("rig", "spin"): spin,
         ("rig", "priority"): priority,
+        ("rig", "memory"): memory if memory is None else str(memory),
         ("scenario", "duration"): seconds,
         ("controller", "omega_c"): omega_c,
         ("observer", "omega_o"): omega_o,

@@ -142,6 +142,8 @@ def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
     telemetry
         files for the record, ending in ``.mcap`` or ``.csv``; relative to the folder where the
         command is run.
+    memory
+        file in which what the controller learns outlives the run; relative to that folder, too.
     """
     return {"device": device, "live": live, **options}
 
@@ -295,7 +297,12 @@ _Y_AND_U = {"y": str, "u": str}
 Safety = call_table("safety", RigSafety, only=True)
 _LABELS = {"w": list_of(str)} | _Y_AND_U
 Labels = call_table("signals", Signals.of, only=True, types=_LABELS, without=("f",))
-_RIG = {"safety": Safety | None, "telemetry": list_of(str), "signals": Labels | None}
+_RIG = {
+    "safety": Safety | None,
+    "telemetry": list_of(str),
+    "signals": Labels | None,
+    "memory": str | None,
+}
 _BOUNDS = tuple(inspect.signature(Constraints).parameters)
 _NOT_IN_FILES = (
     *("constraints", "operating_point", "uncertain", "setup", "progress"),

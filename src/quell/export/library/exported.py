@@ -60,6 +60,11 @@ _OPERATIONS = {
         "once, before the first step after manual operation; false before the first sample",
     ),
     "retune": ("retune(s, &parameters)", "between two samples: other parameters, without a jump"),
+    "save": ("save(s, image)", "any time: all that the controller knows, as bytes"),
+    "load": (
+        "load(s, image, length, resume)",
+        "after the init: what was saved; false, and nothing changed, if it does not fit",
+    ),
     "reset": ("reset(s)", "from rest at the next sample; what was learned is kept"),
     "stopping_point": (
         "stopping_point(s)",
