@@ -46,9 +46,10 @@ DEVIATIONS = {
     "15.5": "advisory: a function may return early, as the function in Python does",
     "17.8": "advisory: an argument may be changed, as in Python",
     "19.2": "advisory: arrays that are never used at once share their place in a union",
+    "21.15": "required: memcpy is the way to the bits of a number that C defines",
     "2.3": "advisory: NAME_real, and structs of which only members are used, are for programs",
     "2.4": "advisory: the enums of flags and reasons are for programs",
-    "2.5": "advisory: NAME_SAMPLE_TIME and NAME_ORDER are for programs",
+    "2.5": "advisory: NAME_SAMPLE_TIME and the like are for programs",
     FLOAT_EQUAL: "flags that are 0 or 1, exact zeros, and x == x, which finds NaN",
 }  # fmt: skip
 """Rules that exported code does not keep, and why."""

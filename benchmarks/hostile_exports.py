@@ -10,7 +10,9 @@ compiles program and controller with its sanitizers of addresses and of undefine
 conversions to integers, and the first report ends the row; ``--sanitizer memory`` has clang look
 for what is read before it is set. After each call u is looked at: that of
 the call if it returns one, else that of a step of a copy of the state. It must be a number within
-the limits in use. Bits are compared to find NaN, which no option of a compiler can change.
+the limits in use. Memory images are saved and loaded between them: whole, cut, damaged, and with
+any numbers behind a right check; one that is refused must change nothing. Bits are compared to find
+NaN, which no option of a compiler can change.
 
 10^7 calls of all rows take some hours of a core: ``--results`` names a file to which each row is
 added when it is ready, and whose rows are not run again; ``--part I/N`` takes each N-th row.
@@ -47,7 +49,7 @@ SANITIZERS = {
 # How often each function is called, of a million calls. ``start`` takes thousands of steps.
 SHARES = {"applied": 60_000, "track": 80_000, "hand_over": 20_000, "start": 200, "reset": 200,
           "retune": 1000, "status": 5000, "get_estimate": 20_000, "stopping_point": 20_000,
-          "step_counts": 150_000}  # fmt: skip
+          "step_counts": 150_000, "save": 3000, "load": 3000}  # fmt: skip
 HEADS = ("controller", "precision", "functions", "calls", "reports", "u not finite",
          "u beyond limits", "time [s]")  # fmt: skip
 
@@ -175,6 +177,52 @@ static void check_copy(const NAME_state *state)
 }
 """
 
+_IMAGES = r"""
+static unsigned char image[MEMORY_SIZE], before[MEMORY_SIZE];
+
+static void put_check(void) /* for images that pass, whatever is in them */
+{
+    uint64_t found = UINT64_C(14695981039346656037);
+    for (int at = 0; at < (int)sizeof image - 8; at += 4) {
+        uint64_t word = 0;
+        for (int i = 3; i >= 0; i--)
+            word = word << 8 | image[at + i];
+        found = (found ^ word) * UINT64_C(1099511628211);
+    }
+    for (int i = 0; i < 8; i++)
+        image[sizeof image - 8 + i] = (unsigned char)(found >> (8 * i));
+}
+
+static void load(NAME_state *state)
+{
+    const int kind = (int)(bits() % 4), numbers = ((int)sizeof image - 40) / (int)sizeof(REAL);
+    size_t length = sizeof image;
+    if (bits() & 1)
+        NAME_save(state, image);
+    put_check();
+    if (kind == 1) { /* damaged: refused, with nothing changed */
+        image[bits() % sizeof image] ^= (unsigned char)(1 + bits() % 255);
+    } else if (kind == 2) { /* cut */
+        length = bits() % sizeof image;
+    } else if (kind == 3) { /* other numbers, with a check that is right */
+        for (int i = (int)(bits() % 8); i >= 0; i--) {
+            const REAL x = bits() & 1 ? hostile() : (REAL)((int)(bits() % 2048) - 1024);
+            memcpy(image + 32 + sizeof x * (bits() % (uint64_t)numbers), &x, sizeof x);
+        }
+        put_check();
+    }
+    NAME_state copy = *state;
+    const bool loaded = NAME_load(state, image, length, bits() & 1);
+    not_finite += loaded && (kind == 1 || kind == 2);
+    if (!loaded) {
+        NAME_save(&copy, before);
+        NAME_save(state, image);
+        not_finite += memcmp(before, image, sizeof image) != 0;
+    }
+    note(loaded);
+}
+"""
+
 _MAIN = r"""
 int main(int count, char **arguments)
 {
@@ -249,6 +297,10 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
             lines += [f"note_real((REAL){each});" for each in channels]
         elif operation == "stopping_point":
             lines = [f"note_real({call[:-1]});"]
+        elif operation == "save":
+            lines = [f"{name}_save(state, image);", "note(image[sizeof image - 8]);"]
+        elif operation == "load":
+            lines = ["load(state);", "check_copy(state);"]
         elif operation == "status":
             lines = [f"note((uint64_t){call[:-1]});"]
         else:
@@ -279,6 +331,7 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
         "EXPONENT": "0x7f800000u" if single else "UINT64_C(0x7ff0000000000000)",
         "LARGEST": "1e12f" if single else "1e60",
         "DIGITS": "60.0" if single else "300.0",
+        "MEMORY_SIZE": f"{name.upper()}_MEMORY_SIZE",
         "SAMPLE_TIME": f"{name.upper()}_SAMPLE_TIME",
         "SEED": f"UINT64_C({0x9E3779B97F4A7C15 + seed})",
         "LIMITS_CHECK": f"beyond += u < state->parameters->{path}.low || "
@@ -287,7 +340,7 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
         "HOSTILE_DERIVATIVES": drawn,
         "DERIVATIVES": drawn,
     }  # fmt: skip
-    text = _HELPERS + _MAIN.replace("CASES", "".join(cases))
+    text = _HELPERS + _IMAGES + _MAIN.replace("CASES", "".join(cases))
     for word, value in words.items():
         text = text.replace(word, value)
     headers = ("float.h", "math.h", "stdint.h", "stdio.h", "stdlib.h", "string.h")

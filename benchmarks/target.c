@@ -26,6 +26,7 @@ extern const struct {
 
 static counted_state state;
 static uint32_t counts[SAMPLES];
+static unsigned char image[COUNTED_MEMORY_SIZE];
 static REAL u[SAMPLES];
 
 static inline uint32_t ticks_since(uint32_t before) { return (before - TIMER[2]) & 0xFFFFFFu; }
@@ -70,6 +71,12 @@ int main(void)
     double empty = TICKS_OF(""), known = TICKS_OF(".rept 1000\n\tnop\n\t.endr\n\t") - empty;
     counted_init(&state);
     uint32_t stack = run();
+    uint32_t before = TIMER[2];
+    counted_save(&state, image);
+    double save = (ticks_since(before) - empty) / TICKS_PER_INSTRUCTION;
+    before = TIMER[2];
+    int loaded = counted_load(&state, image, sizeof image, true);
+    double load = (ticks_since(before) - empty) / TICKS_PER_INSTRUCTION;
     double sum = 0.0, most = 0.0, error = 0.0, square = 0.0;
     for (int k = 0; k < SAMPLES; k++) {
         double count = (counts[k] - empty) / TICKS_PER_INSTRUCTION;
@@ -80,6 +87,8 @@ int main(void)
     }
     printf("known %.9g\nmean %.9g\nmost %.9g\n", known / TICKS_PER_INSTRUCTION, sum / SAMPLES, most);
     printf("stack %lu\nstate %lu\n", (unsigned long)stack, (unsigned long)sizeof state);
+    printf("save %.9g\nload %.9g\n", save, loaded ? load : -1.0);
+    printf("image %lu\n", (unsigned long)sizeof image);
     printf("difference %.9g\n", sqrt(error / square));
     exit(0);
 }

@@ -41,6 +41,8 @@ _COUNTING = ("-icount", "shift=10,sleep=off")
 _KNOWN = 1000.0
 DRIVE = ql.plants.LinearPlant(A=[[0.0, 1.0], [0.0, -0.6]], B=[0.0, 5.0], C=[1.0, 0.0])
 
+# The memory image, and instructions that it takes to save and to load it.
+_MEMORY = ("image [B]", "save", "load")
 OPTIMISE = "-O2 -fpeel-loops"
 TYPES = {"single": ("float", np.float32), "double": ("double", np.float64)}
 
@@ -79,6 +81,10 @@ def cases() -> list[Case]:
     fed = ql.ADRC(observer, omega_c=10.0, feedforward=ql.Feedforward.of(DRIVE), **limits)
     moving = ql.controllers.Prefiltered(fed, ql.controllers.ProfileGenerator(2.0, 20.0, 500.0))
     pid = ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits)
+    on_top = ql.Compensator(observer, **limits)
+    both = ql.Compensated(pid, on_top)
+    bands = ql.SafeSet(-1.5, 1.5, alpha=8.0, f_rate=1.0)
+    safe = ql.ADRC(observer, omega_c=10.0, safe_set=bands, **limits)
     learners = ql.learners
     guarded = law(learners.Kalman(), ql.Guard())
     network, process = law(learners.MLP(hidden=5)), law(learners.GaussianProcess(budget=20))
@@ -92,6 +98,9 @@ def cases() -> list[Case]:
         Case("MF-ESO, order 2, three tables", m4, "single", DRIVE, of_all),
         Case("MF-ESO, order 2, b0 online", m4, "single", DRIVE, online),
         Case("MF-ESO, order 2", m7, "double", DRIVE, mf),
+        Case("compensator, order 2", m4, "single", DRIVE, on_top),
+        Case("PID with a compensator", m4, "single", DRIVE, both),
+        Case("MF-ESO, order 2, safe set", m4, "single", DRIVE, safe),
         Case("MF-ESO, order 2, f and f'", m4, "single", DRIVE, mf_2),
         Case(moves, m4, "single", DRIVE, moving),
         Case(moves, m7, "double", DRIVE, moving),
@@ -163,6 +172,9 @@ def measured(
         "constants": constants,
         "state": found["state"],
         "stack": found["stack"],
+        "image": found["image"],
+        "save": found["save"],
+        "load": found["load"],
         "difference": found["difference"],
     }
 
@@ -188,7 +200,7 @@ def shown(case: Case, found: dict[str, float]) -> list[str]:
         over = "" if bar is None else f" ≤ {bar:.0f}" if found[name] <= bar else f" > {bar:.0f} (!)"
         return f"{found[name]:.0f}{over}"
 
-    names = ("instructions", "most", "code", "constants", "state", "stack")
+    names = ("instructions", "most", "code", "constants", "state", "stack", "image", "save", "load")
     last = (f"{found['difference']:.1e}", f"{found['golden']:.3g}")
     return [case.name, case.board, case.precision, *map(text, names), *last]
 
@@ -204,7 +216,9 @@ def main() -> None:
         sys.exit(f"{tool} is not installed; {emulator.INSTALL}")
     rows, runs = [], dict[str, ql.Trajectory]()
     heads = ("controller", "processor", "precision", "instructions, mean", "most", "code [B]")
-    table = Table(*heads, "constants [B]", "state [B]", "stack [B]", "u − double", "golden [ulp]")
+    table = Table(
+        *heads, "constants [B]", "state [B]", "stack [B]", *_MEMORY, "u − double", "golden [ulp]"
+    )
     table.title = f"arm-none-eabi-gcc {arguments.optimise}"
     for case in cases():
         if case.name not in runs:

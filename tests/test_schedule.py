@@ -331,6 +331,18 @@ schedule = {schedule}
         load(file)
 
 
+def test_the_exported_library_hands_its_signals_over(tmp_path: Any) -> None:
+    """As the last arguments of a step, in the header and in both examples."""
+    law = ql.ADRC(OBSERVER, 40.0, schedule=ql.Schedule(POINTS, b0=B0), u_min=-1.0, u_max=1.0)
+    ql.export.c(law, tmp_path, name="arm", precision="single", accept=True)
+    header = (tmp_path / "src" / "arm.h").read_text()
+    assert "float arm_step(arm_state *state, float r, float y, float signal_1);" in header
+    for example in ("README.md", "examples/arm/arm.ino"):
+        text = (tmp_path / example).read_text()
+        assert "reference, y, signal_1);" in text
+        assert "float signal_1" in text
+
+
 # ---- Tuning ----
 
 

@@ -129,6 +129,7 @@ LEARNERS: ChainMap[str, Any] = ChainMap(
         "RLS on the strongest": ql.learners.RLS(
             State() + RBF(8) + Periodic(highest=4) + Bias(), strongest=9
         ),
+        "RLS with a map": ql.learners.RLS(Periodic(orders=(1, 3)) + Bias(), recall=True),
         "NLMS on random features": ql.learners.NLMS(features=RandomFourier(20)),
         "gradient on radial features": ql.learners.BatchGradient(
             features=RBF(16, states=(1,)) + Bias()

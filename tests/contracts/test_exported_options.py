@@ -126,7 +126,7 @@ PARTS: dict[str, Part] = {
     }),
     "RLS": Part(ql.learners.RLS, _learning, {}, {
         "features": Several((State() + Bias(), State() + Input(), RBF(4), Periodic())), "memory_time": 20.0, "prior": 5.0, "strongest": With(3, {"features": State() + RBF(4) + Bias()}),
-        "relearn": 5.0, **_SCALED, "gain_interval": With((0.7, 1.4), {"features": State() + Input()}),
+        "relearn": 5.0, "recall": With(True, {"features": Periodic(orders=(1, 2)) + Bias()}), **_SCALED, "gain_interval": With((0.7, 1.4), {"features": State() + Input()}),
     }),
     "NLMS": Part(ql.learners.NLMS, _learning, {}, {
         **_FEATURES, "rate": 0.1, "regularisation": 0.02, **_SCALED, "gain_interval": With((0.7, 1.4), {"features": State() + Input()}),
@@ -267,6 +267,7 @@ NO_PARTS = {
     "LinearLaw",
     "Model",
     "Notch",
+    "PidEqual",
     "Prefilter",
 }
 IN_PYTHON = {"JaxModel", "PythonModel", "RiverModel", "SklearnModel", "TorchModel"}

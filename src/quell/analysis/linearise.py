@@ -78,8 +78,8 @@ from quell.controllers.compensated import (
 from quell.controllers.compensator import Compensator
 from quell.controllers.law import AdrcState, without_forces
 from quell.controllers.linear import LinearLaw
+from quell.controllers.memory import named_arrays
 from quell.controllers.schedule import is_scheduled
-from quell.controllers.stateful import named_arrays
 from quell.guard import UnguardedDesign, UnguardedMemory
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import cos, sin

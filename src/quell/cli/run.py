@@ -270,6 +270,7 @@ def export(
     precision: Literal["double", "single"] = "double",
     what: Literal["controller", "plant", "loop"] = "controller",
     resolution: float | None = None,
+    memory: Path | None = None,
     accept: Switch = False,
     prove: Switch = False,
     trust: Trust = False,
@@ -298,6 +299,9 @@ def export(
     resolution
         Of an encoder [y-unit per count]: adds NAME_step_counts to the C code, which takes r and y
         as integers.
+    memory
+        File of `quell run-rig --memory`, or bytes of NAME_save: the exported controller begins with
+        what was learned.
     accept
         Write in single precision even if it differs too much, or can't be compared.
     prove
@@ -312,7 +316,11 @@ def export(
         if precision != "double" or accept or prove or resolution is not None:
             rule = "are for --to c; an FMU is in double"
             raise ValueError(f"--precision, --resolution, --accept and --prove: {rule}")
-        _to_fmu(load(setup, trust), what, out, name or "", overwrite)
+        if what == "plant":
+            refuse({"memory": (memory, None)}, "is of a controller; a plant has none")
+        given = load(setup, trust)
+        _learned(given.controller, memory, "double")
+        _to_fmu(given, what, out, name or "", overwrite)
         return
     if what != "controller":
         raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
@@ -323,7 +331,7 @@ def export(
         given.needed("plant")
         given.needed("scenario")
     exported = c(
-        given.controller,
+        _learned(given.controller, memory, precision),
         out,
         name=name or "controller",
         precision=precision,
@@ -337,6 +345,26 @@ def export(
     _print(given.title, exported)
     if exported.proof is not None and not exported.proof.proved:
         sys.exit(ExitCode.NOT_PROVED)
+
+
+def _learned(controller: Any, memory: Path | None, precision: str) -> Any:
+    """Return a controller with what is in a memory image, in double or in the given precision."""
+    from quell.controllers import in_single_precision
+    from quell.controllers.memory import HEADER, file_content
+
+    if memory is None:
+        return controller
+    try:
+        image = file_content(memory)
+        if not hasattr(controller, "restore"):
+            raise ValueError(f"{type(controller).__name__} has no memory image; leave it out")
+        is_single = len(image) >= HEADER.size and HEADER.unpack_from(image)[2] == 4
+        if is_single and precision == "single":
+            controller = in_single_precision(controller)
+        controller.restore(image)
+    except ValueError as error:
+        raise ValueError(f"--memory {memory}: {error}") from None
+    return controller
 
 
 def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> None:

@@ -16,6 +16,7 @@ from quell.controllers.base import Controller, omega_c_for
 from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
+from quell.controllers.from_pid import PidEqual, equal_to_pid
 from quell.controllers.law import NonlinearFeedback
 from quell.controllers.linear import LinearController, LinearLaw
 from quell.controllers.online_gain import GainEstimate, OnlineGain
@@ -43,6 +44,7 @@ __all__ = [
     "LinearLaw",
     "NonlinearFeedback",
     "OnlineGain",
+    "PidEqual",
     "Prefilter",
     "Prefiltered",
     "ProfileGenerator",
@@ -53,6 +55,7 @@ __all__ = [
     "adrc_for_dead_time",
     "baselines",
     "dead_time_tuning",
+    "equal_to_pid",
     "in_single_precision",
     "omega_c_for",
     "warn_if_unwise",

@@ -63,7 +63,7 @@ class ShaperMemory(NamedTuple):
 
 @prefilter.register(ShaperDesign)
 def _prefilter(design: ShaperDesign, memory: ShaperMemory, r: float) -> float:
-    at = int(memory.at[0])
+    at = min(max(int(memory.at[0]), 0), memory.past.size - 1)
     at = at + 1 if at < memory.past.size - 1 else 0
     memory.at[0] = at
     memory.past[at] = r
@@ -279,7 +279,7 @@ def _advance(design: ProfileDesign, memory: ProfileMemory) -> None:
     loop.p, loop.v, loop.a, loop.jerk = _motion(memory, part, t, p, v, a)
     if loop.samples >= _MOST_SAMPLES_PROFILE:
         loop.p_begin, loop.v_begin, loop.a_begin = loop.p, loop.v, loop.a
-        memory.times[min(int(part), memory.times.size - 1)] -= t
+        memory.times[min(max(int(part), 0), memory.times.size - 1)] -= t
         loop.offset = loop.samples = 0.0
 
 
@@ -308,9 +308,10 @@ def _motion(
     loop = memory.loop[0]
     if part > loop.last:
         return loop.target, 0.0, 0.0, 0.0
-    jerk = memory.jerks[int(part)]
+    place = min(max(int(part), 0), memory.jerks.size - 1)
+    jerk = memory.jerks[place]
     if part == loop.last:
-        left = memory.times[int(part)] - t
+        left = memory.times[place] - t
         way = jerk * left * left * left / 6.0
         return loop.target - way, 0.5 * jerk * left * left, -jerk * left, jerk
     way, v, a = moved(v, a, jerk, t)

@@ -34,6 +34,7 @@ from quell.controllers.compensated import Compensated, CompensatedDesign
 from quell.controllers.compensator import change_design, manual_operation
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
+from quell.controllers.memory import Layout, images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper
 from quell.controllers.safe_set import SafeSetDesign
 from quell.features.base import CustomDesign
@@ -132,7 +133,8 @@ def _with_carries(design: Any, state: Any) -> Any:
             state = state._replace(safe_set=wide)
         learner = state.learner
         if isinstance(design.learner, KalmanDesign) and needs_carries(design.learner):
-            wide = np.hstack([learner.covariance, np.zeros((learner.theta.size, 1))])
+            # Only the lower triangle; what is above has the carries.
+            wide = np.hstack([np.tril(learner.covariance), np.zeros((learner.theta.size, 1))])
             state = state._replace(learner=learner._replace(covariance=wide))
     return _with_longer(state)
 
@@ -147,7 +149,7 @@ def _with_longer(state: Any) -> Any:
     if isinstance(state, KalmanMemory):
         state = state._replace(carry=np.zeros(state.theta.size))
     if isinstance(state, KalmanMemory | NoiseGateMemory):
-        return state._replace(mean=np.zeros(2 * state.mean.size))
+        return state._replace(mean=np.append(state.mean, np.zeros(state.mean.size)))
     return state
 
 
@@ -242,15 +244,16 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
 class SinglePrecision(Wrapper):
     """A controller in single precision; make it with ``in_single_precision``.
 
-    The given controller is copied and not changed; ``parameters.controller`` and the state are
-    single. If it is an ADRC, or one behind a prefilter, the methods for start, manual operation and
-    retuning are available here, too.
+    The given controller is copied and not changed; what it has learned is kept.
+    ``parameters.controller`` and the state are single. If it is an ADRC, or one behind a prefilter,
+    the methods for start, manual operation and retuning are available here, too.
     """
 
     def __init__(self, controller: Controller) -> None:
         check_controller(controller)
         self.controller: Any = copy.deepcopy(controller)  # in double: it designs the parameters
         self._initialise()
+        self._use_state(single_state(self.parameters.controller, learned_state(controller)))
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
@@ -276,6 +279,9 @@ class SinglePrecision(Wrapper):
             values = np.array(derivatives, dtype=np.float64)
             set_reference_derivatives(self.parameters, self._state, values)
         return super().step(r, y)
+
+    def _images(self) -> Layout:
+        return images_of(self.parameters.controller, self._state, self.dt)
 
     @property
     def _inner(self) -> Any:

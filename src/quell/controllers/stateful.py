@@ -24,6 +24,14 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.checks import Described
 from quell.controllers.base import Limits, RateLimit, changed_limits, control, set_applied_control
+from quell.controllers.memory import (
+    Layout,
+    images_of,
+    named_arrays,
+    read_image,
+    start_from_rest,
+    written_image,
+)
 from quell.kernels import dispatch
 from quell.kernels.dispatch import compiled_call, dispatcher_for, explain_compile_errors
 from quell.kernels.sized import Constant, ConstantFlag, SizedArray, layout_of, type_of
@@ -121,7 +129,7 @@ def _address(kind: Any, packed: Any, c: Any) -> Any:
 
 
 @intrinsic
-def _unpacked(typing_context: Any, packed: Any) -> Any:
+def unpacked(typing_context: Any, packed: Any) -> Any:
     """Return parameters and state of a packed controller."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -138,7 +146,7 @@ def _unpacked(typing_context: Any, packed: Any) -> Any:
 @compiled_call
 def step_packed(packed: Any, r: float, y: float) -> float:
     """Take one sample; see ``controllers.base.control``."""
-    design, state = _unpacked(packed)
+    design, state = unpacked(packed)
     return control(design, state, r, y)
 
 
@@ -337,6 +345,55 @@ class StatefulController(Described):
         for name, value in checked.items():
             self._arrays[name][...] = value
 
+    def memory(self) -> bytes:
+        """Return the whole running state, with what was learned, as a memory image.
+
+        The bytes are those of ``NAME_save`` of the exported controller in the same precision; the
+        module ``quell.controllers.memory`` describes them. Write them to a file, and hand them to
+        ``restore`` of a controller that is made in the same way.
+
+        Raises
+        ------
+        ValueError
+            for a learner that is a Python object: its memory is not made of numbers.
+        """
+        return written_image(self._images())
+
+    def restore(self, image: bytes, *, running: bool = False) -> None:
+        """Take over what is in a memory image; an image that does not fit changes nothing.
+
+        Parameters
+        ----------
+        image
+            bytes from ``memory()``, or from ``NAME_save`` of the exported controller.
+        running
+            whether to continue the running loop, bit by bit, at its next sample. By default the
+            loop starts from rest with what was learned, as after the power was off: the estimates
+            in the image are of another time.
+
+        Raises
+        ------
+        ValueError
+            for an image that is cut, damaged, of another controller or precision, or has numbers
+            that are not finite; with ``running`` also for one of other parameters.
+        """
+        found = read_image(self._images(), image, running=checks.flag("running", running))
+        for name, array in found.items():
+            self._arrays[name][...] = array
+        if not running:
+            start_from_rest(self.parameters, self._state)
+
+    def _images(self) -> Layout:
+        """Return the layout of the images of this controller, with the arrays of its state."""
+        if self._external_fields:
+            raise ValueError(
+                f"{type(self).__name__}: its learner is a Python object, whose memory an image can "
+                "not hold; save that object by its own library and make the controller with it, or "
+                "take a learner of quell.learners such as Kalman() or RLS()"
+            )
+        this: Any = self
+        return images_of(self.parameters, self._state, float(this.dt))
+
     @property
     def _external_fields(self) -> tuple[str, ...]:
         """Names of state entries that refer to an object outside of the state."""
@@ -356,15 +413,3 @@ class StatefulController(Described):
             saved[name] = np.empty((), dtype=object)
             saved[name][()] = snapshot
         return saved
-
-
-def named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a nested NamedTuple by dotted name, ``Scalars`` as a vector."""
-    found: dict[str, NDArray[np.float64]] = {}
-    for name, value in state._asdict().items():
-        if isinstance(value, tuple):
-            found |= named_arrays(value, f"{prefix}{name}.")
-        else:
-            is_record = value.dtype.names is not None
-            found[prefix + name] = value.view(value.dtype[0]) if is_record else value
-    return found

@@ -23,7 +23,9 @@ from quell.controllers.compensated import CompensatedDesign, CompensatedState
 from quell.controllers.compensator import change_design, start_at_rest
 from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
 from quell.controllers.linear import LinearDesign, LinearState
+from quell.controllers.memory import Layout
 from quell.controllers.prefilters import PrefilteredDesign, PrefilteredState, settle, stopping_point
+from quell.export.image_code import ImageCode
 from quell.export.translate.expressions import implementation_of
 from quell.export.translate.program import Program
 from quell.export.translate.structs import Findings, arrays_of, initial_lines
@@ -74,8 +76,8 @@ _WITHOUT_VECTORS = [
 ]
 
 
-# Stands for the lines of ``init``, which are known when all others are.
-_INITIAL = "    initial"
+# Stand for the lines of ``init``, ``save`` and ``load``, which are known when all others are.
+_INITIAL, _SAVE, _LOAD = "    initial", "    save", "    load"
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,7 @@ class CFiles:
         self._prototypes: list[str] = []
         self._definitions: list[str] = []
         self._step = ""  # code of the operation of each sample
+        self._images: Layout | None = None
 
     @property
     def both(self) -> tuple[Value, Value]:
@@ -172,6 +175,7 @@ class CFiles:
         head = head.replace("NAME", f"{self.name}_{name}")
         given = re.findall(r"(\w+)(?:\[\d+\])?[,)]", head)
         used = words("\n".join(body)) | ({"state"} if _INITIAL in body else set())
+        used |= {"state", "image"} if _SAVE in body or _LOAD in body else set()
         body = (*(f"    (void){each};" for each in given if each not in used), *body)
         self._prototypes += ["", *comment_block(doc), *wrapped(f"{head};")]
         self._definitions += ["", *wrapped(head), "{", *body, "}"]
@@ -185,6 +189,41 @@ class CFiles:
             f"void NAME({self.name}_state *state)",
             "Set the state before the first sample, with the default parameters.",
             _INITIAL,
+        )
+
+    def add_memory(self, images: Layout, reset: str) -> None:
+        """Add the functions of the memory image; ``reset`` is the code that starts from rest."""
+        self._images = images
+        size = f"{self.name.upper()}_MEMORY_SIZE"
+        self.includes.append("#include <stddef.h>")
+        self.add(
+            "save",
+            f"void NAME(const {self.name}_state *state, unsigned char *image)",
+            f"Write the whole state, with what was learned, as {size} bytes.\n\n"
+            "The bytes are those of controller.memory() in quell. To save while a timer interrupt\n"
+            "steps the controller, copy the state with the interrupt masked, and save the copy.",
+            "    uint64_t check;",
+            "",
+            _SAVE,
+        )
+        self.add(
+            "load",
+            f"bool NAME({self.name}_state *state, const unsigned char *image, size_t length, "
+            "bool resume)",
+            "Take over what is in an image; return false, with nothing changed, if it does not\n"
+            "fit: if it is cut, damaged, of another controller, or has numbers that are not finite."
+            "\n\nWith resume the running loop continues at its next sample; that needs all\n"
+            "parameters of the controller that was saved, but for the limits. Without it the loop\n"
+            "starts from rest with what was learned, as after the power was off. The state must\n"
+            f"have been set by {self.name}_init before.",
+            "    if (!memory_fits(image, length, resume)) {",
+            "        return false;",
+            "    }",
+            _LOAD,
+            "    if (!resume) {",
+            f"        {reset};",
+            "    }",
+            "    return true;",
         )
 
     def write(
@@ -242,6 +281,7 @@ class CFiles:
         kernels = self.program.kernel_lines("\n".join(self._definitions), self._step)
         structs.keep_used("\n".join([*kernels, *self._definitions]))
         tables: list[str] = []
+        image = self._write_image_code()
         place = self._definitions.index(_INITIAL)
         self._definitions[place : place + 1] = [
             "    (void)memset(state, 0, sizeof *state);",
@@ -257,6 +297,7 @@ class CFiles:
             "",
             "#include <float.h>",
             "#include <math.h>",
+            *(["#include <stdint.h>"] if self._images else []),
             "#include <string.h>",
             "",
             "#ifdef __FAST_MATH__",
@@ -274,7 +315,19 @@ class CFiles:
         lines[-1] += ";"
         for table in tables:
             lines += ["", *wrapped(table)]
-        return "\n".join([*lines, *self._definitions, ""])
+        return "\n".join([*lines, *image, *self._definitions, ""])
+
+    def _write_image_code(self) -> list[str]:
+        """Write the lines of ``save`` and ``load``; return the functions behind them."""
+        if self._images is None:
+            return []
+        has_origin = any("origin;" in member for member in self.members)
+        structs = self.program.structs
+        code = ImageCode(self._images, self.state, structs, self.memory, has_origin)
+        for mark, lines in ((_SAVE, code.save_lines()), (_LOAD, code.load_lines())):
+            place = self._definitions.index(mark)
+            self._definitions[place : place + 1] = lines
+        return code.functions()
 
 
 def _struct(kind: Any) -> Struct:

@@ -18,6 +18,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensated import compensating_part, takes_control
 from quell.controllers.compensator import samples_to_settle
+from quell.controllers.memory import images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.single import SinglePrecision
@@ -186,7 +187,9 @@ class _Writer:
     ) -> None:
         self.controller, self.name, self.resolution = controller, name, resolution
         self.described = in_double_precision(controller)
-        self.files = CFiles(name, parameters_of(controller), controller.initial_state(), findings)
+        parameters, state = parameters_of(controller), learned_state(controller)
+        self.files = CFiles(name, parameters, state, findings)
+        self.images = images_of(parameters, state, float(controller.dt))
         self.real = self.files.real
         self.state = f"{name}_state *state"
         has_own = isinstance(self.described, Prefiltered)  # derivatives, from its prefilter
@@ -213,6 +216,7 @@ class _Writer:
             self._add_manual_operation()
         self._add_retune()
         self._add_reset()
+        self.files.add_memory(self.images, self.files.call(reset_loop, *self.files.both))
         if self.moves:
             self._add_stop()
         channels = tuple((name, width) for name, width in self.controller.channels if width)
@@ -227,6 +231,7 @@ class _Writer:
             "quell from the kernels that simulate it.",
         ]
         defines = [f"#define {upper}_SAMPLE_TIME {dt} /* [s] */"]
+        defines.append(f"#define {upper}_MEMORY_SIZE {self.images.size} /* [bytes] */")
         if observing is not None:
             defines.append(f"#define {upper}_ORDER {observing.observer.order}")
         self.files.enums += self._enums(channels)

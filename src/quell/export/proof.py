@@ -347,6 +347,8 @@ CALLS = {
     "status": "",
     "get_estimate": "",
     "stopping_point": "",
+    "save": "image",
+    "load": "image, (size_t)any_int, any_int != 0",
 }
 """Arguments of the functions, each call with other numbers; without ``init`` and ``retune``."""
 RETURN_U = {"step": "REAL r, REAL y", "step_counts": "int32_t r, int32_t count",
@@ -418,12 +420,17 @@ def _program(controller: Any, source: CSource, path: str) -> str:
     """Return the program that calls all functions in any order, with any numbers."""
     name, real = source.name, source.real
     more = ", any_real" * len(source.further)
+    size = f"{name.upper()}_MEMORY_SIZE"
     cases: list[str] = []
     for i, (operation, given) in enumerate(CALLS.items()):
         if operation in source.operations:
             arguments = "".join(f", {each}" for each in [given] if each)
             call = f"{name}_{operation}(state{arguments.replace('DERIVATIVES', more)});"
-            cases += [f"        case {i}:", f"            {call}", "            break;"]
+            cases.append(f"        case {i}:")
+            if operation == "load":
+                cases += ["            for (int k = 0; k < SIZE; k++) {".replace("SIZE", size),
+                          "                image[k] = any_byte;", "            }"]  # fmt: skip
+            cases += [f"            {call}", "            break;"]
     counts = "step_counts" in source.operations
     narrower = narrower_limit(controller, path, source.precision == "single")
     retuning = [
@@ -444,6 +451,8 @@ def _program(controller: Any, source: CSource, path: str) -> str:
         f"static volatile {real} any_real;",
         "static volatile int any_int;",
         *(["static volatile int32_t any_count;"] if counts else []),
+        "static volatile unsigned char any_byte;",
+        f"static unsigned char image[{size}];",
         f"static {name}_state controller;",
         f"static {name}_parameters narrower;",
         "",

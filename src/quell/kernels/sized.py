@@ -75,6 +75,9 @@ Scratch: TypeAlias = Annotated[NDArray[np.float64], "scratch"]
 """Annotates an array in a state that one call fills and only the same call reads: exported code has
 a local variable in its place. A kernel gives it a name before it uses it."""
 
+Work: TypeAlias = Annotated[NDArray[np.float64], "work"]
+"""Annotates an array in a state whose numbers no later sample reads: a memory image is without."""
+
 # Larger arrays are passed in Numba's own way: loops over them are not unrolled, and buffers of
 # many lengths would each be compiled for. 16 × 16 is a Kalman learner with 16 features.
 _MOST_ELEMENTS = 256
@@ -259,6 +262,7 @@ class _Annotations(NamedTuple):
     constants: tuple[int, ...]  # indices of constants
     sized: tuple[bool, ...]  # for each field, whether an array in it has a known shape
     scratch: tuple[int, ...]  # indices of arrays that no later call reads
+    work: tuple[int, ...]  # indices of arrays that no later sample reads
 
 
 def constant_fields(kind: type) -> tuple[str, ...]:
@@ -273,6 +277,12 @@ def scratch_fields(kind: type) -> tuple[str, ...]:
     return tuple(names[i] for i in _annotations(kind).scratch)
 
 
+def work_fields(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a NamedTuple that are work space, with Scratch or Work."""
+    names = getattr(kind, "_fields", ())
+    return tuple(names[i] for i in (*_annotations(kind).scratch, *_annotations(kind).work))
+
+
 @functools.cache
 def _annotations(kind: Any) -> _Annotations:
     notes = getattr(kind, "__annotations__", {})
@@ -281,7 +291,8 @@ def _annotations(kind: Any) -> _Annotations:
     constants = tuple(i for i, name in enumerate(names) if name in ("Size", "Flag", Size, Flag))
     sized = tuple(name not in ("Buffer", Buffer) for name in names)
     scratch = tuple(i for i, name in enumerate(names) if name in ("Scratch", Scratch))
-    return _Annotations(constants, sized, scratch)
+    work = tuple(i for i, name in enumerate(names) if name in ("Work", Work))
+    return _Annotations(constants, sized, scratch, work)
 
 
 if TYPE_CHECKING:

@@ -80,6 +80,7 @@ The common part of learners on features: choice of features, scaling, noise gate
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple, Protocol
 
@@ -176,6 +177,16 @@ def coefficients(learner: Any, memory: Any, theta: Vector) -> None:
 def learner_flags(learner: Any, memory: Any) -> int:
     """Return the learner's ``Status`` flags for this sample; by default none."""
     return 0
+
+
+@functools.singledispatch
+def meaning(parameters: Any) -> Any:
+    """Return those parameters without which the numbers in a learner's memory mean something else.
+
+    A memory image fits where they are equal (``controllers/memory.py``). By default these are all;
+    a learner registers its own, without gains and times, for the type of its parameters.
+    """
+    return parameters
 
 
 def checked_learner_design(learner: Learner, observer: ESO, omega_c: float) -> Any:
@@ -713,6 +724,11 @@ class Inputs(NamedTuple):
     def order(self) -> int:
         """Order n of the plant."""
         return int(self.scaling.floors.size) - 2
+
+
+@meaning.register(Inputs)
+def _meaning(inputs: Inputs) -> Any:
+    return inputs.features, inputs.unscaled
 
 
 @kernel

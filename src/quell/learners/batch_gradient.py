@@ -57,12 +57,13 @@ from quell.features.base import (
     write_units,
 )
 from quell.kernels.dispatch import is_finite, kernel
-from quell.kernels.sized import Buffer, Flag, Scalars, Size, clear
+from quell.kernels.sized import Buffer, Flag, Scalars, Size, Work, clear
 from quell.learners.base import (
     adapt,
     coefficients,
     commit,
     forget,
+    meaning,
     predict,
     restart,
     startup_samples,
@@ -81,7 +82,7 @@ class Buffers(NamedTuple):
     residuals: Buffer  # ΔF (n,), a ring
     total: Vector  # Σ Δf̂ I over the ring (p,)
     fresh: Vector  # the same over the entries written since the ring last wrapped around (p,)
-    current: Vector  # work space for the newest features (p,)
+    current: Work  # work space for the newest features (p,)
     position: Vector  # (2,): row of the next entry; 1 once the ring has been full
 
 
@@ -179,7 +180,7 @@ class ScaledMemory(NamedTuple):
     loop: NDArray[ScaledLoop]
     scale: Vector  # (m + 2,): what x_1 … x_m, u and Δf̂ are divided by
     sizes: Vector  # (k,): what features of unknown size are divided by
-    scaled: Vector  # work space for the scaled state (m,)
+    scaled: Work  # work space for the scaled state (m,)
     units: Vector  # (p,): ``unit`` of the features for ``scale``
 
 
@@ -225,6 +226,11 @@ def _rescale(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float
         memory.units[i] = current[i]
     memory.loop[0].has_scale = 1.0
     clear_buffers(memory.buffers)
+
+
+@meaning.register(ScaledDesign)
+def _meaning(learner: ScaledDesign) -> Any:
+    return learner.features, learner.unscaled, learner.batch
 
 
 @kernel

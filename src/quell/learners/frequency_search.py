@@ -131,6 +131,12 @@ class SearchMemory(NamedTuple):
 
 
 @kernel
+def _count(memory: SearchMemory) -> int:
+    """Return the number of frequencies in the fit; one that there can be whatever the state has."""
+    return min(max(int(memory.loop[0].found), 0), memory.good.size)
+
+
+@kernel
 def search_from_nothing(search: FrequencySearch, memory: SearchMemory, window: float) -> None:
     """Begin with no sinusoid, in the newest ``window`` entries."""
     loop = memory.loop[0]
@@ -161,9 +167,9 @@ def begin_scan(search: FrequencySearch, memory: SearchMemory) -> None:
 def begin_rows(search: FrequencySearch, memory: SearchMemory) -> None:
     """Begin a pass over the window with its newest row."""
     loop, fit = memory.loop[0], memory.fit
-    shift_amplitudes(search.orders, fit, int(loop.found), loop.entries - loop.newest)
+    shift_amplitudes(search.orders, fit, _count(memory), loop.entries - loop.newest)
     loop.row, loop.newest = 0.0, loop.entries
-    begin_pass(search.orders, fit, int(loop.found))
+    begin_pass(search.orders, fit, _count(memory))
 
 
 # ---- The verdict on a fit of frequencies ----
@@ -202,7 +208,7 @@ def judge(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
         result = _adopt(search, memory, omega)
         loop.continues, loop.level = 1.0, loop.rest / loop.window
         loop.start, loop.good_found = loop.newest - loop.window, loop.found
-        for j in range(int(loop.found)):
+        for j in range(_count(memory)):
             memory.good[j] = fit.omega[j]
         loop.found = _resolved(memory)
         loop.window = float(math.floor(min(_GROWTH * loop.window, longest)))
@@ -211,7 +217,7 @@ def judge(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
     if loop.continues > 0.0:
         # From where the last good window began, with its frequencies.
         loop.continues, loop.found = 0.0, loop.good_found
-        for j in range(int(loop.found)):
+        for j in range(_count(memory)):
             fit.omega[j] = memory.good[j]
         loop.window = min(loop.entries - loop.start, longest)
         _fit_again(search, memory)
@@ -236,7 +242,7 @@ def _fit_again(search: FrequencySearch, memory: SearchMemory) -> None:
 def _resolved(memory: SearchMemory) -> float:
     """Return the number of frequencies up to the last one that the window resolves; at least 1."""
     found = 1.0
-    for j in range(1, int(memory.loop[0].found)):
+    for j in range(1, _count(memory)):
         if _is_resolved(memory.loop[0], memory.fit, j):
             found = j + 1.0
     return found
@@ -249,10 +255,10 @@ def _adopt(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
     result, taken = NOTHING, memory.taken
     for i in range(omega.size):
         taken[i] = 0.0
-    for j in range(int(loop.found)):
+    for j in range(_count(memory)):
         if not _is_resolved(loop, fit, j):
             continue
-        i = _oscillator_for(search, memory, omega, taken, fit.omega[j])
+        i = max(_oscillator_for(search, memory, omega, taken, fit.omega[j]), 0)
         taken[i] = 1.0
         is_new = abs(omega[i] * search.step - fit.omega[j]) * loop.window > _DOUBT
         if is_new or adopted[i] == 0.0 or fit.deviation[j] < _WORSE * adopted[i]:
@@ -291,7 +297,7 @@ def _oscillator_for(
 def _is_resolved(loop: SearchLoop, fit: LineFit, j: int) -> bool:
     """Return whether the window is long enough for frequency ``j``."""
     resolved = fit.deviation[j] * loop.window < _DOUBT and fit.omega[j] * loop.window >= _PHASE
-    for k in range(int(loop.found)):
+    for k in range(min(max(int(loop.found), 0), fit.omega.size)):
         apart = abs(fit.omega[j] - fit.omega[k]) * loop.window
         resolved = resolved and (k == j or apart >= _APART)
     return bool(resolved)
@@ -494,20 +500,21 @@ def _add_signal(search: FrequencySearch, memory: SearchMemory, i: int, value: fl
 @kernel
 def _take_row(search: FrequencySearch, memory: SearchMemory) -> None:
     loop, fit, past = memory.loop[0], memory.fit, memory.past
-    width, newest = memory.late.size, int(loop.newest) - 1
-    at, last = (newest - int(loop.row)) % ENTRIES * width, newest % ENTRIES * width
+    width, newest = memory.late.size, int(loop.newest) % ENTRIES + ENTRIES - 1
+    row = min(max(int(loop.row), 0), ENTRIES - 1)
+    at, last = (newest - row) % ENTRIES * width, newest % ENTRIES * width
     value = past[at]
     # Less the newest values, so that a set-point far from zero costs no digits.
     for i in range(fit.signal.size):
         fit.signal[i] = past[at + 1 + i] - past[last + 1 + i]
-    pairs = 2 * search.orders.size * int(loop.found)
+    pairs = 2 * search.orders.size * _count(memory)
     if loop.stage == SCAN:
         rest = value - fit.solution[0] - fitted(fit, pairs)
         for i in range(fit.signal.size):
             rest -= fit.solution[1 + i] * fit.signal[i]
         _add_to_scores(memory, rest * sin(math.pi * (loop.row + 0.5) / loop.window) ** 2)
     else:
-        add_row(search.orders, fit, int(loop.found), -loop.row, value)
+        add_row(search.orders, fit, _count(memory), -loop.row, value)
     next_row(fit, pairs)
     loop.row += 1.0
 
@@ -544,7 +551,7 @@ def _finish_pass(search: FrequencySearch, memory: SearchMemory, omega: Vector) -
 @kernel
 def _finish_fit(search: FrequencySearch, memory: SearchMemory) -> bool:
     """Take a step of Gauss and Newton; return whether it was the last."""
-    loop, fit, found = memory.loop[0], memory.fit, int(memory.loop[0].found)
+    loop, fit, found = memory.loop[0], memory.fit, _count(memory)
     first = 1 + fit.signal.size
     linear = first + 2 * search.orders.size * found
     size = linear + found
@@ -581,7 +588,7 @@ def _add_strongest_line(search: FrequencySearch, memory: SearchMemory) -> None:
         size = score[2 * i] * score[2 * i] + score[2 * i + 1] * score[2 * i + 1]
         if size > largest and search.lines[i] * loop.window >= 2.0 * math.pi:
             best, largest = i, size
-    j, p = int(loop.found), search.orders.size
+    j, p = min(_count(memory), fit.omega.size - 1), search.orders.size
     fit.omega[j] = min(max(search.lines[best] / search.orders[0], search.low), search.high)
     for i in range(2 * j * p, 2 * (j + 1) * p):
         fit.amplitude[i] = 0.0

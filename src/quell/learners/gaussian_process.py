@@ -27,7 +27,7 @@ from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import exp, sqrt
 from quell.kernels.sized import Buffer, Size
-from quell.learners.base import features_first
+from quell.learners.base import features_first, meaning
 from quell.learners.online import Online, infer, learn
 from quell.observers.eso import ESO
 from quell.types import Vector
@@ -212,6 +212,11 @@ def _remove_point(memory: ProcessMemory, count: int) -> None:
         memory.kernel[i, out] = memory.kernel[i, last]
         memory.inverse[i, out] = memory.inverse[i, last]
         memory.covariance[i, out] = memory.covariance[i, last]
+
+
+@meaning.register(ProcessDesign)
+def _meaning(model: ProcessDesign) -> Any:
+    return model.inputs, model.budget, model.weight
 
 
 @dataclass(frozen=True)

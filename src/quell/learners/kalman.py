@@ -67,6 +67,7 @@ from quell.learners.base import (
     lag_memory,
     lag_of,
     lag_push,
+    meaning,
     predict,
     relative_noise,
     reset_lag,
@@ -392,6 +393,12 @@ def _forget(learner: KalmanDesign, memory: KalmanMemory) -> None:
 def _coefficients(learner: KalmanDesign, memory: KalmanMemory, theta: Vector) -> None:
     for i in range(theta.size):
         theta[i] = memory.theta[i] * learner.scale[i]
+
+
+@meaning.register(KalmanDesign)
+def _meaning(learner: KalmanDesign) -> Any:
+    which = (learner.states, learner.bias, learner.with_u, learner.oscillators.orders)
+    return learner.scale, learner.dt, *which, type(learner.search).__name__
 
 
 # ---- The learner Kalman ----

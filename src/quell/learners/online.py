@@ -48,7 +48,7 @@ from quell.features.base import reset_scale, reset_sizes, update_scale
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.functions import is_single, tanh
-from quell.kernels.sized import Buffer, Scalars, Size, clear
+from quell.kernels.sized import Buffer, Scalars, Size, Work, clear
 from quell.learners.base import (
     FeatureLearner,
     Inputs,
@@ -60,6 +60,7 @@ from quell.learners.base import (
     features_first,
     forget,
     group_delay,
+    meaning,
     no_coefficients,
     noise_gate_memory,
     predict,
@@ -166,8 +167,8 @@ class OnlineMemory(NamedTuple):
 
     scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
     sizes: Vector  # (k,): what features of unknown size are divided by
-    scaled: Vector  # work space for the scaled state (n,)
-    features: Vector  # work space for the features of a prediction (p,)
+    scaled: Work  # work space for the scaled state (n,)
+    features: Work  # work space for the features of a prediction (p,)
     ring: Buffer  # the last features (D + 1, p)
     loop: NDArray[OnlineLoop]
     gate: NoiseGateMemory
@@ -263,6 +264,11 @@ def _forget(learner: OnlineDesign, memory: OnlineMemory) -> None:
 
 
 coefficients.register(OnlineDesign)(no_coefficients)
+
+
+@meaning.register(OnlineDesign)
+def _meaning(learner: OnlineDesign) -> Any:
+    return meaning(learner.inputs), type(learner.model).__name__, meaning(learner.model)
 
 
 class Online(FeatureLearner):
@@ -463,6 +469,11 @@ class Network:
         covariance = parameters.rule.prior * np.eye(theta.size)
         gradient, gain = np.zeros((2, theta.size))
         return NetworkMemory(theta, covariance, gradient, gain, np.zeros(1))
+
+
+@meaning.register(NetworkDesign)
+def _meaning_of_network(model: NetworkDesign) -> Any:
+    return model.inputs, model.hidden
 
 
 class MLP(Online):

@@ -307,8 +307,8 @@ def write_deviations(fit: LineFit, linear: int, size: int, noise: float) -> None
     Cholesky factor ``solve`` has left; at most 10 rad/sample, for what is not determined.
     """
     gram, column = fit.gram, fit.column
-    for j in range(linear, size):
-        total = 0.0
+    for place in range(min(size - linear, fit.deviation.size)):
+        j, total = linear + place, 0.0
         for i in range(j, size):
             value = 1.0 if i == j else 0.0
             for k in range(j, i):
@@ -317,4 +317,4 @@ def write_deviations(fit: LineFit, linear: int, size: int, noise: float) -> None
             total += column[i] * column[i]
         determined = gram[j, j] > 0.0
         deviation = sqrt(noise * total) if determined else _UNKNOWN
-        fit.deviation[j - linear] = min(deviation, _UNKNOWN)
+        fit.deviation[place] = min(deviation, _UNKNOWN)

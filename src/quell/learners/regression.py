@@ -48,7 +48,7 @@ from quell import checks
 from quell.features import Features
 from quell.features.base import reset_scale, reset_sizes, update_scale, write, write_units
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
-from quell.kernels.sized import Flag, Scalars, Size, clear
+from quell.kernels.sized import Flag, Scalars, Size, Work, clear
 from quell.learners.base import (
     FeatureLearner,
     Inputs,
@@ -62,6 +62,7 @@ from quell.learners.base import (
     lag_memory,
     lag_of,
     lag_push,
+    meaning,
     noise_gate_memory,
     predict,
     reset_gate,
@@ -111,6 +112,22 @@ def share_excess(rule: Any, memory: Any, theta: Vector, i: int, excess: float) -
     """
 
 
+@generic_with_default
+def restart_rule(rule: Any, memory: Any, theta: Vector) -> None:
+    """Start from rest: the position may have another origin now. By default nothing changes."""
+
+
+@generic_with_default
+def forget_rule(rule: Any, memory: Any) -> None:
+    """Forget what the rule keeps besides θ; by default only ``reset_uncertainty``."""
+    reset_uncertainty(rule, memory)
+
+
+@generic_with_default
+def convert_rule(rule: Any, memory: Any, ratio: float) -> None:
+    """Convert what the rule keeps in units of the scaled f, which is now ``ratio`` of before."""
+
+
 @kernel
 def keep_within(
     rule: Any, memory: Any, theta: Vector, i: int, lowest: float, highest: float
@@ -151,9 +168,9 @@ class LinearMemory(NamedTuple):
     theta: Vector  # (p,), scaled
     scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
     sizes: Vector  # (k,): what features of unknown size are divided by
-    old_scale: Vector  # work space (n + 2,)
-    scaled: Vector  # work space for the scaled state (n,)
-    features: Vector  # work space (p,)
+    old_scale: Work  # work space (n + 2,)
+    scaled: Work  # work space for the scaled state (n,)
+    features: Work  # work space (p,)
     units: Vector  # (p,): ``unit`` of the features for ``scale``
     chain: Matrix  # (p, N): the lag filters of the features
     filtered: Vector  # (p,): their outputs
@@ -214,6 +231,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
     if scale[last] != old[last]:
         for i in range(theta.size):
             theta[i] *= old[last] / scale[last]
+        convert_rule(learner.rule, memory.rule, old[last] / scale[last])
     for j in range(last):
         grown = grown or scale[j] != old[j]
     if not grown:
@@ -287,7 +305,9 @@ def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
     finite = True
     for i in range(memory.theta.size):
         finite = finite and is_finite(memory.theta[i])
-    if not finite:
+    if finite:
+        restart_rule(learner.rule, memory.rule, memory.theta)
+    else:
         _forget_theta(learner, memory)
 
 
@@ -295,7 +315,7 @@ def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
 def _forget_theta(learner: LinearDesign, memory: LinearMemory) -> None:
     for i in range(memory.theta.size):
         memory.theta[i] = 0.0
-    reset_uncertainty(learner.rule, memory.rule)
+    forget_rule(learner.rule, memory.rule)
 
 
 @forget.register(LinearDesign)
@@ -317,6 +337,11 @@ def _coefficients(learner: LinearDesign, memory: LinearMemory, theta: Vector) ->
         theta[i] = memory.theta[i] * memory.units[i] * f_scale if scaled else 0.0
     if learner.constant >= 0:
         theta[learner.constant] += memory.loop[0].bias
+
+
+@meaning.register(LinearDesign)
+def _meaning(learner: LinearDesign) -> Any:
+    return meaning(learner.inputs), learner.constant, learner.with_u, type(learner.rule).__name__
 
 
 # ---- The base class of the learners that are linear in θ ----

@@ -49,6 +49,7 @@ from quell.learners.base import (
     lag_memory,
     lag_of,
     lag_push,
+    meaning,
     no_coefficients,
     predict,
     reset_lag,
@@ -136,10 +137,11 @@ def _commit(
     # After a start from rest, f_plain of a whole cycle comes first.
     if loop.samples - loop.phase >= size and loop.has_begun != 0.0:
         for _ in range(learner.speed):
-            if loop.row < half:
-                _pass_forwards(learner, memory, int(loop.row) - learner.settling)
-            elif loop.row < 2 * half:
-                _pass_backwards(learner, memory, 2 * half - 1 - int(loop.row))
+            row = min(max(int(loop.row), 0), 2 * half)
+            if row < half:
+                _pass_forwards(learner, memory, row - learner.settling)
+            elif row < 2 * half:
+                _pass_backwards(learner, memory, 2 * half - 1 - row)
             loop.row += 1.0
     loop.samples += 1.0
     loop.phase += 1.0
@@ -151,7 +153,7 @@ def _commit(
 @kernel
 def _place(memory: RepetitiveMemory) -> int:
     """Return the phase as a place in the tables; it is one of theirs whatever the state has."""
-    return min(int(memory.loop[0].phase), memory.past.size - 1)
+    return min(max(int(memory.loop[0].phase), 0), memory.past.size - 1)
 
 
 @kernel
@@ -204,6 +206,11 @@ def _clear_tables(memory: RepetitiveMemory) -> None:
 
 
 coefficients.register(RepetitiveDesign)(no_coefficients)
+
+
+@meaning.register(RepetitiveDesign)
+def _meaning(learner: RepetitiveDesign) -> Any:
+    return learner.samples
 
 
 # ---- The learner of what repeats with a known period ----

@@ -51,11 +51,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.features import Features
+from quell.features import Features, Joined, Periodic
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
 from quell.kernels.single import add_symmetrically
-from quell.kernels.sized import Scalars, clear
+from quell.kernels.sized import Scalars, Work, clear
+from quell.learners.recall import RecallMemory, RecallRule, recall_memory, recall_rule
 from quell.learners.regression import Linear, reset_uncertainty, share_excess, update_theta
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -258,9 +259,9 @@ class SelectionMemory(NamedTuple):
     active: Vector  # indices of the active features (k,)
     inactive: Vector  # (p,): 1 if a feature is inactive, else 0
     weak: Vector  # ψ (p,)
-    chosen: Vector  # work space for the active features (k,)
+    chosen: Work  # work space for the active features (k,)
     covariance: Matrix  # P (k, k)
-    gain: Vector  # work space (k,)
+    gain: Work  # work space (k,)
     loop: NDArray[SelectionLoop]
 
 
@@ -277,6 +278,12 @@ def selection_memory(rule: SelectionRule, count: int, features: int) -> Selectio
         gain=np.zeros(count),
         loop=SelectionLoop.zeros(),
     )
+
+
+@kernel
+def _active(memory: SelectionMemory, k: int) -> int:
+    """Return the index of active feature ``k``; it is that of a feature whatever the state has."""
+    return min(max(int(memory.active[k]), 0), memory.weak.size - 1)
 
 
 @update_theta.register(SelectionRule)
@@ -297,11 +304,11 @@ def _update_theta_selection(
     for i in range(theta.size):
         memory.weak[i] += step * memory.inactive[i] * features[i]
     for k in range(chosen.size):
-        chosen[k] = features[int(memory.active[k])]
+        chosen[k] = features[_active(memory, k)]
     noise = rule.rls.noise / confidence
     inverse = least_squares_gain(rule.rls, memory.covariance, gain, chosen, noise)
     for k in range(chosen.size):
-        theta[int(memory.active[k])] += gain[k] * inverse * error
+        theta[_active(memory, k)] += gain[k] * inverse * error
     memory.loop[0].samples += 1.0
     if memory.loop[0].samples >= rule.interval:
         memory.loop[0].samples = 0.0
@@ -313,12 +320,12 @@ def _exchange(rule: SelectionRule, memory: SelectionMemory, theta: Vector) -> No
     """Let the strongest inactive feature take the place of the weakest active one."""
     place = enters = 0
     for k in range(memory.active.size):
-        if abs(theta[int(memory.active[k])]) < abs(theta[int(memory.active[place])]):
+        if abs(theta[_active(memory, k)]) < abs(theta[_active(memory, place)]):
             place = k
     for i in range(theta.size):
         if abs(memory.weak[i]) > abs(memory.weak[enters]):
             enters = i
-    leaves = int(memory.active[place])
+    leaves = _active(memory, place)
     if not abs(memory.weak[enters]) > _STRONGER * abs(theta[leaves]):
         return
     memory.active[place] = enters
@@ -344,10 +351,10 @@ def _share_excess_selection(
     rule: SelectionRule, memory: SelectionMemory, theta: Vector, i: int, excess: float
 ) -> None:
     for k in range(memory.active.size):
-        if int(memory.active[k]) == i and memory.covariance[k, k] > 0.0:
+        if _active(memory, k) == i and memory.covariance[k, k] > 0.0:
             for j in range(memory.active.size):
                 share = excess_share(memory.covariance, k, j)
-                theta[int(memory.active[j])] -= share * excess
+                theta[_active(memory, j)] -= share * excess
 
 
 # ---- Recursive least squares as a rule of linear learners ----
@@ -360,7 +367,7 @@ class RlsMemory(NamedTuple):
     """State besides θ."""
 
     covariance: Matrix  # P (p, p)
-    gain: Vector  # work space for Pφ (p,)
+    gain: Work  # work space for Pφ (p,)
 
 
 @update_theta.register(RlsRule)
@@ -394,6 +401,25 @@ def _share_excess_rls(
             theta[j] -= excess_share(memory.covariance, i, j) * excess
 
 
+def _periodic_blocks(features: Features) -> list[tuple[list[Features], Periodic]]:
+    """Return the blocks that are periodic in position, each with the blocks before it."""
+    blocks: list[Features] = []
+    waiting = [features]
+    while waiting:
+        block = waiting.pop(0)
+        if isinstance(block, Joined):
+            waiting = [block.first, block.second, *waiting]
+        else:
+            blocks.append(block)
+    found = enumerate(blocks)
+    return [(blocks[:i], block) for i, block in found if isinstance(block, Periodic)]
+
+
+def _finite_or(time: float | None, default: float) -> float:
+    """Return a time that is given and finite, or the default [s]."""
+    return default if time is None or not math.isfinite(time) else time
+
+
 class RLS(Linear):
     """Recursive least squares on any features, with a memory of limited length.
 
@@ -412,6 +438,11 @@ class RLS(Linear):
         ratio of the RMS error to its usual size from which the plant counts as changed: then θ is
         learned again as quickly as at the start, for example 4; by default
         never.
+    recall
+        whether the position has another origin after each start from rest, as that of an encoder
+        without index pulse. The map of the ``Periodic`` features, of which there must be one block,
+        is then looked for at all shifts and is used again within half a period, if it fits
+        (``learners/recall.py``); else it is learned anew.
 
     The other parameters are described in the base classes ``Linear`` and ``FeatureLearner``.
 
@@ -435,6 +466,7 @@ class RLS(Linear):
         prior: float = 10.0,
         strongest: int | None = None,
         relearn: float | None = None,
+        recall: bool = False,
         frequency: float | None = None,
         scale: Any = None,
         gain_interval: tuple[float, float] = (0.5, 2.0),
@@ -447,6 +479,17 @@ class RLS(Linear):
         self.relearn = checks.optional(checks.positive, "relearn", relearn)
         if self.relearn is not None and self.relearn <= 1.0:
             raise ValueError(f"relearn = {relearn!r}: must be greater than 1, the usual error")
+        self.recall = checks.flag("recall", recall)
+        if self.recall and self.strongest is not None:
+            raise ValueError(
+                f"recall = True, strongest = {strongest!r}: a map is recalled as a whole; leave "
+                "one of them out, or name the map's orders, Periodic(orders=...)"
+            )
+        if self.recall and len(_periodic_blocks(self.features)) != 1:
+            raise ValueError(
+                "recall = True: the features must have one block Periodic, whose map is looked "
+                "for, for example features=Periodic(orders=(7, 28)) + Bias()"
+            )
 
     def rule(self, observer: ESO, omega_c: float, features: int) -> Any:
         """Return noise, forgetting and prior, and how features are selected and learned again."""
@@ -456,14 +499,22 @@ class RLS(Linear):
         if self.strongest is not None and self.strongest < features:
             interval = round(EXCHANGE_LAGS * lag_time / dt)
             rule = SelectionRule(rule, min(omega_c * dt, 1.0), max(interval, 1))
-        if self.relearn is None:
+        if self.relearn is not None:
+            rule = relearning_rule(rule, self.relearn, dt, lag_time, omega_c)
+        if not self.recall:
             return rule
-        return relearning_rule(rule, self.relearn, dt, lag_time, omega_c)
+        (before, block), order = _periodic_blocks(self.features)[0], observer.order
+        first = sum(len(each.names(order)) for each in before)
+        constant, orders = self.features.constant(order), block.design(order).orders
+        follow = -math.expm1(-dt / _finite_or(self.memory_time, _MEMORY / omega_c))
+        return recall_rule(rule, first, constant, orders, follow)
 
     def rule_memory(
         self, rule: Any, features: int
-    ) -> RlsMemory | SelectionMemory | RelearningMemory:
+    ) -> RlsMemory | SelectionMemory | RelearningMemory | RecallMemory:
         """Return the prior covariance and work space."""
+        if isinstance(rule, RecallRule):
+            return recall_memory(self.rule_memory(rule.inner, features), rule, features)
         if isinstance(rule, RelearningRule):
             inner = self.rule_memory(rule.inner, features)
             return RelearningMemory(inner, RelearningLoop.zeros())

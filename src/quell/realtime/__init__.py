@@ -21,6 +21,7 @@ from quell.lazy import imported_on_use
 if TYPE_CHECKING:
     from quell.realtime.devices import Device, TwinDevice
     from quell.realtime.live import LiveSink
+    from quell.realtime.memory_file import MemoryFile
     from quell.realtime.proxy import CompensatedDrive
     from quell.realtime.recordings import CsvSink, McapSink, load
     from quell.realtime.registry import open_device
@@ -35,6 +36,7 @@ _HOMES = {
     "Device": "devices",
     "LiveSink": "live",
     "McapSink": "recordings",
+    "MemoryFile": "memory_file",
     "Rig": "rig",
     "RigRun": "run",
     "Safety": "supervisor",
@@ -47,8 +49,8 @@ _HOMES = {
 }
 
 __all__ = [
-    "CompensatedDrive", "CsvSink", "Device", "LiveSink", "McapSink", "Rig", "RigRun", "Safety",
-    "TwinDevice", "load", "open_device", "record_target", "replay", "run_rig",
+    "CompensatedDrive", "CsvSink", "Device", "LiveSink", "McapSink", "MemoryFile", "Rig", "RigRun",
+    "Safety", "TwinDevice", "load", "open_device", "record_target", "replay", "run_rig",
 ]  # fmt: skip
 
 __getattr__ = imported_on_use(__name__, _HOMES)

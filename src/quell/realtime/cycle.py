@@ -91,6 +91,7 @@ from quell.realtime.system import (
     empty_counts,
     load_acquire,
     now,
+    store_release,
     wait_until,
 )
 from quell.realtime.telemetry import Ring, push
@@ -237,6 +238,7 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
     design, state, rules = controller.design, controller.state, controller.rules
     supervisor, reference, row = controller.supervisor, controller.reference, controller.log.row
     memory = supervisor.memory[0]
+    store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
     update_mode(rules, supervisor, k, y, reference.r.size)
     first = k - min(left_out, rules.hold)
     if memory.mode == Mode.RUN and memory.began == k:
@@ -259,6 +261,7 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
         set_applied_control(design, state, u)
         supervisor.counters[0].clipped += 1 if memory.mode == Mode.RUN else 0
     row[recordings.R] = r
+    store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
     return u
 
 
@@ -502,9 +505,13 @@ class ControlLoop:
         clock: Any,
         ring: Ring,
         *,
+        state: Any = None,
         interpret: bool = False,
     ) -> ControlLoop:
-        """Return the compiled loop of a device and a controller that has learned nothing yet."""
+        """Return the compiled loop of a device and a controller.
+
+        It runs on ``state``; by default on a new one with nothing learned.
+        """
         channels = row_channels(controller.channels)
         row = np.zeros(sum(width for _, width in channels))
         known = {name for name, width in channels if width}
@@ -514,7 +521,7 @@ class ControlLoop:
         )
         supervised = SupervisedController(
             design=controller.parameters,
-            state=controller.initial_state(),
+            state=controller.initial_state() if state is None else state,
             rules=rules,
             supervisor=initial_state(),
             reference=reference,

@@ -16,7 +16,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from os import PathLike
 from types import FrameType
@@ -42,6 +42,7 @@ from quell.kernels.dispatch import call_specialised, compiled, explain_compile_e
 from quell.quantities import UNKNOWN, Signals
 from quell.realtime.cycle import ControlLoop
 from quell.realtime.devices import Device, PythonHandle, handle_of
+from quell.realtime.memory_file import MemoryFile, memory_file
 from quell.realtime.recordings import Event, Header, MemorySink, Sink, file_sink, row_channels
 from quell.realtime.supervisor import (
     RESERVED,
@@ -263,10 +264,12 @@ def run_rig(
     on_change: Callable[[ModeChange], None] | None = None,
     overwrite: bool = False,
     signals: Signals | None = None,
+    memory: MemoryFile | str | PathLike[str] | None = None,
 ) -> RigRun:
     """Close a controller's loop around a device in real time, at the controller's sample time.
 
-    The controller starts with nothing learned, on a state of its own, as in ``simulate``. For
+    The controller starts with nothing learned, on a state of its own, as in ``simulate``, or with
+    what is in the file ``memory``. For
     ``safety.settle_time`` it observes, with u at zero and y as its reference; then it takes over
     without a bump, and the scenario's time begins. At the end, on Ctrl-C or SIGTERM, when its
     terminal is closed, and after any fault, u is ramped to zero; a second Ctrl-C makes it zero at
@@ -307,6 +310,11 @@ def run_rig(
     signals
         names and units of y and u for records, telemetry and plots, `{y = "angle [rad]", u =
         "voltage [V]"}`; those of the device, or of the plant in the setup, by default.
+    memory
+        file, or a ``MemoryFile``, in which what was learned outlives the run. If it exists, the
+        controller begins with it, from rest; one that does not fit is an error, before anything
+        moves. It is replaced when the run ends, whole or not at all, but not after a fault, to
+        which what was learned may have contributed; and on ``MemoryFile.save()`` or SIGUSR1.
 
     Raises
     ------
@@ -339,13 +347,18 @@ def run_rig(
         derivatives = getattr(controller, "derivatives", 0)
         reference = reference_samples(scenario, dt, derivatives, approach)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
-        memory = MemorySink()
+        kept, state, learned = memory_file(memory), None, ""
+        if kept is not None:
+            state, learned = kept.start(controller)
+        rows = MemorySink()
         writer = TelemetryWriter(
-            _header(device, controller, signals), [memory, *_sinks(telemetry, overwrite)]
+            _header(device, controller, signals), [rows, *_sinks(telemetry, overwrite)]
         )
         if isinstance(handle, PythonHandle):
             device.read()  # an error of the driver comes before compiling
-        loop = ControlLoop.of(device, controller, reference, rules, system_clock(spin), writer.ring)
+        loop = ControlLoop.of(
+            device, controller, reference, rules, system_clock(spin), writer.ring, state=state
+        )
         supervisor = loop.controller.supervisor
         writer.urgent = loop.interpreted and priority > 1
         if hasattr(device, "restart_session"):
@@ -354,9 +367,13 @@ def run_rig(
         writer.header = replace(writer.header, started=time.time_ns())
         real_time = real_time_process(priority, loop.interpreted)
         # Signals first and last: a second Ctrl-C must not lose the end of the record.
-        with _requests_by_signals(supervisor.requests), writer, real_time as notes:
-            _run_thread(loop, dt, priority, cpu, notes, on_change)
+        by_signal = nullcontext() if kept is None else kept.saved_by_signal()
+        with _requests_by_signals(supervisor.requests), by_signal, writer, real_time as notes:
+            notes += [learned] if learned else []
+            _run_thread(loop, dt, priority, cpu, notes, on_change, kept)
             device.close()  # before the record is finished, which may take time
+    if kept is not None:
+        notes.append(_last_save(kept, supervisor, dt))
     if scenario.disturbances or scenario.noise != 0.0:
         notes.append("disturbances and noise of the scenario are ignored: the rig has its own")
     handle = loop.handle
@@ -364,7 +381,7 @@ def run_rig(
         count, last = int(handle.faults[0]), handle.errors[0]
         notes.append(f"the device raised {count} errors, the last of them: {last!r}")
     notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
-    record = replace(memory.trajectory(), u_limits=(rules.low, rules.high))
+    record = replace(rows.trajectory(), u_limits=(rules.low, rules.high))
     counters, changes = dict(getattr(device, "counters", {})), mode_changes(supervisor, dt)
     notes += silence_of(record, changes, before, counters)
     return RigRun(
@@ -377,6 +394,17 @@ def run_rig(
         notes=tuple(notes),
         rules=rules,
     )
+
+
+def _last_save(kept: MemoryFile, supervisor: SupervisorState, dt: float) -> str:
+    """Save at the end of a run, unless a fault has ended it; return a note."""
+    faults = [each for each in mode_changes(supervisor, dt) if each.cause.ending is Ending.FAULT]
+    if faults:
+        return (
+            f"memory: NOT saved at the end, {kept.path} is as before: {faults[0].cause.text}; what "
+            "was learned may have contributed"
+        )
+    return kept.write(supervisor.steps)
 
 
 def _header(device: Device, controller: Controller, signals: Signals | None) -> Header:
@@ -416,6 +444,7 @@ def _run_thread(
     cpu: int | None,
     notes: list[str],
     on_change: Callable[[ModeChange], None] | None,
+    memory: MemoryFile | None,
 ) -> None:
     """Run the loop on a thread of its own; report changes of mode, give up a driver that hangs."""
     raised: list[BaseException] = []
@@ -443,6 +472,8 @@ def _run_thread(
                 seen += 1
                 if on_change is not None:
                     on_change(change)
+            if memory is not None and (note := memory.save_if_asked(supervisor.steps)):
+                notes.append(note)
             if counters.cycles != cycles or not loop.interpreted:
                 cycles, progressed = int(counters.cycles), time.monotonic()
             hung = time.monotonic() - progressed > max(_HUNG, _HUNG_SAMPLES * dt)

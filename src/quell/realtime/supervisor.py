@@ -221,15 +221,17 @@ class SupervisorState(NamedTuple):
     changes: NDArray[np.int64]  #: k, mode and cause of each change of mode (·, 3)
     changed: NDArray[np.int64]  #: number of changes of mode that are kept (1,), an atomic word
     requests: NDArray[np.int64]  #: a ``Request`` (1,), an atomic word that another thread writes
+    #: twice the number of control steps, odd during one (1,): an atomic word
+    steps: NDArray[np.int64]
 
 
 def initial_state() -> SupervisorState:
     """Return the state before the first cycle."""
-    memory, changed, requests = Memory.zeros(), np.zeros(1, np.int64), np.zeros(1, np.int64)
+    memory, (changed, requests, steps) = Memory.zeros(), np.zeros((3, 1), np.int64)
     memory[0].began, memory[0].y = -1, np.nan
     memory[0].y_rest_low, memory[0].y_rest_high = np.inf, -np.inf
     changes = np.zeros((_KEPT, 3), np.int64)
-    return SupervisorState(memory, Counters.zeros(), changes, changed, requests)
+    return SupervisorState(memory, Counters.zeros(), changes, changed, requests, steps)
 
 
 # ---- A check of the signs of y, u and b0 by the first motion after the controller takes over ----

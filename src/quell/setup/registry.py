@@ -22,6 +22,7 @@ from quell.controllers import (
     Schedule,
     TrackingDifferentiator,
     adrc_for_dead_time,
+    equal_to_pid,
 )
 from quell.controllers.baselines import (
     LQG,
@@ -143,6 +144,8 @@ def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
     telemetry
         files for the record, ending in ``.mcap`` or ``.csv``; relative to the folder where the
         command is run.
+    memory
+        file in which what the controller learns outlives the run; relative to that folder, too.
     """
     return {"device": device, "live": live, **options}
 
@@ -265,6 +268,13 @@ _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, Line
 _CONTROLLERS = (
     call_table("adrc", ADRC, types=_LAW),
     call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=_LAW),
+    call_table(
+        "adrc-pid",
+        ADRC.from_pid,
+        forwards_to=(equal_to_pid, ADRC),
+        types=_LAW,
+        without=("half_gain", "feedback", "law_poles"),
+    ),
     call_table("compensator", Compensator, types=_PARTS),
     call_table("pid", PID, forwards_to=_LINEAR),
     call_table("pid-simc", PID.simc, forwards_to=_PID),
@@ -292,7 +302,12 @@ _Y_AND_U = {"y": str, "u": str}
 Safety = call_table("safety", RigSafety, only=True)
 _LABELS = {"w": list_of(str)} | _Y_AND_U
 Labels = call_table("signals", Signals.of, only=True, types=_LABELS, without=("f",))
-_RIG = {"safety": Safety | None, "telemetry": list_of(str), "signals": Labels | None}
+_RIG = {
+    "safety": Safety | None,
+    "telemetry": list_of(str),
+    "signals": Labels | None,
+    "memory": str | None,
+}
 _BOUNDS = tuple(inspect.signature(Constraints).parameters)
 _NOT_IN_FILES = (
     *("constraints", "operating_point", "uncertain", "setup", "progress"),

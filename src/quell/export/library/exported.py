@@ -60,6 +60,11 @@ _OPERATIONS = {
         "once, before the first step after manual operation; false before the first sample",
     ),
     "retune": ("retune(s, &parameters)", "between two samples: other parameters, without a jump"),
+    "save": ("save(s, image)", "any time: all that the controller knows, as bytes"),
+    "load": (
+        "load(s, image, length, resume)",
+        "after the init: what was saved; false, and nothing changed, if it does not fit",
+    ),
     "reset": ("reset(s)", "from rest at the next sample; what was learned is kept"),
     "stopping_point": (
         "stopping_point(s)",
@@ -143,7 +148,7 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         "one": one,
         "zero": "0.0f" if single else "0.0",
         "dt": repr(float(controller.dt)),
-        **_reference_texts(source),
+        **_with_signals(_reference_texts(source), source),
         "operations": "\n".join(rows),
         "fast_math": ", and so do the compensated sums" if single else "",
         "double": "" if single else _DOUBLE,
@@ -193,6 +198,19 @@ def _reference_texts(source: CSource) -> dict[str, str]:
         "reference": "r[0]",
         "derivatives": "".join(f", r[{i + 1}]" for i in range(count)),
     }
+
+
+def _with_signals(texts: dict[str, str], source: CSource) -> dict[str, str]:
+    """Return the texts with the signals of a schedule, as further variables of the examples."""
+    names, zero = source.further[source.derivatives :], "0.0"
+    zero += "f" if source.precision == "single" else ""
+    what = "/* a signal that the gains follow: write it before each step */"
+    found = dict(texts)
+    for name in names:
+        found["declared_reference"] += f"\nvolatile {source.real} {name}; {what}"
+        found["defined_reference"] += f"\nstatic {source.real} {name} = {zero}; {what}"
+        found["derivatives"] += f", {name}"
+    return found
 
 
 # ---- Code, constants, state and stack of an exported controller and its functions ----

@@ -27,6 +27,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensated import compensating_part
 from quell.controllers.compensator import samples_to_settle
+from quell.controllers.memory import learned_state
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
@@ -229,7 +230,7 @@ class Player:
     def __init__(self, controller: Any) -> None:
         single = isinstance(controller, SinglePrecision)
         self.default = parameters_of(controller)
-        self.design, self.state = self.default, controller.initial_state()
+        self.design, self.state = self.default, learned_state(controller)
         self.limited = self.default
         self.real: Callable[[Any], Any] = np.float32 if single else float
         numbers = ("derivatives", "external_signals")
@@ -474,6 +475,7 @@ def test_program(source: CSource, vectors: Vectors) -> str:
     blocks = sum(row.action is Action.LEARN for row in vectors.rows)
     return filled("test.c", {
         "name": source.name,
+        "NAME": source.name.upper(),
         "precision": source.precision,
         "real": source.real,
         "epsilon": "FLT_EPSILON" if single else "DBL_EPSILON",

@@ -387,10 +387,11 @@ def wrapped(line: str) -> list[str]:
 
 def _broken(line: str, indent: int) -> list[str]:
     """Return a line in parts, all but the first with the same indentation."""
-    place = _break(line) if len(line) > _WIDTH else None
-    if place is None:
-        return [line]
-    return [line[:place].rstrip(), *_broken(" " * indent + line[place:].lstrip(), indent)]
+    parts: list[str] = []
+    while len(line) > _WIDTH and (place := _break(line)) is not None:
+        parts.append(line[:place].rstrip())
+        line = " " * indent + line[place:].lstrip()
+    return [*parts, line]
 
 
 def _break(line: str) -> int | None:

@@ -69,6 +69,23 @@ static real play(@name@_state *state@limited_parameter@, const sample *now)
     return @name@_step(state, now->r, now->y@derivatives@);
 }
 
+/* Save, forget everything, load: nothing may change; a damaged image must be refused. */
+static int power_cycle(@name@_state *state)
+{
+    static unsigned char image[@NAME@_MEMORY_SIZE];
+    int wrong = 0;
+
+    @name@_save(state, image);
+    @name@_init(state);
+    image[sizeof image / 2] ^= 1;
+    wrong += @name@_load(state, image, sizeof image, true);
+    image[sizeof image / 2] ^= 1;
+    wrong += !@name@_load(state, image, sizeof image, true);
+    if (wrong)
+        printf("the memory image is not loaded as it was saved\n");
+    return wrong;
+}
+
 int main(int argc, char **argv)
 {
     const double tolerance = argc > 1 ? atof(argv[1]) : TOLERANCE;
@@ -80,6 +97,8 @@ int main(int argc, char **argv)
     @name@_init(&state);
     for (int k = 0; k < count; k++) {
         const sample *now = &samples[k];
+        if (k == 30 || k == count - 1)
+            wrong += power_cycle(&state);
         const real u = play(&state@limited_argument@, now);
         const double difference = in_ulps(u, now->u, SCALE);
         const int status = @name@_status(&state);
