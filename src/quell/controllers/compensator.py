@@ -71,6 +71,7 @@ from quell.controllers.schedule import (
     Schedule,
     checked_schedule,
     gain_in_use,
+    set_signal,
     with_gains,
 )
 from quell.controllers.stateful import PackedController, StatefulController, unpacked
@@ -551,7 +552,7 @@ class Compensator(StatefulController):
                 f"{self.external_signals} external ones"
             )
         for i, value in enumerate(values):
-            self._state.schedule.given[i] = float(value)
+            set_signal(self._state.schedule, i, float(value))
 
     def at(self, *signals: float) -> Any:
         """Return the controller without schedule that this one is at fixed signals.

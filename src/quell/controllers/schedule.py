@@ -40,6 +40,7 @@ the frozen loops do not have. Measure it (``benchmarks/schedule.py``).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -126,7 +127,8 @@ class AxisLoop(Scalars):
 class ScheduleMemory(NamedTuple):
     """State of a schedule."""
 
-    given: Vector  # external signals
+    given: Vector  # external signals, the last usable ones
+    usable: Vector  # 1 where the signal that was given last is usable, else 0
     first: NDArray[AxisLoop]  # (1,)
     second: NDArray[AxisLoop]  # (1,)
     values: Vector  # k − k_base and (L − L_base)/(1 − L_1) in use
@@ -283,7 +285,7 @@ def _signal(axis: Axis, memory: ScheduleMemory, loop: Any, seen: Vector) -> floa
         return loop.y
     if axis.signal == _SPEED:
         return seen[1]
-    return memory.given[axis.given]
+    return memory.given[axis.given] if memory.usable[axis.given] != 0.0 else math.inf
 
 
 @kernel
@@ -397,6 +399,15 @@ def _follow(
     return status | more
 
 
+@kernel
+def set_signal(memory: ScheduleMemory, i: int, value: float) -> None:
+    """Set an external signal; one that is not usable leaves the last one."""
+    memory.usable[i] = 0.0
+    if is_usable(value):
+        memory.given[i] = value
+        memory.usable[i] = 1.0
+
+
 @set_signals.register(ScheduleDesign)
 def _set_signals(
     design: ScheduleDesign, memory: ScheduleMemory, values: Vector, begin: int
@@ -405,7 +416,7 @@ def _set_signals(
     first = begin if begin >= 0 else values.size - count
     if first >= 0 and first + count <= values.size:
         for i in range(count):
-            memory.given[i] = values[first + i]
+            set_signal(memory, i, values[first + i])
 
 
 @forget_signals.register(ScheduleDesign)
@@ -591,7 +602,8 @@ class Schedule:
         loop = ScheduleLoop.zeros()
         loop[0].b0 = 1.0 / design.inverse_b0
         return ScheduleMemory(
-            given=np.full(self.external, np.nan),
+            given=np.zeros(self.external),
+            usable=np.zeros(self.external),
             first=AxisLoop.zeros(),
             second=AxisLoop.zeros(),
             values=np.zeros(design.law + design.gains),
