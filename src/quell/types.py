@@ -43,6 +43,7 @@ class Status(IntFlag):
     CONTROL_HELD = 1024
     SAFE_SET_ACTED = 2048
     UNSAFE = 4096
+    HELD = 8192
 
     @property
     def message(self) -> str:
@@ -102,6 +103,10 @@ _MESSAGES = {
     Status.UNSAFE: (
         "The limits of u did not allow what the safe set needs: y or its rate may leave its band; "
         "raise u_max or rate_limit, or lower alpha or omega_c."
+    ),
+    Status.HELD: (
+        "The plant is held, as the machine says, or y rests although u should move it; the learner "
+        "waits: check brake and end stops."
     ),
 }
 _NOTHING = "No step reported a problem."

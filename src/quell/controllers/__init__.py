@@ -16,6 +16,7 @@ from quell.controllers.base import Controller, omega_c_for
 from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
+from quell.controllers.held import HeldPlant
 from quell.controllers.law import NonlinearFeedback
 from quell.controllers.linear import LinearController, LinearLaw
 from quell.controllers.prefilters import (
@@ -36,6 +37,7 @@ __all__ = [
     "DeadTimeTuning",
     "Estimate",
     "Feedforward",
+    "HeldPlant",
     "LinearController",
     "LinearLaw",
     "NonlinearFeedback",
