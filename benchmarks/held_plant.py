@@ -282,7 +282,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--part", choices=["releases", "alarms"])
     parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--windows", type=float, nargs="*")
+    parser.add_argument("--change", type=float)
     given = parser.parse_args()
+    if given.windows:
+        from quell.controllers import held as module
+        module._WINDOWS = tuple(given.windows)
+    if given.change:
+        from quell.controllers import held as module
+        module._CHANGE = given.change
     began = time.perf_counter()
     for name, part in {"releases": releases, "alarms": alarms}.items():
         if given.part in (None, name):

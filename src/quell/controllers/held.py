@@ -47,19 +47,25 @@ _HELD = int(Status.HELD)
 
 # Windows in lags of the observer. In 2 lags f̂ shows most of a change; 10 are the time over which
 # learners average noise.
-_WINDOWS = (2.0, 10.0)
+_WINDOWS = (0.5, 2.0, 10.0)
 # Ranges of y by which the change of u should have moved it.
 _VISIBLE = 20.0
-# Least change of f̂ relative to the largest |f̂| and |b0 u|.
+# Range of white noise in its mean change from sample to sample: in 10⁴ samples 8 deviations of which
+# such a change is 1.13. Of a motion it is the number of samples.
+_WHITE = 7.0
+_LEAST_SAMPLES = 14
+# Least change of f̂ relative to the largest |b0 u| so far.
 _CHANGE = 0.1
-# Bands by which a free plant should have moved when it is decided whether it is free.
-_DECIDED = 4.0
-# Least and largest share of that motion. What began before y left the band is ahead of what is
-# predicted from then on, by less from sample to sample.
-_LEAST, _MOST = 0.5, 4.0
+# Bands by which a free plant should have moved when it may be called free, and when it has to be
+# said; least share of that motion in both. The second is for a gain that is half of b0.
+_NEAR, _FAR = 4.0, 16.0
+_LEAST, _LEAST_FAR = 0.6, 0.35
+# Largest share. What began before y left the band is ahead of what is predicted from then on, by
+# less from sample to sample.
+_MOST = 4.0
 
 # Columns of the windows.
-_SAMPLES, _LOW, _HIGH, _U, _MOVED, _LARGEST, _CHANGED, _FIRST, _BEFORE = range(9)
+_SAMPLES, _LOW, _HIGH, _Y, _STEPS, _MOVED, _CHANGED, _FIRST, _BEFORE = range(9)
 _COLUMNS = 9
 
 # Phases.
@@ -93,6 +99,7 @@ class HeldLoop(Scalars):
     started: float  # 1 when the windows have begun
     y: float  # last measurement
     count: float  # least change of y so far: what the sensor resolves [y-unit]
+    peak: float  # largest |b0 u| so far
     centre: float  # of the band in which y rests
     band: float  # A
     f: float  # f̂ of before, less the learner's share that follows u
@@ -173,22 +180,23 @@ def _advance(design: HeldDesign, x: Vector, moved: Vector, u: float, f: float) -
 
 
 @kernel
-def _begin_window(memory: HeldMemory, i: int, y: float, u: float, f: float, before: float) -> None:
+def _begin_window(memory: HeldMemory, i: int, y: float, f: float, before: float) -> None:
     window = memory.windows[i]
-    window[_SAMPLES] = window[_MOVED] = window[_LARGEST] = window[_CHANGED] = 0.0
-    window[_LOW] = window[_HIGH] = y
-    window[_U], window[_FIRST], window[_BEFORE] = u, f, before
+    window[_SAMPLES] = window[_STEPS] = window[_MOVED] = window[_CHANGED] = 0.0
+    window[_LOW] = window[_HIGH] = window[_Y] = y
+    window[_FIRST], window[_BEFORE] = f, before
     for j in range(memory.moved.size):
         memory.responses[i, j] = 0.0
+    memory.responses[i, 0] = y
 
 
 @kernel
 def _begin_windows(
-    design: HeldDesign, memory: HeldMemory, y: float, u: float, f: float, before: float
+    design: HeldDesign, memory: HeldMemory, y: float, f: float, before: float
 ) -> None:
     """Begin all windows, every second one by half its length earlier."""
     for i in range(design.lengths.size):
-        _begin_window(memory, i, y, u, f, before)
+        _begin_window(memory, i, y, f, before)
         if i % 2 == 1:
             memory.windows[i, _SAMPLES] = 0.5 * design.lengths[i]
     memory.loop[0].phase = _FREE
@@ -197,30 +205,44 @@ def _begin_windows(
 @kernel
 def _least_band(design: HeldDesign, loop: HeldLoop, y: float) -> float:
     """Return the range of y that its sensor can not tell from rest."""
-    return max(max(design.resolution, loop.count), resolution(loop.y) * abs(y))
+    return max(max(design.resolution, 1.5 * loop.count), resolution(loop.y) * abs(y))
 
 
 @kernel
 def _update_window(
-    design: HeldDesign, memory: HeldMemory, i: int, y: float, u: float, f: float, size: float
+    design: HeldDesign,
+    memory: HeldMemory,
+    i: int,
+    y: float,
+    change: float,
+    u: float,
+    f: float,
+    slope: float,
 ) -> bool:
     """Update a window; return whether it ends with a plant that is held."""
     window, loop = memory.windows[i], memory.loop[0]
     response = memory.responses[i]
-    _advance(design, response, memory.moved, u - window[_U], 0.0)
+    _advance(design, response, memory.moved, u, window[_BEFORE] + slope * u)
     window[_SAMPLES] += 1.0
     window[_LOW], window[_HIGH] = min(window[_LOW], y), max(window[_HIGH], y)
-    window[_MOVED] = max(window[_MOVED], abs(response[0]))
-    window[_LARGEST] = max(window[_LARGEST], size)
-    window[_CHANGED] = max(window[_CHANGED], abs(f - window[_FIRST]))
+    window[_STEPS] += change
+    window[_MOVED] = max(window[_MOVED], abs(response[0] - window[_Y]))
+    window[_CHANGED] = max(window[_CHANGED], abs(f - window[_BEFORE]))
     if window[_SAMPLES] < design.lengths[i]:
         return False
-    band = max(window[_HIGH] - window[_LOW], _least_band(design, loop, y))
-    if window[_MOVED] > _VISIBLE * band and window[_CHANGED] > _CHANGE * window[_LARGEST]:
+    covered = window[_HIGH] - window[_LOW]
+    least = _least_band(design, loop, y)
+    rests = covered <= least or covered * window[_SAMPLES] < _WHITE * window[_STEPS]
+    band = max(covered, least)
+    if (
+        rests
+        and window[_MOVED] > _VISIBLE * band
+        and window[_CHANGED] > _CHANGE * loop.peak
+    ):
         loop.centre, loop.band = 0.5 * (window[_LOW] + window[_HIGH]), band
         loop.f = window[_BEFORE]
         return True
-    _begin_window(memory, i, y, u, f, window[_FIRST])
+    _begin_window(memory, i, y, f, window[_FIRST])
     return False
 
 
@@ -232,14 +254,16 @@ def _is_released(
     if loop.phase == _FREE:
         change = abs(y - loop.y)
         if loop.started == 0.0:
-            _begin_windows(design, memory, y, u, f, f)
+            _begin_windows(design, memory, y, f, f)
             loop.started = 1.0
         elif change > 0.0 and (loop.count == 0.0 or change < loop.count):
             loop.count = change
         loop.y = y
-        size = max(abs(f + slope * u), abs(b0 * u))
+        loop.peak = max(loop.peak, abs(b0 * u))
         for i in range(design.lengths.size):
-            if loop.phase == _FREE and _update_window(design, memory, i, y, u, f, size):
+            if loop.phase == _FREE and _update_window(
+                design, memory, i, y, change, u, f, slope
+            ):
                 loop.phase = _STILL
                 _rest(memory)
         return False
@@ -255,15 +279,16 @@ def _is_released(
     predicted = memory.predicted[0] - loop.centre
     if predicted < 0.0:
         predicted, away = -predicted, -away
-    if predicted < _DECIDED * loop.band or away > _MOST * predicted:
-        # Not yet far enough to say; after a long window it was another force.
-        if loop.samples > design.lengths[design.lengths.size - 1]:
-            loop.y = y
-            _begin_windows(design, memory, y, u, f, loop.f)
-        return False
-    released = away >= _LEAST * predicted
-    loop.y = y
-    _begin_windows(design, memory, y, u, loop.f if released else f, loop.f)
+    least = _LEAST if predicted < _FAR * loop.band else _LEAST_FAR
+    released = (
+        predicted >= _NEAR * loop.band and least * predicted <= away <= _MOST * predicted
+    )
+    refuted = predicted >= _FAR * loop.band and away < least * predicted
+    # After a long window it was another force.
+    late = loop.samples > design.lengths[design.lengths.size - 1]
+    if released or refuted or late:
+        loop.y = y
+        _begin_windows(design, memory, y, loop.f if released else f, loop.f)
     return released
 
 
@@ -323,9 +348,9 @@ def _miss(design: HeldDesign, memory: HeldMemory) -> None:
 
 @look_anew.register(HeldDesign)
 def _look_anew(design: HeldDesign, memory: HeldMemory) -> None:
-    count = memory.loop[0].count
+    count, peak = memory.loop[0].count, memory.loop[0].peak
     clear(memory.loop)
-    memory.loop[0].count = count
+    memory.loop[0].count, memory.loop[0].peak = count, peak
 
 
 @dataclass(frozen=True)
@@ -370,7 +395,7 @@ class HeldPlant:
         check_rest(observer, "held")
         model, n = without_delay(observer.model), observer.order
         lag = observer.lag_time / observer.dt
-        lengths = [2.0 * max(round(0.5 * lags * lag), 1) for lags in _WINDOWS for _ in range(2)]
+        lengths = [2.0 * max(round(0.5 * lags * lag), _LEAST_SAMPLES // 2) for lags in _WINDOWS for _ in range(2)]
         parts = (model.transition[:n, :n], model.input[:n], model.feed[:n])
         return HeldDesign(*map(np.ascontiguousarray, parts), np.array(lengths), 2.0 * self.noise)
 
