@@ -27,13 +27,14 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
+import stiction
 from quell.controllers.base import control
 from quell.kernels.dispatch import compiled
 
 # Sub-steps of a sample, in which friction may stick.
 SUBSTEPS = 8
 HELD = int(ql.Status.HELD)
-NOTHING, BY_HAND, SIGNAL = 0, 1, 2
+NOTHING, BY_HAND, SIGNAL, NEVER = 0, 1, 2, 3
 
 
 @compiled
@@ -275,12 +276,54 @@ def alarms(given: Any) -> None:
     Console(width=140).print(table)
 
 
+def learners(given: Any) -> None:
+    """Print the cost with learners where plants stick, and the overshoot of a servo with them."""
+    table = Table("plant", "reference", "learner", "guard", "RMS over that without", title="free plants with friction")
+    for twin in stiction.TWINS:
+        *_, size, speed = stiction.TWINS[twin]
+        found = stiction.learners(speed)
+        for label in ("none", "Kalman", "RLS, tanh"):
+            for guard in (None, ql.Guard()) if label != "none" else (None,):
+                for name, reference in stiction.references(size).items():
+                    errors = [
+                        stiction.error(twin, found[label], guard, reference, held=held)
+                        for held in (None, ql.HeldPlant())
+                    ]
+                    table.add_row(twin, name, label, str(guard is not None), f"{errors[1] / errors[0]:.4f}")
+    Console(width=140).print(table)
+    table = Table("learner", "guard", "nothing", "HeldPlant()", "set_held", "by hand", "never held", title="overshoot of a servo after 2 s, %, and largest RMS error of the next moves over that by hand")
+    for label, learner in {"none": None, "Kalman": ql.learners.Kalman(), "Kalman(u=True)": ql.learners.Kalman(u=True, gain_interval=(0.5, 2.0)), "RLS": ql.learners.RLS(), "NLMS": ql.learners.NLMS()}.items():
+        for guard in (None, ql.Guard()) if learner is not None else (None,):
+            cells = [_held_servo(learner, guard, each, mode) for each, mode in ((None, NOTHING), (ql.HeldPlant(), NOTHING), (None, SIGNAL), (None, BY_HAND), (None, NEVER))]
+            table.add_row(label, str(guard is not None), *(f"{over:.2f}; {rms / cells[3][1]:.3f}" for over, rms in cells))
+    Console(width=140).print(table)
+
+
+def _held_servo(learner: Any, guard: Any, held: Any, mode: int) -> tuple[float, float]:
+    """Return overshoot [%] and RMS error after the release of a servo with viscous friction."""
+    dt, omega_c = 0.5e-3, 60.0
+    observer = ql.ESO.model_free(order=2, b0=5000.0, omega_o=300.0, dt=dt)
+    controller = ql.ADRC(observer, omega_c, u_min=-3.5, u_max=3.5, learner=learner, guard=guard, held=held)
+    size = round(12.0 / dt)
+    t = dt * np.arange(size)
+    r = np.where(t < 5.0, np.sin(6.0 * t) + np.sin(13.0 * t), 1.0)
+    r = np.where(t >= 8.5, 1.0 + np.sin(6.0 * (t - 8.5)), r)
+    times = np.array([round(4.999 / dt), round(7.0 / dt)]) if mode != NEVER else np.array([-1, -1])
+    r[(t >= 4.5) & (t < 5.0)] = 0.0
+    load = 500.0 * np.sin(2.0 * t)
+    x, y, u, flags = np.zeros(2), *np.zeros((3, size))
+    plant = np.array([5000.0, dt, math.tau / 2**20, 0.0, 0.0, 0.0, 0.0, math.inf])
+    play(controller.parameters, controller._state, mode % NEVER, plant, times, r, load, np.zeros(size), x, y, u, flags)
+    after = t >= 7.0
+    return 100.0 * max(float(np.max(y[after & (t < 8.5)])) - 1.0, 0.0), float(np.sqrt(np.mean((r - y)[t > 8.5] ** 2)))
+
+
 def main() -> None:
     """Run the parts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--setups", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--part", choices=["releases", "alarms"])
+    parser.add_argument("--part", choices=["releases", "alarms", "learners"])
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--windows", type=float, nargs="*")
     parser.add_argument("--change", type=float)
@@ -292,7 +335,7 @@ def main() -> None:
         from quell.controllers import held as module
         module._CHANGE = given.change
     began = time.perf_counter()
-    for name, part in {"releases": releases, "alarms": alarms}.items():
+    for name, part in {"releases": releases, "alarms": alarms, "learners": learners}.items():
         if given.part in (None, name):
             part(given)
     print(f"{time.perf_counter() - began:.0f} s")

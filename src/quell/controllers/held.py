@@ -56,10 +56,12 @@ _WHITE = 7.0
 _LEAST_SAMPLES = 14
 # Least change of f̂ relative to the largest |b0 u| so far.
 _CHANGE = 0.1
-# Bands by which a free plant should have moved when it may be called free, and when it has to be
-# said; least share of that motion in both. The second is for a gain that is half of b0.
-_NEAR, _FAR = 4.0, 16.0
-_LEAST, _LEAST_FAR = 0.6, 0.35
+# Bands by which a free plant should have moved: from the first point on its motion is compared with
+# the predicted one, at the second it may be called free, at the third it has to be said.
+_NEAR, _FAR, _FARTHER = 4.0, 16.0, 64.0
+# Least share of the predicted motion there. A gain of half of b0 makes a half of it; what sticks and
+# breaks loose makes less than a third, unless it sticks with twice the force of its motion.
+_LEAST, _LEAST_FARTHER = 0.6, 0.35
 # Largest share. What began before y left the band is ahead of what is predicted from then on, by
 # less from sample to sample.
 _MOST = 4.0
@@ -104,6 +106,9 @@ class HeldLoop(Scalars):
     band: float  # A
     f: float  # f̂ of before, less the learner's share that follows u
     samples: float  # since the band was left
+    predicted: float  # distance from the centre that a free plant should have by now
+    away_near: float  # distance from the centre at the point from which motions are compared
+    predicted_near: float  # the predicted one there
 
 
 class HeldMemory(NamedTuple):
@@ -273,17 +278,26 @@ def _is_released(
         _rest(memory)
         return False
     if loop.phase == _STILL:
-        loop.phase, loop.samples = _LEAVING, 0.0
+        loop.phase = _LEAVING
+        loop.samples = loop.predicted = loop.away_near = loop.predicted_near = 0.0
     loop.samples += 1.0
     _advance(design, memory.predicted, memory.moved, u, loop.f + slope * u)
-    predicted = memory.predicted[0] - loop.centre
+    predicted, before = memory.predicted[0] - loop.centre, loop.predicted
+    loop.predicted = predicted
     if predicted < 0.0:
-        predicted, away = -predicted, -away
-    least = _LEAST if predicted < _FAR * loop.band else _LEAST_FAR
+        predicted, before, away = -predicted, -before, -away
+    if predicted < _NEAR * loop.band:
+        loop.away_near, loop.predicted_near = away, predicted
+    # From the near point on: a steady motion is ahead of what is predicted at first only.
+    away -= loop.away_near
+    further = predicted - loop.predicted_near
+    least = _LEAST_FARTHER if predicted >= _FARTHER * loop.band else _LEAST
     released = (
-        predicted >= _NEAR * loop.band and least * predicted <= away <= _MOST * predicted
+        predicted >= _FAR * loop.band and least * further <= away <= _MOST * further
     )
-    refuted = predicted >= _FAR * loop.band and away < least * predicted
+    # The release may have been at the end of the sample in which y left the band.
+    further = before - loop.predicted_near
+    refuted = before >= _FAR * loop.band and away < _LEAST_FARTHER * further
     # After a long window it was another force.
     late = loop.samples > design.lengths[design.lengths.size - 1]
     if released or refuted or late:

@@ -355,7 +355,6 @@ _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 _LEARNER_CUT = int(Status.LEARNER_CUT)
 _HELD = int(Status.HELD)
-_NOT_LEARNED_FROM = int(Status.MEASUREMENT_HELD | Status.HELD)
 
 # A decaying offset below this is set to zero: arithmetic with denormal numbers (below 2.2e-308) is
 # slow. Any value between that and the rounding error of u gives the same u. In single precision
@@ -454,9 +453,9 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
                 loop.y = y
         status |= _estimate(design, state, u_acting, status & _MEASUREMENT_HELD == 0)
         f_plain = seen[design.law.size] + loop.f_learned_shown
-        if status & _HELD == 0:
+        if loop.held == 0.0:
             assess(design.guard, state.guard, f_plain)
-        if status & _NOT_LEARNED_FROM == 0:
+        if status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
             status |= learner_flags(design.learner, state.learner)
     loop.f_known = known_share(design.feedforward, loop.r, state.reference)
@@ -505,7 +504,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     status |= flags_of_applied(design.safe_set, state.safe_set, u)
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
-    if design.learns and status & _NOT_LEARNED_FROM == 0:
+    if design.learns and status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
         excessive = is_excessive(unlimited, u, smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
         lost = has_escaped(watch, output, excessive) or has_lost_range(
