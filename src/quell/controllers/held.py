@@ -100,7 +100,8 @@ class HeldLoop(Scalars):
     phase: float  # 0 free, 1 held, 2 the band is left
     started: float  # 1 when the windows have begun
     y: float  # last measurement
-    count: float  # least change of y so far: what the sensor resolves [y-unit]
+    change: float  # of y in the last sample
+    count: float  # least change of y, or of its change, so far: what the sensor resolves [y-unit]
     peak: float  # largest |b0 u| so far
     centre: float  # of the band in which y rests
     band: float  # A
@@ -208,9 +209,16 @@ def _begin_windows(
 
 
 @kernel
+def _update_count(loop: HeldLoop, change: float, y: float) -> None:
+    """Take a change of y, or of its change: both are whole counts."""
+    if change > 2.0 * resolution(y) * abs(y) and (loop.count == 0.0 or change < loop.count):
+        loop.count = change
+
+
+@kernel
 def _least_band(design: HeldDesign, loop: HeldLoop, y: float) -> float:
     """Return the range of y that its sensor can not tell from rest."""
-    return max(max(design.resolution, 1.5 * loop.count), resolution(loop.y) * abs(y))
+    return max(max(design.resolution, 1.5 * loop.count), resolution(y) * abs(y))
 
 
 @kernel
@@ -257,13 +265,14 @@ def _is_released(
 ) -> bool:
     loop = memory.loop[0]
     if loop.phase == _FREE:
-        change = abs(y - loop.y)
+        change = y - loop.y
         if loop.started == 0.0:
             _begin_windows(design, memory, y, f, f)
-            loop.started = 1.0
-        elif change > 0.0 and (loop.count == 0.0 or change < loop.count):
-            loop.count = change
-        loop.y = y
+            loop.started, change = 1.0, 0.0
+        else:
+            _update_count(loop, abs(change), y)
+            _update_count(loop, abs(change - loop.change), y)
+        loop.y, loop.change, change = y, change, abs(change)
         loop.peak = max(loop.peak, abs(b0 * u))
         for i in range(design.lengths.size):
             if loop.phase == _FREE and _update_window(
