@@ -129,7 +129,7 @@ def test_a_compensator_detects_as_an_adrc_does() -> None:
 def test_the_signal_keeps_the_load_and_the_learned() -> None:
     """Under a load that the observer knows: at the release f̂ is that load, not −b0 u; u stays far from its limit."""
     controller = adrc(learner=ql.learners.Kalman())
-    y, u, status = run(controller, SIGNAL, (0.3, 0.8), load=-4000.0, seconds=0.8)
+    _, u, status = run(controller, SIGNAL, (0.3, 0.8), load=-4000.0, seconds=0.8)
     assert controller.estimate.f == pytest.approx(-4000.0, rel=0.02)
     assert abs(u[-1] - 0.8) < 0.02
     assert status[-1] & ql.Status.HELD
@@ -139,13 +139,17 @@ def test_the_signal_keeps_the_load_and_the_learned() -> None:
 def test_a_load_that_is_compensated_changes_nothing() -> None:
     """A load ramp regulated to standstill may look held; the run is the same as without detection, to the last bit."""
     load = 3000.0 * np.sin(2.0 * np.pi * 0.5 * DT * np.arange(6000))
-    plain, detecting = (run(adrc(held), hold=(9.0, 9.0), seconds=3.0, load=load) for held in (None, ql.HeldPlant()))
+    plain, detecting = (
+        run(adrc(held), hold=(9.0, 9.0), seconds=3.0, load=load) for held in (None, ql.HeldPlant())
+    )
     np.testing.assert_array_equal(plain[1], detecting[1])
 
 
 def test_an_axis_that_sticks_breaks_loose_as_without_detection() -> None:
     """EMPS's dry friction, moves and rests: the error is the same within 1 %."""
-    plant = ql.plants.dc_motor(resistance=1.0, torque_constant=0.37, inertia=1.0, viscous=2.0, coulomb=0.2146)
+    plant = ql.plants.dc_motor(
+        resistance=1.0, torque_constant=0.37, inertia=1.0, viscous=2.0, coulomb=0.2146
+    )
     observer = ESO.model_free(order=2, b0=0.37, omega_o=100.0, dt=2e-3)
     reference = ql.signals.SmoothMove(0.1, 1.0) + ql.signals.SmoothMove(-0.1, 1.0, start=2.0)
     errors = []
@@ -201,7 +205,8 @@ def test_every_form_of_the_observer_takes_part(observer: ESO) -> None:
     With f' the wind-up throws y back instead of over its goal.
     """
     plain, detecting = (
-        overshoot(run(ql.ADRC(observer, 40.0, held=held, **LIMITS))[0]) for held in (None, ql.HeldPlant())
+        overshoot(run(ql.ADRC(observer, 40.0, held=held, **LIMITS))[0])
+        for held in (None, ql.HeldPlant())
     )
     signal = overshoot(run(ql.ADRC(observer, 40.0, **LIMITS), SIGNAL)[0])
     free = overshoot(run(ql.ADRC(observer, 40.0, **LIMITS), hold=(9.0, 9.0))[0])

@@ -92,8 +92,8 @@ _MODULES = (
 
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning", "Estimate",
-    "Feedforward", "Guard", "HeldPlant", "Reason", "SafeSet", "Scenario", "Status", "Trajectory", "Tuned",
-    "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
+    "Feedforward", "Guard", "HeldPlant", "Reason", "SafeSet", "Scenario", "Status", "Trajectory",
+    "Tuned", "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
     "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
     "plants", "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
     "tuning",

@@ -105,8 +105,8 @@ _MESSAGES = {
         "raise u_max or rate_limit, or lower alpha or omega_c."
     ),
     Status.HELD: (
-        "The plant is held, as the machine says, or y rests although u should move it; the learner "
-        "waits: check brake and end stops."
+        "The plant is held, as the machine says, or y rests although u should move it, as with a "
+        "brake or an end stop, or a load that is compensated: check whether u acts."
     ),
 }
 _NOTHING = "No step reported a problem."

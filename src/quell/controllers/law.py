@@ -62,10 +62,10 @@ from quell.controllers.held import (
     f_before,
     follow,
     held_flag,
+    is_released,
     look_anew,
     miss,
     take_motion,
-    is_released,
 )
 from quell.controllers.safe_set import (
     flags_of_applied,
