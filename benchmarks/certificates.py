@@ -204,7 +204,7 @@ def honest(count: int) -> None:
     ):
         pairs = list(zip(loops, guards, strict=True))
         runs = in_parallel([partial(errors, loop, Harmonic(), guard) for loop, guard in pairs])
-        ratios = np.array([[np.nan] * 3 if run is None else run for run in runs]) / plain
+        ratios = np.array(runs) / plain
         kappas = [
             np.inf if guard is None else loop.controller(Harmonic(), guard).parameters.guard.bound
             for loop, guard in pairs

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 
 import numpy as np
@@ -33,8 +34,10 @@ def healthy_loops(order: int, count: int, *seed: int) -> list[GeneralLoop]:
     rng, found = np.random.default_rng([*seed, order]), []
     while len(found) < count:
         loop = draw_loop(rng, order=order)
-        plain = error_of(loop, None, None) if loop.margin >= HEALTHY else None
-        if plain is not None and not is_fragile(loop, plain):
+        if loop.margin < HEALTHY:
+            continue
+        plain = error_of(loop, None, None)
+        if math.isfinite(plain.rms) and not is_fragile([loop], plain):
             found.append(loop)
     return found
 

@@ -84,12 +84,13 @@ class Bench:
         wire: str = "udp",
         url: str = "",
         kind: type[Rig] = Rig,
+        plant: Any = PLANT,
         **settings: Any,
     ) -> None:
         if wire == "serial":
             pytest.importorskip("serial")
         self._stack = stack
-        self.rig = stack.enter_context(kind(PLANT, DT, listen(url or url_of(wire)), **settings))
+        self.rig = stack.enter_context(kind(plant, DT, listen(url or url_of(wire)), **settings))
         self.rig.prepare()
         self.url = self.rig.listener.url
 

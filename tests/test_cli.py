@@ -83,7 +83,7 @@ def test_the_torsional_experiment_has_a_longest_sample_time(quell: Callable[...,
 def test_the_guards_trial_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
-    """A table a line a kind, JSON, and a figure as PNG, SVG and PDF; without a terminal.
+    """A table a line a kind, bars, JSON, and a figure as PNG, SVG and PDF; without a terminal.
 
     The turncoat of this seed is compiled in the guard's own tests.
     """
@@ -107,7 +107,9 @@ def test_the_guards_trial_is_printed_written_and_drawn(
     assert "…" not in shown.out, "a column is cut"
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["settings"]["seed"] == 6
-    assert result["adversarial"]["unstable_where_plain_is_stable"] == 0
+    assert result["hostile"]["lost"] == 0
+    assert "Honest loops, minute of load: 0.00 % have a mean ratio above 1.05" in shown.out
+    assert "means over 4 draws" in " ".join(shown.out.split())
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
         "stress.png",
         "stress.svg",

@@ -13,7 +13,7 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
-from quell.experiments.stress import axes
+from quell.experiments.stress import axes, study
 from quell.experiments.stress.axes import AxesResult, AxisErrors, AxisOutcome, RestOutcome, Settling
 from quell.plants.base import advance
 from tests.commands import Shown
@@ -45,7 +45,8 @@ def test_a_trial_is_paired_and_plain_data(monkeypatch: pytest.MonkeyPatch) -> No
     """Short runs: without learner in both loops the ratios are one to the bit; results are for ``json.dump``."""
     monkeypatch.setattr(axes, "_RUN_LAGS", 4.0)
     monkeypatch.setattr(axes, "_PERIODS", 0.1)
-    monkeypatch.setattr(axes, "DRAWS", 2)
+    monkeypatch.setattr(study, "USUAL", range(2))
+    monkeypatch.setattr(study, "OTHERS", range(2, 4))
     monkeypatch.setattr(axes, "_DURATION", 0.2)
     monkeypatch.setattr(axes, "_JUDGED_AT", 0.1)
     monkeypatch.setattr(axes, "settle", lambda learner, guard, draws: Settling(16.6, 0.004))
@@ -62,7 +63,7 @@ def test_a_trial_is_paired_and_plain_data(monkeypatch: pytest.MonkeyPatch) -> No
     assert all(bar.figure is not None for bar in result.bars())
     found = result.to_json()
     assert json.loads(json.dumps(found)) == found
-    assert found["all"]["loops"] == 2
+    assert found["honest"]["loops"] == 2
 
 
 def outcome(guarded: float, unguarded: float) -> AxisOutcome:
@@ -80,7 +81,8 @@ def test_bars_tell_harm_and_lost_benefit() -> None:
     assert late.figure == 1.5
     assert over.figure == pytest.approx(1.5)
     assert not over.met
-    assert AxesResult({}, [outcome(math.inf, 1.0)]).bars()[0].figure == 1
+    lost, rms, *_ = AxesResult({}, [outcome(math.inf, 1.0)]).bars()
+    assert (lost.figure, rms.figure, rms.met) == (1, None, False)
     assert AxesResult({}, []).bars() == []
 
 
@@ -143,11 +145,13 @@ def test_the_arm_moves_as_two_rods_do() -> None:
 
 
 @pytest.mark.compiled
-def test_a_step_of_the_paper_settles_as_published() -> None:
+def test_a_step_of_the_paper_settles_as_published(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without learner after 16.6 s with 4.5 ‰ of overshoot (docs/theory); the learner of the trial settles sooner."""
     plain = axes.settle(None, None, range(2))
     assert plain == pytest.approx((16.61, 0.0045), rel=0.02)
-    found = axes.run_near_rest(3, 1, None)
+    monkeypatch.setattr(axes, "USUAL", range(1))
+    monkeypatch.setattr(axes, "OTHERS", range(1, 2))
+    found = axes.run_near_rest(3, None)
     assert found.guarded == found.unguarded
     assert found.unguarded.time < 0.8 * plain.time
     assert (found.longer, found.further) == (1.0, pytest.approx(0.0, abs=1e-3))

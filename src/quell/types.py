@@ -101,8 +101,8 @@ _MESSAGES = {
         "The safe set changed the control signal to keep y and its rate in their bands."
     ),
     Status.UNSAFE: (
-        "The limits of u did not allow what the safe set needs: y or its rate may leave its band; "
-        "raise u_max or rate_limit, or lower alpha or omega_c."
+        "NOT safe: limits of u did not allow what the safe set needs (raise u_max or rate_limit, "
+        "or lower alpha), or y moved as f_rate, noise and gain_error do not allow (raise them)."
     ),
     Status.HELD: (
         "The plant is held, as the machine says, or y rests although u should move it, as with a "

@@ -75,7 +75,8 @@ def studies() -> dict[str, Case]:
     springs = {spring: {"MF-ESO": judged} for spring in acc.SPRINGS}
     masses = acc.Result(acc.generated(2), "drawn", springs, {}, 1.0, 1.0)
     loop = stress.draw_loops(1, np.random.default_rng(0))[0]
-    one = stress.Outcome("honest", loop, "rls", False, False, 1.0, 0.9, 0.8)
+    ratios = stress.Errors(1.0, 0.9, 0.8), stress.Errors(1.0, 1.0, 1.0)
+    one = stress.Outcome("honest", loop, "rls", *ratios)
     trial_of_guard = stress.Result({}, [one])
     rates = {spring: {"MF-ESO": [(0.1, 0.0, 0.2)] * 7} for spring in acc.SPRINGS}
 
@@ -121,10 +122,13 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     step = Verification(measured, plain, 1.0, 1.0, plain["y"], plain["u"])
     compared = compare.compare(LAG, {"ADRC": adrc()}, scenario)
     omegas = [4.0, 8.0]
+    pid = ql.baselines.PID(4.0, 1.0, 3.0, tf=0.05, dt=0.01)
+    add_on = ql.tuning.tune_compensator(([1.0], [1.0, 1.0, 0.0]), pid, speeds=(1.0, 1.0))
     plots = {
         "Trajectory": Case(run.plot, 5),
         "BatchTrajectory": Case(batch.plot, 2),
         "Tuned": Case(tuned.plot, 4),
+        "TunedCompensator": Case(add_on.plot, 1),
         "Identified": Case(model.plot, 7),
         "Verification": Case(step.plot, 2),
         "Sweep": Case(lambda ax=None: swept.plot("b", ax=ax), 2),
@@ -175,6 +179,7 @@ _DRAWS = re.compile(r"^ *def (plot(?:_\w+)?|draw)\(", re.MULTILINE)
 _PUBLIC = {
     "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory
     "tuning/tuned.py plot": "Tuned",
+    "tuning/compensator.py plot": "TunedCompensator",
     "identification/result.py plot": "Identified",
     "commissioning.py plot": "Verification",
     "sweeping/sweep.py plot": "Sweep",

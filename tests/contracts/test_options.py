@@ -31,6 +31,11 @@ draws = 3
 metrics = ["iae"]
 parameters = { "observer.b0" = { low = 1.5, high = 2.5 } }
 """
+PROXY = """dt = 0.05
+observer = { kind = "model-free", order = 1, b0 = 2.0, omega_o = 8.0 }
+controller = { kind = "compensator", u_min = -5.0, u_max = 5.0 }
+rig = { device = "twin:torsional" }
+"""
 _FIGURES, _SETUP = ("--no-figures",), ("setup.toml",)
 # What each command does its work with, where that takes long; its arguments are the output then.
 WORK = {
@@ -39,6 +44,7 @@ WORK = {
     "reproduce acc": ("quell.experiments.acc.study.run",),
     "stress": ("quell.experiments.stress.study.run", "quell.experiments.stress.general.run"),
     "rig": ("quell.realtime.rig.Rig",),
+    "proxy": ("quell.realtime.rig.Rig",),
     "studio": ("quell.studio.server.serve",),
     "run-rig": ("quell.realtime.run_rig",),
     "sweep": ("quell.sweeping.sweep",),
@@ -65,6 +71,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "b0": ("record.csv", "--order", "1"),
     "excite": ("out.csv", "--duration", "20"),
     "rig": ("--device", "udp://127.0.0.1:0"),
+    "proxy": ("proxy.toml", "--host", "udp://127.0.0.1:0"),
     "run": (*_SETUP, *_FIGURES),
     "run-rig": (*_SETUP, *_FIGURES),
     "replay": ("recording.csv", *_SETUP, *_FIGURES),
@@ -125,6 +132,10 @@ CASES: dict[str, dict[str, Case]] = {
     "rig": {
         "--device": (("--device", "udp://127.0.0.1:0"), ("--device", "udp://127.0.0.2:0")), "--plant": ("--plant", "two-mass"), "--dt": ("--dt", "0.002"), "--watchdog": ("--watchdog", "9"),
         "--u-max": ("--u-max", "3"), "--rest": ("--no-rest",), "--wait": ("--wait", "0.001"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
+    },
+    "proxy": {
+        "SETUP": ("slow.toml", "--host", "udp://127.0.0.1:0"), "--host": (("proxy.toml", "--host", "udp://127.0.0.1:0"), ("proxy.toml", "--host", "udp://127.0.0.2:0")), "--device": ("--device", "twin:two-mass"),
+        "--watchdog": ("--watchdog", "9"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
     },
     "run": {"SETUP": ("--no-figures",), "--example": (("--example",), _SETUP), "--save": ("--save", "run.nc")},
     "run-rig": {
@@ -208,6 +219,8 @@ def _write_inputs() -> None:
     rng = np.random.default_rng(3)
     Path("setup.toml").write_text(SETUP, encoding="utf-8")
     Path("other.toml").write_text(SETUP.replace("b0 = 2.0", "b0 = 2.5"), encoding="utf-8")
+    Path("proxy.toml").write_text(PROXY, encoding="utf-8")
+    Path("slow.toml").write_text(PROXY.replace("omega_o = 8.0", "omega_o = 4.0"), encoding="utf-8")
     t, u = 0.05 * np.arange(600), np.repeat(np.sign(rng.normal(size=60)), 10)
     y = np.zeros(600)
     for k in range(599):

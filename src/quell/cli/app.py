@@ -13,7 +13,7 @@ from quell.cli.compare import compare
 from quell.cli.exit_codes import HELP, ExitCode
 from quell.cli.identify import b0, excite, identify
 from quell.cli.reproduce import acc, torsional, two_mass
-from quell.cli.rig import replay, rig, run_rig
+from quell.cli.rig import proxy, replay, rig, run_rig
 from quell.cli.run import export, run, studio, sweep
 from quell.cli.stress import stress
 from quell.cli.tune import tune
@@ -46,6 +46,7 @@ for _each in (
     b0,
     excite,
     rig,
+    proxy,
     run,
     run_rig,
     replay,

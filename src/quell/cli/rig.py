@@ -38,6 +38,7 @@ from quell.files import MAX_SIZE
 from quell.realtime.registry import examples
 
 if TYPE_CHECKING:
+    from quell.controllers import Compensator
     from quell.realtime import Rig, RigRun
     from quell.realtime.run import ModeChange
     from quell.records.trajectory import Trajectory
@@ -155,6 +156,82 @@ def _print_counters(server: Rig) -> None:
         )
     if server.unlogged:
         print(f"the log lacks {server.unlogged} ticks: it could not be written as quickly")
+
+
+# ---- quell proxy ----
+
+_HOST = (
+    f"Address at which the host finds the drive, like {examples(listening=True)}. At 127.0.0.1 it "
+    "serves this computer only."
+)
+
+
+def proxy(
+    setup: Path,
+    *,
+    host: Annotated[str, Parameter(help=_HOST)],
+    device: Annotated[str | None, Parameter(help="Drive in place of the file's [rig].")] = None,
+    watchdog: Whole = 20,
+    seconds: float | None = None,
+    log: Path | None = None,
+    overwrite: Overwrite = False,
+    priority: Whole = 50,
+    cpu: WholeOrNone = None,
+    trust: Trust = False,
+) -> None:
+    """Put a compensator between a host and a drive that both stay as they are.
+
+    The host's commands are u_0; to the host the proxy is the drive, to the drive it is the host.
+
+    Parameters
+    ----------
+    setup
+        The file, in TOML, with [controller] kind = "compensator", limits of u, and the drive in
+        [rig].
+    watchdog
+        After so many ticks in a row without a command of the host u_0 is zero until a new session.
+    seconds
+        How long to run [s]; until interrupted by default.
+    log
+        Write each tick to this CSV file: y, u_0, the command as it came, state.
+    priority
+        SCHED_FIFO priority of the ticks, 1 to 99; 0 for ordinary scheduling.
+    cpu
+        Number of the processor for the ticks; any by default.
+    """
+    from quell.realtime import CompensatedDrive, open_device
+    from quell.realtime.registry import listen
+    from quell.realtime.rig import Rig, checked_seconds
+    from quell.realtime.system import checked_cpu, checked_priority, termination_handler
+    from quell.setup import load
+
+    loaded = load(setup, trust)
+    url = str(loaded.needed("rig")["device"]) if device is None else device
+    if seconds is not None:
+        checked_seconds("--seconds", seconds)
+    checked_priority(priority)
+    checked_cpu(cpu)
+    compensator, dt = cast("Compensator", loaded.controller), float(loaded.controller.dt)
+    limits: dict[str, Any] = {"watchdog": watchdog, "log": log, "overwrite": overwrite}
+    with (
+        closing(CompensatedDrive(open_device(url, dt, trust), compensator)) as drive,
+        closing(listen(host)) as listener,
+        Rig(drive, dt, listener=listener, **limits) as server,
+    ):
+        with exit_on_signal(listener.close):
+            server.prepare()
+        if hasattr(drive.device, "restart_session"):
+            drive.device.restart_session()  # compiling may have taken longer than it waits
+        with termination_handler(lambda *_: server.stop()):
+            rule = f"u_0 = 0 after {watchdog} ticks without a command"
+            between = f"compensator between {listener.url} and {url}"
+            print(f"{between}: a tick every {dt:g} s, {rule}", flush=True)
+            notes = server.run(seconds, priority=priority, cpu=cpu)
+        _print_counters(server)
+        estimate = drive.estimate
+        print(f"last tick: u = {estimate.u:.6g}, f = {estimate.f:.6g}, {estimate.status!r}")
+    for note in notes:
+        print(note)
 
 
 # ---- quell run-rig ----

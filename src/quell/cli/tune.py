@@ -299,6 +299,8 @@ def tune(
 ) -> int:
     """Tune a controller for a linear plant: the best load rejection under constraints.
 
+    Of a setup with a [compensator] that is tuned, and its controller stays as it is.
+
     The plant is that of a setup file, a transfer function, one that a record shows, or that an
     experiment at a rig shows (--device). A record is identified first, and the deviations of gain,
     poles and delay become the set of plants. PI, PID and other structures are tuned under the same
@@ -384,6 +386,8 @@ def tune(
         unused |= options_of(of_model, MODEL_OPTIONS)
         refuse(unused, "goes with a record or --device, which is identified")
         refuse(of_rig, "goes with --device, an experiment at a rig")
+        if setup is not None and not (num or den or dt) and has_compensator(setup):
+            return _tune_compensator(console, setup, options, trust, out, outputs)
         plant, dt, options, name = _plant(setup, num, den, dt, options, works, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
@@ -417,6 +421,57 @@ def tune(
         step = verified(console, place, tuned, model, y_now)
     _write(console, tuned, out, outputs, {"model": model.to_json()}, step)
     return ExitCode.DONE if step is None else exit_code(step.run)
+
+
+def has_compensator(path: Path) -> bool:
+    """Return whether a setup file has a compensator, which is then what is tuned."""
+    from quell.setup.schema import read
+
+    return "compensator" in read(path)[1]
+
+
+def _tune_compensator(
+    console: Console,
+    path: Path,
+    options: dict[str, Any],
+    trust: bool,
+    out: Path | None,
+    outputs: Outputs,
+) -> int:
+    """Tune the compensator of a setup; its controller stays as it is."""
+    from quell.controllers.compensated import Compensated
+    from quell.controllers.prefilters import without_prefilters
+    from quell.files import written_atomically
+    from quell.setup.loading import load, varied
+    from quell.tuning import Constraints, tune_compensator
+    from quell.tuning.report import toml_text
+
+    usable = {"m_s", "m_t", "m_ks", "delay"}
+    rule = "is for a controller; of the compensator in this file m_s, m_t, m_ks and delay count"
+    refuse({name: (value, None) for name, value in options.items() if name not in usable}, rule)
+    setup = load(path, trust)
+    plant, both = setup.needed("plant"), without_prefilters(setup.controller)
+    assert isinstance(both, Compensated)
+    delay = options.pop("delay", 0.0)
+    bounds = Constraints(**{"m_s": 2.0, "m_t": 2.0, "damping": None} | options)
+    with console.status("tuning the compensator"):
+        tuned = tune_compensator(plant, both.controller, constraints=bounds, delay=delay)
+    print_line(console, f"{setup.title}, dt = {both.dt:g} s")
+    print_line(console, str(tuned))
+    if out is not None:
+        changes = {"observer": tuned.tables["observer"]}
+        text = toml_text(varied(setup, changes).tables(), str(tuned))
+        with written_atomically(out, outputs.overwrite) as part:
+            part.write_text(text, encoding="utf-8")
+        print_line(console, f"Setup: {out}")
+    paths = []
+    if outputs.figures:
+        from quell.experiments.common import save_figure
+
+        figure = tuned.plot().figure
+        paths += save_figure(figure, outputs.figures, "tuned", outputs.overwrite)
+    write_results(console, tuned.to_json(), outputs, paths)
+    return ExitCode.DONE
 
 
 def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:

@@ -1,7 +1,7 @@
 """A controller with a disturbance compensator on top of it.
 
 Any controller gives u_0 from r and y, and the compensator adds what cancels the total disturbance
-(``controllers/compensator.py``):
+(``controllers/compensator.py``)::
 
     u_0 = C(r, y),      u = sat( u_0 − (f_L + Δf̂)/b0 )
 

@@ -1,7 +1,7 @@
 """A disturbance compensator: observer, learner and guard on top of any controller.
 
 A controller or drive that stays as it is asks for u_0. The compensator adds what cancels the total
-disturbance f, as an ESO of the plant between u and y estimates it and a learner predicts it:
+disturbance f, as an ESO of the plant between u and y estimates it and a learner predicts it::
 
     u = sat( u_0 − (f_L + Δf̂) / b0 )
 
@@ -16,11 +16,11 @@ kernel, that of ``controllers/law.py``.
 
 A compensator changes the loop: between u_0 and y, the controller finds the plant of the observer,
 but with the observer's lag, and with the margins of a loop of its own. For an observer of order n
-with all poles at −ω_o and no model, the feedback that is added is
+with all poles at −ω_o and no model, the feedback that is added is::
 
     u = u_0 − Q(s) (s^n y/b0 − u),     Q = ω_o^(n+1) / (s + ω_o)^(n+1),     n + 1 = N
 
-so it integrates below ω_o/N, and at the resonance of a flexible plant it is as strong as Q there.
+So it integrates below ω_o/N, and at the resonance of a flexible plant it is as strong as Q there.
 ``analyse`` and ``tune`` judge that loop together with the controller's
 (``Compensated``).
 

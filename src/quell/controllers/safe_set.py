@@ -1,22 +1,23 @@
 """A safe set: bands for y and its rate that no reference, u_0 or learner makes the loop leave.
 
-**The barrier.** For a border y_max of an order-n plant ``y^(n) = b0 u + f − a · x``, let
+**The barrier.** For a border y_max of an order-n plant ``y^(n) = b0 u + f − a · x``, let::
 
     ψ_0 = y_max − y,      ψ_i = (d/dt + α) ψ_{i−1},      i = 1 … n − 1
 
 If ψ_{n−1} never becomes negative, no ψ_i does that begins above zero: each is ψ_{i+1} through a lag
 of 1/α. So y does not exceed y_max (exponential control barrier functions: Nguyen & Sreenath,
 *American Control Conference* 2016; Ames et al., *European Control Conference* 2019). ψ_{n−1} is
-linear in the state,
+linear in the state::
 
     ψ_{n−1} = α^(n−1) y_max − c · x,      c_i = C(n − 1, i − 1) α^(n−i)
 
 and one sample later, with u held, it is known exactly: ``x⁺ = Φ x + Γ_u u + Γ_f f``. The condition
+is::
 
     ψ_{n−1}⁺ ≥ λ ψ_{n−1},      λ = exp(−α dt)
 
-is therefore one bound of u, in closed form, and its limit for dt → 0 is the law of ADRC with the
-bandwidth α and the reference y_max:
+It is one bound of u, in closed form, and its limit for dt → 0 is the law of ADRC with the
+bandwidth α and the reference y_max::
 
     c·Γ_u u ≤ (1 − λ) α^(n−1) y_max − c·(Φ − λ I) x̂ − c·Γ_f f̂ − δ                              (1)
 
@@ -25,12 +26,12 @@ as little as these bounds allow; where the two bands contradict each other, that
 
 **The margin** δ pays for what is not known (arXiv 2308.13943, 2512.05292: robust barriers with an
 estimate of the disturbance). The set has an observer of its own, which receives y and the applied u
-and nothing of a learner, so its errors do not depend on what a learner does. They obey
+and nothing of a learner, so its errors do not depend on what a learner does. They obey::
 
     e⁺ = (I − L C)(Φ e + w) − L v,      w = ∫ exp(A s) E f'(t − s) ds over a sample
 
-and what they do to (1) is ``q = c·(Φ e + w) − λ c·e``. With the sum of the absolute values of the
-impulse response of q, δ is the largest |q| for all signals within the bounds
+What they do to (1) is ``q = c·(Φ e + w) − λ c·e``. With the sum of the absolute values of the
+impulse response of q, δ is the largest ``|q|`` for all signals within the bounds::
 
     |f'| ≤ f_rate,      |v| ≤ noise,      |b/b0 − 1| ≤ gain_error with |u| ≤ max(|u_min|, |u_max|)
 
@@ -39,11 +40,13 @@ all ψ_i ≥ 0, and an observer that has settled (some lags after a start), ψ_{
 and y and y' stay in their bands: for orders 1 and 2 at all times but for f' dt²/8 of a curve within
 a sample, of higher order up to (α dt)² of the band. From a start outside, ψ_{n−1} grows towards
 zero as exp(−α t). All of that as long as the limits of u allow what (1) asks for: else u is at the
-limit that comes nearest, and the flag ``UNSAFE`` says so. In a band of width H that takes
+limit that comes nearest, and the flag ``UNSAFE`` says so. It also says that a measurement was
+farther from the expected one than signals within the bounds allow: then a bound does not hold, and
+nothing is guaranteed. In a band of width H that takes::
 
     |b0 u + f| ≤ α² H for n = 2,      3 α³ H for n = 3
 
-so α follows from what the actuator has.
+So α follows from what the actuator has.
 """
 
 from __future__ import annotations
@@ -71,6 +74,10 @@ _UNSAFE = int(Status.UNSAFE)
 # between the nodes may add.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 _BETWEEN_NODES = 1.01
+# An observer has forgotten its start after so many lags: exp(−20) = 2e-9.
+_SETTLED_LAGS = 20.0
+# Rounding of a measurement and of its prediction, as a share of y; of single precision, too.
+_ROUNDING = 1e-6
 
 
 class NoSafeSet(NamedTuple):
@@ -100,6 +107,8 @@ class SafeSetDesign(NamedTuple):
     eso: EsoModel  # the observer without learner
     position: Band
     rate: Band
+    surprise: float  # largest error of an expected measurement with all signals in their bounds
+    settled: float  # samples after which that holds
 
 
 class SafeSetLoop(Scalars):
@@ -108,6 +117,8 @@ class SafeSetLoop(Scalars):
     started: float  # 1 after the first finite measurement, else 0
     low: float  # lowest u that keeps the loop in the set
     high: float  # highest u that does
+    samples: float  # since the start, up to ``settled``
+    surprised: float  # 1 if a measurement was farther from the expected one than bounds allow
 
 
 class SafeSetMemory(NamedTuple):
@@ -148,11 +159,17 @@ def _see(design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float) -> No
             begin(design.eso, memory.z, memory.seen, y)
             loop.started = 1.0
         return
+    expected = expected_measurement(design.eso, memory.z, u, 0.0)
+    loop.surprised = 0.0
     if not is_usable(y):
-        y = expected_measurement(design.eso, memory.z, u, 0.0)
+        y = expected
+    elif loop.samples < design.settled:
+        loop.samples += 1.0
+    elif not abs(y - expected) <= design.surprise + _ROUNDING * abs(y):
+        loop.surprised = 1.0
     observe(design.eso, memory.z, memory.seen, y, u, 0.0)
     if not is_finite(memory.seen[memory.seen.size - 1]):
-        loop.started = 0.0
+        loop.started = loop.samples = 0.0
 
 
 @kernel
@@ -185,7 +202,7 @@ def _nearest_safe(design: SafeSetDesign, memory: SafeSetMemory, u: float) -> tup
 @flags_of_applied.register(SafeSetDesign)
 def _flags_of_applied(design: SafeSetDesign, memory: SafeSetMemory, u: float) -> int:
     loop = memory.loop[0]
-    if loop.started == 0.0 or loop.low <= u <= loop.high:
+    if loop.started == 0.0 or (loop.low <= u <= loop.high and loop.surprised == 0.0):
         return 0
     return _UNSAFE
 
@@ -202,7 +219,7 @@ def shift_f(design: Any, memory: Any, change: float) -> None:
 
 @shift_f.register(SafeSetDesign)
 def _shift_f(design: SafeSetDesign, memory: SafeSetMemory, change: float) -> None:
-    last = memory.z.size - 1
+    last = memory.seen.size - 1
     memory.z[last] += change
     memory.seen[last] += change
 
@@ -239,8 +256,9 @@ def _set_motion(design: SafeSetDesign, memory: SafeSetMemory, x: Vector, f: floa
 def settle_safe_set(design: Any, memory: Any, x: Vector, f: float) -> None:
     """Set the observer of a safe set to given estimates, for a plant that is known there."""
     if isinstance(design, SafeSetDesign):
-        memory.z[:-1] = memory.seen[:-1] = x
-        memory.z[-1] = memory.seen[-1] = f
+        size = memory.seen.size
+        memory.seen[:] = np.append(x, f)
+        memory.z[:size], memory.z[size:] = memory.seen, 0.0
         memory.loop[0].started = 1.0
 
 
@@ -321,7 +339,11 @@ class SafeSet:
             )
         position = self._band(observer, model, n, (self.y_min, self.y_max), largest)
         rate = self._band(observer, model, n - 1, (self.rate_min, self.rate_max), largest)
-        return SafeSetDesign(model, position, rate)
+        # The expected measurement is wrong by C (Φ e + w) + v: the same with c = C, λ = 0 and v.
+        first = np.eye(n)[0]
+        surprise = self._largest_error(observer, model, first, 0.0, largest) + self.noise
+        settled = float(round(_SETTLED_LAGS * observer.lag_time / observer.dt))
+        return SafeSetDesign(model, position, rate, surprise, settled)
 
     def memory(self, design: SafeSetDesign) -> SafeSetMemory:
         """Return the state before the first sample."""

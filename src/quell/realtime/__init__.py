@@ -21,6 +21,7 @@ from quell.lazy import imported_on_use
 if TYPE_CHECKING:
     from quell.realtime.devices import Device, TwinDevice
     from quell.realtime.live import LiveSink
+    from quell.realtime.proxy import CompensatedDrive
     from quell.realtime.recordings import CsvSink, McapSink, load
     from quell.realtime.registry import open_device
     from quell.realtime.rig import Rig
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from quell.realtime.target import record_target
 
 _HOMES = {
+    "CompensatedDrive": "proxy",
     "CsvSink": "recordings",
     "Device": "devices",
     "LiveSink": "live",
@@ -45,8 +47,8 @@ _HOMES = {
 }
 
 __all__ = [
-    "CsvSink", "Device", "LiveSink", "McapSink", "Rig", "RigRun", "Safety", "TwinDevice",
-    "load", "open_device", "record_target", "replay", "run_rig",
+    "CompensatedDrive", "CsvSink", "Device", "LiveSink", "McapSink", "Rig", "RigRun", "Safety",
+    "TwinDevice", "load", "open_device", "record_target", "replay", "run_rig",
 ]  # fmt: skip
 
 __getattr__ = imported_on_use(__name__, _HOMES)

@@ -36,6 +36,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.compensated import takes_control
+from quell.controllers.prefilters import without_prefilters
 from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors
 from quell.quantities import UNKNOWN, Signals
 from quell.realtime.cycle import ControlLoop
@@ -316,6 +318,11 @@ def run_rig(
     handle = handle_of(device)
     with closing(device):
         check_controller(controller)
+        if takes_control(without_prefilters(getattr(controller, "controller", controller))):
+            raise ValueError(
+                "controller = Compensator: takes u_0 of a host, not a reference; run it between "
+                "host and drive (quell proxy), or with its controller as quell.Compensated"
+            )
         dt = controller.dt
         own = getattr(device, "dt", dt)
         if abs(own - dt) > 1e-9 * dt:  # allows for the rounding of 1 / rate

@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Learner
     from quell.setup.schema import CallTable as Metrics
     from quell.setup.schema import CallTable as Observer
+    from quell.setup.schema import CallTable as OnTop
     from quell.setup.schema import CallTable as Plant
     from quell.setup.schema import CallTable as Prefilter
     from quell.setup.schema import CallTable as Rig
@@ -32,6 +33,7 @@ else:
         Learner,
         Metrics,
         Observer,
+        OnTop,
         Plant,
         Prefilter,
         Rig,
@@ -53,8 +55,11 @@ class Description(Table):
     )
     dt: float = Field(description="sample time of the loop and all of its parts [s].")
     plant: Plant | None = _optional("the plant, for `quell run` and observers with a model.")
-    observer: Observer | None = _optional("the observer of an `adrc` controller.")
+    observer: Observer | None = _optional("the observer of an `adrc` or a compensator.")
     controller: Controller = Field(description="the controller.")
+    compensator: OnTop | None = _optional(
+        "a compensator on top of a controller without observer; none by default."
+    )
     learner: Learner | None = _optional("the learner; none by default.")
     guard: Guard | None = _optional("the guard of the learner; none by default.")
     prefilter: Prefilter | None = _optional("the prefilter of the reference; none by default.")

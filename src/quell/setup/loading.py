@@ -29,6 +29,7 @@ from pydantic_core import PydanticUndefined
 
 from quell import checks
 from quell.controllers.base import Controller
+from quell.controllers.compensated import Compensated
 from quell.controllers.prefilters import Prefiltered
 from quell.files import nonfinite_to_none
 from quell.plants.base import Plant, signals_of
@@ -169,13 +170,20 @@ def assembled(
     model = None if plant is None else made_once("model", (plant,), partial(linear_model, plant))
     parts = {key: build(key, plant=model) for key in ("observer", "learner", "guard")}
     kind, used = tables.controller.kind_name, tables.controller.context
+    if tables.compensator is not None:
+        kind, used = f"{kind} with a compensator", tables.compensator.context
     unused = [key for key, part in parts.items() if part is not None and key not in used]
     if unused:
         rule = f"a controller of the kind {kind} does not use it"
         raise SetupError([f"{name}: {key}: {rule}" for key in unused])
     # A controller is designed for the linear part; a feedforward also uses friction and delay.
     designs = "plant" in parameters_of(tables.controller.function)
-    controller = build("controller", plant=model if designs else plant, **parts)
+    own = parts if tables.compensator is None else {}
+    controller = build("controller", plant=model if designs else plant, **own)
+    if tables.compensator is not None:
+        compensator = build("compensator", **parts)
+        combine = partial(builder.attempt, "compensator", (), Compensated, controller, compensator)
+        controller = made_once("compensated", (controller, compensator), combine)
     prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
     if rig is not None and plant is not None and signals_of(plant).known:
         rig = {"signals": signals_of(plant), **rig}
@@ -419,7 +427,7 @@ def _with(name: str, where: Any, steps: list[str | int], value: Any, path: str) 
 # ---- Arguments of quell.tune from a setup file ----
 
 # What a tuning replaces. A law without effect stands in for the controller.
-_REPLACED = ("observer", "controller", "learner", "guard", "prefilter")
+_REPLACED = ("observer", "controller", "compensator", "learner", "guard", "prefilter")
 _NO_CONTROLLER = {"kind": "pid", "kp": 0.0}
 
 

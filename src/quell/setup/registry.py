@@ -11,11 +11,13 @@ from typing import Any
 from quell import features, guard, learners, signals
 from quell.controllers import (
     ADRC,
+    Compensator,
     Feedforward,
     LinearController,
     NonlinearFeedback,
     ProfileGenerator,
     ReferenceModel,
+    SafeSet,
     TrackingDifferentiator,
     adrc_for_dead_time,
 )
@@ -252,12 +254,14 @@ _SERIES: Mapping[str, Callable[..., Any]] = {
     "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
-_LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True)}
+_BANDS = {"safe_set": call_table("safe-set", SafeSet, only=True) | None}
+_LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **_BANDS}
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
 _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)
 _CONTROLLERS = (
     call_table("adrc", ADRC, types=_LAW),
     call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=_LAW),
+    call_table("compensator", Compensator, types=_BANDS),
     call_table("pid", PID, forwards_to=_LINEAR),
     call_table("pid-simc", PID.simc, forwards_to=_PID),
     call_table(_DOUBLE_INTEGRATOR, PID.simc_double_integrator, forwards_to=_PID),
@@ -273,6 +277,7 @@ PREFILTERS = _call_tables(
 )
 Observer, Learner, Prefilter = one_of(OBSERVERS), one_of(LEARNERS), one_of(PREFILTERS)
 Controller = one_of(CONTROLLERS, default="adrc")
+OnTop = call_table("compensator", Compensator, only=True, types=_BANDS)
 _CERTIFIED = {"certified_for": one_of(PLANTS, many=Plant) | None}
 Guard = call_table("guard", guard.Guard, only=True, types=_CERTIFIED)
 _SIGNALS = {"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)}

@@ -6,10 +6,19 @@ the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` p
 and returns a ``Tuned``.
 """
 
+from quell.tuning.compensator import TunedCompensator, tune_compensator
 from quell.tuning.constraints import Constraints
 from quell.tuning.plants import identified_plants
 from quell.tuning.structures import STRUCTURES
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 
-__all__ = ["STRUCTURES", "Constraints", "Tuned", "identified_plants", "tune"]
+__all__ = [
+    "STRUCTURES",
+    "Constraints",
+    "Tuned",
+    "TunedCompensator",
+    "identified_plants",
+    "tune",
+    "tune_compensator",
+]

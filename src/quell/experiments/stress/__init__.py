@@ -6,7 +6,10 @@ May import ``experiments.common``.
 from quell.experiments.stress.adversaries import KINDS, Adversary, Turncoat, draw_adversary
 from quell.experiments.stress.figures import draw, save
 from quell.experiments.stress.study import (
+    DRAWS,
     HONEST,
+    Bar,
+    Errors,
     Loop,
     Outcome,
     Result,
@@ -18,9 +21,12 @@ from quell.experiments.stress.study import (
 )
 
 __all__ = [
+    "DRAWS",
     "HONEST",
     "KINDS",
     "Adversary",
+    "Bar",
+    "Errors",
     "Loop",
     "Outcome",
     "Result",

@@ -23,9 +23,8 @@ coupled (``arm``), with a right b0 and with one that is too small; and for every
 the features in the trial of settling near rest (``near_rest``).
 
 On flexible axes the error is y, as the reference is zero. Measures are the RMS errors from the
-start of the load on, and of the second half of that time (*late*), each the mean over ``DRAWS``
-draws of the noise, which are the same with and without learner. *Chance* is the loop without
-learner and other draws of the noise, over the loop without learner.
+start of the load on, and of the second half of that time (*late*), each the mean over draws of the
+noise; ``study`` says how loops are judged by means, and what chance is.
 
 Every axis has ``Harmonic()`` or ``Kalman()`` in turn, every joint of an arm ``Harmonic()``. A run
 is *lost* if it diverges or leaves |y| = 100 rad where the loop without learner does not. The ratios
@@ -74,7 +73,7 @@ each of the two measures.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
@@ -85,11 +84,22 @@ from quell.analysis import analyse
 from quell.controllers import ADRC
 from quell.controllers.base import control
 from quell.experiments import two_mass_spring as setup
-from quell.experiments.common import quantiles, step_scores
+from quell.experiments.common import step_scores
 from quell.experiments.stress.adversaries import log_uniform
-from quell.experiments.stress.general import HONEST, Bar
+from quell.experiments.stress.general import HONEST
 from quell.experiments.stress.loops import Table
-from quell.experiments.stress.study import check_numbers
+from quell.experiments.stress.study import (
+    OTHERS,
+    USUAL,
+    Bar,
+    Judged,
+    bars_of,
+    check_numbers,
+    compare,
+    mean_errors,
+    ratios,
+    summary,
+)
 from quell.features import RandomFourier
 from quell.files import nonfinite_to_none
 from quell.guard import Guard
@@ -356,11 +366,6 @@ class JointErrors(NamedTuple):
     rms: Vector  #: from 5 s on (2,)
     late: Vector  #: in the second half of that time (2,)
 
-    def worst(self, other: JointErrors) -> tuple[float, float]:
-        """Return the ratios to those of another loop, the larger of the two joints'."""
-        rms, late = (float(np.max(a / b)) for a, b in zip(self, other, strict=True))
-        return rms, late
-
 
 def draw_arm(rng: np.random.Generator, too_small: float = 1.0) -> Arm:
     """Return a random arm of at least ``LEAST_MARGIN``."""
@@ -402,10 +407,11 @@ def _margin(gain: float) -> float:
 
 def arm_errors(arm: Arm, learner: Learner | None, guard: Guard | None, draws: range) -> JointErrors:
     """Return the errors of the joints, over these draws of the noise."""
-    (r, asked), found = arm.reference(), []
+    r, asked = arm.reference()
     plant = arm.plant.sampled(ARM_DT, dispatch.interpret_all)
     one, other = arm.controllers(learner, guard)
-    for draw in draws:
+
+    def once(draw: int) -> JointErrors:
         rng, q = np.random.default_rng([arm.seed, draw]), np.empty_like(r)
         noise = _NOISE * rng.standard_normal(r.shape)
         loops = (one.parameters, one.initial_state(), other.parameters, other.initial_state())
@@ -415,8 +421,9 @@ def arm_errors(arm: Arm, learner: Learner | None, guard: Guard | None, draws: ra
             return JointErrors(np.full(2, np.inf), np.full(2, np.inf))
         square = ((q - asked) ** 2)[round(_JUDGED_AT / ARM_DT) :]
         late = square[square.shape[0] // 2 :]
-        found.append(np.sqrt([square.mean(axis=0), late.mean(axis=0)]))
-    return JointErrors(*np.mean(found, axis=0))
+        return JointErrors(np.sqrt(square.mean(axis=0)), np.sqrt(late.mean(axis=0)))
+
+    return mean_errors(once, draws)
 
 
 @compiled_loop("plant", "design1", "design2", "r", "noise")
@@ -513,8 +520,8 @@ class RestOutcome(NamedTuple):
 
 def settle(learner: Learner | None, guard: Guard | None, draws: range) -> Settling:
     """Return how the step ends, in the mean over these draws of the noise."""
-    found = []
-    for seed in draws:
+
+    def once(seed: int) -> Settling:
         settings = setup.Settings(seed=seed)
         observer = setup.controller(settings).observer
         controller = ADRC(observer, settings.omega_c, learner=learner, guard=guard)
@@ -525,47 +532,48 @@ def settle(learner: Learner | None, guard: Guard | None, draws: range) -> Settli
         part = run.window(*setup.STEP_WINDOW)
         scores = step_scores(run.t[part], run["y"][part], 1.0, setup.BAND)
         pair = scores["settling_time"], scores["overshoot"]
-        found.append([math.inf if value is None else value for value in pair])
-    return Settling(*np.mean(found, axis=0).tolist())
+        return Settling(*(math.inf if value is None else value for value in pair))
+
+    return mean_errors(once, draws)
 
 
-def run_near_rest(features: int, draws: int, guard: Guard | None) -> RestOutcome:
-    """Run the steps with the features of a seed, for so many draws of the noise."""
+def run_near_rest(features: int, guard: Guard | None) -> RestOutcome:
+    """Run the steps with the features of a seed."""
     learner = RLS(features=RandomFourier(FEATURES, seed=features))
-    usual = range(draws)
-    unguarded = settle(learner, None, usual)
+    unguarded = settle(learner, None, USUAL)
     return RestOutcome(
         features=features,
-        guarded=unguarded if guard is None else settle(learner, guard, usual),
+        guarded=unguarded if guard is None else settle(learner, guard, USUAL),
         unguarded=unguarded,
-        plain=settle(None, None, usual),
-        other_noise=settle(None, None, range(draws, 2 * draws)),
+        plain=settle(None, None, USUAL),
+        other_noise=settle(None, None, OTHERS),
     )
 
 
 # ---- The trial on axes ----
 
-DRAWS = 4
-"""Draws of the noise over which the errors of a loop are averaged."""
 _AXES_PER_ARM, _AXES_PER_STEP = 4, 8
 # Overshoot [fraction of the step] that a guard may add near rest: half of the settling band.
 _FURTHER = 0.001
 _WORST_LISTED = 10
+# What a bar is over, what it measures, where that is in a ``summary``, and the bar.
+_BARS = (
+    ("all", "lost", "lost", 0.0),
+    ("axes", "RMS, guarded over no learner, largest", "rms max", 1.02),
+    ("axes", "late, guarded over no learner, largest", "late max", 1.02),
+)
+_ARM_BAR = ("RMS, guarded over no learner, largest of the worse joints", "rms max", 1.0)
 
 
 class AxisErrors(NamedTuple):
-    """RMS errors, means over the draws of the noise; infinite if one of the runs is lost."""
+    """RMS errors, means over draws of the noise, or their ratios; infinite if a run is lost."""
 
     rms: float  #: from the start of the load on
     late: float  #: of the second half of that time
 
-    def over(self, other: AxisErrors) -> AxisErrors:
-        """Return the ratios to those of another loop."""
-        return AxisErrors(*(a / b for a, b in zip(self, other, strict=True)))
-
 
 @dataclass(frozen=True)
-class AxisOutcome:
+class AxisOutcome(Judged):
     """The ratios of one loop."""
 
     learner: str
@@ -577,14 +585,9 @@ class AxisOutcome:
     chance: AxisErrors  #: no learner with other draws of the noise, over no learner
 
     @property
-    def lost(self) -> bool:
-        """Whether the guarded loop is lost."""
-        return math.isinf(self.guarded.rms)
-
-    @property
     def over_unguarded(self) -> AxisErrors:
         """The guarded loop over the unguarded one; zero where that is lost."""
-        return self.guarded.over(self.unguarded)
+        return AxisErrors(*(a / b for a, b in zip(self.guarded, self.unguarded, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -607,31 +610,18 @@ class AxesResult:
     def bars(self) -> list[Bar]:
         """Return the figures that have a bar."""
         every = [*self.outcomes, *self.arms]
-        rows = [Bar("all", "lost", float(sum(o.lost for o in every)), 0.0)] if every else []
-        return rows + self._axis_bars() + self._arm_bars() + self._rest_bars()
-
-    def _axis_bars(self) -> list[Bar]:
-        if not self.outcomes:
-            return []
-        found, chance = summary(self.outcomes), _chance(self.outcomes)
-        over_none = "guarded over no learner, largest"
-        over_unguarded = "guarded over unguarded, median"
-        rows = [
-            Bar("RMS", over_none, found["rms"]["max"], 1.02, chance["rms"]["max"]),
-            Bar("late", over_none, found["late"]["max"], 1.02, chance["late"]["max"]),
-        ]
-        for name in ("rms", "late"):
-            median = found[f"{name}_over_unguarded"]["median"]
-            rows.append(Bar("RMS" if name == "rms" else name, over_unguarded, median, 1.15))
-        return rows
-
-    def _arm_bars(self) -> list[Bar]:
-        rows, measure = [], "guarded over no learner, largest of the worse joints"
+        rows = bars_of(_BARS, AxisErrors, {"all": every, "axes": self.outcomes})
+        if self.outcomes:
+            found = summary(self.outcomes, AxisErrors, "over_unguarded")
+            median = "guarded over unguarded, median"
+            rows += [
+                Bar(f"axes, {name}", median, found[key]["median"], 1.15)
+                for name, key in (("RMS", "rms"), ("late", "late"))
+            ]
         for kind, outcomes in self.by_structure.items():
             if outcomes[0] in self.arms:
-                found, chance = summary(outcomes)["rms"]["max"], _chance(outcomes)["rms"]["max"]
-                rows.append(Bar(kind, f"RMS, {measure}", found, 1.0, chance))
-        return rows
+                rows += bars_of([(kind, *_ARM_BAR)], AxisErrors, {kind: outcomes})
+        return rows + self._rest_bars()
 
     def _rest_bars(self) -> list[Bar]:
         if not self.rest:
@@ -649,39 +639,20 @@ class AxesResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists for ``json.dump``."""
-        worst = sorted((*self.outcomes, *self.arms), key=lambda o: -o.guarded.rms)[:_WORST_LISTED]
+        counted = [o for o in (*self.outcomes, *self.arms) if not o.plain_lost]
+        worst = sorted(counted, key=lambda o: -o.guarded.rms)[:_WORST_LISTED]
         return {
             "settings": self.settings,
             "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
-            "all": summary(self.outcomes),
-            "chance": _chance(self.outcomes),
+            "honest": summary(self.outcomes, AxisErrors),
+            "honest_other_noise": summary(self.outcomes, AxisErrors, "chance"),
+            "honest_over_unguarded": summary(self.outcomes, AxisErrors, "over_unguarded"),
             "near_rest": [_rest_to_json(outcome) for outcome in self.rest],
-            "structures": {name: summary(each) for name, each in self.by_structure.items()},
-            "worst": [_to_json(outcome) for outcome in worst],
+            "structures": {
+                name: summary(each, AxisErrors) for name, each in self.by_structure.items()
+            },
+            "worst": [outcome.to_json() for outcome in worst],
         }
-
-
-def summary(outcomes: Sequence[AxisOutcome]) -> dict[str, Any]:
-    """Return counts, and quantiles of the ratios; None for those of no numbers."""
-    found: dict[str, Any] = {"loops": len(outcomes), "lost": sum(o.lost for o in outcomes)}
-    for name in AxisErrors._fields:
-        found[name] = quantiles(getattr(o.guarded, name) for o in outcomes)
-        over_unguarded = (getattr(o.over_unguarded, name) for o in outcomes)
-        found[f"{name}_over_unguarded"] = quantiles(over_unguarded)
-    return found
-
-
-def _chance(outcomes: Sequence[AxisOutcome]) -> dict[str, Any]:
-    return {
-        name: quantiles(getattr(o.chance, name) for o in outcomes) for name in AxisErrors._fields
-    }
-
-
-def _to_json(outcome: AxisOutcome) -> dict[str, Any]:
-    found = asdict(outcome)
-    for name in ("guarded", "unguarded", "chance"):
-        found[name] = nonfinite_to_none(getattr(outcome, name)._asdict())
-    return found
 
 
 def _rest_to_json(outcome: RestOutcome) -> dict[str, Any]:
@@ -710,7 +681,7 @@ def run(
     jobs: list[Callable[[], Any]] = [partial(run_one, seed, i, guard) for i in range(count)]
     for too_small in (1.0, TOO_SMALL):
         jobs += [partial(run_arm, seed, i, too_small, guard) for i in range(of_arms)]
-    jobs += [partial(run_near_rest, seed + i, DRAWS, guard) for i in range(steps)]
+    jobs += [partial(run_near_rest, seed + i, guard) for i in range(steps)]
     settings = {
         "honest": count,
         "seed": seed,
@@ -730,51 +701,46 @@ def run_one(seed: int, index: int, guard: Guard | None) -> AxisOutcome:
     """Run the loop with this number."""
     axis = draw_axis(np.random.default_rng([seed, index]))
     kind = list(HONEST)[index % len(HONEST)]
-    plain = errors(axis, None, None)
-    unguarded = errors(axis, HONEST[kind], None).over(plain)
-    guarded = unguarded
-    if guard is not None:
-        guarded = errors(axis, HONEST[kind], guard).over(plain)
+    of_axis, learner = partial(errors, axis), HONEST[kind]
     return AxisOutcome(
-        learner=kind,
-        loop=axis.describe(),
-        structure=axis.structure,
-        sensor=axis.sensor,
-        guarded=guarded,
-        unguarded=unguarded,
-        chance=errors(axis, None, None, first=DRAWS).over(plain),
+        kind, axis.describe(), axis.structure, axis.sensor, *_beside(of_axis, learner, guard)
     )
 
 
 def run_arm(seed: int, index: int, too_small: float, guard: Guard | None) -> AxisOutcome:
     """Run the arm with this number, with a b0 that is so many times too small."""
     drawn = draw_arm(np.random.default_rng([seed, index]), too_small)
-    usual, others = range(DRAWS), range(DRAWS, 2 * DRAWS)
-    plain = arm_errors(drawn, None, None, usual)
-    unguarded = arm_errors(drawn, LEARNER, None, usual)
-    guarded = unguarded if guard is None else arm_errors(drawn, LEARNER, guard, usual)
-    return AxisOutcome(
-        learner=type(LEARNER).__name__,
-        loop=drawn.describe(),
-        structure=drawn.kind,
-        sensor="each joint",
-        guarded=AxisErrors(*guarded.worst(plain)),
-        unguarded=AxisErrors(*unguarded.worst(plain)),
-        chance=AxisErrors(*arm_errors(drawn, None, None, others).worst(plain)),
-    )
+    found = _beside(partial(arm_errors, drawn), LEARNER, guard)
+    name = type(LEARNER).__name__
+    return AxisOutcome(name, drawn.describe(), drawn.kind, "each joint", *found)
 
 
-def errors(axis: Axis, learner: Learner | None, guard: Guard | None, first: int = 0) -> AxisErrors:
-    """Return the errors of a loop, over draws of the noise from number ``first`` on."""
-    controller, found = axis.controller(learner, guard), []
-    for draw in range(first, first + DRAWS):
+def _beside(
+    errors: Callable[[Learner | None, Guard | None, range], Any],
+    learner: Learner | None,
+    guard: Guard | None,
+) -> tuple[AxisErrors, AxisErrors, AxisErrors]:
+    """Return the ratios to the loop without learner: guarded, unguarded, and by chance."""
+    plain, guarded, chance = compare(errors, learner, guard)
+    unguarded = guarded if guard is None else ratios(errors(learner, None, USUAL), plain)
+    return AxisErrors(*guarded), AxisErrors(*unguarded), AxisErrors(*chance)
+
+
+def errors(
+    axis: Axis, learner: Learner | None, guard: Guard | None, draws: Iterable[int]
+) -> AxisErrors:
+    """Return the errors of a loop, over these draws of the noise."""
+    controller = axis.controller(learner, guard)
+
+    def once(draw: int) -> AxisErrors:
         run = simulate(axis.plant, controller, axis.scenario(draw), limit=_LIMIT)
         if run.diverged:
             return AxisErrors(math.inf, math.inf)
         square = run["y"][run.t >= axis.load_at] ** 2
         late = square[square.size // 2 :]
-        found.append([math.sqrt(np.mean(square)), math.sqrt(np.mean(late))])
-    return AxisErrors(*np.mean(found, axis=0).tolist())
+        return AxisErrors(math.sqrt(np.mean(square)), math.sqrt(np.mean(late)))
+
+    return mean_errors(once, draws)
 
 
 __all__ = ["STRUCTURES", "AxesResult", "Axis", "AxisOutcome", "draw_axis", "run", "run_one"]

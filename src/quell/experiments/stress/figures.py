@@ -1,4 +1,4 @@
-"""The figure of the guard's trial: distributions of the ratios, by kind of learner."""
+"""The figure of the guard's trial: distributions of the loops' ratios, by kind of learner."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from quell.experiments.common import save_figures
 from quell.experiments.stress.axes import AxesResult
 from quell.experiments.stress.general import HONEST as HONEST_LEARNERS
 from quell.experiments.stress.general import GeneralResult
-from quell.experiments.stress.study import HONEST, Result
+from quell.experiments.stress.study import HONEST, Judged, Result
 from quell.records.plotting import grid_of_axes, new_figure
 
-_PANELS = {"ratio": "whole run", "load_ratio": "60 s of load"}
+_PANELS = {"whole": "whole run", "load": "60 s of load"}
 _AXES_PANELS = {"rms": "whole time of load", "late": "its second half"}
 _GENERAL_PANELS = {"rms": "whole run", "window": "worst window", "peak": "largest error"}
 
 
 def draw(result: Result | GeneralResult | AxesResult, ax: Any = None) -> Any:
-    """Draw for each kind of learner the share of runs whose ratio is below x; return the axes.
+    """Draw for each kind of learner the share of loops whose ratio is below x; return the axes.
 
     For the trial on flexible axes it is each kind of observer.
 
@@ -35,17 +35,17 @@ def draw(result: Result | GeneralResult | AxesResult, ax: Any = None) -> Any:
         axes to draw into, two, or three for general loops; those of a new figure by default.
     """
     if isinstance(result, Result):
-        groups: Mapping[str, Sequence[Any]] = {kind: result.of(kind) for kind in result.kinds}
+        groups: Mapping[str, Sequence[Judged]] = {kind: result.of(kind) for kind in result.kinds}
         return _draw(groups, _PANELS, "RMS error over that of MF-ESO", (HONEST,), ax)
     if isinstance(result, AxesResult):
-        found = {name: [o.guarded for o in each] for name, each in result.by_structure.items()}
+        found = result.by_structure
         return _draw(found, _AXES_PANELS, "RMS error over that without learner", (), ax)
     groups = result.grouped(result.healthy, "kind")
     return _draw(groups, _GENERAL_PANELS, "over that of MF-ESO", HONEST_LEARNERS, ax)
 
 
 def _draw(
-    groups: Mapping[str, Sequence[Any]],
+    groups: Mapping[str, Sequence[Judged]],
     panels: Mapping[str, str],
     xlabel: str,
     honest: Collection[str],
@@ -55,7 +55,7 @@ def _draw(
     axes = grid_of_axes(given, make, 1, len(panels), sharey=True)[0]
     for ax, (name, title) in zip(axes, panels.items(), strict=True):
         for i, (kind, outcomes) in enumerate(groups.items()):
-            values = np.sort([getattr(outcome, name) for outcome in outcomes])
+            values = np.sort([getattr(outcome.guarded, name) for outcome in outcomes])
             values = values[np.isfinite(values)]
             if values.size:
                 shares = (np.arange(values.size) + 1.0) / values.size
@@ -65,7 +65,7 @@ def _draw(
         ax.axvline(1.0, color="0.5", linewidth=0.8)
         ax.set(xscale="log", title=title, xlabel=xlabel)
         ax.grid(alpha=0.3, which="both")
-    axes[0].set_ylabel("share of runs")
+    axes[0].set_ylabel("share of loops")
     axes[1].legend(fontsize="small", loc="upper left")
     return axes
 

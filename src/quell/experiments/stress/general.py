@@ -1,6 +1,6 @@
-"""The trial of the guard in general loops: runs, named cases, searched learners, the result.
+"""The trial of the guard in general loops: named cases, searched learners, the result.
 
-Measures of a run: RMS error, largest error, worst window.
+Measures of a loop: RMS error, largest error, worst window.
 
 Cases that the first guard failed, each by its name: levels, a slow process, perfect knowledge.
 
@@ -17,19 +17,23 @@ error after the load.
 **Perfect knowledge.** On chains of integrators, b0 exact, a learner returns the load itself. Its
 benefit is what it takes from the RMS error of MF-ESO after 100 lags; the guard costs a share of it.
 
-The whole trial in general loops: random runs and named cases, beside MF-ESO.
+The figures of levels and perfect knowledge are means over draws of the noise; chance is the loop
+with the learner unguarded and other draws. The slow process has no noise.
 
-The trial in general loops: hostile and honest learners, each beside MF-ESO on the same seed.
+The whole trial in general loops: random loops and named cases, beside MF-ESO.
 
-Errors are those of y against the response that the loop is designed for. A run's ratios are its
-measures (``measures``) over those of MF-ESO. A run is *lost* if it diverges, or leaves ``|y|`` =
+The trial in general loops: hostile and honest learners, each beside MF-ESO on the same seeds.
+
+Errors are those of y against the response that the loop is designed for. The measures of a loop are
+means over draws of the noise, and its ratios are those over the measures of MF-ESO (``study``,
+which also says what chance is). A loop is *lost* if one of its runs diverges, or leaves ``|y|`` =
 100, where MF-ESO does not. Bars hold for loops whose modulus margin is at least ``HEALTHY``. With
 limits of u the margin of the linear part says little: a loop in which MF-ESO itself hardly holds is
 *fragile*, and does not count: with limits that are 20 % lower it is lost, or has measures 1.5 times
 as large.
 
-How much of a ratio is chance is what MF-ESO itself shows with another draw of the same noise: where
-friction holds a plant or lets it slip, or limits of u hardly suffice, this decides which happens.
+Where friction holds a plant or lets it slip, or limits of u hardly suffice, the draw of the noise
+decides which happens: a single run says little there, and chance says how little a mean does.
 
 Seeds below 10 000 are for tuning; seeds from 1 000 000 on are for judging, and are looked at once.
 
@@ -51,7 +55,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from math import comb
@@ -61,7 +65,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.controllers import ADRC
-from quell.experiments.common import quantiles
 from quell.experiments.stress import loops
 from quell.experiments.stress.adversaries import INPUTS, RULES, Program, Watched, draw_adversary
 from quell.experiments.stress.adversaries import KINDS as BLIND_KINDS
@@ -75,7 +78,18 @@ from quell.experiments.stress.loops import (
     ideal,
     load_gain,
 )
-from quell.experiments.stress.study import check_numbers
+from quell.experiments.stress.study import (
+    OTHERS,
+    USUAL,
+    Bar,
+    Judged,
+    bars_of,
+    check_numbers,
+    compare,
+    mean_errors,
+    ratios,
+    summary,
+)
 from quell.files import nonfinite_to_none
 from quell.guard import Guard
 from quell.learners import Harmonic, Kalman, Learner
@@ -96,16 +110,12 @@ LATE_SHARE = 0.5
 
 
 class Measures(NamedTuple):
-    """Measures of an error e(t), all in its unit."""
+    """Measures of an error e(t), all in its unit, or their ratios; infinite if a run is lost."""
 
     rms: float  #: RMS of the whole run
     peak: float  #: largest ``|e|``
     window: float  #: largest RMS over a window of ``WINDOW_LAGS``
     late: float  #: RMS of the second half
-
-    def over(self, other: Measures) -> Measures:
-        """Return the ratios to those of another run."""
-        return Measures(*(a / max(b, 1e-300) for a, b in zip(self, other, strict=True)))
 
 
 def measure_error(error: Vector, window: int) -> Measures:
@@ -139,7 +149,10 @@ PERFECT_LOADS = ("sine", "coloured", "square", "steps", "amplitude-modulated", "
 
 @dataclass(frozen=True)
 class Case:
-    """The figures of one case: without learner, with it unguarded, with it guarded."""
+    """The figures of one case: without learner, with it unguarded, with it guarded.
+
+    Each is a mean over draws of the noise.
+    """
 
     case: str
     learner: str
@@ -147,7 +160,13 @@ class Case:
     plain: float
     unguarded: float
     guarded: float
+    other_noise: float  #: unguarded with other draws of the noise; NaN without noise
     floor: float = 0.0  #: added to both sides of a ratio, for measures that may be zero
+
+    @property
+    def of_other_noise(self) -> Case:
+        """The same with other draws of the noise in place of the guard: what chance does."""
+        return replace(self, guarded=self.other_noise)
 
     @property
     def over_unguarded(self) -> float:
@@ -163,6 +182,22 @@ class Case:
     def lost_share(self) -> float:
         """Share of the benefit that the guard costs."""
         return (self.guarded - self.unguarded) / (self.plain - self.unguarded)
+
+
+def _figures(
+    figure: Callable[[Learner | None, Guard | None, int], float], learner: Learner, guard: Guard
+) -> tuple[float, float, float, float]:
+    """Return the four figures of a case, means over draws of the noise."""
+
+    def mean(learner: Learner | None, guard: Guard | None, draws: range) -> float:
+        return float(np.mean([figure(learner, guard, draw) for draw in draws]))
+
+    return (
+        mean(None, None, USUAL),
+        mean(learner, None, USUAL),
+        mean(learner, guard, USUAL),
+        mean(learner, None, OTHERS),
+    )
 
 
 def run_named(guard: Guard, seed: int = 0) -> list[Case]:
@@ -190,17 +225,17 @@ def level_case(
     size = _SIZE if kind == "sine" else _SIZE * np.sqrt(2.0)
     omega = _OMEGA if kind == "sine" else 0.5
     w[later] += size * LOADS[kind](t[later] - _LOAD_AT, rng, omega)
-    noise = Table(_NOISE * rng.standard_normal(t.size), dt)
-    scenario = Scenario(0.0, _END, (Table(w, dt),), noise)
+    noises = _NOISE * rng.standard_normal((OTHERS.stop, t.size))
     plant = LinearPlant.of(([1.0], [1.0, 0.5, 0.0]))
     observer = ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=dt)
 
-    def late(learner: Learner | None, guard: Guard | None) -> float:
+    def late(learner: Learner | None, guard: Guard | None, draw: int) -> float:
         controller = ADRC(observer, 1.0, learner=learner, guard=guard)
+        scenario = Scenario(0.0, _END, (Table(w, dt),), Table(noises[draw], dt))
         y = simulate(plant, controller, scenario, record_every=4)["y"]
         return float(np.sqrt(np.mean(y[y.size // 2 :] ** 2)))
 
-    figures = late(None, None), late(learner, None), late(learner, guard)
+    figures = _figures(late, learner, guard)
     return Case(f"level {level:g}, {kind}", name, "late RMS", *figures)
 
 
@@ -227,7 +262,7 @@ def slow_case(what: str, dead_time: float, name: str, learner: Learner, guard: G
             return float(np.max(np.abs(y[int(load_at / dt) :] - goal)))
         return max(float(np.max(y)) - goal, 0.0)
 
-    figures = figure(None, None), figure(learner, None), figure(learner, guard)
+    figures = figure(None, None), figure(learner, None), figure(learner, guard), math.nan
     case = f"slow process, {what}" + (f", {dead_time:g} s dead time" if dead_time else "")
     return Case(case, name, "peak" if what == "load" else "overshoot", *figures, _FLOOR * goal)
 
@@ -238,27 +273,26 @@ def perfect_case(order: int, kind: str, guard: Guard, seed: int) -> Case:
     lag = (order + 1) / omega_o
     t: Vector = dt * np.arange(round(_PERFECT_LAGS * lag / dt) + 1, dtype=np.float64)
     w = LOADS[kind](t, rng, 0.8)
-    noise = Table(1e-4 / omega_o**order * rng.standard_normal(t.size), dt)
-    scenario = Scenario(0.0, float(t[-1]), (Table(w, dt),), noise)
+    noises = 1e-4 / omega_o**order * rng.standard_normal((OTHERS.stop, t.size))
     A, B, C = np.diag(np.ones(order - 1), 1), np.eye(order)[-1:].T, np.eye(order)[:1]
     plant = GeneralPlant(LinearPlant(A, B, C))
     observer = ESO.model_free(order, 1.0, omega_o, dt)
     weights = np.zeros((2, len(INPUTS)))
     weights[:, INPUTS.index("load")] = 1.0
 
-    def late(guard: Guard | None, with_learner: bool = True) -> float:
-        learner = Program(weights, load=w, guard=guard)  # type: ignore[arg-type]
-        controller = Watched(observer, 1.0, learner=learner, guard=guard)
-        plain = ADRC(observer, 1.0)
-        y = simulate(plant, controller if with_learner else plain, scenario)["y"]
+    knows = Program(weights, load=w)  # type: ignore[arg-type]
+
+    def late(learner: Learner | None, guard: Guard | None, draw: int) -> float:
+        controller = ADRC(observer, 1.0)
+        if learner is not None:
+            controller = Watched(observer, 1.0, learner=replace(knows, guard=guard), guard=guard)
+        scenario = Scenario(0.0, float(t[-1]), (Table(w, dt),), Table(noises[draw], dt))
+        y = simulate(plant, controller, scenario)["y"]
         return float(np.sqrt(np.mean(y[round(PERFECT_FROM_LAGS * lag / dt) :] ** 2)))
 
-    return Case(
-        f"perfect, order {order}, {kind}",
-        "the load itself",
-        "RMS after 100 lags",
-        *(late(None, False), late(None), late(guard)),
-    )
+    case = f"perfect, order {order}, {kind}"
+    figures = _figures(late, knows, guard)
+    return Case(case, "the load itself", "RMS after 100 lags", *figures)
 
 
 # ---- Adversaries that know the loop ----
@@ -371,7 +405,6 @@ def found_points(order: int) -> list[Vector]:
 
 HEALTHY = 0.35
 """Least modulus margin of the loops for which the bars hold."""
-OTHER_NOISE = "MF-ESO, other noise"
 HONEST: dict[str, Learner] = {"Harmonic": Harmonic(), "Kalman": Kalman()}
 # What tells fragile loops: share of the limits, and ratio to the measures with the full limits.
 # Chosen by hand; with the first guard all saturated loops with ratios above 8 were fragile.
@@ -383,12 +416,12 @@ _RECORDS_PER_LAG = 20.0
 
 
 @dataclass(frozen=True)
-class GeneralOutcome:
-    """The result of one run; ratios are NaN if one of the two loops is lost."""
+class GeneralOutcome(Judged):
+    """The ratios of one loop."""
 
     kind: str
     honest: bool
-    index: int  #: number of the run in the trial, apart for hostile and honest learners
+    index: int  #: number of the loop in the trial, apart for hostile and honest learners
     learner: str
     loop: str
     family: str
@@ -397,46 +430,49 @@ class GeneralOutcome:
     reference: str
     level: float  #: constant part of the load
     margin: float
-    plain_lost: bool
     fragile: bool  #: whether MF-ESO hardly holds within the limits of u
-    lost: bool
-    rms: float
-    peak: float
-    window: float
-    late: float
-    other_noise: Measures  #: MF-ESO with another draw of the noise, over MF-ESO; NaN if it is lost
+    guarded: Measures  #: over MF-ESO
+    chance: Measures  #: MF-ESO with other draws of the noise, over MF-ESO
 
     @property
     def healthy(self) -> bool:
         """Whether the bars hold for its loop."""
         return self.margin >= HEALTHY and not (self.plain_lost or self.fragile)
 
-    @property
-    def of_other_noise(self) -> GeneralOutcome:
-        """The outcome of MF-ESO with another draw of the noise, in place of the learner's."""
-        measured = self.other_noise
-        lost = math.isnan(measured.rms) and not self.plain_lost
-        return replace(self, kind=OTHER_NOISE, learner="", lost=lost, **measured._asdict())
 
-
-def error_of(loop: GeneralLoop, learner: Learner | None, guard: Guard | None) -> Measures | None:
-    """Return the measures of a run, None if it is lost."""
+def error_of(loop: GeneralLoop, learner: Learner | None, guard: Guard | None) -> Measures:
+    """Return the measures of a run, infinite ones if it is lost."""
     every = max(int(loop.lag / _RECORDS_PER_LAG / loop.dt), 1)
     controller = loop.controller(learner, guard)
     run = simulate(loop.plant, controller, loop.scenario, record_every=every, limit=_LIMIT)
     if run.diverged:
-        return None
+        return Measures(*[math.inf] * 4)
     wanted = ideal(loop.tables[0], loop.dt, loop.order)[::every]
     return measure_error(run["y"] - wanted, round(WINDOW_LAGS * loop.lag / (every * loop.dt)))
 
 
-def is_fragile(loop: GeneralLoop, plain: Measures) -> bool:
-    """Return whether MF-ESO, which has these measures, hardly holds within the limits of u."""
+def errors(
+    drawn: Sequence[GeneralLoop], learner: Learner | None, guard: Guard | None, draws: Iterable[int]
+) -> Measures:
+    """Return the measures of a loop, given with all draws of its noise, over some of them."""
+    return mean_errors(lambda draw: error_of(drawn[draw], learner, guard), draws)
+
+
+def is_fragile(drawn: Sequence[GeneralLoop], plain: Measures) -> bool:
+    """Return whether MF-ESO hardly holds within the limits of u.
+
+    ``drawn`` is the loop with some draws of the noise, over which ``plain`` are its measures.
+    """
+    loop = drawn[0]
     if min(loop.u_limit, loop.plant.limit) == math.inf:
         return False
-    lower = replace(loop.plant, limit=_LOWER_LIMITS * loop.plant.limit)
-    found = error_of(replace(loop, plant=lower, u_limit=_LOWER_LIMITS * loop.u_limit), None, None)
-    return found is None or max(found.over(plain)[:3]) > _FRAGILE
+    plant, u_limit = (
+        replace(loop.plant, limit=_LOWER_LIMITS * loop.plant.limit),
+        _LOWER_LIMITS * loop.u_limit,
+    )
+    lower = [replace(each, plant=plant, u_limit=u_limit) for each in drawn]
+    found = errors(lower, None, None, range(len(lower)))
+    return max(ratios(found, plain)[:3]) > _FRAGILE
 
 
 def run_one(
@@ -446,9 +482,9 @@ def run_one(
     rng = np.random.default_rng([seed, index, int(honest)])
     loop = draw_loop(rng)
     learner = HONEST[kind] if honest else draw_attack(kind, rng, loop, guard)
-    plain = error_of(loop, None, None)
-    learned = None if plain is None else error_of(loop, learner, guard)
-    again = None if plain is None else error_of(replace(loop, draw=1), None, None)
+    drawn = [replace(loop, draw=draw) for draw in range(OTHERS.stop)]  # each keeps its tables
+    plain, guarded, chance = compare(partial(errors, drawn), learner, guard)
+    usual = [drawn[draw] for draw in USUAL]
     return GeneralOutcome(
         kind=kind,
         honest=honest,
@@ -461,19 +497,10 @@ def run_one(
         reference=loop.reference,
         level=loop.level,
         margin=loop.margin,
-        plain_lost=plain is None,
-        fragile=plain is not None and is_fragile(loop, plain),
-        lost=learned is None and plain is not None,
-        **_over(learned, plain)._asdict(),
-        other_noise=_over(again, plain),
+        fragile=math.isfinite(plain.rms) and is_fragile(usual, plain),
+        guarded=Measures(*guarded),
+        chance=Measures(*chance),
     )
-
-
-def _over(measured: Measures | None, plain: Measures | None) -> Measures:
-    """Return the ratios to those of MF-ESO; NaN if one of the two is lost."""
-    if measured is None or plain is None:
-        return Measures(*[math.nan] * 4)
-    return measured.over(plain)
 
 
 def run_all(
@@ -485,7 +512,7 @@ def run_all(
     kinds: Sequence[str] = KINDS,
     progress: Callable[[float], None] | None = None,
 ) -> list[GeneralOutcome]:
-    """Run ``runs`` hostile and ``honest`` honest learners, the kinds of each in turn."""
+    """Run loops with hostile and with honest learners, the kinds of each in turn."""
     good = tuple(HONEST)
     jobs = [partial(run_one, seed, i, kinds[i % len(kinds)], guard) for i in range(runs)]
     jobs += [partial(run_one, seed, i, good[i % len(good)], guard, True) for i in range(honest)]
@@ -494,41 +521,24 @@ def run_all(
 
 # ---- The result of the trial in general loops, and whether it meets the bars ----
 
-# A run counts as worse from this ratio of the RMS errors on.
-_WORSE = 1.05
 _WORST_LISTED = 10
 # What a bar is over, what it measures, where that is in a ``summary``, and the bar.
 _BARS = (
     ("all", "lost where MF-ESO has a modulus margin of 0.35", "lost", 0.0),
-    ("hostile", "RMS of the run, 99 %", "rms p99", 1.05),
-    ("hostile", "RMS of the run, largest", "rms max", 1.2),
+    ("hostile", "RMS error, 99 %", "rms p99", 1.05),
+    ("hostile", "RMS error, largest", "rms max", 1.2),
     ("hostile", "worst window, 99 %", "window p99", 1.5),
     ("hostile", "worst window, largest", "window max", 2.5),
-    ("honest", "RMS of the run, largest", "rms max", 1.2),
-    ("honest", "share worse by more than 5 %", "worse", 0.003),
+    ("honest", "RMS error, largest", "rms max", 1.2),
+    ("honest", "share worse by more than 5 %", "rms worse", 0.003),
     ("honest", "largest error, 99 %", "peak p99", 1.1),
     ("honest", "largest error, largest", "peak max", 1.5),
 )
 
 
-class Bar(NamedTuple):
-    """A limit that a figure must not exceed."""
-
-    over: str
-    measure: str
-    figure: float | None  # None without runs
-    bar: float
-    other_noise: float | None = None  # the figure of MF-ESO itself, with another draw of the noise
-
-    @property
-    def met(self) -> bool:
-        """Whether the figure is within the bar."""
-        return self.figure is not None and self.figure <= self.bar
-
-
 @dataclass(frozen=True)
 class GeneralResult:
-    """All runs of a trial in general loops, and the named cases."""
+    """All loops of a trial, and the named cases."""
 
     settings: Mapping[str, Any]
     outcomes: Sequence[GeneralOutcome]
@@ -541,7 +551,7 @@ class GeneralResult:
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Numbers of runs that do not count, by the reason, and of these the lost ones."""
+        """Numbers of loops that do not count, by the reason, and of these the lost ones."""
         low = [o for o in self.outcomes if o.margin < HEALTHY]
         rest = [o for o in self.outcomes if o.margin >= HEALTHY and not o.healthy]
         return {
@@ -569,78 +579,56 @@ class GeneralResult:
         return groups
 
     def bars(self) -> list[Bar]:
-        """Return the figures that have a bar; those of cases that were not run are left out."""
+        """Return the figures that have a bar; those of what was not run are left out."""
         groups = {"all": self.healthy, "hostile": self.hostile, "honest": self.honest}
-        figures = {name: summary(group) for name, group in groups.items()}
-        others = {name: _with_other_noise(group) for name, group in groups.items()}
-        found = [
-            Bar(over, measure, _look_up(figures[over], key), bar, _look_up(others[over], key))
-            for over, measure, key, bar in _BARS
-        ]
-        return found + [bar for bar in self._case_bars() if bar.figure is not None]
+        return bars_of(_BARS, Measures, groups) + self._case_bars()
 
     def _case_bars(self) -> list[Bar]:
         levels, slow, perfect = (
             [case for case in self.cases if case.case.startswith(begins)]
             for begins in ("level", "slow process", "perfect")
         )
-        over_unguarded = max((case.over_unguarded for case in levels), default=None)
-        over_plain = max((case.over_plain for case in slow), default=None)
-        on_steps = [case.lost_share for case in perfect if "steps" in case.case]
-        on_others = [case.lost_share for case in perfect if "steps" not in case.case]
-        return [
-            Bar("level", "late RMS, guarded over unguarded", over_unguarded, 1.1),
-            Bar("slow process", "overshoot, load peak", over_plain, 1.0),
-            Bar("perfect", "share of benefit lost", max(on_others, default=None), 0.05),
-            Bar("perfect, rare steps", "share of benefit lost", max(on_steps, default=None), 0.05),
-        ]
+        on_steps = [case for case in perfect if "steps" in case.case]
+        on_others = [case for case in perfect if "steps" not in case.case]
+        rows = (
+            ("level", "late RMS, guarded over unguarded", levels, "over_unguarded", 1.1),
+            ("slow process", "overshoot, load peak", slow, "over_plain", 1.0),
+            ("perfect", "share of benefit lost", on_others, "lost_share", 0.05),
+            ("perfect, rare steps", "share of benefit lost", on_steps, "lost_share", 0.05),
+        )
+        found = []
+        for over, measure, cases, name, limit in rows:
+            if cases:
+                figure = max(getattr(case, name) for case in cases)
+                noise = max(getattr(case.of_other_noise, name) for case in cases)
+                found.append(
+                    Bar(over, measure, figure, limit, None if math.isnan(noise) else noise)
+                )
+        return found
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists for ``json.dump``."""
-        worst = sorted(self.healthy, key=lambda o: -(o.rms if np.isfinite(o.rms) else np.inf))
+        worst = sorted(self.healthy, key=lambda o: -o.guarded.rms)[:_WORST_LISTED]
         groups = {"hostile": self.hostile, "honest": self.honest}
         return {
             "settings": dict(self.settings),
             "left_out": self.left_out,
             "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
-            **{name: summary(group) for name, group in groups.items()},
-            **{f"{name}_other_noise": _with_other_noise(group) for name, group in groups.items()},
+            **{name: summary(group, Measures) for name, group in groups.items()},
+            **{
+                f"{name}_other_noise": summary(group, Measures, "chance")
+                for name, group in groups.items()
+            },
             **{
                 f"{name}_by_{by}": {
-                    key: summary(some) for key, some in self.grouped(group, by).items()
+                    key: summary(some, Measures) for key, some in self.grouped(group, by).items()
                 }
                 for name, group in groups.items()
                 for by in ("kind", "family", "load", "reference", "order")
             },
-            "worst": [_to_json(outcome) for outcome in worst[:_WORST_LISTED]],
+            "worst": [outcome.to_json() for outcome in worst],
             "cases": [nonfinite_to_none(asdict(case)) for case in self.cases],
         }
-
-
-def _to_json(outcome: GeneralOutcome) -> Any:
-    """Return a dictionary for ``json.dump``."""
-    return nonfinite_to_none({**asdict(outcome), "other_noise": outcome.other_noise._asdict()})
-
-
-def _look_up(found: Mapping[str, Any], key: str) -> float | None:
-    """Return a figure of a ``summary``."""
-    name, *part = key.split()
-    return found[name][part[0]] if part else found[name]
-
-
-def _with_other_noise(outcomes: Sequence[GeneralOutcome]) -> dict[str, Any]:
-    """Return the ``summary`` of MF-ESO itself, with another draw of the noise in the same loops."""
-    return summary([outcome.of_other_noise for outcome in outcomes])
-
-
-def summary(outcomes: Sequence[GeneralOutcome]) -> dict[str, Any]:
-    """Return counts and quantiles of the ratios to MF-ESO; None for the quantiles of no numbers."""
-    found: dict[str, Any] = {"runs": len(outcomes), "lost": sum(o.lost for o in outcomes)}
-    for name in Measures._fields:
-        found[name] = quantiles(getattr(o, name) for o in outcomes)
-    rms = [o.rms for o in outcomes if math.isfinite(o.rms)]
-    found["worse"] = float(np.mean([ratio > _WORSE for ratio in rms])) if rms else None
-    return found
 
 
 # ---- The whole trial in general loops ----
@@ -656,9 +644,10 @@ def run(
 ) -> GeneralResult:
     """Run a trial in general loops, with the guard or without (None), and the named cases.
 
-    There are ``runs`` runs with hostile learners and ``honest`` with honest ones, all kinds in
-    turn. Seeds below 10 000 are for tuning, from 1 000 000 on for judging. The named cases compare
-    with the loop without guard, so they need one. ``progress`` is called with the finished share.
+    There are ``runs`` loops with hostile learners and ``honest`` with honest ones, all kinds in
+    turn, each with ``study.DRAWS`` draws of the noise. Seeds below 10 000 are for tuning, from
+    1 000 000 on for judging. The named cases compare with the loop without guard, so they need one.
+    ``progress`` is called with the finished share.
     """
     check_numbers(runs, honest, seed)
     outcomes = run_all(runs, honest, seed, guard=guard, progress=part_of(progress, 0, 9, 10))
@@ -760,13 +749,14 @@ def judge(
 ) -> Vector:
     """Return the score of each point (points, SIZE): the mean of that over loops and the worst."""
     plain = in_parallel([partial(error_of, loop, None, None) for loop in loops])
-    kept = [(loop, base) for loop, base in zip(loops, plain, strict=True) if base is not None]
+    kept = [each for each in zip(loops, plain, strict=True) if math.isfinite(each[1].rms)]
 
     def one(point: Vector) -> float:
         scores = [0.0]
         for loop, base in kept:
             run = error_of(loop, adversary_at(point, loop, guard), guard)
-            scores.append(_LOST if run is None else score(run.over(base)))
+            found = Measures(*ratios(run, base))
+            scores.append(score(found) if math.isfinite(found.rms) else _LOST)
         return float((1.0 - _WORST) * np.mean(scores) + _WORST * np.max(scores))
 
     return np.array(in_parallel([partial(one, point) for point in points]))
@@ -776,7 +766,6 @@ __all__ = [
     "FAMILIES",
     "INPUTS",
     "KINDS",
-    "Bar",
     "Case",
     "Found",
     "GeneralLoop",
@@ -791,6 +780,7 @@ __all__ = [
     "draw_attack",
     "draw_loop",
     "error_of",
+    "errors",
     "exact_weights",
     "harm",
     "judge",
@@ -800,5 +790,4 @@ __all__ = [
     "run_one",
     "search",
     "spread",
-    "summary",
 ]

@@ -608,14 +608,10 @@ class AdrcStructure:
         if not self.form.based:
             observer["order"] = self.order
         observer |= {"b0": b0, "omega_o": omega_o}
-        if self.reduced is not None and str(self.reduced):
-            num, den = (np.asarray(part).tolist() for part in self.model.plant)
-            observer["plant"] = {"kind": "linear", "num": num, "den": den}
-        elif self.form.based:  # the plant of the file may be late, or not linear
-            linear = LinearPlant.of(self.model.plant)
-            parts = zip("ABC", (linear.A, linear.B, linear.C), strict=True)
-            observer["plant"] = {"kind": "linear"} | {key: part.tolist() for key, part in parts}
-            if without_far_zeros(self.model.plant, omega_o).zeros.size:
+        if self.reduced is not None:  # the plant of the file may be late, or not linear
+            observer["plant"] = {"kind": "linear", **matrices(self.reduced)}
+            far = without_far_zeros(self.model.plant, omega_o).zeros.size > 0
+            if far and not str(self.reduced):
                 observer["far"] = math.inf
         if poles is not None:
             observer["poles"] = _listed(poles)
@@ -633,6 +629,16 @@ class AdrcStructure:
         if self.form.half_law:
             controller["half_gain"] = True
         return {"observer": observer, "controller": controller}
+
+
+def matrices(model: Reduced) -> dict[str, Any]:
+    """Return the keys of a setup file for a model: num and den, or A, B and C of a whole plant."""
+    if str(model):
+        num, den = (np.asarray(part).tolist() for part in model.plant)
+        return {"num": num, "den": den}
+    linear = LinearPlant.of(model.plant)
+    parts = zip("ABC", (linear.A, linear.B, linear.C), strict=True)
+    return {key: part.tolist() for key, part in parts}
 
 
 def _pair(omega: float, damping: float) -> NDArray[np.complex128]:

@@ -1,0 +1,202 @@
+"""A compensator on top of any controller: what it adds, what it leaves alone, how it is tuned."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.analysis.linearise import linear_law
+from quell.controllers.law import law_gains
+from quell.types import Status
+
+DT = 0.01
+PLANT = ([2.0], [1.0, 1.0, 0.0])
+PID = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT)
+OBSERVER = ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=DT)
+
+
+def rms_under_load(controller: Any, omega: float = 2.0, duration: float = 20.0) -> float:
+    """Return the late RMS error under a sinusoidal load at the plant's input."""
+    load = ql.signals.Sinusoid(1.0, omega)
+    run = ql.simulate(PLANT, controller, ql.Scenario(duration=duration, disturbances=[load]))
+    return float(np.sqrt(np.mean(run["y"][len(run) // 2 :] ** 2)))
+
+
+def test_an_adrc_is_a_compensator_with_a_law() -> None:
+    """u_0 from the law of the same estimates, given from outside, makes the same u, sample by sample."""
+    adrc = ql.ADRC(OBSERVER, omega_c=3.0, u_min=-4.0, u_max=4.0)
+    compensator = ql.Compensator(OBSERVER, u_min=-4.0, u_max=4.0)
+    twin = ql.Compensator(OBSERVER, u_min=-4.0, u_max=4.0)
+    k, y, rate = law_gains(2, 3.0), 0.0, 0.0
+    for _ in range(400):
+        u = adrc.step(1.0, y)
+        twin.step(0.0, y)  # the estimates of this sample
+        x = twin.estimate.x
+        assert compensator.step(float(k @ (np.array([1.0, 0.0]) - x)) / 2.0, y) == pytest.approx(
+            u, abs=1e-9
+        )
+        twin.applied(u)
+        rate += DT * (2.0 * u - rate + 0.7)
+        y += DT * rate
+    assert adrc.estimate.f == pytest.approx(compensator.estimate.f, rel=1e-9)
+
+
+def test_without_a_disturbance_it_adds_nothing_to_a_plant_that_its_model_describes() -> None:
+    """A drive that takes commands keeps its dynamics: u is u_0 to rounding."""
+    drive = ([25.0], [1.0, 8.0, 25.0])
+    compensator = ql.Compensator(ql.ESO.model_based(drive, omega_o=60.0, dt=DT))
+    command = ql.signals.Step(1.0) + ql.signals.Sinusoid(0.5, 3.0)
+    run = ql.simulate(drive, compensator, ql.Scenario(reference=command, duration=5.0))
+    np.testing.assert_allclose(run["u"], run["r"], atol=1e-8)
+
+
+def test_it_rejects_a_load_that_the_controller_leaves_and_with_a_guarded_learner_nearly_all() -> (
+    None
+):
+    """On a PID controller under a sinusoidal load."""
+    alone = rms_under_load(PID)
+    compensator = ql.Compensator(OBSERVER)
+    assert rms_under_load(ql.Compensated(PID, compensator)) < 0.3 * alone
+    learner: dict[str, Any] = {"learner": ql.learners.Harmonic(bias=False), "guard": ql.Guard()}
+    learning = ql.Compensated(PID, ql.Compensator(OBSERVER, omega_c=3.0, **learner))
+    assert rms_under_load(learning, duration=60.0) < 0.02 * alone
+
+
+def test_its_loop_is_the_one_that_analyse_has() -> None:
+    """The closed loop's poles of a PID controller with compensator are those of its simulated step."""
+    both = ql.Compensated(PID, ql.Compensator(OBSERVER))
+    loop = ql.analysis.analyse(PLANT, both)
+    run = ql.simulate(PLANT, both, ql.Scenario(reference=ql.signals.Step(1e-3), duration=3.0))
+    law, sampled = linear_law(both), loop.plant
+    x, state, y = np.zeros(sampled.N.shape[0]), np.zeros(law.C.size), []
+    for r in run["r"]:
+        y.append(float(sampled.C @ x))
+        u = float(law.C @ state + law.D_r * r + law.D_y * y[-1])
+        state = law.A @ state + law.B_r * r + law.B_y * y[-1] + law.B_u * u
+        x = x + sampled.N @ x + sampled.B * u
+    np.testing.assert_allclose(run["y"], y, atol=1e-9)
+
+
+def test_limits_are_those_of_the_sum_and_the_controller_does_not_wind_up() -> None:
+    """Held at its limit for ten seconds, a PI controller returns as one that was just told; its own limits are taken over."""
+    pi = ql.baselines.PID(2.0, 3.0, dt=DT, u_min=-1.0, u_max=1.0)
+    both = ql.Compensated(pi, ql.Compensator(ql.ESO.model_free(1, 1.0, 20.0, DT)))
+    assert (both.limits.low, both.limits.high) == (-1.0, 1.0)
+    for _ in range(1000):
+        assert both.step(5.0, 0.0) == 1.0
+    assert both.estimate.status & Status.SATURATED
+    # The plant did not move, which is a load of −1 for the observer; but u_0 has not wound up.
+    assert abs(both.controller._state.loop[0].u) < 1.0 + 2.0 * 5.0
+    before = [both.step(-1.0, 0.0) for _ in range(30)]
+    assert min(before) == -1.0
+
+
+def test_manual_operation_and_hand_over_are_bumpless() -> None:
+    """Tracked at u = 0.4 by hand, both parts follow; the next u is 0.4, too."""
+    both = ql.Compensated(PID, ql.Compensator(OBSERVER))
+    for _ in range(500):
+        both.track(0.5, 0.5, 0.4)
+    both.hand_over()
+    assert both.step(0.5, 0.5) == pytest.approx(0.4, abs=1e-9)
+    fresh = ql.Compensated(PID, ql.Compensator(OBSERVER))
+    fresh.start(0.5, u=0.4)
+    assert fresh.step(0.5, 0.5) == pytest.approx(0.4, abs=1e-6)
+
+
+def test_a_missing_u_0_is_the_last_one_and_zero_before_the_first() -> None:
+    """Not the last y, which has another unit."""
+    compensator = ql.Compensator(OBSERVER)
+    assert compensator.step(math.nan, 7.0) == 0.0
+    assert compensator.estimate.status == Status.REFERENCE_HELD
+    told = ql.Compensator(OBSERVER)
+    told.step(0.0, 7.0)
+    for each in (compensator, told):
+        each.step(0.5, 7.0)
+    assert compensator.step(math.nan, 7.0) == told.step(0.5, 7.0)
+    compensator.reset()
+    assert compensator.step(math.inf, -3.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ql.Compensator(PID), "must be an ESO"),
+        (lambda: ql.Compensator(OBSERVER, learner=ql.learners.Kalman()), "omega_c = None"),
+        (
+            lambda: ql.Compensator(
+                OBSERVER,
+                omega_c=1.0,
+                learner=ql.learners.Kalman(),
+                guard=ql.Guard(certified_for=PLANT),
+            ),
+            "certified_for bounds the loop of an ADRC",
+        ),
+        (
+            lambda: ql.Compensator(
+                ql.ESO.model_based(
+                    ql.plants.LinearPlant([[0.0, 1.0], [0.0, -1.0]], [1.0, 4.0], [1.0, 0.0]),
+                    omega_o=10.0,
+                    dt=DT,
+                    E=[0.0, 1.0],
+                )
+            ),
+            "does not enter the plant where u does",
+        ),
+        (
+            lambda: ql.Compensated(ql.ADRC(OBSERVER, 3.0), ql.Compensator(OBSERVER)),
+            "has an observer",
+        ),
+        (
+            lambda: ql.Compensated(PID, ql.Compensator(ql.ESO.model_free(2, 2.0, 30.0, 0.02))),
+            "must be the same",
+        ),
+        (lambda: ql.Compensated(PID, ql.ADRC(OBSERVER, 3.0)), "must be a quell.Compensator"),
+        (
+            lambda: ql.Compensated(
+                ql.controllers.Prefiltered(PID, ql.baselines.ZV(3.0)), ql.Compensator(OBSERVER)
+            ),
+            "put the prefilter in front of both",
+        ),
+        (
+            lambda: ql.controllers.Prefiltered(ql.Compensator(OBSERVER), ql.baselines.ZV(3.0)),
+            "takes u_0",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused_with_the_reason(make: Any, message: str) -> None:
+    """And with what to do."""
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
+    """M_s, M_t and M_ks by ``analyse`` are those of the report, at the plant and where all its poles are elsewhere."""
+    tuned = ql.tuning.tune_compensator(PLANT, PID)
+    loop = ql.analysis.analyse(PLANT, tuned.controller)
+    assert 1.0 / loop.margins.modulus == pytest.approx(tuned.after.m_s, rel=0.01)
+    assert tuned.after.m_s <= 2.0
+    assert loop.noise_to_control_peak <= 1.01 * 3.0 * tuned.before.m_ks
+    assert tuned.after.iae < 0.3 * tuned.before.iae
+    assert tuned.worth
+    assert "NOT" not in str(tuned)
+    for factor in (0.88, 1.2):
+        den = [1.0, factor, 0.0]
+        elsewhere = ql.analysis.analyse(([2.0 * factor**2], den), tuned.controller)
+        assert 1.0 / elsewhere.margins.modulus <= 1.01 * tuned.after.m_s_elsewhere
+
+
+def test_where_the_controller_uses_the_margin_itself_no_compensator_is_sold() -> None:
+    """Below its own peak tuning refuses; a noise bound that leaves nothing makes the report say NOT."""
+    peak = 1.0 / ql.analysis.analyse(PLANT, PID).margins.modulus
+    below = ql.tuning.Constraints(m_s=0.99 * peak, m_t=None, damping=None)
+    with pytest.raises(ValueError, match="can not give margin back"):
+        ql.tuning.tune_compensator(PLANT, PID, constraints=below)
+    noise = ql.analysis.analyse(PLANT, PID).noise_to_control_peak
+    quiet = ql.tuning.Constraints(m_s=2.0, m_t=2.0, m_ks=1.001 * noise, damping=None)
+    found = ql.tuning.tune_compensator(PLANT, PID, constraints=quiet)
+    assert not found.worth
+    assert "NOT worth a compensator" in str(found)
