@@ -423,8 +423,9 @@ class HeldPlant:
             for lags in _WINDOWS
             for _ in range(2)
         ]
-        parts = (model.transition[:n, :n], model.input[:n], model.feed[:n])
-        return HeldDesign(*map(np.ascontiguousarray, parts), np.array(lengths), 2.0 * self.noise)
+        transition = np.ascontiguousarray(model.transition[:n, :n])
+        enters, feed = model.input[:n].copy(), model.feed[:n].copy()
+        return HeldDesign(transition, enters, feed, np.array(lengths), 2.0 * self.noise)
 
     def memory(self, design: HeldDesign, observer: ESO) -> HeldMemory:
         """Return the state before the first sample."""
