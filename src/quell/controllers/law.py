@@ -480,6 +480,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         # Else a finite θ that is out of all proportion overflows again in the next sample.
         _forget_learning(design, state)
         clear(state.watch)
+        look_anew(design.held, state.held)
         begin(design.eso, state.z, seen, loop.y)
         constant = slope = loop.offset = 0.0
         unlimited = loop.u
