@@ -531,17 +531,17 @@ def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured
         set_motion(design.safe_set, state.safe_set, seen, before + fed)
         look_anew(design.held, state.held)
         return _HELD
-    if not is_measured:
+    if is_measured:
+        # A learner's share that follows u is right for any u.
+        known = fed - loop.slope * u_acting
+        residual = f_before(design.held, state.held) - known
+        follow(design.held, state.held, design.eso, z, loop.y, loop.u, fed, residual)
+        f = seen[order] + known
+        if is_released(design.held, state.held, loop.y, u_acting, f, loop.slope, design.b0):
+            take_motion(design.held, state.held, z, seen)
+            set_motion(design.safe_set, state.safe_set, seen, seen[order] + fed)
+    else:
         miss(design.held, state.held)
-        return held_flag(design.held, state.held)
-    # A learner's share that follows u is right for any u.
-    known = fed - loop.slope * u_acting
-    residual = f_before(design.held, state.held) - known
-    follow(design.held, state.held, design.eso, z, loop.y, loop.u, fed, residual)
-    f = seen[order] + known
-    if is_released(design.held, state.held, loop.y, u_acting, f, loop.slope, design.b0):
-        take_motion(design.held, state.held, z, seen)
-        set_motion(design.safe_set, state.safe_set, seen, seen[order] + fed)
     return held_flag(design.held, state.held)
 
 
