@@ -69,6 +69,10 @@ def cases() -> list[Case]:
     fed = ql.ADRC(observer, omega_c=10.0, feedforward=ql.Feedforward.of(DRIVE), **limits)
     moving = ql.controllers.Prefiltered(fed, ql.controllers.ProfileGenerator(2.0, 20.0, 500.0))
     pid = ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits)
+    on_top = ql.Compensator(observer, **limits)
+    both = ql.Compensated(pid, on_top)
+    bands = ql.SafeSet(-1.5, 1.5, alpha=8.0, f_rate=1.0)
+    safe = ql.ADRC(observer, omega_c=10.0, safe_set=bands, **limits)
     learners = ql.learners
     guarded = law(learners.Kalman(), ql.Guard())
     network, process = law(learners.MLP(hidden=5)), law(learners.GaussianProcess(budget=20))
@@ -79,6 +83,9 @@ def cases() -> list[Case]:
         Case("PID", m4, "single", DRIVE, pid),
         Case("MF-ESO, order 2", m4, "single", DRIVE, mf, small),
         Case("MF-ESO, order 2", m7, "double", DRIVE, mf),
+        Case("compensator, order 2", m4, "single", DRIVE, on_top),
+        Case("PID with a compensator", m4, "single", DRIVE, both),
+        Case("MF-ESO, order 2, safe set", m4, "single", DRIVE, safe),
         Case("MF-ESO, order 2, f and f'", m4, "single", DRIVE, mf_2),
         Case(moves, m4, "single", DRIVE, moving),
         Case(moves, m7, "double", DRIVE, moving),

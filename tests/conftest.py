@@ -58,9 +58,12 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the marker."""
+    """Declare the markers."""
     config.addinivalue_line(
         "markers", "compiled: what it runs is compiled; all other tests run it as plain Python"
+    )
+    config.addinivalue_line(
+        "markers", "slow: a trial of more than some seconds; pytest -m '' runs these, too"
     )
 
 

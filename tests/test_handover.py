@@ -223,6 +223,61 @@ def test_a_model_that_comes_later_changes_nothing_at_rest() -> None:
         assert controller.estimate.f == pytest.approx(f, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    "compiled", [pytest.param(True, marks=pytest.mark.compiled), False], ids=["compiled", "Python"]
+)
+@pytest.mark.parametrize("disturbed", ["not", "by new limits", "by a restored state"])
+def test_a_prepared_retuning_does_what_retune_does(compiled: bool, disturbed: str) -> None:
+    """To rounding, to a design and back, also after what makes the packed parameters useless."""
+    del compiled  # the mark decides
+    learner = ql.learners.Kalman()
+    other = ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT)
+    controllers = [ql.ADRC(OBSERVER, omega_c=2.0, learner=learner) for _ in range(2)]
+    one, another = controllers
+    there = one.prepare_retune(omega_c=6.0, observer=other)
+    back = one.prepare_retune(omega_c=2.0, observer=OBSERVER)
+    assert one.omega_c == 2.0
+    us = []
+    for controller in controllers:
+        rig, found = Rig(), []
+        for k in range(200):
+            if k == 60 and disturbed == "by new limits":
+                controller.set_limits(u_min=-9.0, u_max=9.0)
+            if k == 60 and disturbed == "by a restored state":
+                controller.state = controller.state
+            if k == 80:
+                if controller is one:
+                    there()
+                else:
+                    another.retune(omega_c=6.0, observer=other)
+                assert (controller.omega_c, controller.observer) == (6.0, other)
+            if k == 120:
+                if controller is one:
+                    back()
+                else:
+                    another.retune(omega_c=2.0, observer=OBSERVER)
+            found.append(controller.step(math.sin(0.05 * k), rig.y))
+            rig.apply(found[-1])
+        us.append(found)
+    assert us[0] == pytest.approx(us[1], rel=1e-9)
+    assert len(set(us[0])) > 100
+
+
+def test_a_prepared_retuning_is_refused_as_retune_is() -> None:
+    """When it is prepared; nothing has changed then."""
+    controller = ql.ADRC(OBSERVER, omega_c=2.0, learner=ql.learners.Kalman())
+    other = ESO.model_free(order=2, b0=3.0, omega_o=20.0, dt=DT)
+    with pytest.raises(ValueError, match=r"what was learned refers to that"):
+        controller.prepare_retune(observer=other)
+    with pytest.raises(ValueError, match=r"omega_c = -1.0"):
+        controller.prepare_retune(omega_c=-1.0)
+    compensator = ql.Compensator(OBSERVER)
+    compensator.step(1.0, 0.0)
+    quick = ESO.model_free(order=2, b0=2.0, omega_o=40.0, dt=DT)
+    compensator.prepare_retune(observer=quick)()
+    assert compensator.observer is quick
+
+
 def test_retuning_before_the_first_measurement_changes_no_state() -> None:
     """There is no u to continue from: the first sample is that of a controller made so."""
     controller = ql.ADRC(OBSERVER, omega_c=3.0)

@@ -30,6 +30,7 @@ ROWS = (
     ("realtime",),
     ("export.translate", "export", "setup"),
     ("commissioning",),
+    ("monitoring",),
     ("experiments.common", "experiments.two_mass_spring", "experiments.torsional"),
     ("experiments.compare", "experiments.acc", "experiments.stress", "experiments.__init__"),
     ("studio",),

@@ -136,12 +136,15 @@ def measured(
     dt: float | None = None,
     time_unit: str | None = None,
     max_size: float = MAX_SIZE,
+    *,
+    reference: bool = False,
 ) -> Measured:
     """Read input and output from a file of any kind that quell knows.
 
     A NetCDF file is a run that ``Trajectory.save`` wrote; a MCAP file, or a CSV file with the
     header of a recording beside it, is a recording of ``quell run-rig``; another file is a table
-    in text, for which ``columns``, ``dt`` and ``time_unit`` are those of ``read_record``.
+    in text, for which ``columns``, ``dt`` and ``time_unit`` are those of ``read_record``; with
+    ``reference`` a column r belongs to the usual ones.
 
     Raises
     ------
@@ -149,18 +152,29 @@ def measured(
         as ``read_record``; and if the file is a setup.
     """
     from quell.identification import read_record
-    from quell.realtime import load
-    from quell.records.trajectory import Trajectory
 
-    plain = bool(columns) or dt is not None or time_unit is not None
-    if path.suffix.lower() == ".nc" and not plain:
-        return _of_run(Trajectory.load(path, max_size))
-    header = path.with_name(path.name + ".json")
-    if not plain and (path.suffix.lower() == ".mcap" or header.is_file()):
-        return _of_run(load(path, max_size))
-    default = ("u", "y") if dt is not None else ("t", "u", "y")
+    run = recorded_run(path, columns, dt, time_unit, max_size)
+    if run is not None:
+        return measured_run(run)
+    default = (*(() if dt is not None else ("t",)), "u", "y", *(("r",) if reference else ()))
     names = tuple(name.strip() for name in columns.split(",")) if columns else default
     return read_record(path, names, dt, time_unit=time_unit, max_size=max_size)
+
+
+def recorded_run(
+    path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
+) -> Trajectory | None:
+    """Return the run in a file that quell wrote; None for a table in text."""
+    from quell.realtime import load
+
+    if columns or dt is not None or time_unit is not None:
+        return None
+    if path.suffix.lower() == ".nc":
+        return Trajectory.load(path, max_size)
+    header = path.with_name(path.name + ".json")
+    if path.suffix.lower() == ".mcap" or header.is_file():
+        return load(path, max_size)
+    return None
 
 
 def measured_records(
@@ -196,19 +210,21 @@ def measured_records(
     return [record._replace(dt=mean) for record in records]
 
 
-def _of_run(run: Trajectory) -> Measured:
-    """Return the samples of a run under control, with held measurements where one is missing."""
-    import numpy as np
-
-    from quell.identification import Measured
+def controlled(run: Trajectory) -> slice:
+    """Return the samples in which the loop ran; all of a run without modes."""
     from quell.realtime.supervisor import Mode
 
-    u, r = run["u"], run["r"]
-    y = np.where(np.isfinite(run["y_measured"]), run["y_measured"], run["y"])
-    part = slice(0, len(run))
     if "mode" in run.names and np.any(run["mode"] == Mode.RUN):
         running = np.flatnonzero(run["mode"] == Mode.RUN)
-        part = slice(int(running[0]), int(running[-1]) + 1)
+        return slice(int(running[0]), int(running[-1]) + 1)
+    return slice(0, len(run))
+
+
+def measured_run(run: Trajectory) -> Measured:
+    """Return the samples of a run under control, with held measurements where one is missing."""
+    u, r = run["u"], run["r"]
+    y = np.where(np.isfinite(run["y_measured"]), run["y_measured"], run["y"])
+    part = controlled(run)
     known = run.every * run.dt, r[part].copy(), run.signals
     return Measured(u[part].copy(), y[part].copy(), *known)
 

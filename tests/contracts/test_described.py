@@ -29,6 +29,7 @@ OTHERS: dict[str, Any] = {
     "Feedforward": ql.Feedforward.rigid(2.25, viscous=0.75),
     "LinearLaw": CONTROLLERS["LinearController"].law,
     "NonlinearFeedback": controller_room.NonlinearFeedback((0.75, 1.25), 0.05),
+    "PidEqual": controller_room.equal_to_pid(2.25, 1.0, dt=0.01),
     "ProfileGenerator": controller_room.ProfileGenerator(1.0, 2.25, 30.0),
     "ReferenceModel": controller_room.ReferenceModel(3.25),
     "TrackingDifferentiator": controller_room.TrackingDifferentiator(2.25),

@@ -259,6 +259,7 @@ NO_PARTS = {
     "LinearLaw",
     "Model",
     "Notch",
+    "PidEqual",
     "Prefilter",
 }
 IN_PYTHON = {"JaxModel", "PythonModel", "RiverModel", "SklearnModel", "TorchModel"}

@@ -70,6 +70,8 @@ BASES: dict[str, tuple[str, ...]] = {
     "tune": (*_SETUP, *_FIGURES),
     "b0": ("record.csv", "--order", "1"),
     "excite": ("out.csv", "--duration", "20"),
+    "rank": ("log.csv", "log-2.csv"),
+    "watch": ("record.csv", "--window", "10", "--order", "1"),
     "rig": ("--device", "udp://127.0.0.1:0"),
     "proxy": ("proxy.toml", "--host", "udp://127.0.0.1:0"),
     "run": (*_SETUP, *_FIGURES),
@@ -129,6 +131,14 @@ CASES: dict[str, dict[str, Case]] = {
         "OUT": ("other.csv",), "--kind": ("--kind", "multisine"), "--low": ("--low", "2"), "--high": ("--high", "30"), "--duration": ("--duration", "40"), "--dt": ("--dt", "0.002"),
         "--u-min": ("--u-min=-2",), "--u-max": ("--u-max", "2"), "--seed": ("--seed", "1"),
     },
+    "rank": {
+        "LOGS": ("b=log-2.csv@0:20",), "--criterion": ("--criterion", "effort"), "--confidence": ("--confidence", "0.5"), "--dt": (("log.csv", "log-2.csv"), ("log.csv", "log-2.csv", "--columns", "u,y,r", "--dt", "0.04")),
+        "--columns": ("--columns", "t,y,u,r"), "--time-unit": ("--time-unit", "ms"),
+    },
+    "watch": {
+        "RECORDS": ("other.csv",), "--state": ("--state", "new.json"), "--window": ("--window", "15"), "--order": ("--order", "2"), "--band": ("--band", "2"), "--alpha": ("--alpha", "0.1"), "--dt": ("--dt", "0.04"),
+        "--columns": ("--columns", "t,y,u"), "--time-unit": ("--time-unit", "ms"),
+    },
     "rig": {
         "--device": (("--device", "udp://127.0.0.1:0"), ("--device", "udp://127.0.0.2:0")), "--plant": ("--plant", "two-mass"), "--dt": ("--dt", "0.002"), "--watchdog": ("--watchdog", "9"),
         "--u-max": ("--u-max", "3"), "--rest": ("--no-rest",), "--wait": ("--wait", "0.001"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
@@ -141,7 +151,7 @@ CASES: dict[str, dict[str, Case]] = {
     "run-rig": {
         "SETUP": (_OF_SETUP, ("other.toml", *_FIGURES)), "--example": ("--example",), "--device": ("--device", "twin:torsional"), "--seconds": ("--seconds", "2"), "--omega-c": ("--omega-c", "3"),
         "--omega-o": ("--omega-o", "9"), "--spin": ("--spin", "0.001"), "--priority": ("--priority", "0"), "--mcap": ("--mcap", "new.mcap"), "--csv": ("--csv", "new.csv"),
-        "--live": ("--live", "0"), "--live-origin": ("--live-origin", "https://a.org"), "--save": ("--save", "taken.json"),
+        "--live": ("--live", "0"), "--live-origin": ("--live-origin", "https://a.org"), "--watch": ("--watch", "new.json"), "--save": ("--save", "taken.json"),
     },
     "replay": {"RECORD": ("other.csv",), "--setup": ("--setup", "other.toml"), "--save": ("--save", "taken.json")},
     "sweep": {
@@ -228,6 +238,9 @@ def _write_inputs() -> None:
     for name in ("record.csv", "other.csv"):
         table = np.column_stack([t, u, y + 1e-3 * rng.normal(size=600)])
         np.savetxt(name, table, delimiter=",", header="t,u,y", comments="")
+        log = name.replace("record", "log").replace("other", "log-2")
+        table = np.column_stack([table, np.repeat(rng.normal(size=60), 10)])
+        np.savetxt(log, table, delimiter=",", header="t,u,y,r", comments="")
     Path("taken.json").write_text("{}", encoding="utf-8")
     Path("plants.csv").write_text("m1,m2,k_lin,k_nonlin,lambda,tau\n1,1,1,0,0,0.01\n")
 
@@ -309,7 +322,7 @@ def test_no_output_replaces_a_file(
 ) -> None:
     """Named files are looked at before the work; so the option has an effect."""
     base = [each for each in BASES[command] if each != "--no-figures"]
-    more = () if option == "--figures" or command == "b0" else _FIGURES
+    more = () if option == "--figures" or command in ("b0", "rank", "watch") else _FIGURES
     code, told = outcome(command, *base, *more, option, "taken.json")
     assert code != 0
     assert "taken.json" in told

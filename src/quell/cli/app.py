@@ -12,6 +12,7 @@ from quell import __version__
 from quell.cli.compare import compare
 from quell.cli.exit_codes import HELP, ExitCode
 from quell.cli.identify import b0, excite, identify
+from quell.cli.monitor import rank, watch
 from quell.cli.reproduce import acc, torsional, two_mass
 from quell.cli.rig import proxy, replay, rig, run_rig
 from quell.cli.run import export, run, studio, sweep
@@ -45,6 +46,8 @@ for _each in (
     tune,
     b0,
     excite,
+    rank,
+    watch,
     rig,
     proxy,
     run,

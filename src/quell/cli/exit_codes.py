@@ -26,6 +26,7 @@ class ExitCode(IntEnum):
     ENDED_BY_SAFETY = 3
     DIVERGED = 4
     NOT_PROVED = 5
+    ALARM = 6
     INTERRUPTED = 130
     TERMINATED = 143
 
@@ -53,6 +54,9 @@ _MEANINGS = {
     ExitCode.NOT_PROVED: (
         "quell export --prove: something is not proved, or there is no Frama-C; all files were "
         "written"
+    ),
+    ExitCode.ALARM: (
+        "quell watch: a number of the machine has changed, now or before; the state was written"
     ),
     ExitCode.INTERRUPTED: "stopped by Ctrl-C; quell run-rig ramps u to zero before",
     ExitCode.TERMINATED: "stopped by SIGTERM",

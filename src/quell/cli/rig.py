@@ -39,6 +39,7 @@ from quell.realtime.registry import examples
 
 if TYPE_CHECKING:
     from quell.controllers import Compensator
+    from quell.monitoring import WatchSink
     from quell.realtime import Rig, RigRun
     from quell.realtime.run import ModeChange
     from quell.records.trajectory import Trajectory
@@ -253,6 +254,7 @@ def run_rig(
     csv: Path | None = None,
     live: WholeOrNone = None,
     live_origin: list[str] | None = None,
+    watch: Path | None = None,
     trust: Trust = False,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
@@ -288,6 +290,10 @@ def run_rig(
     live_origin
         Web page that may watch, too, such as https://app.foxglove.dev; by default only programs and
         pages of this computer may.
+    watch
+        State of the machine, as `quell watch` keeps it, to which each minute of this run is added
+        while it runs: an alarm is printed at once. A new file is a new state; make it with quell
+        watch for other windows.
     """
     from quell.setup import EXAMPLES, made, read
 
@@ -303,6 +309,7 @@ def run_rig(
         "mcap": mcap,
         "csv": csv,
         "live": live,
+        "watch": watch,
     }
     others |= numbers | {"live_origin": live_origin}
     file = setup or EXAMPLES / "torsional_rig.toml"
@@ -323,7 +330,7 @@ def run_rig(
     files = [path for path in (mcap, csv) if path is not None]
     name, data = read(file)
     given = made(name, _changed(data, changes), trust)
-    if code := _run(given, files, (live, live_origin or []), outputs):
+    if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
 
 
@@ -331,6 +338,7 @@ def _run(
     setup: Setup,
     files: list[Path],
     viewers: tuple[int | None, list[str]],
+    watch: Path | None,
     outputs: RunOutputs,
 ) -> int:
     """Run the loop, print and write its results; return the exit code."""
@@ -351,6 +359,8 @@ def _run(
         refuse({"live_origin": (origins, [])}, "goes with --live, a port to watch at")
     # The port first: if it is in use no file is created.
     sinks = files if port is None else [LiveSink(port, origins=origins), *files]
+    watching = None if watch is None else _watching(console, watch, setup)
+    sinks = sinks if watching is None else [*sinks, watching]
     run = _close_loop(console, setup, url, options, sinks)
     if run is None:
         return ExitCode.ENDED_BY_SAFETY
@@ -360,6 +370,8 @@ def _run(
     print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
     learned = print_outcome(console, record)
     code = exit_code(run)
+    if watching is not None:
+        print_line(console, watching.describe())
     results = {
         "title": setup.title,
         "device": url,
@@ -378,6 +390,15 @@ def _run(
             raise
         print(f"quell: {error}", file=sys.stderr)
     return code
+
+
+def _watching(console: Console, path: Path, setup: Setup) -> WatchSink:
+    """Return the sink that watches the machine."""
+    from quell.monitoring import Machine, WatchSink
+
+    observer = getattr(setup.controller, "observer", None)
+    machine = Machine(order=min(getattr(observer, "degree", 2), 2))
+    return WatchSink(path, machine, lambda alarm: print_line(console, alarm.describe()))
 
 
 def _write(
@@ -538,6 +559,7 @@ def replay(
         The file of the controller, in TOML, with the record's sample time; by default that of
         `quell run-rig`.
     """
+    from quell.commissioning import controlled
     from quell.controllers import ADRC
     from quell.realtime import load as load_record
     from quell.realtime import replay as replay_record
@@ -554,7 +576,7 @@ def replay(
     except ValueError as error:
         raise with_path(given.file, "", error, ()) from None
     console = Console()
-    part = _controlled(recorded)
+    part = controlled(recorded)
     scores = {"recorded": _scores(recorded, part), "replayed": _scores(replayed, part)}
     rows = table(f"{record.name} through {given.title}", "", *_HEADINGS)
     for name, values in scores.items():
@@ -580,16 +602,6 @@ def replay(
         "setup": given.as_json(),
     }
     write_results(console, results, outputs, paths)
-
-
-def _controlled(run: Trajectory) -> slice:
-    """Return the samples in which the loop ran; all of a record without modes."""
-    from quell.realtime.supervisor import Mode
-
-    if "mode" not in run.names or Mode.RUN not in run["mode"]:
-        return slice(0, len(run))
-    running = (run["mode"] == Mode.RUN).nonzero()[0]
-    return slice(int(running[0]), int(running[-1]) + 1)
 
 
 def _scores(run: Trajectory, part: slice) -> dict[str, float | None]:

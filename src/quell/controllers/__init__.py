@@ -16,6 +16,7 @@ from quell.controllers.base import Controller, omega_c_for
 from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
+from quell.controllers.from_pid import PidEqual, equal_to_pid
 from quell.controllers.held import HeldPlant
 from quell.controllers.law import NonlinearFeedback
 from quell.controllers.linear import LinearController, LinearLaw
@@ -41,6 +42,7 @@ __all__ = [
     "LinearController",
     "LinearLaw",
     "NonlinearFeedback",
+    "PidEqual",
     "Prefilter",
     "Prefiltered",
     "ProfileGenerator",
@@ -50,6 +52,7 @@ __all__ = [
     "adrc_for_dead_time",
     "baselines",
     "dead_time_tuning",
+    "equal_to_pid",
     "in_single_precision",
     "omega_c_for",
     "warn_if_unwise",

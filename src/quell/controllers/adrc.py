@@ -42,7 +42,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,9 +51,7 @@ from quell import checks
 from quell.controllers.base import RateLimit, checked_limits, set_reference_derivatives
 from quell.controllers.compensator import (
     Compensator,
-    change_design,
     check_replacement,
-    check_structure,
     padded,
 )
 from quell.controllers.feedforward import (
@@ -62,6 +60,7 @@ from quell.controllers.feedforward import (
     derivatives_used,
     feedforward_design,
 )
+from quell.controllers.from_pid import equal_to_pid
 from quell.controllers.held import HeldPlant
 from quell.controllers.law import (
     AdrcDesign,
@@ -265,6 +264,44 @@ class ADRC(Compensator):
         warn_if_unwise(observer, self.omega_c)
         self._warn_of_idle_guard()
 
+    @classmethod
+    def from_pid(
+        cls,
+        kp: float,
+        ki: float,
+        kd: float = 0.0,
+        *,
+        tf: float | tuple[float, float] = 0.0,
+        dt: float,
+        b0: float | None = None,
+        learner: Learner | None = None,
+        guard: Guard | None = None,
+        **options: Any,
+    ) -> ADRC:
+        """Return the ADRC that is equal, from y to u, to a PID controller that is sampled.
+
+        ``controllers.equal_to_pid`` has a report: what differs and where to go from there.
+
+        Parameters
+        ----------
+        kp, ki, kd, tf, dt, b0
+            as for ``equal_to_pid``, with the same errors.
+        learner, guard, **options
+            of ``ADRC``, those that leave the law linear and its poles where they are: limits,
+            ``feedforward``, ``safe_set``.
+
+        Examples
+        --------
+        >>> controller = ADRC.from_pid(2.0, 1.0, dt=0.01, u_min=-5.0, u_max=5.0)
+        >>> round(controller.omega_c, 3), controller.observer.form
+        (0.868, 'reduced')
+        """
+        for name in {"half_gain", "feedback", "law_poles"} & options.keys():
+            raise ValueError(f"{name} = {options[name]!r}: the PID controller decides it; leave it")
+        equal = equal_to_pid(kp, ki, kd, tf=tf, dt=dt, b0=b0)
+        parts: dict[str, Any] = {"learner": learner, "guard": guard, **options}
+        return cls(equal.observer, equal.omega_c, law_poles=equal.law_poles, **parts)
+
     def _design(self, observer: ESO, omega_c: float | None = None) -> AdrcDesign:
         """Return the parameters with an observer and a bandwidth, by default the present one."""
         omega_c = omega_c or self.omega_c
@@ -333,9 +370,10 @@ class ADRC(Compensator):
         The control signal continues from where the old gains would have it, and the difference
         decays with the new ``omega_c``. A faster observer still moves it in the middle of a motion,
         by its own better estimate. What was learned is kept. A call takes some milliseconds,
-        because the designs are sampled again. Raises ``ValueError`` for an observer of another
-        kind, for a change of b0 or model that a learner's coefficients or the state do not allow;
-        the controller is then unchanged.
+        because the designs are sampled again: ``prepare_retune`` does that beforehand, for a loop
+        that has no such time. Raises ``ValueError`` for an observer of another kind, for a change
+        of b0 or model that a learner's coefficients or the state do not allow; the controller is
+        then unchanged.
 
         Parameters
         ----------
@@ -346,16 +384,33 @@ class ADRC(Compensator):
             ``omega_o``, ``b0`` or model; unchanged by default. For a plant with zeros, or with a
             separate input for f, only ``omega_o`` may change.
         """
+        self._replaced(observer, omega_c, compiles=False)()
+
+    def prepare_retune(
+        self, *, omega_c: float | None = None, observer: ESO | None = None
+    ) -> Callable[[], None]:
+        """Return a function that does what ``retune`` does, in a step's time.
+
+        All that takes time is done here, before the loop needs it; the code of the change is
+        compiled. The function may be called in any later sample, and again, to switch between
+        designs. ``set_limits`` or a restored state in between make its next calls slower, by a
+        tenth of a millisecond. Parameters, rules and errors are those of ``retune``.
+        """
+        return self._replaced(observer, omega_c, compiles=True)
+
+    def _replaced(
+        self, observer: ESO | None, omega_c: float | None, compiles: bool
+    ) -> Callable[[], None]:
+        """Return a function that changes observer and bandwidth."""
         omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:
             check_replacement(self.observer, observer, self._learns)
         observer = observer or self.observer
-        old, new = self.parameters, self._design(observer, omega_c)
-        check_structure(old, new)
-        self.observer, self.omega_c, self.parameters = observer, omega_c, new
+        change = self._change_to(
+            self._design(observer, omega_c), compiles, observer=observer, omega_c=omega_c
+        )
         warn_if_unwise(observer, omega_c)
-        change_design(old, new, self._state)
-        self._pack_again()
+        return change
 
 
 # ---- ADRC of order 1 for a first-order plant with dead time, K e^(−Ls)/(T s + 1) ----
@@ -407,7 +462,7 @@ def dead_time_tuning(
     Examples
     --------
     >>> [round(number, 3) for number in dead_time_tuning(2.0, time_constant=4.0, dead_time=1.0)]
-    [2.571, 0.284, 4.858]
+    [2.634, 0.279, 4.861]
     """
     K = checks.nonzero("gain", gain, "or u does not reach y")
     T = checks.positive("time_constant", time_constant, "s")

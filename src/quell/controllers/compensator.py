@@ -37,7 +37,7 @@ offset does not disturb its estimate.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -65,7 +65,7 @@ from quell.controllers.safe_set import (
     settle_safe_set,
     shift_f,
 )
-from quell.controllers.stateful import StatefulController
+from quell.controllers.stateful import PackedController, StatefulController, unpacked
 from quell.guard import (
     GUARD_CHANNELS,
     Guard,
@@ -75,7 +75,15 @@ from quell.guard import (
     limit,
     write_channels,
 )
-from quell.kernels.dispatch import call_specialised, compiled
+from quell.kernels import dispatch
+from quell.kernels.dispatch import (
+    call_specialised,
+    compiled,
+    compiled_call,
+    dispatcher_for,
+    kernel,
+)
+from quell.kernels.sized import layout_of
 from quell.learners.base import (
     NO_LAG,
     Learner,
@@ -244,6 +252,7 @@ def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
         state.loop[0].manual = 0.0
 
 
+@kernel
 def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     """Convert a running state to new parameters, without a jump of u."""
     loop, size = state.loop[0], new.law.size
@@ -253,7 +262,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     before = unlimited_control(old, state, loop.constant, loop.slope)
     # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
     # Its derivatives, if the observer has them, stay: how u moves from now on is not known.
-    acting = acting_control(old.eso, state.z, float(loop.u))
+    acting = acting_control(old.eso, state.z, loop.u)
     change = (old.b0 - new.b0) * acting
     for i in range(size):
         change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
@@ -265,6 +274,22 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     state.z[size] += change
     state.seen[size] += change
     loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)
+
+
+@compiled_call
+def change_packed(old: Any, new: Any) -> None:
+    """Convert a running state, see ``change_design``; both are packed with that state."""
+    before, state = unpacked(old)
+    after, _ = unpacked(new)
+    change_design(before, after, state)
+
+
+def changing(dispatcher: Any, packed: PackedController) -> Callable[[Any, Any], None]:
+    """Return the compiled function of ``dispatcher`` for controllers of one type."""
+    if dispatch.interpret_all:
+        return lambda old, new: change_design(old.arrays[0], *new.arrays)
+    compiled: Callable[[Any, Any], None] = dispatcher.compile((packed.type, packed.type))
+    return compiled
 
 
 def check_replacement(old: ESO, new: Any, learns: bool) -> None:
@@ -669,11 +694,48 @@ class Compensator(StatefulController):
             new observer of the same order, form, structure and sample time.
         """
         check_replacement(self.observer, observer, self._learns)
-        old, new = self.parameters, self._design(observer)
-        check_structure(old, new)
-        self.observer, self.parameters = observer, new
-        change_design(old, new, self._state)
-        self._pack_again()
+        self._change_to(self._design(observer), compiles=False, observer=observer)()
+
+    def prepare_retune(self, *, observer: ESO) -> Callable[[], None]:
+        """Return a function that does what ``retune`` does, in a step's time.
+
+        As ``ADRC.prepare_retune``.
+        """
+        check_replacement(self.observer, observer, self._learns)
+        return self._change_to(self._design(observer), compiles=True, observer=observer)
+
+    def _change_to(self, new: AdrcDesign, compiles: bool, **named: Any) -> Callable[[], None]:
+        """Return a function that changes to other parameters and sets the attributes named.
+
+        If it ``compiles``, the parameters are packed and the change is compiled beforehand.
+        """
+        check_structure(self.parameters, new)
+        ready: PackedController | None = None
+        change: Any = None
+        if compiles:
+            if self._packed is None:
+                self.prepare()
+            if layout_of(new) == layout_of(self.parameters):
+                ready = PackedController(new, self._state, self._packed)
+                change = changing(dispatcher_for(change_packed, new), ready)
+
+        def apply() -> None:
+            old, packed = self.parameters, self._packed
+            vars(self).update(named)
+            if (
+                ready is not None
+                and packed is not None
+                and packed.arrays[1] is ready.arrays[1]
+                and old.limits is new.limits
+            ):
+                change(packed, ready)
+                self.parameters, self._packed = new, ready
+                return
+            self.parameters = new._replace(limits=old.limits)
+            change_design(old, self.parameters, self._state)
+            self._pack_again()
+
+        return apply
 
     @property
     def _external_fields(self) -> tuple[str, ...]:

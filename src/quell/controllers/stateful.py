@@ -121,7 +121,7 @@ def _address(kind: Any, packed: Any, c: Any) -> Any:
 
 
 @intrinsic
-def _unpacked(typing_context: Any, packed: Any) -> Any:
+def unpacked(typing_context: Any, packed: Any) -> Any:
     """Return parameters and state of a packed controller."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -138,7 +138,7 @@ def _unpacked(typing_context: Any, packed: Any) -> Any:
 @compiled_call
 def step_packed(packed: Any, r: float, y: float) -> float:
     """Take one sample; see ``controllers.base.control``."""
-    design, state = _unpacked(packed)
+    design, state = unpacked(packed)
     return control(design, state, r, y)
 
 

@@ -20,6 +20,7 @@ from quell.controllers import (
     SafeSet,
     TrackingDifferentiator,
     adrc_for_dead_time,
+    equal_to_pid,
 )
 from quell.controllers.baselines import (
     LQG,
@@ -261,6 +262,13 @@ _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, Line
 _CONTROLLERS = (
     call_table("adrc", ADRC, types=_LAW),
     call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=_LAW),
+    call_table(
+        "adrc-pid",
+        ADRC.from_pid,
+        forwards_to=(equal_to_pid, ADRC),
+        types=_LAW,
+        without=("half_gain", "feedback", "law_poles"),
+    ),
     call_table("compensator", Compensator, types=_BANDS),
     call_table("pid", PID, forwards_to=_LINEAR),
     call_table("pid-simc", PID.simc, forwards_to=_PID),

@@ -1,0 +1,58 @@
+"""The time that a change of bandwidths takes in the loop: ``retune``, and one that is prepared.
+
+    python benchmarks/retune.py
+
+prints, for an ADRC of order 2 with and without ``Kalman`` and a guard, the median and the 99 %
+quantile of a step, of ``retune``, and of the function that ``prepare_retune`` returned.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import quell as ql
+
+DT, CALLS = 1e-3, 1000
+
+
+def times(call: Callable[[], Any], between: Callable[[], Any]) -> str:
+    """Return median and 99 % quantile of a call, with another call in between, as text."""
+    found = np.empty(CALLS)
+    for i in range(CALLS):
+        began = time.perf_counter()
+        call()
+        found[i] = time.perf_counter() - began
+        between()
+    median, most = 1e6 * np.quantile(found, [0.5, 0.99])
+    return f"{median:8.1f} {most:8.1f}"
+
+
+def main() -> None:
+    """Print the table."""
+    print(f"{'':28}{'median':>8} {'99 %':>8}  [µs]")
+    slow = ql.ESO.model_free(order=2, b0=5.0, omega_o=100.0, dt=DT)
+    fast = ql.ESO.model_free(order=2, b0=5.0, omega_o=120.0, dt=DT)
+    kinds: dict[str, dict[str, Any]] = {
+        "ADRC": {},
+        "ADRC, Kalman, guard": {"learner": ql.learners.Kalman(), "guard": ql.Guard()},
+    }
+    for name, parts in kinds.items():
+        controller = ql.ADRC(slow, omega_c=20.0, u_min=-5.0, u_max=5.0, **parts)
+        prepared = controller.prepare_retune(omega_c=25.0, observer=fast)
+
+        def step(controller: Any = controller) -> float:
+            return float(controller.step(1.0, 0.5))
+
+        def retune(controller: Any = controller) -> None:
+            controller.retune(omega_c=20.0, observer=slow)
+
+        for what, call in (("step", step), ("retune", retune), ("prepared", prepared)):
+            print(f"{name + ': ' + what:28}{times(call, step)}")
+
+
+if __name__ == "__main__":
+    main()

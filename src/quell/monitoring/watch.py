@@ -1,0 +1,634 @@
+"""``Watch``: what changes in a machine over months, with false alarms that are bounded for ever.
+
+Each window of operation gives a row of numbers (``windows``). As long as the machine is what it
+was, the windows of one feature are exchangeable: any order of them is as likely as any other. Then
+the rank of the newest value among all so far, with ties broken at random, gives p-values ::
+
+    p_t = (number below x_t + U_t (number equal, itself included)) / t
+
+that are independent and uniform on (0, 1), whatever the distribution of the values (Vovk, Gammerman
+& Shafer, *Algorithmic Learning in a Random World*, 2nd ed. 2022: conformal test martingales). On
+such numbers no betting pays: with ``z = Φ⁻¹(p)`` a bet on a shift by δ deviations from window s on
+multiplies its stake in each window by ::
+
+    L = exp(δ z − δ²/2),        E[L] = 1
+
+and a mixture of the bets over shifts δ and begins s, with weights of the begins that add up to
+one, ::
+
+    E_t = Σ_δ π_δ Σ_{s ≤ t} w_s Π_{i=s}^{t} L_i + W_{t+1}
+    w_s = W_s − W_{s+1},     W_s = 1/(1 + ln s)
+
+is a nonnegative martingale that begins at one. So by Ville's inequality the probability that it
+ever reaches 1/α is α at most (Ramdas, Grünwald, Vovk & Shafer, *Statistical Science* 38, 2023).
+With F features each alarms at F/α: the probability of any false alarm, over all time and however
+often one looks, is α at most. The sums over s are one number for each δ::
+
+    S_t = (S_{t−1} + w_t) L_t
+
+What it costs: a begin at window s must make up for ``w_s ≈ 1/(s ln² s)``, some 13 nats after half a
+year of hours, beside 7 for α and F; a shift by δ gives δ²/2 in each window.
+
+Exchangeable is an assumption. It fails where windows differ for other reasons (another product,
+another program of moves, day and night), or where neighbouring windows are alike because of a slow
+temperature: then changes of these are found, as alarms. The correlation of neighbours is looked at,
+and a line with NOT says so.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+from bisect import bisect_left, bisect_right, insort
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.files import MAX_SIZE, bytes_of, check_size, write_json
+from quell.monitoring.windows import (
+    MOST_MISSING,
+    Signals,
+    check_window,
+    features_of,
+    windows_of,
+    without_gaps,
+)
+from quell.types import Vector
+
+# Shifts that are bet on, in deviations of the windows, in both directions with equal weights.
+# Chosen by hand: half to three deviations; larger ones show within the ranks' own limit.
+_SHIFTS = np.array([0.5, 1.0, 2.0, 3.0])
+_BETS = np.concatenate([_SHIFTS, -_SHIFTS])
+_VERSION = 1
+# Windows of a state: eleven years of hours. Chosen by hand, a state then has some 20 MB.
+_MOST_WINDOWS = 100_000
+# Share of windows in which a feature must be seen to be watched; windows from which on that and the
+# correlation of neighbours is judged; least correlation that is told. Chosen by hand.
+_SEEN, _JUDGED, _CORRELATED = 0.5, 30, 0.15
+# Windows after which a change that does not alarm never will: the ranks are full of it.
+_NEVER = 300
+
+_HINTS = {
+    ("b0", -1): "less torque for u (a magnet, a phase, the supply), or more inertia",
+    ("b0", 1): "less inertia, as after a coupling that slips or a lost load",
+    ("coulomb", 1): "more friction: bearings, seals, lubrication",
+    ("viscous", 1): "more friction: bearings, seals, lubrication",
+    ("viscous", -1): "less damping, or with b0 less torque constant",
+    ("resonance", -1): "a coupling, belt or foot that is softer, or more inertia",
+    ("resonance", 1): "a coupling that is stiffer, or less inertia",
+    ("peak", 1): "less damping of a resonance",
+    ("stiffness", -1): "a spring that is softer",
+    ("noise", 1): "the sensor or its cable",
+    ("error", 1): "the loop follows worse: see the other numbers",
+    ("load", 1): "another load or an offset",
+    ("load", -1): "another load or an offset",
+}
+
+
+class Alarm(NamedTuple):
+    """A feature that has changed."""
+
+    feature: str
+    window: int  #: number of the window at which the alarm came, from 1 on
+    at: str  #: its label
+    since: int  #: number of the window with which the change probably began
+    since_at: str  #: its label
+    before: float  #: median before
+    after: float  #: median from then on
+    spread: float  #: deviation of single windows before
+
+    def describe(self) -> str:
+        """Return the change in a line."""
+        change = self.after - self.before
+        share = f" ({100.0 * change / abs(self.before):+.3g} %)" if self.before else ""
+        hint = _HINTS.get((self.feature, 1 if change > 0.0 else -1))
+        return (
+            f"ALARM: {self.feature} {'rose' if change > 0.0 else 'fell'} from {self.before:.4g} "
+            f"± {self.spread:.2g} to {self.after:.4g}{share} since window {self.since} "
+            f"({self.since_at}), seen at window {self.window} ({self.at})"
+            f"{f': {hint}' if hint else ''}"
+        )
+
+
+class _Track:
+    """The evidence about one feature."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.values: list[float] = []
+        self.windows: list[int] = []  # in which they were, from 1 on
+        self.ranked: list[float] = []
+        self.evidence = np.full(_BETS.size, -math.inf)  # ln S
+        self.runs = np.zeros(_BETS.size)  # ln of the best product so far, from ``begins`` on
+        self.begins = np.ones(_BETS.size, dtype=np.int64)
+        self.alarm: Alarm | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of windows in which the feature was seen."""
+        return len(self.values)
+
+    def log_evidence(self) -> float:
+        """Return ln E."""
+        terms = np.append(
+            self.evidence - math.log(_BETS.size), -math.log1p(math.log(self.count + 1))
+        )
+        return float(np.logaddexp.reduce(terms))
+
+    def take(self, value: float, window: int, draw: float) -> None:
+        """Take the value of a window."""
+        below, upto = bisect_left(self.ranked, value), bisect_right(self.ranked, value)
+        count = self.count + 1
+        insort(self.ranked, value)
+        self.values.append(value)
+        self.windows.append(window)
+        self.bet((below + draw * (upto - below + 1)) / count)
+
+    def bet(self, p: float) -> None:
+        """Multiply the stakes for a p-value."""
+        from scipy.special import ndtri
+
+        gain = _BETS * float(ndtri(p)) - 0.5 * _BETS**2
+        t = self.count
+        weight = 1.0 / (1.0 + math.log(t)) - 1.0 / (1.0 + math.log(t + 1))
+        self.evidence = np.logaddexp(self.evidence, math.log(weight)) + gain
+        new = self.runs <= 0.0
+        self.begins[new] = t
+        self.runs = np.where(new, 0.0, self.runs) + gain
+
+    def alarmed(self, at: list[str]) -> Alarm:
+        """Return the alarm of now."""
+        best = int(np.argmax(self.runs))
+        begin = int(self.begins[best]) - 1
+        before, after = np.array(self.values[:begin]), np.array(self.values[begin:])
+        known = before.size > 0
+        middle = float(np.median(before)) if known else math.nan
+        spread = 1.4826 * float(np.median(np.abs(before - middle))) if known else math.nan
+        since, now = self.windows[begin], self.windows[-1]
+        labels = at[now - 1], since, at[since - 1]
+        return Alarm(self.name, now, *labels, middle, float(np.median(after)), spread)
+
+
+class Watch:
+    """Alarms about the numbers of a machine that change, with few false ones over all time.
+
+    Feed it the rows of windows in the order of time. The probability that it ever raises an alarm
+    while the windows of each feature are exchangeable is ``alpha`` at most.
+
+    Parameters
+    ----------
+    features
+        names of the numbers that are watched; those of the first row by default.
+    alpha
+        probability of a false alarm, over all features and all time.
+    seed
+        of the draws that break ties; any number that was not chosen with a look at the data.
+
+    Raises
+    ------
+    ValueError
+        for an alpha that is not between 0 and 1, or names that repeat.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng, watch = np.random.default_rng(1), Watch()
+    >>> for day in range(200):
+    ...     row = {"b0": (500.0 if day < 150 else 450.0) + 10.0 * rng.normal()}
+    ...     for alarm in watch.update(row, f"day {day}"):
+    ...         print(alarm.feature, "since", alarm.since_at, "seen at", alarm.at)
+    b0 since day 149 seen at day 154
+    """
+
+    alarms: list[Alarm]  #: those raised so far, one for a feature at most
+
+    def __init__(
+        self, features: tuple[str, ...] | None = None, *, alpha: float = 0.01, seed: int = 0
+    ) -> None:
+        self.alpha = checks.positive("alpha", alpha)
+        if self.alpha >= 1.0:
+            raise ValueError(f"alpha = {alpha!r}: must be below 1, such as 0.01")
+        self.seed = checks.whole("seed", seed, 0)
+        self.labels: list[str] = []
+        self.alarms = []
+        self.left_out: set[str] = set()
+        self._tracks: dict[str, _Track] = {}
+        if features is not None:
+            self._begin(tuple(features))
+
+    def _begin(self, names: tuple[str, ...]) -> None:
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"features = {names!r}: must be different names, one at least")
+        self._tracks = {name: _Track(name) for name in names}
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the numbers that are watched."""
+        return tuple(self._tracks)
+
+    @property
+    def threshold(self) -> float:
+        """Logarithm of the evidence at which a feature alarms, ln(F/alpha)."""
+        return math.log(max(len(self._tracks), 1) / self.alpha)
+
+    def evidence(self, feature: str) -> float:
+        """Return the logarithm of the evidence against a feature being as before."""
+        return self._track(feature).log_evidence()
+
+    def values(self, feature: str) -> Vector:
+        """Return the values of a feature so far, without the windows that did not show it."""
+        return np.array(self._track(feature).values)
+
+    def _track(self, feature: str) -> _Track:
+        return self._tracks[checks.one_of("feature", feature, self.features)]
+
+    def update(self, row: Mapping[str, float], label: str = "") -> list[Alarm]:
+        """Take the numbers of the next window; return the alarms that it raises.
+
+        Parameters
+        ----------
+        row
+            numbers by name. One that is NaN or missing says nothing; names that are not watched
+            are left out, and the report says so.
+        label
+            of the window, such as its date.
+
+        Raises
+        ------
+        ValueError
+            for a row without numbers at the begin, or more windows than a state can have.
+        """
+        if not self._tracks:
+            self._begin(tuple(row))
+        if len(self.labels) >= _MOST_WINDOWS:
+            rule = "is the most of a state: begin a new one, with longer windows"
+            raise ValueError(f"{_MOST_WINDOWS} windows: {rule}")
+        self.left_out |= row.keys() - self._tracks.keys()
+        self.labels.append(label)
+        number, new = len(self.labels), []
+        for name, track in self._tracks.items():
+            value = float(row.get(name, math.nan))
+            if not math.isfinite(value):
+                continue
+            draw = random.Random(f"{self.seed}/{name}/{number}").random()
+            track.take(value, number, draw)
+            if track.alarm is None and track.log_evidence() >= self.threshold:
+                track.alarm = track.alarmed(self.labels)
+                new.append(track.alarm)
+        self.alarms += new
+        return new
+
+    def windows_to_alarm(self, feature: str) -> int | None:
+        """Return after how many windows a change far beyond the spread alarms from now on.
+
+        That is the usual number; the draws make it more or less. None if it usually never does:
+        there are too few windows to compare with.
+        """
+        track = self._track(feature)
+        if track.alarm is not None:
+            return 0
+        trial = _Track(feature)
+        trial.values = [0.0] * track.count
+        trial.evidence = track.evidence.copy()
+        before = track.count
+        for k in range(1, _NEVER + 1):
+            trial.values.append(0.0)
+            # Above all values before, and in the middle of those since.
+            trial.bet((before + 0.5 * k) / (before + k))
+            if trial.log_evidence() >= self.threshold:
+                return k
+        return None
+
+    def describe(self) -> str:
+        """Return alarms, and in lines with NOT what can not be said."""
+        lines = [alarm.describe() for alarm in self.alarms]
+        count = len(self.labels)
+        if not lines:
+            lines.append(
+                f"no alarm in {count} windows; false alarms have a probability of "
+                f"{self.alpha:g} at most, over all time"
+            )
+        unseen, unable, correlated = [], [], []
+        for name, track in self._tracks.items():
+            if count >= _JUDGED and track.count < _SEEN * count:
+                unseen.append(f"{name} (in {track.count} of {count} windows)")
+            elif track.alarm is None and self.windows_to_alarm(name) is None:
+                unable.append(name)
+            if track.alarm is None and (rho := self._neighbours(track)) is not None:
+                correlated.append(f"{name} ({rho:.2f})")
+        if unseen:
+            lines.append(f"NOT watched well: {', '.join(unseen)}: the windows do not show them")
+        if unable:
+            names = "all numbers" if len(unable) == len(self._tracks) else ", ".join(unable)
+            lines.append(
+                f"NOT enough windows yet: {names}: a change now may never alarm; "
+                f"{self._needed()} are needed before it"
+            )
+        if correlated:
+            lines.append(
+                f"NOT exchangeable: neighbouring windows are correlated: {', '.join(correlated)}; "
+                "the bound on false alarms does not hold for these: take longer windows"
+            )
+        if self.left_out:
+            lines.append(
+                f"NOT watched: {', '.join(sorted(self.left_out))}: not among the features of the "
+                "first window; begin a new state to watch them"
+            )
+        return "\n".join(lines)
+
+    def _needed(self) -> int:
+        """Return how many windows before a change are enough for an alarm."""
+        trial = Watch(self.features, alpha=self.alpha)
+        track = trial._tracks[self.features[0]]
+        for count in range(1, 10_000):
+            track.values.append(0.0)
+            track.bet(0.5)
+            if count % 5 == 0 and trial.windows_to_alarm(self.features[0]) is not None:
+                return count
+        return 10_000
+
+    def _neighbours(self, track: _Track) -> float | None:
+        """Return the correlation of neighbouring windows, if it is more than by chance."""
+        from scipy.special import ndtri
+        from scipy.stats import rankdata
+
+        follow = np.flatnonzero(np.diff(track.windows) == 1)
+        if follow.size < _JUDGED:
+            return None
+        scores = ndtri((rankdata(track.values) - 0.5) / track.count)
+        first, second = scores[follow], scores[follow + 1]
+        size = float(np.std(first) * np.std(second))
+        if size == 0.0:
+            return None
+        rho = float(np.mean((first - np.mean(first)) * (second - np.mean(second)))) / size
+        most = float(ndtri(1.0 - 1e-3 / len(self._tracks))) / math.sqrt(follow.size)
+        return rho if rho > max(most, _CORRELATED) else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the state for JSON, from which ``from_json`` goes on."""
+        tracks = {}
+        for name, track in self._tracks.items():
+            tracks[name] = {
+                "values": track.values,
+                "windows": track.windows,
+                "evidence": [None if v == -math.inf else v for v in track.evidence.tolist()],
+                "runs": track.runs.tolist(),
+                "begins": track.begins.tolist(),
+                "alarm": None if track.alarm is None else _finite(track.alarm._asdict()),
+            }
+        kept = {"alpha": self.alpha, "seed": self.seed, "labels": self.labels}
+        return {
+            "quell_watch": _VERSION,
+            **kept,
+            "left_out": sorted(self.left_out),
+            "features": tracks,
+        }
+
+    @classmethod
+    def from_json(cls, value: Any) -> Watch:
+        """Return the watch of a state; raise ``ValueError`` if it is none."""
+        try:
+            if value["quell_watch"] != _VERSION:
+                raise ValueError(f"version {value['quell_watch']!r}: must be {_VERSION}")
+            made = cls(tuple(value["features"]) or None, alpha=value["alpha"], seed=value["seed"])
+            made.labels = [str(label) for label in value["labels"]]
+            made.left_out = set(map(str, value["left_out"]))
+            for name, kept in value["features"].items():
+                made._tracks[name] = _track_of(name, kept, len(made.labels))
+        except (TypeError, KeyError, AttributeError, OverflowError) as error:
+            raise ValueError(f"no state of quell watch: {error!r}") from None
+        found = (track.alarm for track in made._tracks.values())
+        alarms = [alarm for alarm in found if alarm is not None]
+        made.alarms = sorted(alarms, key=lambda alarm: alarm.window)
+        return made
+
+
+def _finite(value: dict[str, Any]) -> dict[str, Any]:
+    return {
+        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in value.items()
+    }
+
+
+def _track_of(name: str, kept: Any, windows: int) -> _Track:
+    """Return the track of a state, checked."""
+    track = _Track(name)
+    track.values = checks.vector(f"{name}.values", kept["values"]).tolist()
+    track.windows = [checks.whole(f"{name}.windows", k, 1, windows) for k in kept["windows"]]
+    if len(track.windows) != len(track.values):
+        raise ValueError(f"{name}: {len(track.values)} values of {len(track.windows)} windows")
+    track.ranked = sorted(track.values)
+    evidence = [-math.inf if v is None else checks.finite(name, v) for v in kept["evidence"]]
+    track.evidence = np.array(evidence)
+    track.runs = checks.vector(f"{name}.runs", kept["runs"], _BETS.size)
+    most = max(track.count, 1)
+    track.begins = np.array([checks.whole(f"{name}.begins", k, 1, most) for k in kept["begins"]])
+    if track.evidence.size != _BETS.size or track.begins.size != _BETS.size:
+        raise ValueError(f"{name}: must have {_BETS.size} bets")
+    if kept["alarm"] is not None:
+        numbers: dict[str, Any] = {
+            k: math.nan if v is None else v for k, v in kept["alarm"].items()
+        }
+        track.alarm = Alarm(**numbers)
+    return track
+
+
+# ---- A machine that is watched: its records, their windows, the state on disk ----
+
+
+class Machine:
+    """The watch of one machine, with how its windows are made; kept in a file.
+
+    Parameters
+    ----------
+    window
+        length of a window [s]: long against what makes neighbouring windows alike.
+    order
+        1 or 2: u acts on this derivative of y.
+    band
+        band of the regression [rad/s], see ``windows.features_of``.
+    alpha
+        probability of a false alarm, over all features and all time.
+
+    Raises
+    ------
+    ValueError
+        for arguments out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        window: float = 60.0,
+        order: int = 2,
+        band: float | None = None,
+        alpha: float = 0.01,
+    ) -> None:
+        self.window = checks.positive("window", window, "s")
+        self.order = checks.whole("order", order, 1, 2)
+        self.band = checks.optional(checks.positive, "band", band, "rad/s")
+        self.watch = Watch(alpha=alpha)
+        self.records: list[str] = []
+        self.left_out = 0  #: windows with too many missing samples, since it was made or loaded
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Window, order, band and alpha."""
+        names = {"window": self.window, "order": self.order, "band": self.band}
+        return {**names, "alpha": self.watch.alpha}
+
+    def take(self, signals: Signals, label: str) -> list[Alarm]:
+        """Take all windows of a record, in order; return the alarms that they raise.
+
+        Raises ``ValueError`` for a record that is shorter than a window, and as ``features_of``.
+        """
+        new: list[Alarm] = []
+        count = 0
+        for count, part in enumerate(windows_of(signals, self.window), start=1):
+            whole = without_gaps(part)
+            if whole is None:
+                self.left_out += 1
+                continue
+            row = features_of(whole, self.order, self.band)
+            new += self.watch.update(row, f"{label}, {(count - 1) * self.window:g} s")
+        if count == 0:
+            duration = signals.y.size * signals.dt
+            raise ValueError(
+                f"{label}: {duration:g} s: must have a window of {self.window:g} s at least; "
+                "record longer, or take shorter windows in a new state"
+            )
+        return new
+
+    def describe(self) -> str:
+        """Return alarms, and in lines with NOT what can not be said."""
+        lines = [self.watch.describe()] if self.watch.labels else []
+        if self.left_out:
+            lines.append(
+                f"NOT watched: {self.left_out} windows in which more than {MOST_MISSING:.1%} of "
+                "the samples were skipped or missing"
+            )
+        return "\n".join(lines)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the state to a JSON file, whole or not at all; replace the one before."""
+        value = {"settings": self.settings, "records": self.records, **self.watch.to_json()}
+        write_json(path, value, overwrite=True)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Machine:
+        """Return the machine that ``save`` wrote; raise ``ValueError`` for another file."""
+        name = os.fspath(path)
+        check_size(Path(path).stat().st_size, bytes_of(max_size), name)
+        try:
+            value = json.loads(Path(path).read_text(encoding="utf-8"))
+            made = cls(**value["settings"])
+            made.records = [str(each) for each in value["records"]]
+            made.watch = Watch.from_json(value)
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            raise ValueError(f"path = {name!r}: no state of quell watch ({error})") from None
+        return made
+
+
+class WatchSink:
+    """A sink of a real-time loop's telemetry that watches the machine while it runs.
+
+    It works on the telemetry's own thread: the loop does not wait for it. Windows with many skipped
+    deadlines or missing measurements are left out. The state is written after each window.
+
+    Parameters
+    ----------
+    path
+        file of the state; if it exists, it is continued with its settings.
+    machine
+        settings of a new state.
+    on_alarm
+        called with each alarm, on the telemetry's thread.
+    """
+
+    name = "watch"
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        machine: Machine | None = None,
+        on_alarm: Callable[[Alarm], None] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        exists = self.path.exists()
+        self.machine = Machine.load(path) if exists else (machine or Machine())
+        self.windows = 0
+        self._on_alarm = on_alarm or (lambda alarm: None)
+        self._rows: list[Any] = []
+        self._columns: dict[str, int] = {}
+        self._features: tuple[str, ...] = ()
+        self._count, self._label, self._dt = 0, "", math.nan
+
+    def open(self, header: Any) -> None:
+        """Begin a record."""
+        from datetime import UTC, datetime
+
+        self._columns = {name: i for i, name in enumerate(header.columns)}
+        self._features = tuple(header.features)
+        self._dt, self._rows, self._count = header.dt, [], 0
+        check_window(round(self.machine.window / self._dt))
+        self._label = datetime.fromtimestamp(1e-9 * header.started, UTC).isoformat("T", "seconds")
+
+    def write(self, rows: Any) -> None:
+        """Take rows; at the end of a window, its numbers."""
+        from quell.realtime.supervisor import Mode
+
+        running = rows[rows[:, self._columns["mode"]] == Mode.RUN]
+        if running.size == 0:
+            return
+        self._rows.append(running.copy())
+        self._count += running.shape[0]
+        samples = max(round(self.machine.window / self._dt), 1)
+        while self._count >= samples:
+            every = np.concatenate(self._rows)
+            self._rows, self._count = [every[samples:]], self._count - samples
+            self._take(every[:samples])
+
+    def _take(self, rows: Any) -> None:
+        """Take the rows of a window."""
+        at = self._columns
+        k, y = rows[:, at["k"]], rows[:, at["y_measured"]].copy()
+        skipped = np.sum(np.diff(k) - 1.0)
+        if skipped > MOST_MISSING * k.size:
+            self.machine.left_out += 1
+            return
+        f = None
+        if "f_residual" in at:
+            f = rows[:, at["f_residual"]] + rows[:, at["f_learned"]]
+        names = [f"theta[{i}]" for i in range(len(self._features))]
+        theta = {
+            of: rows[:, at[name]]
+            for of, name in zip(self._features, names, strict=True)
+            if name in at
+        }
+        signals = without_gaps(Signals(rows[:, at["u"]], y, rows[:, at["r"]], f, theta, self._dt))
+        if signals is None:
+            self.machine.left_out += 1
+            return
+        row = features_of(signals, self.machine.order, self.machine.band)
+        label = f"{self._label} + {k[0] * self._dt:g} s"
+        for alarm in self.machine.watch.update(row, label):
+            self._on_alarm(alarm)
+        self.windows += 1
+        self.machine.save(self.path)
+
+    def describe(self) -> str:
+        """Return what the watch says, and which windows this record had."""
+        lines = [f"watched: {self.windows} windows of {self.machine.window:g} s, in {self.path}"]
+        if self.windows + self.machine.left_out == 0:
+            lines.append(f"NOT watched: no whole window of {self.machine.window:g} s; run longer")
+        return "\n".join([*lines, self.machine.describe()])
+
+    def flush(self) -> None:
+        """Do nothing: the state is written after each window."""
+
+    def close(self) -> None:
+        """Do nothing; a window that is not full is left out."""

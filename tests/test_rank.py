@@ -1,0 +1,259 @@
+"""Which of several tunings was best, from logs."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from quell.identification import Measured
+from quell.monitoring import rank
+from quell.monitoring.rank import correlation_time, period_of
+from tests.commands import in_this_process
+
+DT = 0.01
+
+
+def log(
+    seed: int,
+    size: float = 1.0,
+    *,
+    samples: int = 8000,
+    memory: float = 0.9,
+    r: Any = None,
+    load: float = 1.0,
+    mean: float = 0.0,
+    gain: float = 1.0,
+) -> Measured:
+    """Return a log whose error has a memory: an autoregression of this size, and a slow load."""
+    rng = np.random.default_rng(seed)
+    error = size * lfilter([1.0], [1.0, -memory], rng.normal(size=samples + 500))[500:]
+    slow = load * lfilter([0.1], [1.0, -0.98], rng.normal(size=samples + 500))[500:]
+    reference = np.zeros(samples) if r is None else r
+    return Measured(mean - slow + 0.01 * gain * error, reference - error, DT, reference)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9, 0.97])
+def test_tunings_that_are_alike_are_not_decided(memory: float) -> None:
+    """In 95 of 100 draws at least, but for the chance of the draws; whatever the correlation."""
+    decided = [
+        rank({"A": log(2 * seed, memory=memory), "B": log(2 * seed + 1, memory=memory)}).best
+        for seed in range(120)
+    ]
+    wrong = sum(each is not None for each in decided)
+    assert wrong <= 11  # of 120: at 5 % more in 1 of 100 cases (binomial)
+
+
+def test_three_tunings_that_are_alike_are_not_decided_either() -> None:
+    """The level is shared by the pairs."""
+    wrong = 0
+    for seed in range(60):
+        found = rank({name: log(3 * seed + i) for i, name in enumerate("ABC")})
+        wrong += any(each.decided for each in found.comparisons)
+    assert wrong <= 7
+
+
+def test_a_better_tuning_is_found_and_its_interval_holds() -> None:
+    """Errors of 0.8 of the other's: found in most draws, never the wrong way round."""
+    found = [rank({"A": log(seed), "B": log(seed + 500, 0.8)}) for seed in range(60)]
+    best = [each.best for each in found]
+    assert best.count("B") >= 54
+    assert "A" not in best
+    held = [
+        each.comparisons[0].least <= 0.2 <= each.comparisons[0].most
+        for each in found
+        if each.comparisons[0].better == "B"
+    ]
+    assert sum(held) >= 0.9 * len(held)
+
+
+def test_the_time_asked_for_is_enough() -> None:
+    """Logs that are longer by it decide a difference as large as the one that was seen, mostly."""
+    enough = tried = 0
+    for seed in range(40):
+        found = rank({"A": log(seed), "B": log(seed + 500, 0.93)}).comparisons[0]
+        if found.decided or math.isnan(found.needed) or found.better == "A":
+            continue
+        assert found.describe().endswith(f"log at least {found.needed:.3g} s more of each")
+        samples = min(8000 + round(found.needed / DT), 400_000)
+        longer = {"A": log(seed + 1000, samples=samples)}
+        longer["B"] = log(seed + 2000, 1.0 - found.lower, samples=samples)
+        tried += 1
+        enough += rank(longer).best == "B"
+    assert tried >= 8
+    assert enough >= 0.55 * tried
+
+
+def test_the_same_reference_cancels_in_pairs() -> None:
+    """What it makes of the error is the same in both: a difference of 3 % is found."""
+    t = DT * np.arange(8000)
+    r = np.sin(0.05 * t**1.7)
+    moving = np.abs(np.sin(0.11 * t)) * 20.0
+    logs = {}
+    for seed, (name, size) in enumerate({"A": 1.0, "B": 0.97}.items()):
+        noise = log(seed, 0.05, r=r)
+        error = size * moving + (r - noise.y)
+        logs[name] = noise._replace(y=r - error)
+    assert rank(logs).best == "B"
+    apart = {
+        "A": logs["A"],
+        "B": logs["B"]._replace(reference=r[::-1], y=logs["B"].y - r + r[::-1]),
+    }
+    assert rank(apart).best is None
+
+
+def test_batches_are_whole_periods_of_a_reference_that_repeats() -> None:
+    """The error after a step is large in each period, in both tunings."""
+    r = np.tile(np.repeat([0.0, 1.0], 150), 30)
+    assert period_of(r) == 300
+    assert period_of(np.zeros(500)) == 0
+    assert period_of(np.random.default_rng(1).normal(size=2000)) == 0
+    assert abs(period_of(np.round(np.sin(np.arange(4000) * 2 * math.pi / 250.3), 6)) - 250) <= 1
+    after = np.tile(np.exp(-np.arange(150) / 20.0), 60)
+    found = {}
+    for seed, (name, size) in enumerate({"A": 1.0, "B": 0.9}.items()):
+        noise = log(seed, 0.02, samples=9000, r=r)
+        jump = np.where(np.tile(np.repeat([0, 1], 150), 30) == 1, 1.0, -1.0)
+        found[name] = noise._replace(y=noise.y - size * jump * after)
+    ranking = rank(found)
+    assert ranking.best == "B"
+    assert ranking.scores["A"].batches * 300 <= 9000
+    assert ranking.comparisons[0].lower == pytest.approx(0.1, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"r": np.full(8000, 2.0)}, "the reference is 2 and 0"),
+        ({"r": np.sin(0.01 * np.arange(8000))}, "of the reference is"),
+        ({"load": 5.0}, "the slow part of u swings"),
+        ({"mean": 9.0}, "the mean of u is 9"),
+    ],
+)
+def test_another_task_is_named_as_the_reason(change: dict[str, Any], reason: str) -> None:
+    """Nothing is decided then, however large the difference."""
+    found = rank({"A": log(1, 0.3, **change), "B": log(2)})
+    assert found.best is None
+    line = found.comparisons[0].describe()
+    assert line.startswith("NOT comparable: A and B: ")
+    assert reason in line
+
+
+def test_a_load_behind_moves_that_repeat_is_seen() -> None:
+    """What the moves make of u is the same in each period, and is taken out."""
+    r = np.tile(np.repeat([0.0, 1.0], 150), 30)
+    logs = {}
+    for seed, (name, load) in enumerate({"A": 0.3, "B": 0.9}.items()):
+        one = log(seed, samples=9000, r=r, load=load)
+        logs[name] = one._replace(u=one.u + 20.0 * np.gradient(r))
+    assert "the slow part of u swings" in rank(logs).comparisons[0].describe()
+    same = {name: one._replace(u=logs["A"].u) for name, one in logs.items()}
+    assert rank(same).comparisons[0].reasons == ()
+
+
+def test_the_same_load_under_another_tuning_is_comparable() -> None:
+    """False alarms of the tests of reference and load: one in 100 at most."""
+    alarms = 0
+    for seed in range(60):
+        logs = {"A": log(2 * seed), "B": log(2 * seed + 1, 0.5, gain=3.0)}
+        alarms += bool(rank(logs).comparisons[0].reasons)
+    assert alarms <= 2
+
+
+def test_a_log_that_is_too_short_says_how_long_it_must_be() -> None:
+    """Ten batches of ten correlation times."""
+    found = rank({"A": log(1, samples=600, memory=0.99), "B": log(2, samples=600, memory=0.99)})
+    line = found.comparisons[0].describe()
+    needed = float(re.findall(r"at least ([\d.]+) s of each", line)[0])
+    assert line.startswith("NOT decided")
+    assert needed > 6.0
+
+
+def test_a_difference_that_logs_like_these_do_not_show_is_called_alike() -> None:
+    """Rather than asking for months."""
+    one = log(1)
+    other = one._replace(y=one.y * (1.0 + 1e-6), u=one.u)
+    shifted = other._replace(y=np.roll(other.y, 400))
+    line = rank({"A": one, "B": shifted}).comparisons[0].describe()
+    assert line.startswith("NOT decided")
+    assert "alike" in line
+
+
+def test_the_correlation_time_is_that_of_the_closed_form() -> None:
+    """(1 + ρ)/(1 − ρ) of an autoregression of first order, and one for white noise."""
+    rng = np.random.default_rng(4)
+    for rho in (0.0, 0.8, 0.95):
+        values = lfilter([1.0], [1.0, -rho], rng.normal(size=200_000))
+        assert correlation_time(values) == pytest.approx((1.0 + rho) / (1.0 - rho), rel=0.1)
+    assert correlation_time(np.ones(100)) == 1.0
+
+
+def test_the_overshoot_is_that_of_the_steps() -> None:
+    """Steps that rest for a while; a reference that always moves has none."""
+    r = np.repeat([0.0, 1.0, 0.0, 1.0], 2000)
+    y = r.copy()
+    for k in (2000, 4000, 6000):
+        y[k + 50] += 0.2 * (r[k] - r[k - 1])
+    measured = log(1)._replace(reference=r, y=y + 1e-6 * log(3).y)
+    found = rank({"A": measured, "B": log(2)})
+    assert found.scores["A"].overshoot == pytest.approx(0.2, abs=1e-3)
+    assert math.isnan(found.scores["B"].overshoot)
+
+
+@pytest.mark.parametrize(
+    ("logs", "message"),
+    [
+        ({"A": log(1)}, "give logs of two or more"),
+        ({"A": log(1), "B": log(2)._replace(reference=None)}, r"logs['B']: has no reference r"),
+        ({"A": log(1), "B": log(2)._replace(dt=0.02)}, "sample times from 0.01 to 0.02 s"),
+        ({"A": log(1), "B": []}, "logs['B']: no log"),
+        ({"A": log(1), "B": [log(2), 3.0]}, "logs['B'][1]: must be a quell"),
+        ({"A": log(1), "B": log(2, samples=10)}, "10 samples; must have"),
+    ],
+)
+def test_bad_logs_are_named(logs: Any, message: str) -> None:
+    """With the tuning, and what to do."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        rank(logs)
+    with pytest.raises(ValueError, match="criterion = 'best'"):
+        rank({"A": log(1), "B": log(2)}, criterion="best")
+
+
+# ---- quell rank ----
+
+
+def written(path: Path, measured: Measured) -> str:
+    """Write a log as a table and return its path."""
+    t = DT * np.arange(measured.y.size)
+    table = np.column_stack([t, measured.u, measured.y, measured.reference])
+    np.savetxt(path, table, delimiter=",", header="t,u,y,r", comments="", fmt="%.9g")
+    return str(path)
+
+
+def test_the_command_names_the_best_and_takes_parts_of_logs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One day on which the tunings alternate is a log of both, by parts."""
+    parts = [log(1), log(2, 0.8), log(3), log(4, 0.8)]
+    day = Measured(*(np.concatenate(each) for each in zip(*[(p.u, p.y) for p in parts], strict=True)),
+                   DT, np.zeros(32000))  # fmt: skip
+    file, json_file = written(tmp_path / "day.csv", day), tmp_path / "found.json"
+    spans = {"old": ("0:80", "160:240"), "new": ("80:160", "240:320")}
+    logs = [f"{name}={file}@{span}" for name, each in spans.items() for span in each]
+    shown = in_this_process(["rank", *logs, "--json", str(json_file)], monkeypatch, capsys)
+    assert shown.code == 0
+    assert "best: new, at 95 % for all together" in shown.out
+    assert "NOT protected" not in shown.out
+    assert json.loads(json_file.read_text())["best"] == "new"
+    alike = in_this_process(["rank", f"{file}@0:80", f"b={file}@160:240"], monkeypatch, capsys)
+    assert "NOT decided which is best" in alike.out
+    assert "NOT protected against drift" in alike.out
+    beyond = in_this_process(["rank", f"{file}@0:80", f"b={file}@160:900"], monkeypatch, capsys)
+    assert beyond.code == 2
+    assert "must be a part of the 320 s of the log" in beyond.err
