@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from quell.controllers.compensated import Compensated
     from quell.controllers.compensator import Compensator, Estimate
     from quell.controllers.feedforward import Feedforward
+    from quell.controllers.held import HeldPlant
     from quell.controllers.safe_set import SafeSet
     from quell.guard import Guard, Reason
     from quell.identification.identify import identify
@@ -68,6 +69,7 @@ _HOMES = {
     "Estimate": "controllers.compensator",
     "Feedforward": "controllers.feedforward",
     "Guard": "guard",
+    "HeldPlant": "controllers.held",
     "Reason": "guard",
     "SafeSet": "controllers.safe_set",
     "Scenario": "simulation.driver",
@@ -90,8 +92,8 @@ _MODULES = (
 
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning", "Estimate",
-    "Feedforward", "Guard", "Reason", "SafeSet", "Scenario", "Status", "Trajectory", "Tuned",
-    "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
+    "Feedforward", "Guard", "HeldPlant", "Reason", "SafeSet", "Scenario", "Status", "Trajectory",
+    "Tuned", "analysis", "baselines", "canonical", "controllers", "envs", "experiments", "export",
     "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
     "plants", "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
     "tuning",

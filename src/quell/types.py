@@ -43,6 +43,7 @@ class Status(IntFlag):
     CONTROL_HELD = 1024
     SAFE_SET_ACTED = 2048
     UNSAFE = 4096
+    HELD = 8192
 
     @property
     def message(self) -> str:
@@ -102,6 +103,10 @@ _MESSAGES = {
     Status.UNSAFE: (
         "NOT safe: limits of u did not allow what the safe set needs (raise u_max or rate_limit, "
         "or lower alpha), or y moved as f_rate, noise and gain_error do not allow (raise them)."
+    ),
+    Status.HELD: (
+        "The plant is held, as the machine says, or y rests although u should move it, as with a "
+        "brake or an end stop, or a load that is compensated: check whether u acts."
     ),
 }
 _NOTHING = "No step reported a problem."

@@ -70,6 +70,7 @@ CONTROLLERS: dict[str, Any] = {
     "ADRC with a safe set": ql.ADRC(
         ESO, 1.5, safe_set=ql.SafeSet(-0.9, 0.9, -3.0, 3.0, alpha=4.0, f_rate=0.1), **LIMITS
     ),
+    "ADRC with held": ql.ADRC(ESO, 1.5, held=ql.HeldPlant(), **LIMITS),
     "Compensator": ql.Compensator(ESO, **LIMITS),
     "Compensated": room.Compensated(PID, ql.Compensator(ESO, **LIMITS)),
     "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
