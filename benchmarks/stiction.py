@@ -85,7 +85,7 @@ def learners(speed: float) -> dict[str, Any]:
     }
 
 
-def error(twin: str, learner: Any, guard: Any, reference: Any) -> float:
+def error(twin: str, learner: Any, guard: Any, reference: Any, held: Any = None) -> float:
     """Return the RMS error in the second half of a run [y-unit]; infinite if it diverges."""
     plant, order, b0, omega_c, omega_o, most, _, _ = TWINS[twin]
     controller = ql.ADRC(
@@ -96,6 +96,7 @@ def error(twin: str, learner: Any, guard: Any, reference: Any) -> float:
         feedforward=True,
         u_min=-most,
         u_max=most,
+        held=held,
     )
     run = ql.simulate(plant(), controller, ql.Scenario(reference, SECONDS))
     if run.diverged:

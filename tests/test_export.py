@@ -114,10 +114,11 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
 
 def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
     """Held values, both limits, u beside manual operation, and a continuation without a jump."""
-    vectors = golden_vectors(ADRC, ("track", "start"))
+    vectors = golden_vectors(ADRC, ("track", "start", "set_held"))
     flags = Status(int(np.bitwise_or.reduce([row.status for row in vectors.rows])))
     held = Status.MEASUREMENT_HELD | Status.REFERENCE_HELD
-    assert flags == held | Status.SATURATED | Status.RATE_LIMITED | Status.CONTROL_HELD
+    u = Status.SATURATED | Status.RATE_LIMITED | Status.CONTROL_HELD
+    assert flags == held | u | Status.HELD
     names = [row.action.name for row in vectors.rows]
     assert set(names) == {
         "STEP",
@@ -128,6 +129,8 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
         "FREE",
         "RESET",
         "START",
+        "HELD",
+        "RELEASED",
     }
     for name in ("HAND_OVER", "START"):
         at = names.index(name)

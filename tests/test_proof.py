@@ -69,7 +69,7 @@ MUTANTS = [
     pytest.param("applied < limits->low", "applied > limits->low", "servo_step", id="wrong sign"),
     pytest.param("estimate.x_hat[1] = row[1];", "estimate.x_hat[1] = row[9];", "servo_get_estimate", id="index"),
     pytest.param("for (int i = 0; i < 2; i++) {", "for (int i = 0; i < 40; i++) {", "", id="too many passes"),
-    pytest.param("    observe(&design->eso, state->z", "    state->z[(int)r] = r;\n    observe(&design->eso, state->z", "", id="NaN as an index"),
+    pytest.param("    observe(&design->eso, z, ", "    z[(int)before] = before;\n    observe(&design->eso, z, ", "", id="NaN as an index"),
 ]  # fmt: skip
 
 

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from quell.controllers.compensated import Compensated
     from quell.controllers.compensator import Compensator, Estimate
     from quell.controllers.feedforward import Feedforward
+    from quell.controllers.held import HeldPlant
     from quell.controllers.online_gain import OnlineGain
     from quell.controllers.safe_set import SafeSet
     from quell.controllers.schedule import Schedule
@@ -71,6 +72,7 @@ _HOMES = {
     "Estimate": "controllers.compensator",
     "Feedforward": "controllers.feedforward",
     "Guard": "guard",
+    "HeldPlant": "controllers.held",
     "OnlineGain": "controllers.online_gain",
     "Reason": "guard",
     "SafeSet": "controllers.safe_set",
@@ -96,8 +98,8 @@ _MODULES = (
 
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning", "Estimate",
-    "Feedforward", "Guard", "OnlineGain", "Reason", "SafeSet", "Scenario", "Schedule", "Status",
-    "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers", "envs",
+    "Feedforward", "Guard", "HeldPlant", "OnlineGain", "Reason", "SafeSet", "Scenario", "Schedule",
+    "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers", "envs",
     "experiments", "export", "features", "identification", "identify", "learners", "metrics",
     "observers", "omega_c_for", "plants", "realtime", "setup", "signals", "simulate", "style",
     "sweep", "sweeping", "tune", "tune_schedule", "tuning",

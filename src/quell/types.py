@@ -43,7 +43,8 @@ class Status(IntFlag):
     CONTROL_HELD = 1024
     SAFE_SET_ACTED = 2048
     UNSAFE = 4096
-    SCHEDULE_HELD = 8192
+    HELD = 8192
+    SCHEDULE_HELD = 16384
 
     @property
     def message(self) -> str:
@@ -103,6 +104,10 @@ _MESSAGES = {
     Status.UNSAFE: (
         "NOT safe: limits of u did not allow what the safe set needs (raise u_max or rate_limit, "
         "or lower alpha), or y moved as f_rate, noise and gain_error do not allow (raise them)."
+    ),
+    Status.HELD: (
+        "The plant is held, as the machine says, or y rests although u should move it, as with a "
+        "brake or an end stop, or a load that is compensated: check whether u acts."
     ),
     Status.SCHEDULE_HELD: (
         "A signal of the schedule was not finite or not given; the last good one was used, or the "

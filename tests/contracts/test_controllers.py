@@ -72,6 +72,7 @@ CONTROLLERS: dict[str, Any] = {
     "ADRC with a safe set": ql.ADRC(
         ESO, 1.5, safe_set=ql.SafeSet(-0.9, 0.9, -3.0, 3.0, alpha=4.0, f_rate=0.1), **LIMITS
     ),
+    "ADRC with held": ql.ADRC(ESO, 1.5, held=ql.HeldPlant(), **LIMITS),
     "ADRC with a schedule": ql.ADRC(
         ESO,
         1.5,

@@ -24,6 +24,7 @@ OTHERS: dict[str, Any] = {
     "Canonical": OBSERVERS["half gain"].plant,
     "PlantBatch": ql.plants.batch(ql.plants.two_mass_spring, m1=[1.0, 1.25]),
     "DeadTimeTuning": _DEAD_TIME,
+    "HeldPlant": ql.HeldPlant(noise=1.5),
     "SafeSet": ql.SafeSet(y_max=1.5, alpha=4.0),
     "OnlineGain": ql.OnlineGain(0.5, 5.0),
     "Schedule": ql.Schedule((0.0, 1.0), b0=(5.0, 0.5)),

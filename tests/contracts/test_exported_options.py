@@ -182,12 +182,12 @@ PARTS: dict[str, Part] = {
     "ADRC": Part(ql.ADRC, _itself, {"observer": OBSERVER, "omega_c": 1.5, **LIMITS}, {
         "observer": ql.ESO.model_free(order=3, b0=1.5, omega_o=12.0, dt=DT), "omega_c": 2.0, "learner": ql.learners.Kalman(),
         "guard": With(ql.Guard(), {"learner": ql.learners.Kalman()}), "feedforward": Several((True, ql.Feedforward((0.3, 0.1, 0.7)))),
-        **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "schedule": Several((ql.Schedule((0.0, 0.5), "y", (0.8, 2.0)), ql.OnlineGain(0.8, 3.0, bandwidth=30.0))), "half_gain": True, "feedback": room.NonlinearFeedback((0.75, 1.25), 0.05), "law_poles": [-1.0, -2.0],
+        **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "held": ql.HeldPlant(), "schedule": Several((ql.Schedule((0.0, 0.5), "y", (0.8, 2.0)), ql.OnlineGain(0.8, 3.0, bandwidth=30.0))), "half_gain": True, "feedback": room.NonlinearFeedback((0.75, 1.25), 0.05), "law_poles": [-1.0, -2.0],
     }),
     "Compensator": Part(ql.Compensator, _itself, {"observer": OBSERVER, **LIMITS}, {
         "observer": Several((ql.ESO.model_free(order=3, b0=1.5, omega_o=12.0, dt=DT), ql.ESO.model_based(([2.0, 0.3], 1.5), 12.0, DT))),
         "omega_c": With(2.0, {"learner": ql.learners.Kalman()}), "learner": With(ql.learners.Kalman(), {"omega_c": 1.5}),
-        "guard": With(ql.Guard(), {"learner": ql.learners.Kalman(), "omega_c": 1.5}), **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0),
+        "guard": With(ql.Guard(), {"learner": ql.learners.Kalman(), "omega_c": 1.5}), **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "held": ql.HeldPlant(),
         "schedule": ql.Schedule((0.0, 0.5), "y", (0.8, 2.0)),
     }),
     "Compensated": Part(room.Compensated, _itself, {"controller": PID, "compensator": ql.Compensator(OBSERVER, **LIMITS)}, {
@@ -197,6 +197,7 @@ PARTS: dict[str, Part] = {
     "SafeSet": Part(ql.SafeSet, lambda safe: ql.ADRC(OBSERVER, 1.5, safe_set=safe, **LIMITS), {"y_max": 0.9}, {
         "y_min": -0.9, "y_max": 0.5, "rate_min": -2.0, "rate_max": 2.0, "alpha": 5.0, "f_rate": 0.1, "noise": 1e-5, "gain_error": 0.1,
     }),
+    "HeldPlant": Part(ql.HeldPlant, lambda held: ql.ADRC(OBSERVER, 1.5, held=held, **LIMITS), {}, {"noise": 1e-5}),
     "Schedule": Part(ql.Schedule, lambda schedule: ql.ADRC(OBSERVER, 1.5, schedule=schedule, **LIMITS), {"points": (-0.5, 0.5), "signal": "reference", "b0": (0.8, 2.0)}, {
         "points": (-0.3, 0.2), "signal": Several(("y", "speed", "external")), "b0": (1.0, 3.0),
         "omega_c": (1.0, 2.0), "omega_o": (9.0, 15.0),

@@ -17,6 +17,7 @@ from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.feedforward import Feedforward
 from quell.controllers.from_pid import PidEqual, equal_to_pid
+from quell.controllers.held import HeldPlant
 from quell.controllers.law import NonlinearFeedback
 from quell.controllers.linear import LinearController, LinearLaw
 from quell.controllers.online_gain import GainEstimate, OnlineGain
@@ -40,6 +41,7 @@ __all__ = [
     "Estimate",
     "Feedforward",
     "GainEstimate",
+    "HeldPlant",
     "LinearController",
     "LinearLaw",
     "NonlinearFeedback",

@@ -63,6 +63,7 @@ from quell.controllers.feedforward import (
     feedforward_design,
 )
 from quell.controllers.from_pid import equal_to_pid
+from quell.controllers.held import HeldPlant
 from quell.controllers.law import (
     AdrcDesign,
     NonlinearFeedback,
@@ -213,6 +214,9 @@ class ADRC(Compensator):
         pairs (real, imaginary) for two conjugate ones; as many as the relative degree.
     safe_set
         bands that y and its rate do not leave, whatever r and the learner ask for; none by default.
+    held
+        detects a plant that is held and undoes at its release what the observer made of it; none by
+        default. ``set_held`` needs none.
     schedule
         tables of b0, omega_c and omega_o over one or two signals, which the gains follow, or an
         ``OnlineGain``, which estimates b0; none by default. With ``feedforward=True`` r^(m)/b0
@@ -255,9 +259,10 @@ class ADRC(Compensator):
         feedback: NonlinearFeedback | None = None,
         law_poles: Sequence[float | tuple[float, float]] | None = None,
         safe_set: SafeSet | None = None,
+        held: HeldPlant | None = None,
         schedule: Schedule | OnlineGain | None = None,
     ) -> None:
-        self._take_parts(observer, learner, guard, safe_set, schedule)
+        self._take_parts(observer, learner, guard, safe_set, held, schedule)
         check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
         self.feedforward = checked_feedforward(feedforward)

@@ -45,6 +45,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import RateLimit, checked_limits, reset_loop
+from quell.controllers.held import HeldPlant, NoHeldMemory, NoHeldPlant, check_rest, look_anew
 from quell.controllers.law import (
     AdrcDesign,
     AdrcLoop,
@@ -267,6 +268,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     loop, size = state.loop[0], new.law.size
     if loop.started == 0.0:
         return
+    look_anew(new.held, state.held)
     before = unlimited_control(old, state, loop.constant, loop.slope)
     # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
     # Its derivatives, if the observer has them, stay: how u moves from now on is not known.
@@ -375,6 +377,9 @@ class Compensator(StatefulController):
     safe_set
         bands that y and its rate do not leave, whatever u_0 and the learner ask for; none by
         default.
+    held
+        detects a plant that is held and undoes at its release what the observer made of it; none by
+        default. ``set_held`` needs none.
     schedule
         tables of b0 and omega_o over one or two signals, which the gains follow; none by default.
 
@@ -409,9 +414,10 @@ class Compensator(StatefulController):
         u_max: float = math.inf,
         rate_limit: RateLimit = math.inf,
         safe_set: SafeSet | None = None,
+        held: HeldPlant | None = None,
         schedule: Schedule | None = None,
     ) -> None:
-        self._take_parts(observer, learner, guard, safe_set, schedule)
+        self._take_parts(observer, learner, guard, safe_set, held, schedule)
         if observer.cancel_f == 0.0:
             raise ValueError(
                 "observer: f does not enter the plant where u does, so adding −f̂/b0 to u does not "
@@ -430,9 +436,15 @@ class Compensator(StatefulController):
         self._warn_of_idle_guard()
 
     def _take_parts(
-        self, observer: Any, learner: Any, guard: Any, safe_set: Any, schedule: Any
+        self,
+        observer: Any,
+        learner: Any,
+        guard: Any,
+        safe_set: Any,
+        held: Any,
+        schedule: Any,
     ) -> None:
-        """Check and keep observer, learner, guard, safe set and schedule."""
+        """Check and keep observer, learner, guard and the other parts."""
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
         self.observer = observer
@@ -448,6 +460,9 @@ class Compensator(StatefulController):
         if safe_set is not None and not isinstance(safe_set, SafeSet):
             raise ValueError(f"safe_set = {safe_set!r}: must be a quell.SafeSet(), or None")
         self.safe_set = safe_set
+        if held is not None and not isinstance(held, HeldPlant):
+            raise ValueError(f"held = {held!r}: must be a quell.HeldPlant(), or None")
+        self.held = held
         self.schedule: Any = checked_schedule(schedule)
         self._check_schedule()
 
@@ -491,6 +506,7 @@ class Compensator(StatefulController):
             b0=observer.b0,
             limits=self._limits,
             safe_set=self._safe_set_design(observer),
+            held=NoHeldPlant() if self.held is None else self.held.design(observer),
             schedule=self._schedule_design(observer),
             learner=learner,
             lag=lag_of(observer) if self._learns else NO_LAG,
@@ -511,8 +527,10 @@ class Compensator(StatefulController):
         """Raise a ``ValueError`` for parts that are made for one b0 or one omega_o."""
         if self.schedule is None:
             return
-        if self.schedule.b0 is not None and (self._learns or self.safe_set is not None):
-            part = "learner" if self._learns else "safe_set"
+        parts = {"learner": self._learns, "safe_set": self.safe_set is not None}
+        parts["held"] = self.held is not None
+        if self.schedule.b0 is not None and any(parts.values()):
+            part = next(name for name, is_there in parts.items() if is_there)
             raise ValueError(
                 f"schedule.b0 with {part}: what the {part.replace('_', ' ')} knows refers to one "
                 "b0, in whose units f is; schedule omega_c only, or leave one of them out"
@@ -639,6 +657,11 @@ class Compensator(StatefulController):
                 if self.safe_set is None
                 else self.safe_set.memory(design.safe_set)
             ),
+            held=(
+                NoHeldMemory(np.zeros(0))
+                if self.held is None
+                else self.held.memory(design.held, self.observer)
+            ),
             schedule=(
                 NoScheduleMemory(np.zeros(0))
                 if self.schedule is None
@@ -737,6 +760,18 @@ class Compensator(StatefulController):
         if self._state.loop[0].started == 0.0:
             raise ValueError("hand_over: there was no sample yet; call track or start before")
         self._state.loop[0].bumpless = 1.0
+
+    def set_held(self, held: bool) -> None:
+        """Say whether the plant is held, by a brake for instance: u does not act until it is not.
+
+        Call it when that changes. While it is held the observer rests at y with the f̂ of before,
+        and the law works with it, so nothing winds up and the release makes no bump.
+        ``estimate.status`` has the flag ``HELD``. It stays across ``start`` and ends with
+        ``reset``. Raises ``ValueError`` for a plant with zeros, whose rest the observer does not
+        know.
+        """
+        check_rest(self.observer, "set_held")
+        self._state.loop[0].held = 1.0 if checks.flag("held", held) else 0.0
 
     def increment(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the change of the control signal [u-unit], within the limits.

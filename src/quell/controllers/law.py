@@ -59,10 +59,25 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.safe_set import flags_of_applied, forget_motion, nearest_safe, see
+from quell.controllers.held import (
+    f_before,
+    follow,
+    held_flag,
+    is_released,
+    look_anew,
+    miss,
+    take_motion,
+)
+from quell.controllers.safe_set import (
+    flags_of_applied,
+    forget_motion,
+    nearest_safe,
+    see,
+    set_motion,
+)
 from quell.controllers.schedule import (
     control_as_observed,
-    follow,
+    follow_signals,
     forget_signals,
     gain_in_use,
     known_with_schedule,
@@ -100,7 +115,14 @@ from quell.learners.base import (
     restart,
 )
 from quell.lti.models import pole_pattern
-from quell.observers.forms import acting_control, begin, expected_measurement, fal, observe
+from quell.observers.forms import (
+    acting_control,
+    begin,
+    begin_with,
+    expected_measurement,
+    fal,
+    observe,
+)
 from quell.types import Matrix, Status, Vector
 
 # ---- The feedforward's part of the control law, sample by sample ----
@@ -343,6 +365,7 @@ def feedback_design(feedback: NonlinearFeedback | None, degree: int, omega_c: fl
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 _LEARNER_CUT = int(Status.LEARNER_CUT)
+_HELD = int(Status.HELD)
 
 # A decaying offset below this is set to zero: arithmetic with denormal numbers (below 2.2e-308) is
 # slow. Any value between that and the rounding error of u gives the same u. In single precision
@@ -372,6 +395,7 @@ class AdrcLoop(Scalars):
     u_manual: float  # control signal of manual operation
     bumpless: float  # 1 if the next u is to continue from the last one, else 0
     offset: float  # decaying term that is added to u after a bumpless transfer
+    held: float  # 1 while the machine says that the plant is held, else 0
 
 
 class AdrcDesign(NamedTuple):
@@ -384,6 +408,7 @@ class AdrcDesign(NamedTuple):
     feedback: Any  # linear or nonlinear law of the errors, see ``feedback``
     feedforward: Any  # with or without a model, see ``feedforward``
     safe_set: Any  # bands for y and its rate, or none
+    held: Any  # detection of a held plant, or none
     schedule: Any  # tables of gains, or none
     fade: float  # factor of the offset from one sample to the next
     b0: float
@@ -408,6 +433,7 @@ class AdrcState(NamedTuple):
     guard: Any
     watch: NDArray[LearnerWatch]  # (1,)
     safe_set: Any
+    held: Any
     schedule: Any
 
 
@@ -426,25 +452,29 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             loop.status = status
             return loop.u
         loop.started = 1.0
+        if loop.held != 0.0:
+            status |= _HELD
+        else:
+            is_released(design.held, state.held, loop.y, u_acting, 0.0, 0.0, design.b0)
     else:
         _finish_sample(design, state, u_acting)
-        known = known_now(design, state, u_acting)
-        u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
-        if status & _MEASUREMENT_HELD != 0:
+        if status & _MEASUREMENT_HELD != 0 and loop.held == 0.0:
             # The last y would look like a disturbance while the plant moves; the expected y does
             # not change the estimates.
+            known = known_now(design, state, u_acting)
+            u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
             y = expected_measurement(design.eso, state.z, u_observed, known)
             if is_usable(y):
                 loop.y = y
-        observe(design.eso, state.z, seen, loop.y, u_observed, known)
-        scheduled_correction(design.schedule, state.schedule, design.eso, state.z, seen, loop.y)
+        status |= _estimate(design, state, u_acting, status & _MEASUREMENT_HELD == 0)
         f_plain = seen[design.law.size] + loop.f_learned_shown
-        assess(design.guard, state.guard, f_plain)
-        if status & _MEASUREMENT_HELD == 0:
+        if loop.held == 0.0:
+            assess(design.guard, state.guard, f_plain)
+        if status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
             status |= learner_flags(design.learner, state.learner)
     order = design.law.size
-    status |= follow(
+    status |= follow_signals(
         design.schedule, state.schedule, loop, state.z, seen, state.reference, order,
         u_acting, continues,
     )  # fmt: skip
@@ -470,6 +500,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         # Else a finite θ that is out of all proportion overflows again in the next sample.
         _forget_learning(design, state)
         clear(state.watch)
+        look_anew(design.held, state.held)
         begin(design.eso, state.z, seen, loop.y)
         constant = slope = loop.offset = 0.0
         unlimited = loop.u
@@ -494,7 +525,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     status |= flags_of_applied(design.safe_set, state.safe_set, u)
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
-    if design.learns and status & _MEASUREMENT_HELD == 0:
+    if design.learns and status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
         excessive = is_excessive(unlimited, u, smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
         lost = has_escaped(watch, output, excessive) or has_lost_range(
@@ -507,6 +538,34 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             _start_learning_again(design, state)
     loop.status = status
     return u
+
+
+@kernel
+def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured: bool) -> int:
+    """Update the observer; return the flag of a held plant."""
+    loop, z, seen, order = state.loop[0], state.z, state.seen, design.law.size
+    fed, before = loop.f_learned + loop.f_known, seen[order]
+    known = known_with_schedule(design.schedule, state.schedule, fed, design.b0, u_acting)
+    u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
+    observe(design.eso, z, seen, loop.y, u_observed, known)
+    scheduled_correction(design.schedule, state.schedule, design.eso, z, seen, loop.y)
+    if loop.held != 0.0:
+        begin_with(design.eso, z, seen, loop.y, order, before)
+        set_motion(design.safe_set, state.safe_set, seen, before + fed)
+        look_anew(design.held, state.held)
+        return _HELD
+    if is_measured:
+        # A learner's share that follows u is right for any u.
+        known = fed - loop.slope * u_acting
+        residual = f_before(design.held, state.held) - known
+        follow(design.held, state.held, design.eso, z, loop.y, loop.u, fed, residual)
+        f = seen[order] + known
+        if is_released(design.held, state.held, loop.y, u_acting, f, loop.slope, design.b0):
+            take_motion(design.held, state.held, z, seen)
+            set_motion(design.safe_set, state.safe_set, seen, seen[order] + fed)
+    else:
+        miss(design.held, state.held)
+    return held_flag(design.held, state.held)
 
 
 @kernel
@@ -616,7 +675,10 @@ def _status_flags(design: AdrcDesign, state: AdrcState) -> int:
 
 @reset_loop.register(AdrcDesign)
 def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
+    held = state.loop[0].held
     clear(state.loop)
+    state.loop[0].held = held
+    look_anew(design.held, state.held)
     state.loop[0].has_reference = has_reference_at_start(design.feedforward)
     for i in range(state.reference.size):
         state.reference[i] = 0.0

@@ -47,7 +47,7 @@ from quell.controllers.schedule import (
     Schedule,
     check_b0_of,
     control_as_observed,
-    follow,
+    follow_signals,
     forget_signals,
     gain_in_use,
     known_with_schedule,
@@ -155,7 +155,7 @@ def _moves(design: OnlineDesign, own: Any, energy: float) -> bool:
     return energy > _NOTHING * own.peak
 
 
-@follow.register(OnlineDesign)
+@follow_signals.register(OnlineDesign)
 def _follow(
     design: OnlineDesign, memory: OnlineMemory, loop: Any, z: Vector, seen: Vector,
     reference: Vector, at_f: int, u: float, continues: bool,

@@ -174,6 +174,10 @@ class Wrapper(StatefulController):
         """End manual operation, see ``ADRC.hand_over``."""
         self._inner.hand_over()
 
+    def set_held(self, held: bool) -> None:
+        """Say whether the plant is held, see ``ADRC.set_held``."""
+        self._inner.set_held(held)
+
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, see ``ADRC.retune``."""
         given = {"omega_c": omega_c, "observer": observer}

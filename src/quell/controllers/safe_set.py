@@ -239,6 +239,20 @@ def _settle_at_rest(
     memory.loop[0].started = 1.0
 
 
+@generic_with_default
+def set_motion(design: Any, memory: Any, x: Vector, f: float) -> None:
+    """Set the observer's estimates to ``x``, of which the first n are taken, and f."""
+
+
+@set_motion.register(SafeSetDesign)
+def _set_motion(design: SafeSetDesign, memory: SafeSetMemory, x: Vector, f: float) -> None:
+    last = memory.seen.size - 1
+    begin(design.eso, memory.z, memory.seen, x[0])
+    for i in range(1, last):
+        memory.z[i] = memory.seen[i] = x[i]
+    memory.z[last] = memory.seen[last] = f
+
+
 def settle_safe_set(design: Any, memory: Any, x: Vector, f: float) -> None:
     """Set the observer of a safe set to given estimates, for a plant that is known there."""
     if isinstance(design, SafeSetDesign):

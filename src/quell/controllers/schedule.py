@@ -175,7 +175,7 @@ def scheduled_correction(
 
 
 @generic_with_default
-def follow(
+def follow_signals(
     design: Any, memory: Any, loop: Any, z: Vector, seen: Vector, reference: Vector, at_f: int,
     u: float, continues: bool,
 ) -> int:  # fmt: skip
@@ -367,7 +367,7 @@ def _bilinear(
     return low + weight * (high - low)
 
 
-@follow.register(ScheduleDesign)
+@follow_signals.register(ScheduleDesign)
 def _follow(
     design: ScheduleDesign, memory: ScheduleMemory, loop: Any, z: Vector, seen: Vector,
     reference: Vector, at_f: int, u: float, continues: bool,

@@ -32,6 +32,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensated import Compensated, CompensatedDesign
 from quell.controllers.compensator import change_design, manual_operation
+from quell.controllers.held import HeldDesign
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
 from quell.controllers.memory import Layout, images_of, learned_state
@@ -131,6 +132,9 @@ def _with_carries(design: Any, state: Any) -> Any:
         if isinstance(design.safe_set, SafeSetDesign):
             wide = state.safe_set._replace(z=np.zeros(design.safe_set.eso.states))
             state = state._replace(safe_set=wide)
+        if isinstance(design.held, HeldDesign):
+            wide = state.held._replace(z=np.zeros(design.eso.states))
+            state = state._replace(held=wide)
         learner = state.learner
         if isinstance(design.learner, KalmanDesign) and needs_carries(design.learner):
             # Only the lower triangle; what is above has the carries.

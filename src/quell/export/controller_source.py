@@ -18,6 +18,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensated import compensating_part, takes_control
 from quell.controllers.compensator import samples_to_settle
+from quell.controllers.held import HeldDesign, rests_at_y
 from quell.controllers.memory import images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
 from quell.controllers.safe_set import SafeSetDesign
@@ -102,11 +103,13 @@ def check_counts(controller: Any, resolution: float) -> None:
             origin = y
             u[k, 1] = control(design, moved, r - y, 0.0)
     same = np.max(np.abs(u[:, 1] - u[:, 0])) <= _ROUNDING * np.max(np.abs(u[:, 0]))
-    banded = isinstance(getattr(design, "safe_set", None), SafeSetDesign)
-    if design.learns or banded or not same:  # what is learned acts much later than in this trial
+    parts = (getattr(design, name, None) for name in ("safe_set", "held"))
+    remembers = any(isinstance(part, SafeSetDesign | HeldDesign) for part in parts)
+    # What is learned acts much later than in this trial.
+    if design.learns or remembers or not same:
         raise TranslationError(
             f"resolution = {resolution!r}: this controller needs the position itself, for a model "
-            "with a spring, a learner or a safe set; hand over y in its unit (NAME_step)"
+            "with a spring, a learner, a safe set or held; hand over y in its unit (NAME_step)"
         )
 
 
@@ -214,6 +217,8 @@ class _Writer:
         if observing is not None:
             self._add_start(2 * samples_to_settle(observing.observer))
             self._add_manual_operation()
+            if rests_at_y(observing.observer):
+                self._add_held()
         self._add_retune()
         self._add_reset()
         self.files.add_memory(self.images, self.files.call(reset_loop, *self.files.both))
@@ -352,6 +357,18 @@ class _Writer:
             "End manual operation: the next step continues from the u of the last one.\n\n"
             "Return false before the first sample: then nothing has changed.",
             f"    return {files.call(c_files.hand_over, *files.both)};",
+        )
+
+    def _add_held(self) -> None:
+        files = self.files
+        held = Value(Number.BOOL, "held")
+        files.add(
+            "set_held",
+            f"void NAME({self.state}, bool held)",
+            "Say whether the plant is held, by a brake for instance: u does not act until it is "
+            "not.\n\nCall it when that changes. While it is held nothing winds up: the release "
+            "makes no bump.",
+            f"    {files.call(c_files.set_held, *files.both, held)};",
         )
 
     def _add_retune(self) -> None:

@@ -342,6 +342,7 @@ CALLS = {
     "applied": "any_real",
     "track": "any_real, any_real, any_realDERIVATIVES",
     "hand_over": "",
+    "set_held": "any_int != 0",
     "start": "any_real, any_real, any_real",
     "reset": "",
     "status": "",

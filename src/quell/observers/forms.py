@@ -141,6 +141,13 @@ def begin(model: Any, z: Vector, estimate: Vector, y: float) -> None:
 
 
 @generic_with_default
+def begin_with(model: Any, z: Vector, estimate: Vector, y: float, at_f: int, f: float) -> None:
+    """Start at rest at y with an estimate of f, in entry ``at_f`` = n; a delayed u goes on."""
+    begin(model, z, estimate, y)
+    z[at_f] = estimate[at_f] = f
+
+
+@generic_with_default
 def acting_control(model: Any, z: Vector, u: float) -> float:
     """Return the u that reaches the plant while ``u`` is applied: ``u`` itself unless delayed."""
     return u
@@ -381,6 +388,13 @@ def _begin_delay(model: DelayedModel, z: Vector, estimate: Vector, y: float) -> 
     for i in range(model.size, z.size):
         z[i] = 0.0
     begin(model.inner, z[: model.size], estimate, y)
+
+
+@begin_with.register(DelayedModel)
+def _begin_delay_with(
+    model: DelayedModel, z: Vector, estimate: Vector, y: float, at_f: int, f: float
+) -> None:
+    begin_with(model.inner, z[: model.size], estimate, y, at_f, f)
 
 
 @acting_control.register(DelayedModel)

@@ -59,6 +59,10 @@ _OPERATIONS = {
         "hand_over(s)",
         "once, before the first step after manual operation; false before the first sample",
     ),
+    "set_held": (
+        "set_held(s, held)",
+        "when a brake closes or opens: while it is held u does not act, and nothing winds up",
+    ),
     "retune": ("retune(s, &parameters)", "between two samples: other parameters, without a jump"),
     "save": ("save(s, image)", "any time: all that the controller knows, as bytes"),
     "load": (

@@ -186,6 +186,8 @@ class Action(IntEnum):
     RESET = 6
     START = 7  # under load
     LEARN = 8  # a block of samples in a small loop
+    HELD = 9  # the plant is held
+    RELEASED = 10
 
 
 class Row(NamedTuple):
@@ -251,6 +253,8 @@ class Player:
             elif action in (Action.LIMIT, Action.FREE):
                 self.design = self.limited if action is Action.LIMIT else self.default
                 c_files.retune(old, self.design, self.state)
+            elif action in (Action.HELD, Action.RELEASED):
+                c_files.set_held(old, self.state, action is Action.HELD)
             elif action is Action.RESET:
                 reset_loop(old, self.state)
             elif action is Action.START:
@@ -330,6 +334,8 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
         _play_limited(player, path, signals)
     if "track" in available:
         _play_manual(player, signals)
+    if "set_held" in available:
+        _play_held(player, signals)
     player.play(Action.RESET, *signals.next())
     for _ in range(_PART):
         player.play(Action.STEP, *signals.next())
@@ -371,6 +377,15 @@ def _play_manual(player: Player, signals: _Signals) -> None:
         given = math.nan if i == _PART // 2 else u * (1.0 - 0.02 * i)
         player.play(Action.TRACK, *signals.next(), given)
     player.play(Action.HAND_OVER, *signals.next())
+    for _ in range(_PART):
+        player.play(Action.STEP, *signals.next())
+
+
+def _play_held(player: Player, signals: _Signals) -> None:
+    r, y = signals.next()
+    for i in range(_PART):
+        player.play(Action.STEP if i else Action.HELD, r, y)
+    player.play(Action.RELEASED, *signals.next())
     for _ in range(_PART):
         player.play(Action.STEP, *signals.next())
 
@@ -442,6 +457,8 @@ _CODE_TEST_PROGRAM = {
         "NAME_retune(state, limited);",
     ),
     Action.FREE: ("NAME_retune(state, &NAME_default_parameters);",),
+    Action.HELD: ("NAME_set_held(state, true);",),
+    Action.RELEASED: ("NAME_set_held(state, false);",),
     Action.RESET: ("NAME_reset(state);",),
     Action.START: ("NAME_start(state, now->y, now->given, now->r);",),
     Action.LEARN: ("return play_loop(state);",),
