@@ -214,6 +214,7 @@ def test_feedforward_of_derivatives_follows_b0() -> None:
         lambda: ql.Schedule((0.0, 1.0), "torque", b0=(1.0, 2.0)),
         lambda: ql.Schedule((0.0, 1.0), ("y", "speed"), b0=(1.0, 2.0)),
         lambda: controller(b0=(-1.0, -2.0, -3.0)),
+        lambda: ql.ADRC(OBSERVER, 40.0, held=ql.HeldPlant(), schedule=ql.Schedule(POINTS, b0=B0)),
         lambda: ql.ADRC(OBSERVER, 40.0, schedule=0.5),  # type: ignore[arg-type]
         lambda: ql.ADRC(
             OBSERVER, 40.0, learner=ql.learners.Kalman(), schedule=ql.Schedule(POINTS, b0=B0)
