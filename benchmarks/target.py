@@ -94,7 +94,7 @@ def cases() -> list[Case]:
     return [
         Case("PID", m4, "single", DRIVE, pid),
         Case("MF-ESO, order 2", m4, "single", DRIVE, mf, small),
-        Case("MF-ESO, order 2, table of b0", m4, "single", DRIVE, of_b0, {"instructions": 224.0}),
+        Case("MF-ESO, order 2, table of b0", m4, "single", DRIVE, of_b0, {"instructions": 229.0}),
         Case("MF-ESO, order 2, three tables", m4, "single", DRIVE, of_all),
         Case("MF-ESO, order 2, b0 online", m4, "single", DRIVE, online),
         Case("MF-ESO, order 2", m7, "double", DRIVE, mf),
