@@ -161,7 +161,9 @@ _TEST = """    for (int i = 0; i < COUNT; i++) {
     """
 
 
+# What a state without integers, or without arrays, has no use for.
 _WHOLE = _CODE[_CODE.index("/* Return the integer") : _CODE.index("/* Write the numbers")]
+_ARRAYS = _CODE[_CODE.index("/* Write the numbers") : _CODE.index("/* Return the check")]
 
 
 class _Part(NamedTuple):
@@ -291,6 +293,8 @@ class ImageCode:
         text = _CODE
         if not count:
             text = text.replace(_WHOLE, "")
+        if not any("memory_put_all(" in line for line in self.save):
+            text = text.replace(_ARRAYS, "")
         for word, code in {
             "RANGES\n": ranges, "TEST": test, "PUT": put, "GET": get, "ORIGIN": origin,
             "ZERO": self.write(0.0), "BEYOND": self.write(_LARGEST_INTEGER + 2),
