@@ -102,8 +102,8 @@ _MESSAGES = {
         "The safe set changed the control signal to keep y and its rate in their bands."
     ),
     Status.UNSAFE: (
-        "NOT safe: limits of u did not allow what the safe set needs (raise u_max or rate_limit, "
-        "or lower alpha), or y moved as f_rate, noise and gain_error do not allow (raise them)."
+        "NOT safe: limits of u did not allow what the safe set needs, or y moved as f_rate, noise "
+        "and gain_error do not allow; raise u_max, rate_limit or these bounds, or lower alpha."
     ),
     Status.HELD: (
         "The plant is held, as the machine says, or y rests although u should move it, as with a "
