@@ -49,7 +49,7 @@ SANITIZERS = {
 # How often each function is called, of a million calls. ``start`` takes thousands of steps.
 SHARES = {"applied": 60_000, "track": 80_000, "hand_over": 20_000, "start": 200, "reset": 200,
           "retune": 1000, "status": 5000, "get_estimate": 20_000, "stopping_point": 20_000,
-          "step_counts": 150_000, "save": 3000, "load": 3000}  # fmt: skip
+          "step_counts": 150_000, "save": 3000, "load": 3000, "set_held": 20_000}  # fmt: skip
 HEADS = ("controller", "precision", "functions", "calls", "reports", "u not finite",
          "u beyond limits", "time [s]")  # fmt: skip
 
@@ -270,6 +270,7 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
         "applied": "hostile()",
         "track": "reference(), measurement(), hostile()DERIVATIVES",
         "start": "measurement(), hostile(), reference()",
+        "set_held": "bits() % 4 == 0",
     }
     cases, at = [], 0
     for operation, part in SHARES.items():

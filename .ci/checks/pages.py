@@ -9,6 +9,7 @@ import re
 import tempfile
 import tomllib
 import warnings
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -52,12 +53,15 @@ def known() -> dict[str, object]:
     return {"ql": ql, "math": math, "u": u, "y": y, "dt": 0.05, **names}
 
 
-def run_block(code: str) -> str:
-    """Run a block of Python; return how it went."""
+def run_block(code: str, before: dict[str, object]) -> str:
+    """Run a block of Python; ``before`` has what the page's blocks before it have defined."""
     for part, reason in NOT_HERE.items():
         if part in code:
             return f"not here: {reason}"
-    exec(compile(code, "block", "exec"), known())
+    names = known()
+    names |= {name: value for name, value in before.items() if name not in names}
+    exec(compile(code, "block", "exec"), names)
+    before |= names
     plt.close("all")
     return "runs"
 
@@ -78,7 +82,8 @@ def run_setup(code: str) -> str:
 
 warnings.simplefilter("ignore")
 for page in sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]):
-    for language, how in (("python", run_block), ("toml", run_setup)):
+    shared: dict[str, object] = {}
+    for language, how in (("python", partial(run_block, before=shared)), ("toml", run_setup)):
         for number, code in enumerate(blocks(page, language), 1):
             with tempfile.TemporaryDirectory() as folder:
                 os.chdir(folder)

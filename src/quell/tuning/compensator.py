@@ -61,11 +61,11 @@ _WORTH = 0.05
 class Measures(NamedTuple):
     """What a loop does: peaks of its sensitivities and the effect of a load."""
 
-    m_s: float  #: largest |S|
-    m_t: float  #: largest |T|
-    m_ks: float  #: largest |K S| [u-unit/y-unit]
-    iae: float  #: ∫|y| after a unit step of the load [y-unit s/u-unit]
-    m_s_elsewhere: float  #: largest |S| with the poles and zeros of ``speeds``
+    m_s: float  #: largest ``|S|``
+    m_t: float  #: largest ``|T|``
+    m_ks: float  #: largest ``|K S|`` [u-unit/y-unit]
+    iae: float  #: ``∫|y|`` after a unit step of the load [y-unit s/u-unit]
+    m_s_elsewhere: float  #: largest ``|S|`` with the poles and zeros of ``speeds``
 
     def __str__(self) -> str:
         return (
