@@ -279,8 +279,8 @@ class SafeSet:
         of 1/alpha. A larger one leaves more of the band to the loop, and asks for more of the
         actuator.
     f_rate
-        largest ``|f'|`` of the total disturbance [y-unit/s^(n+1)], of a plant with the observer's b0.
-        It says how wrong the estimate of f may be, and so how wide the margin is.
+        largest ``|f'|`` of the total disturbance [y-unit/s^(n+1)], of a plant with the observer's
+        b0. It says how wrong the estimate of f may be, and so how wide the margin is.
     noise
         largest error of the measurement [y-unit], half a step of an encoder for instance.
     gain_error

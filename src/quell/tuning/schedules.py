@@ -12,8 +12,8 @@ tuning, which may lie far apart: the optimum of an ADRC often has two places, on
 poles in the law and one with them in the observer.
 
 The result is judged at the points, and between them where the plant is a function: M_s and M_t of
-the frozen loop, and the integral of ``|y|`` after a step of the load over that of a controller that is
-tuned for this very point, with the same structure and constraints.
+the frozen loop, and the integral of ``|y|`` after a step of the load over that of a controller that
+is tuned for this very point, with the same structure and constraints.
 """
 
 from __future__ import annotations
