@@ -58,8 +58,7 @@ def run_block(code: str, before: dict[str, object]) -> str:
     for part, reason in NOT_HERE.items():
         if part in code:
             return f"not here: {reason}"
-    names = known()
-    names |= {name: value for name, value in before.items() if name not in names}
+    names = known() | before
     exec(compile(code, "block", "exec"), names)
     before |= names
     plt.close("all")
