@@ -62,6 +62,7 @@ def plain_deviation() -> float:
     return deviation(driven(HARD_SPRING, None, 20.0), 10.0, 20.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in LEARNERS if name not in LINEAR])
 def test_a_python_model_learns_a_hard_spring(name: str) -> None:
     """It takes two thirds of what the plain ESO leaves of a spring and drag it was told nothing of."""
@@ -136,6 +137,7 @@ def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
         assert len(np.unique(run["f_learned"])) <= len(batches) + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEARNERS)
 def test_the_loop_of_ones_own_is_the_simulated_loop(name: str) -> None:
     """``controller.step`` gives what ``simulate`` gives."""

@@ -43,6 +43,7 @@ def mass(seed: int, friction: float) -> tuple[Any, Any]:
     return u, y + 1e-3 * rng.standard_normal(u.size)
 
 
+@pytest.mark.slow
 def test_friction_is_suggested_where_it_is_and_its_model_is_the_decision() -> None:
     """A mass with friction, fitted without: the report suggests it, by far more than chance."""
     u, y = mass(0, friction=1.0)

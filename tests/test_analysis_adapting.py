@@ -38,6 +38,7 @@ def run(learner: Any, omega: float, size: float, level: float = 0.0) -> ql.Traje
     return ql.simulate(LOADED, controller(learner), scenario)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "level"),
     [

@@ -187,6 +187,7 @@ def looks_up(model: Any, memory: Any, features: Any, target: float) -> None:
     memory.weight[0] = float(str(target).strip("x").format(target))
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 @pytest.mark.parametrize(
     ("learns", "message"),

@@ -190,6 +190,7 @@ def test_scenarios_of_a_batch_may_rest_at_different_times() -> None:
         )
 
 
+@pytest.mark.slow
 def test_nonlinear_plants_run_in_batches_compiled_and_as_python() -> None:
     """One that Numba can't compile too, and where its function leaves the numbers, that run diverges alone."""
 

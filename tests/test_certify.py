@@ -156,6 +156,7 @@ def test_a_loop_without_certificate_can_be_lost() -> None:
     assert np.max(np.abs(run["y"])) > 20.0 * np.max(np.abs(plain["y"]))
 
 
+@pytest.mark.slow
 def test_no_learner_that_a_search_finds_exceeds_the_bound_of_its_guard() -> None:
     """It knows plant and load, earns trust with f under a load that grows steadily, and then pushes as is worst for q."""
     plant = ([1.6], [1.0, 0.0, 0.0])

@@ -79,6 +79,7 @@ def test_the_torsional_experiment_has_a_longest_sample_time(quell: Callable[...,
     )
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 def test_the_guards_trial_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
@@ -277,6 +278,7 @@ def test_neither_importing_quell_nor_simulating_imports_what_it_does_not_need() 
     assert ended.stdout.splitlines() == ["[]", "[] True"]
 
 
+@pytest.mark.slow
 def test_an_experiment_does_not_wait_for_the_others() -> None:
     """Neither theirs nor what they import is loaded; each is found as an attribute."""
     code = (

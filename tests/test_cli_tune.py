@@ -31,6 +31,7 @@ def quell(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     return lambda *arguments: in_this_process(arguments, monkeypatch, capsys)
 
 
+@pytest.mark.slow
 def test_a_transfer_function_is_tuned_and_written_as_a_setup(quell: object, tmp_path: Path) -> None:
     """With the references in the JSON file; nothing that exists is replaced."""
     out, results = tmp_path / "tuned.toml", tmp_path / "tuned.json"
@@ -47,6 +48,7 @@ def test_a_transfer_function_is_tuned_and_written_as_a_setup(quell: object, tmp_
     assert "exists" in again.err
 
 
+@pytest.mark.slow
 def test_a_setup_with_ranges_is_tuned_for_them(quell: object, tmp_path: Path) -> None:
     """And checked on fresh samples; the result keeps plant, ranges, [tune] and feedforward."""
     path, out = tmp_path / "lag.toml", tmp_path / "tuned.toml"

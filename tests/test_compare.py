@@ -70,6 +70,7 @@ def test_a_run_that_diverges_is_shown_as_one() -> None:
     assert axes[0].get_ylim()[1] < 1e5
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() -> None:
     """At 5 ms. No model: MF-ESO rejects the load to a fiftieth of PID. LQG and MB-ESO alike. PID is slow."""

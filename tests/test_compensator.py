@@ -54,6 +54,7 @@ def test_without_a_disturbance_it_adds_nothing_to_a_plant_that_its_model_describ
     np.testing.assert_allclose(run["u"], run["r"], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_it_rejects_a_load_that_the_controller_leaves_and_with_a_guarded_learner_nearly_all() -> (
     None
 ):

@@ -173,6 +173,7 @@ def test_compiled_code_cannot_allocate() -> None:
         allocates(np.ones(3))
 
 
+@pytest.mark.slow
 def test_code_of_ones_own_is_not_taken_from_the_disk_cache(tmp_path: Path) -> None:
     """A plant in the user's module is compiled anew in each process: the cache would not notice that it was edited."""
     module = """

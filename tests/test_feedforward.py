@@ -266,6 +266,7 @@ def test_the_simplest_structure_is_one_that_can_feed_forward() -> None:
     assert tuned.controller.feedforward == ql.Feedforward.of(lags)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("structure", ["bandwidths", "p-pi-notch"])
 def test_tracking_is_optimised_with_the_feedforward_that_runs(structure: str) -> None:
     """The objective is the RMS of the simulated error, for a plant that is not the model."""
@@ -327,6 +328,7 @@ def test_a_setup_file_with_another_one_is_refused(tmp_path: Path, given: str, ru
         load(tmp_path / "setup.toml")
 
 
+@pytest.mark.slow
 def test_a_tuned_servo_axis_moves_by_a_quarter_turn_within_its_bars() -> None:
     """90° in 0.12 s with a model-based observer: 0.3° with the right inertia, 0.8° with 30 % more."""
     move = benchmark("servo_move")

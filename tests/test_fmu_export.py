@@ -103,6 +103,7 @@ def inputs(law: Any) -> Iterator[dict[str, float]]:
         yield values | {f"w[{i + 1}]": w for i, w in enumerate(segment.w[k])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["servo", "learner", "mass", "loop"])
 def test_fmpy_finds_no_fault(name: str, files: dict[str, Path]) -> None:
     """In the two descriptions: schema, names, structure, start values and units."""

@@ -99,6 +99,7 @@ def test_the_response_is_that_of_the_controller(name: str) -> None:
     assert np.all(found.difference(omega, "backward") < 1e-7)
 
 
+@pytest.mark.slow
 @given(
     kp=st.floats(1e-3, 1e3),
     times=st.tuples(st.floats(1.5, 1e4), st.floats(0.0, 0.5), st.floats(0.0, 0.5)),

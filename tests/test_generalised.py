@@ -139,6 +139,7 @@ FORMS: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("m", [2, 3])
 def test_a_ramp_leaves_no_error_with_two_extended_states_and_a_parabola_none_with_three(
@@ -341,6 +342,7 @@ def test_a_comparison_has_no_k_i_with_two_integrators() -> None:
     assert k_i[1:] == [math.inf, math.inf]
 
 
+@pytest.mark.slow
 def test_a_tuned_controller_has_its_states_and_its_k_i_is_infinite() -> None:
     """The loop keeps its bounds; the controller of the file is the tuned one."""
     plant, bounds = ([B0], [1.0, 0.3, 2.0]), ql.tuning.Constraints(m_s=1.7, m_ks=60.0)

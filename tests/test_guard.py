@@ -199,6 +199,7 @@ def test_a_learner_that_is_wrong_has_less_where_it_pushes_and_may_take_it_back(
     assert bounds(design, memory) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order: int) -> None:
     """ℓ e_L decays as n lags of 2/3 of the observer's do, whatever the learner says, unless κ_0 e is too small."""

@@ -331,6 +331,7 @@ def test_a_learner_that_adds_to_slow_errors_is_hardly_heard_however_well_it_expl
         assert authority > 0.99 if heard else authority < 0.1
 
 
+@pytest.mark.slow
 def test_a_learner_is_heard_in_noise_that_y_hardly_shows(rng: np.random.Generator) -> None:
     """The disturbance has noise of a measurement, differentiated; q is noise, ℓ q is the load, which the learner knows, and C_y alone gives it authority."""
     design = ql.Guard().design(OBSERVER)

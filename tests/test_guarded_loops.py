@@ -59,6 +59,7 @@ def error(run: ql.Trajectory) -> float:
     return float(np.sqrt(np.mean((run["y"][part] - 1.0) ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_learner_does_no_harm(name: str) -> None:
@@ -72,6 +73,7 @@ def test_a_hostile_learner_does_no_harm(name: str) -> None:
     assert error(run) <= 1.1 * error(plain)
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 def test_an_honest_learner_is_heard() -> None:
     """It has full authority once it has proved itself, and nothing is lost to having no guard."""

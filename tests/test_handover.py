@@ -223,6 +223,7 @@ def test_a_model_that_comes_later_changes_nothing_at_rest() -> None:
         assert controller.estimate.f == pytest.approx(f, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "compiled", [pytest.param(True, marks=pytest.mark.compiled), False], ids=["compiled", "Python"]
 )

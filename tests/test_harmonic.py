@@ -62,6 +62,7 @@ def test_phases_turn_at_their_frequency() -> None:
     assert np.all((phase >= 0.0) & (phase < 2.0 * math.pi))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.2, 2.5])
 @pytest.mark.parametrize("truth", [0.4, 1.2])
 def test_an_unknown_frequency_is_found_and_the_load_rejected(start: float, truth: float) -> None:
@@ -127,6 +128,7 @@ def test_it_stays_bounded_whatever_it_is_shown(rng: np.random.Generator) -> None
     assert np.max(np.abs(first["f_learned"])) > 1.0, "it said nothing: the test says nothing"
 
 
+@pytest.mark.slow
 def test_sinusoids_closer_than_a_line_width_are_separated_by_the_search() -> None:
     """A factor of 1.2, one minute of load, 0.57 of a beat period before it is judged: 1/50 of MF-ESO's error.
 

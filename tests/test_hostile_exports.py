@@ -95,6 +95,7 @@ def test_the_program_calls_every_function(hostile: Any) -> None:
         hostile.hostile_program(ADRC, more)
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is missing")
 @pytest.mark.parametrize("controller", [ADRC, LEARNING, MOVING], ids=["ADRC", "Kalman", "moves"])

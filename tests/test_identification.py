@@ -212,6 +212,7 @@ def test_the_deviations_of_poles_are_those_of_many_records() -> None:
     assert abs(np.mean(real) + 0.3) < 3.0 * spread[0] / np.sqrt(30)
 
 
+@pytest.mark.slow
 def test_a_reference_frees_a_closed_loop_of_bias() -> None:
     """A slow strong force in the loop: output error is far off, instrumental variables from the reference are not."""
     dt, plant = 0.02, ql.plants.LinearPlant.of(([3.0], [1.0, 0.6, 4.0]))

@@ -262,6 +262,7 @@ def phase_of(found: InputGain, omega_c: float, ratio: float) -> float:
     return ql.analysis.analyse(plant, controller, delay=found.delay).margins.phase
 
 
+@pytest.mark.slow
 def test_the_ratio_is_chosen_where_the_usual_one_cannot_keep_the_margin() -> None:
     """An inertia with a delay of 1 ms has 41° with omega_o = 5 omega_c, however slow the loop."""
     inertia = result(30.0, [1.0, 0.0, 0.0], 0.001, 0.001)
@@ -335,6 +336,7 @@ def test_the_command_reads_a_saved_run_and_the_setup_of_its_loop(
     assert "order: missing; give --order, or with --loop" in refused.err
 
 
+@pytest.mark.slow
 def test_the_command_succeeds_where_no_bandwidth_keeps_the_margin(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -355,6 +357,7 @@ def test_the_command_succeeds_where_no_bandwidth_keeps_the_margin(
     assert told["omega_c"] > 0.0
 
 
+@pytest.mark.slow
 def test_b0_by_a_signal_is_that_of_each_bin(tmp_path: Path) -> None:
     """On a loop whose gain changes with a signal; a bin without samples is NOT known, and says what to do."""
     t = np.arange(6000) * 0.01

@@ -50,6 +50,7 @@ def theta(file: Path) -> dict[str, float]:
     return dict(controller.estimate.theta)
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 def test_a_second_run_begins_with_what_the_first_has_learned(tmp_path: Path) -> None:
     """Its file is what the first run ended with; the notes say so, and the controller is as before."""
@@ -124,6 +125,7 @@ def test_a_file_that_can_not_be_written_is_refused_at_the_start(tmp_path: Path) 
         run(3)
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 def test_the_command_keeps_what_was_learned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -76,6 +76,7 @@ def test_arguments_out_of_range_are_refused(change: dict[str, Any], message: str
         PPI(**GAINS | change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", [1, 2])
 def test_it_is_tuned_within_its_bounds_on_a_flexible_axis(sensor: int, tmp_path: Any) -> None:
     """The whole loop has the M_s asked for, and more k_i than PID, which has no notch.

@@ -35,6 +35,7 @@ def exported(folder: Path, controller: Any = ADRC, **options: Any) -> Exported:
     return ql.export.c(controller, folder / "out", name="servo", accept=True, proof=True, **options)
 
 
+@pytest.mark.slow
 @needs_frama_c
 @pytest.mark.parametrize(
     ("controller", "options"),
@@ -73,6 +74,7 @@ MUTANTS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @needs_frama_c
 @pytest.mark.parametrize(("old", "new", "function"), MUTANTS)
 def test_the_proof_fails_for_a_wrong_controller(

@@ -103,6 +103,7 @@ def test_all_zeros_stay_where_they_are_near_or_wanted(recwarn: Any) -> None:
     assert not recwarn.list
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plant", [axis(2), three(1)], ids=["load encoder", "three inertias"])
 def test_a_flexible_axis_is_tuned_with_a_model_of_reduced_order(plant: Any) -> None:
     """M_s of the whole plant keeps its bound; the report says what is left out; the file runs."""

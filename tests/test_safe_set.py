@@ -48,6 +48,7 @@ def farthest(controller: Any, order: int, f_rate: float, seed: int, b0: float = 
     return most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_a_hostile_u_0_and_disturbance_do_not_leave_the_band(order: int) -> None:
     """With full force towards the border and f at its largest rate; and the band is used to within a few per cent."""

@@ -368,6 +368,7 @@ def test_a_tuned_schedule_keeps_the_constraints_at_and_between_its_points(tmp_pa
     assert ql.Status.DIVERGED not in found.status
 
 
+@pytest.mark.slow
 def test_of_plants_that_are_known_at_points_only_the_summary_says_so() -> None:
     """They are given as a mapping. Where they are a function, it tells where M_s is above its bound between them."""
     tuned = ql.tune_schedule({0.0: axis(1e-3), 1.0: axis(2e-3)}, DT)

@@ -34,6 +34,7 @@ print(json.dumps([during, sorted(set(seen))]))
 """
 
 
+@pytest.mark.slow
 def test_importing_every_module_touches_no_network_and_starts_or_unpickles_nothing() -> None:
     """In a fresh interpreter, as Python itself reports it; the same hook sees each of these."""
     done = run_python(AUDIT, timeout=120)

@@ -303,6 +303,7 @@ def test_coefficients_learn_below_their_last_digit() -> None:
     np.testing.assert_allclose(moved[1], moved[0], atol=2.0**-21)
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 def test_compiled_code_computes_in_single_precision_too() -> None:
     """It is the interpreted run but for fused operations, in a loop and by steps; ``.ci/run`` has it with a guarded learner."""

@@ -146,6 +146,7 @@ def test_new_parameters_of_a_loop_are_not_compiled_for() -> None:
     assert smaller._step != step
 
 
+@pytest.mark.slow
 def test_loops_are_compiled_once_for_all_that_share_code(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -102,6 +102,7 @@ def test_a_plant_that_cools_down_at_the_start_is_not_taken_for_one_at_rest(seed:
     assert any("contradict the start at rest" in text for text in forced.shortcomings)
 
 
+@pytest.mark.slow
 def test_the_gain_of_drawn_steps_is_in_its_interval_or_said_to_be_undecided() -> None:
     """Orders 1 to 3, dead times and lengths of rest (benchmarks/step_records.py): few are wrong, no sign is."""
     trial = benchmark("step_records")
@@ -149,6 +150,7 @@ def test_the_model_of_the_noise_is_that_of_an_autoregressive_process() -> None:
     assert noise_model(white)[0].size == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [0.0, 0.95])
 @pytest.mark.parametrize("kind", ["step", "prbs"])
 def test_deviations_hold_in_white_and_coloured_noise(memory: float, kind: str) -> None:
@@ -260,6 +262,7 @@ def test_poles_at_zero_may_be_given(integrators: int) -> None:
     assert found.den == pytest.approx(den, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_clean_record_of_a_lag_gives_a_lag_from_order_four_on() -> None:
     """Without noise, and without a warning of NumPy (warnings are errors here)."""
     u = np.sign(np.sin(2.0 * np.pi * 0.7 * np.arange(2000) * 1e-3)) + 0.3
@@ -330,6 +333,7 @@ def saved(path: Path, u: Vector, y: Vector) -> None:
     np.savetxt(path, table, delimiter=",", header="time_s,u,y", comments="")
 
 
+@pytest.mark.slow
 def test_the_command_tunes_from_a_step_test_by_itself(
     quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -136,6 +136,7 @@ def test_only_the_page_with_the_token_is_answered(url: str) -> None:
         Client(host + "/wrong/")
 
 
+@pytest.mark.slow
 def test_connections_that_ask_for_nothing_are_closed_and_lock_out_no_page(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -164,6 +165,7 @@ def test_connections_that_ask_for_nothing_are_closed_and_lock_out_no_page(
     assert len(lines) == 1
 
 
+@pytest.mark.slow
 def test_a_large_plant_is_analysed_apart_and_for_a_limited_time(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,6 +186,7 @@ def test_a_large_plant_is_analysed_apart_and_for_a_limited_time(
     other.close()
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own_gives_the_same_frames() -> None:
     """A list beyond the limit makes a setup large; errors are the same sentence; a stop ends it."""
     den = np.poly(-np.linspace(1.0, 1.5, 45)).tolist()
@@ -218,6 +221,7 @@ def test_a_malformed_message_gives_an_error_and_no_more(client: Client, text: st
     assert "texts" in client.ask("texts", do="toml", setup=TABLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [

@@ -228,6 +228,7 @@ def drop(page: Any, *files: tuple[str, bytes]) -> None:
     page.dispatch_event("body", "drop", {"dataTransfer": transfer})
 
 
+@pytest.mark.slow
 def test_a_record_that_is_opened_is_shown_and_tuned_for(page: Any) -> None:
     """Plots, report and set of plants; the form has the model; a dropped one replaces it."""
     page.click("#record-box summary")

@@ -47,6 +47,7 @@ def nothing(part: str, share: float) -> None:
     """Take progress."""
 
 
+@pytest.mark.slow
 def test_a_record_is_identified_as_on_the_command_line_and_tuned_for(
     client: Client, tmp_path: Path
 ) -> None:
@@ -76,6 +77,7 @@ def test_a_record_is_identified_as_on_the_command_line_and_tuned_for(
     assert client.ask("done", **task, setup=setup)["tuned"][0]["plants"] == 1
 
 
+@pytest.mark.slow
 def test_nothing_is_tuned_for_a_record_that_does_not_decide(client: Client) -> None:
     """Noise: the line with NOT is shown, there is no setup, and tuning is refused with its text."""
     random = np.random.default_rng(1)

@@ -248,6 +248,7 @@ def test_a_sweep_that_stopped_goes_on_with_what_is_missing(tmp_path: Path) -> No
     assert calls == []
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_whole_files_and_its_sweep_goes_on(tmp_path: Path) -> None:
     """With SIGKILL, in the middle of the sweep, so that nothing can be cleaned up."""
     setup = setup_of(tmp_path, SETUP.replace("draws = 4", "draws = 12"))

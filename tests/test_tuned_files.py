@@ -30,6 +30,7 @@ def quell(
 
 
 # The rule of thumb that warns of bandwidths beside a delay is more careful than M_s.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")
 @pytest.mark.parametrize("delay", [0.0, 0.12])
 @pytest.mark.parametrize("structure", STRUCTURES)
@@ -56,6 +57,7 @@ def test_the_file_of_every_structure_is_the_tuned_loop(
     assert load_window["peak_error"] > 0.0
 
 
+@pytest.mark.slow
 def test_the_gain_is_printed_with_its_sign(quell: object) -> None:
     """Of ADRC and of PI, as text and in the JSON; K is positive for a positive plant."""
     for structure, name in (("bandwidths", "b0"), ("pi", "K")):
@@ -92,6 +94,7 @@ def record(path: Path) -> None:
     np.savetxt(path, np.column_stack([t, u, y]), delimiter=",", header="t,u,y", comments="")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", ["numbers", "setup", "record", "model"])
 def test_limits_of_u_reach_the_file_by_every_route(
     quell: object, tmp_path: Path, route: str
@@ -117,6 +120,7 @@ def test_limits_of_u_reach_the_file_by_every_route(
     assert (setup.controller.limits.low, setup.controller.limits.high) == (0.5, 4.5)
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_record_bounds_what_noise_does_to_u(quell: object, tmp_path: Path) -> None:
     """Its white part: 1e-4 of y was drawn; half the range of u is 2, of which it may use 2 %."""
     record(tmp_path / "record.csv")
@@ -129,6 +133,7 @@ def test_the_noise_of_a_record_bounds_what_noise_does_to_u(quell: object, tmp_pa
     assert "2 % of half the range of u, 2," in line
 
 
+@pytest.mark.slow
 def test_the_scenario_begins_at_the_operating_point_of_the_record(
     quell: object, tmp_path: Path
 ) -> None:
@@ -147,6 +152,7 @@ def test_the_scenario_begins_at_the_operating_point_of_the_record(
     assert "overshoot" not in load_window
 
 
+@pytest.mark.slow
 def test_an_operating_point_that_is_given_is_where_the_scenario_begins(quell: object) -> None:
     """By numbers, with a delay and a lag whose states are at rest, too; half of one is refused, and one beside a setup."""
     at = ("--u-rest", "3", "--y-rest", "-2.5", "--delay", "0.12")
@@ -240,6 +246,7 @@ def test_a_nonlinear_plant_is_judged_at_its_operating_point(tmp_path: Path) -> N
     assert run.metrics(**setup.windows[0])["overshoot"] < 0.5
 
 
+@pytest.mark.slow
 def test_a_delay_of_the_table_tune_is_in_the_plant_of_the_file(
     quell: object, tmp_path: Path
 ) -> None:
@@ -257,6 +264,7 @@ def test_a_delay_of_the_table_tune_is_in_the_plant_of_the_file(
     assert other.controller.ki == pytest.approx(setup.controller.ki, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_table_of_a_tuning_is_not_cut_in_80_columns(
     quell: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -129,6 +129,7 @@ def test_a_freed_adrc_has_the_feedback_of_a_filtered_pi_or_pid_controller(order:
 # ---- optima
 
 
+@pytest.mark.slow
 def test_constraints_hold_on_a_grid_a_hundred_times_finer(tuned: ql.Tuned) -> None:
     """Within 0.1 %, and each active one is reached."""
     x = np.log(tuned.plants.omega)
@@ -163,6 +164,7 @@ def test_freed_poles_are_better_than_bandwidths_and_pid(tuned: ql.Tuned) -> None
     assert "best" in tuned.costs[-1]
 
 
+@pytest.mark.slow
 def test_a_result_does_not_depend_on_what_it_is_compared_with(tuned: ql.Tuned) -> None:
     """A freed ADRC starts at the optimal PID controller also if that is not shown."""
     alone = ql.tune(LAGS, DT, order=2, structure="freed", objective="load", compare=())
@@ -188,6 +190,7 @@ def by_default() -> ql.Tuned:
     return ql.tune(LAGS, DT)
 
 
+@pytest.mark.slow
 def test_the_default_is_as_good_as_the_best_structure_that_was_tried(by_default: ql.Tuned) -> None:
     """Its IAE is within 5 % of the least one; no simpler structure's is."""
     iae = {name: design.measures["iae"] for name, design in by_default.designs.items()}
@@ -237,6 +240,7 @@ def test_noise_and_limits_of_u_give_the_bound_of_noise() -> None:
     assert "2 % of half the range of u" in found.noise_bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [False, True])
 def test_the_resolution_of_a_plants_encoder_is_known(late: bool) -> None:
     """Counts and y of a turn, as 360 degrees, give the same design as the resolution; also behind a delay."""
@@ -427,6 +431,7 @@ def test_where_no_start_keeps_to_the_limits_the_optima_of_other_limits_are_start
     assert limits[-1] == pytest.approx(0.85 * 1.6)
 
 
+@pytest.mark.slow
 def test_contradicting_constraints_are_named_with_their_excess() -> None:
     """An unstable plant needs more gain than M_ks allows at so small an M_t."""
     unstable = ([1.0], [1.0, -1.0])

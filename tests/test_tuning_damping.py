@@ -92,6 +92,7 @@ def test_a_mode_of_the_plant_may_stay_and_keeps_half_of_its_damping() -> None:
     assert "mode of the plant: damping 0.0" in tuned.damping
 
 
+@pytest.mark.slow
 def test_a_structure_that_cannot_keep_the_bound_of_damping_says_so() -> None:
     """A PI controller rings on a lag with an integrator at this M_s; the default takes another."""
     bounds = Constraints(m_s=2.5, m_t=2.5, m_ks=30.0, damping=0.9)
@@ -172,6 +173,7 @@ def test_the_bound_of_damping_is_an_option_of_setup_files(tmp_path: Any) -> None
 # ---- peaks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3])
 def test_constraints_hold_at_the_narrow_peaks_of_undamped_axes(count: int) -> None:
     """Within 0.1 %, at frequencies as dense as the poles ask for; the grid alone missed 0.7 %."""
@@ -190,6 +192,7 @@ def test_constraints_hold_at_the_narrow_peaks_of_undamped_axes(count: int) -> No
 # ---- more freedom
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("removed", ["m_t", "m_ks", "delay_margin"])
 def test_without_a_constraint_the_objective_is_not_worse(removed: str) -> None:
     """Within the tolerance of the constraints."""

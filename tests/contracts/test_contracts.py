@@ -448,6 +448,7 @@ OTHER_FEATURES = ("with u", "on the strongest", "radial features", "random featu
 IN_LOOPS = [name for name in LEARNERS if not name.endswith(OTHER_FEATURES)]
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", TO_DRIVE)
 def test_a_learner_says_the_same_interpreted(name: str, rng: np.random.Generator) -> None:

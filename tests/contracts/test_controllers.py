@@ -125,6 +125,7 @@ def test_every_controller_has_an_example() -> None:
 WITHOUT_REST = ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise)
 
 
+@pytest.mark.slow
 def test_a_loop_runs_the_same_again_and_interpreted() -> None:
     """Same seed, same output; no second compilation; interpreted = compiled; ``step`` gives the same u and state.
 
@@ -145,6 +146,7 @@ def test_a_loop_runs_the_same_again_and_interpreted() -> None:
 IN_LOOPS = [name for name in CONTROLLERS if name != "Prefiltered ADRC"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IN_LOOPS)
 def test_a_step_at_a_time_is_the_simulated_run_and_interpreted(name: str) -> None:
     """Compiled ``step`` with what was measured gives the u of an interpreted run but for rounding, and its state; again, the same bits."""

@@ -177,6 +177,7 @@ def test_it_is_a_device_and_opened_by_its_url(example: Any) -> None:
     assert example.sample(device, 0.0) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 @every
 def test_it_measures_the_plant_that_u_moves(example: Any) -> None:

@@ -356,6 +356,7 @@ def programs() -> dict[str, dict[str, Any]]:
     return found
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("name", PARTS)
 @pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")

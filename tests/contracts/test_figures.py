@@ -155,6 +155,7 @@ def drawn_axes(returned: Any) -> list[Any]:
     return list(np.ravel(np.asarray(returned, dtype=object)))
 
 
+@pytest.mark.slow
 def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str, Case]) -> None:
     """A new figure is pyplot's current one; given axes come back; another number is an error."""
     for name, (draw, count) in cases.items():

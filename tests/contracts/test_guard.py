@@ -171,6 +171,7 @@ def rms(loop: Loop, controller: ql.ADRC) -> float:
     return float(np.sqrt(np.mean(run["y"][run.t >= 0.25 * LAGS * lag] ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "plant"), PAIRS)
 def test_a_guarded_learner_does_no_harm(name: str, plant: str) -> None:
     """Its error is at most 1.02 times that without learner, whether the model is right or its load is 30 % off.

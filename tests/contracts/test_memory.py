@@ -69,6 +69,7 @@ def saved(in_c: InC, size: int) -> bytes:
     return image.raw
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 @pytest.mark.parametrize("name", CASES)
@@ -97,6 +98,7 @@ def test_python_and_c_continue_each_others_loops(tmp_path: Path, name: str, sing
         assert again.step(r, y, *more) == in_c.run("step", r, y, *more)
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize(
     "name", [f"learner: {each}" for each in ("Kalman", "RLS", "Harmonic", "Repetitive", "MLP")]
@@ -128,6 +130,7 @@ def test_a_learner_in_python_has_no_image_and_says_what_to_do(name: str) -> None
             attempt()
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 def test_damaged_images_are_refused_and_change_nothing(tmp_path: Path, single: bool) -> None:
@@ -154,6 +157,7 @@ def test_damaged_images_are_refused_and_change_nothing(tmp_path: Path, single: b
     assert saved(in_c, len(image)) == controller.memory() == image
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -290,6 +290,7 @@ def test_every_option_has_a_case() -> None:
         assert covered <= {f"--{each.lstrip('-').lower()}" for each in options}, command
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of a dt that contradicts the times
 @pytest.mark.parametrize(
     ("command", "option"),

@@ -34,6 +34,7 @@ def scores(name: str, dt: float, seed: int, reset: bool = True) -> dict[str, flo
     return dict(study.score(run) | study.margins(law, run))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", DTS)
 def test_mf_eso_overshoots_by_four_and_a_half_per_mille_and_settles_in_16_6_seconds(
     dt: float,
@@ -55,6 +56,7 @@ def test_mb_eso_does_not_overshoot_and_settles_in_12_seconds(dt: float) -> None:
         assert 12.0 <= found["settling_time"] <= 12.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reset", [True, False])
 @pytest.mark.parametrize("dt", DTS)
 def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_bandwidth(
@@ -69,6 +71,7 @@ def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_band
         assert found["control_variation"] <= 1.1 * scores(study.MF, dt, seed)["control_variation"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "overshoot", "settling", "peak", "variation"),
     [
@@ -101,6 +104,7 @@ def test_without_the_reset_mf_eso_has_the_rms_error_of_the_reference() -> None:
     )
 
 
+@pytest.mark.slow
 def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_whatever_the_batch() -> (
     None
 ):

@@ -39,6 +39,7 @@ ROWS = {
 README = Path(__file__).parents[2] / "README.md"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", PRINTED)
 def test_the_independent_program_gives_the_printed_figures(case: tuple[bool, int, float]) -> None:
     """MF-ESO with two extended states at 7 and 7.5 rad/s among them, to the printed digits."""
@@ -47,6 +48,7 @@ def test_the_independent_program_gives_the_printed_figures(case: tuple[bool, int
     assert (*first, f"{1e3 * found.overshoot:.2f}", f"{found.settling:.1f}") == PRINTED[case]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS)
 def test_the_rows_of_the_readme_are_those_of_the_independent_program(row: str) -> None:
     """To the printed digits, with f held over a sample as in quell; the control variation within twice its interval."""
