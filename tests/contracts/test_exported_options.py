@@ -373,6 +373,7 @@ def test_every_program_repeats_the_kernels_bit_for_bit(tmp_path: Path, name: str
         assert "largest difference 0 ulp" in done.stdout, row
 
 
+@pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")
 def test_what_changes_the_code_is_seen() -> None:
     """A number alone is no program of its own; a search for frequencies, another feature and another order are."""
     found = programs()
