@@ -27,7 +27,7 @@ _REFINED = 400
 
 
 class OnlineCertificate(NamedTuple):
-    """What holds for every b0 that an ``OnlineGain`` can find, and every b in its limits."""
+    """Bounds that hold for every b0 that an ``OnlineGain`` can find, and every b in its limits."""
 
     ratio: tuple[float, float]  #: lowest and highest b/b0 of the interval
     stable: tuple[float, float]  #: range of b/b0 for which the frozen loop is stable

@@ -42,7 +42,7 @@ def rank(
     json: Path | None = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Say which of several tunings was best, from logs of the running machine.
+    """Decide which of several tunings was best, from logs of the running machine.
 
     A verdict that the logs do not allow is a line that begins with NOT, with what to do.
 

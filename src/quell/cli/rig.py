@@ -103,15 +103,11 @@ def rig(
         Number of the processor for the ticks; any by default.
     """
     from quell.realtime.registry import listen
-    from quell.realtime.rig import Rig, checked_seconds
-    from quell.realtime.system import checked_cpu, checked_priority, termination_handler
+    from quell.realtime.rig import Rig
     from quell.setup.schema import plant_given
 
     model = plant_given(plant, dt, argument="--plant", trust=trust)
-    if seconds is not None:
-        checked_seconds("--seconds", seconds)
-    checked_priority(priority)
-    checked_cpu(cpu)
+    _check_pace(seconds, priority, cpu)
     limits: dict[str, Any] = {
         "watchdog": watchdog,
         "u_max": u_max,
@@ -123,16 +119,37 @@ def rig(
     with closing(listen(device)) as listener, Rig(model, dt, listener=listener, **limits) as server:
         with exit_on_signal(listener.close):  # compiling may take a minute the first time
             server.prepare()
-        with termination_handler(lambda *_: server.stop()):
-            limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
-            rules = f"u = 0 after {watchdog} ticks without a command{limit}"
-            start = ", from rest" if rest else ""
-            start += f", waits up to {wait:g} s for each command" if wait > 0.0 else ""
-            print(f"{plant} at {listener.url}: a tick every {dt:g} s, {rules}{start}", flush=True)
-            notes = server.run(seconds, priority=priority, cpu=cpu)
+        limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
+        rules = f"u = 0 after {watchdog} ticks without a command{limit}"
+        start = ", from rest" if rest else ""
+        start += f", waits up to {wait:g} s for each command" if wait > 0.0 else ""
+        line = f"{plant} at {listener.url}: a tick every {dt:g} s, {rules}{start}"
+        notes = _served(server, line, seconds, priority, cpu)
     _print_counters(server)
     for note in notes:
         print(note)
+
+
+def _check_pace(seconds: float | None, priority: int, cpu: int | None) -> None:
+    """Check how long, and how, a rig is to tick."""
+    from quell.realtime.rig import checked_seconds
+    from quell.realtime.system import checked_cpu, checked_priority
+
+    if seconds is not None:
+        checked_seconds("--seconds", seconds)
+    checked_priority(priority)
+    checked_cpu(cpu)
+
+
+def _served(
+    server: Rig, line: str, seconds: float | None, priority: int, cpu: int | None
+) -> list[str]:
+    """Print a line and tick until the time is over or a signal comes; return the notes."""
+    from quell.realtime.system import termination_handler
+
+    with termination_handler(lambda *_: server.stop()):
+        print(line, flush=True)
+        return server.run(seconds, priority=priority, cpu=cpu)
 
 
 def _print_counters(server: Rig) -> None:
@@ -202,16 +219,12 @@ def proxy(
     """
     from quell.realtime import CompensatedDrive, open_device
     from quell.realtime.registry import listen
-    from quell.realtime.rig import Rig, checked_seconds
-    from quell.realtime.system import checked_cpu, checked_priority, termination_handler
+    from quell.realtime.rig import Rig
     from quell.setup import load
 
     loaded = load(setup, trust)
     url = str(loaded.needed("rig")["device"]) if device is None else device
-    if seconds is not None:
-        checked_seconds("--seconds", seconds)
-    checked_priority(priority)
-    checked_cpu(cpu)
+    _check_pace(seconds, priority, cpu)
     compensator, dt = cast("Compensator", loaded.controller), float(loaded.controller.dt)
     limits: dict[str, Any] = {"watchdog": watchdog, "log": log, "overwrite": overwrite}
     with (
@@ -223,11 +236,10 @@ def proxy(
             server.prepare()
         if hasattr(drive.device, "restart_session"):
             drive.device.restart_session()  # compiling may have taken longer than it waits
-        with termination_handler(lambda *_: server.stop()):
-            rule = f"u_0 = 0 after {watchdog} ticks without a command"
-            between = f"compensator between {listener.url} and {url}"
-            print(f"{between}: a tick every {dt:g} s, {rule}", flush=True)
-            notes = server.run(seconds, priority=priority, cpu=cpu)
+        rule = f"u_0 = 0 after {watchdog} ticks without a command"
+        between = f"compensator between {listener.url} and {url}"
+        line = f"{between}: a tick every {dt:g} s, {rule}"
+        notes = _served(server, line, seconds, priority, cpu)
         _print_counters(server)
         estimate = drive.estimate
         print(f"last tick: u = {estimate.u:.6g}, f = {estimate.f:.6g}, {estimate.status!r}")

@@ -548,7 +548,7 @@ class Compensator(StatefulController):
 
     @property
     def gain_estimate(self) -> Any:
-        """What an ``OnlineGain`` knows of b; a ``ValueError`` if b0 is not estimated."""
+        """The estimate of b by an ``OnlineGain``; a ``ValueError`` if b0 is not estimated."""
         if not hasattr(self.schedule, "read"):
             raise ValueError("gain_estimate: give schedule=quell.OnlineGain(low, high) for one")
         return self.schedule.read(self._state.schedule)
@@ -762,7 +762,7 @@ class Compensator(StatefulController):
         self._state.loop[0].bumpless = 1.0
 
     def set_held(self, held: bool) -> None:
-        """Say whether the plant is held, by a brake for instance: u does not act until it is not.
+        """Set whether the plant is held, by a brake for instance: u does not act until it is not.
 
         Call it when that changes. While it is held the observer rests at y with the f̂ of before,
         and the law works with it, so nothing winds up and the release makes no bump.

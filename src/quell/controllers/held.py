@@ -163,7 +163,7 @@ def f_before(design: Any, memory: Any) -> float:
 
 @generic_with_default
 def take_motion(design: Any, memory: Any, z: Vector, seen: Vector) -> None:
-    """Give the loop's observer the estimates of a plant that was released."""
+    """Set the loop's observer to the estimates of a plant that was released."""
 
 
 @generic_with_default

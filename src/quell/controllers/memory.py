@@ -75,7 +75,7 @@ _WORD = 2**64 - 1
 
 
 class Layout(NamedTuple):
-    """What a controller's images have in common.
+    """The layout of a controller's images.
 
     Attributes
     ----------

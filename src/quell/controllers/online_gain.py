@@ -232,7 +232,7 @@ def _forget_motion(design: OnlineDesign, memory: OnlineMemory, b0: float) -> Non
 
 
 class GainEstimate(NamedTuple):
-    """What an online estimate of b0 knows."""
+    """The state of an online estimate of b0."""
 
     b0: float
     """b0 in use [y-unit/u-unit/s^n]."""

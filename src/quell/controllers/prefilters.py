@@ -175,7 +175,7 @@ class Wrapper(StatefulController):
         self._inner.hand_over()
 
     def set_held(self, held: bool) -> None:
-        """Say whether the plant is held, see ``ADRC.set_held``."""
+        """Set whether the plant is held, see ``ADRC.set_held``."""
         self._inner.set_held(held)
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:

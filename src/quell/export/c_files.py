@@ -626,7 +626,7 @@ def _hand_over_both(design: CompensatedDesign, state: CompensatedState) -> bool:
 
 @generic
 def set_held(design: Any, state: Any, held: bool) -> None:
-    """Say whether the plant is held: u does not act until it is not."""
+    """Set whether the plant is held: u does not act until it is not."""
     raise TypeError
 
 

@@ -365,7 +365,7 @@ class _Writer:
         files.add(
             "set_held",
             f"void NAME({self.state}, bool held)",
-            "Say whether the plant is held, by a brake for instance: u does not act until it is "
+            "Set whether the plant is held, by a brake for instance: u does not act until it is "
             "not.\n\nCall it when that changes. While it is held nothing winds up: the release "
             "makes no bump.",
             f"    {files.call(c_files.set_held, *files.both, held)};",

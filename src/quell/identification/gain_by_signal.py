@@ -22,8 +22,7 @@ from quell.types import Vector
 
 # Stretches of a bin that are used, the longest ones: each takes a second and more.
 _MOST_STRETCHES = 6
-# Half width of a 95 % interval in deviations, and the share of b0 from which on it is not known:
-# those of ``InputGain``.
+# Half width of a 95 % interval in deviations, and its share of b0 from which on b0 is not known.
 _WITHIN_95, _POOR = 1.96, 0.3
 
 

@@ -150,7 +150,7 @@ def rank(
     criterion: str = "rms",
     confidence: float = 0.95,
 ) -> Ranking:
-    """Say which of several tunings was best, from logs of the running machine.
+    """Decide which of several tunings was best, from logs of the running machine.
 
     Alternate the tunings (A, B, A, B) rather than log each once: what drifts from hour to hour then
     is in both.

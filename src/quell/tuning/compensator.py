@@ -59,7 +59,7 @@ _WORTH = 0.05
 
 
 class Measures(NamedTuple):
-    """What a loop does: peaks of its sensitivities and the effect of a load."""
+    """Figures of a loop: peaks of its sensitivities and the effect of a load."""
 
     m_s: float  #: largest ``|S|``
     m_t: float  #: largest ``|T|``
@@ -241,14 +241,14 @@ def tune_compensator(
     compensator = Compensator(best.observer, **options)
     numbers = {name: value for name, value in options.items() if isinstance(value, int | float)}
     both = Compensated(controller, compensator)
-    both_alone = Compensated(controller, Compensator(best.observer))  # without learner
     tables = {"observer": best.table, "compensator": numbers}
     first = plants.all.scaled()[0]
-    ways = (response(first, law_of(each), inputs) for each in (controller, both_alone))
-    y = tuple(ways)
-    return TunedCompensator(
-        both, best.name, before, best.measures, bounds, tables, dt, (y[0], y[1])
+    plain = Compensated(controller, Compensator(best.observer))  # without learner
+    loads = (
+        response(first, law_of(controller), inputs),
+        response(first, law_of(plain), inputs),
     )
+    return TunedCompensator(both, best.name, before, best.measures, bounds, tables, dt, loads)
 
 
 def _with_speeds(given: Given, speeds: tuple[float, float]) -> Given:
