@@ -190,6 +190,24 @@ def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
         assert 1.0 / elsewhere.margins.modulus <= 1.01 * tuned.after.m_s_elsewhere
 
 
+@pytest.mark.parametrize(
+    ("controller", "options", "message"),
+    [
+        (ql.ADRC(OBSERVER, 3.0), {}, "has an observer"),
+        (None, {}, "must be a controller"),
+        (PID, {"speeds": 0.9}, "speeds"),
+        (PID, {"speeds": (0.9, 1.0, 1.1)}, "speeds"),
+        (PID, {"speeds": (0.0, 1.2)}, "must be a factor up to 1"),
+    ],
+)
+def test_tuning_names_the_argument_that_is_wrong(
+    controller: Any, options: dict[str, Any], message: str
+) -> None:
+    """A controller that can have no compensator is not one without margin."""
+    with pytest.raises(ValueError, match=message):
+        ql.tuning.tune_compensator(PLANT, controller, **options)
+
+
 def test_where_the_controller_uses_the_margin_itself_no_compensator_is_sold() -> None:
     """Below its own peak tuning refuses; a noise bound that leaves nothing makes the report say NOT."""
     peak = 1.0 / ql.analysis.analyse(PLANT, PID).margins.modulus

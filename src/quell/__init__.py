@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         features,
         identification,
         learners,
+        monitoring,
         observers,
         plants,
         realtime,
@@ -92,8 +93,8 @@ _HOMES = {
 }
 _MODULES = (
     "analysis", "controllers", "controllers.baselines", "envs", "experiments", "export", "features",
-    "identification", "learners", "observers", "plants", "realtime", "records.metrics", "setup",
-    "signals", "sweeping", "tuning",
+    "identification", "learners", "monitoring", "observers", "plants", "realtime",
+    "records.metrics", "setup", "signals", "sweeping", "tuning",
 )  # fmt: skip
 
 __all__ = [
@@ -101,8 +102,8 @@ __all__ = [
     "Feedforward", "Guard", "HeldPlant", "OnlineGain", "Reason", "SafeSet", "Scenario", "Schedule",
     "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers", "envs",
     "experiments", "export", "features", "identification", "identify", "learners", "metrics",
-    "observers", "omega_c_for", "plants", "realtime", "setup", "signals", "simulate", "style",
-    "sweep", "sweeping", "tune", "tune_schedule", "tuning",
+    "monitoring", "observers", "omega_c_for", "plants", "realtime", "setup", "signals", "simulate",
+    "style", "sweep", "sweeping", "tune", "tune_schedule", "tuning",
 ]  # fmt: skip
 
 

@@ -159,6 +159,22 @@ def takes_control(controller: Any) -> bool:
     return isinstance(controller, Compensator) and not isinstance(controller, ADRC)
 
 
+def check_takes_compensator(controller: Any) -> None:
+    """Raise a ``ValueError`` if a compensator can not stand on top of a controller."""
+    check_controller(controller)
+    if without_prefilters(controller) is not controller:
+        raise ValueError(
+            "controller is behind a prefilter: put the prefilter in front of both, as "
+            "Prefiltered(Compensated(controller, compensator), prefilter)"
+        )
+    if isinstance(controller, Compensator | Wrapper):
+        raise ValueError(
+            f"controller = {type(controller).__name__}: has an observer, or is a wrapper; take a "
+            "controller without observer such as quell.baselines.PID, and give a learner or a "
+            "guard of an ADRC to itself"
+        )
+
+
 class Compensated(Wrapper):
     """A controller with a compensator on top: ``u = u_0 − (f_L + Δf̂)/b0``.
 
@@ -195,18 +211,7 @@ class Compensated(Wrapper):
     compensator: Compensator
 
     def __init__(self, controller: Controller, compensator: Compensator) -> None:
-        check_controller(controller)
-        if without_prefilters(controller) is not controller:
-            raise ValueError(
-                "controller is behind a prefilter: put the prefilter in front of both, as "
-                "Prefiltered(Compensated(controller, compensator), prefilter)"
-            )
-        if isinstance(controller, Compensator | Wrapper):
-            raise ValueError(
-                f"controller = {type(controller).__name__}: has an observer, or is a wrapper; take "
-                "a controller without observer such as quell.baselines.PID, and give a learner or "
-                "a guard of an ADRC to itself"
-            )
+        check_takes_compensator(controller)
         if not takes_control(compensator):
             rule = "must be a quell.Compensator(observer, ...)"
             raise ValueError(f"compensator = {compensator!r}: {rule}")

@@ -32,7 +32,7 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis, subsystem
 from quell.analysis.margins import Response
 from quell.controllers.base import Controller
-from quell.controllers.compensated import Compensated
+from quell.controllers.compensated import Compensated, check_takes_compensator
 from quell.controllers.compensator import Compensator
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
@@ -203,6 +203,7 @@ def tune_compensator(
     >>> tuned.after.iae < 0.3 * tuned.before.iae, tuned.after.m_s <= 2.0
     (True, True)
     """
+    check_takes_compensator(controller)
     dt = float(controller.dt)
     how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag, "b_range": b_range}
     given = given_plants(plant, dt, operating_point=operating_point, **how)
@@ -253,8 +254,8 @@ def tune_compensator(
 
 def _with_speeds(given: Given, speeds: tuple[float, float]) -> Given:
     """Return the plants, and the first one with all poles and zeros at other frequencies."""
-    low, high = checks.positive_vector("speeds", speeds).tolist()
-    if not low <= 1.0 <= high:
+    low, high = checks.vector("speeds", speeds, 2).tolist()
+    if not 0.0 < low <= 1.0 <= high:
         raise ValueError(f"speeds = {speeds!r}: must be a factor up to 1 and one from 1 on")
     first, more = LinearPlant.of(given.linear[0]), []
     for factor in {low, high} - {1.0}:
