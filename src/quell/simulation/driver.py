@@ -49,6 +49,7 @@ from quell.kernels.dispatch import (
     explain_compile_errors,
     interpreted,
     is_available,
+    kernel,
     specialised,
 )
 from quell.plants.base import Plant, advance, begin_run, check_run, measure
@@ -512,6 +513,10 @@ def run_block(
         until_next -= 1
         advance(plant, x, scratch, t0 + k * dt, u, w[k])
     return r.size, row, until_next, status
+
+
+run_samples = kernel(interpreted(run_block))
+"""``run_block`` for compiled loops over several loops, which call it for each of them."""
 
 
 class Loop:
