@@ -20,12 +20,21 @@ from quell.analysis.plots import (
     plot_root_locus,
 )
 from quell.controllers.adrc import Finding
+from quell.lti.zeros import (
+    Existence,
+    InvariantZeros,
+    invariant_zeros,
+    observer_exists,
+    unobservable_modes,
+)
 
 __all__ = [
     "Adapting",
     "Certificate",
+    "Existence",
     "Finding",
     "Frozen",
+    "InvariantZeros",
     "LoopAnalysis",
     "Margins",
     "OnlineCertificate",
@@ -35,14 +44,17 @@ __all__ = [
     "certify",
     "certify_online",
     "frozen",
+    "invariant_zeros",
     "linear_law",
     "loops_over_omega_o",
     "loops_over_time",
     "observer_error",
+    "observer_exists",
     "plot_bode",
     "plot_gang_of_four",
     "plot_margins_against_omega_o",
     "plot_margins_over_time",
     "plot_nyquist",
     "plot_root_locus",
+    "unobservable_modes",
 ]
