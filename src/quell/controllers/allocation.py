@@ -12,10 +12,14 @@ that was applied after all limits (docs/axes).
 do with a u outside of it:
 
 ``"each"``
-    cut each actuator by itself. With more actuators than axes those that are cut are taken out and
-    the others make up for them, again and again until all are within (redistributed pseudo-inverse:
-    Bordignon, *Constrained control allocation*, 1996; Johansen & Fossen, *Automatica* 49, 2013,
-    section 2.2). That is near the least-squares solution, not always equal to it.
+    cut each actuator by itself. With more actuators than axes the others make up for those that
+    are cut: u is the weighted least-squares solution within the range,
+
+        min  γ Σ_i ((B0 u − v)_i / ‖B0_i‖)² + Σ_k W_k (u_k − u_r,k)²,      γ = 10⁸
+
+    with W of largest entry 1, by an active set (Härkegård, *IEEE Conf. Decision and Control* 2002,
+    "Efficient active set algorithms for solving constrained least squares problems in aircraft
+    control allocation"). Rows are scaled, so axes in metres and radians count alike.
 ``"direction"``
     go from the point of the range that is nearest to u_r towards u as far as the range allows: v
     keeps its direction.
@@ -53,6 +57,10 @@ _GAIN_HELD = int(Status.GAIN_HELD)
 # an error of a percent in B0 then makes one of 30 % in a direction of v. And that from which B0
 # counts as singular. Chosen by hand.
 _POOR, _SINGULAR = 30.0, 1e8
+# Weight of what the axes miss over that of u, and rounds of the active set for each actuator: it
+# ends by itself after about as many as there are actuators. An actuator is freed if its slope is
+# above this share of what moving it through its whole range changes. Chosen by hand.
+_GAMMA, _ROUNDS, _RELEASE = 1e8, 4, 1e-12
 # A pivot below this share of the largest entry of a matrix that a function returned counts as zero.
 _LEAST_PIVOT = 1e-12
 
@@ -145,8 +153,8 @@ def _by_function(gain: FunctionGain, memory: GainMemory, x: Matrix) -> int:
             for j in range(n):
                 kept[i, j] = fresh[i, j]
         return 0
-    if not weighted_inverse(fresh, gain.weights, gain.weights, memory.work, memory.inverse):
-        weighted_inverse(memory.B, gain.weights, gain.weights, memory.work, memory.inverse)
+    if not weighted_inverse(fresh, gain.weights, memory.work, memory.inverse):
+        weighted_inverse(memory.B, gain.weights, memory.work, memory.inverse)
         return _GAIN_HELD
     for i in range(n):
         for j in range(m):
@@ -155,23 +163,18 @@ def _by_function(gain: FunctionGain, memory: GainMemory, x: Matrix) -> int:
 
 
 @kernel
-def weighted_inverse(
-    B: Matrix, weights: Vector, free: Vector, work: Matrix, inverse: Matrix
-) -> bool:
-    """Write ``W⁻¹ Bᵀ (B W⁻¹ Bᵀ)⁻¹`` (m, n) of the actuators whose ``free`` is not zero.
+def weighted_inverse(B: Matrix, weights: Vector, work: Matrix, inverse: Matrix) -> bool:
+    """Write ``W⁻¹ Bᵀ (B W⁻¹ Bᵀ)⁻¹`` (m, n), m ≥ n; return False if there is none.
 
-    ``inverse`` has zeros for the others. Returns False if these actuators do not move all axes;
-    then nothing is of use.
+    Then ``inverse`` is of no use.
     """
     n, m = B.shape
     for i in range(n):
         for j in range(n):
             total = 0.0
             for k in range(m):
-                if free[k] != 0.0:
-                    total += B[i, k] * B[j, k] / weights[k]
+                total += B[i, k] * B[j, k] / weights[k]
             inverse[j, i] = total  # m ≥ n: room for (n, n)
-    # The square part moves to the work space and back, inverted.
     if not inverted(inverse[:n], work, inverse[:n]):
         return False
     for i in range(n):
@@ -180,11 +183,9 @@ def weighted_inverse(
     for k in range(m):
         for j in range(n):
             total = 0.0
-            if free[k] != 0.0:
-                for i in range(n):
-                    total += B[i, k] * work[i, j]
-                total /= weights[k]
-            inverse[k, j] = total
+            for i in range(n):
+                total += B[i, k] * work[i, j]
+            inverse[k, j] = total / weights[k]
     return True
 
 
@@ -205,10 +206,21 @@ class RangeMemory(NamedTuple):
 
     low: Vector  # (m,)
     high: Vector  # (m,)
-    free: Vector  # (m,) 1 for actuators that are not cut
     step: Vector  # (m,)
     rest: Vector  # v that is left (n,)
-    inverse: Matrix  # (m, n)
+    free: Vector  # (m,) 1 for actuators that are not at an end of their range
+    slope: Vector  # of the sum of squares (m,)
+    H: Matrix  # of the sum of squares (m, m)
+    L: Matrix  # its factor for the free actuators (m, m)
+
+
+def range_memory(n: int, m: int) -> RangeMemory:
+    """Return room for n axes and m actuators."""
+    k = m if m > n else 0  # as many actuators as axes leave no squares to sum
+    low, high, step, free, slope = (np.zeros(size) for size in (m, m, m, k, k))
+    return RangeMemory(
+        low, high, step, np.zeros(n), free, slope, np.zeros((k, k)), np.zeros((k, k))
+    )
 
 
 class CutEach(NamedTuple):
@@ -298,36 +310,122 @@ def _cut_each(
     n, m = gain.B.shape
     set_range(limits, before, memory)
     _wish(gain, rule.wished, v, memory.rest, u)
-    flags, fresh = 0, 0
+    flags = 0
     for k in range(m):
         u[k], cut = _cut(memory, limits, k, u[k])
         flags |= cut
-        memory.free[k] = 0.0 if cut != 0 else 1.0
-        fresh += 1 if cut != 0 else 0
-    if m == n:
-        return flags
-    for _ in range(m):  # each round cuts at least one more, or is the last
-        if fresh == 0:
-            break
-        fresh = 0
-        for i in range(n):
-            memory.rest[i] = v[i]
-            for k in range(m):
-                part = u[k] if memory.free[k] == 0.0 else rule.wished[k]
-                memory.rest[i] -= gain.B[i, k] * part
-        if not weighted_inverse(gain.B, rule.weights, memory.free, gain.work, memory.inverse):
-            break
+    usable = flags & _OVERFLOWED == 0
+    for i in range(n):
+        usable = usable and is_finite(v[i])
+    if m > n and flags != 0 and usable:
+        _least_squares(rule, gain, memory, v, u)
         for k in range(m):
-            if memory.free[k] != 0.0:
-                wish = rule.wished[k]
-                for i in range(n):
-                    wish += memory.inverse[k, i] * memory.rest[i]
-                u[k], cut = _cut(memory, limits, k, wish)
-                flags |= cut
-                if cut != 0:
-                    memory.free[k] = 0.0
-                    fresh += 1
+            u[k], cut = _cut(memory, limits, k, u[k])
+            flags |= cut & _OVERFLOWED
     return flags
+
+
+@kernel
+def _least_squares(
+    rule: CutEach, gain: GainMemory, memory: RangeMemory, v: Vector, u: Vector
+) -> None:
+    """Write the least-squares solution within the range into ``u``, which begins inside of it.
+
+    In each round the solution for the actuators that are free is found. Either one of them meets
+    the end of its range and is free no more, or one that is at an end and wants to go back is freed
+    (Nocedal & Wright, *Numerical Optimization*, algorithm 16.3).
+    """
+    n, m = gain.B.shape
+    H, L, slope, free = memory.H, memory.L, memory.slope, memory.free
+    largest = 0.0
+    for k in range(m):
+        largest = max(largest, rule.weights[k])
+        free[k] = 1.0 if memory.low[k] < u[k] < memory.high[k] else 0.0
+        for j in range(m):
+            H[k, j] = 0.0
+    for i in range(n):
+        size = 0.0
+        for k in range(m):
+            size += gain.B[i, k] * gain.B[i, k]
+        for k in range(m):
+            for j in range(m):
+                H[k, j] += _GAMMA / size * gain.B[i, k] * gain.B[i, j]
+    for k in range(m):
+        H[k, k] += rule.weights[k] / largest
+    for _ in range(_ROUNDS * m):
+        _slope(rule, gain, v, u, largest, slope)
+        _solve_free(H, L, slope, free, memory.step)
+        share, end = 1.0, -1
+        for k in range(m):
+            step = memory.step[k]
+            room = memory.high[k] - u[k] if step > 0.0 else memory.low[k] - u[k]
+            if free[k] != 0.0 and abs(step) * share > abs(room):
+                share, end = room / step, k
+        for k in range(m):
+            if free[k] != 0.0:
+                u[k] = min(max(u[k] + share * memory.step[k], memory.low[k]), memory.high[k])
+        if end >= 0:
+            u[end] = memory.high[end] if memory.step[end] > 0.0 else memory.low[end]
+            free[end] = 0.0
+            continue
+        _slope(rule, gain, v, u, largest, slope)
+        worst, wish = -1, 0.0
+        for k in range(m):
+            if free[k] == 0.0 and memory.low[k] < memory.high[k]:
+                back = -slope[k] if u[k] <= memory.low[k] else slope[k]
+                if back > wish + _RELEASE * H[k, k] * (memory.high[k] - memory.low[k]):
+                    worst, wish = k, back
+        if worst < 0:
+            return
+        free[worst] = 1.0
+
+
+@kernel
+def _slope(
+    rule: CutEach, gain: GainMemory, v: Vector, u: Vector, largest: float, slope: Vector
+) -> None:
+    """Write half of the derivative of the sum of squares by u (m,)."""
+    n, m = gain.B.shape
+    for k in range(m):
+        slope[k] = rule.weights[k] / largest * (u[k] - rule.wished[k])
+    for i in range(n):
+        size, missed = 0.0, -v[i]
+        for k in range(m):
+            size += gain.B[i, k] * gain.B[i, k]
+            missed += gain.B[i, k] * u[k]
+        for k in range(m):
+            slope[k] += _GAMMA / size * missed * gain.B[i, k]
+
+
+@kernel
+def _solve_free(H: Matrix, L: Matrix, slope: Vector, free: Vector, step: Vector) -> None:
+    """Write the solution of ``H step = −slope`` for the free actuators, by Cholesky; else 0."""
+    m = slope.size
+    for i in range(m):
+        step[i] = 0.0
+        if free[i] == 0.0:
+            continue
+        total = -slope[i]
+        for j in range(i + 1):
+            if free[j] == 0.0:
+                continue
+            entry = H[i, j]
+            for k in range(j):
+                if free[k] != 0.0:
+                    entry -= L[i, k] * L[j, k]
+            if j < i:
+                L[i, j] = entry / L[j, j]
+                total -= L[i, j] * step[j]
+            else:
+                L[i, i] = math.sqrt(max(entry, 1.0e-300))
+        step[i] = total / L[i, i]
+    for i in range(m - 1, -1, -1):
+        if free[i] == 0.0:
+            continue
+        for j in range(i + 1, m):
+            if free[j] != 0.0:
+                step[i] -= L[j, i] * step[j]
+        step[i] /= L[i, i]
 
 
 @kernel
@@ -421,7 +519,7 @@ def checked_actuator_limits(
     """Return the limits of ``count`` actuators: one value for all, or one for each."""
     lows, highs = (np.full(count, each) if np.ndim(each) == 0 else each for each in (u_min, u_max))
     rates: Sequence[RateLimit]
-    rates = [rate_limit] * count if np.ndim(rate_limit) == 0 else list(rate_limit)
+    rates = list(rate_limit) if checks.is_sequence(rate_limit) else [rate_limit] * count
     for name, values in (("u_min", lows), ("u_max", highs), ("rate_limit", rates)):
         if len(values) != count:
             raise ValueError(
@@ -455,12 +553,13 @@ class Gain(NamedTuple):
     def memory(self) -> GainMemory:
         """Return the memory before the first sample."""
         n, m = self.shape
-        inverse, work = np.zeros((m, n)), np.zeros((n, 2 * n))
+        inverse: Matrix = np.zeros((m, n))
+        work = np.zeros((n, 2 * n))
         is_inverse = getattr(self.design, "is_inverse", False)
         if n == m:
-            inverse = np.linalg.inv(self.first)
+            inverse = np.asarray(np.linalg.inv(self.first), dtype=np.float64)
         else:
-            weighted_inverse(self.first, self.weights, np.ones(m), work, inverse)
+            weighted_inverse(self.first, self.weights, work, inverse)
         fresh = np.zeros((n, n) if is_inverse else (n, m))
         return GainMemory(self.first.copy(), inverse, fresh, work)
 
@@ -515,7 +614,7 @@ def checked_gain(B0: Any, M: Any, weights: Any, names: Sequence[str], most: int)
             "them; leave them out"
         )
     _check_condition(name, first, names)
-    start = np.linalg.inv(first) if name == "M" else first
+    start: Matrix = np.asarray(np.linalg.inv(first) if name == "M" else first, dtype=np.float64)
     if not callable(given):
         return Gain(ConstantGain(start), None, (n, count), start, of_actuators)
     code = _compiled_gain(name, given, (n, most), first.shape)
@@ -530,7 +629,7 @@ def _check_condition(name: str, matrix: Matrix, names: Sequence[str]) -> None:
     Rows and columns are scaled first: axes in metres and radians have B0 of other sizes, which says
     nothing about their coupling.
     """
-    scaled = np.array(matrix, dtype=float)
+    scaled: Any = np.array(matrix, dtype=float)
     for _ in range(10):
         for axis in (0, 1):
             size = np.max(np.abs(scaled), axis=axis, keepdims=True)

@@ -38,6 +38,7 @@ from quell.controllers.allocation import (
     checked_actuator_limits,
     checked_gain,
     checked_rule,
+    range_memory,
     update_gain,
 )
 from quell.controllers.base import (
@@ -371,7 +372,7 @@ class Axes(StatefulController):
         wished: Sequence[float] | None = None,
     ) -> None:
         given = axes if isinstance(axes, dict) else {}
-        parts = list(given.values()) if given else list(axes)  # type: ignore[arg-type]
+        parts: list[Any] = list(given.values()) if given else list(axes)
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
         check_axes(parts, self.names)
         self.axes: tuple[ADRC, ...] = tuple(copy.copy(axis) for axis in parts)
@@ -447,11 +448,10 @@ class Axes(StatefulController):
         states: Any = NoAxisMemory(np.zeros(0))
         for axis in reversed(self.axes):
             states = AxisStates(axis.initial_state(), states)
-        room = (np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(n), np.zeros((m, n)))
         return AxesState(
             axes=states,
             gain=self._gain.memory(),
-            range=RangeMemory(*room),
+            range=range_memory(n, m),
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
             v=np.zeros(n),
@@ -537,7 +537,7 @@ class Axes(StatefulController):
         _applied_to_axes(state.gain, state.u, state.v)
         tell_axes(self.parameters.axes, state.axes, 0, state.v)
 
-    def start(  # type: ignore[override]
+    def start(
         self,
         y: Sequence[float] | Vector,
         u: Sequence[float] | Vector | None = None,
@@ -629,9 +629,7 @@ class Axes(StatefulController):
         self._update_parameters()
         self._pack_again()
 
-    def set_limits(  # type: ignore[override]
-        self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None
-    ) -> None:
+    def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
         """Change limits of the actuators while running; what is not given stays.
 
         Parameters are those of ``Axes``. The next ``step`` is within the new limits of u.

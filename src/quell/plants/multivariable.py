@@ -183,7 +183,7 @@ class MultivariableLinearPlant(Described):
             raise ValueError(f"model is of discrete time, dt = {model.dt!r}: give it in continuous")
         if isinstance(model, tuple | list) and len(model) in (3, 4):
             A, B, *between, C = model
-            return cls(A, B, C, *between, name=name)
+            return cls(A, B, C, between[0] if between else None, name)
         if all(hasattr(model, part) for part in "ABC"):
             if np.any(np.asarray(getattr(model, "D", 0.0))):
                 raise ValueError("model has D other than zero: y must not follow u at once")

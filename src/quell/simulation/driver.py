@@ -146,8 +146,9 @@ class Scenario:
                     f"{name} has {len(getattr(self, name))} signals: must be one, the loop has one "
                     "output; several axes are controlled by quell.Axes"
                 )
-        given = (as_signal(self.reference), *map(as_signal, self.disturbances))
-        noise = as_signal(self.noise).seeded(self.seed)
+        one: Any = self.reference, self.noise
+        given = (as_signal(one[0]), *map(as_signal, self.disturbances))
+        noise = as_signal(one[1]).seeded(self.seed)
         # The noise has the seed itself: its bits must not depend on the number of disturbances.
         reference, *disturbances = seeded_apart(given, self.seed)
         return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
@@ -273,12 +274,13 @@ def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal
         )
     if not given:
         return []
-    before = (scenario.reference, *scenario.disturbances)  # which have the first seeds
+    reference: Any = scenario.reference
+    before = (reference, *scenario.disturbances)  # which have the first seeds
     signals = [as_signal(each) for each in (*before, *scenario.schedule)]
     return list(seeded_apart(signals, scenario.seed)[len(before) :])
 
 
-def segments(scenario: SampledScenario) -> Iterator[Segment]:
+def segments(scenario: Any) -> Iterator[Any]:
     """Return an iterator over all segments, which evaluates the next one in another thread.
 
     The compiled loop releases the interpreter lock, so the signals then cost no time.
@@ -289,7 +291,7 @@ def segments(scenario: SampledScenario) -> Iterator[Segment]:
         return
     context = copy_context()  # with the caller's np.errstate
 
-    def evaluate(samples: tuple[int, int]) -> Segment:
+    def evaluate(samples: tuple[int, int]) -> Any:
         return context.run(scenario.segment, *samples)
 
     with ThreadPoolExecutor(1) as thread:
@@ -560,7 +562,7 @@ class Loop:
     code.
     """
 
-    block = staticmethod(run_block)
+    block: Any = staticmethod(run_block)
 
     def __init__(
         self,
