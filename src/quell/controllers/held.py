@@ -182,6 +182,11 @@ def look_anew(design: Any, memory: Any) -> None:
     """Forget what was seen; what the sensor resolves is kept."""
 
 
+@generic_with_default
+def scale_loads(design: Any, memory: Any, ratio: float) -> None:
+    """Multiply all that is known of f: the loads stay, and the inertia has changed."""
+
+
 @kernel
 def _advance(design: HeldDesign, x: Vector, moved: Vector, u: float, f: float) -> None:
     """Take a state of the model through a sample."""
@@ -357,6 +362,19 @@ def _take_motion(design: HeldDesign, memory: HeldMemory, z: Vector, seen: Vector
         z[i] = memory.z[i]
     for i in range(seen.size):
         seen[i] = memory.seen[i]
+
+
+@scale_loads.register(HeldDesign)
+def _scale_loads(design: HeldDesign, memory: HeldMemory, ratio: float) -> None:
+    memory.loop[0].f *= ratio
+    memory.loop[0].peak *= ratio
+    for i in range(design.lengths.size):
+        for j in (_CHANGED, _FIRST, _BEFORE):
+            memory.windows[i, j] *= ratio
+    for i in range(design.input.size, memory.seen.size):
+        change = (ratio - 1.0) * memory.seen[i]
+        memory.seen[i] += change
+        memory.z[i] += change
 
 
 @held_flag.register(HeldDesign)
