@@ -75,7 +75,7 @@ _LEAST, _LEAST_FARTHER = 0.6, 0.35
 # less from sample to sample.
 _MOST = 4.0
 
-# Columns of the windows.
+# Columns of the windows; those from ``_CHANGED`` on are an f.
 _SAMPLES, _LOW, _HIGH, _Y, _STEPS, _MOVED, _CHANGED, _FIRST, _BEFORE = range(9)
 _COLUMNS = 9
 
@@ -369,7 +369,7 @@ def _scale_loads(design: HeldDesign, memory: HeldMemory, ratio: float) -> None:
     memory.loop[0].f *= ratio
     memory.loop[0].peak *= ratio
     for i in range(design.lengths.size):
-        for j in (_CHANGED, _FIRST, _BEFORE):
+        for j in range(_CHANGED, _COLUMNS):
             memory.windows[i, j] *= ratio
     for i in range(design.input.size, memory.seen.size):
         change = (ratio - 1.0) * memory.seen[i]
