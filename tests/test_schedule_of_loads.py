@@ -16,10 +16,10 @@ B0 = (5000.0, 1000.0, 500.0)
 POINTS = (0.0, 0.4, 1.0)
 TABLE = ql.Schedule(POINTS, b0=B0)
 LEARNERS: dict[str, Any] = {
-    "Kalman": ql.learners.Kalman(state=False, u=True),
+    "Kalman": ql.learners.Kalman(state=False),
     "Harmonic": ql.learners.Harmonic(omegas=(25.0,), state=False),
     "Repetitive": ql.learners.Repetitive(period=0.25),
-    "BatchGradient": ql.learners.BatchGradient(ql.features.Periodic(period=0.25), rate=1e-4),
+    "BatchGradient": ql.learners.BatchGradient(rate=1e-5, u=False),
 }
 
 
@@ -55,17 +55,17 @@ def run(
 # ---- At a fixed signal ----
 
 
-@pytest.mark.parametrize("guarded", [True, False])
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize(
+    ("name", "guarded"),
+    [*((name, False) for name in LEARNERS), ("Kalman", True), ("Harmonic", True)],
+)
 def test_a_learner_at_a_fixed_signal_is_the_one_for_the_b0_there(name: str, guarded: bool) -> None:
     """The loop, its f_L and its guard: f/b0 is learned, so it does not matter which b0 the observer has."""
-    if name == "Repetitive" and guarded:
-        guarded = False
     parts: dict[str, Any] = {"learner": LEARNERS[name], "guard": ql.Guard() if guarded else None}
     law = ql.ADRC(free(), 40.0, schedule=TABLE, **parts)
     load = ql.signals.Sinusoid(amplitude=0.2, omega=25.0) + ql.signals.Constant(0.1)
     found, own = (run(each, 0.7, load, 2.0) for each in (law, law.at(0.7)))
-    assert float(np.max(np.abs(own["f_learned"]))) > 10.0
+    assert float(np.max(np.abs(own["f_learned"]))) > 1.0
     for channel in ("u", "f_learned", "f_residual"):
         size = float(np.max(np.abs(own[channel])))
         np.testing.assert_allclose(found[channel], own[channel], rtol=0.0, atol=1e-6 * size)
@@ -161,19 +161,18 @@ def test_at_rest_under_a_load_that_is_learned_u_does_not_jump(guarded: bool) -> 
 
 
 def test_what_was_learned_at_one_inertia_is_right_at_another() -> None:
-    """A periodic load, learned at the smallest inertia: at the largest the first period is as good as later ones."""
+    """A periodic load, learned at the smallest inertia: the jump to the largest leaves no error."""
     load = ql.signals.Sinusoid(amplitude=0.2, omega=25.0)
     law = ql.ADRC(free(), 40.0, learner=LEARNERS["Harmonic"], guard=ql.Guard(), schedule=TABLE)
-    found = run(law, ql.signals.Step(at=8.0, height=1.0), load, 12.0)
+    found = run(law, ql.signals.Step(at=5.0, height=1.0), load, 5.5)
     period = 2 * math.pi / 25.0
 
     def rms(start: float) -> float:
         part = (found.t >= start) & (found.t < start + period)
         return float(np.sqrt(np.mean(found["y"][part] ** 2)))
 
-    assert rms(8.0) < 1.5 * rms(11.5)
     plain = run(ql.ADRC(free(), 40.0, schedule=TABLE), 1.0, load, 2.0)
-    assert rms(8.0) < 0.02 * float(np.sqrt(np.mean(plain["y"][plain.t > 1.0] ** 2)))
+    assert rms(5.0) < 1e-6 * float(np.sqrt(np.mean(plain["y"][plain.t > 1.0] ** 2)))
 
 
 def test_a_learner_that_knows_the_load_stays_right_while_the_inertia_moves() -> None:
@@ -183,8 +182,8 @@ def test_a_learner_that_knows_the_load_stays_right_while_the_inertia_moves() -> 
     errors = []
     for learner in (None, LEARNERS["Harmonic"]):
         law = ql.ADRC(free(), 40.0, learner=learner, schedule=TABLE)
-        found = run(law, signal, load, 10.0)
-        errors.append(float(np.sqrt(np.mean(found["y"][found.t > 8.0] ** 2))))
+        found = run(law, signal, load, 5.0)
+        errors.append(float(np.sqrt(np.mean(found["y"][found.t > 4.0] ** 2))))
     assert errors[1] < 0.01 * errors[0]
 
 
@@ -285,10 +284,10 @@ dt = 0.001
 plant = { kind = "linear", A = [[0.0, 1.0], [0.0, 0.0]], B = [0.0, 1000.0], C = [1.0, 0.0] }
 observer = { kind = "model-free", order = 2, b0 = 1000.0, omega_o = 200.0 }
 scenario = { duration = 0.3, reference = 0.1, schedule = [0.3] }
+guard = {}
+learner = { kind = "harmonic", omegas = [25.0] }
 [controller]
 omega_c = 40.0
-learner = { kind = "harmonic", omegas = [25.0] }
-guard = {}
 held = {}
 safe_set = { y_max = 0.5, alpha = 15.0 }
 feedforward = { kind = "rigid", inertia = 1e-3, coulomb = 0.01 }

@@ -13,6 +13,7 @@ from quell.controllers import (
     ADRC,
     Compensator,
     Feedforward,
+    HeldPlant,
     LinearController,
     NonlinearFeedback,
     OnlineGain,
@@ -259,7 +260,10 @@ _SERIES: Mapping[str, Callable[..., Any]] = {
     "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
-_PARTS = {"safe_set": call_table("safe-set", SafeSet, only=True) | None}
+_PARTS = {
+    "safe_set": call_table("safe-set", SafeSet, only=True) | None,
+    "held": call_table("held-plant", HeldPlant, only=True) | None,
+}
 _SCHEDULES = {"table": Schedule, "online-gain": OnlineGain}
 _PARTS["schedule"] = one_of(_call_tables(_SCHEDULES), default="table") | None
 _LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **_PARTS}
