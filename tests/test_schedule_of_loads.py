@@ -95,7 +95,7 @@ def test_a_safe_set_at_a_fixed_signal_is_the_one_for_the_b0_there() -> None:
     safe = ql.SafeSet(y_max=0.5, alpha=15.0, f_rate=60.0, noise=1e-6)
     law = ql.ADRC(free(), 40.0, safe_set=safe, schedule=TABLE)
     r = ql.signals.Step(at=0.05, height=0.7)
-    load = ql.signals.Sinusoid(amplitude=0.05, omega=6.0)
+    load = ql.signals.Sinusoid(amplitude=0.004, omega=6.0)  # |b0 d'| ≤ 48
     lightest = run(law, 0.0, load, 0.8, r)
     assert lightest.status & ql.Status.SAFE_SET_ACTED
     np.testing.assert_allclose(
@@ -104,6 +104,7 @@ def test_a_safe_set_at_a_fixed_signal_is_the_one_for_the_b0_there() -> None:
     for signal in (0.0, 0.7, 1.0):
         found = run(law, signal, load, 0.8, r)
         assert found.status & ql.Status.SAFE_SET_ACTED
+        assert not found.status & ql.Status.UNSAFE
         assert 0.45 < float(np.max(found["y"])) <= 0.5
 
 
@@ -228,6 +229,18 @@ def test_an_inertia_that_jumps_in_a_move_leaves_no_error_where_a_model_is_fed_fo
     assert float(np.max(np.abs(plain["r"] - plain["y"])[plain.t > 1.07])) > 50.0 * before
 
 
+def test_at_rest_on_a_spring_that_the_model_knows_u_does_not_jump() -> None:
+    """The force of the spring stays as the other loads do, although it is a·x̂ and not in f̂."""
+    spring = ql.plants.LinearPlant([[0.0, 1.0], [-800.0, -3.0]], [0.0, 2000.0], [1.0, 0.0])
+    law = ql.ADRC(ql.ESO.model_based(spring, 200.0, DT), 40.0, schedule=TABLE)
+    law.set_signals(0.0)
+    law.start(0.5, 0.3)
+    assert law.step(0.5, 0.5) == pytest.approx(0.3, abs=1e-9)
+    law.set_signals(1.0)
+    u = [law.step(0.5, 0.5) for _ in range(20)]
+    np.testing.assert_allclose(u, 0.3, atol=1e-9)
+
+
 def test_y_stays_in_its_band_while_the_inertia_moves() -> None:
     """Under loads within the bound that the safe set was given, for b0 that moves by 10 in 0.2 s."""
     safe = ql.SafeSet(y_min=-0.5, y_max=0.5, alpha=15.0, f_rate=130.0, noise=1e-6)
@@ -237,15 +250,16 @@ def test_y_stays_in_its_band_while_the_inertia_moves() -> None:
         signal = ql.signals.Constant(0.5) + ql.signals.Sinusoid(
             amplitude=0.5, omega=15.0, phase=float(random.uniform(0, 6.28))
         )
-        omega = float(random.uniform(2.0, 8.0))  # |d'| ≤ 0.4/omega · omega/… [Nm/s]
+        omega = float(random.uniform(2.0, 8.0))  # |b0 d'| ≤ 120
         load = ql.signals.Sinusoid(
             amplitude=0.06 / omega, omega=omega, phase=float(random.uniform(0, 6.28))
         )
         steps = ql.signals.Samples(
             np.arange(0.0, 3.0, 0.25), random.uniform(-0.8, 0.8, 12), hold="previous"
         )
-        found = run(law, signal, load, 3.0, steps)
+        found = run(law, signal, load + ql.signals.Constant(0.3), 3.0, steps)
         assert found.status & ql.Status.SAFE_SET_ACTED
+        assert not found.status & ql.Status.UNSAFE
         assert float(np.max(np.abs(found["y"]))) <= 0.5
 
 
