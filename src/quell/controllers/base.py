@@ -74,6 +74,14 @@ def set_schedule_signals(controller: Any, state: Any, values: Vector) -> None:
     """
 
 
+@generic_with_default
+def set_held(controller: Any, state: Any, held: bool) -> None:
+    """Set whether the plant is held: u does not act until it is not.
+
+    Ignored by a controller without observer, which does not know it.
+    """
+
+
 @generic
 def write_row(controller: Any, state: Any, row: Vector) -> None:
     """Write the controller's ``channels`` into ``row``."""

@@ -37,12 +37,14 @@ from quell.controllers.base import (
     is_usable,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
     write_row,
 )
 from quell.controllers.compensator import Compensator, manual_operation
+from quell.controllers.held import rests_at_y
 from quell.controllers.law import AdrcDesign, AdrcState, known_now, unlimited_control
 from quell.controllers.prefilters import Wrapper, without_prefilters
 from quell.controllers.schedule import control_as_observed
@@ -115,6 +117,11 @@ def _set_schedule_signals(
     set_schedule_signals(design.compensator, state.compensator, values)
 
 
+@set_held.register(CompensatedDesign)
+def _set_held(design: CompensatedDesign, state: CompensatedState, held: bool) -> None:
+    set_held(design.compensator, state.compensator, held)
+
+
 @write_row.register(CompensatedDesign)
 def _write_row(design: CompensatedDesign, state: CompensatedState, row: Vector) -> None:
     row[0] = state.compensator.loop[0].r
@@ -152,6 +159,17 @@ def compensating_part(controller: Any) -> Compensator | None:
     """Return the part of a controller with the observer: itself, or its compensator; else None."""
     part = controller.compensator if isinstance(controller, Compensated) else controller
     return part if isinstance(part, Compensator) else None
+
+
+def can_be_held(controller: Any) -> bool:
+    """Return whether ``set_held`` has an effect: whether an observer in it knows the plant's rest.
+
+    The controller may be behind a prefilter, or in single precision.
+    """
+    while controller is not None and not isinstance(controller, Compensator):
+        inner = getattr(controller, "compensator", None)
+        controller = inner or getattr(controller, "controller", None)
+    return controller is not None and rests_at_y(controller.observer)
 
 
 def takes_control(controller: Any) -> bool:
