@@ -111,6 +111,16 @@ def set_applied_control(controller: Any, state: Any, u: float) -> None:
 
 
 @generic_with_default
+def hold_integrators(controller: Any, state: Any, u_before: float) -> None:
+    """Undo what the last ``control`` added to integrators: u does not act while a plant is held.
+
+    By default the controller is told that ``u_before`` was applied, which it was told before; so
+    its integrators stay within what its anti-windup leaves.
+    """
+    set_applied_control(controller, state, u_before)
+
+
+@generic_with_default
 def bumpless_transfer(controller: Any, state: Any) -> None:
     """Continue from the applied u at the next sample, as if the loop had been at rest until now.
 

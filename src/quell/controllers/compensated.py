@@ -7,7 +7,9 @@ Any controller gives u_0 from r and y, and the compensator adds what cancels the
 
 Limits are those of the sum. What they take is taken from u_0: the controller is told that it
 applied ``u_0 + u − u_unlimited``, so that its integrator does not wind up, whichever of the two
-parts asked for too much. In manual operation, too.
+parts asked for too much. In manual operation, too. While the plant is held (``set_held``) its
+integrator stays as it is (``hold_integrators``): u_0 follows the reference with the rest of the
+law, and the release finds the integrator as the brake has found it.
 
 Where a measurement is missing, both receive the one that the observer expects.
 
@@ -34,6 +36,7 @@ from quell.controllers.base import (
     bumpless_transfer,
     check_controller,
     control,
+    hold_integrators,
     is_usable,
     reset_loop,
     set_applied_control,
@@ -92,6 +95,9 @@ def _control(design: CompensatedDesign, state: CompensatedState, r: float, y: fl
         measured = expected_measurement(eso, z, observed, known)
     given = control(design.controller, state.controller, r, measured)
     u = control(design.compensator, state.compensator, given, y)
+    if inner.held != 0.0:
+        hold_integrators(design.controller, state.controller, loop.u_given)
+        return u
     loop.u_given = given
     if int(inner.status) & _CUT != 0 or inner.manual != 0.0:
         wished = unlimited_control(
@@ -143,9 +149,10 @@ def _reset_loop(design: CompensatedDesign, state: CompensatedState) -> None:
 
 @set_applied_control.register(CompensatedDesign)
 def _set_applied_control(design: CompensatedDesign, state: CompensatedState, u: float) -> None:
-    loop = state.loop[0]
-    loop.u_given += u - state.compensator.loop[0].u
-    set_applied_control(design.controller, state.controller, loop.u_given)
+    loop, inner = state.loop[0], state.compensator.loop[0]
+    if inner.held == 0.0:
+        loop.u_given += u - inner.u
+        set_applied_control(design.controller, state.controller, loop.u_given)
     set_applied_control(design.compensator, state.compensator, u)
 
 
