@@ -31,6 +31,7 @@ from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
+from quell.controllers.state_feedback import Regulator, regulator, state_feedback
 
 __all__ = [
     "ADRC",
@@ -51,6 +52,7 @@ __all__ = [
     "Prefiltered",
     "ProfileGenerator",
     "ReferenceModel",
+    "Regulator",
     "SafeSet",
     "Schedule",
     "TrackingDifferentiator",
@@ -60,5 +62,7 @@ __all__ = [
     "equal_to_pid",
     "in_single_precision",
     "omega_c_for",
+    "regulator",
+    "state_feedback",
     "warn_if_unwise",
 ]

@@ -290,7 +290,7 @@ def extended_model(
     whole[:n, :n], whole[:n, n : n + q] = A, E
     whole[n : size - q, n + q :] = np.eye(size - n - q)
     rows = np.hstack([C, np.zeros((p, size - n))])
-    units = _units(whole, rows / sizes[:, None], omega)
+    units = units_of(whole, rows / sizes[:, None], omega)
     continuous = whole * units[None, :] / units[:, None]
     inner = continuous[: n + q, : n + q]
     inputs = np.vstack([np.hstack([B, E]) / units[:n, None], np.zeros((q, B.shape[1] + q))])
@@ -312,8 +312,11 @@ def extended_model(
     )
 
 
-def _units(whole: Matrix, rows: Matrix, omega: float) -> Vector:
-    """Return the units (N,) of the extended states, rounded to powers of two."""
+def units_of(whole: Matrix, rows: Matrix, omega: float) -> Vector:
+    """Return units (N,) of the states of ``x' = whole x``, powers of two.
+
+    One of them moves one of the outputs ``rows x`` by one, within 1/omega.
+    """
     from scipy.linalg import expm, matrix_balance
 
     balanced, (scale, _) = matrix_balance(whole, permute=False, separate=True)
@@ -493,6 +496,26 @@ class MultivariableDesign(NamedTuple):
             period=self.due.shape[0],
             predictor=self.predictor,
         )
+
+
+# Below this ratio of singular values a direction counts as undecided. Chosen by hand.
+_RANK = 1e-9
+
+
+def settle(stages: list[tuple[Matrix, Vector]], units: Vector) -> Vector:
+    """Return x (N,) with the least ``|rows x − wanted|``, one pair of these after the other.
+
+    Each stage decides what those before it leave open. ``units`` are those of x.
+    """
+    found, free = np.zeros(units.size), np.eye(units.size)
+    for rows, wanted in stages:
+        scaled = rows * units
+        size = float(np.max(np.abs(scaled), initial=np.finfo(np.float64).tiny))
+        left = scaled @ free / size
+        found += free @ (np.linalg.pinv(left, rcond=_RANK) @ ((wanted - scaled @ found) / size))
+        _, values, right = np.linalg.svd(left)
+        free = free @ right[int(np.count_nonzero(values > _RANK)) :].T
+    return found * units
 
 
 # Most sets of measured outputs and samples of a period that have gains of their own; 2 outputs at

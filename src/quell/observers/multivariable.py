@@ -59,6 +59,7 @@ from quell.observers.gains import (
     check_existence,
     extended_model,
     rates_of,
+    settle,
 )
 from quell.observers.multivariable_forms import (
     GainModel,
@@ -68,9 +69,6 @@ from quell.observers.multivariable_forms import (
     observe_sample,
 )
 from quell.types import Matrix, Vector
-
-# Below this ratio of singular values a direction counts as undecided at rest. Chosen by hand.
-_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,21 +207,16 @@ class MultivariableESO:
         y, u = self._measurements("y", y), self._inputs("u", u, self.B.shape[1])
         (n, q), known = self.E.shape, np.isfinite(y)
         units = self._scaled.units[: n + q]
-        stages = (  # each decides what those before it leave open
-            (np.hstack([self.C[known], np.zeros((int(known.sum()), q))]), (y - self.D @ u)[known]),
+        shown = np.hstack([self.C[known], np.zeros((int(known.sum()), q))])
+        size = np.linalg.norm(shown * units, axis=1)
+        stages = [  # each decides what those before it leave open
+            (shown / size[:, None], (y - self.D @ u)[known] / size),
             (np.hstack([self.A, self.E]) / units[:n, None], -(self.B @ u) / units[:n]),
             (np.eye(n + q)[n:] / units[n:, None], np.zeros(q)),
             (np.eye(n + q)[:n] / units[:n, None], np.zeros(n)),
-        )
-        found, free = np.zeros(n + q), np.eye(n + q)
-        for rows, wanted in stages:
-            scaled = rows * units
-            size = np.max(np.abs(scaled), axis=1, initial=np.finfo(np.float64).tiny)
-            left = (scaled @ free) / size[:, None]
-            found += free @ (np.linalg.pinv(left, rcond=_RANK) @ ((wanted - scaled @ found) / size))
-            _, values, right = np.linalg.svd(left)
-            free = free @ right[int(np.count_nonzero(values > _RANK)) :].T
-        return np.append(found * units, np.zeros(self.estimates - n - q))
+        ]
+        found = settle(stages, units)
+        return np.append(found, np.zeros(self.estimates - n - q))
 
     def filter(self, y: Any, u: Any, d_known: Any = None, start: Any = None) -> Matrix:
         """Return the estimates (K, N) for a record of K samples.
