@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag, expm
+from scipy.linalg import block_diag, expm, solve_discrete_are
 
-from quell.controllers import regulator, state_feedback
+from quell.controllers import quadratic_feedback, regulator, state_feedback
 from quell.observers.eso import ESO
 
-from .test_multivariable import DT, ENCODERS, JM, LOAD, SERVO, TORQUE, K
+from .test_multivariable import DT, ENCODERS, JL, JM, LOAD, SERVO, TORQUE, K
 
 AT_LOAD = ENCODERS[1:]
 
@@ -86,6 +86,21 @@ def test_all_poles_of_a_servos_loop_lie_in_one_place(omega_c: float, dt: float) 
     np.testing.assert_allclose(found, [1, 4, 6, 4, 1], atol=1e-3)
 
 
+@pytest.mark.parametrize("dt", [DT, 1e-3])
+@pytest.mark.parametrize("omega_c", [30.0, 120.0, 400.0])
+def test_the_quadratic_feedback_is_that_of_the_riccati_equation(omega_c: float, dt: float) -> None:
+    """SciPy's solution for a servo, and the rigid axis' bandwidth where that is slow."""
+    weight, control = AT_LOAD.T @ AT_LOAD, 1.0 / ((JM + JL) ** 2 * omega_c**4)
+    gain = quadratic_feedback(SERVO, TORQUE, weight, control, dt)
+    held = expm(np.block([[SERVO, TORQUE], [np.zeros((1, 5))]]) * dt)
+    phi, gamma = held[:4, :4], held[:4, 4:]
+    P = solve_discrete_are(phi, gamma, weight, [[control]])
+    wanted = np.linalg.solve(control + gamma.T @ P @ gamma, gamma.T @ P @ phi)
+    np.testing.assert_allclose(gain, wanted, rtol=1e-5, atol=1e-6 * np.max(np.abs(wanted)))
+    slow = np.sort(np.abs(np.log(np.linalg.eigvals(phi - gamma @ gain).astype(complex))))[0] / dt
+    assert slow == pytest.approx(omega_c, rel=0.1)
+
+
 def test_axes_that_are_not_coupled_have_gains_of_their_own() -> None:
     """Two double integrators: ω_c² and 2 ω_c over each axis' own gain."""
     A = block_diag(*[np.diag([1.0], 1)] * 2)
@@ -101,6 +116,9 @@ def test_axes_that_are_not_coupled_have_gains_of_their_own() -> None:
         (lambda: state_feedback(SERVO, [0.0] * 4, 20.0, DT), "u must move all states"),
         (lambda: state_feedback(SERVO, TORQUE, 0.0, DT), "omega_c = 0.0"),
         (lambda: state_feedback(SERVO, TORQUE, 20.0, -1.0), "dt = -1.0"),
+        (lambda: quadratic_feedback(SERVO, TORQUE, np.eye(4), 0.0, DT), "control_weight = 0.0"),
+        (lambda: quadratic_feedback(SERVO, TORQUE, np.eye(3), 1.0, DT), "state_weight has shape"),
+        (lambda: quadratic_feedback(SERVO, TORQUE, 0.0 * SERVO, 1.0, DT), "state_weight must see"),
         (lambda: state_feedback(SERVO, [1.0], 20.0, DT), "B has shape"),
     ],
 )

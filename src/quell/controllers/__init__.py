@@ -31,7 +31,12 @@ from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
-from quell.controllers.state_feedback import Regulator, regulator, state_feedback
+from quell.controllers.state_feedback import (
+    Regulator,
+    quadratic_feedback,
+    regulator,
+    state_feedback,
+)
 
 __all__ = [
     "ADRC",
@@ -62,6 +67,7 @@ __all__ = [
     "equal_to_pid",
     "in_single_precision",
     "omega_c_for",
+    "quadratic_feedback",
     "regulator",
     "state_feedback",
     "warn_if_unwise",

@@ -19,8 +19,10 @@ not, the state has to move, as a spring is wound up before it carries a load. Wi
 for a constant d, and each further derivative adds what its change needs. X and U are the same for
 the reference: ``A X + B U = 0``, ``C X = I``.
 
-K has all poles of ``Φ − Γ_u K`` at ``exp(−omega_c dt)``: the gain of an observer of the transposed
-system (``observers/gains.py``).
+``state_feedback`` puts all poles of ``Φ − Γ_u K`` at ``exp(−omega_c dt)``, ``quadratic_feedback``
+minimises a quadratic cost: the gains of observers of the transposed system
+(``observers/gains.py``). A flexible mode far above omega_c is better left where it is, which the
+second one does; to move it costs large gains.
 """
 
 from __future__ import annotations
@@ -33,7 +35,13 @@ import numpy as np
 from quell import checks
 from quell.lti.models import zero_order_hold
 from quell.lti.zeros import fitting_matrices
-from quell.observers.gains import place_equal_poles, settle, units_of
+from quell.observers.gains import (
+    kalman_gain_of,
+    place_equal_poles,
+    predicted_covariances,
+    settle,
+    units_of,
+)
 from quell.types import Matrix
 
 # An equation that is left with more than this share of its terms has no solution. Chosen by hand.
@@ -160,6 +168,56 @@ def state_feedback(A: Any, B: Any, omega_c: float, dt: float) -> Matrix:
         )
     found: Matrix = gain.T * units[None, :]
     return found
+
+
+def quadratic_feedback(A: Any, B: Any, state_weight: Any, control_weight: Any, dt: float) -> Matrix:
+    """Return K (m, n) of ``u = −K x`` with the least ``Σ xᵀ Q x + uᵀ R u`` over the samples.
+
+    Parameters
+    ----------
+    A, B
+        matrices (n, n) and (n, m), or a vector (n,) for one input.
+    state_weight
+        Q (n, n), symmetric, without negative eigenvalues. ``C.T @ C`` weighs the outputs ``C x``.
+    control_weight
+        the diagonal of R (m,), above zero. An inertia J with the weight 1 on its angle and
+        ``1/(J² omega_c⁴)`` on the torque has poles of the radius omega_c, with a damping of 0.7.
+    dt
+        sample time [s]; u is held over a sample.
+
+    Raises
+    ------
+    ValueError
+        for weights that do not fit; if u does not stabilise all states, or the cost does not see
+        an unstable one.
+
+    Examples
+    --------
+    >>> A, B, Q = [[0.0, 1.0], [0.0, 0.0]], [0.0, 2.0], [[1.0, 0.0], [0.0, 0.0]]
+    >>> quadratic_feedback(A, B, Q, 4.0 / 10.0**4, 1e-5).round(2).tolist()
+    [[50.0, 7.07]]
+    """
+    A, B, _, _ = fitting_matrices(A, B, np.eye(np.shape(A)[0]))
+    n, m = B.shape
+    dt = checks.positive("dt", dt, "s")
+    Q = checks.weight("state_weight", state_weight, n)
+    R = checks.vector("control_weight", control_weight, m)
+    if not np.all(R > 0.0):
+        raise ValueError(f"control_weight = {control_weight!r}: each entry must be above zero")
+    phi, (gamma,) = zero_order_hold(A, [B], dt)
+    units = units_of(A.T, B.T / np.sqrt(R)[:, None], 0.1 / dt)
+    transition, inputs = phi.T * units[None, :] / units[:, None], gamma.T * units[None, :]
+    cost = Q / (units[:, None] * units[None, :])
+    found = predicted_covariances(transition, cost, inputs, R, np.ones((1, m)))
+    if found is None:
+        raise ValueError(
+            f"control_weight = {R.tolist()!r} with dt = {dt!r} s: no gain is stable and has the "
+            "least cost; u must move all states that do not decay, and state_weight must see them"
+        )
+    # The filter's gain L corrects after the prediction; the law acts before it: K = (Φᵀ L)ᵀ.
+    gain = transition @ kalman_gain_of(found[0], inputs, R, np.ones(m, dtype=bool))
+    law: Matrix = (gain * units[:, None]).T
+    return law
 
 
 def _equilibrated(matrix: Matrix) -> tuple[Matrix, Matrix]:
