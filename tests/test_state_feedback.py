@@ -12,7 +12,7 @@ from scipy.linalg import block_diag, expm, solve_discrete_are
 from quell.controllers import quadratic_feedback, regulator, state_feedback
 from quell.observers.eso import ESO
 
-from .test_multivariable import DT, ENCODERS, JL, JM, LOAD, SERVO, TORQUE, K
+from .test_multivariable_observer import DT, ENCODERS, JL, JM, LOAD, SERVO, TORQUE, K
 
 AT_LOAD = ENCODERS[1:]
 

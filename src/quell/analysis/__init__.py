@@ -5,9 +5,12 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 
 from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify, observer_error
+from quell.analysis.disk import DiskMargin
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
+from quell.analysis.matrices import MatrixLaw, axes_law
+from quell.analysis.multivariable import MultivariableLoop, Peak, Pole
 from quell.analysis.online import OnlineCertificate, certify_online
 from quell.analysis.plots import (
     loops_over_omega_o,
@@ -31,16 +34,22 @@ from quell.lti.zeros import (
 __all__ = [
     "Adapting",
     "Certificate",
+    "DiskMargin",
     "Existence",
     "Finding",
     "Frozen",
     "InvariantZeros",
     "LoopAnalysis",
     "Margins",
+    "MatrixLaw",
+    "MultivariableLoop",
     "OnlineCertificate",
+    "Peak",
+    "Pole",
     "adapting",
     "advise",
     "analyse",
+    "axes_law",
     "certify",
     "certify_online",
     "frozen",
