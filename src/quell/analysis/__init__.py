@@ -5,6 +5,7 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 
 from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify, observer_error
+from quell.analysis.coupling import Coupling, coupling, relative_gains
 from quell.analysis.disk import DiskMargin
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
@@ -34,6 +35,7 @@ from quell.lti.zeros import (
 __all__ = [
     "Adapting",
     "Certificate",
+    "Coupling",
     "DiskMargin",
     "Existence",
     "Finding",
@@ -52,6 +54,7 @@ __all__ = [
     "axes_law",
     "certify",
     "certify_online",
+    "coupling",
     "frozen",
     "invariant_zeros",
     "linear_law",
@@ -65,5 +68,6 @@ __all__ = [
     "plot_margins_over_time",
     "plot_nyquist",
     "plot_root_locus",
+    "relative_gains",
     "unobservable_modes",
 ]
