@@ -5,6 +5,7 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 
 from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify, observer_error
+from quell.analysis.coupled import CoupledCertificate, certify_axes, certify_coupled
 from quell.analysis.coupling import Coupling, coupling, relative_gains
 from quell.analysis.disk import DiskMargin
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
@@ -35,6 +36,7 @@ from quell.lti.zeros import (
 __all__ = [
     "Adapting",
     "Certificate",
+    "CoupledCertificate",
     "Coupling",
     "DiskMargin",
     "Existence",
@@ -53,6 +55,8 @@ __all__ = [
     "analyse",
     "axes_law",
     "certify",
+    "certify_axes",
+    "certify_coupled",
     "certify_online",
     "coupling",
     "frozen",
