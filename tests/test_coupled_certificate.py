@@ -12,6 +12,7 @@ import quell as ql
 from quell import analysis
 from quell.analysis import certify_axes, certify_coupled
 from quell.analysis.coupled import coupled_loop
+from quell.guard.guard import state_path
 from quell.lti.models import MatrixSystem, System, zero_order_hold
 from quell.plants.linear import sampled_plant
 from quell.types import Matrix
@@ -98,10 +99,7 @@ def test_the_gains_are_those_of_the_loop_with_the_controllers_themselves() -> No
     x, states = np.zeros(4), [np.zeros(law.A.shape[0]) for law in laws]
     K = np.linalg.inv(known)
     # The path from e_L to w starts with its feedthrough of one: w[0] = e_L[0].
-    pulse, (expected, state) = np.zeros((60, 2)), (np.zeros((60, 2)), None)
-    w = np.zeros((60, 2))
-    from quell.guard.guard import state_path
-
+    pulse, expected, w = np.zeros((60, 2)), np.zeros((60, 2)), np.zeros((60, 2))
     path = state_path(plain[0].observer, plain[0].parameters.law)
     inner = np.zeros(path.N.shape[0])
     for k in range(60):
