@@ -12,6 +12,7 @@ from quell.controllers.adrc import (
     dead_time_tuning,
     warn_if_unwise,
 )
+from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, omega_c_for
 from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
@@ -34,6 +35,7 @@ from quell.controllers.single import in_single_precision
 
 __all__ = [
     "ADRC",
+    "Axes",
     "Compensated",
     "Compensator",
     "Controller",
