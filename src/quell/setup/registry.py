@@ -242,10 +242,9 @@ def _call_tables(
     functions: Mapping[str, Callable[..., Any]],
     types: Mapping[str, Any] | None = None,
     descriptions: Mapping[str, str] | None = None,
-    beside: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> dict[str, type[CallTable]]:
     return {
-        kind: call_table(kind, function, types=types, descriptions=descriptions, beside=beside)
+        kind: call_table(kind, function, types=types, descriptions=descriptions)
         for kind, function in functions.items()
     }
 
