@@ -389,10 +389,10 @@ def print_missing(console: Console, seed: int) -> None:
             gone = np.repeat(random.random(samples // burst) < share, burst)
             there[gone, 1] = math.nan
             for options in kinds.values():
-                found = ESO.state_space(A, AT_MOTOR, ANGLES, BOTH, DT, **options).filter(there, u)
-                row.append(
-                    f"{1e6 * np.sqrt(np.mean((found[2000:, 2] - angles[2000:, 1]) ** 2)):.3g}"
-                )
+                observer = ESO.state_space(A, AT_MOTOR, ANGLES, BOTH, DT, **options)
+                error = observer.filter(there, u)[2000:, 2] - angles[2000:, 1]
+                lost = not np.max(np.abs(error)) < 1.0
+                row.append("diverges" if lost else f"{1e6 * np.sqrt(np.mean(error**2)):.3g}")
             name = f"{share:.0%}" + (f" in bursts of {burst}" if burst > 1 else "")
             if share > 0.0 or burst == 1:
                 table.add_row(name, *row)
