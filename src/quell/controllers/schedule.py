@@ -660,7 +660,9 @@ class Schedule:
         two of them for tables over two signals.
     b0
         nominal control gain at the points [y-unit/u-unit/s^n], all of one sign; of two signals a
-        list for each point of the first one. That of the observer by default.
+        list for each point of the first one. That of the observer by default. It is 1/J of an
+        inertia; a learner, and the inertia of a model's feedforward, refer to the observer's b0. A
+        learner's bounds of noise are those there: take a small one for a noisy y.
     omega_c
         controller bandwidth at the points [rad/s]; that of the controller by default.
     omega_o
