@@ -5,6 +5,8 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 
 from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify, observer_error
+from quell.analysis.coupled import CoupledCertificate, certify_axes, certify_coupled
+from quell.analysis.coupling import Coupling, coupling, relative_gains
 from quell.analysis.disk import DiskMargin
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
@@ -34,6 +36,8 @@ from quell.lti.zeros import (
 __all__ = [
     "Adapting",
     "Certificate",
+    "CoupledCertificate",
+    "Coupling",
     "DiskMargin",
     "Existence",
     "Finding",
@@ -51,7 +55,10 @@ __all__ = [
     "analyse",
     "axes_law",
     "certify",
+    "certify_axes",
+    "certify_coupled",
     "certify_online",
+    "coupling",
     "frozen",
     "invariant_zeros",
     "linear_law",
@@ -65,5 +72,6 @@ __all__ = [
     "plot_margins_over_time",
     "plot_nyquist",
     "plot_root_locus",
+    "relative_gains",
     "unobservable_modes",
 ]

@@ -72,6 +72,9 @@ _TOWARDS_ZERO = 1e-3
 # Error of an eigenvalue in units of the rounding error over its condition; chosen by hand.
 _EPSILON = float(np.finfo(float).eps)
 _ROUNDING = 10.0 * _EPSILON
+# Radius of the circle on which rounding puts a repeated pole, in units of ‖A‖ and the root of ε,
+# and the distance of two poles that differ, in units of their errors; chosen by hand.
+_CIRCLE, _APART = 2.0, 3.0
 # Error of the mean of a repeated pole, as a share of the distance of its members; chosen by hand.
 _MEAN = 1e-3
 
@@ -126,9 +129,9 @@ class MultivariableLoop:
     >>> law = (np.zeros((2, 2)), np.eye(2), 100.0 * np.eye(2), D_y)
     >>> loop = MultivariableLoop((A, B, C), law, dt=0.01)
     >>> loop.stable, round(loop.m_s("outputs").value, 2)
-    (True, 1.64)
+    (True, 2.12)
     >>> round(loop.disk_margin("both").alpha, 3)
-    0.499
+    0.234
     """
 
     def __init__(
@@ -230,7 +233,7 @@ class MultivariableLoop:
 
     @cached_property
     def _grouped(self) -> list[Pole]:
-        return _groups(self._closed())
+        return grouped_poles(self._closed())
 
     @property
     def poles(self) -> list[Pole]:
@@ -480,12 +483,12 @@ def _channel_names(
     return found
 
 
-def _groups(N: Matrix) -> list[Pole]:
-    """Return the poles with their multiplicities, the slowest first.
+def grouped_poles(N: Matrix) -> list[Pole]:
+    """Return the poles of ``A = N + I`` with their multiplicities, the slowest first.
 
-    Rounding moves an eigenvalue by up to ε ‖N‖ over its condition, the product of its left and its
-    right eigenvector: that of a pole that is repeated k times is about the k-th root of ε. Poles
-    whose distance is within their errors are one.
+    Rounding moves an eigenvalue by up to ε ‖A‖ over its condition, the product of its left and its
+    right eigenvector, and one that is repeated k times by about the k-th root of ε. Poles whose
+    distance is within the errors of both are one.
     """
     from scipy.linalg import eig, matrix_balance
 
@@ -495,14 +498,19 @@ def _groups(N: Matrix) -> list[Pole]:
         return found
     scaled = matrix_balance(whole, permute=False)[0]
     values, left, right = eig(scaled, left=True, right=True)
-    angle = np.abs(np.sum(left.conj() * right, axis=0))
-    norm = float(np.linalg.norm(scaled, 2))
-    # No eigenvalue of a matrix of this size is more sensitive than that of a single Jordan block.
-    error = _ROUNDING * norm / np.maximum(angle, _EPSILON ** (1.0 - 1.0 / values.size))
-    # A repeated pole lies on a circle around the mean, each within its own error of it.
-    group = np.arange(values.size)
-    for i in range(values.size):
-        near = np.abs(values - values[i]) <= 2.0 * np.maximum(error, error[i])
+    # A itself is rounded, not only what is left of it without I.
+    size, norm = values.size, float(np.linalg.norm(scaled + np.eye(len(scaled)), 2))
+    condition = np.abs(np.sum(left.conj() * right, axis=0))
+    away = np.abs(values[:, None] - values)
+    # The circle of a pole that is repeated k times, for the largest k that has as many poles in it.
+    circles = _CIRCLE * norm * _EPSILON ** (1.0 / np.arange(1.0, size + 1.0))
+    inside = np.sort(away, axis=1) <= circles
+    circle = circles[size - 1 - np.argmax(inside[:, ::-1], axis=1)]
+    error = np.minimum(_ROUNDING * norm / np.maximum(condition, _EPSILON**2), circle)
+    error = np.maximum(error, _ROUNDING * norm)
+    group = np.arange(size)
+    for i in range(size):
+        near = away[i] <= _APART * np.minimum(error, error[i])
         group[np.isin(group, group[near])] = group[i]
     for label in np.unique(group):
         members = values[group == label]

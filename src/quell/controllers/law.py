@@ -54,6 +54,7 @@ from quell.controllers.base import (
     largest_magnitude,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
@@ -716,6 +717,11 @@ def _set_reference_derivatives(design: AdrcDesign, state: AdrcState, derivatives
 @set_schedule_signals.register(AdrcDesign)
 def _set_schedule_signals(design: AdrcDesign, state: AdrcState, values: Vector) -> None:
     set_signals(design.schedule, state.schedule, values, -1)
+
+
+@set_held.register(AdrcDesign)
+def _set_held(design: AdrcDesign, state: AdrcState, held: bool) -> None:
+    state.loop[0].held = 1.0 if held else 0.0
 
 
 @write_row.register(AdrcDesign)

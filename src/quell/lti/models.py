@@ -368,12 +368,6 @@ class MatrixSystem(NamedTuple):
         """Return the system from one input to one output."""
         return System(self.N, self.B[:, input], self.C[output], float(self.D[output, input]))
 
-    @property
-    def largest_pole(self) -> float:
-        """Largest |z| of all poles; 0 without states."""
-        size = self.N.shape[0]
-        return System(self.N, np.zeros(size), np.zeros(size), 0.0).largest_pole
-
 
 # ---- Exact sampling of linear models ----
 

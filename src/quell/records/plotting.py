@@ -39,9 +39,9 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0
 _DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
 
 
-def thinned(t: Vector, values: Vector, points: int = _POINTS) -> tuple[Vector, Vector]:
-    """Return about ``points`` samples that draw the same line: the extremes of each interval."""
-    interval = t.size // (points // 2)
+def thinned(t: Vector, values: Vector) -> tuple[Vector, Vector]:
+    """Return about ``_POINTS`` samples that draw the same line: the extremes of each interval."""
+    interval = t.size // (_POINTS // 2)
     if interval < 4:
         return t, values
     whole = t.size // interval * interval
