@@ -345,7 +345,8 @@ class ADRC(Compensator):
         if not isinstance(schedule, ScheduleDesign) or not schedule.has_b0:
             return schedule
         if not isinstance(self.feedforward, Feedforward):
-            return schedule._replace(cancel=observer.cancel)
+            has_model = bool(np.any(observer.cancel != 0.0))
+            return schedule._replace(cancel=observer.cancel if has_model else np.zeros(0))
         fixed, fixed_acting = self.feedforward.fixed(observer)
         return schedule._replace(fixed=fixed, fixed_acting=fixed_acting)
 

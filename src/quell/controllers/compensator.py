@@ -570,7 +570,8 @@ class Compensator(StatefulController):
     def _schedule_design(self, observer: ESO) -> Any:
         if self.schedule is None:
             return NoSchedule()
-        return self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+        schedule = self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+        return schedule._replace(fixed=np.ones(1) if schedule.has_b0 else np.zeros(0))  # u_0
 
     def _with_parts(self, schedule: Any, observer: ESO) -> Any:
         """Return parameters of a schedule with what the other parts of the controller need."""
@@ -579,6 +580,7 @@ class Compensator(StatefulController):
         return schedule._replace(
             extended=observer.disturbance_order if self._learns else 0,
             has_safe_set=self.safe_set is not None,
+            has_held=self.held is not None,
         )
 
     @property
