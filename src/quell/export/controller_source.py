@@ -9,6 +9,7 @@ import numpy as np
 from quell import checks
 from quell.controllers.base import (
     Limits,
+    change_parameters,
     check_controller,
     control,
     reset_loop,
@@ -375,7 +376,7 @@ class _Writer:
     def _add_retune(self) -> None:
         files = self.files
         new = Value(files.design.kind, "parameters", root="new")
-        call = files.call(c_files.retune, files.design, new, files.memory)
+        call = files.call(change_parameters, files.design, new, files.memory)
         files.add(
             "retune",
             f"void NAME({self.state}, const {self.name}_parameters *parameters)",

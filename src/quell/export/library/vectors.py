@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.controllers.base import (
+    change_parameters,
     control,
     reset_loop,
     set_held,
@@ -253,7 +254,7 @@ class Player:
                 c_files.hand_over(old, self.state)
             elif action in (Action.LIMIT, Action.FREE):
                 self.design = self.limited if action is Action.LIMIT else self.default
-                c_files.retune(old, self.design, self.state)
+                change_parameters(old, self.design, self.state)
             elif action in (Action.HELD, Action.RELEASED):
                 set_held(old, self.state, action is Action.HELD)
             elif action is Action.RESET:
