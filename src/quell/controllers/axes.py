@@ -530,6 +530,11 @@ class Axes(StatefulController):
         return len(self.axes)
 
     @property
+    def first_gain(self) -> Matrix:
+        """B0 before the first sample (n, m)."""
+        return self._gain.first.copy()
+
+    @property
     def _most(self) -> int:
         return max(axis.observer.order for axis in self.axes)
 
