@@ -142,7 +142,7 @@ CASES: dict[str, dict[str, Case]] = {
     },
     "rig": {
         "--device": (("--device", "udp://127.0.0.1:0"), ("--device", "udp://127.0.0.2:0")), "--plant": ("--plant", "two-mass"), "--dt": ("--dt", "0.002"), "--watchdog": ("--watchdog", "9"),
-        "--u-max": ("--u-max", "3"), "--rest": ("--no-rest",), "--wait": ("--wait", "0.001"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
+        "--u-max": ("--u-max", "3"), "--rest": ("--no-rest",), "--wait": ("--wait", "0.001"), "--channel": ("--channel", "0.5"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
     },
     "proxy": {
         "SETUP": ("slow.toml", "--host", "udp://127.0.0.1:0"), "--host": (("proxy.toml", "--host", "udp://127.0.0.1:0"), ("proxy.toml", "--host", "udp://127.0.0.2:0")), "--device": ("--device", "twin:two-mass"),

@@ -252,14 +252,16 @@ def b0(
 
 
 def _column(record: Path, by: str, read: ReadOptions, dt: float | None, size: int) -> Any:
-    """Return a further column of a table in text."""
-    from quell.commissioning import measured
+    """Return a further column of a table in text, or a channel of a recording."""
+    from quell.commissioning import controlled, measured, recorded_run
 
-    if record.suffix.lower() in (".nc", ".mcap"):
-        raise ValueError(
-            f"by = {by!r}: {record.name} is no table in text; write the recording as CSV "
-            "(quell run-rig --csv), or give u, y and the signal as columns of a table"
-        )
+    run = recorded_run(record, read.columns, dt, read.time_unit, read.max_size)
+    if run is not None:
+        widths = dict(run.channels)
+        if widths.get(by) != 1:
+            one = ", ".join(name for name, width in widths.items() if width == 1)
+            raise ValueError(f"by = {by!r}: must be a channel of {record.name}, one of {one}")
+        return run[by][controlled(run)]
     columns = [name.strip() for name in (read.columns or ("u,y" if dt else "t,u,y")).split(",")]
     names = ",".join([*columns[:-1], by])
     found = measured(record, names, dt, read.time_unit, read.max_size).y

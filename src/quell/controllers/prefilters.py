@@ -55,6 +55,7 @@ from quell.controllers.base import (
     is_usable,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
@@ -297,6 +298,11 @@ def _set_schedule_signals(
     design: PrefilteredDesign, state: PrefilteredState, values: Vector
 ) -> None:
     set_schedule_signals(design.controller, state.controller, values)
+
+
+@set_held.register(PrefilteredDesign)
+def _set_held(design: PrefilteredDesign, state: PrefilteredState, held: bool) -> None:
+    set_held(design.controller, state.controller, held)
 
 
 @write_row.register(PrefilteredDesign)

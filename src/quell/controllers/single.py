@@ -25,6 +25,7 @@ from quell.controllers.base import (
     control,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
@@ -182,6 +183,11 @@ def _set_reference_derivatives(design: SingleDesign, state: Any, derivatives: Ve
 @in_both_precisions
 def _set_schedule_signals(design: SingleDesign, state: Any, values: Vector) -> None:
     set_schedule_signals(design.controller, state, values)
+
+
+@set_held.register(SingleDesign)
+def _set_held(design: SingleDesign, state: Any, held: bool) -> None:
+    set_held(design.controller, state, held)
 
 
 @write_row.register(SingleDesign)

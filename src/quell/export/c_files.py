@@ -625,27 +625,6 @@ def _hand_over_both(design: CompensatedDesign, state: CompensatedState) -> bool:
 
 
 @generic
-def set_held(design: Any, state: Any, held: bool) -> None:
-    """Set whether the plant is held: u does not act until it is not."""
-    raise TypeError
-
-
-@set_held.register(AdrcDesign)
-def _set_held(design: AdrcDesign, state: AdrcState, held: bool) -> None:
-    state.loop[0].held = 1.0 if held else 0.0
-
-
-@set_held.register(PrefilteredDesign)
-def _set_held_inside(design: PrefilteredDesign, state: PrefilteredState, held: bool) -> None:
-    set_held(design.controller, state.controller, held)
-
-
-@set_held.register(CompensatedDesign)
-def _set_held_of_both(design: CompensatedDesign, state: CompensatedState, held: bool) -> None:
-    set_held(design.compensator, state.compensator, held)
-
-
-@generic
 def move_origin(design: Any, state: Any, distance: float) -> None:
     """Count y and r from a point that is ``distance`` further on."""
     raise TypeError

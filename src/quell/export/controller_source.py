@@ -12,6 +12,7 @@ from quell.controllers.base import (
     check_controller,
     control,
     reset_loop,
+    set_held,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -368,7 +369,7 @@ class _Writer:
             "Set whether the plant is held, by a brake for instance: u does not act until it is "
             "not.\n\nCall it when that changes. While it is held nothing winds up: the release "
             "makes no bump.",
-            f"    {files.call(c_files.set_held, *files.both, held)};",
+            f"    {files.call(set_held, *files.both, held)};",
         )
 
     def _add_retune(self) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from quell.controllers.base import (
     control,
     reset_loop,
+    set_held,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -254,7 +255,7 @@ class Player:
                 self.design = self.limited if action is Action.LIMIT else self.default
                 c_files.retune(old, self.design, self.state)
             elif action in (Action.HELD, Action.RELEASED):
-                c_files.set_held(old, self.state, action is Action.HELD)
+                set_held(old, self.state, action is Action.HELD)
             elif action is Action.RESET:
                 reset_loop(old, self.state)
             elif action is Action.START:
