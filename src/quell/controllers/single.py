@@ -157,7 +157,7 @@ def _with_longer(state: Any) -> Any:
         return state
     state = type(state)(*map(_with_longer, state))
     if isinstance(state, GuardMemory):
-        return state._replace(shown=np.append(state.shown, np.zeros(CARRIES)))
+        return state._replace(filtered=np.append(state.filtered, np.zeros(CARRIES)))
     if isinstance(state, KalmanMemory):
         state = state._replace(carry=np.zeros(state.theta.size))
     if isinstance(state, KalmanMemory | NoiseGateMemory):
