@@ -38,7 +38,12 @@ COUNT = math.tau / 2**20
 
 
 def servo(**options: Any) -> MultivariableESO:
-    """Return an observer of the servo with torques on the motor and on the load."""
+    """Return an observer of the servo with torques on the motor and on the load.
+
+    Gains by noise are fixed unless asked for otherwise.
+    """
+    if "omega_o" not in options:
+        options = {"time_varying": False} | options
     noise = {"noise_variance": [COUNT**2 / 12] * 2, "drift": [1.0, 1.0]}
     given = {"omega_o": 800.0} if "omega_o" in options else noise
     both = np.hstack([TORQUE, LOAD])
@@ -261,6 +266,51 @@ def test_all_poles_of_random_plants_lie_in_one_place() -> None:
             assert np.max(error) < 1e-5 * np.max(wanted)
 
 
+def test_units_do_not_matter() -> None:
+    """States, outputs, disturbances and time in units of 1e-6 to 1e6: the same observers."""
+    random = np.random.default_rng(11)
+    for case in range(25):
+        (A, B, C, E, dt), options = draw(random)
+        (n, q), p, m = E.shape, C.shape[0], 1 + case % 3
+        x, y, d = (10.0 ** random.uniform(-6, 6, size) for size in (n, p, q))
+        t = 10.0 ** random.uniform(-4, 3)
+        units = np.concatenate([x, *(d / t**i for i in range(m))])
+        plant = (
+            A * x[:, None] / x / t,
+            B * x[:, None] / t,
+            C * y[:, None] / x,
+            E * x[:, None] / d / t,
+        )
+        noise, drift = options["noise_variance"], options["drift"]
+        more: dict[str, Any] = {"accept_zeros": True, "disturbance_order": m}
+        pairs = (
+            ({"omega_o": 3.0}, {"omega_o": 3.0 / t}),
+            (
+                {"noise_variance": noise, "drift": drift},
+                {"noise_variance": noise * y**2, "drift": drift * d**2 / t ** (2 * m - 1)},
+            ),
+        )
+        for one, other in pairs:
+            wanted = ESO.state_space(A, B, C, E, dt, **one, **more).gains[0]
+            found = ESO.state_space(*plant, dt * t, **other, **more).gains[0] * y / units[:, None]
+            size = np.max(np.abs(wanted), axis=1, keepdims=True)
+            assert np.max(np.abs(found - wanted) / size) < 1e-5
+
+
+def test_the_predictor_form_knows_the_measurements_up_to_the_sample_before() -> None:
+    """Its estimates are the current form's, moved by one sample of the model."""
+    random = np.random.default_rng(8)
+    y, u = 1e-3 * random.normal(size=(40, 2)), random.normal(size=(40, 1))
+    for options in ({"omega_o": 800.0}, {}, {"time_varying": True}):
+        current, late = servo(**options), servo(**options, form="predictor")
+        model = servo(omega_o=800.0).model
+        known = current.filter(y, u, start=np.zeros(6))
+        found = late.filter(y, u, start=np.zeros(6))
+        wanted = known[:-1] @ model.transition.T + u[1:] @ model.input.T
+        size = np.max(np.abs(wanted), axis=0)
+        assert np.max(np.abs(found[1:] - wanted) / size) < 1e-12
+
+
 # ---- Missing samples and several rates ----
 
 
@@ -311,6 +361,28 @@ def test_a_missing_load_encoder_leaves_the_gain_that_suits_the_motors() -> None:
     assert max(abs(noisy.poles())) < 1.0
     assert max(abs(noisy.poles([1]))) < 1.0
     assert max(abs(servo().poles([1]))) == pytest.approx(1.0, abs=1e-9)  # two torques, one sensor
+
+
+def test_the_decay_with_samples_missing_is_that_of_the_mean_square() -> None:
+    """Without gaps the slowest pole; half of the load's samples are too many for a fast observer.
+
+    A slower one stands it, and says so: 4000 draws of 60 samples have that mean square.
+    """
+    fast, slow = servo(), servo(omega_o=800.0)
+    assert fast.rms_decay([0.0, 0.0]) == pytest.approx(np.max(np.abs(fast.poles())), rel=1e-6)
+    assert fast.rms_decay([0.0, 0.5]) > 1.0 > fast.rms_decay([0.0, 0.05])
+    assert servo(every=(1, 4)).rms_decay([0.0, 0.0]) < 1.0
+    assert slow.rms_decay([0.0, 0.5]) < 1.0
+    random = np.random.default_rng(4)
+    errors = random.normal(size=(4000, 6, 1))
+    both, motor = slow._error(0, np.array([True, True])), slow._error(0, np.array([True, False]))
+    sizes = []
+    for _ in range(60):
+        gone = random.random(4000) < 0.1
+        errors = np.where(gone[:, None, None], motor @ errors, both @ errors)
+        sizes.append(np.sqrt(np.mean(errors**2)))
+    measured = (sizes[-1] / sizes[29]) ** (1.0 / 30.0)
+    assert measured == pytest.approx(slow.rms_decay([0.0, 0.1]), abs=0.02)
 
 
 def test_what_is_not_measured_has_no_effect() -> None:
@@ -532,7 +604,7 @@ def test_bad_arguments_are_named(options: dict[str, Any], message: str) -> None:
 def test_options_without_effect_are_refused() -> None:
     """Gains by poles do not know what a sample is worth."""
     both = np.hstack([TORQUE, LOAD])
-    for option in ({"every": (1, 4)}, {"time_varying": True}):
+    for option in ({"every": (1, 4)}, {"time_varying": True}, {"time_varying": False}):
         with pytest.raises(ValueError, match="only gains by noise"):
             ESO.state_space(SERVO, TORQUE, ENCODERS, both, DT, omega_o=800.0, **option)
     with pytest.raises(ValueError, match="know no noise"):
@@ -550,6 +622,12 @@ def test_options_without_effect_are_refused() -> None:
         (lambda r: r.start([math.nan, math.nan]), "at least one output"),
         (lambda r: r.set([0.0]), "estimate has shape"),
         (lambda r: r.observer.poles([2]), "missing = 2"),
+        (lambda r: r.observer.rms_decay([0.5]), "missing has shape"),
+        (lambda r: r.observer.rms_decay([0.5, 2.0]), "missing = .* from 0 to 1"),
+        (
+            lambda r: servo(time_varying=True).rms_decay([0.0, 0.5]),
+            "calculated for what is missing",
+        ),
         (lambda r: r.observer.filter(np.zeros((3, 2)), np.zeros((4, 1))), "u has shape"),
     ],
 )
