@@ -17,25 +17,7 @@ from quell.setup import EXAMPLES, SetupError, load, load_axes, made, made_axes
 from quell.tuning.report import toml_text
 
 from .commands import Shown
-
-GANTRY = """
-dt = 1e-3
-plant = { kind = "multivariable-linear", A = [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]], B = [[0, 0], [5, 0.5], [0, 0], [0.4, 6]], C = [[1, 0, 0, 0], [0, 0, 1, 0]] }
-axes = { B0 = "plant", u_max = [20.0, 30.0], u_min = -25.0 }
-scenario = { duration = 0.5, disturbances = [0.0, { kind = "step", at = 0.2 }], seed = 3 }
-[[axis]]
-name = "x"
-observer = { kind = "model-free", order = 2, omega_o = 60.0 }
-controller = { omega_c = 8.0 }
-reference = { kind = "step", height = 0.1 }
-[[axis]]
-name = "y"
-observer = { kind = "model-free", order = 2, omega_o = 60.0 }
-controller = { omega_c = 8.0 }
-noise = { kind = "noise", power = 1e-12, sample_time = 1e-3 }
-[[metrics]]
-start = 0.1
-"""
+from .setups import GANTRY
 
 
 def gantry(**changes: Any) -> dict[str, Any]:
@@ -175,7 +157,7 @@ def test_one_axis_is_not_several() -> None:
         ("sweep", "gantry.toml"),
         ("run-rig", "gantry.toml"),
         ("replay", "run.csv", "--setup", "gantry.toml"),
-        ("export", "gantry.toml", "--out", "c"),
+        ("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu"),
         ("compare", "gantry.toml"),
         ("studio", "gantry.toml", "--no-browser"),
         ("proxy", "gantry.toml", "--host", "udp://127.0.0.1:0"),
@@ -195,6 +177,21 @@ def test_a_command_of_one_axis_says_so(
     assert shown.code == 2
     assert "gantry.toml: NOT for several axes yet" in shown.err
     assert {path.name for path in tmp_path.iterdir()} == {"gantry.toml", "run.csv"}
+
+
+def test_the_controller_of_several_axes_is_exported_to_c(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """``quell export`` takes its file; what C of several axes cannot have is refused by its name."""
+    (tmp_path / "gantry.toml").write_text(GANTRY, encoding="utf-8")
+    shown = quell("export", "gantry.toml", "--out", "c", "--name", "gantry")
+    assert shown.code == 0, shown.err
+    header = (tmp_path / "c" / "src" / "gantry.h").read_text()
+    assert "gantry_step" in header
+    single = quell("export", "gantry.toml", "--out", "d", "--precision", "single")
+    assert single.code == 2
+    assert "NOT compared with double precision" in single.err
+    assert not (tmp_path / "d").exists()
 
 
 @pytest.mark.compiled

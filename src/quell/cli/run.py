@@ -318,7 +318,8 @@ def export(
         exit code is not 0.
     """
     from quell.export import c
-    from quell.setup import load
+    from quell.setup import load, made, made_axes, read
+    from quell.setup.description import is_of_axes
 
     if to == "fmu":
         if precision != "double" or accept or prove or resolution is not None:
@@ -334,8 +335,12 @@ def export(
         raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
     if precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
-    given = load(setup, trust)
-    if precision == "single" and not accept:
+    file, data = read(setup)
+    several = is_of_axes(data)
+    given = (made_axes if several else made)(file, data, trust)
+    # Single precision is compared with double in a simulated run, of one axis.
+    plant, scenario = (None, None) if several else (given.plant, given.scenario)
+    if precision == "single" and not (accept or several):
         given.needed("plant")
         given.needed("scenario")
     exported = c(
@@ -343,8 +348,8 @@ def export(
         out,
         name=name or "controller",
         precision=precision,
-        plant=given.plant,
-        scenario=given.scenario,
+        plant=plant,
+        scenario=scenario,
         resolution=resolution,
         accept=accept,
         proof=prove,

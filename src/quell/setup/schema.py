@@ -322,7 +322,7 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
             lines.append(f"{path}: missing{remedy}")
         elif kind == "union_tag_invalid" and isinstance(value, Mapping):
             hint = nearest(str(value["kind"]), _tags(context))
-            if value["kind"] in plants.AXES_PLANTS and path.rpartition(".")[2] == "plant":
+            if str(value["kind"]) in plants.AXES_PLANTS and path.rpartition(".")[2] == "plant":
                 hint = "it has several signals, and is for a setup with a table [[axis]] for each"
             lines.append(f"{path}.kind = {_short(value['kind'])}: unknown; {hint}")
         elif kind == "union_tag_not_found" and isinstance(value, Mapping):
