@@ -80,6 +80,9 @@ from quell.types import Matrix, Vector
 # Step of the differences that stand for derivatives, relative to the size of the parameters:
 # between rounding of the simulation (1e-12) and curvature (second order).
 _STEP = 1e-4
+# The same where y of other axes are inputs: they explain most of what the parameters change, and
+# the rest must be right.
+_SMALL_STEP = 1e-6
 # Largest |z| of a stable predictor: one, and rounding of multiple eigenvalues at z = 1.
 _LIMIT = 1.0 + 1e-6
 # Growth over the record by which a pole may be below the limit and count as at it: no effect on ŷ.
@@ -335,7 +338,8 @@ def _steps(form: Form, y: Vector) -> Vector:
     powers = np.append(n - np.arange(float(n)), gains)[: form.gains.stop]
     powers = np.append(powers, np.ones(int(form.forgets)))
     times = np.full(form.size - form.times.start, 1.0 / rate)
-    return _STEP * np.append(rate**powers, times)
+    step = _SMALL_STEP if form.couplings else _STEP
+    return step * np.append(rate**powers, times)
 
 
 def _predictor(form: Form, phi: Vector, samples: int) -> Predictor:
