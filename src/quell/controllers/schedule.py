@@ -35,10 +35,10 @@ is right at another. With ``ρ = b0(σ)/b_n``::
     g = f/ρ,    g_L = h + s u,    f_L = ρ g_L,    u = (u_0 − Δf̂ − ρ h) / (b_n ρ + ρ s)
 
 A gain of the plant that is wrong by a constant factor, ``b = β b0(σ)``, is a constant coefficient
-of u: ``g = b_n (β d + (β − 1) u)``; for f itself it would be (β − 1) b0(σ). The regression of
-``learners/base.py`` stays one without bias: the observer's error, in units of g, obeys the same
-equation as without a schedule, and a term (ρ'/ρ) (Δg − Δĝ) that comes from its own lag error. For
-the g_L that is right, Δg = g − g_L is zero, so is Δĝ = Δf̂/ρ, and
+of u: ``g = b_n (β d + (β − 1) u)``; for f itself it would be (β − 1) b0(σ). The observer's error,
+in units of g, obeys the same equation as without a schedule but for a term (ρ'/ρ) (Δg − Δĝ), that
+of its own lag error. So the regression of ``learners/base.py`` has no bias at its solution: for the
+g_L that is right, Δg = g − g_L is zero, so is Δĝ = Δf̂/ρ, and
 
     Δĝ + g_L^F = θ·φ^F        with the filter F of before, however quickly b0 changes.
 
