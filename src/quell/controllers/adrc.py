@@ -74,6 +74,7 @@ from quell.controllers.law import (
 from quell.controllers.online_gain import OnlineGain
 from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import NoSchedule, Schedule, ScheduleDesign
+from quell.controllers.stateful import Retuning
 from quell.guard import Guard
 from quell.learners.base import Learner
 from quell.lti.canonical import format_roots
@@ -444,7 +445,8 @@ class ADRC(Compensator):
             ``omega_o``, ``b0`` or model; unchanged by default. For a plant with zeros, or with a
             separate input for f, only ``omega_o`` may change.
         """
-        self._replaced(observer, omega_c, compiles=False)()
+        design = partial(self._retuning, omega_c=omega_c, observer=observer)
+        self._change_to(design, compiles=False)()
 
     def prepare_retune(
         self, *, omega_c: float | None = None, observer: ESO | None = None
@@ -456,23 +458,21 @@ class ADRC(Compensator):
         designs. ``set_limits`` or a restored state in between make its next calls slower, by a
         tenth of a millisecond. Parameters, rules and errors are those of ``retune``.
         """
-        return self._replaced(observer, omega_c, compiles=True)
+        design = partial(self._retuning, omega_c=omega_c, observer=observer)
+        return self._change_to(design, compiles=True)
 
-    def _replaced(
-        self, observer: ESO | None, omega_c: float | None, compiles: bool
-    ) -> Callable[[], None]:
-        """Return a function that changes observer and bandwidth."""
+    def _retuning(self, *, omega_c: float | None = None, observer: ESO | None = None) -> Retuning:
+        """Return the parameters with other bandwidths, and what sets the attributes for them."""
         omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:
             check_replacement(self.observer, observer, self._learns)
         if self.schedule is not None:
             self.schedule.check_retuning(self.observer, observer, omega_c != self.omega_c)
         observer = observer or self.observer
-        change = self._change_to(
-            self._design(observer, omega_c), compiles, observer=observer, omega_c=omega_c
-        )
+        new = self._design(observer, omega_c)
+        found = self._retuning_to(new, observer=observer, omega_c=omega_c)
         self._warn_of_design(observer, omega_c)
-        return change
+        return found
 
 
 # ---- ADRC of order 1 for a first-order plant with dead time, K e^(−Ls)/(T s + 1) ----
