@@ -77,7 +77,6 @@ from quell.controllers.schedule import (
     gain_in_use,
     known_of_model,
     set_signal,
-    with_gains,
 )
 from quell.controllers.stateful import Retuning, StatefulController
 from quell.guard import (
@@ -107,7 +106,7 @@ from quell.learners.base import (
     window_samples,
 )
 from quell.observers.design import scaled_response
-from quell.observers.eso import ESO
+from quell.observers.eso import ESO, with_gains
 from quell.observers.forms import (
     NonlinearModel,
     acting_control,

@@ -31,8 +31,9 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.controllers.adrc import ADRC
-from quell.controllers.schedule import Schedule, with_gains
+from quell.controllers.schedule import Schedule
 from quell.files import nonfinite_to_none, written_atomically
+from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
