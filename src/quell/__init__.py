@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from quell.controllers import baselines
     from quell.controllers.adrc import ADRC
+    from quell.controllers.axes import Axes
     from quell.controllers.base import omega_c_for
     from quell.controllers.compensated import Compensated
     from quell.controllers.compensator import Compensator, Estimate
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from quell.lti.canonical import canonical
     from quell.observers.eso import ESO
     from quell.records import metrics
+    from quell.records.axes import AxesTrajectory
     from quell.records.plotting import style
     from quell.records.trajectory import BatchTrajectory, Trajectory
     from quell.simulation.driver import Scenario
@@ -65,6 +67,8 @@ __version__ = "0.2.0"
 
 _HOMES = {
     "ADRC": "controllers.adrc",
+    "Axes": "controllers.axes",
+    "AxesTrajectory": "records.axes",
     "Compensated": "controllers.compensated",
     "Compensator": "controllers.compensator",
     "DesignWarning": "types",
@@ -98,12 +102,13 @@ _MODULES = (
 )  # fmt: skip
 
 __all__ = [
-    "ADRC", "ESO", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning", "Estimate",
-    "Feedforward", "Guard", "HeldPlant", "OnlineGain", "Reason", "SafeSet", "Scenario", "Schedule",
-    "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers", "envs",
-    "experiments", "export", "features", "identification", "identify", "learners", "metrics",
-    "monitoring", "observers", "omega_c_for", "plants", "realtime", "setup", "signals", "simulate",
-    "style", "sweep", "sweeping", "tune", "tune_schedule", "tuning",
+    "ADRC", "ESO", "Axes", "AxesTrajectory", "BatchTrajectory", "Compensated", "Compensator",
+    "DesignWarning", "Estimate", "Feedforward", "Guard", "HeldPlant", "OnlineGain", "Reason",
+    "SafeSet", "Scenario", "Schedule", "Status", "Trajectory", "Tuned", "analysis", "baselines",
+    "canonical", "controllers", "envs", "experiments", "export", "features", "identification",
+    "identify", "learners", "metrics", "monitoring", "observers", "omega_c_for", "plants",
+    "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
+    "tune_schedule", "tuning",
 ]  # fmt: skip
 
 

@@ -45,6 +45,7 @@ class Status(IntFlag):
     UNSAFE = 4096
     HELD = 8192
     SCHEDULE_HELD = 16384
+    GAIN_HELD = 32768
 
     @property
     def message(self) -> str:
@@ -112,6 +113,10 @@ _MESSAGES = {
     Status.SCHEDULE_HELD: (
         "A signal of the schedule was not finite or not given; the last good one was used, or the "
         "gains without a schedule: check its source."
+    ),
+    Status.GAIN_HELD: (
+        "The function of B0 or M returned a matrix that is not finite or has no inverse; the last "
+        "good one was used: check it where the machine was."
     ),
 }
 _NOTHING = "No step reported a problem."

@@ -5,9 +5,14 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 
 from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify, observer_error
+from quell.analysis.coupled import CoupledCertificate, certify_axes, certify_coupled
+from quell.analysis.coupling import Coupling, coupling, relative_gains
+from quell.analysis.disk import DiskMargin
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
+from quell.analysis.matrices import MatrixLaw, axes_law
+from quell.analysis.multivariable import MultivariableLoop, Peak, Pole
 from quell.analysis.online import OnlineCertificate, certify_online
 from quell.analysis.plots import (
     loops_over_omega_o,
@@ -20,29 +25,53 @@ from quell.analysis.plots import (
     plot_root_locus,
 )
 from quell.controllers.adrc import Finding
+from quell.lti.zeros import (
+    Existence,
+    InvariantZeros,
+    invariant_zeros,
+    observer_exists,
+    unobservable_modes,
+)
 
 __all__ = [
     "Adapting",
     "Certificate",
+    "CoupledCertificate",
+    "Coupling",
+    "DiskMargin",
+    "Existence",
     "Finding",
     "Frozen",
+    "InvariantZeros",
     "LoopAnalysis",
     "Margins",
+    "MatrixLaw",
+    "MultivariableLoop",
     "OnlineCertificate",
+    "Peak",
+    "Pole",
     "adapting",
     "advise",
     "analyse",
+    "axes_law",
     "certify",
+    "certify_axes",
+    "certify_coupled",
     "certify_online",
+    "coupling",
     "frozen",
+    "invariant_zeros",
     "linear_law",
     "loops_over_omega_o",
     "loops_over_time",
     "observer_error",
+    "observer_exists",
     "plot_bode",
     "plot_gang_of_four",
     "plot_margins_against_omega_o",
     "plot_margins_over_time",
     "plot_nyquist",
     "plot_root_locus",
+    "relative_gains",
+    "unobservable_modes",
 ]

@@ -114,9 +114,16 @@ def eigenvalues(N: Matrix) -> NDArray[np.complex128]:
     at z = 0, where rounding errors would spread them: of a nilpotent block of 200 states over a
     circle of the radius 0.83. They are found from the structure instead.
     """
+    whole, left_out = without_idle_chains(N)
+    found = np.linalg.eigvals(whole).astype(np.complex128)
+    return np.append(found, np.full(left_out, -1.0 + 0.0j)) if left_out else found
+
+
+def without_idle_chains(N: Matrix) -> tuple[Matrix, int]:
+    """Return ``A − I`` without chains of delays as in ``eigenvalues``, and how many states less."""
     delays = without_delays(N)
     if delays is None:
-        return np.linalg.eigvals(N).astype(np.complex128)
+        return N, 0
     steps, M = delayed_parts(delays, N[delays.kept])
     rest, M = _merge_equal(delays.N.copy(), M)
     last = np.zeros(rest.shape[0], dtype=np.intp)  # longest delay of each state
@@ -134,8 +141,7 @@ def eigenvalues(N: Matrix) -> NDArray[np.complex128]:
     for k, part in zip(steps.astype(np.intp), M, strict=True):
         for j in np.flatnonzero(np.any(part != 0.0, axis=0)):
             whole[: rest.shape[0], first[j] + k - 1] += part[:, j]
-    found = np.linalg.eigvals(whole).astype(np.complex128)
-    return np.append(found, np.full(N.shape[0] - size, -1.0 + 0.0j))
+    return whole, N.shape[0] - size
 
 
 def _merge_equal(N: Matrix, M: NDArray[np.float64]) -> tuple[Matrix, NDArray[np.float64]]:
@@ -181,7 +187,7 @@ class Response:
         kept = delays.kept
         steps, parts = delayed_parts(delays, np.vstack([system.N[kept], system.C]))
         N, C = delays.N, system.C[kept]
-        scale = _scales(N, parts[:, :-1])
+        scale = balancing_scales(N, parts[:, :-1])
         self._M = parts[:, :-1] * scale[None, None, :] / scale[None, :, None]
         self._M = self._M.reshape(steps.size, -1)
         self._C_k = parts[:, -1] * scale
@@ -229,7 +235,7 @@ class Response:
         return np.asarray(product + D, dtype=np.complex128)
 
 
-def _scales(N: Matrix, M: NDArray[np.float64]) -> Vector:
+def balancing_scales(N: Matrix, M: NDArray[np.float64]) -> Vector:
     """Return factors that balance a matrix with the sizes of its delayed parts."""
     from scipy.linalg import matrix_balance
 

@@ -10,10 +10,12 @@ from quell.cli.options import (
     MODEL_OPTIONS,
     OUTPUTS,
     READ_OPTIONS,
+    RESULT_OUTPUTS,
     ModelOptions,
     Outputs,
     Overwrite,
     ReadOptions,
+    ResultOutputs,
     Trust,
     Whole,
     WholeOrNone,
@@ -181,9 +183,8 @@ def b0(
     by: str | None = None,
     bins: int | None = None,
     read: ReadOptions = READ_OPTIONS,
-    json: Path | None = None,
     trust: Trust = False,
-    overwrite: Overwrite = False,
+    outputs: ResultOutputs = RESULT_OUTPUTS,
 ) -> None:
     """Find b0, lag and delay in a record of a running loop, and the omega_c for a phase margin.
 
@@ -211,15 +212,11 @@ def b0(
         table in text. b0 is then found in each bin of it, and no omega_c.
     bins
         Number of bins between the least and the largest value of `--by`; 5 by default.
-    json
-        Write the results to this file, for programs.
     """
     from quell.commissioning import measured
-    from quell.files import check_writable, write_json
     from quell.identification import identify_b0
 
-    if json is not None:
-        check_writable(json, overwrite)
+    outputs = check_outputs(outputs)
     samples = measured(record, read.columns, dt, read.time_unit, read.max_size)
     ran = {} if loop is None else _of_loop(loop, samples.dt, trust)
     order = ran.get("order") if order is None else order
@@ -232,7 +229,8 @@ def b0(
         if ratio is not None or phase_margin != 60.0:
             raise ValueError("ratio, phase_margin: have no effect with --by; leave them out")
         signal = _column(record, by, read, dt, samples.y.size)
-        _print_bins(console, record, samples, signal, by, order, bins, max_delay, json, overwrite)
+        rows = _print_bins(console, record, samples, signal, by, order, bins, max_delay)
+        write_results(console, {"order": order, "by": by, "bins": rows}, outputs)
         return
     if bins is not None:
         raise ValueError(f"bins = {bins!r}: has no effect without --by; give the column, too")
@@ -250,9 +248,7 @@ def b0(
             console, f"the loop ran with b0 = {ran['b0']:.5g}: b/b0 = {factor:.3g} ± {spread:.2g}"
         )
     results |= _print_bandwidth(console, found, phase_margin, ratio)
-    if json is not None:
-        write_json(json, results, overwrite)
-        print_line(console, f"Results: {json}")
+    write_results(console, results, outputs)
 
 
 def _column(record: Path, by: str, read: ReadOptions, dt: float | None, size: int) -> Any:
@@ -286,11 +282,9 @@ def _print_bins(
     order: int,
     bins: int | None,
     max_delay: float | None,
-    json: Path | None,
-    overwrite: bool,
-) -> None:
-    """Find, print and write b0 in each bin of a signal."""
-    from quell.files import nonfinite_to_none, write_json
+) -> list[dict[str, Any]]:
+    """Find and print b0 in each bin of a signal; return the results, one for each bin."""
+    from quell.files import nonfinite_to_none
     from quell.identification import identify_b0_by
 
     with console.status("Searching; the first time, code is compiled for some seconds."):
@@ -315,10 +309,8 @@ def _print_bins(
         )
         table = f"points = [{', '.join(points)}], b0 = [{', '.join(gains)}]"
         print_line(console, f"schedule = {{ {table} }}  # of [controller]")
-    if json is not None:
-        rows = [each._asdict() | {"interval": each.interval} for each in found]
-        write_json(json, nonfinite_to_none({"order": order, "by": by, "bins": rows}), overwrite)
-        print_line(console, f"Results: {json}")
+    rows = [each._asdict() | {"interval": each.interval} for each in found]
+    return list(nonfinite_to_none(rows))
 
 
 def _of_loop(path: Path, dt: float, trust: bool) -> dict[str, Any]:

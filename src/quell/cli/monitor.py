@@ -10,8 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quell.cli.exit_codes import ExitCode
-from quell.cli.options import READ_OPTIONS, Overwrite, ReadOptions, WholeOrNone
-from quell.cli.output import Console, number, print_line, table
+from quell.cli.options import (
+    READ_OPTIONS,
+    RESULT_OUTPUTS,
+    ReadOptions,
+    ResultOutputs,
+    WholeOrNone,
+)
+from quell.cli.output import Console, check_outputs, number, print_line, table, write_results
 
 if TYPE_CHECKING:
     from quell.identification import Measured
@@ -39,8 +45,7 @@ def rank(
     confidence: float = 0.95,
     dt: float | None = None,
     read: ReadOptions = READ_OPTIONS,
-    json: Path | None = None,
-    overwrite: Overwrite = False,
+    outputs: ResultOutputs = RESULT_OUTPUTS,
 ) -> None:
     """Decide which of several tunings was best, from logs of the running machine.
 
@@ -59,15 +64,11 @@ def rank(
         Probability with which all verdicts hold.
     dt
         Sample time [s] of tables without times; columns are then u,y,r by default.
-    json
-        Write the results to this file, for programs.
     """
     from quell.commissioning import measured
-    from quell.files import check_writable, write_json
     from quell.monitoring import rank as rank_logs
 
-    if json is not None:
-        check_writable(json, overwrite)
+    outputs = check_outputs(outputs)
     given = [_named(text) for text in logs]
     tunings: dict[str, list[Measured]] = {}
     for one in given:
@@ -78,9 +79,7 @@ def rank(
     console = Console()
     _print_scores(console, found)
     print_line(console, found.describe())
-    if json is not None:
-        write_json(json, found.to_json(), overwrite)
-        print_line(console, f"Results: {json}")
+    write_results(console, found.to_json(), outputs)
 
 
 def _named(text: str) -> _Named:
@@ -144,8 +143,7 @@ def watch(
     alpha: float | None = None,
     dt: float | None = None,
     read: ReadOptions = READ_OPTIONS,
-    json: Path | None = None,
-    overwrite: Overwrite = False,
+    outputs: ResultOutputs = RESULT_OUTPUTS,
 ) -> None:
     """Watch the numbers of a machine over its records, and raise an alarm when one has changed.
 
@@ -172,15 +170,12 @@ def watch(
         Probability of a false alarm over all time and all numbers, 0.01 by default.
     dt
         Sample time [s] of tables without times; columns are then u,y by default.
-    json
-        Write alarms and evidence to this file, for programs.
     """
-    from quell.files import check_writable, write_json
+    from quell.files import check_writable
     from quell.monitoring import Machine
     from quell.monitoring.windows import signals_of
 
-    if json is not None:
-        check_writable(json, overwrite)
+    outputs = check_outputs(outputs)
     settings = {"window": window, "order": order, "band": band, "alpha": alpha}
     given = {name: value for name, value in settings.items() if value is not None}
     console = Console()
@@ -208,9 +203,7 @@ def watch(
     if state is not None:
         machine.save(state)
         print_line(console, f"State: {state}")
-    if json is not None:
-        write_json(json, _results(machine), overwrite)
-        print_line(console, f"Results: {json}")
+    write_results(console, _results(machine), outputs)
     if machine.watch.alarms:
         sys.exit(ExitCode.ALARM)
 

@@ -62,7 +62,22 @@ FIGURES = Path("quell-figures")
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Outputs:
+class ResultOutputs:
+    """The file that a command writes which draws nothing.
+
+    Parameters
+    ----------
+    json
+        Write the results to this file, for programs.
+    """
+
+    json: Annotated[Path | None, Parameter(name="--json")] = None
+    overwrite: Overwrite = False
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Outputs(ResultOutputs):
     """Files that a command writes.
 
     Parameters
@@ -74,9 +89,7 @@ class Outputs:
         quell-figures-2 and so on if that exists.
     """
 
-    json: Annotated[Path | None, Parameter(name="--json")] = None
     figures: Annotated[Path | None, Parameter(negative_none="no-", show_default=False)] = FIGURES
-    overwrite: Overwrite = False
 
 
 @Parameter(name="*")
@@ -98,7 +111,7 @@ class RunOutputs(Outputs):
     save: Path | None = None
 
 
-OUTPUTS, RUN_OUTPUTS = Outputs(), RunOutputs()
+RESULT_OUTPUTS, OUTPUTS, RUN_OUTPUTS = ResultOutputs(), Outputs(), RunOutputs()
 
 
 @Parameter(name="*")

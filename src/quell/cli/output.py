@@ -16,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from quell.cli.options import FIGURES, Outputs, RunOutputs
+from quell.cli.options import FIGURES, Outputs, ResultOutputs, RunOutputs
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from quell.records.trajectory import Trajectory
     from quell.types import Progress as ProgressCallback
 
-T = TypeVar("T", bound=Outputs)
+T = TypeVar("T", bound=ResultOutputs)
 
 COMPILING = "simulating (the first run compiles for some seconds)"
 """Label of a progress bar until the first samples are done."""
@@ -86,7 +86,7 @@ def print_line(console: Console, text: str) -> None:
     console.print(escape(text), soft_wrap=True)
 
 
-def check_outputs(outputs: T, figures: Sequence[str], recordings: Sequence[Path] = ()) -> T:
+def check_outputs(outputs: T, figures: Sequence[str] = (), recordings: Sequence[Path] = ()) -> T:
     """Check, before the work is done, that the results can be written; create the figures' folder.
 
     Return the outputs with the folder for the figures, whose names are given. ``recordings`` are
@@ -103,15 +103,18 @@ def check_outputs(outputs: T, figures: Sequence[str], recordings: Sequence[Path]
 
     named = (outputs.json, outputs.save if isinstance(outputs, RunOutputs) else None)
     files = [file for file in named if file is not None]
-    if outputs.figures is not None and outputs.figures is not FIGURES:
-        files += figure_files(make_folder(outputs.figures), figures)
+    folder = outputs.figures if isinstance(outputs, Outputs) else None
+    if folder is not None and folder is not FIGURES:
+        files += figure_files(make_folder(folder), figures)
     for file in files:
         check_writable(file, outputs.overwrite)
     places = [file.absolute() for file in (*files, *recordings)]
     for file in places:
         if places.count(file) > 1:
             raise ValueError(f"path = {str(file)!r}: must be a file for one output, is for two")
-    return replace(outputs, figures=new_folder(FIGURES)) if outputs.figures is FIGURES else outputs
+    if isinstance(outputs, Outputs) and folder is FIGURES:
+        return replace(outputs, figures=new_folder(FIGURES))
+    return outputs
 
 
 def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:
@@ -153,12 +156,15 @@ def write_record(console: Console, run: Trajectory, outputs: RunOutputs, name: s
 
 
 def write_results(
-    console: Console, results: dict[str, Any], outputs: Outputs, figures: Sequence[Path]
+    console: Console,
+    results: dict[str, Any],
+    outputs: ResultOutputs,
+    figures: Sequence[Path] = (),
 ) -> None:
     """Write the results to the JSON file, if any; print where they and the figures are."""
     from quell.files import write_json
 
-    if figures:
+    if figures and isinstance(outputs, Outputs):
         names = sorted({path.stem for path in figures})
         noun = "Figures" if len(names) > 1 else "Figure"
         print_line(console, f"{noun}: {', '.join(names)} (PNG, SVG, PDF) in {outputs.figures}/")

@@ -12,6 +12,7 @@ from quell.controllers.adrc import (
     dead_time_tuning,
     warn_if_unwise,
 )
+from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, omega_c_for
 from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
@@ -31,9 +32,16 @@ from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
+from quell.controllers.state_feedback import (
+    Regulator,
+    quadratic_feedback,
+    regulator,
+    state_feedback,
+)
 
 __all__ = [
     "ADRC",
+    "Axes",
     "Compensated",
     "Compensator",
     "Controller",
@@ -51,6 +59,7 @@ __all__ = [
     "Prefiltered",
     "ProfileGenerator",
     "ReferenceModel",
+    "Regulator",
     "SafeSet",
     "Schedule",
     "TrackingDifferentiator",
@@ -60,5 +69,8 @@ __all__ = [
     "equal_to_pid",
     "in_single_precision",
     "omega_c_for",
+    "quadratic_feedback",
+    "regulator",
+    "state_feedback",
     "warn_if_unwise",
 ]

@@ -73,7 +73,7 @@ from quell.controllers.law import (
 )
 from quell.controllers.online_gain import OnlineGain
 from quell.controllers.safe_set import SafeSet
-from quell.controllers.schedule import NoSchedule, Schedule
+from quell.controllers.schedule import NoSchedule, Schedule, ScheduleDesign
 from quell.controllers.stateful import Retuning
 from quell.guard import Guard
 from quell.learners.base import Learner
@@ -338,16 +338,29 @@ class ADRC(Compensator):
         if self.schedule is None:
             return NoSchedule()
         law = partial(self._law, degree=observer.degree)
-        return self.schedule.design(observer, self.omega_c, law)
+        return self._with_parts(self.schedule.design(observer, self.omega_c, law), observer)
+
+    def _with_parts(self, schedule: Any, observer: ESO) -> Any:
+        schedule = super()._with_parts(schedule, observer)
+        if not isinstance(schedule, ScheduleDesign) or not schedule.has_b0:
+            return schedule
+        if not isinstance(self.feedforward, Feedforward):
+            return schedule._replace(cancel=observer.cancel)
+        fixed, fixed_acting = self.feedforward.fixed(observer)
+        return schedule._replace(fixed=fixed, fixed_acting=fixed_acting)
+
+    def _take_inertia(self, ratio: float) -> None:
+        if isinstance(self.feedforward, Feedforward):
+            self.feedforward = self.feedforward.with_inertia(ratio, self.observer.degree)
 
     def _check_law_of_schedule(self) -> None:
         """Raise a ``ValueError`` for parts of the law that a schedule does not reach."""
         if self.schedule is None:
             return
-        if self.schedule.b0 is not None and isinstance(self.feedforward, Feedforward):
+        if isinstance(self.schedule, OnlineGain) and isinstance(self.feedforward, Feedforward):
             raise ValueError(
-                "schedule.b0 with the feedforward of a model: the model has one inertia, and the "
-                "table has others; take feedforward = true, which follows b0"
+                "schedule = OnlineGain(...) with the feedforward of a model: the model has an "
+                "inertia, and the estimate others; take feedforward = true, which follows b0"
             )
         if self.schedule.omega_c is not None and self.feedback is not None:
             raise ValueError(

@@ -39,6 +39,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -71,8 +72,10 @@ from quell.controllers.schedule import (
     NoScheduleMemory,
     Point,
     Schedule,
+    ScheduleDesign,
     checked_schedule,
     gain_in_use,
+    known_of_model,
     set_signal,
     with_gains,
 )
@@ -276,7 +279,10 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
         change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
     shift_f(new.safe_set, state.safe_set, change)
     # The model's share of f depends on them, too, and is not in the estimate.
-    known = known_share(new.feedforward, loop.r, state.reference)
+    known = known_of_model(
+        new.schedule, memory, new.feedforward, loop.r, state.reference, new.b0,
+        known_share(new.feedforward, loop.r, state.reference),
+    )  # fmt: skip
     change -= known - loop.f_known
     loop.f_known = known
     state.z[size] += change
@@ -501,7 +507,10 @@ class Compensator(StatefulController):
     def _safe_set_design(self, observer: ESO) -> Any:
         if self.safe_set is None:
             return NoSafeSet()
-        return self.safe_set.design(observer, self._limits)
+        ratio = 1.0
+        if isinstance(self.schedule, Schedule):
+            ratio = self.schedule.largest_ratio(observer)
+        return self.safe_set.design(observer, self._limits, ratio)
 
     def _check_schedule(self) -> None:
         """Raise a ``ValueError`` for parts that are made for one b0 or one omega_o."""
@@ -509,22 +518,45 @@ class Compensator(StatefulController):
             return
         parts = {"learner": self._learns, "safe_set": self.safe_set is not None}
         parts["held"] = self.held is not None
-        if self.schedule.b0 is not None and any(parts.values()):
-            part = next(name for name, is_there in parts.items() if is_there)
+        part = next((name for name, is_there in parts.items() if is_there), None)
+        if self.schedule.b0 is not None and part is not None:
+            if not isinstance(self.schedule, Schedule):
+                raise ValueError(
+                    f"schedule = {self.schedule!r} with {part}: it changes b0 where the machine "
+                    f"does not change, so what the {part.replace('_', ' ')} knows of f would be "
+                    "wrong; take a table over a signal (Schedule), or leave one of them out"
+                )
+            if np.any(self.observer.cancel != 0.0):
+                raise ValueError(
+                    f"schedule.b0 with {part}: the observer has a model with a = "
+                    f"{self.observer.cancel.tolist()}, which follows the inertia, too, and does "
+                    "not follow a table of b0; take ESO.model_free"
+                )
+        if self.schedule.b0 is not None and getattr(self.guard, "certified_for", None) is not None:
             raise ValueError(
-                f"schedule.b0 with {part}: what the {part.replace('_', ' ')} knows refers to one "
-                "b0, in whose units f is; schedule omega_c only, or leave one of them out"
+                "schedule.b0 with a guard that is certified_for a plant: the bound is that of one "
+                "b0; give Guard() without it"
             )
         if self.schedule.omega_o is not None and self._learns:
             raise ValueError(
-                "schedule.omega_o with learner: a learner and its guard reckon with the lag of one "
-                "omega_o; schedule omega_c only, or leave one of them out"
+                "schedule.omega_o with learner: each feature is filtered with the observer's lag, "
+                "and a change of omega_o changes the filter under what is in it, so the learner "
+                "would take the change for one of the plant; schedule b0 and omega_c only"
             )
 
     def _schedule_design(self, observer: ESO) -> Any:
         if self.schedule is None:
             return NoSchedule()
-        return self.schedule.design(observer, self.omega_c, None)
+        return self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+
+    def _with_parts(self, schedule: Any, observer: ESO) -> Any:
+        """Return parameters of a schedule with what the other parts of the controller need."""
+        if not isinstance(schedule, ScheduleDesign) or not schedule.has_b0:
+            return schedule
+        return schedule._replace(
+            extended=observer.disturbance_order if self._learns else 0,
+            has_safe_set=self.safe_set is not None,
+        )
 
     @property
     def gain_estimate(self) -> Any:
@@ -571,9 +603,16 @@ class Compensator(StatefulController):
         found = self.schedule.at(values, base)
         made = type(self).__new__(type(self))
         vars(made).update(vars(self), schedule=None, omega_c=found.omega_c)
+        ratio = found.b0 / self.observer.b0
         made.observer = with_gains(self.observer, found.b0, found.omega_o)
+        if self.safe_set is not None:  # its f_rate is that of the observer's b0
+            made.safe_set = replace(self.safe_set, f_rate=ratio * self.safe_set.f_rate)
+        made._take_inertia(1.0 / ratio)
         made._initialise()
         return made
+
+    def _take_inertia(self, ratio: float) -> None:
+        """Convert what depends on the inertia to ``ratio`` times as much: nothing here."""
 
     def set_limits(
         self,

@@ -75,7 +75,7 @@ _LEAST, _LEAST_FARTHER = 0.6, 0.35
 # less from sample to sample.
 _MOST = 4.0
 
-# Columns of the windows.
+# Columns of the windows; those from ``_CHANGED`` on are an f.
 _SAMPLES, _LOW, _HIGH, _Y, _STEPS, _MOVED, _CHANGED, _FIRST, _BEFORE = range(9)
 _COLUMNS = 9
 
@@ -180,6 +180,11 @@ def miss(design: Any, memory: Any) -> None:
 @generic_with_default
 def look_anew(design: Any, memory: Any) -> None:
     """Forget what was seen; what the sensor resolves is kept."""
+
+
+@generic_with_default
+def scale_loads(design: Any, memory: Any, ratio: float) -> None:
+    """Multiply all that is known of f: the loads stay, and the inertia has changed."""
 
 
 @kernel
@@ -357,6 +362,19 @@ def _take_motion(design: HeldDesign, memory: HeldMemory, z: Vector, seen: Vector
         z[i] = memory.z[i]
     for i in range(seen.size):
         seen[i] = memory.seen[i]
+
+
+@scale_loads.register(HeldDesign)
+def _scale_loads(design: HeldDesign, memory: HeldMemory, ratio: float) -> None:
+    memory.loop[0].f *= ratio
+    memory.loop[0].peak *= ratio
+    for i in range(design.lengths.size):
+        for j in range(_CHANGED, _COLUMNS):
+            memory.windows[i, j] *= ratio
+    for i in range(design.input.size, memory.seen.size):
+        change = (ratio - 1.0) * memory.seen[i]
+        memory.seen[i] += change
+        memory.z[i] += change
 
 
 @held_flag.register(HeldDesign)

@@ -158,7 +158,8 @@ def _moves(design: OnlineDesign, own: Any, energy: float) -> bool:
 @follow_signals.register(OnlineDesign)
 def _follow(
     design: OnlineDesign, memory: OnlineMemory, loop: Any, z: Vector, seen: Vector,
-    reference: Vector, at_f: int, u: float, continues: bool,
+    reference: Vector, at_f: int, u: float, continues: bool, safe_set: Any, set_memory: Any,
+    held: Any, held_memory: Any,
 ) -> int:  # fmt: skip
     own = memory.loop[0]
     if own.found == 0.0:

@@ -225,6 +225,30 @@ def _shift_f(design: SafeSetDesign, memory: SafeSetMemory, change: float) -> Non
 
 
 @generic_with_default
+def scale_f(design: Any, memory: Any, ratio: float) -> None:
+    """Multiply the estimate of f: the loads stay, and the inertia has changed."""
+
+
+@scale_f.register(SafeSetDesign)
+def _scale_f(design: SafeSetDesign, memory: SafeSetMemory, ratio: float) -> None:
+    last = memory.seen.size - 1
+    memory.z[last] *= ratio
+    memory.seen[last] *= ratio
+
+
+@generic_with_default
+def divide_bounds(design: Any, memory: Any, ratio: float) -> None:
+    """Convert the bounds of ``ratio`` times u, which ``nearest_safe`` found, to those of u."""
+
+
+@divide_bounds.register(SafeSetDesign)
+def _divide_bounds(design: SafeSetDesign, memory: SafeSetMemory, ratio: float) -> None:
+    loop = memory.loop[0]
+    loop.low /= ratio
+    loop.high /= ratio
+
+
+@generic_with_default
 def settle_at_rest(design: Any, memory: Any, y: float, u: float, samples: int) -> None:
     """Let the observer settle at a plant that rests at y under u."""
 
@@ -325,8 +349,12 @@ class SafeSet:
             rule = "must be below 1, or the sign of b is not known"
             raise ValueError(f"gain_error = {self.gain_error!r}: {rule}")
 
-    def design(self, observer: ESO, limits: Limits) -> SafeSetDesign:
-        """Return the parameters for an observer and limits of u."""
+    def design(self, observer: ESO, limits: Limits, ratio: float = 1.0) -> SafeSetDesign:
+        """Return the parameters for an observer and limits of u.
+
+        With a schedule b0 is up to ``ratio`` times that of the observer, and so is what f_rate and
+        gain_error do; the bounds are those of b0(σ)/b0 u.
+        """
         model, n = _plain(observer), observer.order
         if self.alpha * observer.dt > 0.5:
             rule = "alpha * dt must be at most 0.5, or u holds for too long before a border"
@@ -337,11 +365,12 @@ class SafeSet:
                 f"gain_error = {self.gain_error!r}: the largest |u| bounds what it does; give "
                 "u_min and u_max"
             )
-        position = self._band(observer, model, n, (self.y_min, self.y_max), largest)
-        rate = self._band(observer, model, n - 1, (self.rate_min, self.rate_max), largest)
+        how = (largest, ratio)
+        position = self._band(observer, model, n, (self.y_min, self.y_max), *how)
+        rate = self._band(observer, model, n - 1, (self.rate_min, self.rate_max), *how)
         # The expected measurement is wrong by C (Φ e + w) + v: the same with c = C, λ = 0 and v.
         first = np.eye(n)[0]
-        surprise = self._largest_error(observer, model, first, 0.0, largest) + self.noise
+        surprise = self._largest_error(observer, model, first, 0.0, *how) + self.noise
         settled = float(round(_SETTLED_LAGS * observer.lag_time / observer.dt))
         return SafeSetDesign(model, position, rate, surprise, settled)
 
@@ -356,7 +385,13 @@ class SafeSet:
         return self.design(observer, limits).position.margin
 
     def _band(
-        self, observer: ESO, model: EsoModel, degree: int, borders: tuple[float, float], most: float
+        self,
+        observer: ESO,
+        model: EsoModel,
+        degree: int,
+        borders: tuple[float, float],
+        most: float,
+        ratio: float,
     ) -> Band:
         """Return the band of the derivative of y that u reaches after ``degree`` integrations."""
         n, dt, (low, high) = observer.order, observer.dt, borders
@@ -371,7 +406,7 @@ class SafeSet:
                 c[n - degree + i] = math.comb(degree - 1, i) * self.alpha ** (degree - 1 - i)
             weight = (1.0 - decay) * self.alpha ** (degree - 1)
         gain = float(c @ control)
-        margin = self._largest_error(observer, model, c, decay, most) / abs(gain)
+        margin = self._largest_error(observer, model, c, decay, most, ratio) / abs(gain)
         state = c @ (phi - decay * np.eye(n)) / gain
         border = weight / gain
         if abs(border) * (high - low) <= 2.0 * margin:
@@ -384,7 +419,7 @@ class SafeSet:
         return Band(low, high, border, state, float(c @ feed) / gain, margin)
 
     def _largest_error(
-        self, observer: ESO, model: EsoModel, c: Vector, decay: float, most: float
+        self, observer: ESO, model: EsoModel, c: Vector, decay: float, most: float, ratio: float
     ) -> float:
         """Return δ: the largest |q| for all signals within their bounds."""
         size, dt = model.gain.size, observer.dt
@@ -397,14 +432,14 @@ class SafeSet:
             """Return the sum of |q| for a pulse that enters the state."""
             return peak_gain(System(N, correction @ entering, row, float(wide @ entering)))
 
-        total = 0.0
-        if self.f_rate > 0.0:
+        total, f_rate = 0.0, ratio * self.f_rate
+        if f_rate > 0.0:
             for node, weight in zip(_NODES, _WEIGHTS, strict=True):
                 moved = _moved_by_f(observer, 0.5 * dt * (1.0 + float(node)))
-                total += _BETWEEN_NODES * 0.5 * dt * float(weight) * self.f_rate * largest(moved)
+                total += _BETWEEN_NODES * 0.5 * dt * float(weight) * f_rate * largest(moved)
         if self.gain_error > 0.0:
             step = np.append(model.feed[:-1], 0.0)
-            total += self.gain_error * abs(observer.b0) * most * largest(step)
+            total += self.gain_error * abs(ratio * observer.b0) * most * largest(step)
         if self.noise > 0.0:
             total += self.noise * peak_gain(System(N, model.gain, row, 0.0))
         return total

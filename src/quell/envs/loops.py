@@ -38,7 +38,6 @@ from quell.controllers.base import (
     Limits,
     control,
     reset_loop,
-    set_reference_derivatives,
     status_flags,
     write_row,
 )
@@ -65,9 +64,16 @@ from quell.learners.base import (
     restart,
 )
 from quell.observers.eso import ESO
-from quell.plants.base import Plant, PlantBatch, advance, begin_run, check_run, measure
+from quell.plants.base import Plant, PlantBatch, begin_run, check_run, measure
 from quell.records.record import columns_of
-from quell.simulation.driver import SampledScenario, Scenario, check_scenario, logged_channels
+from quell.simulation.driver import (
+    SIGNALS,
+    SampledScenario,
+    Scenario,
+    check_scenario,
+    logged_channels,
+    run_samples,
+)
 from quell.types import Channels, Matrix, Vector
 
 # ---- The quantity that a policy sets in each sample ----
@@ -390,7 +396,6 @@ def _moved(typing_context: Any, first: Any, shift: Any) -> Any:
 # ---- The compiled loop of the environments ----
 
 Integers = NDArray[np.int64]
-SIGNALS = 4  # r, y, y_measured, u: the first columns of ``Step.row``
 NOISE = 1  # column of the noise in a table of signals; the reference comes first, w last
 
 
@@ -410,6 +415,7 @@ class Step(NamedTuple):
     sample: Integers  # sample at which each loop is (N,)
     status: Integers  # flags of the step (N,)
     diverged: Integers  # 1 if ``|y|`` was beyond the limit (N,)
+    log: NDArray[np.float64]  # work space: r, y, y_measured, u of its samples (N, repeat, 4)
 
 
 class Rules(NamedTuple):
@@ -455,27 +461,41 @@ def run_step(
         y = measure(plant, lane.x)
         if active[i] != 0:
             set_action(design, lane.controller, actions[i])
-            u, cost, status, diverged = 0.0, 0.0, 0, 0
-            for _ in range(min(rules.repeat, rules.samples - 1 - k)):
-                if rules.derivatives > 0:
-                    set_reference_derivatives(design, lane.controller, table[k, 2:begin])
-                u = control(design, lane.controller, table[k, 0], y + table[k, NOISE])
-                status |= status_flags(design, lane.controller)
-                advance(plant, lane.x, lane.scratch, k * rules.dt, u, table[k, begin:])
+            log, until = step.log[i], min(k + rules.repeat, rules.samples - 1)
+            done, _, _, status = run_samples(
+                plant,
+                lane.x,
+                lane.scratch,
+                design,
+                lane.controller,
+                k * rules.dt,
+                rules.dt,
+                table[k:until, 0],
+                table[k:until, 2:begin],
+                table[k:until, begin:],
+                table[k:until, NOISE],
+                log,
+                0,
+                1,
+                0,
+                rules.limit,
+            )
+            y = measure(plant, lane.x)
+            diverged = 0 if abs(y) <= rules.limit else 1
+            u, cost = 0.0, 0.0
+            for j in range(done):
                 k += 1
-                y = measure(plant, lane.x)
-                if not abs(y) <= rules.limit:
-                    diverged = 1
-                    break
-                error = table[k, 0] - y
-                cost += (error * error + rules.cost_of_u * (u * u)) * rules.dt
+                u = log[j, 3]
+                if j + 1 < done or diverged == 0:
+                    error = table[k, 0] - (log[j + 1, 1] if j + 1 < done else y)
+                    cost += (error * error + rules.cost_of_u * (u * u)) * rules.dt
             if diverged != 0:
                 cost += (rules.samples - k) * rules.worst * rules.dt
             row[3] = u
             step.cost[i], step.status[i], step.diverged[i] = cost, status, diverged
             step.sample[i] = k
         row[0], row[1], row[2] = table[k, 0], y, y + table[k, NOISE]
-        at = SIGNALS
+        at = len(SIGNALS)
         for j in range(begin, table.shape[1]):
             row[at] = table[k, j]
             at += 1
@@ -579,6 +599,7 @@ class Loops:
             sample=np.zeros(count, np.int64),
             status=np.zeros(count, np.int64),
             diverged=np.zeros(count, np.int64),
+            log=np.zeros((count, min(self.rules.repeat, self.rules.samples), len(SIGNALS))),
         )
 
     def column(self, name: str) -> int:
@@ -595,7 +616,7 @@ class Loops:
         self._lanes.memory[chosen] = self._rest
         for array in (self.step.sample, self.step.status, self.step.diverged, self.step.cost):
             array[chosen] = 0
-        self.step.row[chosen, SIGNALS - 1] = 0.0
+        self.step.row[chosen, len(SIGNALS) - 1] = 0.0
         for i in which:
             episode = self.episodes.draw(rngs[i])
             if not self.episodes.are_equal:

@@ -83,8 +83,8 @@ def correction_gains(plant: SampledPlant, observer: ESO, law: Vector) -> Correct
     check_one_state_of_f(observer)
     path = state_path(observer, law)
     to_error, to_output = plain_loop(plant, observer, law)
-    _check_stable(to_error, "the loop without learner")
-    _check_stable(path, "the observer's answer to a correction")
+    check_stable(to_error, "the loop without learner")
+    check_stable(path, "the observer's answer to a correction")
     return CorrectionGains(peak_gain(path.then(to_error)), peak_gain(path.then(to_output)))
 
 
@@ -102,7 +102,8 @@ def check_one_state_of_f(observer: ESO) -> None:
         )
 
 
-def _check_stable(system: System, what: str) -> None:
+def check_stable(system: System, what: str) -> None:
+    """Raise a ``ValueError`` for an unstable system; ``what`` names it."""
     pole = system.largest_pole
     if pole >= 1.0:
         raise ValueError(f"{what} is unstable, with a pole at |z| = {pole:.9g}: nothing is certain")

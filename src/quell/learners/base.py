@@ -376,18 +376,30 @@ def grown(weight: float, forget: float) -> float:
 
 
 @kernel
+def follow_noise(noise: float, forget: float, y: float, error: float) -> float:
+    """Return the mean square ``noise`` of ``error = y − x̂_1`` after a sample; rounding counts."""
+    rounding = resolution(forget) * y
+    return noise + forget * (error * error + rounding * rounding - noise)
+
+
+@kernel
+def follow_moments(mean: Vector, variance: Vector, i: int, value: float, forget: float) -> None:
+    """Update mean and variance of signal ``i`` with a sample."""
+    away = value - mean[i]
+    add_small(mean, variance.size, i, forget * away)
+    variance[i] += forget * (away * away - variance[i])
+
+
+@kernel
 def update_gate(gate: NoiseGate, memory: NoiseGateMemory, seen: Vector, y: float, u: float) -> bool:
     """Update the means with a sample; return whether any state moves."""
-    rounding, error = resolution(gate.forget) * y, y - seen[0]
-    memory.noise[0] += gate.forget * (error * error + rounding * rounding - memory.noise[0])
+    memory.noise[0] = follow_noise(memory.noise[0], gate.forget, y, y - seen[0])
     memory.noise[1] = grown(memory.noise[1], gate.forget)
-    size = memory.variance.size
-    order = size - 1
+    order = memory.variance.size - 1
     moves = False
     for i in range(order + 1):
-        away = (seen[i] if i < order else u) - memory.mean[i]
-        add_small(memory.mean, size, i, gate.forget * away)
-        memory.variance[i] += gate.forget * (away * away - memory.variance[i])
+        value = seen[i] if i < order else u
+        follow_moments(memory.mean, memory.variance, i, value, gate.forget)
         # u alone does not count: without motion it is the answer to a load.
         moves = moves or (i < order and is_moving(gate, memory, i))
     return moves

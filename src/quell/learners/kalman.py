@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
-from quell.kernels.single import add_small, add_symmetrically
+from quell.kernels.single import add_symmetrically
 from quell.kernels.sized import Flag, Scalars, Scratch, Size, clear
 from quell.learners.base import (
     AVERAGING_LAGS,
@@ -62,6 +62,8 @@ from quell.learners.base import (
     adapt,
     coefficients,
     commit,
+    follow_moments,
+    follow_noise,
     forget,
     grown,
     lag_memory,
@@ -71,7 +73,6 @@ from quell.learners.base import (
     predict,
     relative_noise,
     reset_lag,
-    resolution,
     restart,
 )
 from quell.learners.frequency_search import (
@@ -271,8 +272,8 @@ def _update_averages(
     target: float,
 ) -> tuple[float, float]:
     """Update the averages; return the mean square of y − x̂_1, and √R."""
-    rounding, doubt = resolution(learner.dt) * y, _UNEXPLAINED_SHARE * target
-    averages.noise += learner.forget * (error * error + rounding * rounding - averages.noise)
+    doubt = _UNEXPLAINED_SHARE * target
+    averages.noise = follow_noise(averages.noise, learner.forget, y, error)
     square = innovation * innovation + doubt * doubt
     averages.unexplained += learner.forget * (square - averages.unexplained)
     averages.weight = grown(averages.weight, learner.forget)
@@ -298,9 +299,7 @@ def _scale_feature(
     learner: KalmanDesign, memory: KalmanMemory, i: int, noise: float, weight: float
 ) -> None:
     filtered, mean, variance = memory.filtered, memory.mean, memory.variance
-    away = filtered[i] - mean[i]
-    add_small(mean, filtered.size, i, learner.forget * away)
-    variance[i] += learner.forget * (away * away - variance[i])
+    follow_moments(mean, variance, i, filtered[i], learner.forget)
     centre = mean[i] if learner.bias else 0.0
     moves = variance[i] > learner.threshold[i] * noise
     filtered[i] = weight * (filtered[i] - centre) if moves else 0.0

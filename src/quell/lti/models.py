@@ -356,6 +356,19 @@ class System(NamedTuple):
         return System(N, B, np.append(following.D * self.C, following.C), following.D * self.D)
 
 
+class MatrixSystem(NamedTuple):
+    """A sampled system of m inputs and p outputs: ``x⁺ − x = N x + B u``, ``y = C x + D u``."""
+
+    N: Matrix  # A − I (n, n)
+    B: Matrix  # (n, m)
+    C: Matrix  # (p, n)
+    D: Matrix  # (p, m)
+
+    def entry(self, output: int, input: int) -> System:  # noqa: A002
+        """Return the system from one input to one output."""
+        return System(self.N, self.B[:, input], self.C[output], float(self.D[output, input]))
+
+
 # ---- Exact sampling of linear models ----
 
 Stack = NDArray[np.float64]  # matrices (models, …, …)

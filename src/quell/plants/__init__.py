@@ -15,12 +15,21 @@ from quell.plants.flexible import (
 from quell.plants.fmu import FMU
 from quell.plants.linear import LinearPlant, delayed, encoded
 from quell.plants.linearise import linearised
+from quell.plants.multibody import Arm, arm, quadrotor_attitude, rotor_levers
+from quell.plants.multivariable import (
+    MultivariableLinearPlant,
+    MultivariableNonlinearPlant,
+    delayed_inputs,
+    encoded_outputs,
+)
 from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.testbeds import DcMotor, TorsionalPlant, dc_motor, torsional, torsional_identified
 
 __all__ = [
-    "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NMassPlant", "NonlinearPlant", "Plant",
-    "PlantBatch", "TorsionalPlant", "batch", "dc_motor", "delayed", "encoded", "labelled",
-    "lagged_two_mass_spring", "linearised", "n_mass", "signals_of", "torsional",
-    "torsional_identified", "two_mass_spring",
+    "FMU", "Arm", "CubicSpringPlant", "DcMotor", "LinearPlant", "MultivariableLinearPlant",
+    "MultivariableNonlinearPlant", "NMassPlant", "NonlinearPlant", "Plant", "PlantBatch",
+    "TorsionalPlant", "arm", "batch", "dc_motor", "delayed", "delayed_inputs", "encoded",
+    "encoded_outputs", "labelled", "lagged_two_mass_spring", "linearised", "n_mass",
+    "quadrotor_attitude", "rotor_levers", "signals_of", "torsional", "torsional_identified",
+    "two_mass_spring",
 ]  # fmt: skip

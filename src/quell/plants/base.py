@@ -89,8 +89,10 @@ def measure(plant: Any, x: Vector) -> float:
 
 
 @generic
-def advance(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def advance(plant: Any, x: Vector, scratch: Vector, t: float, u: Any, w: Vector) -> None:
     """Advance the state ``x`` (n,) by a sample from the time ``t`` [s], with held u and w (m,).
+
+    u is a number, or an array for a plant with several control signals.
 
     ``scratch`` has room for 6 n numbers. It is the same array during a run, and zero before it.
     """

@@ -48,7 +48,7 @@ def processor_time(most: int) -> float:
 
 _ATTRIBUTES = (
     *("dt", "every", "status", "ended", "limit", "plant"),
-    *("signals", "u_min", "u_max"),
+    *("signals", "u_min", "u_max", "axis_names", "axis_features"),
 )
 
 

@@ -39,9 +39,9 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0
 _DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
 
 
-def thinned(t: Vector, values: Vector, points: int = _POINTS) -> tuple[Vector, Vector]:
-    """Return about ``points`` samples that draw the same line: the extremes of each interval."""
-    interval = t.size // (points // 2)
+def thinned(t: Vector, values: Vector) -> tuple[Vector, Vector]:
+    """Return about ``_POINTS`` samples that draw the same line: the extremes of each interval."""
+    interval = t.size // (_POINTS // 2)
     if interval < 4:
         return t, values
     whole = t.size // interval * interval
@@ -181,6 +181,43 @@ def _draw_estimates(run: Any, ax: Any) -> None:
             draw_line(ax, run.t, run[name], label=label, linewidth=1.0)
     unit = run.signals.unit("y-unit/s^n") if run.signals.y.unit else ""
     ax.set_ylabel(Quantity(run.signals.f.name, unit).label("total disturbance"))
+
+
+def plot_axes(run: Any, axes: Any = None) -> Any:
+    """Draw output, error and estimates of each axis of a machine, and all control signals.
+
+    ``run`` is an ``AxesTrajectory``. Returns the matplotlib axes: a row of outputs, of errors, of
+    estimates, and one for the control signals.
+    """
+    machine = [run.axis(i) for i in range(len(run.axis_names))]
+    count = len(machine)
+    if axes is None:
+        figure = new_figure(4.2 * count, 8.5)
+        grid = figure.add_gridspec(4, count)
+        places = [grid[row, i] for row in range(3) for i in range(count)]
+        axes = np.array([figure.add_subplot(place) for place in [*places, grid[3, :]]])
+    axes = np.ravel(axes)
+    if axes.size != 3 * count + 1:
+        raise ValueError(f"axes: must be {3 * count + 1} matplotlib axes, got {axes.size}")
+    for i, (name, axis) in enumerate(zip(run.axis_names, machine, strict=True)):
+        column = axes[i : 3 * count : count]
+        for ax, draw in zip(column, (_draw_output, _draw_error, _draw_estimates), strict=True):
+            draw(axis, ax)
+            ax.legend(loc="upper right", fontsize="small")
+            ax.grid(alpha=0.3)
+            if i:
+                ax.set_ylabel("")
+        column[0].set_title(name)
+    u = run["u"].reshape(len(run), -1)
+    for k in range(u.shape[1]):
+        draw_line(axes[-1], run.t, u[:, k], label=f"u[{k}]", linewidth=1.0)
+    axes[-1].set_ylabel("control signals")
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].legend(loc="upper right", fontsize="small")
+    axes[-1].grid(alpha=0.3)
+    if run.diverged:
+        axes[0].set_title(f"ended at {run.ended:.3g} s: diverged", color="C3")
+    return axes
 
 
 def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: Any = None) -> Any:

@@ -37,6 +37,7 @@ _DESCRIPTIONS = {
     "y_measured": ("output as measured, with noise", "y-unit"),
     "u": ("control signal as applied", "u-unit"),
     "u_wished": ("control signal before limits", "u-unit"),
+    "v": ("B0 u, as applied to the axes", "y-unit/s^n"),
     "w": ("disturbances", "w-unit"),
     "x": ("state of the plant", "state-unit"),
     "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),
@@ -73,6 +74,10 @@ _NAMED = {
 
 def describe(name: str, signals: Signals = UNKNOWN) -> tuple[str, str]:
     """Return a channel's description and unit, those of the plant's ``signals`` if known."""
+    axis, _, channel = name.rpartition(".")  # an estimate of one of several axes
+    if axis and channel in _DESCRIPTIONS:
+        text, unit = _DESCRIPTIONS[channel]
+        return f"{text}, {axis}", unit
     text, unit = _DESCRIPTIONS.get(name, (name, "1"))
     if name in _NAMED:
         known = signals.y if name.startswith("y") else signals.u
@@ -103,7 +108,7 @@ def signals_of_loop(signals: Signals, controller: Any) -> Signals:
 
 def is_vector(name: str, width: int) -> bool:
     """Return whether a channel has an axis for its entries, be it of length 1."""
-    return width > 1 or name in _VECTORS
+    return width > 1 or name.rpartition(".")[2] in _VECTORS
 
 
 def readable_names(channels: Channels) -> tuple[str, ...]:

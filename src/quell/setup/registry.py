@@ -15,6 +15,7 @@ from quell.controllers import (
     ADRC,
     Compensator,
     Feedforward,
+    HeldPlant,
     LinearController,
     NonlinearFeedback,
     OnlineGain,
@@ -241,10 +242,9 @@ def _call_tables(
     functions: Mapping[str, Callable[..., Any]],
     types: Mapping[str, Any] | None = None,
     descriptions: Mapping[str, str] | None = None,
-    beside: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> dict[str, type[CallTable]]:
     return {
-        kind: call_table(kind, function, types=types, descriptions=descriptions, beside=beside)
+        kind: call_table(kind, function, types=types, descriptions=descriptions)
         for kind, function in functions.items()
     }
 
@@ -326,7 +326,10 @@ _SERIES: Mapping[str, Callable[..., Any]] = {
     "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
-_PARTS = {"safe_set": call_table("safe-set", SafeSet, only=True) | None}
+_PARTS = {
+    "safe_set": call_table("safe-set", SafeSet, only=True) | None,
+    "held": call_table("held-plant", HeldPlant, only=True) | None,
+}
 _SCHEDULES = {"table": Schedule, "online-gain": OnlineGain}
 _PARTS["schedule"] = one_of(_call_tables(_SCHEDULES), default="table") | None
 _LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **_PARTS}

@@ -49,10 +49,17 @@ from quell.kernels.dispatch import (
     explain_compile_errors,
     interpreted,
     is_available,
+    kernel,
     specialised,
 )
 from quell.plants.base import Plant, advance, begin_run, check_run, measure
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel
+from quell.plants.multivariable import (
+    CompiledMultivariable,
+    EncodedOutputsModel,
+    PythonMultivariable,
+    is_several,
+)
 from quell.plants.nonlinear import (
     CompiledNonlinear,
     CompiledParametric,
@@ -75,12 +82,14 @@ class Scenario:
     Parameters
     ----------
     reference
-        signal or number that y has to follow [y-unit].
+        signal or number that y has to follow [y-unit]; for several axes a sequence with one for
+        each.
     disturbances
         one signal or number for each disturbance input of the plant, in its order; missing ones are
         zero.
     noise
-        signal added to y before the controller sees it; none by default.
+        signal added to y before the controller sees it; none by default. For several outputs one
+        for all, which draws numbers of its own for each, or a sequence with one for each.
     duration
         length of the run [s]; the record has the samples from 0 to ``duration``, both included.
     x0
@@ -101,10 +110,10 @@ class Scenario:
         ``rest_at`` do not increase within the duration.
     """
 
-    reference: Signal | float = 0.0
+    reference: Signal | float | Sequence[Signal | float] = 0.0
     duration: float = 10.0
     disturbances: Sequence[Signal | float] = ()
-    noise: Signal | float = 0.0
+    noise: Signal | float | Sequence[Signal | float] = 0.0
     x0: ArrayLike | None = None
     rest_at: Sequence[float] = field(default=())
     seed: int = 0
@@ -113,10 +122,11 @@ class Scenario:
     def __post_init__(self) -> None:
         checks.positive("duration", self.duration, "s")
         checks.whole("seed", self.seed, 0)
-        as_signal(self.reference, "reference")
-        as_signal(self.noise, "noise")
-        for name in ("disturbances", "schedule"):
+        for name in ("reference", "noise", "disturbances", "schedule"):
             given = getattr(self, name)
+            if name in ("reference", "noise") and not checks.is_sequence(given):
+                as_signal(given, name)
+                continue
             if not checks.is_sequence(given):
                 raise ValueError(f"{name} = {given!r}: must be a sequence of signals or numbers")
             for i, signal in enumerate(given):
@@ -131,8 +141,15 @@ class Scenario:
         if len(self.disturbances) > inputs:
             plant = f"the plant has {inputs} disturbance inputs"
             raise ValueError(f"disturbances has {len(self.disturbances)} signals: {plant}")
-        given = (as_signal(self.reference), *map(as_signal, self.disturbances))
-        noise = as_signal(self.noise).seeded(self.seed)
+        for name in ("reference", "noise"):
+            if checks.is_sequence(getattr(self, name)):
+                raise ValueError(
+                    f"{name} has {len(getattr(self, name))} signals: must be one, the loop has one "
+                    "output; several axes are controlled by quell.Axes"
+                )
+        one: Any = self.reference, self.noise
+        given = (as_signal(one[0]), *map(as_signal, self.disturbances))
+        noise = as_signal(one[1]).seeded(self.seed)
         # The noise has the seed itself: its bits must not depend on the number of disturbances.
         reference, *disturbances = seeded_apart(given, self.seed)
         return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
@@ -151,9 +168,9 @@ def check_scenario(value: Any, name: str = "scenario") -> None:
 _SEGMENT = 8192
 # Times the largest of 1, |x0| and the reference: |y| beyond it has diverged. Chosen by hand, far
 # above the overshoot of any loop.
-_DIVERGED = 1e6
+DIVERGED = 1e6
 # Times the same: |y| beyond it is outside of the usual range. Chosen by hand.
-_UNUSUAL = 10.0
+UNUSUAL = 10.0
 _NOTHING = Constant(0.0)  # what inputs without a signal get
 # Noise with a shorter sample time, in units of dt, was not meant so. Chosen by hand: a sensor that
 # is sampled twice as quickly as the loop is usual.
@@ -192,27 +209,20 @@ class SampledScenario:
         cls, scenario: Scenario, plant: Plant, controller: Controller, limit: float | None
     ) -> SampledScenario:
         """Sample a scenario for a plant and a controller; ``limit`` as in ``simulate``."""
-        dt, duration = controller.dt, scenario.duration
-        if duration / dt > _MOST_SAMPLES:
-            raise ValueError(
-                f"duration = {duration!r} s with dt = {dt!r} s: must be at most "
-                f"{_MOST_SAMPLES:.0e} samples"
-            )
-        samples = math.floor(in_steps(duration, dt)) + 1
-        _warn_of_times(scenario, dt, samples)
-        given = scenario.x0
-        x0 = np.zeros(plant.order) if given is None else checks.vector("x0", given, plant.order)
+        check_one_signal(plant)
+        dt = controller.dt
+        samples, x0 = samples_and_start(scenario, plant, dt)
         signals = scenario.seeded_signals(plant.disturbances)
-        size = _size(signals[0], x0, samples, dt)
-        limit = _DIVERGED * size if limit is None else checks.positive("limit", limit)
-        rests = frozenset(first_sample_at(time, dt, samples) for time in scenario.rest_at)
+        size = size_of(signals[0], x0, samples, dt)
+        limit = DIVERGED * size if limit is None else checks.positive("limit", limit)
+        rests = rest_samples(scenario, dt, samples)
         derivative, derivatives = signals[0], []
         for _ in range(getattr(controller, "derivatives", 0)):
             check_derivative(derivative)
             derivative = derivative.derivative()
             derivatives.append(derivative)
         derivatives += _schedule_signals(scenario, controller)
-        usual = _UNUSUAL * size
+        usual = UNUSUAL * size
         return cls(signals, tuple(derivatives), samples, dt, x0, limit, usual, rests)
 
     def segment(self, first: int, last: int) -> Segment:
@@ -220,9 +230,39 @@ class SampledScenario:
         reference, disturbances, noise = self.signals
         t = np.arange(first, last, dtype=np.float64)
         t *= self.dt
-        derivatives, w = _columns(self.derivatives, t), _columns(disturbances, t)
+        derivatives, w = columns_at(self.derivatives, t), columns_at(disturbances, t)
         r, added = (np.ascontiguousarray(s(t), np.float64) for s in (reference, noise))
         return Segment(first, self.dt, first in self.rest_samples, r, derivatives, w, added)
+
+
+def check_one_signal(plant: Any) -> None:
+    """Raise a ``ValueError`` for a plant with several inputs or outputs."""
+    if is_several(plant):
+        raise ValueError(
+            f"plant = {plant.name!r} has {plant.inputs} control signals and {plant.outputs} "
+            "outputs, the controller one of each: control it by quell.Axes"
+        )
+
+
+def samples_and_start(scenario: Scenario, plant: Any, dt: float) -> tuple[int, Vector]:
+    """Return the number of samples of a run, and the plant's state at its start."""
+    duration = scenario.duration
+    if duration / dt > _MOST_SAMPLES:
+        raise ValueError(
+            f"duration = {duration!r} s with dt = {dt!r} s: must be at most "
+            f"{_MOST_SAMPLES:.0e} samples"
+        )
+    samples = math.floor(in_steps(duration, dt)) + 1
+    _warn_of_times(scenario, dt, samples)
+    given = scenario.x0
+    return samples, np.zeros(plant.order) if given is None else checks.vector(
+        "x0", given, plant.order
+    )
+
+
+def rest_samples(scenario: Scenario, dt: float, samples: int) -> frozenset[int]:
+    """Return the samples at which the plant is put back to its start."""
+    return frozenset(first_sample_at(time, dt, samples) for time in scenario.rest_at)
 
 
 def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal]:
@@ -235,7 +275,8 @@ def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal
         )
     if not given:
         return []
-    before = (scenario.reference, *scenario.disturbances)  # which have the first seeds
+    reference: Any = scenario.reference
+    before = (reference, *scenario.disturbances)  # which have the first seeds
     signals = [as_signal(each) for each in (*before, *scenario.schedule)]
     return list(seeded_apart(signals, scenario.seed)[len(before) :])
 
@@ -244,10 +285,10 @@ def sampled_schedule(scenario: Scenario, controller: Controller) -> Matrix:
     """Return the external signals of a controller's schedule at each sample (N, signals)."""
     samples = math.floor(in_steps(scenario.duration, controller.dt)) + 1
     t = controller.dt * np.arange(samples, dtype=np.float64)
-    return _columns(tuple(_schedule_signals(scenario, controller)), t)
+    return columns_at(tuple(_schedule_signals(scenario, controller)), t)
 
 
-def segments(scenario: SampledScenario) -> Iterator[Segment]:
+def segments(scenario: Any) -> Iterator[Any]:
     """Return an iterator over all segments, which evaluates the next one in another thread.
 
     The compiled loop releases the interpreter lock, so the signals then cost no time.
@@ -258,7 +299,7 @@ def segments(scenario: SampledScenario) -> Iterator[Segment]:
         return
     context = copy_context()  # with the caller's np.errstate
 
-    def evaluate(samples: tuple[int, int]) -> Segment:
+    def evaluate(samples: tuple[int, int]) -> Any:
         return context.run(scenario.segment, *samples)
 
     with ThreadPoolExecutor(1) as thread:
@@ -306,7 +347,7 @@ def _noises(value: Any) -> Iterator[BandLimitedNoise]:
             yield from _noises(part)
 
 
-def _columns(signals: tuple[Signal, ...], t: Vector) -> Matrix:
+def columns_at(signals: tuple[Signal, ...], t: Vector) -> Matrix:
     """Return signals at the times ``t`` as the columns of a matrix."""
     columns = np.zeros((t.size, len(signals)))
     for j, signal in enumerate(signals):
@@ -315,7 +356,7 @@ def _columns(signals: tuple[Signal, ...], t: Vector) -> Matrix:
     return columns
 
 
-def _size(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
+def size_of(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
     """Return the largest of 1, ``|x0|`` and the reference in the first samples.
 
     The limit depends on these because a loop in encoder counts has large values and is stable.
@@ -335,14 +376,14 @@ LARGEST_ERROR = 0.01
 _SPREAD, _SHARPEST = 16, 16
 # Most doublings of the sub-steps that are tried for advice.
 _MOST_DOUBLINGS = 10
-_WRAPPERS = (EncodedPlantModel, DelayedPlantModel)
+_WRAPPERS = (EncodedPlantModel, DelayedPlantModel, EncodedOutputsModel)
 
 
 class Samples(NamedTuple):
     """Samples of a run, from which the plant is integrated over one sample."""
 
     t: Vector  # [s] (k,)
-    u: Vector  # (k,)
+    u: Any  # (k,), or (k, m) for a plant with several inputs
     w: Matrix  # (k, m)
     x: Matrix  # (k, n)
 
@@ -352,7 +393,7 @@ def step_differences(
     coarse: Any,
     fine: Any,
     t: Vector,
-    u: Vector,
+    u: Any,
     w: Matrix,
     x: Matrix,
     scratch: Vector,
@@ -383,7 +424,8 @@ class IntegrationCheck:
             if isinstance(model, DelayedPlantModel):
                 self._size, self._delay = model.size, 1
             model = model.inner
-        kinds = CompiledNonlinear | CompiledParametric | PythonNonlinear | FrictionModel
+        several = CompiledMultivariable | PythonMultivariable
+        kinds = CompiledNonlinear | CompiledParametric | PythonNonlinear | FrictionModel | several
         self.needed = isinstance(model, kinds)
         self.model, self.error, self.enough = model, 0.0, 0
         self._step_differences = (
@@ -521,6 +563,10 @@ def run_block(
     return r.size, row, until_next, status
 
 
+run_samples = kernel(interpreted(run_block))
+"""``run_block`` for compiled loops over several loops, which call it for each of them."""
+
+
 class Loop:
     """A plant and a controller during a run; ``run`` takes them through a segment.
 
@@ -528,12 +574,14 @@ class Loop:
     code.
     """
 
+    block: Any = staticmethod(run_block)
+
     def __init__(
         self,
-        plant: Plant,
+        plant: Any,
         model: Any,
-        controller: Controller,
-        scenario: SampledScenario,
+        controller: Any,
+        scenario: Any,
         interpret: bool,
         like: Loop | None = None,
     ) -> None:
@@ -594,13 +642,13 @@ class Loop:
             arguments = self._arguments(segment, log, row, every)
             if self._run_block is None:
                 other = None if self._like is None else self._like._run_block
-                self._run_block = other or self._entry(run_block, *arguments)
+                self._run_block = other or self._entry(self.block, *arguments)
             samples, row, self.until_next, flags = self._run_block(*arguments)
         check_run(self.model, self.scratch)
         self.done = first + samples
-        if samples < segment.r.size and row > 0:
+        if samples < len(segment.r) and row > 0:
             self.last_row = log[row - 1].copy()
-        self.status |= flags if samples == segment.r.size else flags | Status.DIVERGED
+        self.status |= flags if samples == len(segment.r) else flags | Status.DIVERGED
         if self.integration.needed:
             self._check_integration(log[from_row:row], from_sample, every, dt)
         return int(row)
@@ -608,7 +656,7 @@ class Loop:
     def is_compiled(self, segment: Segment) -> bool:
         """Return whether its code is in this process, or in the disk cache."""
         log = np.empty((1, self.width))
-        return self._as_python or is_available(run_block, *self._arguments(segment, log, 0, 1))
+        return self._as_python or is_available(self.block, *self._arguments(segment, log, 0, 1))
 
     def _arguments(self, segment: Segment, log: Matrix, row: int, every: int) -> tuple[Any, ...]:
         """Return the arguments of ``run_block``."""
@@ -623,11 +671,30 @@ class Loop:
         loop that diverges for another reason may be too fast for its sub-steps, too.
         """
         if self.diverged:
-            log = log[: int(np.argmin(np.append(np.abs(log[:, 1]) <= self.scenario.range, False)))]
+            usual = [self.is_usual(row) for row in log]
+            log = log[: int(np.argmin(np.append(usual, False)))]
         t = (first + every * np.arange(log.shape[0], dtype=np.float64)) * dt
-        first_state = 4 + self.plant.disturbances
-        w, x = log[:, 4:first_state], log[:, first_state : first_state + self.x.size]
-        self.integration.add(Samples(t, log[:, 3], w, x), all_of_them=self.diverged)
+        first_state = self.first_state
+        w = log[:, first_state - self.plant.disturbances : first_state]
+        x = log[:, first_state : first_state + self.x.size]
+        self.integration.add(Samples(t, self.controls(log), w, x), all_of_them=self.diverged)
+
+    @property
+    def first_state(self) -> int:
+        """The first column of a log that has the plant's state."""
+        return len(SIGNALS) + int(self.plant.disturbances)
+
+    def controls(self, log: Matrix) -> Any:
+        """Return the control signals of rows of a log."""
+        return log[:, 3]
+
+    def is_usual(self, row: Vector) -> bool:
+        """Return whether y of a row of a log is in its usual range."""
+        return bool(abs(row[1]) <= self.scenario.range)
+
+    def measured(self) -> Vector:
+        """Return the outputs now."""
+        return np.array([measure(self.model, self.x)])
 
 
 def logged_channels(plant: Plant, controller: Controller) -> Channels:
@@ -670,11 +737,11 @@ def _warn_of_undefined_functions(plant: str, loop: Loop) -> None:
     """Warn if a function of the user returned NaN or infinity while y was in its usual range."""
     if not (loop.diverged and loop.integration.needed):
         return
-    row, first = loop.last_row, 4 + loop.plant.disturbances
+    row, first = loop.last_row, loop.first_state
     before = loop.x0 if row is None else row[first : first + loop.x.size]
-    usual = loop.ended == 0 if row is None else abs(row[1]) <= loop.scenario.range
+    usual = loop.ended == 0 if row is None else loop.is_usual(row)
     with np.errstate(all="ignore"):
-        defined = bool(np.all(np.isfinite([*loop.x, measure(loop.model, loop.x)])))
+        defined = bool(np.all(np.isfinite([*loop.x, *loop.measured()])))
     if defined or not usual:
         return
     warn(
@@ -691,7 +758,7 @@ def _diverges_anyway(loop: Loop) -> bool:
         return True
     scenario = replace(loop.scenario, limit=loop.scenario.range)
     model = with_substeps(loop.model, loop.integration.enough)
-    again = Loop(loop.plant, model, loop.controller, scenario, loop.interpret)
+    again = type(loop)(loop.plant, model, loop.controller, scenario, loop.interpret)
     again.integration.needed = False
     samples = loop.ended + 1
     log, every = np.empty((1, loop.width)), samples

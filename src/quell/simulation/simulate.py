@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
+from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, check_controller, limits_of
 from quell.controllers.single import check_compilable, in_single_precision
 from quell.kernels import dispatch
@@ -32,6 +33,7 @@ from quell.lti.models import is_linear_model
 from quell.parallel import in_parallel, one_blas_thread, part_of
 from quell.plants.base import Plant, PlantBatch, check_plant, signals_of
 from quell.plants.linear import LinearPlant
+from quell.records.axes import AxesTrajectory
 from quell.records.record import columns_of, readable_names, signals_of_loop
 from quell.records.trajectory import BatchTrajectory, Trajectory
 from quell.simulation.driver import (
@@ -46,6 +48,7 @@ from quell.simulation.driver import (
     segment_bounds,
     segments,
 )
+from quell.simulation.several import simulate_axes
 from quell.types import Channels
 
 # ---- Many runs at once, on all cores ----
@@ -269,6 +272,17 @@ def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
 ) -> Trajectory: ...
 @overload
 def simulate(
+    plant: Any,
+    controller: Axes,
+    scenario: Scenario,
+    *,
+    record_every: int = 1,
+    limit: float | None = None,
+    interpret: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> AxesTrajectory: ...
+@overload
+def simulate(
     plant: Plant | Sequence[Plant],
     controller: Controller | Sequence[Controller],
     scenario: Scenario | Sequence[Scenario],
@@ -293,7 +307,7 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-) -> Trajectory | BatchTrajectory:
+) -> Trajectory | BatchTrajectory | AxesTrajectory:
     """Run a controller on a plant through a scenario, or a batch of them on all cores.
 
     The controller starts with nothing learned, from a new state: neither it nor the plant is
@@ -332,8 +346,8 @@ def simulate(
 
     Returns
     -------
-    Trajectory or BatchTrajectory
-        the recorded samples, up to the end of the run.
+    Trajectory, BatchTrajectory or AxesTrajectory
+        the recorded samples, up to the end of the run; ``AxesTrajectory`` for ``quell.Axes``.
 
     Raises
     ------
@@ -350,6 +364,15 @@ def simulate(
     interpret = interpret or dispatch.interpret_all
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
+    if isinstance(controller, Axes):
+        for name, value, usual in (
+            ("precision", precision, "double"), ("record", record, None), ("workers", workers, None)
+        ):  # fmt: skip
+            if value != usual:
+                raise ValueError(f"{name} = {value!r}: several axes are simulated without it")
+        check_plant(plant)
+        check_scenario(scenario)
+        return simulate_axes(plant, controller, scenario, record_every, limit, interpret, progress)
     if checks.one_of("precision", precision, ("double", "single")) == "single":
         if not interpret:
             check_compilable()

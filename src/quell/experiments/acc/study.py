@@ -199,21 +199,19 @@ def draw(
     return _spread(against_spread(progress), ax)
 
 
-def against_spread(
-    progress: Progress, spreads: Sequence[float] = SPREADS, count: int = _COUNT
-) -> Rates:
+def against_spread(progress: Progress) -> Rates:
     """Return by spring and controller the failure rate and its interval for each spread."""
     found: dict[str, dict[str, list[tuple[float, float, float]]]] = {s: {} for s in SPRINGS}
     ours = designs(DT)
-    for i, spread in enumerate(spreads):
-        samples = generated(count, spread, seed=1)
+    for i, spread in enumerate(SPREADS):
+        samples = generated(_COUNT, spread, seed=1)
         for spring, cubic in SPRINGS.items():
-            progress("spread", i / len(spreads))
+            progress("spread", i / len(SPREADS))
             judged = {name: judge_published(C, samples, cubic) for name, C in PUBLISHED.items()}
             judged |= {name: judge_sampled(C, samples, cubic) for name, C in ours.items()}
             for name, one in judged.items():
                 failures = int(np.sum(one.fails))
-                point = (failures / count, *interval(failures, count))
+                point = (failures / _COUNT, *interval(failures, _COUNT))
                 found[spring].setdefault(name, []).append(point)
     return found
 

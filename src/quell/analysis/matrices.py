@@ -1,0 +1,199 @@
+"""Sampled systems of several inputs and outputs: frequency responses, and matrices as given.
+
+The counterpart of ``analysis/margins`` for one signal: the same powers of z⁻¹ for dead times, the
+same scaling, a linear solve per frequency.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.analysis.margins import (
+    Complex,
+    balancing_scales,
+    delayed_parts,
+    without_delays,
+)
+from quell.controllers.linear import LinearLaw
+from quell.lti.models import MatrixSystem
+from quell.types import Matrix, Vector
+
+# ---- Frequency responses of several inputs and outputs ----
+
+# Numbers in the matrices of the frequencies that are solved together: 16 MB, as for one signal.
+_BLOCK = 1_000_000
+
+
+class MatrixResponse:
+    """The frequency response of a system of several inputs and outputs."""
+
+    def __init__(self, system: MatrixSystem) -> None:
+        delays = without_delays(system.N, *system.B.T)
+        steps, N, B, C = np.zeros(0), system.N, system.B, system.C
+        M = np.zeros((0, *N.shape))
+        self._C_late = np.zeros((0, *C.shape))
+        if delays is not None:
+            kept, r = delays.kept, delays.kept.size
+            steps, parts = delayed_parts(delays, np.vstack([N[kept], C]))
+            M, self._C_late = parts[:, :r], parts[:, r:]
+            N, B, C = delays.N, B[kept], C[:, kept]
+        scale = balancing_scales(N, M) if N.size else np.ones(0)
+        self._steps, self._D = steps, system.D
+        self._M = (M * scale / scale[:, None]).reshape(steps.size, N.size)
+        self._C_late = self._C_late * scale
+        self._N, self._B, self._C = N * scale / scale[:, None], B / scale[:, None], C * scale
+
+    def __call__(self, omega: Any, dt: float) -> Complex:
+        """Return the responses (k, p, m) at the frequencies ``omega`` (k,) [rad/s]."""
+        omega = np.atleast_1d(np.asarray(omega, dtype=np.float64))
+        count = math.ceil(omega.size * (self._N.size + self._steps.size) / _BLOCK)
+        parts = np.array_split(omega, max(count, 1))
+        return np.concatenate([self._block(part, dt) for part in parts])
+
+    def _block(self, omega: Vector, dt: float) -> Complex:
+        size = self._N.shape[0]
+        resolvent = np.expm1(1j * omega * dt)[:, None, None] * np.eye(size) - self._N
+        output: Any = self._C
+        if self._steps.size:
+            late = np.exp(-1j * dt * omega[:, None] * self._steps)
+            resolvent -= (late @ self._M).reshape(resolvent.shape)
+            output = self._C + np.tensordot(late, self._C_late, 1)
+        try:
+            solved = np.linalg.solve(
+                resolvent, np.broadcast_to(self._B, (omega.size, *self._B.shape))
+            )
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                f"omega = {omega.tolist()!r} rad/s: the response is infinite at one of "
+                "them, a pole; leave it out"
+            ) from None
+        found: Complex = output @ solved + self._D
+        return found
+
+
+# ---- Plants and laws as users give them ----
+
+
+class MatrixLaw(NamedTuple):
+    """A sampled linear controller: ``x⁺ = A x + B_y y + B_r r``, ``u = C x + D_y y + D_r r``."""
+
+    A: Matrix  # (k, k)
+    B_y: Matrix  # (k, p)
+    B_r: Matrix  # (k, number of references)
+    C: Matrix  # (m, k)
+    D_y: Matrix  # (m, p)
+    D_r: Matrix  # (m, number of references)
+
+
+def axes_law(laws: Sequence[LinearLaw], B0: Any) -> MatrixLaw:
+    """Return the law of several axes, ``u = B0⁻¹ v``, with the v of a law for each axis.
+
+    Raises ``ValueError`` for a B0 that is not square or has no inverse.
+
+    Parameters
+    ----------
+    laws
+        the law of each axis, from y_i and r_i to v_i (``linear_law`` of a controller with b0 = 1).
+    B0
+        gain matrix (axes, axes), ``y_i^(n_i) = f_i + (B0 u)_i``.
+    """
+    laws = list(laws)
+    axes = len(laws)
+    if not axes or not all(isinstance(law, LinearLaw) for law in laws):
+        raise ValueError(f"laws = {laws!r}: must have a quell.controllers.LinearLaw for each axis")
+    B0 = checks.matrix("B0", B0)
+    if B0.shape != (axes, axes):
+        raise ValueError(
+            f"B0 has shape {B0.shape}: must be ({axes}, {axes}), a row for each of the {axes} axes "
+            "and a column for each actuator"
+        )
+    if np.linalg.matrix_rank(B0) < axes:
+        raise ValueError(f"B0 = {B0.tolist()!r}: must have an inverse, u = B0⁻¹ v")
+    from scipy.linalg import block_diag
+
+    def whole(of: Callable[[LinearLaw], Any]) -> Matrix:
+        found: Matrix = block_diag(*(of(law) for law in laws))
+        return found
+
+    return MatrixLaw(
+        A=whole(lambda law: law.A + np.outer(law.B_u, law.C)),
+        B_y=whole(lambda law: (law.B_y + law.B_u * law.D_y)[:, None]),
+        B_r=whole(lambda law: (law.B_r + law.B_u * law.D_r)[:, None]),
+        C=np.linalg.solve(B0, whole(lambda law: law.C[None])),
+        D_y=np.linalg.solve(B0, np.diag([law.D_y for law in laws])),
+        D_r=np.linalg.solve(B0, np.diag([law.D_r for law in laws])),
+    )
+
+
+def plant_matrices(plant: Any) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A (n, n), B (n, m), C (p, n) of a sampled plant, checked.
+
+    Raises ``ValueError`` for other objects, matrices that do not fit, or direct feedthrough.
+    """
+    parts = plant
+    if all(hasattr(plant, name) for name in "ABC"):
+        parts = (plant.A, plant.B, plant.C, getattr(plant, "D", None))
+    if not isinstance(parts, tuple | list) or len(parts) not in (3, 4):
+        raise ValueError(
+            f"plant = {plant!r}: must be sampled matrices (A, B, C), or an object that has them"
+        )
+    A, B, C = parts[:3]
+    A = checks.matrix("A", A)
+    n = A.shape[0]
+    if A.shape != (n, n):
+        raise ValueError(f"A has shape {A.shape}: must be square, a row for each state")
+    B, C = checks.matrix("B", B), checks.matrix("C", C)
+    if B.shape[0] != n:
+        raise ValueError(
+            f"B has shape {B.shape} and A has shape {A.shape}: B must have a row for each of the "
+            f"{n} states, and a column for each control signal"
+        )
+    if C.shape[1] != n:
+        raise ValueError(
+            f"C has shape {C.shape} and A has shape {A.shape}: C must have a row for each output, "
+            f"and a column for each of the {n} states"
+        )
+    if len(parts) == 4 and parts[3] is not None and np.any(parts[3]):
+        raise ValueError(
+            f"D = {np.asarray(parts[3]).tolist()}: must be zero, the outputs may not follow the "
+            "control signals at once; add the delay of the sensors as states"
+        )
+    return A, B, C
+
+
+def law_matrices(law: Any, m: int, p: int) -> MatrixLaw:
+    """Return a law with checked shapes, for m control signals and p measurements."""
+    parts = tuple(law) if isinstance(law, tuple | list) else None
+    if parts is None or len(parts) not in (4, 6):
+        raise ValueError(
+            f"law = {law!r}: must be a MatrixLaw, matrices (A, B_y, B_r, C, D_y, D_r), or "
+            "(A, B_y, C, D_y) without references"
+        )
+    if len(parts) == 4:
+        A, B_y, C, D_y = parts
+        parts = (A, B_y, np.zeros((np.shape(A)[0], 0)), C, D_y, np.zeros((m, 0)))
+    found = MatrixLaw(*map(checks.matrix, MatrixLaw._fields, parts))
+    k, references = found.A.shape[0], found.B_r.shape[1]
+    what = {
+        "A": ((k, k), "a row and a column for each state of the law"),
+        "B_y": ((k, p), f"a row for each state of the law, a column for each of the {p} outputs"),
+        "B_r": ((k, references), "a row for each state of the law, a column for each reference"),
+        "C": ((m, k), f"a row for each of the {m} control signals, a column for each state"),
+        "D_y": ((m, p), f"a row for each of the {m} control signals, a column for each output"),
+        "D_r": (
+            (m, references),
+            f"a row for each of the {m} control signals, as many columns as B_r",
+        ),
+    }
+    for name, (shape, meaning) in what.items():
+        if getattr(found, name).shape != shape:
+            raise ValueError(
+                f"law: {name} has shape {getattr(found, name).shape}, with A of shape "
+                f"{found.A.shape}: must be {shape}, {meaning}"
+            )
+    return found

@@ -1,0 +1,699 @@
+"""From what the axes ask for to what the actuators do: B0, its inverse, and limits.
+
+The axes are ``y_i^(n_i) = f_i + v_i`` with ``v = B0 u``, B0 (n, m). Each axis asks for v_i. With
+the weights W of the actuators (diagonal) and a wished u_r, the u that comes nearest to u_r is
+
+    u = u_r + B0⁺ (v − B0 u_r),        B0⁺ = W⁻¹ B0ᵀ (B0 W⁻¹ B0ᵀ)⁻¹
+
+which is ``B0⁻¹ v`` for as many actuators as axes. Every observer then receives (B0 u)_i with the u
+that was applied after all limits (docs/axes).
+
+*Limits.* In a sample each actuator has a range, from its limits of magnitude and of rate. What to
+do with a u outside of it:
+
+``"each"``
+    cut each actuator by itself. With more actuators than axes the others make up for those that
+    are cut: u is the weighted least-squares solution within the range,
+
+        min  γ Σ_i ((B0 u − v)_i / ‖B0_i‖)² + Σ_k W_k (u_k − u_r,k)²,      γ = 10⁸
+
+    with W of largest entry 1, by an active set (Härkegård, *IEEE Conf. Decision and Control* 2002,
+    "Efficient active set algorithms for solving constrained least squares problems in aircraft
+    control allocation"). Rows are scaled, so axes in metres and radians count alike.
+``"direction"``
+    go from the point of the range that is nearest to u_r towards u as far as the range allows: v
+    keeps its direction.
+axes in order of priority
+    give the first axis all that the range allows, then the second, and so on.
+
+*B0 as a function* of the estimates, or its inverse M, is evaluated in each sample. One that is not
+finite or has no inverse is not used: the last good one stays, and the status has ``GAIN_HELD``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba import types as nb_types
+
+from quell import checks
+from quell.controllers.base import Limits, RateLimit, checked_limits
+from quell.kernels import user_functions
+from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.sized import Flag
+from quell.kernels.user_functions import POINTER, call
+from quell.types import Matrix, Status, Vector, warn
+
+_SATURATED = int(Status.SATURATED)
+_RATE_LIMITED = int(Status.RATE_LIMITED)
+_OVERFLOWED = int(Status.OVERFLOWED)
+_GAIN_HELD = int(Status.GAIN_HELD)
+
+# Condition number of B0, each axis and each actuator scaled to one, from which a warning is issued:
+# an error of a percent in B0 then makes one of 30 % in a direction of v. And that from which B0
+# counts as singular. Chosen by hand.
+_POOR, _SINGULAR = 30.0, 1e8
+# Weight of what the axes miss over that of u, and rounds of the active set for each actuator: it
+# ends by itself after about as many as there are actuators. An actuator is freed if its slope is
+# above this share of what moving it through its whole range changes. Chosen by hand.
+_GAMMA, _ROUNDS, _RELEASE = 1e8, 4, 1e-12
+# A pivot below this share of the largest entry of a matrix that a function returned counts as zero.
+_LEAST_PIVOT = 1e-12
+
+
+class GainMemory(NamedTuple):
+    """B0 of the present sample, with its inverse and room to calculate it."""
+
+    B: Matrix  # (n, m)
+    inverse: Matrix  # B0⁺ (m, n)
+    fresh: Matrix  # what a function returned (n, m), or M (n, n)
+    work: Matrix  # (n, 2 n)
+
+
+class ConstantGain(NamedTuple):
+    """A constant B0: the memory has it from the start."""
+
+    B: Matrix  # (n, m)
+
+
+class FunctionGain(NamedTuple):
+    """B0, or its inverse M, as a function of the estimates, by address."""
+
+    address: int
+    is_inverse: Flag
+    weights: Vector  # of the actuators (m,)
+
+
+@kernel
+def inverted(matrix: Matrix, work: Matrix, inverse: Matrix) -> bool:
+    """Write the inverse of a square matrix by Gauss-Jordan elimination; return whether it has one.
+
+    ``work`` has room for (n, 2 n) numbers.
+    """
+    n = matrix.shape[0]
+    largest = 0.0
+    for i in range(n):
+        for j in range(n):
+            if not is_finite(matrix[i, j]):
+                return False
+            largest = max(largest, abs(matrix[i, j]))
+            work[i, j] = matrix[i, j]
+            work[i, n + j] = 1.0 if i == j else 0.0
+    for k in range(n):
+        pivot = k
+        for i in range(k + 1, n):
+            if abs(work[i, k]) > abs(work[pivot, k]):
+                pivot = i
+        if not abs(work[pivot, k]) > _LEAST_PIVOT * largest:
+            return False
+        for j in range(2 * n):
+            swapped = work[k, j]
+            work[k, j] = work[pivot, j]
+            work[pivot, j] = swapped
+        scale = 1.0 / work[k, k]
+        for j in range(2 * n):
+            work[k, j] *= scale
+        for i in range(n):
+            if i != k:
+                factor = work[i, k]
+                for j in range(2 * n):
+                    work[i, j] -= factor * work[k, j]
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] = work[i, n + j]
+    return True
+
+
+@generic
+def update_gain(gain: Any, memory: GainMemory, x: Matrix) -> int:
+    """Set B0 for the estimates ``x[axis, derivative]``; return the status flag."""
+    raise TypeError
+
+
+@update_gain.register(ConstantGain)
+def _constant(gain: ConstantGain, memory: GainMemory, x: Matrix) -> int:
+    return 0
+
+
+@update_gain.register(FunctionGain)
+def _by_function(gain: FunctionGain, memory: GainMemory, x: Matrix) -> int:
+    call(gain.address, x, memory.fresh)
+    n, m = memory.B.shape
+    fresh = memory.fresh
+    if n == m:
+        target = memory.B if gain.is_inverse else memory.inverse
+        if not inverted(fresh, memory.work, target):
+            return _GAIN_HELD
+        kept = memory.inverse if gain.is_inverse else memory.B
+        for i in range(n):
+            for j in range(n):
+                kept[i, j] = fresh[i, j]
+        return 0
+    if not weighted_inverse(fresh, gain.weights, memory.work, memory.inverse):
+        weighted_inverse(memory.B, gain.weights, memory.work, memory.inverse)
+        return _GAIN_HELD
+    for i in range(n):
+        for j in range(m):
+            memory.B[i, j] = fresh[i, j]
+    return 0
+
+
+@kernel
+def weighted_inverse(B: Matrix, weights: Vector, work: Matrix, inverse: Matrix) -> bool:
+    """Write ``W⁻¹ Bᵀ (B W⁻¹ Bᵀ)⁻¹`` (m, n), m ≥ n; return False if there is none.
+
+    Then ``inverse`` is of no use.
+    """
+    n, m = B.shape
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(m):
+                total += B[i, k] * B[j, k] / weights[k]
+            inverse[j, i] = total  # m ≥ n: room for (n, n)
+    if not inverted(inverse[:n], work, inverse[:n]):
+        return False
+    for i in range(n):
+        for j in range(n):
+            work[i, j] = inverse[i, j]
+    for k in range(m):
+        for j in range(n):
+            total = 0.0
+            for i in range(n):
+                total += B[i, k] * work[i, j]
+            inverse[k, j] = total / weights[k]
+    return True
+
+
+# ---- Limits ----
+
+
+class ActuatorLimits(NamedTuple):
+    """Limits of magnitude and of the change in a sample of each actuator (m,)."""
+
+    low: Vector
+    high: Vector
+    most_change: Vector
+    least_change: Vector
+
+
+class RangeMemory(NamedTuple):
+    """The range of the actuators in a sample, and room to calculate."""
+
+    low: Vector  # (m,)
+    high: Vector  # (m,)
+    step: Vector  # (m,)
+    rest: Vector  # v that is left (n,)
+    free: Vector  # (m,) 1 for actuators that are not at an end of their range
+    slope: Vector  # of the sum of squares (m,)
+    H: Matrix  # of the sum of squares (m, m)
+    L: Matrix  # its factor for the free actuators (m, m)
+
+
+def range_memory(n: int, m: int) -> RangeMemory:
+    """Return room for n axes and m actuators."""
+    k = m if m > n else 0  # as many actuators as axes leave no squares to sum
+    low, high, step, free, slope = (np.zeros(size) for size in (m, m, m, k, k))
+    return RangeMemory(
+        low, high, step, np.zeros(n), free, slope, np.zeros((k, k)), np.zeros((k, k))
+    )
+
+
+class CutEach(NamedTuple):
+    """Each actuator is cut by itself."""
+
+    wished: Vector  # u_r (m,)
+    weights: Vector  # (m,)
+
+
+class KeepDirection(NamedTuple):
+    """All actuators are scaled together."""
+
+    wished: Vector
+
+
+class ByPriority(NamedTuple):
+    """The axes get what they ask for one after the other."""
+
+    wished: Vector
+    order: Any  # axes, the most important first (n,), integers
+
+
+@kernel
+def set_range(limits: ActuatorLimits, before: Vector, memory: RangeMemory) -> None:
+    """Set the range of each actuator after ``before``; limits of magnitude go before those of rate.
+
+    As for one actuator, u is within its limits even if it has to change faster for that.
+    """
+    for i in range(before.size):
+        low, high = limits.low[i], limits.high[i]
+        memory.low[i] = min(max(before[i] + limits.least_change[i], low), high)
+        memory.high[i] = max(min(before[i] + limits.most_change[i], high), low)
+
+
+@kernel
+def _cut(memory: RangeMemory, limits: ActuatorLimits, i: int, wish: float) -> tuple[float, int]:
+    """Return a value of actuator i within its range, and the flag of what cut it."""
+    if wish > memory.high[i]:
+        value = memory.high[i]
+        return value, _SATURATED if value == limits.high[i] else _RATE_LIMITED
+    if wish < memory.low[i]:
+        value = memory.low[i]
+        return value, _SATURATED if value == limits.low[i] else _RATE_LIMITED
+    if not is_finite(wish):
+        return min(max(0.0, memory.low[i]), memory.high[i]), _OVERFLOWED
+    return wish, 0
+
+
+@kernel
+def _wish(memory: GainMemory, wished: Vector, v: Vector, rest: Vector, u: Vector) -> None:
+    """Write ``u_r + B0⁺ (v − B0 u_r)`` into ``u`` (m,)."""
+    n, m = memory.B.shape
+    for i in range(n):
+        rest[i] = v[i]
+        for k in range(m):
+            rest[i] -= memory.B[i, k] * wished[k]
+    for k in range(m):
+        u[k] = wished[k]
+        for i in range(n):
+            u[k] += memory.inverse[k, i] * rest[i]
+
+
+@generic
+def allocate(
+    rule: Any,
+    limits: ActuatorLimits,
+    gain: GainMemory,
+    memory: RangeMemory,
+    v: Vector,
+    before: Vector,
+    u: Vector,
+) -> int:
+    """Write the control signals ``u`` (m,) for ``v`` (n,) after ``before``; return the flags."""
+    raise TypeError
+
+
+@allocate.register(CutEach)
+def _cut_each(
+    rule: CutEach,
+    limits: ActuatorLimits,
+    gain: GainMemory,
+    memory: RangeMemory,
+    v: Vector,
+    before: Vector,
+    u: Vector,
+) -> int:
+    n, m = gain.B.shape
+    set_range(limits, before, memory)
+    _wish(gain, rule.wished, v, memory.rest, u)
+    flags = 0
+    for k in range(m):
+        u[k], cut = _cut(memory, limits, k, u[k])
+        flags |= cut
+    usable = flags & _OVERFLOWED == 0
+    for i in range(n):
+        usable = usable and is_finite(v[i])
+    if m > n and flags != 0 and usable:
+        _least_squares(rule, gain, memory, v, u)
+        for k in range(m):
+            u[k], cut = _cut(memory, limits, k, u[k])
+            flags |= cut & _OVERFLOWED
+    return flags
+
+
+@kernel
+def _least_squares(
+    rule: CutEach, gain: GainMemory, memory: RangeMemory, v: Vector, u: Vector
+) -> None:
+    """Write the least-squares solution within the range into ``u``, which begins inside of it.
+
+    In each round the solution for the actuators that are free is found. Either one of them meets
+    the end of its range and is free no more, or one that is at an end and wants to go back is freed
+    (Nocedal & Wright, *Numerical Optimization*, algorithm 16.3).
+    """
+    n, m = gain.B.shape
+    H, L, slope, free = memory.H, memory.L, memory.slope, memory.free
+    largest = 0.0
+    for k in range(m):
+        largest = max(largest, rule.weights[k])
+        free[k] = 1.0 if memory.low[k] < u[k] < memory.high[k] else 0.0
+        for j in range(m):
+            H[k, j] = 0.0
+    for i in range(n):
+        size = 0.0
+        for k in range(m):
+            size += gain.B[i, k] * gain.B[i, k]
+        for k in range(m):
+            for j in range(m):
+                H[k, j] += _GAMMA / size * gain.B[i, k] * gain.B[i, j]
+    for k in range(m):
+        H[k, k] += rule.weights[k] / largest
+    for _ in range(_ROUNDS * m):
+        _slope(rule, gain, v, u, largest, slope)
+        _solve_free(H, L, slope, free, memory.step)
+        share, end = 1.0, -1
+        for k in range(m):
+            step = memory.step[k]
+            room = memory.high[k] - u[k] if step > 0.0 else memory.low[k] - u[k]
+            if free[k] != 0.0 and abs(step) * share > abs(room):
+                share, end = room / step, k
+        for k in range(m):
+            if free[k] != 0.0:
+                u[k] = min(max(u[k] + share * memory.step[k], memory.low[k]), memory.high[k])
+        if end >= 0:
+            u[end] = memory.high[end] if memory.step[end] > 0.0 else memory.low[end]
+            free[end] = 0.0
+            continue
+        _slope(rule, gain, v, u, largest, slope)
+        worst, wish = -1, 0.0
+        for k in range(m):
+            if free[k] == 0.0 and memory.low[k] < memory.high[k]:
+                back = -slope[k] if u[k] <= memory.low[k] else slope[k]
+                if back > wish + _RELEASE * H[k, k] * (memory.high[k] - memory.low[k]):
+                    worst, wish = k, back
+        if worst < 0:
+            return
+        free[worst] = 1.0
+
+
+@kernel
+def _slope(
+    rule: CutEach, gain: GainMemory, v: Vector, u: Vector, largest: float, slope: Vector
+) -> None:
+    """Write half of the derivative of the sum of squares by u (m,)."""
+    n, m = gain.B.shape
+    for k in range(m):
+        slope[k] = rule.weights[k] / largest * (u[k] - rule.wished[k])
+    for i in range(n):
+        size, missed = 0.0, -v[i]
+        for k in range(m):
+            size += gain.B[i, k] * gain.B[i, k]
+            missed += gain.B[i, k] * u[k]
+        for k in range(m):
+            slope[k] += _GAMMA / size * missed * gain.B[i, k]
+
+
+@kernel
+def _solve_free(H: Matrix, L: Matrix, slope: Vector, free: Vector, step: Vector) -> None:
+    """Write the solution of ``H step = −slope`` for the free actuators, by Cholesky; else 0."""
+    m = slope.size
+    for i in range(m):
+        step[i] = 0.0
+        if free[i] == 0.0:
+            continue
+        total = -slope[i]
+        for j in range(i + 1):
+            if free[j] == 0.0:
+                continue
+            entry = H[i, j]
+            for k in range(j):
+                if free[k] != 0.0:
+                    entry -= L[i, k] * L[j, k]
+            if j < i:
+                L[i, j] = entry / L[j, j]
+                total -= L[i, j] * step[j]
+            else:
+                L[i, i] = math.sqrt(max(entry, 1.0e-300))
+        step[i] = total / L[i, i]
+    for i in range(m - 1, -1, -1):
+        if free[i] == 0.0:
+            continue
+        for j in range(i + 1, m):
+            if free[j] != 0.0:
+                step[i] -= L[j, i] * step[j]
+        step[i] /= L[i, i]
+
+
+@kernel
+def _share_within(memory: RangeMemory, u: Vector) -> float:
+    """Return the largest share in [0, 1] of ``memory.step`` that keeps u in its range."""
+    share = 1.0
+    for k in range(u.size):
+        step = memory.step[k]
+        if step > memory.high[k] - u[k]:
+            share = min(share, max(memory.high[k] - u[k], 0.0) / step)
+        elif step < memory.low[k] - u[k]:
+            share = min(share, max(u[k] - memory.low[k], 0.0) / -step)
+    return share
+
+
+@kernel
+def _go(memory: RangeMemory, limits: ActuatorLimits, u: Vector) -> int:
+    """Move u by ``memory.step`` as far as its range allows; return the flags."""
+    share = _share_within(memory, u)
+    flags = 0
+    for k in range(u.size):
+        u[k], wrong = _cut(memory, limits, k, u[k] + share * memory.step[k])
+        flags |= wrong & _OVERFLOWED
+        if share < 1.0 and (u[k] == memory.high[k] or u[k] == memory.low[k]):
+            at_end = u[k] == limits.high[k] or u[k] == limits.low[k]
+            flags |= _SATURATED if at_end else _RATE_LIMITED
+    if share < 1.0 and flags == 0:  # rounding left u just inside of the range
+        flags = _SATURATED
+    return flags
+
+
+@allocate.register(KeepDirection)
+def _keep_direction(
+    rule: KeepDirection,
+    limits: ActuatorLimits,
+    gain: GainMemory,
+    memory: RangeMemory,
+    v: Vector,
+    before: Vector,
+    u: Vector,
+) -> int:
+    set_range(limits, before, memory)
+    _wish(gain, rule.wished, v, memory.rest, u)
+    flags = 0
+    for k in range(u.size):
+        wish = u[k]
+        if not is_finite(wish):
+            wish = 0.0
+            flags |= _OVERFLOWED
+        u[k], _ = _cut(memory, limits, k, rule.wished[k])
+        memory.step[k] = wish - u[k]
+    return flags | _go(memory, limits, u)
+
+
+@allocate.register(ByPriority)
+def _by_priority(
+    rule: ByPriority,
+    limits: ActuatorLimits,
+    gain: GainMemory,
+    memory: RangeMemory,
+    v: Vector,
+    before: Vector,
+    u: Vector,
+) -> int:
+    n, m = gain.B.shape
+    set_range(limits, before, memory)
+    for k in range(m):
+        u[k], _ = _cut(memory, limits, k, rule.wished[k])
+    flags = 0
+    for i in range(n):
+        memory.rest[i] = v[i]
+        for k in range(m):
+            memory.rest[i] -= gain.B[i, k] * u[k]
+    for place in range(n):
+        i = rule.order[place]
+        for k in range(m):
+            memory.step[k] = gain.inverse[k, i] * memory.rest[i]
+            if not is_finite(memory.step[k]):
+                memory.step[k] = 0.0
+                flags |= _OVERFLOWED
+        flags |= _go(memory, limits, u)
+    return flags
+
+
+# ---- What users give, checked ----
+
+
+def checked_actuator_limits(
+    u_min: Any, u_max: Any, rate_limit: Any, count: int, dt: float
+) -> ActuatorLimits:
+    """Return the limits of ``count`` actuators: one value for all, or one for each."""
+    lows, highs = (np.full(count, each) if np.ndim(each) == 0 else each for each in (u_min, u_max))
+    rates: Sequence[RateLimit]
+    rates = list(rate_limit) if checks.is_sequence(rate_limit) else [rate_limit] * count
+    for name, values in (("u_min", lows), ("u_max", highs), ("rate_limit", rates)):
+        if len(values) != count:
+            raise ValueError(
+                f"{name} has {len(values)} values, there are {count} actuators: must be one for "
+                "all, or one for each"
+            )
+    found = []
+    for i in range(count):
+        try:
+            found.append(checked_limits(lows[i], highs[i], rates[i], dt))
+        except ValueError as error:
+            raise ValueError(f"actuator {i + 1}: {error}") from None
+    return ActuatorLimits(*(np.array(part, dtype=float) for part in zip(*found, strict=True)))
+
+
+def limits_of_actuator(limits: ActuatorLimits, i: int) -> Limits:
+    """Return the limits of one actuator."""
+    low, high, most, least = (float(part[i]) for part in limits)
+    return Limits(low, high, most, least)
+
+
+class Gain(NamedTuple):
+    """B0 as given: the parameters, and the memory before the first sample."""
+
+    design: Any
+    code: Any  # the compiled function, kept as long as its address
+    shape: tuple[int, int]  # (n, m)
+    first: Matrix  # B0 before the first sample
+    weights: Vector
+
+    def memory(self) -> GainMemory:
+        """Return the memory before the first sample."""
+        n, m = self.shape
+        inverse: Matrix = np.zeros((m, n))
+        work = np.zeros((n, 2 * n))
+        is_inverse = getattr(self.design, "is_inverse", False)
+        if n == m:
+            inverse = np.asarray(np.linalg.inv(self.first), dtype=np.float64)
+        else:
+            weighted_inverse(self.first, self.weights, work, inverse)
+        fresh = np.zeros((n, n) if is_inverse else (n, m))
+        return GainMemory(self.first.copy(), inverse, fresh, work)
+
+
+def checked_gain(B0: Any, M: Any, weights: Any, names: Sequence[str], most: int) -> Gain:
+    """Return B0 of axes with these names, given as B0 or as its inverse M.
+
+    Parameters
+    ----------
+    B0, M
+        a matrix or a function of the estimates (n, most), one of them; neither is the unit matrix.
+    weights
+        of the actuators, or None for ones.
+    names
+        of the n axes.
+    most
+        largest order of an axis.
+
+    Raises
+    ------
+    ValueError
+        for both, shapes that do not fit, a matrix that is singular or a function that fails.
+    """
+    if B0 is not None and M is not None:
+        raise ValueError("B0 and M are both given: M is the inverse of B0; give one of them")
+    name, given = ("M", M) if M is not None else ("B0", B0)
+    n = len(names)
+    if given is None:
+        given = np.eye(n)
+    x = np.zeros((n, most))
+    if callable(given):
+        rule = f"it takes x, an array ({n}, {most}) of estimates x[axis, derivative]"
+        first = user_functions.attempt(f"{name}(zeros)", rule, given, x)
+        first = checks.matrix(f"{name}(zeros)", first)
+    else:
+        first = checks.matrix(name, given)
+    of_axes = ", ".join(names)
+    columns = n if name == "M" else first.shape[1]
+    if first.shape != (n, columns) or first.shape[1] < n:
+        what = "a row and a column" if name == "M" else "a row"
+        raise ValueError(
+            f"{name} has shape {first.shape}, there are {n} axes ({of_axes}): must have {what} for "
+            f"each axis{'' if name == 'M' else ' and at least as many columns, one per actuator'}"
+        )
+    count = first.shape[1]
+    of_actuators = np.ones(count) if weights is None else checks.vector("weights", weights, count)
+    if np.any(of_actuators <= 0.0):
+        raise ValueError(f"weights = {weights!r}: must be positive")
+    if weights is not None and count == n:
+        raise ValueError(
+            f"weights = {weights!r}: there are as many actuators as axes, so u has no freedom for "
+            "them; leave them out"
+        )
+    _check_condition(name, first, names)
+    start: Matrix = np.asarray(np.linalg.inv(first) if name == "M" else first, dtype=np.float64)
+    if not callable(given):
+        return Gain(ConstantGain(start), None, (n, count), start, of_actuators)
+    code = _compiled_gain(name, given, (n, most), first.shape)
+    design = FunctionGain(code.address, name == "M", of_actuators)
+    user_functions.set_origin(code.address, given)
+    return Gain(design, code, (n, count), start, of_actuators)
+
+
+def _check_condition(name: str, matrix: Matrix, names: Sequence[str]) -> None:
+    """Refuse a matrix that is singular, and warn of one that is nearly so.
+
+    Rows and columns are scaled first: axes in metres and radians have B0 of other sizes, which says
+    nothing about their coupling.
+    """
+    scaled: Any = np.array(matrix, dtype=float)
+    for _ in range(10):
+        for axis in (0, 1):
+            size = np.max(np.abs(scaled), axis=axis, keepdims=True)
+            if np.any(size == 0.0) and axis == 1:
+                row = names[int(np.argmin(size))]
+                raise ValueError(f"{name} = {matrix.tolist()!r}: no actuator moves axis {row!r}")
+            scaled = scaled / np.sqrt(np.where(size > 0.0, size, 1.0))
+    values = np.linalg.svd(scaled, compute_uv=False)
+    condition = math.inf if values[-1] == 0.0 else float(values[0] / values[-1])
+    if not condition < _SINGULAR:
+        raise ValueError(
+            f"{name} = {matrix.tolist()!r} is singular (condition number {condition:.3g}, axes and "
+            "actuators scaled): the actuators can not move the axes independently"
+        )
+    if condition > _POOR:
+        warn(
+            f"{name} is badly conditioned, {condition:.3g} with axes and actuators scaled, above "
+            f"{_POOR:g}: an error of 1 % in it makes one of {condition:.0f} % in some direction; "
+            "identify it well, or use fewer axes"
+        )
+
+
+def _compiled_gain(
+    name: str, function: Callable[..., Any], inner: tuple[int, int], outer: tuple[int, int]
+) -> Any:
+    """Return the compiled function that writes the matrix for estimates."""
+    try:
+        own = user_functions.jit_user_function(function)
+
+        def write(px, pout):  # type: ignore[no-untyped-def]
+            out = numba.carray(pout, outer)
+            matrix = own(numba.carray(px, inner))
+            for i in range(outer[0]):
+                for j in range(outer[1]):
+                    out[i, j] = matrix[i][j]
+
+        return user_functions.compile_cfunc(nb_types.void(POINTER, POINTER), write)
+    except user_functions.NotCompilableError as error:
+        raise ValueError(
+            f"{name} can't be compiled ({error}): it must be a function of numbers and arrays that "
+            "returns a matrix, as nested tuples or an array, without Python objects"
+        ) from None
+
+
+def checked_rule(
+    saturation: Any, wished: Any, gain: Gain, names: Sequence[str]
+) -> CutEach | KeepDirection | ByPriority:
+    """Return what is done with u outside of its limits."""
+    count = gain.shape[1]
+    point = np.zeros(count) if wished is None else checks.vector("wished", wished, count)
+    if wished is not None and count == gain.shape[0]:
+        raise ValueError(
+            f"wished = {wished!r}: there are as many actuators as axes, so u has no freedom for "
+            "it; leave it out"
+        )
+    if isinstance(saturation, str):
+        if checks.one_of("saturation", saturation, ("each", "direction")) == "each":
+            return CutEach(point, gain.weights)
+        return KeepDirection(point)
+    order = list(saturation) if checks.is_sequence(saturation) else [saturation]
+    places = [names.index(each) if each in names else each for each in order]
+    if sorted(map(str, places)) != sorted(map(str, range(len(names)))):
+        raise ValueError(
+            f"saturation = {saturation!r}: must be 'each', 'direction', or all axes in the order "
+            f"of their priority, of {', '.join(names)}"
+        )
+    return ByPriority(point, np.array(places, dtype=np.int64))

@@ -1,0 +1,718 @@
+"""Several axes that are coupled: one ESO, law, learner and guard for each, and a matrix B0.
+
+The machine is
+
+    y_i^(n_i) = f_i + (B0 u)_i,        i = 1 … n
+
+with u (m,) of the actuators, m ≥ n. Each axis is an ``ADRC`` of its own with b0 = 1 and the input
+``v_i = (B0 u)_i``: whatever couples the axes beyond B0 (centrifugal and Coriolis forces, gravity, a
+B0 that is not right) is in f_i, which its observer estimates and its learner learns. The axes ask
+for v, ``controllers/allocation.py`` finds u within the limits of the actuators, and every observer
+receives ``(B0 u)_i`` with the u that was applied. So the limits of one actuator, which take
+something from all axes, are no disturbance to any of them.
+
+B0 is a constant matrix or a function of the estimates, of a robot for instance the inverse of its
+mass matrix M(q). With an exact B0 the axes are independent loops; with another one their stability
+is that of the whole, of which ``quell.analysis`` has measures.
+
+In a sample each axis runs as ``controllers/law.py`` does it, then u is found for all.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+from quell.controllers.adrc import ADRC
+from quell.controllers.allocation import (
+    ActuatorLimits,
+    GainMemory,
+    RangeMemory,
+    allocate,
+    checked_actuator_limits,
+    checked_gain,
+    checked_rule,
+    range_memory,
+    update_gain,
+)
+from quell.controllers.base import (
+    RateLimit,
+    control,
+    reset_loop,
+    set_applied_control,
+    set_reference_derivatives,
+    status_flags,
+    write_row,
+)
+from quell.controllers.compensator import Estimate, samples_to_settle, start_at_rest
+from quell.controllers.stateful import PackedController, StatefulController, unpacked
+from quell.kernels import dispatch
+from quell.kernels.dispatch import (
+    compiled_call,
+    dispatcher_for,
+    explain_compile_errors,
+    generic,
+    kernel,
+)
+from quell.kernels.sized import Scalars, clear
+from quell.types import Channels, Matrix, Status, Vector
+
+# ---- Functions of a controller of several signals, as ``controllers.base`` has them for one ----
+
+
+@generic
+def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) -> None:
+    """Take one sample: write the control signals ``u`` (m,) for references and measurements."""
+    raise TypeError
+
+
+# ---- The axes, one inside of the other, so that each may be of another kind ----
+
+
+class NoAxis(NamedTuple):
+    """The end of the axes."""
+
+
+class NoAxisMemory(NamedTuple):
+    """The end of the axes' states."""
+
+    nothing: Vector  # (0,)
+
+
+class AxisDesigns(NamedTuple):
+    """Parameters of an axis, and of those behind it."""
+
+    axis: Any
+    others: Any
+
+
+class AxisStates(NamedTuple):
+    """State of an axis, and of those behind it."""
+
+    axis: Any
+    others: Any
+
+
+@generic
+def ask_axes(axes: Any, states: Any, i: int, r: Vector, y: Vector, v: Vector, x: Matrix) -> int:
+    """Run the axes from the i-th on: write v and the estimates x; return the flags."""
+    raise TypeError
+
+
+@generic
+def tell_axes(axes: Any, states: Any, i: int, v: Vector) -> None:
+    """Tell the axes from the i-th on what was applied."""
+    raise TypeError
+
+
+@generic
+def reset_axes(axes: Any, states: Any) -> None:
+    """Start the axes from rest at the next sample."""
+    raise TypeError
+
+
+@generic
+def write_axes(axes: Any, states: Any, widths: Any, i: int, row: Vector) -> None:
+    """Write the channels of the axes from the i-th on into ``row``; ``widths`` has their number."""
+    raise TypeError
+
+
+@generic
+def set_axes_derivatives(axes: Any, states: Any, counts: Any, i: int, values: Vector) -> None:
+    """Set the derivatives of the references of the axes from the i-th on."""
+    raise TypeError
+
+
+@ask_axes.register(NoAxis)
+def _ask_none(axes: NoAxis, states: Any, i: int, r: Any, y: Any, v: Any, x: Any) -> int:
+    return 0
+
+
+@ask_axes.register(AxisDesigns)
+def _ask(
+    axes: AxisDesigns, states: AxisStates, i: int, r: Vector, y: Vector, v: Vector, x: Matrix
+) -> int:
+    v[i] = control(axes.axis, states.axis, r[i], y[i])
+    for j in range(axes.axis.law.size):
+        x[i, j] = states.axis.seen[j]
+    flags = status_flags(axes.axis, states.axis)
+    return flags | ask_axes(axes.others, states.others, i + 1, r, y, v, x)
+
+
+@tell_axes.register(NoAxis)
+def _tell_none(axes: NoAxis, states: Any, i: int, v: Any) -> None:
+    pass
+
+
+@tell_axes.register(AxisDesigns)
+def _tell(axes: AxisDesigns, states: AxisStates, i: int, v: Vector) -> None:
+    set_applied_control(axes.axis, states.axis, v[i])
+    tell_axes(axes.others, states.others, i + 1, v)
+
+
+@reset_axes.register(NoAxis)
+def _reset_none(axes: NoAxis, states: Any) -> None:
+    pass
+
+
+@reset_axes.register(AxisDesigns)
+def _reset(axes: AxisDesigns, states: AxisStates) -> None:
+    reset_loop(axes.axis, states.axis)
+    reset_axes(axes.others, states.others)
+
+
+@write_axes.register(NoAxis)
+def _write_none(axes: NoAxis, states: Any, widths: Any, i: int, row: Any) -> None:
+    pass
+
+
+@write_axes.register(AxisDesigns)
+def _write(axes: AxisDesigns, states: AxisStates, widths: Any, i: int, row: Vector) -> None:
+    write_row(axes.axis, states.axis, row[: widths[i]])
+    write_axes(axes.others, states.others, widths, i + 1, row[widths[i] :])
+
+
+@set_axes_derivatives.register(NoAxis)
+def _no_derivatives(axes: NoAxis, states: Any, counts: Any, i: int, values: Any) -> None:
+    pass
+
+
+@set_axes_derivatives.register(AxisDesigns)
+def _derivatives(
+    axes: AxisDesigns, states: AxisStates, counts: Any, i: int, values: Vector
+) -> None:
+    if counts[i] > 0:
+        set_reference_derivatives(axes.axis, states.axis, values[: counts[i]])
+    set_axes_derivatives(axes.others, states.others, counts, i + 1, values[counts[i] :])
+
+
+# ---- A sample of all axes ----
+
+
+class AxesLoop(Scalars):
+    """Scalars of the loop of all axes."""
+
+    status: float  # flags of the last sample
+    manual: float  # 1 in manual operation, else 0
+    started: float  # 1 after the first sample or a start, else 0
+
+
+class AxesDesign(NamedTuple):
+    """Parameters of several axes."""
+
+    axes: Any  # AxisDesigns
+    gain: Any  # B0
+    rule: Any  # what is done at the limits
+    limits: ActuatorLimits
+    widths: Any  # channels of each axis (n,), integers
+    derivatives: Any  # derivatives of the reference of each axis (n,), integers
+
+
+class AxesState(NamedTuple):
+    """State of several axes."""
+
+    axes: Any  # AxisStates
+    gain: GainMemory
+    range: RangeMemory
+    loop: NDArray[AxesLoop]  # (1,)
+    x: Matrix  # estimates x[axis, derivative] (n, largest order)
+    v: Vector  # what the axes asked for, then what was applied (n,)
+    u: Vector  # applied control signals (m,)
+    u_limited: Vector  # those of the law; they differ from u in manual operation (m,)
+    r: Vector  # references and measurements of a call from Python (n,)
+    y: Vector
+
+
+@kernel
+def _applied_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
+    """Write ``B0 u`` into ``v``."""
+    for i in range(v.size):
+        v[i] = 0.0
+        for k in range(u.size):
+            v[i] += memory.B[i, k] * u[k]
+
+
+@control_all.register(AxesDesign)
+def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
+    loop = state.loop[0]
+    flags = ask_axes(design.axes, state.axes, 0, r, y, state.v, state.x)
+    flags |= update_gain(design.gain, state.gain, state.x)
+    if loop.manual != 0.0:
+        loop.status = flags
+        return
+    flags |= allocate(
+        design.rule, design.limits, state.gain, state.range, state.v, state.u, state.u_limited
+    )
+    for k in range(u.size):
+        state.u[k] = state.u_limited[k]
+        u[k] = state.u[k]
+    _applied_to_axes(state.gain, state.u, state.v)
+    tell_axes(design.axes, state.axes, 0, state.v)
+    loop.status, loop.started = flags, 1.0
+
+
+@status_flags.register(AxesDesign)
+def _status_flags(design: AxesDesign, state: AxesState) -> int:
+    return int(state.loop[0].status)
+
+
+@reset_loop.register(AxesDesign)
+def _reset_loop(design: AxesDesign, state: AxesState) -> None:
+    reset_axes(design.axes, state.axes)
+    clear(state.loop)
+    for k in range(state.u.size):
+        state.u[k] = 0.0
+
+
+@write_row.register(AxesDesign)
+def _write_row(design: AxesDesign, state: AxesState, row: Vector) -> None:
+    n = state.v.size
+    for i in range(n):
+        row[i] = state.v[i]
+    row[n] = state.loop[0].status
+    write_axes(design.axes, state.axes, design.widths, 0, row[n + 1 :])
+
+
+@set_reference_derivatives.register(AxesDesign)
+def _set_derivatives(design: AxesDesign, state: AxesState, derivatives: Vector) -> None:
+    set_axes_derivatives(design.axes, state.axes, design.derivatives, 0, derivatives)
+
+
+@compiled_call
+def step_axes(packed: Any) -> None:
+    """Take one sample with the references and measurements that are in the state."""
+    design, state = unpacked(packed)
+    control_all(design, state, state.r, state.y, state.u)
+
+
+def _step_as_python(packed: Any) -> None:
+    design, state = packed.arrays
+    with np.errstate(all="ignore"):  # compiled code does not warn
+        control_all(design, state, state.r, state.y, state.u)
+
+
+# ---- The controller ----
+
+
+class Axes(StatefulController):
+    """Several coupled axes, each with its own ADRC, and the matrix from actuators to axes.
+
+    Parameters
+    ----------
+    axes
+        an ``ADRC`` for each axis, all with one ``dt``, with an observer of ``b0 = 1`` and without
+        limits of u: what it calls u is v_i, the acceleration (for order 2) that it asks for. In a
+        dictionary each has a name. They are copied.
+    B0
+        from the control signals to the axes (n, m) [y-unit/s^n per u-unit]: a matrix, or a function
+        of the estimates that returns it. The function takes ``x[axis, derivative]``, so ``x[0, 0]``
+        is the position of the first axis and ``x[1, 1]`` the rate of the second; it is compiled.
+        By default the unit matrix: each actuator moves one axis.
+    M
+        the inverse of B0 instead, of a robot its mass matrix: a matrix or a function.
+    u_min, u_max
+        limits of the actuators [u-unit]: one for all, or one for each.
+    rate_limit
+        largest rates [u-unit/s]: one for all, or a list with one, or with (lowest, highest), for
+        each.
+    saturation
+        what happens at the limits: ``"each"`` cuts each actuator, ``"direction"`` scales all, so
+        that v keeps its direction, and a list of all axes gives them what they ask for in this
+        order.
+    weights
+        of the actuators, where there are more than axes: u is the smallest ``Σ W (u − wished)²``
+        that does what the axes ask for (m,).
+    wished
+        the u from which that is measured (m,) [u-unit], as the thrusts that carry a craft; zero by
+        default.
+
+    Raises
+    ------
+    ValueError
+        for axes that do not fit, matrices of other shapes, a B0 that is singular or a function
+        that fails.
+
+    Warns
+    -----
+    DesignWarning
+        if B0 is badly conditioned.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> def joint():
+    ...     observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3)
+    ...     return ql.ADRC(observer, omega_c=8.0)
+    >>> robot = ql.plants.arm(gravity=0.0)
+    >>> controller = ql.Axes([joint(), joint()], M=robot.inertia, u_max=20.0, u_min=-20.0)
+    >>> controller.step(r=[0.1, 0.0], y=[0.0, 0.0]).round(3).tolist()
+    [2.667, 0.576]
+    """
+
+    parameters: AxesDesign
+    _state: AxesState
+
+    def __init__(
+        self,
+        axes: Sequence[ADRC] | dict[str, ADRC],
+        B0: Any = None,
+        *,
+        M: Any = None,
+        u_min: float | Sequence[float] = -np.inf,
+        u_max: float | Sequence[float] = np.inf,
+        rate_limit: RateLimit | Sequence[RateLimit] = np.inf,
+        saturation: str | Sequence[int | str] = "each",
+        weights: Sequence[float] | None = None,
+        wished: Sequence[float] | None = None,
+    ) -> None:
+        given = axes if isinstance(axes, dict) else {}
+        parts: list[Any] = list(given.values()) if given else list(axes)
+        self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
+        check_axes(parts, self.names)
+        self.axes: tuple[ADRC, ...] = tuple(copy.copy(axis) for axis in parts)
+        self._gain = checked_gain(B0, M, weights, self.names, self._most)
+        self.B0, self.M, self.weights = B0, M, weights
+        self._rule = checked_rule(saturation, wished, self._gain, self.names)
+        self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        self._initialise()
+
+    # ---- What simulation and real-time loop use ----
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.axes[0].dt
+
+    @property
+    def inputs(self) -> int:
+        """Number of control signals m."""
+        return self._gain.shape[1]
+
+    @property
+    def outputs(self) -> int:
+        """Number of axes n, and so of references and measurements."""
+        return len(self.axes)
+
+    @property
+    def _most(self) -> int:
+        return max(axis.observer.order for axis in self.axes)
+
+    @property
+    def derivatives(self) -> tuple[int, ...]:
+        """Number of derivatives of the reference that each axis feeds forward."""
+        return tuple(axis.derivatives for axis in self.axes)
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """No names: each axis has its own, ``axes[i].features``."""
+        return ()
+
+    @property
+    def channels(self) -> Channels:
+        """Name and width of each recorded channel: v, flags, then ``AXIS.x_hat`` and so on."""
+        own = [
+            (f"{name}.{channel}", width)
+            for name, axis in zip(self.names, self.axes, strict=True)
+            for channel, width in axis.channels
+        ]
+        return (("v", self.outputs), ("status", 1), *own)
+
+    @property
+    def limits(self) -> Any:
+        """Limits of the actuators (m,): ``low``, ``high``, and the largest changes in a sample."""
+        return self._actuators
+
+    def _update_parameters(self) -> None:
+        designs: Any = NoAxis()
+        for axis in reversed(self.axes):
+            designs = AxisDesigns(axis.parameters, designs)
+        widths = [sum(width for _, width in axis.channels) for axis in self.axes]
+        self.parameters = AxesDesign(
+            designs,
+            self._gain.design,
+            self._rule,
+            self._actuators,
+            np.array(widths, dtype=np.int64),
+            np.array(self.derivatives, dtype=np.int64),
+        )
+
+    def initial_state(self) -> AxesState:
+        """Return a state before the first sample, with nothing learned."""
+        n, m = self._gain.shape
+        states: Any = NoAxisMemory(np.zeros(0))
+        for axis in reversed(self.axes):
+            states = AxisStates(axis.initial_state(), states)
+        return AxesState(
+            axes=states,
+            gain=self._gain.memory(),
+            range=range_memory(n, m),
+            loop=AxesLoop.zeros(),
+            x=np.zeros((n, self._most)),
+            v=np.zeros(n),
+            u=np.zeros(m),
+            u_limited=np.zeros(m),
+            r=np.zeros(n),
+            y=np.zeros(n),
+        )
+
+    def _use_state(self, state: AxesState) -> None:
+        super()._use_state(state)
+        for axis, own in zip(self.axes, self._states(state), strict=True):
+            axis._use_state(own)
+
+    @staticmethod
+    def _states(state: AxesState) -> Iterator[Any]:
+        """Yield the state of each axis."""
+        inner = state.axes
+        while isinstance(inner, AxisStates):
+            yield inner.axis
+            inner = inner.others
+
+    # ---- Sample by sample ----
+
+    def prepare(self) -> None:
+        """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
+        packed = PackedController(self.parameters, self._state)
+        if dispatch.interpret_all:
+            self._step: Any = _step_as_python
+        else:
+            with explain_compile_errors(self.parameters):
+                entry = dispatcher_for(step_axes, self.parameters)
+                self._step = entry.compile((packed.type,))
+        self._packed = packed
+
+    def step(  # type: ignore[override]
+        self, r: Sequence[float] | Vector, y: Sequence[float] | Vector, *derivatives: Any
+    ) -> Vector:
+        """Take one sample: return the control signals (m,) [u-unit].
+
+        Parameters
+        ----------
+        r, y
+            references and measurements of the axes (n,) [y-unit]. One that is not finite is
+            replaced as ``ADRC.step`` does; ``status`` reports it.
+        derivatives
+            r' (n,), r'' (n,) …, for axes with feedforward; zero by default.
+        """
+        if self._packed is None:
+            self.prepare()
+        state = self._state
+        try:
+            state.r[:], state.y[:] = r, y
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"r = {r!r}, y = {y!r}: each must have {self.outputs} numbers, one for each axis "
+                f"({', '.join(self.names)})"
+            ) from None
+        if derivatives:
+            self._set_derivatives(derivatives)
+        self._step(self._packed)
+        return state.u.copy()
+
+    def _set_derivatives(self, derivatives: Sequence[Any]) -> None:
+        for given in derivatives:
+            checks.vector("derivatives", given, self.outputs)
+        for i, axis in enumerate(self.axes):
+            if axis.derivatives:
+                own = np.array([float(each[i]) for each in derivatives[: axis.derivatives]])
+                set_reference_derivatives(axis.parameters, axis._state, own)
+
+    def applied(self, u: Sequence[float] | Vector) -> None:  # type: ignore[override]
+        """Set the control signals that were really applied since the last ``step`` (m,) [u-unit].
+
+        Call it before the next ``step``. Limits that are known beforehand belong in ``u_min``,
+        ``u_max`` and ``rate_limit``.
+        """
+        self._state.u[:] = checks.vector("u", u, self.inputs)
+        self._tell()
+
+    def _tell(self) -> None:
+        state = self._state
+        _applied_to_axes(state.gain, state.u, state.v)
+        tell_axes(self.parameters.axes, state.axes, 0, state.v)
+
+    def start(
+        self,
+        y: Sequence[float] | Vector,
+        u: Sequence[float] | Vector | None = None,
+        r: Sequence[float] | Vector | None = None,
+    ) -> None:
+        """Start at a machine that rests at ``y`` under ``u``: ``step`` continues from there.
+
+        What was learned is kept.
+
+        Parameters
+        ----------
+        y
+            measurements (n,) [y-unit].
+        u
+            control signals that hold the machine there (m,) [u-unit]; zero by default. One that
+            holds an arm against gravity, for instance.
+        r
+            references of the next step (n,); ``y`` by default.
+        """
+        rest = checks.vector("y", y, self.outputs)
+        given = np.zeros(self.inputs) if u is None else checks.vector("u", u, self.inputs)
+        goals = rest if r is None else checks.vector("r", r, self.outputs)
+        state = self._state
+        reset_loop(self.parameters, state)
+        state.x[:] = 0.0
+        state.x[:, 0] = rest
+        update_gain(self.parameters.gain, state.gain, state.x)
+        state.u[:] = given
+        _applied_to_axes(state.gain, state.u, state.v)
+        for i, axis in enumerate(self.axes):
+            at = (float(rest[i]), float(state.v[i]), float(goals[i]))
+            start_at_rest(axis.parameters, axis._state, samples_to_settle(axis.observer), *at)
+        state.loop[0].started = 1.0
+
+    def track(
+        self,
+        r: Sequence[float] | Vector,
+        y: Sequence[float] | Vector,
+        u: Sequence[float] | Vector,
+    ) -> None:
+        """Take one sample in manual operation: ``u`` (m,) is applied, unlimited.
+
+        ``hand_over`` ends it.
+        """
+        given = checks.vector("u", u, self.inputs)
+        state = self._state
+        with self._manual_operation(given):
+            self.step(r, y)
+        state.u[:] = given
+        self._tell()
+        state.loop[0].started = 1.0
+
+    @contextmanager
+    def _manual_operation(self, u: Vector) -> Iterator[None]:
+        state = self._state
+        _applied_to_axes(state.gain, u, state.v)
+        wanted = state.v.copy()
+        state.loop[0].manual = 1.0
+        for axis, v in zip(self.axes, wanted, strict=True):
+            axis._state.loop[0].manual, axis._state.loop[0].u_manual = 1.0, v
+        try:
+            yield
+        finally:
+            state.loop[0].manual = 0.0
+            for axis in self.axes:
+                axis._state.loop[0].manual = 0.0
+
+    def hand_over(self) -> None:
+        """End manual operation: the next ``step`` continues from the u of the last ``track``.
+
+        Raises ``ValueError`` before the first sample.
+        """
+        if self._state.loop[0].started == 0.0:
+            raise ValueError("hand_over: there was no sample yet; call track or start before")
+        for axis in self.axes:
+            axis.hand_over()
+
+    def retune(self, axis: int | str, **changes: Any) -> None:
+        """Change the bandwidth or the observer of one axis while running, without a bump.
+
+        Parameters
+        ----------
+        axis
+            its name or number.
+        **changes
+            ``omega_c`` and ``observer``, as for ``ADRC.retune``, with the same errors.
+        """
+        self.axes[self.index(axis)].retune(**changes)
+        self._update_parameters()
+        self._pack_again()
+
+    def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
+        """Change limits of the actuators while running; what is not given stays.
+
+        Parameters are those of ``Axes``. The next ``step`` is within the new limits of u.
+        """
+        old, m, dt = self._actuators, self.inputs, self.dt
+        low = old.low if u_min is None else u_min
+        high = old.high if u_max is None else u_max
+        rates = np.inf if rate_limit is None else rate_limit
+        new = checked_actuator_limits(low, high, rates, m, dt)
+        if rate_limit is None:
+            new = new._replace(most_change=old.most_change, least_change=old.least_change)
+        self._actuators = new
+        self._update_parameters()
+        self._pack_again()
+
+    def index(self, axis: int | str) -> int:
+        """Return the number of an axis, from 0, given its name or number."""
+        if isinstance(axis, str):
+            return self.names.index(checks.one_of("axis", axis, self.names))
+        return checks.whole("axis", axis, 0, self.outputs - 1)
+
+    # ---- What it knows ----
+
+    @property
+    def estimates(self) -> dict[str, Estimate]:
+        """Estimates and status of each axis after the last step, by its name."""
+        return {name: axis.estimate for name, axis in zip(self.names, self.axes, strict=True)}
+
+    @property
+    def status(self) -> Status:
+        """Flags of the last step: those of all axes and of the actuators."""
+        return Status(int(self._state.loop[0].status))
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints."""
+        found: dict[str, Any] = {"axes": dict(zip(self.names, self.axes, strict=True))}
+        for name in ("B0", "M"):
+            if getattr(self, name) is not None:
+                found[name] = getattr(self, name)
+        for name, values in (("u_min", self._actuators.low), ("u_max", self._actuators.high)):
+            if np.all(np.isfinite(values)):
+                found[name] = values.tolist()
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy is made from; a function of B0 is compiled anew for it."""
+        kept = super().__getstate__()
+        return {name: value for name, value in kept.items() if name != "_gain"}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        vars(self).update({name: value for name, value in kept.items() if name != "state"})
+        self.axes = tuple(copy.copy(axis) for axis in self.axes)
+        self._gain = checked_gain(self.B0, self.M, self.weights, self.names, self._most)
+        self._initialise()
+        self.state = kept["state"]
+
+
+def check_axes(axes: Sequence[Any], names: Sequence[str]) -> None:
+    """Check that these can be the axes of a controller."""
+    if len(axes) < 1:
+        raise ValueError("axes has no entries: give an ADRC for each axis")
+    for name, axis in zip(names, axes, strict=True):
+        if not isinstance(name, str) or not name or "." in name:
+            raise ValueError(f"axes: name {name!r} must be a text without a dot")
+        checks.printable("axes", name)
+        if not isinstance(axis, ADRC):
+            raise ValueError(f"axes: {name} = {axis!r:.60}: must be an ADRC")
+        if axis.dt != axes[0].dt:
+            raise ValueError(
+                f"axes: {name} has dt = {axis.dt!r} s, {names[0]} {axes[0].dt!r} s: must be one dt"
+            )
+        if axis.observer.b0 != 1.0:
+            raise ValueError(
+                f"axes: {name} has an observer with b0 = {axis.observer.b0!r}: must be 1, its "
+                "input is v = B0 u; the gain of the actuator belongs in B0"
+            )
+        limits = axis.limits
+        if any(map(np.isfinite, limits)):
+            raise ValueError(
+                f"axes: {name} has limits of u: must have none, give u_min, u_max and rate_limit "
+                "of the actuators to Axes"
+            )
+        if axis.schedule is not None:
+            raise ValueError(
+                f"axes: {name} has a schedule: must have none; make B0 a function of the estimates"
+            )

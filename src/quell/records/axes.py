@@ -1,0 +1,180 @@
+"""The record of one run of several axes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quell import checks
+from quell.files import MAX_SIZE
+from quell.quantities import UNKNOWN, Signals
+from quell.records.metrics import SETTLING_BAND, Metrics
+from quell.records.netcdf import Stored, load_record
+from quell.records.record import Record, columns_of
+from quell.records.trajectory import Trajectory
+from quell.types import Channels, Matrix, Status
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True, eq=False)
+class AxesTrajectory(Record):
+    """The record of one run of several axes.
+
+    ``run["y"]`` is a channel: (samples, p); r, y_measured, u, v, w and x likewise; ``run.t`` are
+    the times [s]. v is what the axes were given, ``B0 u``. The estimates of an axis are channels
+    like ``run["shoulder.x_hat"]``. ``run.axis("shoulder")`` is one axis as a ``Trajectory``, with
+    all that such a record can do.
+
+    ``status`` has all flags that any step reported, and ``DIVERGED`` if the run ended early;
+    ``message`` explains them.
+    """
+
+    log: Matrix  #: all channels side by side (samples, columns)
+    channels: Channels  #: name and width of the channels, in the order of the columns
+    dt: float  #: sample time of the run [s]
+    every: int = 1  #: every ``every``-th sample was recorded
+    status: Status = Status.OK
+    ended: float = 0.0  #: time at which the run ended [s]
+    limit: float = math.inf  #: the ``|y|`` beyond which the run would have been ended [y-unit]
+    plant: str = ""  #: name of the plant
+    axis_names: tuple[str, ...] = ()
+    axis_features: tuple[tuple[str, ...], ...] = ()  #: names of each axis' features
+    final_state: Any = None
+    signals: Signals = UNKNOWN
+    features: tuple[str, ...] = ()
+
+    @property
+    def diverged(self) -> bool:
+        """True if the run ended early."""
+        return Status.DIVERGED in self.status
+
+    @property
+    def message(self) -> str:
+        """All that the run reported, and what to do."""
+        if not self.diverged:
+            return self.status.message
+        return (
+            f"An output went beyond limit = {self.limit:.3g}, or was no number, at "
+            f"{self.ended:.6g} s, and the run ended there. {self.status.message}"
+        )
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.log.shape[0])
+
+    def axis(self, which: int | str) -> Trajectory:
+        """Return one axis as a record of its own: its u is v_i [y-unit/s^n].
+
+        Parameters
+        ----------
+        which
+            name or number, from 0.
+        """
+        if isinstance(which, str):
+            which = self.axis_names.index(checks.one_of("axis", which, self.axis_names))
+        i = checks.whole("axis", which, 0, len(self.axis_names) - 1)
+        prefix = f"{self.axis_names[i]}."
+        own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
+        own = [each for each in own if each[2].startswith(prefix)]
+        whole = [(name, width, name) for name, width in self.channels if name in ("w", "x")]
+        singles = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
+        columns = [columns_of(self.channels, source).start + i for _, source in singles]
+        for _, _, source in (*whole, *own):
+            columns += range(*columns_of(self.channels, source).indices(self.log.shape[1]))
+        channels = [(name, 1) for name, _ in singles]
+        channels += [(name, width) for name, width, _ in (*whole, *own)]
+        return Trajectory(
+            log=np.ascontiguousarray(self.log[:, columns]),
+            channels=tuple(channels),
+            dt=self.dt,
+            every=self.every,
+            status=self.status,
+            ended=self.ended,
+            limit=self.limit,
+            plant=f"{self.plant}, {self.axis_names[i]}",
+            features=self.axis_features[i] if self.axis_features else (),
+        )
+
+    def metrics(
+        self,
+        start: float = 0.0,
+        stop: float | None = None,
+        *,
+        band: float = SETTLING_BAND,
+    ) -> dict[str, Metrics]:
+        """Return the measures of each axis, by its name; see ``Trajectory.metrics``."""
+        return {
+            name: self.axis(i).metrics(start, stop, band=band)
+            for i, name in enumerate(self.axis_names)
+        }
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw outputs with references, errors and estimates of each axis, and the actuators.
+
+        Parameters
+        ----------
+        axes
+            matplotlib axes, three for each axis of the machine and one more: rows of output, error
+            and estimated f, then all control signals; a new figure by default.
+
+        Returns
+        -------
+        numpy.ndarray
+            the matplotlib axes.
+        """
+        from quell.records.plotting import plot_axes
+
+        return plot_axes(self, axes)
+
+    def to_pandas(self) -> Any:
+        """Return a ``pandas.DataFrame`` with a row for each sample; needs the extra ``pandas``."""
+        from quell.records.record import to_pandas
+
+        return to_pandas(self)
+
+    def to_csv(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write all channels as CSV, a line for each sample; see ``Trajectory.to_csv``."""
+        from quell.records.record import write_csv
+
+        write_csv(self, path, overwrite)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
+        attributes = {
+            "plant": self.plant,
+            "status": int(self.status),
+            "ended": self.ended,
+            "limit": self.limit,
+            "message": self.message,
+            "axis_names": json.dumps(self.axis_names),
+            "axis_features": json.dumps(self.axis_features),
+        }
+        return self._dataset(("time",), attributes)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> AxesTrajectory:
+        """Return the record that ``save`` wrote, without ``final_state``; see ``Trajectory``."""
+
+        def made(stored: Stored, found: dict[str, Any]) -> AxesTrajectory:
+            known = {each.name for each in fields(cls)}
+            names = json.loads(stored.attributes["axis_names"])
+            features = json.loads(stored.attributes["axis_features"])
+            return cls(
+                **{name: value for name, value in found.items() if name in known},
+                status=Status(int(stored.attributes["status"])),
+                ended=float(stored.attributes["ended"]),
+                limit=float(stored.attributes["limit"]),
+                axis_names=tuple(map(str, names)),
+                axis_features=tuple(tuple(map(str, each)) for each in features),
+            )
+
+        attributes = {"dt", "every", "status", "ended", "plant", "axis_names", "axis_features"}
+        writer = "AxesTrajectory.save"
+        return load_record(path, writer, ("time",), attributes, set(), max_size, made)

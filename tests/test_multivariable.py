@@ -1,0 +1,329 @@
+"""Loops of several inputs and outputs: sensitivities, margins, disk margins, poles."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+import quell as ql
+from quell import analysis
+from quell.analysis.disk import best_scales, worst_change
+from quell.analysis.multivariable import MultivariableLoop
+from quell.lti.models import zero_order_hold
+
+DT = 1e-3
+
+
+def lqg(rng: np.random.Generator, m: int, p: int, n: int = 4, delay: int = 0) -> MultivariableLoop:
+    """Return a random stable loop: a sampled plant, its inputs late by samples, and LQG with r."""
+    A = rng.normal(size=(n, n)) * 3.0 - np.eye(n)
+    B, C = rng.normal(size=(n, m)), rng.normal(size=(p, n))
+    A, (B,) = zero_order_hold(A, [B], 0.01)
+    for _ in range(delay):
+        k = A.shape[0]
+        A = np.block([[A, B], [np.zeros((m, k + m))]])
+        B, C = np.vstack([np.zeros((k, m)), np.eye(m)]), np.hstack([C, np.zeros((p, m))])
+    k = A.shape[0]
+    X = solve_discrete_are(A, B, C.T @ C + 1e-6 * np.eye(k), 0.01 * np.eye(m))
+    F = np.linalg.solve(0.01 * np.eye(m) + B.T @ X @ B, B.T @ X @ A)
+    Y = solve_discrete_are(A.T, C.T, B @ B.T + 1e-6 * np.eye(k), 1e-4 * np.eye(p))
+    L = A @ Y @ C.T @ np.linalg.inv(C @ Y @ C.T + 1e-4 * np.eye(p))
+    law = (A - B @ F - L @ C, L, B, -F, np.zeros((m, p)), np.eye(m))
+    return MultivariableLoop((A, B, C), law, 0.01)
+
+
+def in_control(loop: MultivariableLoop) -> tuple[Any, Any]:
+    """Return plant and C_y of a loop as systems of python-control; u = −C_y y."""
+    N, B, C, D = loop.plant
+    plant = control.ss(N + np.eye(N.shape[0]), B, C, D, loop.dt)
+    law = loop.law
+    return plant, control.ss(law.A, law.B_y, -law.C, -law.D_y, loop.dt)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_sensitivities_are_those_of_python_control_and_of_a_dense_grid(seed: int) -> None:
+    """S and T at both places to 1e-8; the largest singular value of S to 1e-6 of a dense grid."""
+    rng = np.random.default_rng([61, seed])
+    m, p, delay = (int(rng.integers(*limits)) for limits in ((1, 4), (1, 4), (0, 7)))
+    loop = lqg(rng, m, p, delay=delay)
+    plant, C_y = in_control(loop)
+    dense = np.geomspace(1e-3, np.pi / loop.dt * (1 - 1e-9), 6_000)
+    for name, L, size in (("S_o", plant * C_y, p), ("S_i", C_y * plant, m)):
+        S = control.feedback(control.ss([], [], [], np.eye(size), loop.dt), L)
+        few = dense[::800]
+        expected = np.moveaxis(S(np.exp(1j * few * loop.dt), squeeze=False), -1, 0)
+        np.testing.assert_allclose(loop.response(name, few), expected, atol=1e-8)
+        np.testing.assert_allclose(
+            loop.response(name.replace("S", "T"), few), np.eye(size) - expected, atol=1e-8
+        )
+        theirs = control.singular_values_response(S, dense).magnitude
+        theirs = theirs.reshape(-1, dense.size)[0]
+        found = loop.peak(name)
+        assert np.max(theirs) * (1.0 - 1e-9) <= found.value
+        at = control.singular_values_response(S, np.array([found.omega])).magnitude.max()
+        assert found.value == pytest.approx(at, rel=1e-6)
+        near = dense[np.argmax(theirs)] * np.linspace(0.999, 1.001, 4_001)
+        near = near[near * loop.dt <= np.pi]
+        own = np.linalg.svd(loop.response(name, near), compute_uv=False)[:, 0]
+        assert found.value == pytest.approx(max(np.max(own), np.max(theirs)), rel=1e-6)
+
+
+def test_one_input_and_one_output_have_the_margins_of_their_loop() -> None:
+    """All numbers of ``analyse``: gain, phase, modulus, delay, disk, at the input and the output."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=40.0, dt=DT)
+    plant = ql.plants.delayed(ql.plants.LinearPlant.of(([1.3], [1.0, 0.4, 0.0])), 0.012, DT)
+    single = analysis.analyse(plant, ql.ADRC(observer, omega_c=8.0))
+    N, B, C = single.plant.N, single.plant.B, single.plant.C
+    law = analysis.axes_law([single.law], [[1.0]])
+    loop = MultivariableLoop((N + np.eye(N.shape[0]), B[:, None], C[None]), law, DT)
+    for channel in ("u1", "y1"):
+        found = loop.channel_margins(channel)
+        for ours, theirs in zip(found, single.margins, strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    for at in ("inputs", "outputs"):
+        disk = loop.disk_margin(at)
+        assert disk.alpha == pytest.approx(single.margins.disk, rel=1e-8)
+        assert disk.unstructured == pytest.approx(single.margins.disk, rel=1e-8)
+        np.testing.assert_allclose(disk.gain, single.margins.disk_gain, rtol=1e-8)
+        assert disk.phase == pytest.approx(single.margins.disk_phase, rel=1e-8)
+        assert 1.0 / loop.m_s(at).value == pytest.approx(single.margins.modulus, rel=1e-8)
+    omega = np.array([0.3, 8.0, 90.0])
+    for name, other in (("PS", "PS"), ("CS", "CS"), ("T_o", "T"), ("S_i", "S")):
+        np.testing.assert_allclose(
+            loop.response(name, omega)[:, 0, 0], single.response(other, omega), rtol=1e-7
+        )
+
+
+def satellite() -> MultivariableLoop:
+    """Return the spinning satellite with a = 10, ``T = [1, a; −a, 1]/(s + 1)``, sampled fast.
+
+    From Skogestad & Postlethwaite, section 3.7.1, and Seiler, Packard & Gahinet, whose loops are in
+    continuous time.
+    """
+    a, dt = 10.0, 1e-5
+    A, (B,) = zero_order_hold(np.array([[0.0, a], [-a, 0.0]]), [np.eye(2)], dt)
+    return MultivariableLoop(
+        (A, B, np.array([[1.0, a], [-a, 1.0]])),
+        (np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), -np.eye(2)),
+        dt,
+    )
+
+
+def test_the_spinning_satellite_has_margins_in_each_channel_and_none_in_both() -> None:
+    """Closed forms: each channel 1/s; M_s = √(1 + a²), α = 4/(2a + √(4a² + 4)) for both."""
+    loop = satellite()
+    one = loop.channel_margins("u1")
+    assert one.phase == pytest.approx(90.0, abs=0.1)
+    assert one.gain[0] == 0.0
+    assert one.gain[1] > 1e3
+    assert one.disk == pytest.approx(2.0, rel=1e-3)
+    for at in ("inputs", "outputs"):
+        assert loop.m_s(at).value == pytest.approx(np.sqrt(101.0), rel=1e-3)
+        assert loop.disk_margin(at).alpha == pytest.approx(4.0 / (20.0 + np.sqrt(404.0)), rel=1e-3)
+        assert loop.disk_margin(at).omega == pytest.approx(0.05, rel=0.01)
+    assert "all inputs at once: disk margin 0.100, gains 0.905 … 1.1 or phases ±5.7°" in str(loop)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_disk_margins_hold_and_their_factors_put_a_pole_on_the_unit_circle(seed: int) -> None:
+    """With the factors that are given the loop has a pole at ω; inside of α it is stable."""
+    rng = np.random.default_rng([62, seed])
+    loop = lqg(rng, 2, 2, delay=int(rng.integers(0, 3)))
+    A, (m, p) = loop.plant.N + np.eye(loop.plant.N.shape[0]), (2, 2)
+    law = loop.law
+    for at, skew in itertools.product(("inputs", "outputs", "both"), (0.0, 1.0, -0.6)):
+        disk = loop.disk_margin(at, skew)
+        assert disk.unstructured <= disk.alpha * (1.0 + 1e-9)
+        assert disk.alpha <= disk.lost_at * (1.0 + 1e-9)
+        if at != "both":
+            assert disk.lost_at == pytest.approx(disk.alpha, rel=1e-4)
+        channels = {"inputs": [0, 1], "outputs": [2, 3], "both": [0, 1, 2, 3]}[at]
+
+        def poles(factors: Any, channels: Any = channels) -> Any:
+            f = np.ones(m + p, dtype=complex)
+            f[channels] = factors
+            B, C = loop.plant.B * f[:m], loop.plant.C * f[m:, None]
+            rows = [np.hstack([A + B @ law.D_y @ C, B @ law.C]), np.hstack([law.B_y @ C, law.A])]
+            return np.linalg.eigvals(np.vstack(rows))
+
+        on_circle = np.exp(1j * disk.omega * loop.dt)
+        assert np.min(np.abs(poles(disk.factors) - on_circle)) < 1e-6
+        for _ in range(30):
+            size = disk.alpha * (1.0 - 1e-6) * np.sqrt(rng.uniform(size=len(channels)))
+            delta = size * np.exp(2j * np.pi * rng.uniform(size=len(channels)))
+            f = (1 + 0.5 * (1 - skew) * delta) / (1 - 0.5 * (1 + skew) * delta)
+            assert np.max(np.abs(poles(f))) < 1.0
+        for gains in itertools.product(*[disk.gain] * len(channels)):
+            if np.all(np.isfinite(gains)):
+                inside = 1.0 + (np.array(gains) - 1.0) * (1.0 - 1e-6)
+                assert np.max(np.abs(poles(inside))) < 1.0
+        for signs in itertools.product((-1.0, 1.0), repeat=len(channels)):
+            turn = np.exp(1j * np.radians(disk.phase) * np.array(signs) * (1.0 - 1e-6))
+            assert np.max(np.abs(poles(turn))) < 1.0
+
+
+def test_structured_margins_do_not_depend_on_units_and_singular_values_on_the_sizes_given() -> None:
+    """Newtons and millinewton metres, metres and microradians: what is given, is taken out."""
+    loop = lqg(np.random.default_rng(5), 2, 2)
+    u, y = np.array([1.0, 1e3]), np.array([1e-6, 1e3])
+    N, B, C, _ = loop.plant
+    law = loop.law
+    other = MultivariableLoop(
+        (N + np.eye(4), B / u, C * y[:, None]),
+        (law.A, law.B_y / y, law.C * u[:, None], law.D_y * u[:, None] / y),
+        loop.dt,
+        u_size=u,
+        y_size=y,
+    )
+    for name in ("S_i", "S_o", "T_o", "S_b"):
+        assert other.peak(name).value == pytest.approx(loop.peak(name).value, rel=1e-8)
+    raw = MultivariableLoop(
+        (N + np.eye(4), B / u, C * y[:, None]),
+        (law.A, law.B_y / y, law.C * u[:, None], law.D_y * u[:, None] / y),
+        loop.dt,
+    )
+    assert raw.m_s("outputs").value > 100.0 * loop.m_s("outputs").value
+    for at in ("inputs", "outputs", "both"):
+        assert raw.disk_margin(at).alpha == pytest.approx(loop.disk_margin(at).alpha, rel=1e-6)
+
+
+@pytest.mark.parametrize("c", [1, 2, 3, 4, 6])
+def test_the_bound_on_mu_is_attained_for_up_to_three_channels(c: int) -> None:
+    """Both bounds agree in any units; for more channels the upper one is above the lower one."""
+    rng = np.random.default_rng(c)
+    for _ in range(5):
+        units = 10.0 ** rng.uniform(-5.0, 5.0, c)
+        M = rng.normal(size=(c, c)) + 1j * rng.normal(size=(c, c))
+        M = M * units[:, None] / units
+        upper, D = best_scales(M)
+        assert upper == pytest.approx(np.linalg.norm(D[:, None] * M / D, 2), rel=1e-9)
+        alpha, delta = worst_change(M)
+        assert np.max(np.abs(delta)) <= alpha * (1.0 + 1e-9)
+        left = np.linalg.svd(np.eye(c) - D[:, None] * M / D * delta, compute_uv=False)[-1]
+        assert left < 1e-6
+        assert alpha * upper >= 1.0 - 1e-9
+        if c <= 3:
+            assert alpha * upper == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_repeated_pole_is_one_with_its_multiplicity() -> None:
+    """Five poles at 0.9998, which eigenvalues scatter beyond the unit circle, are one."""
+    z = 0.9998
+    A = z * np.eye(5) + np.diag(np.ones(4), 1)
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(5, 5)))[0]
+    A = turn @ A @ turn.T
+    assert np.max(np.abs(np.linalg.eigvals(A))) > 1.0
+    none = (np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+    loop = MultivariableLoop((A, np.eye(5)[:, :1], np.eye(5)[:1]), none, DT)
+    (pole,) = loop.poles
+    assert pole.multiplicity == 5
+    assert pole.z == pytest.approx(z, abs=1e-9)
+    assert loop.stable
+
+
+def test_poles_that_differ_stay_apart_and_delays_are_counted_at_zero() -> None:
+    """A pair, a single pole and three samples of delay in a chain."""
+    A = np.zeros((6, 6))
+    A[:2, :2] = [[0.9, 0.1], [-0.1, 0.9]]
+    A[2, 2], A[4, 3], A[5, 4] = 0.95, 1.0, 1.0
+    none = (np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+    loop = MultivariableLoop((A, np.ones((6, 1)), np.ones((1, 6))), none, DT)
+    found = sorted((p.multiplicity, round(p.z.real, 9), round(p.z.imag, 9)) for p in loop.poles)
+    assert found == [(1, 0.9, -0.1), (1, 0.9, 0.1), (1, 0.95, 0.0), (3, 0.0, 0.0)]
+
+
+def test_a_pole_on_the_unit_circle_is_not_called_stable() -> None:
+    """An integrator that nothing controls, single or double: a line that begins with NOT."""
+    none = (np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+    for A in (np.diag([1.0, 0.5]), np.array([[1.0, DT], [0.0, 1.0]])):
+        loop = MultivariableLoop((A, np.ones((2, 1)), np.ones((1, 2))), none, DT)
+        assert not loop.stable
+        assert loop.summary().splitlines()[-1].startswith("NOT certain to be stable: a pole at")
+
+
+def test_an_unstable_loop_has_no_margins_and_says_why() -> None:
+    """Zeros, and infinite peaks."""
+    loop = satellite()
+    A = loop.plant.N + np.eye(2)
+    law = (np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), np.eye(2))
+    wrong = MultivariableLoop((A, loop.plant.B, loop.plant.C), law, loop.dt)
+    assert wrong.m_s("inputs").value == np.inf
+    assert wrong.disk_margin().alpha == 0.0
+    assert wrong.channel_margins("y2").modulus == 0.0
+    assert wrong.summary().startswith("unstable: a pole at |z| = 1.00001")
+
+
+def test_the_closed_loop_is_that_of_a_simulation() -> None:
+    """From r, d and n to y, u and e, sample by sample."""
+    rng = np.random.default_rng(9)
+    loop = lqg(rng, 2, 3, delay=1)
+    N, B, C, _ = loop.plant
+    law = loop.law
+    law = law._replace(D_r=rng.normal(size=(2, 2)))
+    loop = MultivariableLoop((N + np.eye(N.shape[0]), B, C), law, loop.dt)
+    given = {"r": rng.normal(size=(30, 2)), "d": rng.normal(size=(30, 2))}
+    given["n"] = rng.normal(size=(30, 3))
+    x, xi = np.zeros(N.shape[0]), np.zeros(law.A.shape[0])
+    y, u = np.zeros((30, 3)), np.zeros((30, 2))
+    for k in range(30):
+        y[k] = C @ x
+        seen = y[k] + given["n"][k]
+        u[k] = law.C @ xi + law.D_y @ seen + law.D_r @ given["r"][k]
+        x = x + N @ x + B @ (u[k] + given["d"][k])
+        xi = law.A @ xi + law.B_y @ seen + law.B_r @ given["r"][k]
+    for target, expected in (("y", y), ("u", u)):
+        total = np.zeros_like(expected)
+        for source, signal in given.items():
+            S = loop.closed_loop(source, target)
+            state = np.zeros(S.N.shape[0])
+            for k in range(30):
+                total[k] += S.C @ state + S.D @ signal[k]
+                state = state + S.N @ state + S.B @ signal[k]
+        np.testing.assert_allclose(total, expected, atol=1e-9)
+    with pytest.raises(ValueError, match="the law has 2 references for 3 outputs"):
+        loop.closed_loop("r", "e")
+
+
+def test_a_dead_time_of_each_channel_costs_no_states() -> None:
+    """Responses through chains of delays equal those of the whole matrices."""
+    loop = lqg(np.random.default_rng(3), 2, 2, delay=6)
+    omega = np.array([0.1, 3.0, 50.0, 300.0])
+    N, B, C, D = loop._broken()
+    z = np.exp(1j * omega * loop.dt)
+    expected = [C @ np.linalg.solve((w - 1) * np.eye(N.shape[0]) - N, B) + D for w in z]
+    found = loop.response("S_b", omega) - np.eye(4)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_matrices_that_do_not_fit_are_refused_with_both_shapes() -> None:
+    """The error says what rows and columns stand for."""
+    A, B, C = np.eye(3) * 0.5, np.ones((3, 2)), np.ones((2, 3))
+    none = (np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"B has shape \(2, 2\) and A has shape \(3, 3\)"):
+        MultivariableLoop((A, B[:2], C), none, DT)
+    with pytest.raises(ValueError, match=r"C has shape \(2, 2\) and A has shape \(3, 3\)"):
+        MultivariableLoop((A, B, C[:, :2]), none, DT)
+    with pytest.raises(ValueError, match=r"D = .*must be zero"):
+        MultivariableLoop((A, B, C, np.ones((2, 2))), none, DT)
+    with pytest.raises(ValueError, match=r"law: D_y has shape \(2, 3\).*must be \(2, 2\)"):
+        MultivariableLoop((A, B, C), (*none[:3], np.zeros((2, 3))), DT)
+    with pytest.raises(ValueError, match="u_size has 3 entries: must have 2"):
+        MultivariableLoop((A, B, C), none, DT, u_size=[1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match=r"inputs = \['a', 'a'\]: must be 2 different names"):
+        MultivariableLoop((A, B, C), none, DT, inputs=["a", "a"])
+    loop = MultivariableLoop((A, B, C), none, DT, inputs=["yaw", "pitch"])
+    with pytest.raises(ValueError, match="channel = 'u1': must be one of yaw, pitch, y1, y2"):
+        loop.channel_margins("u1")
+    with pytest.raises(ValueError, match=r"skew = 2.0: must be from -1 to 1"):
+        loop.disk_margin(skew=2.0)
+    observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=DT)
+    single = analysis.linear_law(ql.ADRC(observer, omega_c=1.0))
+    with pytest.raises(ValueError, match=r"B0 has shape \(1, 2\): must be \(1, 1\), a row for"):
+        analysis.axes_law([single], [[1.0, 2.0]])
+    with pytest.raises(ValueError, match="must have an inverse"):
+        analysis.axes_law([single, single], [[1.0, 2.0], [2.0, 4.0]])

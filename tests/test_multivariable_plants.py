@@ -1,0 +1,221 @@
+"""Plants with several inputs and outputs: exact where they can be, and equal to other programs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import quell as ql
+from quell.plants.base import advance
+from quell.plants.multivariable import measure_all
+
+
+def moved(plant, x, u, w, dt: float, samples: int = 1):  # type: ignore[no-untyped-def]
+    """Return state and outputs after some samples under constant signals."""
+    model = plant.sampled(dt, interpret=True)
+    x = np.array(x, dtype=float)
+    y, scratch = np.zeros(plant.outputs), np.zeros(6 * x.size)
+    for _ in range(samples):
+        advance(model, x, scratch, 0.0, np.array(u, dtype=float), np.array(w, dtype=float))
+    measure_all(model, x, y)
+    return x, y
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_linear_plant_is_the_matrix_exponential(seed: int) -> None:
+    """x(dt) follows from exp of the plant with its held inputs."""
+    rng = np.random.default_rng(seed)
+    n, m, p, q = 4, 2, 3, 1
+    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
+    C, E = rng.standard_normal((p, n)), rng.standard_normal((n, q))
+    plant = ql.plants.MultivariableLinearPlant(A, B, C, E)
+    x0, u, w = rng.standard_normal(n), rng.standard_normal(m), rng.standard_normal(q)
+    whole = np.zeros((n + m + q, n + m + q))
+    whole[:n] = np.hstack([A, B, E])
+    x = (expm(0.1 * whole) @ np.concatenate([x0, u, w]))[:n]
+    found, y = moved(plant, x0, u, w, 0.1)
+    np.testing.assert_allclose(found, x, atol=1e-12)
+    np.testing.assert_allclose(y, C @ x, atol=1e-12)
+
+
+def test_nonlinear_plant_with_the_same_equations_is_the_linear_one() -> None:
+    """Runge-Kutta over small steps comes to the exact sample, with parameters as well."""
+
+    def f(t, x, u, w, a):  # type: ignore[no-untyped-def]
+        return x[1], -a * x[0] + u[0] + 0.5 * u[1] + w[0]
+
+    nonlinear = ql.plants.MultivariableNonlinearPlant(
+        f, order=2, inputs=2, output=np.eye(2), substeps=20, parameters={"a": 4.0}
+    )
+    linear = ql.plants.MultivariableLinearPlant(
+        [[0, 1], [-4, 0]], [[0, 0], [1, 0.5]], np.eye(2), [[0], [1]]
+    )
+    arguments = ([0.3, -0.2], [1.0, -0.4], [0.2], 0.05)
+    np.testing.assert_allclose(
+        moved(nonlinear, *arguments)[0], moved(linear, *arguments)[0], atol=1e-9
+    )
+    other = nonlinear.with_parameters(a=1.0)
+    assert abs(moved(other, *arguments)[0] - moved(linear, *arguments)[0]).max() > 1e-4
+
+
+class TestArm:
+    """The planar arm."""
+
+    def test_two_rods_have_the_known_mass_matrix(self) -> None:
+        """M of two slender rods (Spong, Hutchinson & Vidyasagar, section 7.3)."""
+        l1, l2, m1, m2, elbow = 0.5, 0.3, 2.0, 0.7, 0.8
+        arm = ql.plants.arm((l1, l2), (m1, m2), payload=0.2)
+        load, c = 0.2, np.cos(elbow)
+        a1 = m1 * l1**2 / 3 + m2 * (l1**2 + l2**2 / 3) + load * (l1**2 + l2**2)
+        a2, a3 = (m2 / 2 + load) * l1 * l2, m2 * l2**2 / 3 + load * l2**2
+        M = [[a1 + 2 * a2 * c, a3 + a2 * c], [a3 + a2 * c, a3]]
+        np.testing.assert_allclose(arm.mass_matrix([0.4, elbow]), M, rtol=1e-12)
+
+    def test_energy_stays_without_friction(self) -> None:
+        """A swinging arm of three links with an elastic joint keeps its energy."""
+        k = 300.0
+        arm = ql.plants.arm(
+            (0.4, 0.3, 0.2), (2.0, 1.0, 0.5), motor_inertia=(0.0, 0.05, 0.0),
+            stiffness=(np.inf, k, np.inf), substeps=10,
+        )  # fmt: skip
+
+        def energy(x):  # type: ignore[no-untyped-def]
+            q, rate = x[:3], x[3:6]
+            M = arm.mass_matrix(q).copy()
+            M[1, 1] -= 0.05  # the motor of the elastic joint moves by itself
+            theta = np.cumsum(q)
+            masses, lengths = np.array([2.0, 1.0, 0.5]), np.array([0.4, 0.3, 0.2])
+            ends = np.cumsum(lengths * np.sin(theta))
+            heights = np.append(0.0, ends[:-1]) + 0.5 * lengths * np.sin(theta)
+            spring = 0.5 * k * (x[6] - x[1]) ** 2
+            return 0.5 * rate @ M @ rate + 0.025 * x[7] ** 2 + 9.81 * masses @ heights + spring
+
+        x0 = np.array([0.3, 0.5, -0.4, 0.0, 1.0, 0.0, 0.5, 0.0])
+        x, _ = moved(arm, x0, np.zeros(3), np.zeros(3), 1e-3, samples=1000)
+        assert np.linalg.norm(x - x0) > 1.0
+        assert energy(x) == pytest.approx(energy(x0), abs=1e-6)
+
+    def test_moves_as_in_mujoco(self) -> None:
+        """A second under gravity, with friction and motors, as another program solves it."""
+        mujoco = pytest.importorskip("mujoco")
+        rods = [(2.0, 0.4), (1.0, 0.3), (0.5, 0.2)]
+        body = ""
+        for i, (mass, length) in enumerate(rods):
+            about = mass * length**2 / 12.0
+            at = rods[i - 1][1] if i else 0.0
+            body += (
+                f'<body pos="{at} 0 0"><joint type="hinge" axis="0 -1 0" armature="{0.01 * i}" '
+                f'damping="{0.1 * (i == 0)}"/><inertial pos="{length / 2} 0 0" mass="{mass}" '
+                f'diaginertia="{about} {about} {about}"/>'
+            )
+        xml = (
+            '<mujoco><option gravity="0 0 -9.81" timestep="0.0005" integrator="RK4"/><worldbody>'
+            f"{body}{'</body>' * 3}</worldbody></mujoco>"
+        )
+        model = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(model)
+        start = np.array([0.3, 0.4, -0.2, 0.5, -1.0, 0.7])
+        data.qpos[:], data.qvel[:] = start[:3], start[3:]
+        torque = np.array([1.0, -0.5, 0.2])
+        for _ in range(2000):
+            data.qfrc_applied[:] = torque
+            mujoco.mj_step(model, data)
+        arm = ql.plants.arm(
+            [each[1] for each in rods], [each[0] for each in rods],
+            motor_inertia=(0.0, 0.01, 0.02), viscous=(0.1, 0.0, 0.0), substeps=1,
+        )  # fmt: skip
+        x, y = moved(arm, start, torque, np.zeros(3), 5e-4, samples=2000)
+        np.testing.assert_allclose(x, [*data.qpos, *data.qvel], atol=1e-6)
+        np.testing.assert_allclose(y, data.qpos, atol=1e-6)
+
+    def test_encoders_are_at_motors_links_or_both(self) -> None:
+        """An elastic joint has two angles, a rigid one a single."""
+        kw = {"motor_inertia": 0.1, "stiffness": (np.inf, 500.0)}
+        x = np.array([0.1, 0.2, 0.0, 0.0, 0.25, 0.0])
+        for encoders, expected in (
+            ("motor", [0.1, 0.25]), ("link", [0.1, 0.2]), ("both", [0.1, 0.25, 0.1, 0.2])
+        ):  # fmt: skip
+            arm = ql.plants.arm(encoders=encoders, **kw)  # type: ignore[arg-type]
+            y = np.zeros(arm.outputs)
+            measure_all(arm.sampled(1e-3, interpret=True), x, y)
+            assert y.tolist() == expected
+
+
+def test_quadrotor_turns_as_its_rotors_push() -> None:
+    """Torques over inertias are the accelerations, and a spin couples the axes."""
+    craft = ql.plants.quadrotor_attitude()
+    thrusts = np.array([2.0, 2.5, 3.0, 2.2])
+    torque = ql.plants.rotor_levers(0.17, 0.015) @ thrusts
+    dx = craft.f(0.0, np.array([0.0] * 6 + [*thrusts]), thrusts, np.zeros(3))
+    np.testing.assert_allclose(dx[3:6], torque / [0.012, 0.012, 0.022], rtol=1e-12)
+    spinning = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 3.0] + [0.0] * 4)
+    dx = craft.f(0.0, spinning, np.zeros(4), np.zeros(3))
+    rates, inertia = spinning[3:6], np.array([0.012, 0.012, 0.022])
+    np.testing.assert_allclose(dx[3:6], -np.cross(rates, inertia * rates) / inertia, rtol=1e-12)
+
+
+class TestChannels:
+    """Encoders and delays of single channels."""
+
+    def integrators(self) -> ql.plants.MultivariableLinearPlant:
+        """Return two integrators."""
+        return ql.plants.MultivariableLinearPlant(np.zeros((2, 2)), np.eye(2), np.eye(2))
+
+    def test_each_input_is_late_by_its_own_samples(self) -> None:
+        """An integrator shows u a sample after it arrives."""
+        plant = ql.plants.delayed_inputs(self.integrators(), [0.0, 0.03], dt=0.01)
+        model = plant.sampled(0.01, interpret=True)
+        x, y, scratch = np.zeros(plant.order), np.zeros(2), np.zeros(6 * plant.order)
+        found = []
+        for k in range(6):
+            u = np.array([1.0, 1.0]) if k == 0 else np.zeros(2)
+            advance(model, x, scratch, 0.0, u, np.zeros(2))
+            measure_all(model, x, y)
+            found.append(y.copy())
+        steps = np.diff(found, axis=0, prepend=0.0) / 0.01
+        assert np.argmax(steps[:, 0]) == 0
+        assert np.argmax(steps[:, 1]) == 3
+        np.testing.assert_allclose(np.sum(steps, axis=0), [1.0, 1.0])
+
+    def test_encoders_quantize_their_output(self) -> None:
+        """A resolution of zero leaves an output as it is."""
+        plant = ql.plants.encoded_outputs(self.integrators(), [0.1, 0.0])
+        _, y = moved(plant, [0.26, 0.26], [0.0, 0.0], [0.0, 0.0], 0.01)
+        assert y.tolist() == pytest.approx([0.3, 0.26])
+
+    def test_a_run_with_both_is_compiled(self) -> None:
+        """Delays and encoders run in ``simulate``."""
+
+        def axis() -> ql.ADRC:
+            return ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.01), 3.0)
+
+        late = ql.plants.delayed_inputs(self.integrators(), [0.01, 0.02], dt=0.01)
+        plant = ql.plants.encoded_outputs(late, 1e-3)
+        run = ql.simulate(plant, ql.Axes([axis(), axis()]), ql.Scenario((1.0, 0.5), duration=3.0))
+        assert run.status == ql.Status.OK
+        np.testing.assert_allclose(run["y"][-1], [1.0, 0.5], atol=1.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: ql.plants.MultivariableLinearPlant(np.eye(2), np.eye(3), np.eye(2)),
+         r"B has shape \(3, 3\), A \(2, 2\): B must be \(2, 3\), a row for each state"),
+        (lambda: ql.plants.MultivariableLinearPlant.of(3), "model = 3: must be"),
+        (lambda: ql.plants.MultivariableNonlinearPlant(lambda t, x, u, w: [1.0], 2, 1, np.eye(2)),
+         r"f returns shape \(1,\): must return the 2 derivatives"),
+        (lambda: ql.plants.MultivariableNonlinearPlant(
+            lambda t, x, u, w: [1.0, u[3]], 2, 1, np.eye(2)), "fails with IndexError"),
+        (lambda: ql.plants.arm((0.4, 0.3), (1.0,)), "masses"),
+        (lambda: ql.plants.arm(stiffness=100.0), "an elastic joint needs a stiffness and a motor"),
+        (lambda: ql.plants.arm(encoders="tool"), "encoders = 'tool'"),
+        (lambda: ql.plants.delayed_inputs(ql.plants.two_mass_spring(), 0.1, 0.01),
+         "has one control signal and one output; must be a plant with several"),
+        (lambda: ql.plants.encoded_outputs(ql.plants.arm(), -1.0), "must not be negative"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_named(wrong, message: str) -> None:  # type: ignore[no-untyped-def]
+    """Errors name both shapes and the rule."""
+    with pytest.raises(ValueError, match=message):
+        wrong()
