@@ -44,7 +44,7 @@ def test_a_transfer_function_is_tuned_and_written_as_a_setup(quell: object, tmp_
     assert load(out).controller.dt == 0.1
     read = json.loads(results.read_text(encoding="utf-8"))
     assert read["design"]["k_i"] == pytest.approx(read["designs"]["pi"]["k_i"])
-    assert {"pid", "freed", "bandwidths"} <= read["designs"].keys()
+    assert {"pid", "poles", "bandwidths"} <= read["designs"].keys()
     again: Shown = quell(*LAG, *more)  # type: ignore[operator]
     assert again.code == 2
     assert "exists" in again.err

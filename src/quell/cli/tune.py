@@ -326,8 +326,8 @@ def tune(
     delay
         Dead time of the plant [s].
     structure
-        bandwidths, freed, half-gain, half-gain-law, reduced, model-based, model-based-freed,
-        delay, delay-freed, bandwidths-2, bandwidths-3, freed-2, model-based-2, pi, pi-unfiltered,
+        bandwidths, poles, half-gain, half-gain-law, reduced, model-based, model-based-poles,
+        delay, delay-poles, bandwidths-2, bandwidths-3, poles-2, model-based-2, pi, pi-unfiltered,
         pid, p-pi-notch or lqg; by default simplest: the simplest whose objective is within 5 % of
         the best.
     order

@@ -220,16 +220,17 @@ class ADRC(Compensator):
         default. ``set_held`` needs none.
     schedule
         tables of b0, omega_c and omega_o over one or two signals, which the gains follow, or an
-        ``OnlineGain``, which estimates b0; none by default. With ``feedforward=True`` r^(m)/b0
-        follows b0.
+        ``OnlineGain``, which estimates b0; none by default. A feedforward follows b0: r^(m)/b0, and
+        the inertia of a model, which is that for the observer's b0.
 
     Raises
     ------
     ValueError
         for a bandwidth or rate limit that is not positive, limits in the wrong order, an
-        observer of a plant with zeros outside of the left half plane; for a schedule of b0 or
-        omega_o with a learner, of b0 with a safe set, of b0 with the feedforward of a model, or of
-        omega_c with a nonlinear feedback.
+        observer of a plant with zeros outside of the left half plane; for a schedule of omega_o
+        with a learner, or of omega_c with a nonlinear feedback; of b0 with a guard that is
+        certified, or with a learner, a safe set or ``held`` where the observer has a model; for an
+        ``OnlineGain`` with one of these three or with the feedforward of a model.
 
     Examples
     --------
@@ -345,7 +346,8 @@ class ADRC(Compensator):
         if not isinstance(schedule, ScheduleDesign) or not schedule.has_b0:
             return schedule
         if not isinstance(self.feedforward, Feedforward):
-            return schedule._replace(cancel=observer.cancel)
+            has_model = bool(np.any(observer.cancel != 0.0))
+            return schedule._replace(cancel=observer.cancel if has_model else np.zeros(0))
         fixed, fixed_acting = self.feedforward.fixed(observer)
         return schedule._replace(fixed=fixed, fixed_acting=fixed_acting)
 

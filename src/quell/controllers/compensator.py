@@ -133,7 +133,7 @@ class Estimate(NamedTuple):
     f_residual: float
     """The observer's share, Δf̂."""
     theta: dict[str, float]
-    """The learner's coefficients by feature."""
+    """The learner's coefficients by feature; with a table of b0 those for the observer's b0."""
     u: float
     """The applied control signal."""
     status: Status
@@ -141,7 +141,10 @@ class Estimate(NamedTuple):
     authority: float = 1.0
     """Share of its output that the guard allows the learner."""
     error_plain: float = math.nan
-    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n]."""
+    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n].
+
+    With a table of b0 it is for the observer's b0, as ``error_learned``.
+    """
     error_learned: float = math.nan
     """The same for the learner with full authority."""
     reason: Reason = Reason.TRUSTED
@@ -547,7 +550,8 @@ class Compensator(StatefulController):
     def _schedule_design(self, observer: ESO) -> Any:
         if self.schedule is None:
             return NoSchedule()
-        return self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+        schedule = self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+        return schedule._replace(fixed=np.ones(1) if schedule.has_b0 else np.zeros(0))  # u_0
 
     def _with_parts(self, schedule: Any, observer: ESO) -> Any:
         """Return parameters of a schedule with what the other parts of the controller need."""
@@ -556,6 +560,7 @@ class Compensator(StatefulController):
         return schedule._replace(
             extended=observer.disturbance_order if self._learns else 0,
             has_safe_set=self.safe_set is not None,
+            has_held=self.held is not None,
         )
 
     @property
@@ -743,7 +748,8 @@ class Compensator(StatefulController):
             estimates x̂ (n,), y and its derivatives; see ``observer.states_of`` if there are zeros.
         f
             total disturbance [y-unit/s^n]; for an observer with more extended states also a list
-            of f, f', … [y-unit/s^(n+j)], the missing ones zero.
+            of f, f', … [y-unit/s^(n+j)], the missing ones zero. With a table of b0 it is the one
+            for the observer's b0.
         u
             control signal applied until the next step [u-unit]; a delayed one has the same past.
         r

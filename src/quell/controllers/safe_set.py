@@ -125,7 +125,7 @@ class SafeSetMemory(NamedTuple):
     """State of a safe set."""
 
     z: Vector  # state of the observer without learner (n + 1,)
-    seen: Vector  # its estimates (n + 1,)
+    estimates: Vector  # of the observer (n + 1,)
     loop: NDArray[SafeSetLoop]  # (1,)
 
 
@@ -156,7 +156,7 @@ def _see(design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float) -> No
     loop = memory.loop[0]
     if loop.started == 0.0:
         if is_usable(y):
-            begin(design.eso, memory.z, memory.seen, y)
+            begin(design.eso, memory.z, memory.estimates, y)
             loop.started = 1.0
         return
     expected = expected_measurement(design.eso, memory.z, u, 0.0)
@@ -167,17 +167,17 @@ def _see(design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float) -> No
         loop.samples += 1.0
     elif not abs(y - expected) <= design.surprise + _ROUNDING * abs(y):
         loop.surprised = 1.0
-    observe(design.eso, memory.z, memory.seen, y, u, 0.0)
-    if not is_finite(memory.seen[memory.seen.size - 1]):
+    observe(design.eso, memory.z, memory.estimates, y, u, 0.0)
+    if not is_finite(memory.estimates[memory.estimates.size - 1]):
         loop.started = loop.samples = 0.0
 
 
 @kernel
-def _bounds(band: Band, seen: Vector, low: float, high: float) -> tuple[float, float]:
+def _bounds(band: Band, estimates: Vector, low: float, high: float) -> tuple[float, float]:
     """Return the bounds of u within ``low`` … ``high`` that a band leaves, or its nearest ones."""
-    rest = band.f * seen[band.state.size]
+    rest = band.f * estimates[band.state.size]
     for i in range(band.state.size):
-        rest += band.state[i] * seen[i]
+        rest += band.state[i] * estimates[i]
     lowest = band.border * band.low - rest + band.margin
     highest = band.border * band.high - rest - band.margin
     if band.border < 0.0:
@@ -193,8 +193,8 @@ def _nearest_safe(design: SafeSetDesign, memory: SafeSetMemory, u: float) -> tup
     loop = memory.loop[0]
     if loop.started == 0.0:
         return u, 0
-    loop.low, loop.high = _bounds(design.position, memory.seen, -math.inf, math.inf)
-    low, high = _bounds(design.rate, memory.seen, loop.low, loop.high)
+    loop.low, loop.high = _bounds(design.position, memory.estimates, -math.inf, math.inf)
+    low, high = _bounds(design.rate, memory.estimates, loop.low, loop.high)
     safe = min(max(u, low), high)
     return safe, _SAFE_SET_ACTED if safe != u else 0
 
@@ -219,9 +219,9 @@ def shift_f(design: Any, memory: Any, change: float) -> None:
 
 @shift_f.register(SafeSetDesign)
 def _shift_f(design: SafeSetDesign, memory: SafeSetMemory, change: float) -> None:
-    last = memory.seen.size - 1
+    last = memory.estimates.size - 1
     memory.z[last] += change
-    memory.seen[last] += change
+    memory.estimates[last] += change
 
 
 @generic_with_default
@@ -231,9 +231,9 @@ def scale_f(design: Any, memory: Any, ratio: float) -> None:
 
 @scale_f.register(SafeSetDesign)
 def _scale_f(design: SafeSetDesign, memory: SafeSetMemory, ratio: float) -> None:
-    last = memory.seen.size - 1
+    last = memory.estimates.size - 1
     memory.z[last] *= ratio
-    memory.seen[last] *= ratio
+    memory.estimates[last] *= ratio
 
 
 @generic_with_default
@@ -257,9 +257,9 @@ def settle_at_rest(design: Any, memory: Any, y: float, u: float, samples: int) -
 def _settle_at_rest(
     design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float, samples: int
 ) -> None:
-    begin(design.eso, memory.z, memory.seen, y)
+    begin(design.eso, memory.z, memory.estimates, y)
     for _ in range(samples):
-        observe(design.eso, memory.z, memory.seen, y, u, 0.0)
+        observe(design.eso, memory.z, memory.estimates, y, u, 0.0)
     memory.loop[0].started = 1.0
 
 
@@ -270,19 +270,19 @@ def set_motion(design: Any, memory: Any, x: Vector, f: float) -> None:
 
 @set_motion.register(SafeSetDesign)
 def _set_motion(design: SafeSetDesign, memory: SafeSetMemory, x: Vector, f: float) -> None:
-    last = memory.seen.size - 1
-    begin(design.eso, memory.z, memory.seen, x[0])
+    last = memory.estimates.size - 1
+    begin(design.eso, memory.z, memory.estimates, x[0])
     for i in range(1, last):
-        memory.z[i] = memory.seen[i] = x[i]
-    memory.z[last] = memory.seen[last] = f
+        memory.z[i] = memory.estimates[i] = x[i]
+    memory.z[last] = memory.estimates[last] = f
 
 
 def settle_safe_set(design: Any, memory: Any, x: Vector, f: float) -> None:
     """Set the observer of a safe set to given estimates, for a plant that is known there."""
     if isinstance(design, SafeSetDesign):
-        size = memory.seen.size
-        memory.seen[:] = np.append(x, f)
-        memory.z[:size], memory.z[size:] = memory.seen, 0.0
+        size = memory.estimates.size
+        memory.estimates[:] = np.append(x, f)
+        memory.z[:size], memory.z[size:] = memory.estimates, 0.0
         memory.loop[0].started = 1.0
 
 
@@ -304,7 +304,8 @@ class SafeSet:
         actuator.
     f_rate
         largest ``|f'|`` of the total disturbance [y-unit/s^(n+1)], of a plant with the observer's
-        b0. It says how wrong the estimate of f may be, and so how wide the margin is.
+        b0. It says how wrong the estimate of f may be, and so how wide the margin is. With a table
+        of b0 the margin is that of its largest one.
     noise
         largest error of the measurement [y-unit], half a step of an encoder for instance.
     gain_error

@@ -18,6 +18,7 @@ import numba
 import numpy as np
 
 from quell import checks
+from quell.controllers.axes import Axes, AxesDesign, AxisDesigns
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
@@ -128,6 +129,12 @@ def _with_carries(design: Any, state: Any) -> Any:
         inner = _with_carries(design.compensator, state.compensator)
         given = _with_carries(design.controller, state.controller)
         return state._replace(controller=given, compensator=inner)
+    if isinstance(design, AxesDesign):
+        return state._replace(axes=_with_carries(design.axes, state.axes))
+    if isinstance(design, AxisDesigns):
+        own, others = design.axis, design.others
+        behind = _with_carries(others, state.others)
+        return state._replace(axis=_with_carries(own, state.axis), others=behind)
     if isinstance(design, AdrcDesign):
         state = state._replace(z=np.zeros(design.eso.states))
         if isinstance(design.safe_set, SafeSetDesign):
@@ -150,7 +157,7 @@ def _with_longer(state: Any) -> Any:
         return state
     state = type(state)(*map(_with_longer, state))
     if isinstance(state, GuardMemory):
-        return state._replace(shown=np.append(state.shown, np.zeros(CARRIES)))
+        return state._replace(filtered=np.append(state.filtered, np.zeros(CARRIES)))
     if isinstance(state, KalmanMemory):
         state = state._replace(carry=np.zeros(state.theta.size))
     if isinstance(state, KalmanMemory | NoiseGateMemory):
@@ -253,6 +260,11 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
     """
     if isinstance(controller, SinglePrecision):
         return controller
+    if isinstance(controller, Axes):
+        raise ValueError(
+            "controller = Axes(…): several axes run in Python in double precision only; "
+            "quell.export.c(…, precision='single', accept=True) writes their C code in single"
+        )
     return SinglePrecision(controller)
 
 

@@ -102,6 +102,9 @@ class CSource:
         names of functions in C that the user has to link.
     signals
         number of signals of a schedule, which ``step`` takes behind the derivatives.
+    axes, actuators
+        names of several axes in C, and the number of control signals; none for one u and y. Then
+        ``derivatives`` are arrays.
     """
 
     name: str
@@ -113,6 +116,8 @@ class CSource:
     derivatives: int = 0
     externals: tuple[str, ...] = ()
     signals: int = 0
+    axes: tuple[str, ...] = ()
+    actuators: int = 0
 
     @property
     def further(self) -> tuple[str, ...]:
@@ -334,6 +339,21 @@ def _struct(kind: Any) -> Struct:
     if not isinstance(kind, Struct):
         raise TypeError
     return kind
+
+
+def check_parts(controller: Any) -> None:
+    """Raise a ``TranslationError`` if a part of a controller calls Python."""
+    parts = [(type(controller).__name__, controller.parameters)]
+    while parts:
+        name, value = parts.pop()
+        if type(value).__module__.startswith("quell.learners.python_model"):
+            raise TranslationError(
+                f"{name} = {type(value).__name__}: this learner calls Python at each sample, which "
+                "C can not; use Kalman, RLS, NLMS, MLP or GaussianProcess, or a model whose "
+                "functions Numba compiles (docs/extend)"
+            )
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            parts += zip(value._fields, value, strict=True)
 
 
 def translated(write: Callable[[Findings], CSource]) -> CSource:

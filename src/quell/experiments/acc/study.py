@@ -316,12 +316,12 @@ ORDER = 4
 
 
 def build() -> Build:
-    """Return the structure, an ADRC of order 4 with freed poles and ``|p| dt <= 0.5``."""
+    """Return the structure, an ADRC of order 4 with free poles and ``|p| dt <= 0.5``."""
     # Scales of the bounds only: the nominal plant has b = 1 and |P| = 1 near 1 rad/s.
     scales: dict[str, Any] = {"b": 1.0, "omega": 1.0, "gain": 1.0}
     bounds = Constraints(damping=None)
     loop = Model(None, delay=0.0, dt=DT, sign=1.0, degree=ORDER, constraints=bounds, **scales)
-    return Build(make_structure("freed", loop, ORDER), {"u_min": -MOST_U, "u_max": MOST_U})
+    return Build(make_structure("poles", loop, ORDER), {"u_min": -MOST_U, "u_max": MOST_U})
 
 
 def start(made: Build) -> dict[str, float]:
