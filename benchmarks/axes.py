@@ -3,18 +3,18 @@
     python benchmarks/axes.py [--part arm|mujoco|quadrotor|cost] [--draws 100] [--seed 7]
 
 *arm*: random rigid two-link arms (those of ``quell stress --loops axes``) that follow sines,
-ω_c/ω_o = 8/60: RMS error against the response that the design asks for, from 5 s on, with M(q), with M at
-the middle of the motion, and with two independent loops; without learner and with ``Harmonic()``
-and a guard.
+ω_c/ω_o = 8/60: RMS error against the response that the design asks for, from 5 s on, with M(q),
+with M at the middle of the motion, and with two independent loops; without learner and with
+``Harmonic()`` and a guard.
 
 *mujoco*: arms of two and three joints, one joint elastic in half of them, simulated by MuJoCo; the
 model's masses, lengths and inertias are each up to 20 % off. Every run must be stable; the guarded
 learner over none.
 
 *quadrotor*: steps of the attitude to random targets, four rotors that meet their limits, inertias
-up to 30 % off. One ``Axes`` with B0 of the attitude, roll and pitch before yaw, against three single
-loops, each with the limits of its torque, whose torques are mixed and cut behind them. RMS of the
-error against the response that the design asks for, all angles.
+up to 30 % off. One ``Axes`` with B0 of the attitude, roll and pitch before yaw, against three
+single loops, each with the limits of its torque, whose torques are mixed and cut behind them. RMS
+of the error against the response that the design asks for, all angles.
 
 *cost*: ``step`` of three axes over three times ``step`` of one, and the compiled loop likewise.
 """
@@ -110,7 +110,8 @@ def mujoco_arm(lengths: Any, masses: Any, motors: Any, stiffness: Any) -> Any:
     for i, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
         about, at = mass * length**2 / 12.0, lengths[i - 1] if i else 0.0
         joint = f'<joint name="j{i}" type="hinge" axis="0 -1 0" damping="0.05"'
-        inertial = f'<inertial pos="{length / 2} 0 0" mass="{mass}" diaginertia="{about} {about} {about}"/>'
+        inertia = f"{about} {about} {about}"
+        inertial = f'<inertial pos="{length / 2} 0 0" mass="{mass}" diaginertia="{inertia}"/>'
         if np.isfinite(stiffness[i]):
             k, d = stiffness[i], 0.01 * 2.0 * np.sqrt(stiffness[i] * motors[i])
             small = "1e-6 1e-6 1e-6"

@@ -205,7 +205,9 @@ def test_the_predictor_is_the_observer_written_out() -> None:
         arrived = late[k + 1] * gain(0.75) + late[k] * (gain(1.0) - gain(0.75))
         e = y[k] - x[0]
         x = np.array([phi_xx * x[0] + gain(1.0) * x[1] + b * arrived, x[1]]) + K * e
-    assert predicted(form, [phi], beta, Inputs.of(u, y), y)[:, 0] == pytest.approx(by_hand, abs=1e-12)
+    assert predicted(form, [phi], beta, Inputs.of(u, y), y)[:, 0] == pytest.approx(
+        by_hand, abs=1e-12
+    )
     columns, of_y = linear_columns(form, phi, Inputs.of(u, y), y)
     assert columns @ beta + of_y == pytest.approx(by_hand, abs=1e-12)
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.axes import Axes, control_all
+from quell.controllers.axes import Axes, control_all, hand_over_all
 from quell.controllers.base import (
     change_parameters,
     reset_loop,
@@ -139,7 +139,7 @@ class AxesPlayer:
             if action is Action.APPLIED:
                 axes_source.set_applied_controls(old, state, given)
             elif action is Action.HAND_OVER:
-                axes_source.hand_over_all(old, state)
+                hand_over_all(old, state)
             elif action in (Action.LIMIT, Action.FREE):
                 self.design = self.limited if action is Action.LIMIT else self.default
                 change_parameters(old, self.design, state)
