@@ -1,6 +1,6 @@
 """What a second encoder, at the load, brings to an axis that has one at the motor.
 
-    python benchmarks/second_encoder.py [--part linear|play|all] [--draws 40] [--seed 2]
+    python benchmarks/second_encoder.py [--part linear|play|missing|all] [--draws 40] [--seed 2]
 
 A motor of 1.2e-4 kg m² and a load of 0.8e-4 kg m² behind a coupling of 60 N m/rad (138 Hz with
 both free), encoders of 2²⁰ counts, torque within ±1.3 N m, 4 kHz. The law is that of
@@ -15,9 +15,12 @@ and M_s of the loop that is opened at u.
 and the load torque is a step and a sinusoid while the axis makes moves. Designs: an encoder at the
 motor and a disturbance at the motor (what a drive has), or on the load; an encoder at the load;
 both encoders, with both disturbances too: the torque of a coupling with play is a pair of these.
-omega_c and the drift of each design are the best of a grid by the mean error of 10 draws (seed 1),
+Of each design omega_c and the drift are the best of a grid by the mean error of 10 draws (seed 1),
 among those with M_s <= 2 of the linear loop and a u that is calm at rest; then they are judged on
 other draws (``--seed``).
+
+``missing``: samples of the load's encoder do not arrive, one by one or in bursts of 5 ms; the error
+of the estimated angle of the load, for each way to choose the gain.
 """
 
 from __future__ import annotations
@@ -79,7 +82,7 @@ class Law(NamedTuple):
 def law_of(sensors: tuple[int, ...], E: Any, omega_c: float, drift: float) -> Law:
     """Return a design; ``drift`` is that of each torque [(N m)²/s]."""
     observer = ESO.state_space(
-        A, AT_MOTOR, ANGLES[list(sensors)], E, DT, accept_zeros=True,
+        A, AT_MOTOR, ANGLES[list(sensors)], E, DT, accept_zeros=True, time_varying=False,
         noise_variance=[COUNT**2 / 12] * len(sensors), drift=[drift] * E.shape[1],
     )  # fmt: skip
     weight = ANGLES[1:].T @ ANGLES[1:]
@@ -357,12 +360,51 @@ def print_play(console: Console, draws: int, seed: int) -> None:
     console.print(f"{draws} machines, seed {seed}: medians, 90 % in brackets")
 
 
+# ---- Samples of the load's encoder that are missing ----
+
+SHARES = (0.0, 0.1, 0.5, 0.9)
+
+
+def print_missing(console: Console, seed: int) -> None:
+    """Print the error of the load's angle where samples of its encoder do not arrive."""
+    random, samples = np.random.default_rng(seed), 40_000
+    phi, (gamma, enter) = zero_order_hold(A, [AT_MOTOR, BOTH], DT)
+    torques = np.cumsum(math.sqrt(DT) * random.normal(size=(samples, 2)), axis=0)
+    u = 0.1 * np.sin(20.0 * DT * np.arange(samples))[:, None] - torques.sum(axis=1, keepdims=True)
+    x, angles = np.zeros(4), np.empty((samples, 2))
+    for k in range(samples):
+        x = phi @ x + gamma @ u[k] + enter @ torques[k]
+        angles[k] = ANGLES @ x
+    y = angles + COUNT / math.sqrt(12) * random.normal(size=angles.shape)
+    noise = {"noise_variance": [COUNT**2 / 12] * 2, "drift": [1.0, 1.0]}
+    kinds = {
+        "by noise": noise,
+        "by noise, fixed gains": noise | {"time_varying": False},
+        "by poles, omega_o = 1500 rad/s": {"omega_o": 1500.0},
+    }
+    table = Table("missing", *kinds)
+    for share in SHARES:
+        for burst in (1, 20):
+            there, row = y.copy(), []
+            gone = np.repeat(random.random(samples // burst) < share, burst)
+            there[gone, 1] = math.nan
+            for options in kinds.values():
+                observer = ESO.state_space(A, AT_MOTOR, ANGLES, BOTH, DT, **options)
+                error = observer.filter(there, u)[2000:, 2] - angles[2000:, 1]
+                lost = not np.max(np.abs(error)) < 1.0
+                row.append("diverges" if lost else f"{1e6 * np.sqrt(np.mean(error**2)):.3g}")
+            name = f"{share:.0%}" + (f" in bursts of {burst}" if burst > 1 else "")
+            if share > 0.0 or burst == 1:
+                table.add_row(name, *row)
+    console.print("RMS error of the load's angle [µrad], while both torques wander", table)
+
+
 def main() -> None:
     """Run the parts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--part", choices=("linear", "play", "all"), default="all")
+    parser.add_argument("--part", choices=("linear", "play", "missing", "all"), default="all")
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--seed", type=int, default=2)
     given = parser.parse_args()
@@ -371,6 +413,8 @@ def main() -> None:
         print_linear(console)
     if given.part in ("play", "all"):
         print_play(console, given.draws, given.seed)
+    if given.part in ("missing", "all"):
+        print_missing(console, given.seed)
 
 
 if __name__ == "__main__":

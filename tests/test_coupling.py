@@ -9,7 +9,14 @@ import pytest
 
 from quell.analysis import coupling, relative_gains
 from quell.lti.models import zero_order_hold
+from quell.plants.multivariable import MultivariableLinear
 from quell.types import Matrix
+
+
+def sampled(A: Any, B: Any, C: Any) -> MultivariableLinear:
+    """Return a sampled plant without disturbances."""
+    return MultivariableLinear(A, B, np.zeros((len(A), 0)), C)
+
 
 DT = 1e-3
 
@@ -29,14 +36,14 @@ def chains(B0: Any, order: int = 2, delays: Any = (), dt: float = DT) -> Any:
             B = np.vstack([B, np.zeros((1, axes))])
             B[:n, j], B[n, j] = 0.0, 1.0
             C = np.hstack([C, np.zeros((axes, 1))])
-    return A, B, C
+    return sampled(A, B, C)
 
 
 def leaky(G: Any, times: Any = (1.0, 3.0)) -> Any:
     """Return ``G diag(1/(T s + 1))``, a plant with gains at rest, as sampled matrices."""
     times = np.asarray(times)
     A, (B,) = zero_order_hold(-np.diag(1.0 / times), [np.diag(1.0 / times)], DT)
-    return A, B, np.asarray(G, dtype=float)
+    return sampled(A, B, np.asarray(G, dtype=float))
 
 
 def test_relative_gains_are_those_of_the_definition_and_independent_of_units() -> None:
@@ -129,16 +136,16 @@ def test_singular_and_nearly_singular_gains_are_not_decided() -> None:
 
 def test_what_cannot_be_judged_is_refused() -> None:
     """Other numbers of inputs, outputs that nothing moves, frequencies that do not exist."""
-    A, B, C = chains(np.eye(2))
+    A, B, _, C = chains(np.eye(2))
     with pytest.raises(ValueError, match=r"B has shape \(4, 1\) and C has shape \(2, 4\): an axis"):
-        coupling((A, B[:, :1], C), DT)
+        coupling(sampled(A, B[:, :1], C), DT)
     with pytest.raises(ValueError, match="output 2 of the plant: no input moves it"):
         coupling(chains([[1.0, 1.0], [0.0, 0.0]]), DT)
     with pytest.raises(ValueError, match="input 1 of the plant: it moves no output"):
         coupling(chains([[0.0, 1.0], [0.0, 1.0]]), DT)
     with pytest.raises(ValueError, match=r"bandwidth = 4000\.0 rad/s: must be at most half"):
-        coupling((A, B, C), DT, bandwidth=4000.0)
+        coupling(sampled(A, B, C), DT, bandwidth=4000.0)
     with pytest.raises(ValueError, match="its rank is not full"):
         relative_gains([[1.0, 2.0], [2.0, 4.0]])
     with pytest.raises(ValueError, match="axes = .*: must be 2 different names"):
-        coupling((A, B, C), DT, axes=("x", "x"))
+        coupling(sampled(A, B, C), DT, axes=("x", "x"))

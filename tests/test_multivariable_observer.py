@@ -38,7 +38,12 @@ COUNT = math.tau / 2**20
 
 
 def servo(**options: Any) -> MultivariableESO:
-    """Return an observer of the servo with torques on the motor and on the load."""
+    """Return an observer of the servo with torques on the motor and on the load.
+
+    Gains by noise are fixed unless asked for otherwise.
+    """
+    if "omega_o" not in options:
+        options = {"time_varying": False} | options
     noise = {"noise_variance": [COUNT**2 / 12] * 2, "drift": [1.0, 1.0]}
     given = {"omega_o": 800.0} if "omega_o" in options else noise
     both = np.hstack([TORQUE, LOAD])
@@ -313,6 +318,28 @@ def test_a_missing_load_encoder_leaves_the_gain_that_suits_the_motors() -> None:
     assert max(abs(servo().poles([1]))) == pytest.approx(1.0, abs=1e-9)  # two torques, one sensor
 
 
+def test_the_decay_with_samples_missing_is_that_of_the_mean_square() -> None:
+    """Without gaps the slowest pole; half of the load's samples are too many for a fast observer.
+
+    A slower one stands it, and says so: 4000 draws of 60 samples have that mean square.
+    """
+    fast, slow = servo(), servo(omega_o=800.0)
+    assert fast.rms_decay([0.0, 0.0]) == pytest.approx(np.max(np.abs(fast.poles())), rel=1e-6)
+    assert fast.rms_decay([0.0, 0.5]) > 1.0 > fast.rms_decay([0.0, 0.05])
+    assert servo(every=(1, 4)).rms_decay([0.0, 0.0]) < 1.0
+    assert slow.rms_decay([0.0, 0.5]) < 1.0
+    random = np.random.default_rng(4)
+    errors = random.normal(size=(4000, 6, 1))
+    both, motor = slow._error(0, np.array([True, True])), slow._error(0, np.array([True, False]))
+    sizes = []
+    for _ in range(60):
+        gone = random.random(4000) < 0.1
+        errors = np.where(gone[:, None, None], motor @ errors, both @ errors)
+        sizes.append(np.sqrt(np.mean(errors**2)))
+    measured = (sizes[-1] / sizes[29]) ** (1.0 / 30.0)
+    assert measured == pytest.approx(slow.rms_decay([0.0, 0.1]), abs=0.02)
+
+
 def test_what_is_not_measured_has_no_effect() -> None:
     """NaN, infinity and numbers above 1e60 are missing, in a sample that counts otherwise."""
     for observer in (servo(omega_o=800.0), servo(), servo(time_varying=True)):
@@ -532,7 +559,7 @@ def test_bad_arguments_are_named(options: dict[str, Any], message: str) -> None:
 def test_options_without_effect_are_refused() -> None:
     """Gains by poles do not know what a sample is worth."""
     both = np.hstack([TORQUE, LOAD])
-    for option in ({"every": (1, 4)}, {"time_varying": True}):
+    for option in ({"every": (1, 4)}, {"time_varying": True}, {"time_varying": False}):
         with pytest.raises(ValueError, match="only gains by noise"):
             ESO.state_space(SERVO, TORQUE, ENCODERS, both, DT, omega_o=800.0, **option)
     with pytest.raises(ValueError, match="know no noise"):
@@ -550,6 +577,12 @@ def test_options_without_effect_are_refused() -> None:
         (lambda r: r.start([math.nan, math.nan]), "at least one output"),
         (lambda r: r.set([0.0]), "estimate has shape"),
         (lambda r: r.observer.poles([2]), "missing = 2"),
+        (lambda r: r.observer.rms_decay([0.5]), "missing has shape"),
+        (lambda r: r.observer.rms_decay([0.5, 2.0]), "missing = .* from 0 to 1"),
+        (
+            lambda r: servo(time_varying=True).rms_decay([0.0, 0.5]),
+            "calculated for what is missing",
+        ),
         (lambda r: r.observer.filter(np.zeros((3, 2)), np.zeros((4, 1))), "u has shape"),
     ],
 )

@@ -12,6 +12,7 @@ from scipy.linalg import block_diag, expm, solve_discrete_are
 from quell.controllers import quadratic_feedback, regulator, state_feedback
 from quell.observers.eso import ESO
 
+from .benchmark_module import benchmark
 from .test_multivariable_observer import DT, ENCODERS, JL, JM, LOAD, SERVO, TORQUE, K
 
 AT_LOAD = ENCODERS[1:]
@@ -157,3 +158,31 @@ def test_a_servo_under_a_load_comes_back_to_its_reference() -> None:
         u = float((law.U * r)[0, 0] + law.Gamma[0] @ running.d - gain[0] @ (running.x - aim))
     assert x[2] == pytest.approx(0.5, abs=1e-9)
     assert x[0] - x[2] == pytest.approx(-0.2 / K, abs=1e-9)
+
+
+def test_a_second_encoder_brings_margins_to_a_known_linear_axis_and_no_more() -> None:
+    """Peak and noise with the load's encoder alone are those with both; M_s is 18 against 1.9.
+
+    (A short version of ``benchmarks/second_encoder.py``.)
+    """
+    trial = benchmark("second_encoder")
+    names = "load's encoder, d on the load", "both, d on the load"
+    alone, both = (trial.linear(trial.law_of(*trial.DESIGNS[name], 80.0, 0.1)) for name in names)
+    assert both.peak == pytest.approx(alone.peak, rel=1e-3)
+    assert both.noise == pytest.approx(alone.noise, rel=2e-3)
+    assert both.peak_sensitivity < 2.0 < 10.0 < alone.peak_sensitivity
+
+
+@pytest.mark.compiled
+def test_two_encoders_hold_a_load_behind_play_and_friction() -> None:
+    """With a disturbance at each side the load rests within a fifth of the motor encoder's error."""
+    trial = benchmark("second_encoder")
+    random = np.random.default_rng(9)
+    machines = [trial.draw(random) for _ in range(3)]
+    settings = {"motor's encoder, d at the motor": (120.0, 100.0), "both, d at both": (400.0, 1.0)}
+    one, two = (
+        [trial.run(trial.law_of(*trial.DESIGNS[name], *design), each, 2.0) for each in machines]
+        for name, design in settings.items()
+    )
+    for alone, both in zip(one, two, strict=True):
+        assert both.resting < 0.2 * alone.resting

@@ -12,7 +12,7 @@ from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
 from quell.analysis.matrices import MatrixLaw, axes_law
-from quell.analysis.multivariable import MultivariableLoop, Peak, Pole
+from quell.analysis.multivariable import MultivariableLoop, Peak, Pole, analyse_axes
 from quell.analysis.online import OnlineCertificate, certify_online
 from quell.analysis.plots import (
     loops_over_omega_o,
@@ -53,6 +53,7 @@ __all__ = [
     "adapting",
     "advise",
     "analyse",
+    "analyse_axes",
     "axes_law",
     "certify",
     "certify_axes",

@@ -20,8 +20,8 @@ uncertain parts. docs/theory has the proof.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -29,14 +29,19 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.certificate import guard_bound, linear_adrc
-from quell.analysis.matrices import plant_matrices
+from quell.analysis.matrices import estimates_at, gain_at, sampled_matrices
 from quell.controllers.adrc import ADRC
-from quell.controllers.base import Controller
+from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none
 from quell.guard.guard import check_one_state_of_f, check_stable, state_path
 from quell.lti.models import MatrixSystem, System, peak_gain
 from quell.observers.design import f_learned_response, response
 from quell.observers.forms import without_delay
+from quell.plants.multivariable import (
+    DelayedInputs,
+    EncodedOutputs,
+    MultivariableNonlinearPlant,
+)
 from quell.types import Matrix, Vector
 
 
@@ -45,12 +50,14 @@ class CoupledCertificate:
     """Bounds for axes that act on each other; made by ``certify_coupled`` and ``certify_axes``."""
 
     gains: Matrix
-    """Γ (axes, axes): peak-to-peak gains from e_j to q_i."""
+    """Peak-to-peak gains Γ (axes, axes) from e_j to q_i."""
     output_gains: Matrix | None
-    """Γ_y (outputs, axes), from e_j to y_i; None if it was not asked for."""
+    """Peak-to-peak gains Γ_y (outputs, axes) from e_j to y_i; None without ``to_output``."""
     uncertain: Matrix
-    """K (axes, axes): bounds of the uncertain parts, κ of the guards on the diagonal."""
+    """Bounds K (axes, axes) of the uncertain parts, κ of the guards on the diagonal."""
     axes: tuple[str, ...]
+    excluded: tuple[str, ...] = ()
+    """What the bounds do not cover."""
 
     @property
     def spectral_radius(self) -> float:
@@ -112,10 +119,11 @@ class CoupledCertificate:
 
     def __str__(self) -> str:
         rho = f"ρ(ΓK) = {self.spectral_radius:.3g}"
+        rest = f"\nnot covered: {'; '.join(self.excluded)}" if self.excluded else ""
         if not self.certified:
             return (
                 f"not certified: {rho} must be below 1: multiply all κ by less than "
-                f"{self.largest_factor:.3g}, or lower that of {self.weakest} most"
+                f"{self.largest_factor:.3g}, or lower that of {self.weakest} most{rest}"
             )
         largest = self.error_factors.sum(axis=1)
         bounds = ", ".join(
@@ -124,6 +132,7 @@ class CoupledCertificate:
         return (
             f"certified: {rho}; all κ may be multiplied by up to {self.largest_factor:.3g}\n"
             f"with any learners |q| stays below these multiples of the largest |q_0|: {bounds}"
+            f"{rest}"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -138,6 +147,7 @@ class CoupledCertificate:
             "output_gains": None if self.output_gains is None else self.output_gains.tolist(),
             "uncertain": self.uncertain.tolist(),
             "error_factors": self.error_factors.tolist(),
+            "excluded": list(self.excluded),
         }
         return dict(nonfinite_to_none(found))
 
@@ -232,70 +242,78 @@ def _peak_gains(name: str, systems: Any) -> Matrix:
 # ---- The loop of several axes ----
 
 
-def certify_axes(
-    plant: Any, controllers: Mapping[str, Controller] | Sequence[Controller], B0: Any
-) -> CoupledCertificate:
+def certify_axes(plant: Any, axes: Axes, operating_point: Any = None) -> CoupledCertificate:
     """Compute what the guards of several axes guarantee together, whatever the learners do.
 
-    Each axis has an ADRC that gives v_i from its own y_i; ``u = B0⁻¹ (b0_i v_i)``, and the observer
-    of an axis is told its v_i. The plant may have other couplings than B0.
+    The loop is linear, without limits; the plant may have other couplings than B0.
 
     Parameters
     ----------
     plant
-        sampled matrices (A, B, C), with delays as states, or an object that has them; output i
-        belongs to axis i.
-    controllers
-        an ``ADRC`` for each axis, in the order of the outputs, or ``{name: ADRC}``; κ is that of
-        its guard, or of ``Guard()`` if it has none.
-    B0
-        gain matrix (axes, axes) that the law inverts, ``y_i^(n_i) = f_i + (B0 u)_i``.
+        a plant with an output for each axis, as for ``analyse_axes``.
+    axes
+        the controller; κ of each axis is that of its guard, or of ``Guard()`` if it has none.
+    operating_point
+        (x, u) at which a nonlinear plant is linearised, and y of which B0 is evaluated at.
 
     Raises
     ------
     ValueError
-        for matrices that do not fit, sample times that differ, a loop that is unstable without
-        learners, or a controller that ``certify`` refuses.
+        for a plant that does not fit, a loop that is unstable without learners, or an axis that
+        ``certify`` refuses.
 
     Examples
     --------
-    Two axes whose true inertia couples them by a third, and whose law does not know it:
+    Two axes whose inertia couples them by a third, and whose law does not know it:
 
     >>> import numpy as np
     >>> import quell as ql
-    >>> from quell.lti.models import zero_order_hold
     >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron([[1.2, 0.4], [0.4, 1.2]], [[0], [1]])
-    >>> A, (B,) = zero_order_hold(A, [B], 0.005)
     >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=0.005)
     >>> axis = ql.ADRC(observer, omega_c=1.0, learner=ql.learners.Kalman(), guard=ql.Guard())
-    >>> found = certify_axes((A, B, np.eye(4)[[0, 2]]), {"x": axis, "y": axis}, np.eye(2))
+    >>> found = certify_axes((A, B, np.eye(4)[[0, 2]]), ql.Axes({"x": axis, "y": axis}))
     >>> found.certified, found.gains.round(2).tolist()
     (False, [[0.25, 0.46], [0.46, 0.25]])
     """
-    names = list(controllers) if isinstance(controllers, Mapping) else None
-    listed = list(controllers.values() if isinstance(controllers, Mapping) else controllers)
-    adrcs = [linear_adrc(each) for each in listed]
-    to_error, to_output = coupled_loop(plant, adrcs, B0)
+    adrcs = [linear_adrc(each) for each in axes.axes]
+    matrices = sampled_matrices(plant, axes.dt, operating_point)
+    inverse = gain_at(axes, estimates_at(axes, plant, operating_point))[1]
+    to_error, to_output = coupled_loop(matrices, adrcs, inverse)
     kappa = [guard_bound(adrc) for adrc in adrcs]
-    return certify_coupled(to_error, kappa, to_output, names)
+    found = certify_coupled(to_error, kappa, to_output, axes.names)
+    return replace(found, excluded=_not_covered(plant, axes))
 
 
-def coupled_loop(plant: Any, adrcs: Sequence[ADRC], B0: Any) -> tuple[MatrixSystem, MatrixSystem]:
-    """Return the loop of several plain observers, from the corrections e_L to q and to y."""
-    A, B, C = plant_matrices(plant)
+def _not_covered(plant: Any, axes: Axes) -> tuple[str, ...]:
+    """Return what of the loop, as the user gave it, is not covered."""
+    limits = np.concatenate([np.ravel(part) for part in axes.limits])
+    found = ["times when an actuator is limited"] if np.any(np.isfinite(limits)) else []
+    while isinstance(plant, DelayedInputs | EncodedOutputs):
+        if isinstance(plant, EncodedOutputs):
+            found.append("the encoders' steps (they count as noise, the same in both loops)")
+        plant = plant.plant
+    if isinstance(plant, MultivariableNonlinearPlant):
+        found.append("large motions (the plant is linearised)")
+    if callable(axes.B0) or callable(axes.M):
+        found.append("changes of B0 with the estimates")
+    return tuple(found)
+
+
+def coupled_loop(
+    plant: tuple[Matrix, Matrix, Matrix], adrcs: Sequence[ADRC], inverse: Matrix
+) -> tuple[MatrixSystem, MatrixSystem]:
+    """Return the loop of several plain observers, from the corrections e_L to q and to y.
+
+    ``plant`` is sampled, and ``u = inverse v``.
+    """
+    A, B, C = plant
     n, axes = A.shape[0], len(adrcs)
-    if C.shape[0] != axes or B.shape[1] != axes:
+    if C.shape[0] != axes or B.shape[1] != inverse.shape[0]:
         raise ValueError(
-            f"plant has {B.shape[1]} inputs and {C.shape[0]} outputs, controllers has {axes}: must "
-            "have one of each for each axis"
+            f"plant has {B.shape[1]} inputs and {C.shape[0]} outputs: must have an output for each "
+            f"of the {axes} axes, and an input for each of the {inverse.shape[0]} actuators of B0"
         )
-    B0 = checks.matrix("B0", B0, axes, axes)
-    if np.linalg.matrix_rank(B0) < axes:
-        raise ValueError(f"B0 = {B0.tolist()!r}: must have an inverse, u = B0⁻¹ v")
-    steps = {adrc.dt for adrc in adrcs}
-    if len(steps) != 1:
-        raise ValueError(f"controllers have dt = {sorted(steps)}: must have the same")
-    B = B @ np.linalg.solve(B0, np.diag([float(adrc.observer.b0) for adrc in adrcs]))
+    B = B @ inverse
     parts = [_axis(adrc) for adrc in adrcs]
     edges = [n, *(n + np.cumsum([part.N.shape[0] for part in parts])).tolist()]
     N, into = np.zeros((edges[-1], edges[-1])), np.zeros((edges[-1], axes))

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.analysis.margins import Complex
-from quell.analysis.matrices import MatrixResponse, plant_matrices
+from quell.analysis.matrices import MatrixResponse, sampled_matrices
 from quell.analysis.multivariable import grouped_poles
 from quell.lti.models import ZERO_TOLERANCE, MatrixSystem
 from quell.types import Matrix, Vector
@@ -193,41 +193,48 @@ class Coupling:
         )
 
 
-def coupling(plant: Any, dt: float, bandwidth: float | None = None, axes: Any = None) -> Coupling:
+def coupling(
+    plant: Any,
+    dt: float,
+    bandwidth: float | None = None,
+    axes: Any = None,
+    operating_point: Any = None,
+) -> Coupling:
     """Compute the relative gains of a plant with as many inputs as outputs, and advise.
 
     Parameters
     ----------
     plant
-        sampled matrices (A, B, C), or an object that has them; output i and input i are axis i.
+        a plant with several inputs and outputs, as for ``analyse_axes``; output i and input i are
+        axis i.
     dt
-        sample time [s].
+        sample time of the loops [s].
     bandwidth
         bandwidth of the loops [rad/s], at which the gains are looked at as well; none by default.
     axes
         names of the axes; ``"axis 1"``, … by default.
+    operating_point
+        (x, u) at which a nonlinear plant is linearised.
 
     Raises
     ------
     ValueError
-        for matrices that do not fit, a bandwidth of more than half the sampling rate, or an output
-        that no input moves.
+        for a plant that ``analyse_axes`` refuses, other numbers of inputs than of outputs, a
+        bandwidth of more than half the sampling rate, or an output that no input moves.
 
     Examples
     --------
     Two arms that move each other, each an integrator of second order:
 
-    >>> from quell.lti.models import zero_order_hold
     >>> import numpy as np
-    >>> M = np.linalg.inv([[2.0, 1.0], [1.0, 0.9]])
-    >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron(M, [[0], [1]])
-    >>> A, (B,) = zero_order_hold(A, [B], 1e-3)
+    >>> B0 = np.linalg.inv([[2.0, 1.0], [1.0, 0.9]])
+    >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron(B0, [[0], [1]])
     >>> found = coupling((A, B, np.eye(4)[[0, 2]]), 1e-3, axes=("shoulder", "elbow"))
     >>> print(found.advice.partition(" (")[0], round(found.factor, 3))
     shoulder and elbow are coupled by 2.2 in B0: use B0 2.25
     """
-    A, B, C = plant_matrices(plant)
     dt = checks.positive("dt", dt, "s")
+    A, B, C = sampled_matrices(plant, dt, operating_point)
     m, p = B.shape[1], C.shape[0]
     if m != p:
         raise ValueError(

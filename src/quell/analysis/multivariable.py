@@ -56,7 +56,15 @@ from quell.analysis.margins import (
     margins,
     without_idle_chains,
 )
-from quell.analysis.matrices import MatrixResponse, law_matrices, plant_matrices
+from quell.analysis.matrices import (
+    MatrixResponse,
+    estimates_at,
+    law_matrices,
+    law_of_axes,
+    plant_matrices,
+    sampled_matrices,
+)
+from quell.controllers.axes import Axes
 from quell.lti.models import MatrixSystem
 from quell.types import Matrix, Vector
 
@@ -470,6 +478,54 @@ class MultivariableLoop:
                 f"{d.gain[1]:.3g} or phases ±{d.phase:.1f}°, at {d.omega:.3g} rad/s"
             )
         return "\n".join([*lines, *filter(None, [self.note])])
+
+
+def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> MultivariableLoop:
+    """Analyse the loop of a plant and several axes, unlimited, with learners at rest.
+
+    Learners are taken as ``analyse`` takes them. A B0 that is a function of the estimates is a
+    constant here, the one at the operating point: what its changes do is not in these margins.
+
+    Parameters
+    ----------
+    plant
+        a plant with an output for each axis: a ``MultivariableLinearPlant`` or what it is made
+        ``of``, such as (A, B, C) in continuous time; one behind delays or encoders, which are left
+        out; a ``MultivariableNonlinearPlant``, with its operating point; or a sampled one, a
+        ``control.StateSpace`` with the same dt or a ``MultivariableLinear``.
+    axes
+        the controller.
+    operating_point
+        (x, u) at which a nonlinear plant is linearised, at rest.
+
+    Raises
+    ------
+    ValueError
+        for another plant or controller, sizes that do not fit, a nonlinear plant without operating
+        point.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> robot = ql.plants.arm(gravity=0.0)
+    >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3)
+    >>> joint = ql.ADRC(observer, omega_c=8.0)
+    >>> pose = ([0.3, 1.2, 0.0, 0.0], [0.0, 0.0])
+    >>> loop = analyse_axes(robot, ql.Axes([joint, joint], M=robot.inertia), pose)
+    >>> round(loop.disk_margin("inputs").alpha, 2)
+    0.84
+    """
+    if not isinstance(axes, Axes):
+        raise ValueError(f"axes = {axes!r}: must be quell.Axes; of one signal, use analyse")
+    matrices = sampled_matrices(plant, axes.dt, operating_point)
+    m, p = matrices[1].shape[1], matrices[2].shape[0]
+    if (p, m) != (axes.outputs, axes.inputs):
+        raise ValueError(
+            f"plant has {m} inputs and {p} outputs: the controller has {axes.outputs} axes and "
+            f"{axes.inputs} actuators"
+        )
+    law = law_of_axes(axes, estimates_at(axes, plant, operating_point))
+    return MultivariableLoop(matrices, law, axes.dt, outputs=axes.names)
 
 
 def _channel_names(

@@ -44,8 +44,9 @@ from quell import checks
 from quell.controllers.base import Limits, RateLimit, checked_limits
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
-from quell.kernels.sized import Flag
+from quell.kernels.sized import Flag, Work
 from quell.kernels.user_functions import POINTER, call
+from quell.learners.base import meaning
 from quell.types import Matrix, Status, Vector, warn
 
 _SATURATED = int(Status.SATURATED)
@@ -70,14 +71,14 @@ class GainMemory(NamedTuple):
 
     B: Matrix  # (n, m)
     inverse: Matrix  # B0⁺ (m, n)
-    fresh: Matrix  # what a function returned (n, m), or M (n, n)
-    work: Matrix  # (n, 2 n)
+    fresh: Work  # what a function returned (n, m), or M (n, n)
+    work: Work  # (n, 2 n)
 
 
 class ConstantGain(NamedTuple):
     """A constant B0: the memory has it from the start."""
 
-    B: Matrix  # (n, m)
+    B0: Matrix  # (n, m)
 
 
 class FunctionGain(NamedTuple):
@@ -86,6 +87,11 @@ class FunctionGain(NamedTuple):
     address: int
     is_inverse: Flag
     weights: Vector  # of the actuators (m,)
+
+
+@meaning.register(FunctionGain)
+def _meaning(gain: FunctionGain) -> Any:
+    return gain.address, gain.is_inverse
 
 
 @kernel
@@ -204,14 +210,14 @@ class ActuatorLimits(NamedTuple):
 class RangeMemory(NamedTuple):
     """The range of the actuators in a sample, and room to calculate."""
 
-    low: Vector  # (m,)
-    high: Vector  # (m,)
-    step: Vector  # (m,)
-    rest: Vector  # v that is left (n,)
-    free: Vector  # (m,) 1 for actuators that are not at an end of their range
-    slope: Vector  # of the sum of squares (m,)
-    H: Matrix  # of the sum of squares (m, m)
-    L: Matrix  # its factor for the free actuators (m, m)
+    low: Work  # (m,)
+    high: Work  # (m,)
+    step: Work  # (m,)
+    rest: Work  # v that is left (n,)
+    free: Work  # (m,) 1 for actuators that are not at an end of their range
+    slope: Work  # of the sum of squares (m,)
+    H: Work  # of the sum of squares (m, m)
+    L: Work  # its factor for the free actuators (m, m)
 
 
 def range_memory(n: int, m: int) -> RangeMemory:

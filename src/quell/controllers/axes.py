@@ -44,6 +44,7 @@ from quell.controllers.allocation import (
 from quell.controllers.base import (
     RateLimit,
     control,
+    is_usable,
     reset_loop,
     set_applied_control,
     set_reference_derivatives,
@@ -51,6 +52,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.compensator import Estimate, samples_to_settle, start_at_rest
+from quell.controllers.memory import Layout
 from quell.controllers.stateful import PackedController, StatefulController, unpacked
 from quell.kernels import dispatch
 from quell.kernels.dispatch import (
@@ -60,7 +62,7 @@ from quell.kernels.dispatch import (
     generic,
     kernel,
 )
-from quell.kernels.sized import Scalars, clear
+from quell.kernels.sized import Scalars, Work, clear
 from quell.types import Channels, Matrix, Status, Vector
 
 # ---- Functions of a controller of several signals, as ``controllers.base`` has them for one ----
@@ -129,6 +131,35 @@ def set_axes_derivatives(axes: Any, states: Any, counts: Any, i: int, values: Ve
     raise TypeError
 
 
+@generic
+def start_axes(
+    axes: Any, states: Any, samples: Any, i: int, y: Vector, v: Vector, r: Vector
+) -> None:
+    """Start the axes from the i-th on at rest; see ``start_at_rest``.
+
+    A reference that is no number is y.
+    """
+    raise TypeError
+
+
+@generic
+def have_started(axes: Any, states: Any) -> bool:
+    """Return whether all axes had a measurement or a start."""
+    raise TypeError
+
+
+@generic
+def continue_axes(axes: Any, states: Any) -> None:
+    """Let the next sample of each axis continue from what was applied."""
+    raise TypeError
+
+
+@generic
+def set_axes_manual(axes: Any, states: Any, manual: float, i: int, v: Vector) -> None:
+    """Begin or end manual operation under v of the axes from the i-th on."""
+    raise TypeError
+
+
 @ask_axes.register(NoAxis)
 def _ask_none(axes: NoAxis, states: Any, i: int, r: Any, y: Any, v: Any, x: Any) -> int:
     return 0
@@ -192,6 +223,54 @@ def _derivatives(
     set_axes_derivatives(axes.others, states.others, counts, i + 1, values[counts[i] :])
 
 
+@start_axes.register(NoAxis)
+def _start_none(axes: NoAxis, states: Any, samples: Any, i: int, y: Any, v: Any, r: Any) -> None:
+    pass
+
+
+@start_axes.register(AxisDesigns)
+def _start(
+    axes: AxisDesigns, states: AxisStates, samples: Any, i: int, y: Vector, v: Vector, r: Vector
+) -> None:
+    goal = r[i] if is_usable(r[i]) else y[i]
+    start_at_rest(axes.axis, states.axis, samples[i], y[i], v[i], goal)
+    start_axes(axes.others, states.others, samples, i + 1, y, v, r)
+
+
+@have_started.register(NoAxis)
+def _none_has_started(axes: NoAxis, states: Any) -> bool:
+    return True
+
+
+@have_started.register(AxisDesigns)
+def _have_started(axes: AxisDesigns, states: AxisStates) -> bool:
+    if states.axis.loop[0].started == 0.0:
+        return False
+    return have_started(axes.others, states.others)
+
+
+@continue_axes.register(NoAxis)
+def _continue_none(axes: NoAxis, states: Any) -> None:
+    pass
+
+
+@continue_axes.register(AxisDesigns)
+def _continue(axes: AxisDesigns, states: AxisStates) -> None:
+    states.axis.loop[0].bumpless = 1.0
+    continue_axes(axes.others, states.others)
+
+
+@set_axes_manual.register(NoAxis)
+def _set_none_manual(axes: NoAxis, states: Any, manual: float, i: int, v: Any) -> None:
+    pass
+
+
+@set_axes_manual.register(AxisDesigns)
+def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v: Vector) -> None:
+    states.axis.loop[0].manual, states.axis.loop[0].u_manual = manual, v[i]
+    set_axes_manual(axes.others, states.others, manual, i + 1, v)
+
+
 # ---- A sample of all axes ----
 
 
@@ -206,7 +285,7 @@ class AxesLoop(Scalars):
 class AxesDesign(NamedTuple):
     """Parameters of several axes."""
 
-    axes: Any  # AxisDesigns
+    axes: Any  # each axis with those behind it
     gain: Any  # B0
     rule: Any  # what is done at the limits
     limits: ActuatorLimits
@@ -217,20 +296,20 @@ class AxesDesign(NamedTuple):
 class AxesState(NamedTuple):
     """State of several axes."""
 
-    axes: Any  # AxisStates
+    axes: Any  # each axis with those behind it
     gain: GainMemory
     range: RangeMemory
     loop: NDArray[AxesLoop]  # (1,)
-    x: Matrix  # estimates x[axis, derivative] (n, largest order)
+    x: Work  # estimates x[axis, derivative] (n, largest order)
     v: Vector  # what the axes asked for, then what was applied (n,)
     u: Vector  # applied control signals (m,)
-    u_limited: Vector  # those of the law; they differ from u in manual operation (m,)
-    r: Vector  # references and measurements of a call from Python (n,)
-    y: Vector
+    u_limited: Work  # those of the law; they differ from u in manual operation (m,)
+    r_given: Work  # references and measurements of a call from Python (n,)
+    y_given: Work
 
 
 @kernel
-def _applied_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
+def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
     """Write ``B0 u`` into ``v``."""
     for i in range(v.size):
         v[i] = 0.0
@@ -252,9 +331,58 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     for k in range(u.size):
         state.u[k] = state.u_limited[k]
         u[k] = state.u[k]
-    _applied_to_axes(state.gain, state.u, state.v)
+    apply_to_axes(state.gain, state.u, state.v)
     tell_axes(design.axes, state.axes, 0, state.v)
     loop.status, loop.started = flags, 1.0
+
+
+def tell_applied(design: AxesDesign, state: AxesState) -> None:
+    """Tell all axes what the control signals in the state do."""
+    apply_to_axes(state.gain, state.u, state.v)
+    tell_axes(design.axes, state.axes, 0, state.v)
+
+
+def start_all(
+    design: AxesDesign, state: AxesState, samples: Any, y: Vector, u: Vector, r: Vector
+) -> None:
+    """Start at a machine that rests at y under u: the next sample continues from there.
+
+    r are the references of the next sample; one that is no number is y. What was learned is kept.
+    Each observer takes as many ``samples`` (n,) as it needs to settle.
+    """
+    reset_loop(design, state)
+    for i in range(state.v.size):
+        for j in range(state.x.shape[1]):
+            state.x[i, j] = y[i] if j == 0 else 0.0
+    update_gain(design.gain, state.gain, state.x)
+    for k in range(state.u.size):
+        state.u[k] = u[k]
+    apply_to_axes(state.gain, state.u, state.v)
+    start_axes(design.axes, state.axes, samples, 0, y, state.v, r)
+    state.loop[0].started = 1.0
+
+
+def begin_manual(design: AxesDesign, state: AxesState) -> None:
+    """Let the axes run in manual operation under the v in the state."""
+    state.loop[0].manual = 1.0
+    set_axes_manual(design.axes, state.axes, 1.0, 0, state.v)
+
+
+def end_manual(design: AxesDesign, state: AxesState) -> None:
+    """End manual operation of a sample."""
+    state.loop[0].manual = 0.0
+    set_axes_manual(design.axes, state.axes, 0.0, 0, state.v)
+
+
+def hand_over_all(design: AxesDesign, state: AxesState) -> bool:
+    """End manual operation: the next sample continues from the control signals of the last one.
+
+    Return false before the first sample of one of the axes: then nothing has changed.
+    """
+    if state.loop[0].started == 0.0 or not have_started(design.axes, state.axes):
+        return False
+    continue_axes(design.axes, state.axes)
+    return True
 
 
 @status_flags.register(AxesDesign)
@@ -288,13 +416,13 @@ def _set_derivatives(design: AxesDesign, state: AxesState, derivatives: Vector) 
 def step_axes(packed: Any) -> None:
     """Take one sample with the references and measurements that are in the state."""
     design, state = unpacked(packed)
-    control_all(design, state, state.r, state.y, state.u)
+    control_all(design, state, state.r_given, state.y_given, state.u)
 
 
 def _step_as_python(packed: Any) -> None:
     design, state = packed.arrays
     with np.errstate(all="ignore"):  # compiled code does not warn
-        control_all(design, state, state.r, state.y, state.u)
+        control_all(design, state, state.r_given, state.y_given, state.u)
 
 
 # ---- The controller ----
@@ -400,6 +528,11 @@ class Axes(StatefulController):
         return len(self.axes)
 
     @property
+    def first_gain(self) -> Matrix:
+        """B0 before the first sample (n, m)."""
+        return self._gain.first.copy()
+
+    @property
     def _most(self) -> int:
         return max(axis.observer.order for axis in self.axes)
 
@@ -457,8 +590,8 @@ class Axes(StatefulController):
             v=np.zeros(n),
             u=np.zeros(m),
             u_limited=np.zeros(m),
-            r=np.zeros(n),
-            y=np.zeros(n),
+            r_given=np.zeros(n),
+            y_given=np.zeros(n),
         )
 
     def _use_state(self, state: AxesState) -> None:
@@ -504,7 +637,7 @@ class Axes(StatefulController):
             self.prepare()
         state = self._state
         try:
-            state.r[:], state.y[:] = r, y
+            state.r_given[:], state.y_given[:] = r, y
         except (TypeError, ValueError):
             raise ValueError(
                 f"r = {r!r}, y = {y!r}: each must have {self.outputs} numbers, one for each axis "
@@ -530,12 +663,7 @@ class Axes(StatefulController):
         ``u_max`` and ``rate_limit``.
         """
         self._state.u[:] = checks.vector("u", u, self.inputs)
-        self._tell()
-
-    def _tell(self) -> None:
-        state = self._state
-        _applied_to_axes(state.gain, state.u, state.v)
-        tell_axes(self.parameters.axes, state.axes, 0, state.v)
+        tell_applied(self.parameters, self._state)
 
     def start(
         self,
@@ -560,17 +688,8 @@ class Axes(StatefulController):
         rest = checks.vector("y", y, self.outputs)
         given = np.zeros(self.inputs) if u is None else checks.vector("u", u, self.inputs)
         goals = rest if r is None else checks.vector("r", r, self.outputs)
-        state = self._state
-        reset_loop(self.parameters, state)
-        state.x[:] = 0.0
-        state.x[:, 0] = rest
-        update_gain(self.parameters.gain, state.gain, state.x)
-        state.u[:] = given
-        _applied_to_axes(state.gain, state.u, state.v)
-        for i, axis in enumerate(self.axes):
-            at = (float(rest[i]), float(state.v[i]), float(goals[i]))
-            start_at_rest(axis.parameters, axis._state, samples_to_settle(axis.observer), *at)
-        state.loop[0].started = 1.0
+        samples = [samples_to_settle(axis.observer) for axis in self.axes]
+        start_all(self.parameters, self._state, samples, rest, given, goals)
 
     def track(
         self,
@@ -587,33 +706,26 @@ class Axes(StatefulController):
         with self._manual_operation(given):
             self.step(r, y)
         state.u[:] = given
-        self._tell()
+        tell_applied(self.parameters, state)
         state.loop[0].started = 1.0
 
     @contextmanager
     def _manual_operation(self, u: Vector) -> Iterator[None]:
-        state = self._state
-        _applied_to_axes(state.gain, u, state.v)
-        wanted = state.v.copy()
-        state.loop[0].manual = 1.0
-        for axis, v in zip(self.axes, wanted, strict=True):
-            axis._state.loop[0].manual, axis._state.loop[0].u_manual = 1.0, v
+        design, state = self.parameters, self._state
+        apply_to_axes(state.gain, u, state.v)
+        begin_manual(design, state)
         try:
             yield
         finally:
-            state.loop[0].manual = 0.0
-            for axis in self.axes:
-                axis._state.loop[0].manual = 0.0
+            end_manual(design, state)
 
     def hand_over(self) -> None:
         """End manual operation: the next ``step`` continues from the u of the last ``track``.
 
-        Raises ``ValueError`` before the first sample.
+        Raises ``ValueError`` before the first measurement of one of the axes.
         """
-        if self._state.loop[0].started == 0.0:
+        if not hand_over_all(self.parameters, self._state):
             raise ValueError("hand_over: there was no sample yet; call track or start before")
-        for axis in self.axes:
-            axis.hand_over()
 
     def retune(self, axis: int | str, **changes: Any) -> None:
         """Change the bandwidth or the observer of one axis while running, without a bump.
@@ -673,6 +785,14 @@ class Axes(StatefulController):
             if np.all(np.isfinite(values)):
                 found[name] = values.tolist()
         return found
+
+    def _images(self) -> Layout:
+        for name, axis in zip(self.names, self.axes, strict=True):
+            try:
+                axis._images()
+            except ValueError as error:
+                raise ValueError(f"axis {name}: {error}") from None
+        return super()._images()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy is made from; a function of B0 is compiled anew for it."""

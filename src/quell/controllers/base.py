@@ -110,6 +110,12 @@ def set_applied_control(controller: Any, state: Any, u: float) -> None:
     raise TypeError
 
 
+@generic
+def change_parameters(old: Any, new: Any, state: Any) -> None:
+    """Continue with other parameters of the same structure, without a jump of u."""
+    raise TypeError
+
+
 @generic_with_default
 def hold_integrators(controller: Any, state: Any, u_before: float) -> None:
     """Undo what the last ``control`` added to integrators: u does not act while a plant is held.

@@ -34,6 +34,7 @@ from quell.controllers.base import (
     Limits,
     RateLimit,
     bumpless_transfer,
+    change_parameters,
     check_controller,
     control,
     hold_integrators,
@@ -160,6 +161,14 @@ def _set_applied_control(design: CompensatedDesign, state: CompensatedState, u: 
 def _bumpless_transfer(design: CompensatedDesign, state: CompensatedState) -> None:
     bumpless_transfer(design.controller, state.controller)
     bumpless_transfer(design.compensator, state.compensator)
+
+
+@change_parameters.register(CompensatedDesign)
+def _change_parameters(
+    old: CompensatedDesign, new: CompensatedDesign, state: CompensatedState
+) -> None:
+    change_parameters(old.controller, new.controller, state.controller)
+    change_parameters(old.compensator, new.compensator, state.compensator)
 
 
 def compensating_part(controller: Any) -> Compensator | None:
@@ -289,6 +298,13 @@ class Compensated(Wrapper):
     @property
     def _inner(self) -> Compensator:
         return self.compensator
+
+    @property
+    def _retuned_part(self) -> Any:
+        return self.compensator
+
+    def _with_part(self, new: Any) -> Any:
+        return self.parameters._replace(compensator=new)
 
     @property
     def external_signals(self) -> int:

@@ -40,12 +40,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import RateLimit, checked_limits, reset_loop
+from quell.controllers.base import RateLimit, change_parameters, checked_limits, reset_loop
 from quell.controllers.held import HeldPlant, NoHeldMemory, NoHeldPlant, check_rest, look_anew
 from quell.controllers.law import (
     AdrcDesign,
@@ -78,7 +79,7 @@ from quell.controllers.schedule import (
     set_signal,
     with_gains,
 )
-from quell.controllers.stateful import PackedController, StatefulController, unpacked
+from quell.controllers.stateful import Retuning, StatefulController
 from quell.guard import (
     GUARD_CHANNELS,
     Guard,
@@ -88,15 +89,10 @@ from quell.guard import (
     limit,
     write_channels,
 )
-from quell.kernels import dispatch
 from quell.kernels.dispatch import (
     call_specialised,
     compiled,
-    compiled_call,
-    dispatcher_for,
-    kernel,
 )
-from quell.kernels.sized import layout_of
 from quell.learners.base import (
     NO_LAG,
     Learner,
@@ -137,7 +133,7 @@ class Estimate(NamedTuple):
     f_residual: float
     """The observer's share, Δf̂."""
     theta: dict[str, float]
-    """The learner's coefficients by feature."""
+    """The learner's coefficients by feature; with a table of b0 those for the observer's b0."""
     u: float
     """The applied control signal."""
     status: Status
@@ -145,7 +141,10 @@ class Estimate(NamedTuple):
     authority: float = 1.0
     """Share of its output that the guard allows the learner."""
     error_plain: float = math.nan
-    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n]."""
+    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n].
+
+    With a table of b0 it is for the observer's b0, as ``error_learned``.
+    """
     error_learned: float = math.nan
     """The same for the learner with full authority."""
     reason: Reason = Reason.TRUSTED
@@ -265,7 +264,7 @@ def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
         state.loop[0].manual = 0.0
 
 
-@kernel
+@change_parameters.register(AdrcDesign)
 def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     """Convert a running state to new parameters, without a jump of u."""
     loop, size = state.loop[0], new.law.size
@@ -292,22 +291,6 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     state.z[size] += change
     state.seen[size] += change
     loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)
-
-
-@compiled_call
-def change_packed(old: Any, new: Any) -> None:
-    """Convert a running state, see ``change_design``; both are packed with that state."""
-    before, state = unpacked(old)
-    after, _ = unpacked(new)
-    change_design(before, after, state)
-
-
-def changing(dispatcher: Any, packed: PackedController) -> Callable[[Any, Any], None]:
-    """Return the compiled function of ``dispatcher`` for controllers of one type."""
-    if dispatch.interpret_all:
-        return lambda old, new: change_design(old.arrays[0], *new.arrays)
-    compiled: Callable[[Any, Any], None] = dispatcher.compile((packed.type, packed.type))
-    return compiled
 
 
 def check_replacement(old: ESO, new: Any, learns: bool) -> None:
@@ -567,7 +550,8 @@ class Compensator(StatefulController):
     def _schedule_design(self, observer: ESO) -> Any:
         if self.schedule is None:
             return NoSchedule()
-        return self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+        schedule = self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+        return schedule._replace(fixed=np.ones(1) if schedule.has_b0 else np.zeros(0))  # u_0
 
     def _with_parts(self, schedule: Any, observer: ESO) -> Any:
         """Return parameters of a schedule with what the other parts of the controller need."""
@@ -576,6 +560,7 @@ class Compensator(StatefulController):
         return schedule._replace(
             extended=observer.disturbance_order if self._learns else 0,
             has_safe_set=self.safe_set is not None,
+            has_held=self.held is not None,
         )
 
     @property
@@ -763,7 +748,8 @@ class Compensator(StatefulController):
             estimates x̂ (n,), y and its derivatives; see ``observer.states_of`` if there are zeros.
         f
             total disturbance [y-unit/s^n]; for an observer with more extended states also a list
-            of f, f', … [y-unit/s^(n+j)], the missing ones zero.
+            of f, f', … [y-unit/s^(n+j)], the missing ones zero. With a table of b0 it is the one
+            for the observer's b0.
         u
             control signal applied until the next step [u-unit]; a delayed one has the same past.
         r
@@ -833,55 +819,29 @@ class Compensator(StatefulController):
         observer
             new observer of the same order, form, structure and sample time.
         """
-        self._check_observer(observer)
-        self._change_to(self._design(observer), compiles=False, observer=observer)()
+        self._change_to(partial(self._retuning, observer=observer), compiles=False)()
 
     def prepare_retune(self, *, observer: ESO) -> Callable[[], None]:
         """Return a function that does what ``retune`` does, in a step's time.
 
         As ``ADRC.prepare_retune``.
         """
-        self._check_observer(observer)
-        return self._change_to(self._design(observer), compiles=True, observer=observer)
+        return self._change_to(partial(self._retuning, observer=observer), compiles=True)
 
-    def _check_observer(self, observer: Any) -> None:
-        """Check that an observer can replace the present one while running."""
+    def _retuning(self, *, omega_c: float | None = None, observer: ESO | None = None) -> Retuning:
+        """Return the parameters with another observer, and what sets the attributes for them."""
+        if omega_c is not None or observer is None:
+            rule = "a compensator has no law; give another observer"
+            raise ValueError(f"omega_c = {omega_c!r}: {rule}")
         check_replacement(self.observer, observer, self._learns)
         if self.schedule is not None:
             self.schedule.check_retuning(self.observer, observer, False)
+        return self._retuning_to(self._design(observer), observer=observer)
 
-    def _change_to(self, new: AdrcDesign, compiles: bool, **named: Any) -> Callable[[], None]:
-        """Return a function that changes to other parameters and sets the attributes named.
-
-        If it ``compiles``, the parameters are packed and the change is compiled beforehand.
-        """
+    def _retuning_to(self, new: AdrcDesign, **named: Any) -> Retuning:
+        """Return parameters, and what sets the attributes ``named``; check their structure."""
         check_structure(self.parameters, new)
-        ready: PackedController | None = None
-        change: Any = None
-        if compiles:
-            if self._packed is None:
-                self.prepare()
-            if layout_of(new) == layout_of(self.parameters):
-                ready = PackedController(new, self._state, self._packed)
-                change = changing(dispatcher_for(change_packed, new), ready)
-
-        def apply() -> None:
-            old, packed = self.parameters, self._packed
-            vars(self).update(named)
-            if (
-                ready is not None
-                and packed is not None
-                and packed.arrays[1] is ready.arrays[1]
-                and old.limits is new.limits
-            ):
-                change(packed, ready)
-                self.parameters, self._packed = new, ready
-                return
-            self.parameters = new._replace(limits=old.limits)
-            change_design(old, self.parameters, self._state)
-            self._pack_again()
-
-        return apply
+        return Retuning(new, partial(vars(self).update, named))
 
     @property
     def _external_fields(self) -> tuple[str, ...]:

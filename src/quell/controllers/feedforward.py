@@ -63,7 +63,8 @@ class Feedforward:
     """The feedforward of a model of the plant, for ``ADRC(..., feedforward=...)``.
 
     ``rigid`` makes it from an inertia, ``of`` from a linear or identified plant. It does not depend
-    on b0, and the observer knows it. The docstring of this module has the equations.
+    on b0, and the observer knows it; with a table of b0 the inertia is that for the observer's b0,
+    and follows 1/b0. The docstring of this module has the equations.
 
     Parameters
     ----------

@@ -235,7 +235,7 @@ def _fixed_control(
 def _all_of_it(
     feedforward: ControlGiven, coefficients: Vector, r: float, reference: Vector, acting: bool
 ) -> float:
-    return 0.0 if acting else r
+    return coefficients[0] * r
 
 
 @generic_with_default

@@ -157,13 +157,15 @@ def _what(design: Any) -> Any:
     if isinstance(design, AdrcDesign):
         kinds = (type(design.learner).__name__, type(design.guard).__name__)
         return kinds, meaning(design.learner), design.b0, design.cancel, design.cancel_f
+    if hasattr(design, "gain"):  # several axes: what they learn is relative to B0
+        return type(design).__name__, meaning(design.gain), _what(design.axes)
     inner = tuple(_what(each) for each in _inside(design))
     return type(design).__name__, type(getattr(design, "prefilter", None)).__name__, inner
 
 
 def _inside(whole: Any) -> tuple[Any, ...]:
-    """Return the controllers inside of a wrapper, by their parameters or by their states."""
-    names = ("controller", "compensator")
+    """Return the controllers inside of a wrapper or of axes, by their parameters or states."""
+    names = ("controller", "compensator", "axes", "axis", "others")
     return tuple(getattr(whole, name) for name in names if hasattr(whole, name))
 
 
@@ -178,6 +180,7 @@ def _zero_places(state: Any, arrays: dict[str, NDArray[Any]]) -> tuple[int, ...]
     """Return the numbers of the image that are flags of manual operation."""
     found, at = [], 0
     loops = [each.loop for each in _adrc_states(state)]
+    loops += [state.loop] if hasattr(state, "axes") else []
     for array in arrays.values():
         for loop in loops:
             if np.shares_memory(array, loop):

@@ -250,7 +250,8 @@ class OnlineGain:
     """b0 that follows an estimate from the reference's motion, for ``ADRC(…, schedule=…)``.
 
     The module's docstring has the equations. It is off unless it is given. For a plant of order 1
-    or 2 without zeros, whose reference moves; not together with a learner, which refers to one b0.
+    or 2 without zeros, whose reference moves; not together with a learner, to whom each step of b0
+    is a change of f.
 
     Parameters
     ----------

@@ -304,7 +304,8 @@ class SafeSet:
         actuator.
     f_rate
         largest ``|f'|`` of the total disturbance [y-unit/s^(n+1)], of a plant with the observer's
-        b0. It says how wrong the estimate of f may be, and so how wide the margin is.
+        b0. It says how wrong the estimate of f may be, and so how wide the margin is. With a table
+        of b0 the margin is that of its largest one.
     noise
         largest error of the measurement [y-unit], half a step of an encoder for instance.
     gain_error

@@ -139,10 +139,11 @@ class ScheduleDesign(NamedTuple):
     law: Size  # m, or zero without a table of omega_c
     gains: Size  # N, or zero without a table of omega_o
     cancel: Vector  # a (n,) of the model that the law cancels
-    fixed: Vector  # c of the feedforward of a model that do not follow 1/b0, when u acts
-    fixed_acting: Vector  # the same for the u that the observer receives in this sample
-    extended: Size  # m of the observer if there is a learner, else 0
-    has_safe_set: Flag
+    fixed: Vector  # c of what is fed forward and does not follow 1/b0, when u acts
+    fixed_acting: Vector  # of a model the same for the u that the observer receives in this sample
+    extended: Size  # m of the observer if there are b0 and a learner, else 0
+    has_safe_set: Flag  # beside b0
+    has_held: Flag  # whether there are b0 and a detection of holds
 
 
 class ScheduleLoop(Scalars):
@@ -323,7 +324,9 @@ def _as_observed(design: ScheduleDesign, memory: ScheduleMemory, u: float) -> fl
 
 @control_at_nominal.register(ScheduleDesign)
 def _control_at_nominal(design: ScheduleDesign, memory: ScheduleMemory, u: float) -> float:
-    return u * _ratio(design, memory) if design.has_b0 else u
+    if design.has_safe_set or design.has_held:
+        return u * _ratio(design, memory)
+    return u
 
 
 @kernel
@@ -334,12 +337,12 @@ def _ratio(design: ScheduleDesign, memory: ScheduleMemory) -> float:
 
 @at_nominal.register(ScheduleDesign)
 def _at_nominal(design: ScheduleDesign, memory: ScheduleMemory, f: float) -> float:
-    return f / _ratio(design, memory) if design.has_b0 else f
+    return f / _ratio(design, memory) if design.extended > 0 else f
 
 
 @at_present.register(ScheduleDesign)
 def _at_present(design: ScheduleDesign, memory: ScheduleMemory, g: float) -> float:
-    return g * _ratio(design, memory) if design.has_b0 else g
+    return g * _ratio(design, memory) if design.extended > 0 else g
 
 
 @show_at_nominal.register(ScheduleDesign)
@@ -378,7 +381,7 @@ def _known_of_model(
     b0: float,
     known: float,
 ) -> float:
-    if design.has_b0:
+    if design.fixed_acting.size > 0:
         fixed = fixed_control(feedforward, design.fixed_acting, r, reference, True)
         known -= (memory.loop[0].b0 - b0) * fixed
     return known
@@ -393,7 +396,7 @@ def _show_feedforward(
     reference: Vector,
     row: Vector,
 ) -> None:
-    if design.has_b0 and design.fixed.size > 0:
+    if design.fixed_acting.size > 0:
         fixed = fixed_control(feedforward, design.fixed, r, reference, False)
         row[0] = fixed + (row[0] - fixed) / _ratio(design, memory)
 
@@ -411,7 +414,7 @@ def _scheduled_law(
 ) -> float:
     for i in range(design.law):
         total += memory.values[i] * (_wished(reference, r, i) - seen[i])
-    if design.has_b0:
+    if design.fixed.size > 0:
         fixed = fixed_control(feedforward, design.fixed, r, reference, False)
         total += (memory.loop[0].b0 - b0) * fixed
     return total
@@ -595,8 +598,6 @@ def _safe_as_applied(
     safe_set: Any,
     set_memory: Any,
 ) -> float:
-    if not design.has_b0:
-        return safe
     if not design.has_safe_set:
         return unlimited
     ratio = _ratio(design, memory)
@@ -660,7 +661,9 @@ class Schedule:
         two of them for tables over two signals.
     b0
         nominal control gain at the points [y-unit/u-unit/s^n], all of one sign; of two signals a
-        list for each point of the first one. That of the observer by default.
+        list for each point of the first one. That of the observer by default. It is 1/J of an
+        inertia; a learner, and the inertia of a model's feedforward, refer to the observer's b0. A
+        learner's bounds of noise are those there: take a small one for a noisy y.
     omega_c
         controller bandwidth at the points [rad/s]; that of the controller by default.
     omega_o
@@ -812,6 +815,7 @@ class Schedule:
             fixed_acting=np.zeros(0),
             extended=0,
             has_safe_set=False,
+            has_held=False,
         )
 
     def memory(self, design: ScheduleDesign) -> ScheduleMemory:

@@ -18,9 +18,11 @@ import numba
 import numpy as np
 
 from quell import checks
+from quell.controllers.axes import Axes, AxesDesign, AxisDesigns
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
+    change_parameters,
     check_controller,
     control,
     reset_loop,
@@ -32,7 +34,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.compensated import Compensated, CompensatedDesign
-from quell.controllers.compensator import change_design, manual_operation
+from quell.controllers.compensator import manual_operation
 from quell.controllers.held import HeldDesign
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
@@ -49,7 +51,6 @@ from quell.kernels.single import in_single
 from quell.learners.base import Lag, NoiseGate, NoiseGateMemory
 from quell.learners.kalman import KalmanDesign, KalmanMemory, needs_carries
 from quell.learners.python_model import PythonDesign
-from quell.observers.eso import ESO
 from quell.observers.forms import delta_form
 from quell.types import Vector
 
@@ -128,6 +129,12 @@ def _with_carries(design: Any, state: Any) -> Any:
         inner = _with_carries(design.compensator, state.compensator)
         given = _with_carries(design.controller, state.controller)
         return state._replace(controller=given, compensator=inner)
+    if isinstance(design, AxesDesign):
+        return state._replace(axes=_with_carries(design.axes, state.axes))
+    if isinstance(design, AxisDesigns):
+        own, others = design.axis, design.others
+        behind = _with_carries(others, state.others)
+        return state._replace(axis=_with_carries(own, state.axis), others=behind)
     if isinstance(design, AdrcDesign):
         state = state._replace(z=np.zeros(design.eso.states))
         if isinstance(design.safe_set, SafeSetDesign):
@@ -217,6 +224,11 @@ def _bumpless_transfer(design: SingleDesign, state: Any) -> None:
     bumpless_transfer(design.controller, state)
 
 
+@change_parameters.register(SingleDesign)
+def _change_parameters(old: SingleDesign, new: SingleDesign, state: Any) -> None:
+    change_parameters(old.controller, new.controller, state)
+
+
 def check_compilable() -> None:
     """Raise a ``ValueError`` if this Numba would compile single precision as double.
 
@@ -248,6 +260,11 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
     """
     if isinstance(controller, SinglePrecision):
         return controller
+    if isinstance(controller, Axes):
+        raise ValueError(
+            "controller = Axes(…): several axes run in Python in double precision only; "
+            "quell.export.c(…, precision='single', accept=True) writes their C code in single"
+        )
     return SinglePrecision(controller)
 
 
@@ -304,12 +321,8 @@ class SinglePrecision(Wrapper):
             self.step(r, y, *derivatives)
         return float(state.loop[0].u_limited)
 
-    def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
-        """Change bandwidths while running, see ``ADRC.retune``."""
-        before = self._adrc
-        self.controller.retune(omega_c=omega_c, observer=observer)
-        self._take_parameters()
-        change_design(before.parameters, self._adrc.parameters, before._state)
+    def _with_part(self, new: Any) -> Any:
+        return SingleDesign(single_design(new))
 
     def read(self, state: Any) -> Any:
         """Return the estimates and the status in ``state``."""

@@ -20,7 +20,7 @@ import numpy as np
 from quell import checks
 from quell.controllers.base import control, is_usable, reset_loop, set_applied_control
 from quell.controllers.compensated import CompensatedDesign, CompensatedState
-from quell.controllers.compensator import change_design, start_at_rest
+from quell.controllers.compensator import start_at_rest
 from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
 from quell.controllers.linear import LinearDesign, LinearState
 from quell.controllers.memory import Layout
@@ -102,6 +102,9 @@ class CSource:
         names of functions in C that the user has to link.
     signals
         number of signals of a schedule, which ``step`` takes behind the derivatives.
+    axes, actuators
+        names of several axes in C, and the number of control signals; none for one u and y. Then
+        ``derivatives`` are arrays.
     """
 
     name: str
@@ -113,6 +116,8 @@ class CSource:
     derivatives: int = 0
     externals: tuple[str, ...] = ()
     signals: int = 0
+    axes: tuple[str, ...] = ()
+    actuators: int = 0
 
     @property
     def further(self) -> tuple[str, ...]:
@@ -334,6 +339,21 @@ def _struct(kind: Any) -> Struct:
     if not isinstance(kind, Struct):
         raise TypeError
     return kind
+
+
+def check_parts(controller: Any) -> None:
+    """Raise a ``TranslationError`` if a part of a controller calls Python."""
+    parts = [(type(controller).__name__, controller.parameters)]
+    while parts:
+        name, value = parts.pop()
+        if type(value).__module__.startswith("quell.learners.python_model"):
+            raise TranslationError(
+                f"{name} = {type(value).__name__}: this learner calls Python at each sample, which "
+                "C can not; use Kalman, RLS, NLMS, MLP or GaussianProcess, or a model whose "
+                "functions Numba compiles (docs/extend)"
+            )
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            parts += zip(value._fields, value, strict=True)
 
 
 def translated(write: Callable[[Findings], CSource]) -> CSource:
@@ -642,30 +662,3 @@ def _move_origin(design: AdrcDesign, state: AdrcState, distance: float) -> None:
 def stop_of_move(design: PrefilteredDesign, state: PrefilteredState) -> float:
     """Return where the reference comes to rest soonest: as r of a step it stops there."""
     return stopping_point(design.prefilter, state.prefilter)
-
-
-@generic
-def retune(old: Any, new: Any, state: Any) -> None:
-    """Continue with other parameters of the same structure, without a jump of u."""
-    raise TypeError
-
-
-@retune.register(AdrcDesign)
-def _retune(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
-    change_design(old, new, state)
-
-
-@retune.register(PrefilteredDesign)
-def _retune_inside(old: PrefilteredDesign, new: PrefilteredDesign, state: PrefilteredState) -> None:
-    retune(old.controller, new.controller, state.controller)
-
-
-@retune.register(CompensatedDesign)
-def _retune_both(old: CompensatedDesign, new: CompensatedDesign, state: CompensatedState) -> None:
-    retune(old.controller, new.controller, state.controller)
-    retune(old.compensator, new.compensator, state.compensator)
-
-
-@retune.register(LinearDesign)
-def _keep_state(old: LinearDesign, new: LinearDesign, state: LinearState) -> None:
-    """Change nothing: the state of a linear law has the same meaning with other limits."""

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.controllers.axes import Axes
 from quell.controllers.base import (
     Limits,
+    change_parameters,
     check_controller,
     control,
     reset_loop,
@@ -25,11 +27,12 @@ from quell.controllers.prefilters import Prefiltered, stopping_point, without_pr
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
-from quell.export.c_files import CFiles, CSource, translated
+from quell.export.axes_source import source_of_axes
+from quell.export.c_files import CFiles, CSource, check_parts, translated
+from quell.export.estimates import enums, estimate_lines, estimate_struct
 from quell.export.translate.structs import Findings
-from quell.export.translate.text import Array, Number, TranslationError, Value, wrapped
-from quell.guard import Reason
-from quell.types import Channels, Status
+from quell.export.translate.text import Array, Number, TranslationError, Value
+from quell.types import Channels
 
 # ---- The parts of a controller that exports look at, in double or single precision ----
 
@@ -116,26 +119,6 @@ def check_counts(controller: Any, resolution: float) -> None:
 
 # ---- The two C files of a controller ----
 
-# Channels that hold integers.
-_WHOLE = ("status", "reason")
-
-# Comments of the members of the estimate.
-_CHANNELS = {
-    "x_hat": "y and its derivatives",
-    "f_residual": "the observer's share of f",
-    "f_learned": "the learner's share of f",
-    "f_derivatives": "derivatives of the observer's share of f",
-    "u_feedforward": "feedforward of the model, a part of u",
-    "status": "flags of the last sample",
-    "authority": "share of its output that the guard allows the learner",
-    "error_plain": "RMS error in f of an ESO without learner",
-    "error_learned": "the same for the learner with full authority",
-    "reason": "for the authority",
-    "theta": "the learner's coefficients",
-    "r_shaped": "reference behind the prefilter",
-    "u_unlimited": "control signal before limits",
-}
-
 
 def c_source(
     controller: Any, name: str = "controller", *, resolution: float | None = None
@@ -162,25 +145,17 @@ def c_source(
         resolution, if the controller needs the position itself.
     """
     check_controller(controller)
-    _check_parts(controller)
+    if isinstance(controller, Axes):
+        if resolution is not None:
+            raise TranslationError(
+                f"resolution = {resolution!r}: several axes take y in its unit; count turns as "
+                "integers before, and hand over differences to a position near the work"
+            )
+        return source_of_axes(controller, name)
+    check_parts(controller)
     if resolution is not None:
         check_counts(controller, resolution)
     return translated(lambda findings: _Writer(controller, name, findings, resolution).write())
-
-
-def _check_parts(controller: Any) -> None:
-    """Raise a ``TranslationError`` if a part of a controller calls Python."""
-    parts = [(type(controller).__name__, controller.parameters)]
-    while parts:
-        name, value = parts.pop()
-        if type(value).__module__.startswith("quell.learners.python_model"):
-            raise TranslationError(
-                f"{name} = {type(value).__name__}: this learner calls Python at each sample, which "
-                "C can not; use Kalman, RLS, NLMS, MLP or GaussianProcess, or a model whose "
-                "functions Numba compiles (docs/extend)"
-            )
-        if isinstance(value, tuple) and hasattr(value, "_fields"):
-            parts += zip(value._fields, value, strict=True)
 
 
 class _Writer:
@@ -240,8 +215,9 @@ class _Writer:
         defines.append(f"#define {upper}_MEMORY_SIZE {self.images.size} /* [bytes] */")
         if observing is not None:
             defines.append(f"#define {upper}_ORDER {observing.observer.order}")
-        self.files.enums += self._enums(channels)
-        self.files.structs += self._estimate_struct(channels)
+        self.files.enums += enums(name, channels)
+        doc = "What a controller knows after a sample."
+        self.files.structs += estimate_struct(f"{name}_estimate", channels, self.real, doc)
         return self.files.write(title, channels, defines, self.derivatives, self.signals)
 
     def _add_step(self) -> None:
@@ -375,7 +351,7 @@ class _Writer:
     def _add_retune(self) -> None:
         files = self.files
         new = Value(files.design.kind, "parameters", root="new")
-        call = files.call(c_files.retune, files.design, new, files.memory)
+        call = files.call(change_parameters, files.design, new, files.memory)
         files.add(
             "retune",
             f"void NAME({self.state}, const {self.name}_parameters *parameters)",
@@ -415,18 +391,7 @@ class _Writer:
         row = Value(Array((total,), Number.REAL), "row", root="row", mutable=True)
         lines = [f"    {real} row[{total}] = {{0}};", f"    {name}_estimate estimate;"]
         lines.append(f"    {files.call(write_row, *files.both, row)};")
-        at = 0
-        for channel, width in channels:
-            whole = channel in _WHOLE
-            for i in range(width):
-                place = f"[{i}]" if width > 1 else ""
-                number = f"row[{at}]"
-                if whole:
-                    number = f"{files.program.calls.helper('truncated')}({number})"
-                lines.append(f"    estimate.{channel}{place} = {number};")
-                at += 1
-        if _has_f(channels):
-            lines.append("    estimate.f = estimate.f_residual + estimate.f_learned;")
+        lines += estimate_lines(files, "estimate", channels)
         files.add(
             "get_estimate",
             f"{name}_estimate NAME(const {self.state})",
@@ -434,28 +399,3 @@ class _Writer:
             *lines,
             "    return estimate;",
         )
-
-    def _estimate_struct(self, channels: Channels) -> list[str]:
-        lines = ["", "/* What a controller knows after a sample. */", "typedef struct {"]
-        for channel, width in channels:
-            kind = "int" if channel in _WHOLE else self.real
-            shape = f"[{width}]" if width > 1 else ""
-            lines.append(f"    {kind} {channel}{shape}; /* {_CHANNELS.get(channel, channel)} */")
-        if _has_f(channels):
-            lines.append(f"    {self.real} f; /* total disturbance: f_residual + f_learned */")
-        return [*lines, f"}} {self.name}_estimate;"]
-
-    def _enums(self, channels: Channels) -> list[str]:
-        name, upper = self.name, self.name.upper()
-        flags = ", ".join(f"{upper}_{flag.name} = {int(flag)}" for flag in Status if flag.name)
-        lines = ["", "/* Flags of a sample, combined by |. */"]
-        lines += wrapped(f"enum {name}_flag {{ {flags} }};")
-        if "reason" in dict(channels):
-            reasons = ", ".join(f"{upper}_{reason.name} = {int(reason)}" for reason in Reason)
-            lines += ["", "/* Reasons of the guard for the learner's authority. */"]
-            lines += wrapped(f"enum {name}_reason {{ {reasons} }};")
-        return lines
-
-
-def _has_f(channels: Channels) -> bool:
-    return {"f_residual", "f_learned"} <= {name for name, _ in channels}

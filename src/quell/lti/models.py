@@ -344,7 +344,7 @@ class System(NamedTuple):
 
     @property
     def largest_pole(self) -> float:
-        """Largest |z| of all poles; 0 without states."""
+        """Largest size of all poles in the z-plane; 0 without states."""
         poles = 1.0 + np.linalg.eigvals(System.balanced(*self).N)
         return float(np.max(np.abs(poles), initial=0.0))
 

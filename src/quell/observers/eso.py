@@ -333,7 +333,7 @@ class ESO:
         disturbance_order: int = 1,
         form: str = "current",
         every: Sequence[int] | None = None,
-        time_varying: bool = False,
+        time_varying: bool | None = None,
         accept_zeros: bool = False,
     ) -> MultivariableESO:
         """Design an observer of a plant with several inputs, outputs and disturbances.
@@ -368,8 +368,10 @@ class ESO:
             at a quarter of the rate; gains by noise only. Outputs are due together in the first
             sample; what they say in between is ignored.
         time_varying
-            whether to calculate the covariance, and the gain from it, in each sample: the Kalman
-            filter for the samples that really arrive. Gains by noise only.
+            gains by noise only: whether to calculate the covariance, and the gain from it, in each
+            sample, as by default. False makes the gain a fixed one for each set of sensors, in a
+            seventh of the time; samples that are missing may then let the error grow, see
+            ``MultivariableESO.rms_decay``.
         accept_zeros
             whether to design an observer although there are invariant zeros from d to y other than
             at s = 0. It finds a constant d, but not one at the frequency of a zero.
@@ -399,7 +401,7 @@ class ESO:
         ...     noise_variance=[count**2 / 12] * 2, drift=[1.0, 1.0],
         ... )
         >>> both
-        MultivariableESO(n=4, m=1, p=2, q=2, omega_o=7198.48, dt=0.00025, form='current') [Gain]
+        MultivariableESO(n=4, m=1, p=2, q=2, omega_o=7198.48, dt=0.00025, form='current') [Riccati]
         >>> running = both.estimator()
         >>> estimate = running.step(y=[0.0, 0.0], u=[0.0])
         >>> running.d.tolist()

@@ -399,7 +399,7 @@ class MultivariableDesign(NamedTuple):
                 "or take an omega_o closer to the plant's own poles and to 0.1/dt"
             )
         rows = []
-        for measured in _sets(p):
+        for measured in sets_of(p):
             on = np.flatnonzero(measured)
             own = placed(on) if on.size else None
             gain = whole * measured
@@ -434,7 +434,7 @@ class MultivariableDesign(NamedTuple):
                 "never corrected: give E a column that reaches it; otherwise bring noise and "
                 "drift closer to each other"
             )
-        sets, P = _sets(p), {}
+        sets, P = sets_of(p), {}
         for on in sets[:-1]:
             P[tuple(on)] = self._without(model, process, noise, on) or usual_P
         P[tuple(sets[-1])] = usual_P
@@ -527,7 +527,7 @@ _BAD = 1e6
 _SLOWEST = 1e-6
 
 
-def _sets(outputs: int) -> NDArray[np.bool_]:
+def sets_of(outputs: int) -> NDArray[np.bool_]:
     """Return all sets (2^p, p) of measured outputs; bit j of a set's number is output j."""
     found: NDArray[np.bool_] = (np.arange(2**outputs)[:, None] >> np.arange(outputs)) & 1 == 1
     return found

@@ -23,22 +23,27 @@ the observer can be made, but a d that moves with the frequency of a zero is not
 and the density of the noise that drives each disturbance (``gains.py``). Sensors that are slower
 than the loop have a gain of their own in each sample of the common period.
 
-**Missing samples.** What is not a finite number has not been measured. The correction uses the
-other sensors, with a gain that depends on which these are:
+**Missing samples.** What is not a finite number has not been measured, and the others correct.
 
-- with poles, the gain that puts all poles in the same place with these sensors; where they can not
-  observe all, the columns of the gain of all sensors;
-- with noise, the steady Kalman gain of an observer without the missing sensors. It is the right one
-  if they stay away, and too large in the first samples. (The best gain for the first sample would
-  be that of the usual covariance, but with a servo's motor encoder alone it is unstable.) Where the
-  others do not observe all, the missing ones count as sensors with 1000 times their noise;
-- with ``time_varying`` the covariance is calculated in each sample: the Kalman filter for what has
-  been measured, whatever comes or does not come. ``N³`` operations a sample in place of ``N²``.
+Gains by noise: the covariance is calculated in each sample, and the gain from it. This is the
+Kalman filter for what has been measured, whatever comes or does not come: its covariance is that of
+the errors, and it is bounded if in every window of some fixed length what has been measured
+observes all (Jazwinski, *Stochastic Processes and Filtering Theory*, 1970, section 7.6). It takes
+``N³`` operations a sample in place of ``N²``.
 
-With the first two, poles are known while the same sensors are missing (``poles``), but no bound
-holds for every sequence of gaps. With the third the covariance is that of the errors, and it is
-bounded if in every window of some fixed length what has been measured observes all (Jazwinski,
-*Stochastic Processes and Filtering Theory*, 1970, section 7.6).
+Gains by poles, and by noise with ``time_varying=False``, are fixed: one for each set of sensors,
+
+- that which puts all poles in the same place with these sensors, where they observe all; else the
+  columns of the gain of all sensors;
+- by noise the steady Kalman gain of an observer without the missing ones. Where the others do not
+  observe all, the missing ones count as sensors with 1000 times their noise.
+
+While the same sensors are missing, the poles are known (``poles``). For samples that are missing at
+random ``rms_decay`` says whether the error decays: the mean of its square follows from
+``E[M ⊗ M]``, ``M = (I − L C) Φ`` (Costa, Fragoso & Marques, *Discrete-Time Markov Jump Linear
+Systems*, Springer 2005, chapter 3). Fast observers of a servo lose it: with two torques and a drift
+of 1 (N m)²/s the error diverges when half of the load encoder's samples are missing one by one,
+whichever fixed gains are taken (``benchmarks/second_encoder.py --part missing``).
 """
 
 from __future__ import annotations
@@ -59,6 +64,7 @@ from quell.observers.gains import (
     check_existence,
     extended_model,
     rates_of,
+    sets_of,
     settle,
 )
 from quell.observers.multivariable_forms import (
@@ -134,7 +140,7 @@ class MultivariableESO:
         disturbance_order: int = 1,
         form: str = "current",
         every: Any = None,
-        time_varying: bool = False,
+        time_varying: bool | None = None,
         accept_zeros: bool = False,
     ) -> MultivariableESO:
         """Design the observer; ``ESO.state_space`` has the parameters and errors."""
@@ -155,8 +161,9 @@ class MultivariableESO:
         common = A, B, C, E, D, dt, order, form, rates
         if by_poles:
             omega = checks.positive("omega_o", omega_o, "rad/s")
-            if due.shape[0] > 1 or checks.flag("time_varying", time_varying):
-                what = "time_varying = True" if due.shape[0] == 1 else f"every = {rates}"
+            if due.shape[0] > 1 or time_varying is not None:
+                late = due.shape[0] > 1
+                what = f"every = {rates}" if late else f"time_varying = {time_varying!r}"
                 raise ValueError(
                     f"{what} with omega_o: only gains by noise know what a sample is worth; give "
                     "noise_variance and drift in place of omega_o"
@@ -164,7 +171,8 @@ class MultivariableESO:
             table, gains = model.by_poles(omega)
             return cls(*common, omega, table, None, gains, table)
         found = model.by_noise(noise_variance, drift, jitter)
-        used = found.riccati if checks.flag("time_varying", time_varying) else found.table
+        is_fixed = time_varying is not None and not checks.flag("time_varying", time_varying)
+        used = found.table if is_fixed else found.riccati
         return cls(*common, found.omega, used, found.covariance, found.gains, found.table)
 
     def __repr__(self) -> str:
@@ -262,17 +270,59 @@ class MultivariableESO:
         missing
             numbers of the outputs that are missing, from 0.
         """
-        p, table = self.C.shape[0], self._table
-        gone = {checks.whole("missing", j, 0, p - 1) for j in missing}
-        size, error = self.estimates, np.eye(self.estimates)
-        scale = self._scaled.units
-        phi = table.transition * scale[None, :] / scale[:, None]
-        for k, due in enumerate(table.due):
-            row = k * 2**p + sum(2**j for j in range(p) if due[j] and j not in gone)
-            gain = table.gains[row].reshape(size, p) / scale[:, None]
-            error = (np.eye(size) - gain @ (table.output * scale)) @ phi @ error
+        p, due = self.C.shape[0], self.model.due > 0.0
+        gone = [checks.whole("missing", j, 0, p - 1) for j in missing]
+        left, error = ~np.isin(np.arange(p), gone), np.eye(self.estimates)
+        for k, row in enumerate(due):
+            error = self._error(k, row & left) @ error
         found: NDArray[np.complex128] = np.linalg.eigvals(error).astype(complex)
-        return np.asarray(found ** (1.0 / table.due.shape[0]))
+        return np.asarray(found ** (1.0 / due.shape[0]))
+
+    def rms_decay(self, missing: Any) -> float:
+        """Return the factor by which the RMS error decays in a sample, with samples missing.
+
+        From 1 on, the error grows without bound.
+
+        Parameters
+        ----------
+        missing
+            for each output (p,) the share of its samples that are missing, each one by chance and
+            independently of all others.
+
+        Raises
+        ------
+        ValueError
+            for ``time_varying`` gains, which are made for what is missing.
+        """
+        if isinstance(self.model, RiccatiModel):
+            raise ValueError(
+                "the gain is calculated for what is missing in each sample: no fixed factor is "
+                "known, and the covariance of an Estimator says what is left"
+            )
+        shares = checks.vector("missing", missing, self.C.shape[0])
+        if not np.all((shares >= 0.0) & (shares <= 1.0)):
+            raise ValueError(f"missing = {missing!r}: each entry must be from 0 to 1")
+        total = np.eye(self.estimates**2)
+        for k, due in enumerate(self.model.due > 0.0):
+            mean = np.zeros_like(total)
+            for on in sets_of(shares.size):
+                if np.any(on & ~due):
+                    continue
+                chance = np.prod(np.where(on, 1.0 - shares, shares)[due])
+                error = self._error(k, on)
+                mean += chance * np.kron(error, error)
+            total = mean @ total
+        largest = float(np.max(np.abs(np.linalg.eigvals(total))))
+        return largest ** (0.5 / self.model.due.shape[0])
+
+    def _error(self, phase: int, on: NDArray[np.bool_]) -> Matrix:
+        """Return ``(I − L C) Φ`` in scaled coordinates, if the outputs ``on`` are measured."""
+        table, scale, size = self._table, self._scaled.units, self.estimates
+        row = phase * 2**on.size + int(np.sum(2 ** np.flatnonzero(on)))
+        gain = table.gains[row].reshape(size, on.size) / scale[:, None]
+        phi = table.transition * scale[None, :] / scale[:, None]
+        found: Matrix = (np.eye(size) - gain @ (table.output * scale)) @ phi
+        return found
 
     @property
     def standard_deviations(self) -> Vector:

@@ -217,7 +217,7 @@ def plot_axes(run: Any, axes: Any = None) -> Any:
         column[0].set_title(name)
     u = run["u"].reshape(len(run), -1)
     for k in range(u.shape[1]):
-        draw_line(axes[-1], run.t, u[:, k], label=f"u[{k}]", linewidth=1.0)
+        draw_line(axes[-1], run.t, u[:, k], label=f"u[{k}]", color=f"C{k % 10}", linewidth=1.0)
     axes[-1].set_ylabel("control signals")
     axes[-1].set_xlabel("time [s]")
     axes[-1].legend(loc="upper right", fontsize="small")

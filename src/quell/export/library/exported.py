@@ -14,7 +14,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,11 +22,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.single import SinglePrecision, in_single_precision
+from quell.export.axes_source import parts_of_axes, source_of_axes
 from quell.export.c_files import CSource
 from quell.export.controller_source import c_source, in_double_precision, limits_path
+from quell.export.library.axes_vectors import (
+    AxesVectors,
+    golden_vectors_of_axes,
+    test_program_of_axes,
+)
 from quell.export.library.vectors import (
     TOLERANCE_REASON,
     Vectors,
@@ -77,6 +84,7 @@ _OPERATIONS = {
     "status": ("status(s)", "after the step: flags, see the enum in the header"),
     "get_estimate": ("get_estimate(s)", "after the step: what the controller knows, for telemetry"),
 }
+_TEXTS = ("CMakeLists.txt", "library.json", "library.properties", "README.md")
 _RETUNING = """## Other limits
 
 Parameters are constants. To change a limit while running, change a copy:
@@ -131,29 +139,42 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
     vectors
         a run of it.
     """
-    name, single = source.name, source.precision == "single"
-    one = "1.0f" if single else "1.0"
+    path = limits_path(controller)
+    values = {
+        **_values(source, controller.dt, f"{path}.high" if path else ""),
+        "title": f"Controller {type(in_double_precision(controller)).__name__}",
+        **_with_signals(_reference_texts(source), source),
+        "operations": _operation_rows(source, _OPERATIONS),
+    }
+    values["loop"] = filled("loop.md", values).rstrip("\n")
+    return _library(source, test_program(source, vectors), filled("example.ino", values), values)
+
+
+def _operation_rows(source: CSource, operations: dict[str, tuple[str, str]]) -> str:
+    """Return the rows of the table of the functions that a controller has."""
     given = "".join(f", {each}" for each in source.further)
-    rows = (
-        f"| `{name}_{call.replace('DERIVATIVES', given)}` | {when} |"
-        for operation, (call, when) in _OPERATIONS.items()
+    return "\n".join(
+        f"| `{source.name}_{call.replace('DERIVATIVES', given)}` | {when} |"
+        for operation, (call, when) in operations.items()
         if operation in source.operations
     )
-    path = limits_path(controller)
-    retuning = _RETUNING.replace("PATH", path).replace("ONE", one) if path else ""
+
+
+def _values(source: CSource, dt: float, limit: str) -> dict[str, object]:
+    """Return values of the templates; ``limit`` is the member of the parameters that is changed."""
+    name, single = source.name, source.precision == "single"
+    one = "1.0f" if single else "1.0"
+    retuning = _RETUNING.replace("PATH.high", limit).replace("ONE", one) if limit else ""
     functions = ", ".join(f"`{each}`" for each in source.externals)
     externals = _EXTERNALS.replace("FUNCTIONS", functions) if functions else ""
-    values = {
+    return {
         "name": name,
         "NAME": name.upper(),
-        "title": f"Controller {type(in_double_precision(controller)).__name__}",
         "precision": source.precision,
         "real": source.real,
         "one": one,
         "zero": "0.0f" if single else "0.0",
-        "dt": repr(float(controller.dt)),
-        **_with_signals(_reference_texts(source), source),
-        "operations": "\n".join(rows),
+        "dt": repr(float(dt)),
         "fast_math": ", and so do the compensated sums" if single else "",
         "double": "" if single else _DOUBLE,
         "retuning": retuning.replace("NAME", name),
@@ -162,14 +183,57 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         "link": " YOUR_FILES" if functions else "",
         "tolerance_reason": TOLERANCE_REASON,
     }
-    texts = ("CMakeLists.txt", "library.json", "library.properties", "README.md")
+
+
+def _library(
+    source: CSource, test: str, example: str, values: Mapping[str, object]
+) -> dict[str, str]:
+    """Return the text of all files of a library by path."""
+    name = source.name
     return {
         f"src/{name}.h": source.header,
         f"src/{name}.c": source.source,
-        f"test_{name}.c": test_program(source, vectors),
-        f"examples/{name}/{name}.ino": filled("example.ino", values),
-        **{each: filled(each, values) for each in texts},
+        f"test_{name}.c": test,
+        f"examples/{name}/{name}.ino": example,
+        **{each: filled(each, values) for each in _TEXTS},
     }
+
+
+# What is otherwise for several axes.
+_OPERATIONS_OF_AXES = _OPERATIONS | {
+    "start": (
+        "start(s, y, u, r)",
+        "the machine rests at y under u; long: before the timer starts",
+    ),
+    "step": ("step(s, r, yDERIVATIVES, u)", "each sample; writes u"),
+    "set_held": (
+        "set_held(s, axis, held)",
+        "when a brake of an axis closes or opens: while it is held nothing winds up",
+    ),
+}
+
+
+def library_files_of_axes(
+    controller: Axes, source: CSource, vectors: AxesVectors
+) -> dict[str, str]:
+    """Return the text of all files of the library of several axes by path."""
+    upper = source.name.upper()
+    arrays = "".join(f", {each}[{upper}_AXES]" for each in source.further)
+    primes = ", ".join("r" + "'" * (i + 1) for i in range(source.derivatives))
+    places = (f"{i} `{name}`" for i, name in enumerate(controller.names))
+    values = {
+        **_values(source, controller.dt, "limits.high[0]"),
+        "title": f"Controller of {controller.outputs} axes with {controller.inputs} actuators",
+        "operations": _operation_rows(source, _OPERATIONS_OF_AXES),
+        "axes": ", ".join(places),
+        "further": "".join(f", {each}" for each in source.further),
+        "local_further": arrays,
+        "declared_further": arrays.replace(", ", f", {source.real} "),
+        "about_further": f" /* with {primes} of the same move */" if primes else "",
+    }
+    values["loop"] = filled("loop_axes.md", values).rstrip("\n")
+    test = test_program_of_axes(source, vectors)
+    return _library(source, test, filled("example_axes.ino", values), values)
 
 
 def _reference_texts(source: CSource) -> dict[str, str]:
@@ -601,6 +665,12 @@ def c(
     check_folder(folder, checks.flag("overwrite", overwrite))
     checks.flag("accept", accept)
     checks.flag("proof", proof)
+    if isinstance(controller, Axes):
+        _check_options_of_axes(controller, single, accept, proof, plant, scenario, resolution)
+        parts, source = parts_of_axes(controller, single), source_of_axes(controller, name, single)
+        run = golden_vectors_of_axes(controller, parts, source.operations)
+        files = write_folder(folder, library_files_of_axes(controller, source, run), overwrite)
+        return Exported(Path(folder), files, source, None)
     single = single or isinstance(controller, SinglePrecision)
     shown = in_single_precision(controller) if single else controller
     source = c_source(shown, name, resolution=resolution)
@@ -614,6 +684,37 @@ def c(
     files = write_folder(folder, library_files(shown, source, vectors) | proving, overwrite)
     done = prove(Path(folder), source, sizes=_function_table(source)) if proof else None
     return Exported(Path(folder), files, source, comparison, done)
+
+
+def _check_options_of_axes(
+    controller: Axes,
+    single: bool,
+    accept: bool,
+    proof: bool,
+    plant: Any,
+    scenario: Any,
+    resolution: float | None,
+) -> None:
+    """Refuse what ``c`` does for one u and y only."""
+    what = f"{controller.outputs} axes"
+    if proof:
+        raise ValueError(
+            f"proof = True: the proof is of controllers with one u and one y, these are {what}; "
+            "leave it out, and prove each axis by itself as an ADRC"
+        )
+    if resolution is not None:
+        c_source(controller, resolution=resolution)  # says why it is refused
+    if plant is not None or scenario is not None:
+        raise ValueError(
+            f"plant, scenario: the comparison of single with double precision is of controllers "
+            f"with one u and one y, these are {what}; leave them out and give accept=True"
+        )
+    if single and not accept:
+        raise ValueError(
+            f"precision = 'single': NOT compared with double precision, which is done for "
+            f"controllers with one u and one y, and these are {what}; compare each axis by itself "
+            "as an ADRC, then give accept=True"
+        )
 
 
 def _function_table(source: CSource) -> str:

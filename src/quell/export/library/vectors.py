@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.controllers.base import (
+    change_parameters,
     control,
     reset_loop,
     set_held,
@@ -56,7 +57,7 @@ BLOCK = 50
 """Samples of a row: u is compared after the last."""
 # Learners wait for two lag times. The kernels are interpreted: some 0.2 ms a sample.
 _LAGS, _LEAST, _MOST = 6.0, 600, 2000
-_MULTIPLIER, _INCREMENT = 1103515245, 12345  # of C's own example of rand()
+MULTIPLIER, INCREMENT = 1103515245, 12345  # of C's own example of rand()
 
 
 class Plant(NamedTuple):
@@ -75,6 +76,11 @@ def plant_for(controller: Any, amplitude: float, real: Callable[[Any], Any]) -> 
     inner = compensating_part(without_prefilters(controller))
     if inner is None or not inner.parameters.learns:
         return None
+    return plant_of(inner, amplitude, real)
+
+
+def plant_of(inner: Any, amplitude: float, real: Callable[[Any], Any]) -> Plant:
+    """Return the plant for an ADRC or a compensator."""
     observer, law = inner.observer, inner.gains
     count = round(_LAGS * observer.lag_time / observer.dt / BLOCK) * BLOCK
     return Plant(
@@ -90,15 +96,15 @@ def plant_for(controller: Any, amplitude: float, real: Callable[[Any], Any]) -> 
 class Loop:
     """The plant while it moves."""
 
-    def __init__(self, plant: Plant, real: Callable[[Any], Any]) -> None:
+    def __init__(self, plant: Plant, real: Callable[[Any], Any], seed: int = 1) -> None:
         self.plant, self.real = plant, real
         self.x = [real(0.0)] * len(plant.gains)
-        self.seed, self.sample = 1, 0
+        self.seed, self.sample = seed, 0
 
     def measure(self) -> tuple[Any, Any]:
         """Return r and y of the next sample."""
         plant, real, half = self.plant, self.real, self.plant.samples // 4
-        self.seed = (self.seed * _MULTIPLIER + _INCREMENT) & 0x7FFFFFFF
+        self.seed = (self.seed * MULTIPLIER + INCREMENT) & 0x7FFFFFFF
         position = self.sample % (2 * half)
         position = position if position < half else 2 * half - position
         r = plant.amplitude * real(position) / real(half)
@@ -125,7 +131,7 @@ def c_code(plant: Plant, write: Callable[[Any], str], real: str, source: CSource
         "B0": write(plant.b0), "DT": write(plant.dt), "AMPLITUDE": write(plant.amplitude),
         "NOISE": write(plant.noise), "HALF": plant.samples // 4, "BLOCK": BLOCK,
         "DERIVATIVES": f", {write(0.5)} * r" * len(source.further),
-        "MULTIPLIER": _MULTIPLIER, "INCREMENT": _INCREMENT, "ZERO": write(0.0),
+        "MULTIPLIER": MULTIPLIER, "INCREMENT": INCREMENT, "ZERO": write(0.0),
     })  # fmt: skip
 
 
@@ -165,14 +171,14 @@ static @REAL@ play_loop(@NAME@_state *state)
 
 # Samples of each part of the run: enough for observers to settle in, few enough that the file is
 # read by people and fits into a small flash memory (in single precision 20 bytes each).
-_FIRST, _PART = 60, 20
+FIRST, PART = 60, 20
 # A start under load takes twice the samples in which the observer settles; longer ones are left
 # out, because the kernels are interpreted here (20 us a sample).
-_LONGEST_START = 4000
+LONGEST_START = 4000
 # A measurement beyond all physical quantities, by precision (``controllers.bad_samples``).
-_ABSURD, _ABSURD_SINGLE = 1e80, 1e30
+ABSURD, ABSURD_SINGLE = 1e80, 1e30
 # How far u goes beyond its limits, relative to their distance.
-_EXCESS = 1.5
+EXCESS = 1.5
 
 
 class Action(IntEnum):
@@ -253,7 +259,7 @@ class Player:
                 c_files.hand_over(old, self.state)
             elif action in (Action.LIMIT, Action.FREE):
                 self.design = self.limited if action is Action.LIMIT else self.default
-                c_files.retune(old, self.design, self.state)
+                change_parameters(old, self.design, self.state)
             elif action in (Action.HELD, Action.RELEASED):
                 set_held(old, self.state, action is Action.HELD)
             elif action is Action.RESET:
@@ -317,19 +323,19 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
     needs no plant. It is so large that u exceeds its limits, if there are any, and 1 otherwise.
     """
     player, path = Player(controller), limits_path(controller)
-    signals = _Signals(_amplitude(controller, path))
+    signals = Signals(_amplitude(controller, path))
     for _ in range(2):  # before the first measurement
         player.play(Action.STEP, math.nan, math.nan)
-    for _ in range(_FIRST):
+    for _ in range(FIRST):
         player.play(Action.STEP, *signals.next())
-    absurd = _ABSURD_SINGLE if player.real is np.float32 else _ABSURD
-    for i in range(_PART):
+    absurd = ABSURD_SINGLE if player.real is np.float32 else ABSURD
+    for i in range(PART):
         r, y = signals.next()
         y = (y, math.nan, y, math.inf, absurd)[i % 5]
         player.play(Action.STEP, math.nan if i % 7 == 3 else r, y)
-    for i in range(_PART):
+    for i in range(PART):
         action = Action.APPLIED if i % 5 == 0 else Action.STEP
-        given = math.nan if i == _PART // 2 else 0.5 * float(player.rows[-1].u)
+        given = math.nan if i == PART // 2 else 0.5 * float(player.rows[-1].u)
         player.play(action, *signals.next(), given)
     if path:
         _play_limited(player, path, signals)
@@ -338,13 +344,13 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
     if "set_held" in available:
         _play_held(player, signals)
     player.play(Action.RESET, *signals.next())
-    for _ in range(_PART):
+    for _ in range(PART):
         player.play(Action.STEP, *signals.next())
-    if "start" in available and _samples(player.described) <= _LONGEST_START:
+    if "start" in available and _samples(player.described) <= LONGEST_START:
         r, y = signals.next()
-        player.play(Action.START, r, y, float(np.median(player.u_of(slice(2, _FIRST)))))
+        player.play(Action.START, r, y, float(np.median(player.u_of(slice(2, FIRST)))))
         player.play(Action.START, r, y, math.nan)  # changes nothing
-        for _ in range(_PART):
+        for _ in range(PART):
             player.play(Action.STEP, *signals.next())
     plant = plant_for(player.described, signals.amplitude, player.real)
     if plant is not None:
@@ -360,43 +366,43 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
     return Vectors(tuple(player.rows), path, limit, scale, row, plant)
 
 
-def _play_limited(player: Player, path: str, signals: _Signals) -> None:
+def _play_limited(player: Player, path: str, signals: Signals) -> None:
     """Set the upper limit into the middle of the range that u had so far, and back."""
-    u = player.u_of(slice(2, _FIRST))
+    u = player.u_of(slice(2, FIRST))
     limits = at_path(player.default, path)
     high = 0.5 * (float(np.min(u)) + float(np.max(u)))
     player.limit_at(path, high if math.isfinite(high) else limits.high)
     for action in (Action.LIMIT, Action.FREE):
         player.play(action, *signals.next())
-        for _ in range(2 * _PART):
+        for _ in range(2 * PART):
             player.play(Action.STEP, *signals.next())
 
 
-def _play_manual(player: Player, signals: _Signals) -> None:
+def _play_manual(player: Player, signals: Signals) -> None:
     u = float(player.rows[-1].u)
-    for i in range(_PART):
-        given = math.nan if i == _PART // 2 else u * (1.0 - 0.02 * i)
+    for i in range(PART):
+        given = math.nan if i == PART // 2 else u * (1.0 - 0.02 * i)
         player.play(Action.TRACK, *signals.next(), given)
     player.play(Action.HAND_OVER, *signals.next())
-    for _ in range(_PART):
+    for _ in range(PART):
         player.play(Action.STEP, *signals.next())
 
 
-def _play_held(player: Player, signals: _Signals) -> None:
+def _play_held(player: Player, signals: Signals) -> None:
     r, y = signals.next()
-    for i in range(_PART):
+    for i in range(PART):
         player.play(Action.STEP if i else Action.HELD, r, y)
     player.play(Action.RELEASED, *signals.next())
-    for _ in range(_PART):
+    for _ in range(PART):
         player.play(Action.STEP, *signals.next())
 
 
-class _Signals:
+class Signals:
     """A reference that moves and steps, and a measurement that follows it with noise."""
 
-    def __init__(self, amplitude: float) -> None:
+    def __init__(self, amplitude: float, seed: int = 1) -> None:
         self.amplitude, self.sample, self.y = amplitude, 0, 0.0
-        self.random = np.random.default_rng(1)  # a fixed seed: the same file each time
+        self.random = np.random.default_rng(seed)  # a fixed one: the same file each time
 
     def next(self) -> tuple[float, float]:
         """Return r and y of the next sample."""
@@ -424,13 +430,13 @@ def _amplitude(controller: Any, path: str) -> float:
         return 1.0
     free = limits._replace(low=player.real(-math.inf), high=player.real(math.inf))
     player.design = _with_limits(player.default, path, free)
-    signals = _Signals(1.0)
-    for _ in range(_FIRST):
+    signals = Signals(1.0)
+    for _ in range(FIRST):
         player.play(Action.STEP, *signals.next())
     u = player.u_of(slice(None))
     span = float(np.max(u) - np.min(u))
     usable = math.isfinite(span) and span > 0.0
-    return _EXCESS * (high - low) / span if usable else 1.0
+    return EXCESS * (high - low) / span if usable else 1.0
 
 
 def _samples(controller: Any) -> int:
@@ -464,6 +470,11 @@ _CODE_TEST_PROGRAM = {
     Action.START: ("NAME_start(state, now->y, now->given, now->r);",),
     Action.LEARN: ("return play_loop(state);",),
 }
+
+
+def tolerance_of(learns: bool) -> float:
+    """Return the largest difference on other machines [ulp]."""
+    return _TOLERANCE_LEARNING if learns else _TOLERANCE
 
 
 def test_program(source: CSource, vectors: Vectors) -> str:
@@ -501,8 +512,8 @@ def test_program(source: CSource, vectors: Vectors) -> str:
         "digits": 9 if single else 17,
         "actions": ", ".join(action.name for action in used),
         "rows": "\n".join(rows),
-        "expected": "\n".join(_expected(source, vectors)),
-        "found": ",\n        ".join(f"(real)estimate.{place}" for place, *_ in _places(source)),
+        "expected": "\n".join(expected_lines(source, vectors.estimate)),
+        "found": ",\n        ".join(f"(real)estimate.{place}" for place, *_ in places(source)),
         "cases": text.replace("LIMIT;", f"{limit};"),
         "limited_parameter": f", {parameters} *limited" if limits else "",
         "limited_variable": f"    static {parameters} limited;\n" if limits else "",
@@ -510,25 +521,24 @@ def test_program(source: CSource, vectors: Vectors) -> str:
         "derivatives": derivatives,
         "loop": c_code(vectors.plant, write, "real", source) if vectors.plant else "",
         "samples": f"count + {blocks * (BLOCK - 1)}" if blocks else "count",
-        "tolerance": repr(_TOLERANCE_LEARNING if vectors.plant else _TOLERANCE),
+        "tolerance": repr(tolerance_of(vectors.plant is not None)),
         "tolerance_reason": TOLERANCE_REASON.replace("\n", "\n * "),
     })  # fmt: skip
 
 
-def _places(source: CSource) -> Iterator[tuple[str, int, slice]]:
+def places(source: CSource) -> Iterator[tuple[str, int, slice]]:
     """Yield the members of the estimate that are compared, their place, and their channel's."""
     at = 0
     for channel, width in source.channels:
-        if channel != "status":
+        if channel.rpartition(".")[2] != "status":
             for i in range(width):
                 yield f"{channel}[{i}]" if width > 1 else channel, at + i, slice(at, at + width)
         at += width
 
 
-def _expected(source: CSource, vectors: Vectors) -> Iterator[str]:
+def expected_lines(source: CSource, row: Any) -> Iterator[str]:
     """Yield the lines of the estimate: name, value, and the largest size in its channel."""
     write = Literals(source.precision == "single").write_real
-    row = vectors.estimate
-    for place, at, part in _places(source):
+    for place, at, part in places(source):
         size = float(np.max(np.abs(np.where(np.isfinite(row[part]), row[part], 0.0))))
         yield f'    {{"{place}", {write(row[at])}, {size!r}}},'
