@@ -707,9 +707,10 @@ class Compensator(StatefulController):
         if self._packed is None:
             self.prepare()
         try:
-            return self._step(self._packed, u_0, y)
+            u: float = self._step(self._packed, u_0, y)
         except TypeError:
             raise TypeError(f"u_0 = {u_0!r}, y = {y!r}: must be numbers") from None
+        return u
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start at a plant that rests at ``y`` under ``u``: the next ``step`` continues from ``u``.

@@ -77,6 +77,11 @@ class AxesTrajectory(Record):
         which
             name or number, from 0.
         """
+        if not self.axis_names:
+            raise ValueError(
+                "this record is of one loop with several signals, which has no axes: take columns "
+                "of run['y'] and run['u']"
+            )
         if isinstance(which, str):
             which = self.axis_names.index(checks.one_of("axis", which, self.axis_names))
         i = checks.whole("axis", which, 0, len(self.axis_names) - 1)
@@ -122,7 +127,8 @@ class AxesTrajectory(Record):
         ----------
         axes
             matplotlib axes, three for each axis of the machine and one more: rows of output, error
-            and estimated f, then all control signals; a new figure by default.
+            and estimated f, then all control signals. For a loop without axes three: outputs,
+            control signals, estimated disturbances. A new figure by default.
 
         Returns
         -------

@@ -196,6 +196,8 @@ def plot_axes(run: Any, axes: Any = None) -> Any:
     ``run`` is an ``AxesTrajectory``. Returns the matplotlib axes: a row of outputs, of errors, of
     estimates, and one for the control signals.
     """
+    if not run.axis_names:
+        return _plot_signals(run, axes)
     machine = [run.axis(i) for i in range(len(run.axis_names))]
     count = len(machine)
     if axes is None:
@@ -224,6 +226,26 @@ def plot_axes(run: Any, axes: Any = None) -> Any:
     axes[-1].grid(alpha=0.3)
     if run.diverged:
         axes[0].set_title(f"ended at {run.ended:.3g} s: diverged", color="C3")
+    return axes
+
+
+def _plot_signals(run: Any, axes: Any) -> Any:
+    """Draw outputs with references, control signals and disturbances of a loop without axes."""
+    axes = np.ravel(_new_axes(3, 2.5) if axes is None else axes)
+    if axes.size != 3:
+        raise ValueError(f"axes: must be 3 matplotlib axes, got {axes.size}")
+    rows = (("y", "outputs"), ("u", "control signals"), ("d_hat", "disturbances"))
+    for ax, (name, label) in zip(axes, rows, strict=True):
+        values = run[name].reshape(len(run), -1)
+        for k in range(values.shape[1]):
+            draw_line(ax, run.t, values[:, k], label=f"{name}[{k}]", color=f"C{k % 10}")
+        if name == "y":
+            for wanted in run["r"].reshape(len(run), -1).T:
+                draw_line(ax, run.t, wanted, color="0.2", linestyle=(0, (4, 3)), linewidth=1.2)
+        ax.set_ylabel(label)
+        ax.legend(loc="upper right", fontsize="small")
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]")
     return axes
 
 
