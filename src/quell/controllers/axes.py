@@ -224,9 +224,7 @@ def _derivatives(
 
 
 @start_axes.register(NoAxis)
-def _start_none(
-    axes: NoAxis, states: Any, samples: Any, i: int, y: Any, v: Any, r: Any
-) -> None:
+def _start_none(axes: NoAxis, states: Any, samples: Any, i: int, y: Any, v: Any, r: Any) -> None:
     pass
 
 

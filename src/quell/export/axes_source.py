@@ -131,9 +131,7 @@ def _set_none_held(axes: NoAxis, states: Any, i: int, axis: int, held: bool) -> 
 
 
 @set_axis_held.register(AxisDesigns)
-def _set_axis_held(
-    axes: AxisDesigns, states: AxisStates, i: int, axis: int, held: bool
-) -> None:
+def _set_axis_held(axes: AxisDesigns, states: AxisStates, i: int, axis: int, held: bool) -> None:
     if axis == i:
         states.axis.loop[0].held = 1.0 if held else 0.0
     set_axis_held(axes.others, states.others, i + 1, axis, held)
@@ -234,9 +232,7 @@ def source_of_axes(controller: Axes, name: str = "controller", single: bool = Fa
 class _Writer:
     """Writer of the public functions of several axes."""
 
-    def __init__(
-        self, controller: Axes, parts: AxesParts, name: str, findings: Findings
-    ) -> None:
+    def __init__(self, controller: Axes, parts: AxesParts, name: str, findings: Findings) -> None:
         self.controller, self.name = controller, name
         self.files = CFiles(name, parts.parameters, parts.state, findings)
         self.images = images_of(parts.parameters, parts.state, float(controller.dt))
@@ -265,7 +261,7 @@ class _Writer:
         files.enums += enums(self.name, tuple(each for channels in own for each in channels))
         files.enums += self._enum_of_axes()
         files.structs += self._structs(own)
-        channels = [("v", self.n), ("status", 1)]
+        channels = [("v", self.n) if self.n > 1 else ("v[0]", 1), ("status", 1)]
         for member, each in zip(self.members, own, strict=True):
             channels += [(f"{member}.{channel}", width) for channel, width in each]
         source = files.write(self._title(), tuple(channels), self._defines(), self.derivatives)
@@ -377,7 +373,7 @@ class _Writer:
             f"{self._parameter('r', n)})",
             "Start at a machine that rests at y under u: the next step continues from u.\n\n"
             "r are the references of the next step. What was learned is kept. The observers take\n"
-            f"{2 * sum(counts)} samples to settle: do not call this in an interrupt. If a y or a u\n"
+            f"{2 * sum(counts)} samples to settle: do not call this in an interrupt. If a y or u\n"
             "is not finite nothing changes but the status; an r that is not finite is y.",
             f"    static const int samples[{n}] = {{{', '.join(map(str, counts))}}};",
             "",

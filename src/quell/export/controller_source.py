@@ -117,6 +117,7 @@ def check_counts(controller: Any, resolution: float) -> None:
 
 # ---- The two C files of a controller ----
 
+
 def c_source(
     controller: Any, name: str = "controller", *, resolution: float | None = None
 ) -> CSource:

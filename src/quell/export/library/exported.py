@@ -185,9 +185,7 @@ def _values(source: CSource, dt: float, limit: str) -> dict[str, object]:
     }
 
 
-def _library(
-    source: CSource, test: str, example: str, values: dict[str, object]
-) -> dict[str, str]:
+def _library(source: CSource, test: str, example: str, values: dict[str, object]) -> dict[str, str]:
     """Return the text of all files of a library by path."""
     name = source.name
     return {
