@@ -11,7 +11,7 @@ import argparse
 import time
 
 from quell.experiments.acc import DT, SPRINGS, designs, interval, judge_sampled, study
-from quell.experiments.acc.loops import FREED, OURS, boxed
+from quell.experiments.acc.loops import FREE_POLES, OURS, boxed
 from quell.tuning.structures.base import vector
 
 # Seeds of the plants for the search, and of the fresh ones, which nothing else uses.
@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=4000, help="fresh plants")
     options = parser.parse_args()
     chosen = {
-        name: controller for name, controller in designs(DT).items() if name in (*OURS, FREED)
+        name: controller for name, controller in designs(DT).items() if name in (*OURS, FREE_POLES)
     }
     if options.tune:
         began = time.perf_counter()

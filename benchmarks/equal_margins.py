@@ -1,6 +1,6 @@
 """What learning gives at equal margins: late errors with M_s and M_ks the same for all.
 
-    python benchmarks/equal_margins.py [--plant axis] [--m-ks 100] [--base freed] [--json FILE]
+    python benchmarks/equal_margins.py [--plant axis] [--m-ks 100] [--base poles] [--json FILE]
         [--figure FILE]
 
 The plant is an axis with viscous friction, ``y'' = −2 y' + 100 (u + w)``, sampled at 500 Hz, or one
@@ -42,8 +42,8 @@ MACHINES = {
     "hanging": (100.0, (25.0, 2.0)),
     "lagged": (5000.0, (0.0, 100.0, 52.0)),
 }
-LINEAR = ("pid", "lqg", "model-based", "bandwidths", "bandwidths-2", "bandwidths-3", "freed")
-LINEAR += ("freed-2",)
+LINEAR = ("pid", "lqg", "model-based", "bandwidths", "bandwidths-2", "bandwidths-3", "poles")
+LINEAR += ("poles-2",)
 # With a learner M_s may exceed the bound by this share.
 TOLERANCE = 0.01
 LEARNERS: dict[str, Callable[[], Any]] = {
@@ -131,7 +131,7 @@ class Machine:
     def tuned(self, structure: str, m_s: float, m_ks: float) -> Any:
         """Return the controller of a structure with the least IAE within the bounds."""
         bounds = Constraints(m_s=m_s, m_t=None, m_ks=m_ks, damping=0.3)
-        order = {"order": self.order} if structure.startswith(("bandwidths", "freed")) else {}
+        order = {"order": self.order} if structure.startswith(("bandwidths", "poles")) else {}
         return ql.tune(
             self.linear, DT, structure=structure, compare=(), constraints=bounds, **order
         ).controller
@@ -170,7 +170,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plant", choices=MACHINES, default="axis")
     parser.add_argument("--m-ks", type=float, default=100.0)
-    parser.add_argument("--base", choices=("freed", "bandwidths", "model-based"), default="freed")
+    parser.add_argument("--base", choices=("poles", "bandwidths", "model-based"), default="poles")
     parser.add_argument("--json", type=Path, help="file for the rows")
     parser.add_argument("--figure", type=Path, help="file for a figure of the best of each kind")
     given = parser.parse_args()

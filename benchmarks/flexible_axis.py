@@ -32,7 +32,7 @@ DT = LATE = 2.5e-4  # s
 MOTOR, STIFFNESS = 3.2e-4, 180.0  # kg m², N m/rad
 BOUND = 1.6  # M_s and M_t
 REFERENCE = "p-pi-notch"
-OTHERS = ("bandwidths", "freed", "model-based", "model-based-freed")
+OTHERS = ("bandwidths", "poles", "model-based", "model-based-poles")
 RATIOS = (0.3, 1.0, 3.0, 10.0)
 
 

@@ -47,7 +47,7 @@ def tuned(model: Identified, **options: Any) -> Any:
     """Return the tuned controllers for a model and its deviations."""
     plants, delays = identified_plants(model)
     how = {"delay": delays, "objective": "load"} | options
-    return ql.tune(plants, model.dt, structure="freed", compare=("pi", "pid", "bandwidths"), **how)
+    return ql.tune(plants, model.dt, structure="poles", compare=("pi", "pid", "bandwidths"), **how)
 
 
 def load_step(model: Identified, controller: Any, duration: float) -> tuple[float, float]:
@@ -72,7 +72,7 @@ def emps(model: Identified, record: Measured) -> None:
     )
     bounds = ql.tuning.Constraints(m_ks=abs(float(gains[0])))
     found = tuned(model, constraints=bounds, u_min=-10.0, u_max=10.0)
-    for name in ("pi", "pid", "bandwidths", "freed"):
+    for name in ("pi", "pid", "bandwidths", "poles"):
         controller = found.designs[name].controller
         if controller is None:
             print(f"  {name}: {found.designs[name].reason}")
@@ -112,7 +112,7 @@ def main() -> None:
         else:
             found = tuned(model)
             duration = 100.0 / found.analysis.margins.phase_omega
-            for one in ("pi", "pid", "bandwidths", "freed"):
+            for one in ("pi", "pid", "bandwidths", "poles"):
                 design = found.designs[one]
                 if design.controller is None:
                     print(f"  {design.name}: {design.reason}")

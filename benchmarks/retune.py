@@ -2,8 +2,9 @@
 
     python benchmarks/retune.py
 
-prints, for an ADRC of order 2 with and without ``Kalman`` and a guard, the median and the 99 %
-quantile of a step, of ``retune``, and of the function that ``prepare_retune`` returned.
+prints the median and the 99 % quantile of a step, of ``retune``, and of the function that
+``prepare_retune`` returned: for an ADRC of order 2 with and without ``Kalman`` and a guard, and for
+wrappers.
 """
 
 from __future__ import annotations
@@ -52,6 +53,24 @@ def main() -> None:
 
         for what, call in (("step", step), ("retune", retune), ("prepared", prepared)):
             print(f"{name + ': ' + what:28}{times(call, step)}")
+    law = ql.ADRC(slow, omega_c=20.0, u_min=-5.0, u_max=5.0)
+    pid = ql.baselines.PID(kp=9.0, ki=5.0, kd=1.0, tf=0.01, dt=DT, u_min=-5.0, u_max=5.0)
+    wrappers: dict[str, Any] = {
+        "prefiltered": ql.controllers.Prefiltered(law, ql.controllers.ReferenceModel(30.0)),
+        "compensated PID": ql.Compensated(pid, ql.Compensator(slow)),
+        "in single precision": ql.controllers.in_single_precision(law),
+    }
+    for name, controller in wrappers.items():
+        prepared = controller.prepare_retune(observer=fast)
+
+        def step_of(controller: Any = controller) -> float:
+            return float(controller.step(1.0, 0.5))
+
+        def retune_of(controller: Any = controller) -> None:
+            controller.retune(observer=slow)
+
+        for what, call in (("step", step_of), ("retune", retune_of), ("prepared", prepared)):
+            print(f"{name + ': ' + what:28}{times(call, step_of)}")
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ LIMITS = {"v_max": 22.0, "a_max": 900.0, "j_max": 5e4}
 MOVE_AT, TORQUE_AT, STEP, SAMPLES = 40, 640, 0.4, 1000
 MOVE = ql.signals.SmoothMove(TARGET, 0.12, smoothness=3, start=0.02)
 DEFAULT = "simplest"
-STRUCTURES = (DEFAULT, "model-based", "bandwidths", "freed")
+STRUCTURES = (DEFAULT, "model-based", "bandwidths", "poles")
 FACTORS = (1.0, 1.3, 0.7)
 BARS = {1.0: 0.3, 1.3: 0.8, 0.7: 0.8}
 """Largest error [deg] of the default by factor of the load's inertia."""

@@ -32,7 +32,7 @@ from quell.tuning.optimiser.requirements import sizes
 # Sample time in radians of the plant's phase crossover, and the longest dead time in samples.
 STEP, MOST = 0.02, 190
 DEAD = (0.01, 0.02, 0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
-NAMES = ("pi", "pid", "bandwidths", "freed")
+NAMES = ("pi", "pid", "bandwidths", "poles")
 
 
 def batch() -> list[tuple[str, list[float], list[float], float]]:
@@ -103,7 +103,7 @@ def trial(plant: tuple[str, list[float], list[float], float], m_s: float) -> dic
     pi = ql.tune((num, den), dt, structure="pi-unfiltered", constraints=free, compare=(), **how)
     m_ks = pi.design.measures["M_ks"]
     bounds = Constraints(m_s=m_s, m_t=None, m_ks=m_ks, damping=None)
-    tuned = ql.tune((num, den), dt, structure="freed", constraints=bounds, compare=NAMES, **how)
+    tuned = ql.tune((num, den), dt, structure="poles", constraints=bounds, compare=NAMES, **how)
     row: dict[str, object] = {"plant": name, "m_s": m_s, "m_ks": m_ks, "k_i": pi.design.k_i}
     for key, design in tuned.designs.items():
         row[key] = design.k_i / pi.design.k_i
@@ -125,14 +125,14 @@ def main() -> None:
     warnings.simplefilter("ignore")
     console, rows, plants = Console(), [], batch()[given.first :: given.every]
     table = Table(title=f"k_i over that of the optimal PI controller; {len(batch())} plants in all")
-    for heading in ("plant", "M_s", *NAMES, "freed/pid", "excess", "CPU s"):
+    for heading in ("plant", "M_s", *NAMES, "poles/pid", "excess", "CPU s"):
         table.add_column(heading)
     for m_s in given.m_s:
         for plant in plants:
             row = trial(plant, m_s)
             rows.append(row)
             numbers = [f"{row[name]:.3f}" for name in NAMES]
-            ratio = row["freed"] / row["pid"]  # type: ignore[operator]
+            ratio = row["poles"] / row["pid"]  # type: ignore[operator]
             rest = (f"{ratio:.3f}", f"{row['excess']:.1e}", f"{row['cpu']:.1f}")
             table.add_row(str(row["plant"]), f"{m_s:g}", *numbers, *rest)
             print(row["plant"], m_s, *numbers, *rest, row["form"], flush=True)
@@ -141,13 +141,13 @@ def main() -> None:
     console.print(table)
     for m_s in given.m_s:
         part = [row for row in rows if row["m_s"] == m_s]
-        freed = np.array([row["freed"] for row in part], dtype=float)
+        poles = np.array([row["poles"] for row in part], dtype=float)
         pid = np.array([row["pid"] for row in part], dtype=float)
         bandwidths = np.array([row["bandwidths"] for row in part], dtype=float)
         console.print(
-            f"M_s = {m_s:g}, {len(part)} plants: freed over PI at least {np.min(freed):.3f}, over "
-            f"PID at least 0.97 for {100 * np.mean(freed >= 0.97 * pid):.0f} % (least "
-            f"{np.min(freed / pid):.3f}, median {np.median(freed / pid):.3f}); bandwidths over PI "
+            f"M_s = {m_s:g}, {len(part)} plants: poles over PI at least {np.min(poles):.3f}, over "
+            f"PID at least 0.97 for {100 * np.mean(poles >= 0.97 * pid):.0f} % (least "
+            f"{np.min(poles / pid):.3f}, median {np.median(poles / pid):.3f}); bandwidths over PI "
             f"{np.min(bandwidths):.3f} to {np.max(bandwidths):.3f}, median "
             f"{np.median(bandwidths):.3f}; excess at most "
             f"{max(row['excess'] for row in part):.1e}; "

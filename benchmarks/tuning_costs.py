@@ -21,7 +21,7 @@ import quell as ql
 from quell.tuning import Constraints
 
 PLANTS = ("4: 1/(s+1)^3", "4: 1/(s+1)^4", "5: alpha = 0.2", "2: e^-s/(1+1s)^2")
-NAMES = ("pid", "bandwidths", "freed", "model-based")
+NAMES = ("pid", "bandwidths", "poles", "model-based")
 NOISE = 10.0
 
 
@@ -34,7 +34,7 @@ def costs(plant: tuple[str, list[float], list[float], float]) -> list[str]:
     pi = ql.tune((num, den), dt, structure="pi-unfiltered", constraints=free, compare=(), **how)
     unit = pi.design
     bounds = Constraints(m_s=1.4, m_t=None, m_ks=NOISE * unit.measures["M_ks"], damping=None)
-    tuned = ql.tune((num, den), dt, structure="freed", constraints=bounds, compare=NAMES, **how)
+    tuned = ql.tune((num, den), dt, structure="poles", constraints=bounds, compare=NAMES, **how)
     found = []
     for name in NAMES:
         design = tuned.designs[name]

@@ -20,7 +20,7 @@ from tuning import batch, sample_time
 import quell as ql
 from quell.tuning import Constraints
 
-STRUCTURES = ("pid", "bandwidths", "freed", "model-based", "model-based-freed")
+STRUCTURES = ("pid", "bandwidths", "poles", "model-based", "model-based-poles")
 TOLERANCE = 1e-3
 
 

@@ -128,12 +128,16 @@ class Driven:
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables by name."""
+        for name in [name for name in values if name == "held"]:
+            self.fmu.setBoolean([self.references[name]], [bool(values[name])])
+        values = {name: value for name, value in values.items() if name != "held"}
         self.fmu.setFloat64([self.references[name] for name in values], [*values.values()])
 
     def get(self, name: str) -> float:
         """Return a variable."""
         whole = name in ("status", "reason")
         read = self.fmu.getInt32 if whole else self.fmu.getFloat64
+        read = self.fmu.getBoolean if name == "held" else read
         return float(read([self.references[name]])[0])
 
     def step(self, length: float, **inputs: float) -> float:

@@ -47,7 +47,7 @@ def feed(design: object, memory: object, f: np.ndarray, g: np.ndarray) -> list[f
 def settle(design: object, memory: object, q: float, correction: float, samples: int) -> None:
     """Samples with the same q and the same correction, whatever the guard thinks of it."""
     for _ in range(samples):
-        f_plain = q + memory.shown[0]
+        f_plain = q + memory.filtered[0]
         assess(design, memory, f_plain)
-        memory.shown[3] = 0.0
+        memory.filtered[3] = 0.0
         record_output(design, memory, correction)

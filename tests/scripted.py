@@ -128,7 +128,7 @@ class Outcome(NamedTuple):
 
     loop: ControlLoop
     rows: Any
-    device: ScriptedDevice
+    device: Any
 
     def __getitem__(self, name: Any) -> Any:
         """Return a column of the rows."""
@@ -138,7 +138,7 @@ class Outcome(NamedTuple):
 
 
 def run(
-    device: ScriptedDevice,
+    device: Any,
     controller: Any = None,
     reference: Any = 1.0,
     duration: float = 3.0,
@@ -147,11 +147,12 @@ def run(
     approach: float = 0.0,
     interpret: bool = False,
     asked: int = 0,
+    channels: tuple[str, ...] = (),
     **safety: Any,
 ) -> Outcome:
     """Run a loop around a scripted device to its end; ``settle`` is 10 by default."""
     controller = adrc() if controller is None else controller
-    width = sum(width for _, width in row_channels(controller.channels))
+    width = sum(width for _, width in row_channels(controller.channels, channels))
     scenario = as_scenario(reference, duration)
     points = reference_samples(scenario, DT, getattr(controller, "derivatives", 0), approach)
     rules = Safety(**{"settle": 10} | safety).rules(controller, scenario)
@@ -162,6 +163,7 @@ def run(
         rules,
         virtual_clock(late),
         ring(4096, width),
+        channels=channels,
         interpret=interpret,
     )
     loop.controller.supervisor.requests[0] = asked

@@ -20,7 +20,7 @@ from quell.cli.app import app
 from quell.cli.reproduce import _print_cases
 from quell.experiments import acc
 from quell.experiments.acc import DT, CaseResult, designs, interval, judge, study, unstable
-from quell.experiments.acc.loops import BOX, MB, MF, boxed, freed, generated
+from quell.experiments.acc.loops import BOX, MB, MF, boxed, free_poles, generated
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
 
@@ -304,7 +304,7 @@ def test_the_search_for_the_box_begins_at_mf_eso_and_may_reach_its_result() -> N
     start = made(study.start(made))
     np.testing.assert_allclose(start.parameters.law, ours.parameters.law, rtol=1e-9)
     np.testing.assert_allclose(start.parameters.eso.gain, ours.parameters.eso.gain, rtol=1e-9)
-    tuned, noise = freed(), study.TooMuchNoise()
+    tuned, noise = free_poles(), study.TooMuchNoise()
     loop = analyse(two_mass_spring(), tuned)
     assert noise(ours) == pytest.approx(-math.log(10.0))
     assert -0.1 < noise(tuned) < 0.0

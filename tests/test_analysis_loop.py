@@ -288,6 +288,15 @@ def test_a_cubic_spring_is_as_stiff_as_its_twist_makes_it() -> None:
     np.testing.assert_allclose(found.A, stiff.A, rtol=1e-14, atol=1e-15)
 
 
+def test_a_force_that_grows_with_the_square_of_the_speed_has_no_slope_at_rest() -> None:
+    """Centrifugal forces: the slope is zero, and no corner."""
+    plant = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (x[1], u - 3.0 * x[1] ** 2 - 2.0 * x[0]), order=2
+    )
+    found = ql.plants.linearised(plant, [0.3, 0.0])
+    np.testing.assert_allclose(found.A, [[0.0, 1.0], [-2.0, 0.0]], atol=1e-9)
+
+
 @pytest.mark.parametrize("friction", [np.sign, abs, lambda v: max(v, 0.0)])
 def test_a_point_without_derivative_is_refused(friction: Any) -> None:
     """Dry friction at standstill has no slope; beside it, it has."""

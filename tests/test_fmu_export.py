@@ -195,6 +195,33 @@ def test_limits_and_bandwidths_change_while_the_fmu_runs(name: str, made: Maker)
         assert running.step(DT, r=r, y=y) == pytest.approx(law.step(r, y), abs=1e-9)
 
 
+def test_a_held_plant_is_a_boolean_input(made: Maker, tmp_path: Path) -> None:
+    """As ``set_held`` in Python, behind a prefilter and under a compensator, too; a PID has none."""
+    pid = ql.baselines.PID(kp=4.0, ki=2.0, kd=1.0, tf=0.05, dt=DT, u_min=-4.0, u_max=4.0)
+    laws: dict[str, Any] = {
+        "servo": plain(),
+        "behind": ql.controllers.Prefiltered(plain(), ql.controllers.ReferenceModel(4.0)),
+        "on_a_pid": ql.Compensated(pid, ql.Compensator(plain().observer)),
+    }
+    for name, law in laws.items():
+        if name != "servo":
+            fmu(law, tmp_path / f"{name}.fmu")
+        running = made(name).begin()
+        assert running.get("held") == 0.0
+        for k in range(200):
+            held = 40 <= k < 120
+            law.set_held(held)
+            r, y = 1.0, 0.2 * math.sin(0.05 * k)
+            assert running.step(DT, r=r, y=y, held=held) == pytest.approx(law.step(r, y), abs=1e-9)
+            assert bool(int(running.get("status")) & ql.Status.HELD) == held
+        assert running.get("held") == 0.0
+        with pytest.raises(Exception, match="fmi3GetBoolean failed"):
+            running.fmu.getBoolean([running.references["u"]])
+    fmu(pid, tmp_path / "pid.fmu", binary=False)
+    with zipfile.ZipFile(tmp_path / "pid.fmu") as archive:
+        assert b"<Boolean" not in archive.read("modelDescription.xml")
+
+
 def test_parameters_are_checked_when_they_act(made: Maker) -> None:
     """They are set one by one, so that a wrong pair is named at the next step; then the old ones still act."""
     running = made("servo").begin()

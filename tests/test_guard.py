@@ -24,7 +24,7 @@ def test_the_correction_lies_within_its_bound(rng: np.random.Generator) -> None:
     f = f_plain = f_shown = largest = 0.0
     heard = 0
     for k in range(8000):
-        largest = max(largest, abs(f_plain - memory.shown[0]))
+        largest = max(largest, abs(f_plain - memory.filtered[0]))
         assess(design, memory, f_plain)
         f += 0.05 * rng.normal() - 0.01 * f
         wild = rng.random() < 0.3
@@ -214,7 +214,7 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
     moved, shadow = np.zeros(samples), np.zeros((1, order + 1))
     for k in range(samples):
         moved[k] = memory.effects[CORRECTED, -1]
-        memory.shown[3] = f_shown
+        memory.filtered[3] = f_shown
         f_learned, _, _ = limit(design, memory, 1.0, f_shown, 0.9 * (-1.0) ** k, 0.0, 0.0)
         record_output(design, memory, f_learned)
         f_shown = lag_push(design.lag, shadow, 0, f_learned)

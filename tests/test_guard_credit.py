@@ -113,7 +113,7 @@ def test_a_motion_that_went_with_the_learner_was_its_own_doing(
     memory = guard.memory(design)
     sample, averages = memory.sample[0], memory.averages[0]
     sample.credit, sample.authority, sample.outside = 1.0, 1.0, 1.0
-    averages.missed, averages.gained, averages.seen = 1.0, 0.5, 0.1
+    averages.missed, averages.gained, averages.missed_recently = 1.0, 0.5, 0.1
 
     def authority(square: float, outside: float) -> float:
         averages.square = averages.square_left = square
@@ -195,7 +195,7 @@ def test_what_a_learner_does_to_a_load_that_begins_is_compared_with_that_load() 
     for gained, removed in ((0.005, 0.5), (-0.005, -0.005)):
         design, memory = trusted()
         averages = memory.averages[0]
-        averages.missed, averages.seen, averages.gained = 0.01, 1.0, gained
+        averages.missed, averages.missed_recently, averages.gained = 0.01, 1.0, gained
         assert removed_share(design, memory) == pytest.approx(removed)
         settle(design, memory, 0.0, 0.0, 1)
         assert (memory.sample[0].credit == -1.0) == (removed < -0.01)
@@ -221,7 +221,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         explained = lag_push(design.lag, disturbance, 0, said)
         f, said = explained if k >= 1300 else f, g
         f *= 100.0 if k % 50 == 20 else 0.01 if 60 <= k < 70 else 1.0
-        q, p = f - memory.shown[0], memory.shown[2]
+        q, p = f - memory.filtered[0], memory.filtered[2]
         assess(design, memory, f)
         large = abs(q) if (k + 1) * forget < 1.0 else min(abs(q), 5.0 * peak)
         peak += rise * (large - peak) if large > peak else -decay * peak

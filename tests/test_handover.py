@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers import Prefiltered, ReferenceModel, in_single_precision
 from quell.controllers.base import control
 from quell.controllers.compensator import samples_to_settle
 from quell.controllers.law import unlimited_control
@@ -264,6 +267,87 @@ def test_a_prepared_retuning_does_what_retune_does(compiled: bool, disturbed: st
     assert len(set(us[0])) > 100
 
 
+def _wrapped(kind: str) -> Any:
+    """Return a wrapper around an ADRC, or a compensator."""
+    law = ql.ADRC(OBSERVER, omega_c=2.0, u_min=-9.0, u_max=9.0)
+    behind = Prefiltered(law, ReferenceModel(8.0))
+    pid = ql.baselines.PID(kp=4.0, ki=2.0, kd=2.0, tf=0.05, dt=DT, u_min=-9.0, u_max=9.0)
+    kinds: dict[str, Callable[[], Any]] = {
+        "prefiltered": lambda: behind,
+        "compensated": lambda: ql.Compensated(pid, ql.Compensator(OBSERVER)),
+        "single": lambda: in_single_precision(law),
+        "prefiltered in single": lambda: in_single_precision(behind),
+        "compensated in single": lambda: in_single_precision(
+            ql.Compensated(pid, ql.Compensator(OBSERVER))
+        ),
+    }
+    return kinds[kind]()
+
+
+WRAPPED = (
+    "prefiltered",
+    "compensated",
+    "single",
+    "prefiltered in single",
+    "compensated in single",
+)
+
+
+@pytest.mark.parametrize("kind", WRAPPED)
+@pytest.mark.parametrize("new_limits", [False, True])
+def test_a_wrapper_prepares_a_retuning_too(kind: str, new_limits: bool) -> None:
+    """It does what ``retune`` does, there and back; what it shows of itself is that of the design."""
+    other = ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT)
+    both: dict[str, Any] = {"there": {"observer": other}, "back": {"observer": OBSERVER}}
+    if not kind.startswith("compensated"):
+        both["there"]["omega_c"], both["back"]["omega_c"] = 6.0, 2.0
+    one, another = _wrapped(kind), _wrapped(kind)
+    prepared = {name: one.prepare_retune(**given) for name, given in both.items()}
+    us = []
+    for controller in (one, another):
+        rig, found = Rig(), []
+        for k in range(240):
+            if k == 60 and new_limits:
+                controller.set_limits(u_min=-7.0, u_max=7.0)
+            for at, name in ((80, "there"), (120, "back"), (160, "there")):
+                if k == at and controller is one:
+                    prepared[name]()
+                elif k == at:
+                    another.retune(**both[name])
+            found.append(controller.step(math.sin(0.05 * k), rig.y))
+            rig.apply(found[-1])
+        us.append(found)
+        assert float(controller._adrc.observer.omega_o) == 60.0
+        assert controller.limits.high == (7.0 if new_limits else 9.0)
+    assert us[0] == us[1]
+    assert len(set(us[0])) > 100
+
+
+@pytest.mark.slow
+@pytest.mark.compiled
+@pytest.mark.parametrize("kind", ["prefiltered", "compensated in single"])
+def test_a_prepared_retuning_of_a_wrapper_is_compiled(kind: str) -> None:
+    """The call is the compiled change, and gives what ``retune`` gives to rounding."""
+    other = ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT)
+    one, another = _wrapped(kind), _wrapped(kind)
+    there = one.prepare_retune(observer=other)
+    before = one._packed
+    us = []
+    for controller in (one, another):
+        rig, found = Rig(), []
+        for k in range(200):
+            if k == 80 and controller is one:
+                there()
+                assert one._packed is not before
+                assert one._packed is not None
+            elif k == 80:
+                another.retune(observer=other)
+            found.append(controller.step(math.sin(0.05 * k), rig.y))
+            rig.apply(found[-1])
+        us.append(found)
+    assert us[0] == pytest.approx(us[1], rel=1e-5 if "single" in kind else 1e-9, abs=1e-6)
+
+
 def test_a_prepared_retuning_is_refused_as_retune_is() -> None:
     """When it is prepared; nothing has changed then."""
     controller = ql.ADRC(OBSERVER, omega_c=2.0, learner=ql.learners.Kalman())
@@ -277,6 +361,11 @@ def test_a_prepared_retuning_is_refused_as_retune_is() -> None:
     quick = ESO.model_free(order=2, b0=2.0, omega_o=40.0, dt=DT)
     compensator.prepare_retune(observer=quick)()
     assert compensator.observer is quick
+    for kind in ("compensated", "compensated in single"):
+        with pytest.raises(ValueError, match="omega_c = 3.0: a compensator has no law"):
+            _wrapped(kind).prepare_retune(omega_c=3.0)
+    with pytest.raises(ValueError, match="controller = PID: must be an ADRC"):
+        in_single_precision(ql.baselines.PID(kp=1.0, dt=DT)).prepare_retune(omega_c=3.0)
 
 
 def test_retuning_before_the_first_measurement_changes_no_state() -> None:

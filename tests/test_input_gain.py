@@ -16,7 +16,7 @@ import quell as ql
 from quell.controllers.baselines import PID
 from quell.identification import InputGain, identify_b0, identify_b0_by
 from quell.identification.input_gain import Candidate, MarginError, bandwidth
-from quell.identification.running_loop import Form, linear_columns, placed, predicted
+from quell.identification.running_loop import Form, Inputs, linear_columns, placed, predicted
 
 from .benchmark_module import benchmark
 from .commands import Shown
@@ -144,7 +144,7 @@ def test_the_predictor_of_an_unstable_plant_without_loads_is_the_stationary_kalm
     for value in y:
         by_hand.append(x[0])
         x = phi @ x + K * (value - x[0])
-    found = predicted(form, [a], np.zeros(4), np.zeros(y.size), y)[:, 0]
+    found = predicted(form, [a], np.zeros(4), Inputs.of(0.0 * y, y), y)[:, 0]
     assert found == pytest.approx(by_hand, abs=1e-6)
 
 
@@ -205,8 +205,10 @@ def test_the_predictor_is_the_observer_written_out() -> None:
         arrived = late[k + 1] * gain(0.75) + late[k] * (gain(1.0) - gain(0.75))
         e = y[k] - x[0]
         x = np.array([phi_xx * x[0] + gain(1.0) * x[1] + b * arrived, x[1]]) + K * e
-    assert predicted(form, [phi], beta, u, y)[:, 0] == pytest.approx(by_hand, abs=1e-12)
-    columns, of_y = linear_columns(form, phi, u, y)
+    assert predicted(form, [phi], beta, Inputs.of(u, y), y)[:, 0] == pytest.approx(
+        by_hand, abs=1e-12
+    )
+    columns, of_y = linear_columns(form, phi, Inputs.of(u, y), y)
     assert columns @ beta + of_y == pytest.approx(by_hand, abs=1e-12)
 
 

@@ -146,7 +146,7 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     theta, authority, share = state.learner.theta.copy(), guard.authority, guard.share
     reset_loop(design, state)
     assert not np.any(state.loop.view(float))
-    filters = (state.guard.chain, state.guard.shown, state.guard.effects, state.learner.chain)
+    filters = (state.guard.chain, state.guard.filtered, state.guard.effects, state.learner.chain)
     for each in (state.shadow, *filters):
         assert not np.any(each)
     assert (guard.output, guard.target, guard.late_effect) == (0.0,) * 3

@@ -107,7 +107,7 @@ def test_all_zeros_stay_where_they_are_near_or_wanted(recwarn: Any) -> None:
 @pytest.mark.parametrize("plant", [axis(2), three(1)], ids=["load encoder", "three inertias"])
 def test_a_flexible_axis_is_tuned_with_a_model_of_reduced_order(plant: Any) -> None:
     """M_s of the whole plant keeps its bound; the report says what is left out; the file runs."""
-    structure = "model-based-freed"
+    structure = "model-based-poles"
     tuned = ql.tune(plant, DT, structure=structure, compare=(), delay=LATE, constraints=BOUNDS)
     loop = ql.analysis.analyse(plant, tuned.controller, delay=LATE)
     assert loop.stable

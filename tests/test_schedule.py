@@ -101,20 +101,21 @@ def test_u_does_not_jump_when_the_signal_jumps_at_rest_under_a_load() -> None:
     np.testing.assert_allclose(found["u"][late], -0.5, atol=5e-7)
 
 
-def test_in_motion_u_continues_from_the_one_before() -> None:
-    """In the sample of the jump u changes as much as before times the ratio of b0, not by what b0 changes."""
-    law = controller(b0=B0)
+def test_in_an_acceleration_u_changes_by_the_torque_of_the_other_inertia() -> None:
+    """What a jump of the signal adds is u_0, the wanted acceleration, times the change of 1/b0; the load adds nothing."""
+    law = ql.ADRC(OBSERVER, 40.0, feedforward=True, schedule=ql.Schedule(POINTS, b0=B0))
     law.set_signals(0.4)
-    y = 0.0
     for k in range(200):
-        y = 0.5 * math.sin(0.02 * k)
-        u = law.step(0.6 * math.sin(0.02 * k + 0.1), y)
+        law.step(0.0, 0.5 * math.sin(0.02 * k), 0.0, 0.0)
     other = copy.deepcopy(law)
-    other.set_signals(0.3999)  # the same cell: a small jump
-    r, y = 0.6 * math.sin(4.1), 0.5 * math.sin(4.0)
-    u_next, u_other = law.step(r, y), other.step(r, y)
-    ratio = other.parameters.schedule and 1000.0 / other._state.schedule.loop[0].b0
-    assert u_other - u == pytest.approx((u_next - u) * ratio, rel=1e-6)
+    other.set_signals(0.9)
+    r, y = 0.3, 0.5 * math.sin(4.0)
+    u, u_other = law.step(r, y, 2.0, 70.0), other.step(r, y, 2.0, 70.0)
+    x, k = law.estimate.x, law.gains
+    wanted = k[0] * (r - x[0]) + k[1] * (2.0 - x[1]) + 70.0
+    more = 1.0 / other._state.schedule.loop[0].b0 - 1.0 / 1000.0
+    assert abs(law.estimate.f) > 0.3 * abs(wanted)
+    assert u_other - u == pytest.approx(wanted * more, rel=1e-9)
 
 
 def test_before_its_first_signal_the_gains_are_those_of_the_controller() -> None:
@@ -214,16 +215,24 @@ def test_feedforward_of_derivatives_follows_b0() -> None:
         lambda: ql.Schedule((0.0, 1.0), "torque", b0=(1.0, 2.0)),
         lambda: ql.Schedule((0.0, 1.0), ("y", "speed"), b0=(1.0, 2.0)),
         lambda: controller(b0=(-1.0, -2.0, -3.0)),
-        lambda: ql.ADRC(OBSERVER, 40.0, held=ql.HeldPlant(), schedule=ql.Schedule(POINTS, b0=B0)),
+        lambda: ql.ADRC(OBSERVER, 40.0, held=ql.HeldPlant(), schedule=ql.OnlineGain(1e3, 3e3)),
         lambda: ql.ADRC(OBSERVER, 40.0, schedule=0.5),  # type: ignore[arg-type]
         lambda: ql.ADRC(
-            OBSERVER, 40.0, learner=ql.learners.Kalman(), schedule=ql.Schedule(POINTS, b0=B0)
+            OBSERVER, 40.0, learner=ql.learners.Kalman(), schedule=ql.OnlineGain(1e3, 3e3)
+        ),
+        lambda: ql.ADRC(
+            ql.ESO.model_based(axis(5e-4, 1e-3), 200.0, DT), 40.0, learner=ql.learners.Kalman(),
+            schedule=ql.Schedule(POINTS, b0=B0),
+        ),
+        lambda: ql.ADRC(
+            OBSERVER, 40.0, learner=ql.learners.Kalman(), guard=ql.Guard(certified_for=axis(5e-4)),
+            schedule=ql.Schedule(POINTS, b0=B0),
         ),
         lambda: ql.ADRC(
             OBSERVER, 40.0, learner=ql.learners.Kalman(), schedule=ql.Schedule(POINTS, omega_o=B0)
         ),
         lambda: ql.ADRC(
-            OBSERVER, 40.0, feedforward=ql.Feedforward.rigid(1e-3), schedule=ql.Schedule(POINTS, b0=B0)
+            OBSERVER, 40.0, feedforward=ql.Feedforward.rigid(1e-3), schedule=ql.OnlineGain(1e3, 3e3)
         ),
         lambda: ql.ADRC(
             ql.ESO.cascade(2, 1.0, 100.0, DT), 40.0, schedule=ql.Schedule(POINTS, omega_o=(50, 60, 70))

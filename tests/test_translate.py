@@ -220,8 +220,23 @@ def states(design: Design, state: State, a: float, b: float) -> float:
     return count.total if count.total == count.total else count.seen
 
 
+@kernel
+def added(state: State, a: float) -> float:
+    """Add to an entry of x, and return it."""
+    state.x[0] += a if a == a else 1.0
+    return state.x[0]
+
+
+def unread(design: Design, state: State, a: float, b: float) -> float:
+    """Combine results of kernels that nobody reads: what the kernels change stays."""
+    lost = 2.0 * added(state, a) + (added(state, b) + 0.5)
+    lost = added(state, 0.25)
+    lost = 0.0
+    return state.x[0] + lost
+
+
 @needs_gcc
-@pytest.mark.parametrize("function", [extremes, branches, loops, numbers, states])
+@pytest.mark.parametrize("function", [extremes, branches, loops, numbers, states, unread])
 def test_a_kernel_calculates_the_same_in_c(tmp_path: Path, function: Callable[..., Any]) -> None:
     """For all pairs of ordinary and of extreme numbers, bit for bit."""
     check_equal(tmp_path, function)

@@ -24,9 +24,9 @@ LAGS = ([1.0], [1.0, 3.0, 3.0, 1.0])
 DT = 0.02
 ALL_STRUCTURES = [
     ("pi-unfiltered", 0), ("pi", 0), ("pid", 0), ("bandwidths", 1), ("bandwidths", 3),
-    ("freed", 2), ("freed", 3), ("half-gain", 2), ("half-gain-law", 2), ("reduced", 2),
-    ("model-based", 0), ("model-based-freed", 0), ("delay", 1), ("delay-freed", 2),
-    ("bandwidths-2", 1), ("bandwidths-2", 2), ("bandwidths-3", 2), ("freed-2", 1), ("freed-2", 2),
+    ("poles", 2), ("poles", 3), ("half-gain", 2), ("half-gain-law", 2), ("reduced", 2),
+    ("model-based", 0), ("model-based-poles", 0), ("delay", 1), ("delay-poles", 2),
+    ("bandwidths-2", 1), ("bandwidths-2", 2), ("bandwidths-3", 2), ("poles-2", 1), ("poles-2", 2),
     ("model-based-2", 0),
 ]  # fmt: skip
 
@@ -41,7 +41,7 @@ def loop_of(plant: Any, dt: float, delay: float = 0.0) -> Any:
 @pytest.fixture(scope="module")
 def tuned() -> ql.Tuned:
     """Three lags under the usual constraints, tuned for the integral gain."""
-    how: dict[str, Any] = {"structure": "freed", "objective": "load"}
+    how: dict[str, Any] = {"structure": "poles", "objective": "load"}
     return ql.tune(LAGS, DT, order=2, compare=("pi", "pid", "bandwidths"), **how)
 
 
@@ -116,13 +116,13 @@ def test_a_freed_adrc_has_the_feedback_of_a_filtered_pi_or_pid_controller(order:
     _, model = loop_of(LAGS, dt)
     pid = make_structure("pi" if order == 1 else "pid", model)
     values = np.array([0.6, 2.0, 0.1] if order == 1 else [2.0, 2.0, 0.6, 0.1])
-    freed = make_structure("freed", model, order)
-    rows = equivalents(pid, values, freed)
+    adrc = make_structure("poles", model, order)
+    rows = equivalents(pid, values, adrc)
     assert len(rows)
     omega = np.geomspace(1e-2, 1e2, 30)
     expected = pid.response(values[None, :], omega)[0]
     for row in rows:
-        found = freed.response(row[None, :], omega)[0]
+        found = adrc.response(row[None, :], omega)[0]
         np.testing.assert_allclose(found, expected, rtol=1.5e-2)
 
 
@@ -159,16 +159,16 @@ def test_measures_are_those_of_the_analysis(tuned: ql.Tuned) -> None:
 def test_freed_poles_are_better_than_bandwidths_and_pid(tuned: ql.Tuned) -> None:
     """At ten times the M_ks of the optimal PI controller; the result says by how much."""
     k_i = {name: design.k_i for name, design in tuned.designs.items()}
-    assert k_i["freed"] > 1.0 * k_i["pid"] > k_i["bandwidths"] > 2.0 * k_i["pi"]
+    assert k_i["poles"] > 1.0 * k_i["pid"] > k_i["bandwidths"] > 2.0 * k_i["pi"]
     assert any("PID" in line for line in tuned.costs)
     assert "best" in tuned.costs[-1]
 
 
 @pytest.mark.slow
 def test_a_result_does_not_depend_on_what_it_is_compared_with(tuned: ql.Tuned) -> None:
-    """A freed ADRC starts at the optimal PID controller also if that is not shown."""
-    alone = ql.tune(LAGS, DT, order=2, structure="freed", objective="load", compare=())
-    assert set(alone.designs) == {"freed"}
+    """An ADRC with free poles starts at the optimal PID controller also if that is not shown."""
+    alone = ql.tune(LAGS, DT, order=2, structure="poles", objective="load", compare=())
+    assert set(alone.designs) == {"poles"}
     assert alone.design.k_i == pytest.approx(tuned.design.k_i, rel=1e-3)
 
 

@@ -59,7 +59,7 @@ def test_no_pole_of_a_tuned_loop_rings() -> None:
 def test_the_poles_of_an_observer_do_not_ring_either() -> None:
     """While u is at a limit they show: an oven had a pair of damping 0.07."""
     oven = [0.7], np.polymul([142.0, 1.0], [19.0, 1.0]).tolist()
-    how: dict[str, Any] = {"structure": "freed", "objective": "load", "order": 2, "compare": ()}
+    how: dict[str, Any] = {"structure": "poles", "objective": "load", "order": 2, "compare": ()}
     tuned = ql.tune(oven, 1.0, delay=5.0, **how)
     solution = tuned.design.solution
     law, observer = solution.structure.poles(solution.values[None, :])

@@ -8,7 +8,7 @@ import numpy as np
 
 from quell.experiments import acc
 from quell.experiments.acc import study
-from quell.experiments.acc.loops import FREED, MB, MF, OURS, L
+from quell.experiments.acc.loops import FREE_POLES, MB, MF, OURS, L
 
 found, published = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
 ours = {name: controller for name, controller in acc.designs().items() if name in OURS}
@@ -35,7 +35,7 @@ print(
 )
 
 boxed, rates = acc.boxed(60, 9), []
-for name in (MF, FREED):
+for name in (MF, FREE_POLES):
     controller = acc.designs()[name]
     judged = acc.judge_sampled(controller, boxed, cubic=True)
     (scores,) = study.scores(controller, list(boxed))

@@ -27,7 +27,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,12 +42,13 @@ from quell.realtime.devices import Device, TwinDevice
 from quell.realtime.recordings import Event
 from quell.realtime.run import RigRun, run_rig
 from quell.realtime.supervisor import Cause, Safety
+from quell.records.axes import AxesTrajectory
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory
 from quell.signals import Signal, Step
 from quell.simulation.driver import Scenario
 from quell.simulation.simulate import simulate
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 # ---- The limits of an experiment at a rig ----
 
@@ -159,6 +160,88 @@ def measured(
     default = (*(() if dt is not None else ("t",)), "u", "y", *(("r",) if reference else ()))
     names = tuple(name.strip() for name in columns.split(",")) if columns else default
     return read_record(path, names, dt, time_unit=time_unit, max_size=max_size)
+
+
+class MeasuredAxes(NamedTuple):
+    """An evenly sampled record with several u and y."""
+
+    u: Matrix  #: (N, m)
+    y: Matrix  #: (N, n)
+    dt: float  #: [s]
+    axes: tuple[str, ...]  #: names of the y
+    actuators: tuple[str, ...]  #: names of the u
+
+
+def measured_axes(
+    path: Path,
+    axes: Sequence[str] | None = None,
+    actuators: Sequence[str] | None = None,
+    columns: str = "",
+    dt: float | None = None,
+    time_unit: str | None = None,
+    max_size: float = MAX_SIZE,
+) -> MeasuredAxes:
+    """Read the inputs and outputs of several axes from a table in text, or a saved run of them.
+
+    Parameters
+    ----------
+    path
+        the file.
+    axes, actuators
+        columns of the y and of the u of a table; names of the axes of a saved run, which has all u.
+    columns
+        column of its times; t by default. There is none with ``dt``.
+    dt, time_unit, max_size
+        as for ``measured``.
+
+    Raises
+    ------
+    ValueError
+        as ``measured``; and for a table without names of both.
+    """
+    if path.suffix.lower() == ".nc":
+        return _of_run(path, axes, actuators or columns or dt or time_unit, max_size)
+    for name, value in (("axes", axes), ("actuators", actuators)):
+        if not value:
+            signals = "y of each axis" if name == "axes" else "u of each actuator"
+            raise ValueError(f"{name}: missing; give the column of the {signals}, by commas")
+    if path.suffix.lower() == ".mcap":
+        raise ValueError(
+            f"{path.name} is no table in text; several axes are read from a table, or from a saved "
+            "run of quell.Axes"
+        )
+    if "," in columns:
+        rule = "must be the column of times only, as axes and actuators name the others"
+        raise ValueError(f"columns = {columns!r}: {rule}")
+    time = () if dt is not None else (columns or "t",)
+    if dt is not None and columns:
+        raise ValueError(f"columns = {columns!r}: there are no times, as dt is given; leave it out")
+    us, ys = list(actuators or ()), list(axes or ())
+    repeated = sorted({name for name in (*us, *ys) if (*us, *ys).count(name) > 1})
+    if repeated:
+        raise ValueError(f"axes, actuators: {', '.join(repeated)} is there twice; give each once")
+    count = max(len(us), len(ys))
+    pairs = [(us[min(i, len(us) - 1)], ys[min(i, len(ys) - 1)]) for i in range(count)]
+    read = [measured(path, ",".join((*time, *pair)), dt, time_unit, max_size) for pair in pairs]
+    u = np.column_stack([read[i].u for i in range(len(us))])
+    y = np.column_stack([read[i].y for i in range(len(ys))])
+    return MeasuredAxes(u, y, read[0].dt, tuple(ys), tuple(us))
+
+
+def _of_run(path: Path, axes: Sequence[str] | None, given: Any, max_size: float) -> MeasuredAxes:
+    """Return the signals of a saved run of several axes."""
+    if given:
+        raise ValueError(
+            "actuators, columns, dt, time_unit: have no effect on a saved run, which has times and "
+            "all u; give its axes only"
+        )
+    run = AxesTrajectory.load(path, max_size)
+    wanted = run.axis_names if axes is None else tuple(axes)
+    places = [run.axis_names.index(checks.one_of("axes", name, run.axis_names)) for name in wanted]
+    u, y = run["u"].copy(), run["y_measured"][:, places].copy()
+    return MeasuredAxes(
+        u, y, run.every * run.dt, wanted, tuple(f"u{k + 1}" for k in range(u.shape[1]))
+    )
 
 
 def recorded_run(

@@ -81,6 +81,22 @@ CONTROLLERS: dict[str, Any] = {
         ),
         **LIMITS,
     ),
+    "ADRC with a schedule, a learner and a guard": ql.ADRC(
+        ESO,
+        1.5,
+        learner=ql.learners.Kalman(u=True),
+        guard=ql.Guard(),
+        schedule=ql.Schedule((-0.5, 0.7), "y", (0.7, 3.0)),
+        **LIMITS,
+    ),
+    "ADRC with a schedule, a safe set and held": ql.ADRC(
+        ESO,
+        1.5,
+        safe_set=ql.SafeSet(-0.9, 0.9, -3.0, 3.0, alpha=4.0, f_rate=0.1),
+        held=ql.HeldPlant(),
+        schedule=ql.Schedule((-0.5, 0.7), "reference", (0.7, 3.0)),
+        **LIMITS,
+    ),
     "Prefiltered ADRC with a schedule over two signals": room.Prefiltered(
         ql.ADRC(
             ESO,

@@ -107,6 +107,7 @@ _LINEAR = {
     "state_bandwidth": Several((0.1, (0.1, 0.2))), "frequency": 2.0, "prior": 5.0,
     "gain_interval": With((0.7, 1.4), {"u": True}),
 }  # fmt: skip
+_TABLE = ql.Schedule((0.0, 0.5), "y", (0.8, 2.0))
 _ESO = {"order": 2, "b0": 1.5, "omega_o": 12.0, "dt": DT}
 _EXTENDED = {"disturbance_order": Several((2, 3))}
 _ORDERS = {
@@ -182,13 +183,18 @@ PARTS: dict[str, Part] = {
     "ADRC": Part(ql.ADRC, _itself, {"observer": OBSERVER, "omega_c": 1.5, **LIMITS}, {
         "observer": ql.ESO.model_free(order=3, b0=1.5, omega_o=12.0, dt=DT), "omega_c": 2.0, "learner": ql.learners.Kalman(),
         "guard": With(ql.Guard(), {"learner": ql.learners.Kalman()}), "feedforward": Several((True, ql.Feedforward((0.3, 0.1, 0.7)))),
-        **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "held": ql.HeldPlant(), "schedule": Several((ql.Schedule((0.0, 0.5), "y", (0.8, 2.0)), ql.OnlineGain(0.8, 3.0, bandwidth=30.0))), "half_gain": True, "feedback": room.NonlinearFeedback((0.75, 1.25), 0.05), "law_poles": [-1.0, -2.0],
+        **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "held": ql.HeldPlant(),
+        "schedule": Several((
+            _TABLE, ql.OnlineGain(0.8, 3.0, bandwidth=30.0), With(_TABLE, {"learner": ql.learners.Kalman(u=True), "guard": ql.Guard()}),
+            With(_TABLE, {"learner": ql.learners.BatchGradient(), "observer": ql.ESO.model_free(2, 1.5, 12.0, DT, delay=DT)}),
+            With(_TABLE, {"safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "held": ql.HeldPlant()}), With(_TABLE, {"feedforward": ql.Feedforward.rigid(0.7, coulomb=0.1)}),
+        )), "half_gain": True, "feedback": room.NonlinearFeedback((0.75, 1.25), 0.05), "law_poles": [-1.0, -2.0],
     }),
     "Compensator": Part(ql.Compensator, _itself, {"observer": OBSERVER, **LIMITS}, {
         "observer": Several((ql.ESO.model_free(order=3, b0=1.5, omega_o=12.0, dt=DT), ql.ESO.model_based(([2.0, 0.3], 1.5), 12.0, DT))),
         "omega_c": With(2.0, {"learner": ql.learners.Kalman()}), "learner": With(ql.learners.Kalman(), {"omega_c": 1.5}),
         "guard": With(ql.Guard(), {"learner": ql.learners.Kalman(), "omega_c": 1.5}), **_RANGE, "safe_set": ql.SafeSet(-0.9, 0.9, alpha=4.0), "held": ql.HeldPlant(),
-        "schedule": ql.Schedule((0.0, 0.5), "y", (0.8, 2.0)),
+        "schedule": Several((_TABLE, With(_TABLE, {"learner": ql.learners.Kalman(u=True), "omega_c": 1.5}))),
     }),
     "Compensated": Part(room.Compensated, _itself, {"controller": PID, "compensator": ql.Compensator(OBSERVER, **LIMITS)}, {
         "controller": baseline_room.LQG(PLANT, omega_c=3.0, omega_o=12.0, dt=DT),

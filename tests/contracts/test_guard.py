@@ -209,8 +209,8 @@ def test_without_authority_nothing_acts_after_ten_lags(name: str, sensor: str) -
         sample.peak = sample.outside = 1.0
         f_learned, _, _ = limit(design, memory, 1.0, shown, rng.normal(), 0.0, 0.0)
         if not trusted and k > 3 * ten_lags:
-            assert f_learned == memory.shown[F_L]
-        acted += f_learned != memory.shown[F_L]
+            assert f_learned == memory.filtered[F_L]
+        acted += f_learned != memory.filtered[F_L]
         record_output(design, memory, f_learned)
         shown = lag_push(lag, shadow, 0, f_learned)
     assert acted > ten_lags

@@ -58,7 +58,11 @@ WORK = {
         "quell.tuning.plants.record_model",
         "quell.commissioning.experiment",
     ),
-    "b0": ("quell.identification.identify_b0", "quell.identification.identify_b0_by"),
+    "b0": (
+        "quell.identification.identify_b0",
+        "quell.identification.identify_b0_by",
+        "quell.identification.identify_b0_matrix",
+    ),
 }
 BASES: dict[str, tuple[str, ...]] = {
     "reproduce two-mass": _FIGURES,
@@ -127,10 +131,12 @@ CASES: dict[str, dict[str, Case]] = {
         "RECORD": ("--columns", "t,y,u"), "--loop": (("record.csv",), ("record.csv", "--loop", "setup.toml")), "--order": ("--order", "2"), "--dt": ("--dt", "0.04"), "--max-delay": ("--max-delay", "0.3"),
         "--phase-margin": (("real",), ("--phase-margin", "50")), "--ratio": (("real",), ("--ratio", "7")), "--columns": ("--columns", "t,y,u"), "--time-unit": ("--time-unit", "ms"),
         "--by": ("--by", "y"), "--bins": (("record.csv", "--order", "1", "--by", "y"), ("record.csv", "--order", "1", "--by", "y", "--bins", "3")),
+        "--axes": (("two.csv", "--order", "1", "--axes", "y,q", "--actuators", "u,v"), ("two.csv", "--order", "1", "--axes", "q,y", "--actuators", "u,v")),
+        "--actuators": (("two.csv", "--order", "1", "--axes", "y,q", "--actuators", "u,v"), ("two.csv", "--order", "1", "--axes", "y,q", "--actuators", "v")),
     },
     "excite": {
         "OUT": ("other.csv",), "--kind": ("--kind", "multisine"), "--low": ("--low", "2"), "--high": ("--high", "30"), "--duration": ("--duration", "40"), "--dt": ("--dt", "0.002"),
-        "--u-min": ("--u-min=-2",), "--u-max": ("--u-max", "2"), "--seed": ("--seed", "1"),
+        "--u-min": ("--u-min=-2",), "--u-max": ("--u-max", "2"), "--seed": ("--seed", "1"), "--actuators": ("--actuators", "2"),
     },
     "rank": {
         "LOGS": ("b=log-2.csv@0:20",), "--criterion": ("--criterion", "effort"), "--confidence": ("--confidence", "0.5"), "--dt": (("log.csv", "log-2.csv"), ("log.csv", "log-2.csv", "--columns", "u,y,r", "--dt", "0.04")),
@@ -142,7 +148,7 @@ CASES: dict[str, dict[str, Case]] = {
     },
     "rig": {
         "--device": (("--device", "udp://127.0.0.1:0"), ("--device", "udp://127.0.0.2:0")), "--plant": ("--plant", "two-mass"), "--dt": ("--dt", "0.002"), "--watchdog": ("--watchdog", "9"),
-        "--u-max": ("--u-max", "3"), "--rest": ("--no-rest",), "--wait": ("--wait", "0.001"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
+        "--u-max": ("--u-max", "3"), "--rest": ("--no-rest",), "--wait": ("--wait", "0.001"), "--channel": ("--channel", "0.5"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
     },
     "proxy": {
         "SETUP": ("slow.toml", "--host", "udp://127.0.0.1:0"), "--host": (("proxy.toml", "--host", "udp://127.0.0.1:0"), ("proxy.toml", "--host", "udp://127.0.0.2:0")), "--device": ("--device", "twin:two-mass"),
@@ -242,6 +248,8 @@ def _write_inputs() -> None:
         log = name.replace("record", "log").replace("other", "log-2")
         table = np.column_stack([table, np.repeat(rng.normal(size=60), 10)])
         np.savetxt(log, table, delimiter=",", header="t,u,y,r", comments="")
+    two = np.column_stack([t, u, y, rng.normal(size=600), rng.normal(size=600)])
+    np.savetxt("two.csv", two, delimiter=",", header="t,u,y,v,q", comments="")
     Path("taken.json").write_text("{}", encoding="utf-8")
     Path("plants.csv").write_text("m1,m2,k_lin,k_nonlin,lambda,tau\n1,1,1,0,0,0.01\n")
 

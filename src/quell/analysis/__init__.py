@@ -5,12 +5,14 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 
 from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify, observer_error
+from quell.analysis.coupled import CoupledCertificate, certify_axes, certify_coupled
+from quell.analysis.coupling import Coupling, coupling, relative_gains
 from quell.analysis.disk import DiskMargin
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
 from quell.analysis.matrices import MatrixLaw, axes_law
-from quell.analysis.multivariable import MultivariableLoop, Peak, Pole
+from quell.analysis.multivariable import MultivariableLoop, Peak, Pole, analyse_axes
 from quell.analysis.online import OnlineCertificate, certify_online
 from quell.analysis.plots import (
     loops_over_omega_o,
@@ -34,6 +36,8 @@ from quell.lti.zeros import (
 __all__ = [
     "Adapting",
     "Certificate",
+    "CoupledCertificate",
+    "Coupling",
     "DiskMargin",
     "Existence",
     "Finding",
@@ -49,9 +53,13 @@ __all__ = [
     "adapting",
     "advise",
     "analyse",
+    "analyse_axes",
     "axes_law",
     "certify",
+    "certify_axes",
+    "certify_coupled",
     "certify_online",
+    "coupling",
     "frozen",
     "invariant_zeros",
     "linear_law",
@@ -65,5 +73,6 @@ __all__ = [
     "plot_margins_over_time",
     "plot_nyquist",
     "plot_root_locus",
+    "relative_gains",
     "unobservable_modes",
 ]

@@ -167,7 +167,7 @@ def certify(
     >>> found.certified, found.worst, round(found.gain, 2)
     (True, 'b = 0.7', 0.52)
     """
-    adrc = _adrc_of(controller)
+    adrc = linear_adrc(controller)
     gains: dict[str, CorrectionGains] = {}
     excluded: list[str] = []
     for name, plant in named_plants(plants).items():
@@ -175,10 +175,11 @@ def certify(
         sampled = sampled_plant(linear, adrc.dt, own_delay + delay, actuator_lag)
         gains[name] = gains_of(name, sampled, adrc.observer, adrc.parameters.law)
         excluded += _not_covered(plant, adrc.parameters.limits)
-    return Certificate(_kappa(adrc), gains, tuple(dict.fromkeys(excluded)))
+    return Certificate(guard_bound(adrc), gains, tuple(dict.fromkeys(excluded)))
 
 
-def _adrc_of(controller: Controller) -> ADRC:
+def linear_adrc(controller: Controller) -> ADRC:
+    """Return the ADRC of a controller that may be certified; ``ValueError`` for another one."""
     controller = without_prefilters(controller)
     if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC, which may have a guard")
@@ -190,7 +191,8 @@ def _adrc_of(controller: Controller) -> ADRC:
     return controller
 
 
-def _kappa(controller: ADRC) -> float:
+def guard_bound(controller: ADRC) -> float:
+    """Return κ of a controller's guard, or that of ``Guard()``."""
     design = controller.parameters.guard
     return Guard().bound if isinstance(design, UnguardedDesign) else float(design.bound)
 

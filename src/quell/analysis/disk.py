@@ -57,7 +57,7 @@ class DiskMargin(NamedTuple):
     """
 
     alpha: float
-    """α: the loop is stable for all ``|δ_i| < α``; zero for an unstable loop."""
+    """The largest α with a stable loop for all ``|δ_i| < α``; zero for an unstable loop."""
     omega: float
     """Frequency at which α is decided [rad/s]; NaN for an unstable loop."""
     unstructured: float

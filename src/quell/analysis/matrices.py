@@ -13,14 +13,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.analysis.linearise import linear_law
 from quell.analysis.margins import (
     Complex,
     balancing_scales,
     delayed_parts,
     without_delays,
 )
+from quell.controllers.allocation import update_gain
+from quell.controllers.axes import Axes
 from quell.controllers.linear import LinearLaw
 from quell.lti.models import MatrixSystem
+from quell.plants.linearise import linearised
+from quell.plants.multivariable import (
+    DelayedInputs,
+    EncodedOutputs,
+    MultivariableLinear,
+    MultivariableLinearPlant,
+    MultivariableNonlinearPlant,
+)
+from quell.plants.nonlinear import checked_point
 from quell.types import Matrix, Vector
 
 # ---- Frequency responses of several inputs and outputs ----
@@ -90,6 +102,94 @@ class MatrixLaw(NamedTuple):
     D_r: Matrix  # (m, number of references)
 
 
+def sampled_matrices(
+    plant: Any, dt: float, operating_point: Any = None
+) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A, B, C of a plant with several inputs and outputs, sampled, with delays as states.
+
+    Parameters
+    ----------
+    plant
+        a ``MultivariableLinearPlant`` or what it is made ``of``, (A, B, C) in continuous time; one
+        behind delays or encoders, which are left out; a ``MultivariableNonlinearPlant``, linearised
+        at the operating point; a sampled plant: a ``MultivariableLinear``, or a system with A, B, C
+        and the same ``dt``.
+    dt
+        sample time [s].
+    operating_point
+        (x, u) of a nonlinear plant.
+
+    Raises
+    ------
+    ValueError
+        for another plant, one of another sample time, a nonlinear one without operating point.
+    """
+    if isinstance(plant, MultivariableLinear):
+        return plant_matrices((plant.transition, plant.input, plant.output))
+    if getattr(plant, "A", None) is not None and getattr(plant, "dt", None):
+        if plant.dt is True or not math.isclose(plant.dt, dt, rel_tol=1e-9):
+            raise ValueError(
+                f"plant is sampled with dt = {plant.dt!r} s, the controller with {dt!r} s: must be "
+                "the same"
+            )
+        return plant_matrices(plant)
+    waiting: Any = 0
+    while isinstance(plant, DelayedInputs | EncodedOutputs):
+        if isinstance(plant, DelayedInputs):
+            plant.sampled(dt)  # made for this dt
+            waiting = waiting + np.array(plant.samples)
+        plant = plant.plant
+    if isinstance(plant, MultivariableNonlinearPlant):
+        if operating_point is None:
+            raise ValueError(
+                f"plant = {plant.name!r} is nonlinear: give the point at which it is linearised, "
+                "operating_point=(x, u)"
+            )
+        plant = linearised(plant, *checked_point(operating_point))
+    sampled = MultivariableLinearPlant.of(plant).sampled(dt)
+    A, B, C = sampled.transition, sampled.input, sampled.output
+    for j, samples in enumerate(np.broadcast_to(waiting, B.shape[1])):
+        for _ in range(samples):
+            n, m = B.shape
+            A = np.block([[A, B[:, j : j + 1]], [np.zeros((1, n + 1))]])
+            B, C = np.vstack([B, np.zeros((1, m))]), np.hstack([C, np.zeros((C.shape[0], 1))])
+            B[:, j] = np.eye(n + 1)[n]
+    return plant_matrices((A, B, C))
+
+
+def gain_at(axes: Axes, x: Any = None) -> tuple[Matrix, Matrix]:
+    """Return B0 (n, m) and B0⁺ (m, n) of axes, for the estimates ``x[axis, derivative]``.
+
+    Where B0 is a function, x is zero by default. Raises ``ValueError`` if it has no value there.
+    """
+    state = axes.initial_state()
+    point = state.x if x is None else np.asarray(x, dtype=np.float64)
+    if update_gain(axes.parameters.gain, state.gain, point):
+        raise ValueError(f"B0 at x = {point.tolist()!r}: is not finite, or has no inverse")
+    return state.gain.B.copy(), state.gain.inverse.copy()
+
+
+def estimates_at(axes: Axes, plant: Any, operating_point: Any) -> Matrix | None:
+    """Return the estimates of axes at rest at an operating point: y, with derivatives of zero."""
+    if operating_point is None:
+        return None
+    while isinstance(plant, DelayedInputs | EncodedOutputs):
+        plant = plant.plant
+    if not isinstance(plant, MultivariableNonlinearPlant):
+        return None
+    state = checks.vector("x", checked_point(operating_point)[0], plant.order)
+    model: Any = plant.sampled(axes.dt, interpret=True)
+    y = checks.vector("output", model.output(state), axes.outputs)
+    estimates = axes.initial_state().x
+    estimates[:, 0] = y
+    return estimates
+
+
+def law_of_axes(axes: Axes, x: Any = None) -> MatrixLaw:
+    """Return the linear law of axes without limits, learners at rest, B0 as in ``gain_at``."""
+    return _joined([linear_law(axis) for axis in axes.axes], gain_at(axes, x)[1])
+
+
 def axes_law(laws: Sequence[LinearLaw], B0: Any) -> MatrixLaw:
     """Return the law of several axes, ``u = B0⁻¹ v``, with the v of a law for each axis.
 
@@ -114,6 +214,11 @@ def axes_law(laws: Sequence[LinearLaw], B0: Any) -> MatrixLaw:
         )
     if np.linalg.matrix_rank(B0) < axes:
         raise ValueError(f"B0 = {B0.tolist()!r}: must have an inverse, u = B0⁻¹ v")
+    return _joined(laws, np.linalg.inv(B0))
+
+
+def _joined(laws: Sequence[LinearLaw], inverse: Matrix) -> MatrixLaw:
+    """Return the law of axes with ``u = inverse v``."""
     from scipy.linalg import block_diag
 
     def whole(of: Callable[[LinearLaw], Any]) -> Matrix:
@@ -124,9 +229,9 @@ def axes_law(laws: Sequence[LinearLaw], B0: Any) -> MatrixLaw:
         A=whole(lambda law: law.A + np.outer(law.B_u, law.C)),
         B_y=whole(lambda law: (law.B_y + law.B_u * law.D_y)[:, None]),
         B_r=whole(lambda law: (law.B_r + law.B_u * law.D_r)[:, None]),
-        C=np.linalg.solve(B0, whole(lambda law: law.C[None])),
-        D_y=np.linalg.solve(B0, np.diag([law.D_y for law in laws])),
-        D_r=np.linalg.solve(B0, np.diag([law.D_r for law in laws])),
+        C=inverse @ whole(lambda law: law.C[None]),
+        D_y=inverse @ np.diag([law.D_y for law in laws]),
+        D_r=inverse @ np.diag([law.D_r for law in laws]),
     )
 
 

@@ -56,7 +56,15 @@ from quell.analysis.margins import (
     margins,
     without_idle_chains,
 )
-from quell.analysis.matrices import MatrixResponse, law_matrices, plant_matrices
+from quell.analysis.matrices import (
+    MatrixResponse,
+    estimates_at,
+    law_matrices,
+    law_of_axes,
+    plant_matrices,
+    sampled_matrices,
+)
+from quell.controllers.axes import Axes
 from quell.lti.models import MatrixSystem
 from quell.types import Matrix, Vector
 
@@ -72,6 +80,9 @@ _TOWARDS_ZERO = 1e-3
 # Error of an eigenvalue in units of the rounding error over its condition; chosen by hand.
 _EPSILON = float(np.finfo(float).eps)
 _ROUNDING = 10.0 * _EPSILON
+# Radius of the circle on which rounding puts a repeated pole, in units of ‖A‖ and the root of ε,
+# and the distance of two poles that differ, in units of their errors; chosen by hand.
+_CIRCLE, _APART = 2.0, 3.0
 # Error of the mean of a repeated pole, as a share of the distance of its members; chosen by hand.
 _MEAN = 1e-3
 
@@ -126,9 +137,9 @@ class MultivariableLoop:
     >>> law = (np.zeros((2, 2)), np.eye(2), 100.0 * np.eye(2), D_y)
     >>> loop = MultivariableLoop((A, B, C), law, dt=0.01)
     >>> loop.stable, round(loop.m_s("outputs").value, 2)
-    (True, 1.64)
+    (True, 2.12)
     >>> round(loop.disk_margin("both").alpha, 3)
-    0.499
+    0.234
     """
 
     def __init__(
@@ -230,7 +241,7 @@ class MultivariableLoop:
 
     @cached_property
     def _grouped(self) -> list[Pole]:
-        return _groups(self._closed())
+        return grouped_poles(self._closed())
 
     @property
     def poles(self) -> list[Pole]:
@@ -469,6 +480,54 @@ class MultivariableLoop:
         return "\n".join([*lines, *filter(None, [self.note])])
 
 
+def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> MultivariableLoop:
+    """Analyse the loop of a plant and several axes, unlimited, with learners at rest.
+
+    Learners are taken as ``analyse`` takes them. A B0 that is a function of the estimates is a
+    constant here, the one at the operating point: what its changes do is not in these margins.
+
+    Parameters
+    ----------
+    plant
+        a plant with an output for each axis: a ``MultivariableLinearPlant`` or what it is made
+        ``of``, such as (A, B, C) in continuous time; one behind delays or encoders, which are left
+        out; a ``MultivariableNonlinearPlant``, with its operating point; or a sampled one, a
+        ``control.StateSpace`` with the same dt or a ``MultivariableLinear``.
+    axes
+        the controller.
+    operating_point
+        (x, u) at which a nonlinear plant is linearised, at rest.
+
+    Raises
+    ------
+    ValueError
+        for another plant or controller, sizes that do not fit, a nonlinear plant without operating
+        point.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> robot = ql.plants.arm(gravity=0.0)
+    >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3)
+    >>> joint = ql.ADRC(observer, omega_c=8.0)
+    >>> pose = ([0.3, 1.2, 0.0, 0.0], [0.0, 0.0])
+    >>> loop = analyse_axes(robot, ql.Axes([joint, joint], M=robot.inertia), pose)
+    >>> round(loop.disk_margin("inputs").alpha, 2)
+    0.84
+    """
+    if not isinstance(axes, Axes):
+        raise ValueError(f"axes = {axes!r}: must be quell.Axes; of one signal, use analyse")
+    matrices = sampled_matrices(plant, axes.dt, operating_point)
+    m, p = matrices[1].shape[1], matrices[2].shape[0]
+    if (p, m) != (axes.outputs, axes.inputs):
+        raise ValueError(
+            f"plant has {m} inputs and {p} outputs: the controller has {axes.outputs} axes and "
+            f"{axes.inputs} actuators"
+        )
+    law = law_of_axes(axes, estimates_at(axes, plant, operating_point))
+    return MultivariableLoop(matrices, law, axes.dt, outputs=axes.names)
+
+
 def _channel_names(
     argument: str, names: Sequence[str] | None, letter: str, count: int
 ) -> tuple[str, ...]:
@@ -480,12 +539,12 @@ def _channel_names(
     return found
 
 
-def _groups(N: Matrix) -> list[Pole]:
-    """Return the poles with their multiplicities, the slowest first.
+def grouped_poles(N: Matrix) -> list[Pole]:
+    """Return the poles of ``A = N + I`` with their multiplicities, the slowest first.
 
-    Rounding moves an eigenvalue by up to ε ‖N‖ over its condition, the product of its left and its
-    right eigenvector: that of a pole that is repeated k times is about the k-th root of ε. Poles
-    whose distance is within their errors are one.
+    Rounding moves an eigenvalue by up to ε ‖A‖ over its condition, the product of its left and its
+    right eigenvector, and one that is repeated k times by about the k-th root of ε. Poles whose
+    distance is within the errors of both are one.
     """
     from scipy.linalg import eig, matrix_balance
 
@@ -495,14 +554,19 @@ def _groups(N: Matrix) -> list[Pole]:
         return found
     scaled = matrix_balance(whole, permute=False)[0]
     values, left, right = eig(scaled, left=True, right=True)
-    angle = np.abs(np.sum(left.conj() * right, axis=0))
-    norm = float(np.linalg.norm(scaled, 2))
-    # No eigenvalue of a matrix of this size is more sensitive than that of a single Jordan block.
-    error = _ROUNDING * norm / np.maximum(angle, _EPSILON ** (1.0 - 1.0 / values.size))
-    # A repeated pole lies on a circle around the mean, each within its own error of it.
-    group = np.arange(values.size)
-    for i in range(values.size):
-        near = np.abs(values - values[i]) <= 2.0 * np.maximum(error, error[i])
+    # A itself is rounded, not only what is left of it without I.
+    size, norm = values.size, float(np.linalg.norm(scaled + np.eye(len(scaled)), 2))
+    condition = np.abs(np.sum(left.conj() * right, axis=0))
+    away = np.abs(values[:, None] - values)
+    # The circle of a pole that is repeated k times, for the largest k that has as many poles in it.
+    circles = _CIRCLE * norm * _EPSILON ** (1.0 / np.arange(1.0, size + 1.0))
+    inside = np.sort(away, axis=1) <= circles
+    circle = circles[size - 1 - np.argmax(inside[:, ::-1], axis=1)]
+    error = np.minimum(_ROUNDING * norm / np.maximum(condition, _EPSILON**2), circle)
+    error = np.maximum(error, _ROUNDING * norm)
+    group = np.arange(size)
+    for i in range(size):
+        near = away[i] <= _APART * np.minimum(error, error[i])
         group[np.isin(group, group[near])] = group[i]
     for label in np.unique(group):
         members = values[group == label]

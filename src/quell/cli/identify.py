@@ -182,11 +182,15 @@ def b0(
     ratio: float | None = None,
     by: str | None = None,
     bins: int | None = None,
+    axes: str | None = None,
+    actuators: str | None = None,
     read: ReadOptions = READ_OPTIONS,
     trust: Trust = False,
     outputs: ResultOutputs = RESULT_OUTPUTS,
 ) -> None:
     """Find b0, lag and delay in a record of a running loop, and the omega_c for a phase margin.
+
+    With --axes and --actuators it finds the matrix B0 of coupled axes, and no omega_c.
 
     Parameters
     ----------
@@ -212,11 +216,27 @@ def b0(
         table in text. b0 is then found in each bin of it, and no omega_c.
     bins
         Number of bins between the least and the largest value of `--by`; 5 by default.
+    axes
+        Columns of the y of coupled axes in a table in text, as q1,q2; --columns then names only the
+        column of times, t by default. Of a saved run (.nc) the names of its axes.
+    actuators
+        Columns of their u in a table, as tau1,tau2; a saved run has all u.
     """
     from quell.commissioning import measured
     from quell.identification import identify_b0
 
     outputs = check_outputs(outputs)
+    if axes is not None or actuators is not None:
+        single = {
+            "loop": (loop, None),
+            "phase_margin": (phase_margin, 60.0),
+            "ratio": (ratio, None),
+        }
+        refuse(
+            single | {"by": (by, None), "bins": (bins, None)}, "is for one axis, not for several"
+        )
+        _print_matrix(record, axes, actuators, order, dt, max_delay, read, outputs)
+        return
     samples = measured(record, read.columns, dt, read.time_unit, read.max_size)
     ran = {} if loop is None else _of_loop(loop, samples.dt, trust)
     order = ran.get("order") if order is None else order
@@ -251,15 +271,65 @@ def b0(
     write_results(console, results, outputs)
 
 
-def _column(record: Path, by: str, read: ReadOptions, dt: float | None, size: int) -> Any:
-    """Return a further column of a table in text."""
-    from quell.commissioning import measured
+def _print_matrix(
+    record: Path,
+    axes: str | None,
+    actuators: str | None,
+    order: int | None,
+    dt: float | None,
+    max_delay: float | None,
+    read: ReadOptions,
+    outputs: ResultOutputs,
+) -> None:
+    """Find, print and write B0 of several axes."""
+    from quell.commissioning import measured_axes
+    from quell.identification import identify_b0_matrix
 
-    if record.suffix.lower() in (".nc", ".mcap"):
-        raise ValueError(
-            f"by = {by!r}: {record.name} is no table in text; write the recording as CSV "
-            "(quell run-rig --csv), or give u, y and the signal as columns of a table"
+    if order is None:
+        raise ValueError("order: missing; give --order, the derivative of y that u acts on")
+    of_y, of_u = (None if text is None else _names(text) for text in (axes, actuators))
+    how = read.columns, dt, read.time_unit, read.max_size
+    samples = measured_axes(record, of_y, of_u, *how)
+    console = Console()
+    with console.status("Searching; the first time, code is compiled for some seconds."):
+        found = identify_b0_matrix(
+            samples.u,
+            samples.y,
+            samples.dt,
+            order,
+            max_delay=max_delay,
+            axes=samples.axes,
+            actuators=samples.actuators,
         )
+    count = f"{found.samples} samples, dt = {found.dt:g} s"
+    print_line(console, f"{record.name}: {count}, order {order}")
+    rows = table("B0 ± deviation", "", *found.actuators)
+    for name, values, spreads in zip(found.axes, found.B0, found.std, strict=True):
+        cells = (f"{value:.5g} ± {std:.2g}" for value, std in zip(values, spreads, strict=True))
+        rows.add_row(name, *cells)
+    console.print(rows)
+    print_line(console, found.describe_rest())
+    if not found.is_poor:
+        entries = ", ".join(f"[{', '.join(f'{b:.5g}' for b in row)}]" for row in found.B0)
+        print_line(console, f"B0 = [{entries}]  # of [axes]")
+    write_results(console, found.to_json(), outputs)
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+def _column(record: Path, by: str, read: ReadOptions, dt: float | None, size: int) -> Any:
+    """Return a further column of a table in text, or a channel of a recording."""
+    from quell.commissioning import controlled, measured, recorded_run
+
+    run = recorded_run(record, read.columns, dt, read.time_unit, read.max_size)
+    if run is not None:
+        widths = dict(run.channels)
+        if widths.get(by) != 1:
+            one = ", ".join(name for name, width in widths.items() if width == 1)
+            raise ValueError(f"by = {by!r}: must be a channel of {record.name}, one of {one}")
+        return run[by][controlled(run)]
     columns = [name.strip() for name in (read.columns or ("u,y" if dt else "t,u,y")).split(",")]
     names = ",".join([*columns[:-1], by])
     found = measured(record, names, dt, read.time_unit, read.max_size).y
@@ -371,7 +441,7 @@ def _print_bandwidth(
 def excite(
     out: Path,
     *,
-    kind: str = "prbs",
+    kind: str | None = None,
     low: float = 0.5,
     high: float = 60.0,
     duration: float = 60.0,
@@ -379,6 +449,7 @@ def excite(
     u_min: float = -1.0,
     u_max: float = 1.0,
     seed: Whole = 0,
+    actuators: Whole = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Design an input that excites a band within limits, for quell identify, and write it as CSV.
@@ -386,9 +457,9 @@ def excite(
     Parameters
     ----------
     out
-        CSV file to write, with columns t,u.
+        CSV file to write, with columns t,u; for several actuators t,u1,u2 and so on.
     kind
-        multisine, prbs or chirp.
+        multisine, prbs or chirp; a PRBS by default, and a multisine for several actuators.
     low
         Lowest frequency of the band [rad/s].
     high
@@ -403,10 +474,28 @@ def excite(
         Upper limit of u.
     seed
         Start of a PRBS, or phases of a multisine.
+    actuators
+        Number of actuators that move at the same time, each with a multisine of its own
+        frequencies, for quell b0 --axes.
     """
     from quell.files import check_writable
-    from quell.identification import excitation
+    from quell.identification import excitation, interleaved_excitations, save_excitations
 
+    if actuators != 1:
+        if kind not in (None, "multisine"):
+            raise ValueError(f"kind = {kind!r}: several actuators have multisines; leave it out")
+        check_writable(out, overwrite)
+        designs = interleaved_excitations(
+            actuators, (low, high), duration, dt, u_min, u_max, seed=seed
+        )
+        save_excitations(designs, out, overwrite)
+        console = Console()
+        for i, each in enumerate(designs):
+            print_line(console, f"u{i + 1}: {each.describe()}")
+        names = ",".join(f"u{i + 1}" for i in range(actuators))
+        print_line(console, f"Samples: {out}, {designs[0].u.size} of t,{names}")
+        return
+    kind = "prbs" if kind is None else kind
     if kind == "chirp":
         refuse({"seed": (seed, 0)}, "a chirp has nothing random")
     check_writable(out, overwrite)

@@ -62,6 +62,7 @@ def rig(
     u_max: float = math.inf,
     rest: bool = True,
     wait: float = 0.0,
+    channel: list[float] | None = None,
     seconds: float | None = None,
     log: Path | None = None,
     overwrite: Overwrite = False,
@@ -92,6 +93,9 @@ def rig(
         How long a tick waits for the command that answers the measurement before it [s]. The plant
         stands still meanwhile, as no real one does: a loop that is late then does as in a
         simulation.
+    channel
+        A number that is sent beside y in each tick, for the schedule of a loop or its channel held;
+        repeat it for more.
     seconds
         How long to run [s]; until interrupted by default.
     log
@@ -114,6 +118,7 @@ def rig(
         "rest": rest,
         "log": log,
         "wait": wait,
+        "channels": channel or (),
         "overwrite": overwrite,
     }
     with closing(listen(device)) as listener, Rig(model, dt, listener=listener, **limits) as server:
@@ -227,8 +232,10 @@ def proxy(
     _check_pace(seconds, priority, cpu)
     compensator, dt = cast("Compensator", loaded.controller), float(loaded.controller.dt)
     limits: dict[str, Any] = {"watchdog": watchdog, "log": log, "overwrite": overwrite}
+    names = (loaded.rig or {}).get("channels", ())
     with (
-        closing(CompensatedDrive(open_device(url, dt, trust), compensator)) as drive,
+        closing(open_device(url, dt, trust)) as behind,
+        closing(CompensatedDrive(behind, compensator, channels=names)) as drive,
         closing(listen(host)) as listener,
         Rig(drive, dt, listener=listener, **limits) as server,
     ):
@@ -466,11 +473,19 @@ def _close_loop(
 
 
 def _device(url: str, setup: Setup) -> Any:
-    """Return the device; ``twin:`` is the plant of the setup itself."""
+    """Return the device; ``twin:`` is the plant of the setup itself.
+
+    It gives the signals of its scenario's schedule, from when it is opened.
+    """
     from quell import realtime
+    from quell.simulation.driver import sampled_schedule
 
     if url == "twin:":
-        return realtime.TwinDevice(setup.needed("plant"), setup.controller.dt)
+        dt, scenario = setup.controller.dt, setup.scenario
+        rows: Any = ()
+        if scenario is not None and scenario.schedule:
+            rows = sampled_schedule(scenario, setup.controller)
+        return realtime.TwinDevice(setup.needed("plant"), dt, channels=rows)
     return realtime.open_device(url, setup.controller.dt, *((True,) if setup.trust else ()))
 
 
@@ -590,7 +605,8 @@ def replay(
     outputs = check_outputs(outputs, [name])
     recorded = load_record(record, max_size)
     try:  # replay refuses a controller that is no ADRC
-        replayed = replay_record(recorded, cast(ADRC, given.controller))
+        names = (given.rig or {}).get("channels", ())
+        replayed = replay_record(recorded, cast(ADRC, given.controller), channels=names)
     except ValueError as error:
         raise with_path(given.file, "", error, ()) from None
     console = Console()

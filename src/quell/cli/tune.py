@@ -91,6 +91,11 @@ class Works:
 WORKS = Works()
 
 
+def of_rest(works: Works) -> dict[str, tuple[Any, Any]]:
+    """Return the options of the operating point and their defaults, for ``refuse``."""
+    return {"u_rest": (works.u_rest, None), "y_rest": (works.y_rest, None)}
+
+
 def rest_of_model(model: Identified, y: float | None = None) -> dict[str, tuple[float, float]]:
     """Return the operating point of a model: u at the mean of y, or at ``y``."""
     import numpy as np
@@ -299,7 +304,8 @@ def tune(
 ) -> int:
     """Tune a controller for a linear plant: the best load rejection under constraints.
 
-    Of a setup with a [compensator] that is tuned, and its controller stays as it is.
+    Of a setup with a [compensator] that is tuned, and its controller stays as it is. With
+    [tune.schedule], a list of operating points, the gains of the controller follow a signal.
 
     The plant is that of a setup file, a transfer function, one that a record shows, or that an
     experiment at a rig shows (--device). A record is identified first, and the deviations of gain,
@@ -320,8 +326,8 @@ def tune(
     delay
         Dead time of the plant [s].
     structure
-        bandwidths, freed, half-gain, half-gain-law, reduced, model-based, model-based-freed,
-        delay, delay-freed, bandwidths-2, bandwidths-3, freed-2, model-based-2, pi, pi-unfiltered,
+        bandwidths, poles, half-gain, half-gain-law, reduced, model-based, model-based-poles,
+        delay, delay-poles, bandwidths-2, bandwidths-3, poles-2, model-based-2, pi, pi-unfiltered,
         pid, p-pi-notch or lqg; by default simplest: the simplest whose objective is within 5 % of
         the best.
     order
@@ -358,6 +364,8 @@ def tune(
     """
     from quell.commissioning import is_record
     from quell.files import check_writable
+    from quell.setup.points import has_schedule
+    from quell.setup.schema import read as tables_of
     from quell.tuning.designs import range_of_u
     from quell.tuning.plants import with_known_noise
 
@@ -386,8 +394,14 @@ def tune(
         unused |= options_of(of_model, MODEL_OPTIONS)
         refuse(unused, "goes with a record or --device, which is identified")
         refuse(of_rig, "goes with --device, an experiment at a rig")
-        if setup is not None and not (num or den or dt) and has_compensator(setup):
-            return _tune_compensator(console, setup, options, trust, out, outputs)
+        if setup is not None and not (num or den or dt):
+            tables = tables_of(setup)[1]
+            if has_schedule(tables):
+                limits = works.limits()
+                refuse(of_rest(works), "is the operating_point of a plant, in a setup")
+                return _tune_schedule(console, setup, options, limits, trust, out, outputs)
+            if "compensator" in tables:
+                return _tune_compensator(console, setup, options, trust, out, outputs)
         plant, dt, options, name = _plant(setup, num, den, dt, options, works, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
@@ -421,13 +435,6 @@ def tune(
         step = verified(console, place, tuned, model, y_now)
     _write(console, tuned, out, outputs, {"model": model.to_json()}, step)
     return ExitCode.DONE if step is None else exit_code(step.run)
-
-
-def has_compensator(path: Path) -> bool:
-    """Return whether a setup file has a compensator, which is then what is tuned."""
-    from quell.setup.schema import read
-
-    return "compensator" in read(path)[1]
 
 
 def _tune_compensator(
@@ -469,6 +476,51 @@ def _tune_compensator(
         from quell.experiments.common import save_figure
 
         figure = tuned.plot().figure
+        paths += save_figure(figure, outputs.figures, "tuned", outputs.overwrite)
+    write_results(console, tuned.to_json(), outputs, paths)
+    return ExitCode.DONE
+
+
+def _tune_schedule(
+    console: Console,
+    path: Path,
+    options: dict[str, Any],
+    limits: dict[str, float],
+    trust: bool,
+    out: Path | None,
+    outputs: Outputs,
+) -> int:
+    """Tune one controller with a schedule for the operating points of a setup."""
+    from quell.setup.points import schedule_task
+    from quell.tuning import report, tune_schedule
+
+    task = schedule_task(path, options, trust, limits)
+    with progress_bar(console, "tuning") as bar:
+        progress = partial(_progress, bar)
+        tuned = tune_schedule(task.plant, task.dt, progress=progress, **task.options)
+    points = f"{len(tuned.own)} operating points"
+    print_line(console, f"{task.setup.title}, dt = {task.dt:g} s, {points}")
+    print_line(console, f"constraints: {tuned.constraints}")
+    if tuned.noise_bound:
+        print_line(console, tuned.noise_bound)
+    headings = ("b0", "M_s", "M_t", report.quantity("load-iae"), "over that of\nits own tuning")
+    rows = table("Loops at fixed signals", " and ".join(tuned.schedule.signals), *headings)
+    for row in tuned.rows():
+        rows.add_row(*row)
+    console.print(rows)
+    for line in tuned.verdicts():
+        print_line(console, line)
+    controller = tuned.controller
+    observer = f"omega_o = {controller.observer.omega_o:.5g}"
+    print_line(console, f"omega_c = {controller.omega_c:.5g}, {observer}, {tuned.schedule}")
+    if out is not None:
+        tuned.save(out, outputs.overwrite)
+        print_line(console, f"Setup: {out}")
+    paths = []
+    if outputs.figures:
+        from quell.experiments.common import save_figure
+
+        figure = tuned.plot()[0].figure
         paths += save_figure(figure, outputs.figures, "tuned", outputs.overwrite)
     write_results(console, tuned.to_json(), outputs, paths)
     return ExitCode.DONE
@@ -534,8 +586,7 @@ def _plant(
     if setup is not None:
         if num or den or dt is not None:
             raise ValueError("setup: goes without --num, --den and --dt, which are in the file")
-        rest = {"u_rest": (works.u_rest, None), "y_rest": (works.y_rest, None)}
-        refuse(rest, "is the operating_point of [plant], and scenario.x0, in a setup")
+        refuse(of_rest(works), "is the operating_point of [plant], and scenario.x0, in a setup")
         task = tuning_task(setup, options, trust, works.limits())
         return task.plant, task.dt, task.options, task.setup.title
     if not num or not den or dt is None:

@@ -32,6 +32,12 @@ from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
+from quell.controllers.state_feedback import (
+    Regulator,
+    quadratic_feedback,
+    regulator,
+    state_feedback,
+)
 
 __all__ = [
     "ADRC",
@@ -53,6 +59,7 @@ __all__ = [
     "Prefiltered",
     "ProfileGenerator",
     "ReferenceModel",
+    "Regulator",
     "SafeSet",
     "Schedule",
     "TrackingDifferentiator",
@@ -62,5 +69,8 @@ __all__ = [
     "equal_to_pid",
     "in_single_precision",
     "omega_c_for",
+    "quadratic_feedback",
+    "regulator",
+    "state_feedback",
     "warn_if_unwise",
 ]

@@ -73,7 +73,8 @@ from quell.controllers.law import (
 )
 from quell.controllers.online_gain import OnlineGain
 from quell.controllers.safe_set import SafeSet
-from quell.controllers.schedule import NoSchedule, Schedule
+from quell.controllers.schedule import NoSchedule, Schedule, ScheduleDesign
+from quell.controllers.stateful import Retuning
 from quell.guard import Guard
 from quell.learners.base import Learner
 from quell.lti.canonical import format_roots
@@ -219,16 +220,17 @@ class ADRC(Compensator):
         default. ``set_held`` needs none.
     schedule
         tables of b0, omega_c and omega_o over one or two signals, which the gains follow, or an
-        ``OnlineGain``, which estimates b0; none by default. With ``feedforward=True`` r^(m)/b0
-        follows b0.
+        ``OnlineGain``, which estimates b0; none by default. A feedforward follows b0: r^(m)/b0, and
+        the inertia of a model, which is that for the observer's b0.
 
     Raises
     ------
     ValueError
         for a bandwidth or rate limit that is not positive, limits in the wrong order, an
-        observer of a plant with zeros outside of the left half plane; for a schedule of b0 or
-        omega_o with a learner, of b0 with a safe set, of b0 with the feedforward of a model, or of
-        omega_c with a nonlinear feedback.
+        observer of a plant with zeros outside of the left half plane; for a schedule of omega_o
+        with a learner, or of omega_c with a nonlinear feedback; of b0 with a guard that is
+        certified, or with a learner, a safe set or ``held`` where the observer has a model; for an
+        ``OnlineGain`` with one of these three or with the feedforward of a model.
 
     Examples
     --------
@@ -337,16 +339,30 @@ class ADRC(Compensator):
         if self.schedule is None:
             return NoSchedule()
         law = partial(self._law, degree=observer.degree)
-        return self.schedule.design(observer, self.omega_c, law)
+        return self._with_parts(self.schedule.design(observer, self.omega_c, law), observer)
+
+    def _with_parts(self, schedule: Any, observer: ESO) -> Any:
+        schedule = super()._with_parts(schedule, observer)
+        if not isinstance(schedule, ScheduleDesign) or not schedule.has_b0:
+            return schedule
+        if not isinstance(self.feedforward, Feedforward):
+            has_model = bool(np.any(observer.cancel != 0.0))
+            return schedule._replace(cancel=observer.cancel if has_model else np.zeros(0))
+        fixed, fixed_acting = self.feedforward.fixed(observer)
+        return schedule._replace(fixed=fixed, fixed_acting=fixed_acting)
+
+    def _take_inertia(self, ratio: float) -> None:
+        if isinstance(self.feedforward, Feedforward):
+            self.feedforward = self.feedforward.with_inertia(ratio, self.observer.degree)
 
     def _check_law_of_schedule(self) -> None:
         """Raise a ``ValueError`` for parts of the law that a schedule does not reach."""
         if self.schedule is None:
             return
-        if self.schedule.b0 is not None and isinstance(self.feedforward, Feedforward):
+        if isinstance(self.schedule, OnlineGain) and isinstance(self.feedforward, Feedforward):
             raise ValueError(
-                "schedule.b0 with the feedforward of a model: the model has one inertia, and the "
-                "table has others; take feedforward = true, which follows b0"
+                "schedule = OnlineGain(...) with the feedforward of a model: the model has an "
+                "inertia, and the estimate others; take feedforward = true, which follows b0"
             )
         if self.schedule.omega_c is not None and self.feedback is not None:
             raise ValueError(
@@ -429,7 +445,8 @@ class ADRC(Compensator):
             ``omega_o``, ``b0`` or model; unchanged by default. For a plant with zeros, or with a
             separate input for f, only ``omega_o`` may change.
         """
-        self._replaced(observer, omega_c, compiles=False)()
+        design = partial(self._retuning, omega_c=omega_c, observer=observer)
+        self._change_to(design, compiles=False)()
 
     def prepare_retune(
         self, *, omega_c: float | None = None, observer: ESO | None = None
@@ -441,23 +458,21 @@ class ADRC(Compensator):
         designs. ``set_limits`` or a restored state in between make its next calls slower, by a
         tenth of a millisecond. Parameters, rules and errors are those of ``retune``.
         """
-        return self._replaced(observer, omega_c, compiles=True)
+        design = partial(self._retuning, omega_c=omega_c, observer=observer)
+        return self._change_to(design, compiles=True)
 
-    def _replaced(
-        self, observer: ESO | None, omega_c: float | None, compiles: bool
-    ) -> Callable[[], None]:
-        """Return a function that changes observer and bandwidth."""
+    def _retuning(self, *, omega_c: float | None = None, observer: ESO | None = None) -> Retuning:
+        """Return the parameters with other bandwidths, and what sets the attributes for them."""
         omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:
             check_replacement(self.observer, observer, self._learns)
         if self.schedule is not None:
             self.schedule.check_retuning(self.observer, observer, omega_c != self.omega_c)
         observer = observer or self.observer
-        change = self._change_to(
-            self._design(observer, omega_c), compiles, observer=observer, omega_c=omega_c
-        )
+        new = self._design(observer, omega_c)
+        found = self._retuning_to(new, observer=observer, omega_c=omega_c)
         self._warn_of_design(observer, omega_c)
-        return change
+        return found
 
 
 # ---- ADRC of order 1 for a first-order plant with dead time, K e^(−Ls)/(T s + 1) ----

@@ -74,6 +74,14 @@ def set_schedule_signals(controller: Any, state: Any, values: Vector) -> None:
     """
 
 
+@generic_with_default
+def set_held(controller: Any, state: Any, held: bool) -> None:
+    """Set whether the plant is held: u does not act until it is not.
+
+    Ignored by a controller without observer, which does not know it.
+    """
+
+
 @generic
 def write_row(controller: Any, state: Any, row: Vector) -> None:
     """Write the controller's ``channels`` into ``row``."""
@@ -100,6 +108,22 @@ def set_applied_control(controller: Any, state: Any, u: float) -> None:
     control signal is equal to a controller with those narrower limits.
     """
     raise TypeError
+
+
+@generic
+def change_parameters(old: Any, new: Any, state: Any) -> None:
+    """Continue with other parameters of the same structure, without a jump of u."""
+    raise TypeError
+
+
+@generic_with_default
+def hold_integrators(controller: Any, state: Any, u_before: float) -> None:
+    """Undo what the last ``control`` added to integrators: u does not act while a plant is held.
+
+    By default the controller is told that ``u_before`` was applied, which it was told before; so
+    its integrators stay within what its anti-windup leaves.
+    """
+    set_applied_control(controller, state, u_before)
 
 
 @generic_with_default

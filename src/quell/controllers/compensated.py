@@ -7,7 +7,9 @@ Any controller gives u_0 from r and y, and the compensator adds what cancels the
 
 Limits are those of the sum. What they take is taken from u_0: the controller is told that it
 applied ``u_0 + u − u_unlimited``, so that its integrator does not wind up, whichever of the two
-parts asked for too much. In manual operation, too.
+parts asked for too much. In manual operation, too. While the plant is held (``set_held``) its
+integrator stays as it is (``hold_integrators``): u_0 follows the reference with the rest of the
+law, and the release finds the integrator as the brake has found it.
 
 Where a measurement is missing, both receive the one that the observer expects.
 
@@ -32,17 +34,21 @@ from quell.controllers.base import (
     Limits,
     RateLimit,
     bumpless_transfer,
+    change_parameters,
     check_controller,
     control,
+    hold_integrators,
     is_usable,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
     write_row,
 )
 from quell.controllers.compensator import Compensator, manual_operation
+from quell.controllers.held import rests_at_y
 from quell.controllers.law import AdrcDesign, AdrcState, known_now, unlimited_control
 from quell.controllers.prefilters import Wrapper, without_prefilters
 from quell.controllers.schedule import control_as_observed
@@ -90,6 +96,9 @@ def _control(design: CompensatedDesign, state: CompensatedState, r: float, y: fl
         measured = expected_measurement(eso, z, observed, known)
     given = control(design.controller, state.controller, r, measured)
     u = control(design.compensator, state.compensator, given, y)
+    if inner.held != 0.0:
+        hold_integrators(design.controller, state.controller, loop.u_given)
+        return u
     loop.u_given = given
     if int(inner.status) & _CUT != 0 or inner.manual != 0.0:
         wished = unlimited_control(
@@ -115,6 +124,11 @@ def _set_schedule_signals(
     set_schedule_signals(design.compensator, state.compensator, values)
 
 
+@set_held.register(CompensatedDesign)
+def _set_held(design: CompensatedDesign, state: CompensatedState, held: bool) -> None:
+    set_held(design.compensator, state.compensator, held)
+
+
 @write_row.register(CompensatedDesign)
 def _write_row(design: CompensatedDesign, state: CompensatedState, row: Vector) -> None:
     row[0] = state.compensator.loop[0].r
@@ -136,9 +150,10 @@ def _reset_loop(design: CompensatedDesign, state: CompensatedState) -> None:
 
 @set_applied_control.register(CompensatedDesign)
 def _set_applied_control(design: CompensatedDesign, state: CompensatedState, u: float) -> None:
-    loop = state.loop[0]
-    loop.u_given += u - state.compensator.loop[0].u
-    set_applied_control(design.controller, state.controller, loop.u_given)
+    loop, inner = state.loop[0], state.compensator.loop[0]
+    if inner.held == 0.0:
+        loop.u_given += u - inner.u
+        set_applied_control(design.controller, state.controller, loop.u_given)
     set_applied_control(design.compensator, state.compensator, u)
 
 
@@ -148,10 +163,29 @@ def _bumpless_transfer(design: CompensatedDesign, state: CompensatedState) -> No
     bumpless_transfer(design.compensator, state.compensator)
 
 
+@change_parameters.register(CompensatedDesign)
+def _change_parameters(
+    old: CompensatedDesign, new: CompensatedDesign, state: CompensatedState
+) -> None:
+    change_parameters(old.controller, new.controller, state.controller)
+    change_parameters(old.compensator, new.compensator, state.compensator)
+
+
 def compensating_part(controller: Any) -> Compensator | None:
     """Return the part of a controller with the observer: itself, or its compensator; else None."""
     part = controller.compensator if isinstance(controller, Compensated) else controller
     return part if isinstance(part, Compensator) else None
+
+
+def can_be_held(controller: Any) -> bool:
+    """Return whether ``set_held`` has an effect: whether an observer in it knows the plant's rest.
+
+    The controller may be behind a prefilter, or in single precision.
+    """
+    while controller is not None and not isinstance(controller, Compensator):
+        inner = getattr(controller, "compensator", None)
+        controller = inner or getattr(controller, "controller", None)
+    return controller is not None and rests_at_y(controller.observer)
 
 
 def takes_control(controller: Any) -> bool:
@@ -264,6 +298,13 @@ class Compensated(Wrapper):
     @property
     def _inner(self) -> Compensator:
         return self.compensator
+
+    @property
+    def _retuned_part(self) -> Any:
+        return self.compensator
+
+    def _with_part(self, new: Any) -> Any:
+        return self.parameters._replace(compensator=new)
 
     @property
     def external_signals(self) -> int:

@@ -39,12 +39,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import RateLimit, checked_limits, reset_loop
+from quell.controllers.base import RateLimit, change_parameters, checked_limits, reset_loop
 from quell.controllers.held import HeldPlant, NoHeldMemory, NoHeldPlant, check_rest, look_anew
 from quell.controllers.law import (
     AdrcDesign,
@@ -70,12 +72,14 @@ from quell.controllers.schedule import (
     NoScheduleMemory,
     Point,
     Schedule,
+    ScheduleDesign,
     checked_schedule,
     gain_in_use,
+    known_of_model,
     set_signal,
     with_gains,
 )
-from quell.controllers.stateful import PackedController, StatefulController, unpacked
+from quell.controllers.stateful import Retuning, StatefulController
 from quell.guard import (
     GUARD_CHANNELS,
     Guard,
@@ -85,15 +89,10 @@ from quell.guard import (
     limit,
     write_channels,
 )
-from quell.kernels import dispatch
 from quell.kernels.dispatch import (
     call_specialised,
     compiled,
-    compiled_call,
-    dispatcher_for,
-    kernel,
 )
-from quell.kernels.sized import layout_of
 from quell.learners.base import (
     NO_LAG,
     Learner,
@@ -134,7 +133,7 @@ class Estimate(NamedTuple):
     f_residual: float
     """The observer's share, Δf̂."""
     theta: dict[str, float]
-    """The learner's coefficients by feature."""
+    """The learner's coefficients by feature; with a table of b0 those for the observer's b0."""
     u: float
     """The applied control signal."""
     status: Status
@@ -142,7 +141,10 @@ class Estimate(NamedTuple):
     authority: float = 1.0
     """Share of its output that the guard allows the learner."""
     error_plain: float = math.nan
-    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n]."""
+    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n].
+
+    With a table of b0 it is for the observer's b0, as ``error_learned``.
+    """
     error_learned: float = math.nan
     """The same for the learner with full authority."""
     reason: Reason = Reason.TRUSTED
@@ -262,7 +264,7 @@ def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
         state.loop[0].manual = 0.0
 
 
-@kernel
+@change_parameters.register(AdrcDesign)
 def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     """Convert a running state to new parameters, without a jump of u."""
     loop, size = state.loop[0], new.law.size
@@ -280,28 +282,15 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
         change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
     shift_f(new.safe_set, state.safe_set, change)
     # The model's share of f depends on them, too, and is not in the estimate.
-    known = known_share(new.feedforward, loop.r, state.reference)
+    known = known_of_model(
+        new.schedule, memory, new.feedforward, loop.r, state.reference, new.b0,
+        known_share(new.feedforward, loop.r, state.reference),
+    )  # fmt: skip
     change -= known - loop.f_known
     loop.f_known = known
     state.z[size] += change
     state.seen[size] += change
     loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)
-
-
-@compiled_call
-def change_packed(old: Any, new: Any) -> None:
-    """Convert a running state, see ``change_design``; both are packed with that state."""
-    before, state = unpacked(old)
-    after, _ = unpacked(new)
-    change_design(before, after, state)
-
-
-def changing(dispatcher: Any, packed: PackedController) -> Callable[[Any, Any], None]:
-    """Return the compiled function of ``dispatcher`` for controllers of one type."""
-    if dispatch.interpret_all:
-        return lambda old, new: change_design(old.arrays[0], *new.arrays)
-    compiled: Callable[[Any, Any], None] = dispatcher.compile((packed.type, packed.type))
-    return compiled
 
 
 def check_replacement(old: ESO, new: Any, learns: bool) -> None:
@@ -521,7 +510,10 @@ class Compensator(StatefulController):
     def _safe_set_design(self, observer: ESO) -> Any:
         if self.safe_set is None:
             return NoSafeSet()
-        return self.safe_set.design(observer, self._limits)
+        ratio = 1.0
+        if isinstance(self.schedule, Schedule):
+            ratio = self.schedule.largest_ratio(observer)
+        return self.safe_set.design(observer, self._limits, ratio)
 
     def _check_schedule(self) -> None:
         """Raise a ``ValueError`` for parts that are made for one b0 or one omega_o."""
@@ -529,22 +521,47 @@ class Compensator(StatefulController):
             return
         parts = {"learner": self._learns, "safe_set": self.safe_set is not None}
         parts["held"] = self.held is not None
-        if self.schedule.b0 is not None and any(parts.values()):
-            part = next(name for name, is_there in parts.items() if is_there)
+        part = next((name for name, is_there in parts.items() if is_there), None)
+        if self.schedule.b0 is not None and part is not None:
+            if not isinstance(self.schedule, Schedule):
+                raise ValueError(
+                    f"schedule = {self.schedule!r} with {part}: it changes b0 where the machine "
+                    f"does not change, so what the {part.replace('_', ' ')} knows of f would be "
+                    "wrong; take a table over a signal (Schedule), or leave one of them out"
+                )
+            if np.any(self.observer.cancel != 0.0):
+                raise ValueError(
+                    f"schedule.b0 with {part}: the observer has a model with a = "
+                    f"{self.observer.cancel.tolist()}, which follows the inertia, too, and does "
+                    "not follow a table of b0; take ESO.model_free"
+                )
+        if self.schedule.b0 is not None and getattr(self.guard, "certified_for", None) is not None:
             raise ValueError(
-                f"schedule.b0 with {part}: what the {part.replace('_', ' ')} knows refers to one "
-                "b0, in whose units f is; schedule omega_c only, or leave one of them out"
+                "schedule.b0 with a guard that is certified_for a plant: the bound is that of one "
+                "b0; give Guard() without it"
             )
         if self.schedule.omega_o is not None and self._learns:
             raise ValueError(
-                "schedule.omega_o with learner: a learner and its guard reckon with the lag of one "
-                "omega_o; schedule omega_c only, or leave one of them out"
+                "schedule.omega_o with learner: each feature is filtered with the observer's lag, "
+                "and a change of omega_o changes the filter under what is in it, so the learner "
+                "would take the change for one of the plant; schedule b0 and omega_c only"
             )
 
     def _schedule_design(self, observer: ESO) -> Any:
         if self.schedule is None:
             return NoSchedule()
-        return self.schedule.design(observer, self.omega_c, None)
+        schedule = self._with_parts(self.schedule.design(observer, self.omega_c, None), observer)
+        return schedule._replace(fixed=np.ones(1) if schedule.has_b0 else np.zeros(0))  # u_0
+
+    def _with_parts(self, schedule: Any, observer: ESO) -> Any:
+        """Return parameters of a schedule with what the other parts of the controller need."""
+        if not isinstance(schedule, ScheduleDesign) or not schedule.has_b0:
+            return schedule
+        return schedule._replace(
+            extended=observer.disturbance_order if self._learns else 0,
+            has_safe_set=self.safe_set is not None,
+            has_held=self.held is not None,
+        )
 
     @property
     def gain_estimate(self) -> Any:
@@ -591,9 +608,16 @@ class Compensator(StatefulController):
         found = self.schedule.at(values, base)
         made = type(self).__new__(type(self))
         vars(made).update(vars(self), schedule=None, omega_c=found.omega_c)
+        ratio = found.b0 / self.observer.b0
         made.observer = with_gains(self.observer, found.b0, found.omega_o)
+        if self.safe_set is not None:  # its f_rate is that of the observer's b0
+            made.safe_set = replace(self.safe_set, f_rate=ratio * self.safe_set.f_rate)
+        made._take_inertia(1.0 / ratio)
         made._initialise()
         return made
+
+    def _take_inertia(self, ratio: float) -> None:
+        """Convert what depends on the inertia to ``ratio`` times as much: nothing here."""
 
     def set_limits(
         self,
@@ -724,7 +748,8 @@ class Compensator(StatefulController):
             estimates x̂ (n,), y and its derivatives; see ``observer.states_of`` if there are zeros.
         f
             total disturbance [y-unit/s^n]; for an observer with more extended states also a list
-            of f, f', … [y-unit/s^(n+j)], the missing ones zero.
+            of f, f', … [y-unit/s^(n+j)], the missing ones zero. With a table of b0 it is the one
+            for the observer's b0.
         u
             control signal applied until the next step [u-unit]; a delayed one has the same past.
         r
@@ -794,55 +819,29 @@ class Compensator(StatefulController):
         observer
             new observer of the same order, form, structure and sample time.
         """
-        self._check_observer(observer)
-        self._change_to(self._design(observer), compiles=False, observer=observer)()
+        self._change_to(partial(self._retuning, observer=observer), compiles=False)()
 
     def prepare_retune(self, *, observer: ESO) -> Callable[[], None]:
         """Return a function that does what ``retune`` does, in a step's time.
 
         As ``ADRC.prepare_retune``.
         """
-        self._check_observer(observer)
-        return self._change_to(self._design(observer), compiles=True, observer=observer)
+        return self._change_to(partial(self._retuning, observer=observer), compiles=True)
 
-    def _check_observer(self, observer: Any) -> None:
-        """Check that an observer can replace the present one while running."""
+    def _retuning(self, *, omega_c: float | None = None, observer: ESO | None = None) -> Retuning:
+        """Return the parameters with another observer, and what sets the attributes for them."""
+        if omega_c is not None or observer is None:
+            rule = "a compensator has no law; give another observer"
+            raise ValueError(f"omega_c = {omega_c!r}: {rule}")
         check_replacement(self.observer, observer, self._learns)
         if self.schedule is not None:
             self.schedule.check_retuning(self.observer, observer, False)
+        return self._retuning_to(self._design(observer), observer=observer)
 
-    def _change_to(self, new: AdrcDesign, compiles: bool, **named: Any) -> Callable[[], None]:
-        """Return a function that changes to other parameters and sets the attributes named.
-
-        If it ``compiles``, the parameters are packed and the change is compiled beforehand.
-        """
+    def _retuning_to(self, new: AdrcDesign, **named: Any) -> Retuning:
+        """Return parameters, and what sets the attributes ``named``; check their structure."""
         check_structure(self.parameters, new)
-        ready: PackedController | None = None
-        change: Any = None
-        if compiles:
-            if self._packed is None:
-                self.prepare()
-            if layout_of(new) == layout_of(self.parameters):
-                ready = PackedController(new, self._state, self._packed)
-                change = changing(dispatcher_for(change_packed, new), ready)
-
-        def apply() -> None:
-            old, packed = self.parameters, self._packed
-            vars(self).update(named)
-            if (
-                ready is not None
-                and packed is not None
-                and packed.arrays[1] is ready.arrays[1]
-                and old.limits is new.limits
-            ):
-                change(packed, ready)
-                self.parameters, self._packed = new, ready
-                return
-            self.parameters = new._replace(limits=old.limits)
-            change_design(old, self.parameters, self._state)
-            self._pack_again()
-
-        return apply
+        return Retuning(new, partial(vars(self).update, named))
 
     @property
     def _external_fields(self) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ that acts then; an observer that knows the delay gets the one of the same time.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -63,7 +63,8 @@ class Feedforward:
     """The feedforward of a model of the plant, for ``ADRC(..., feedforward=...)``.
 
     ``rigid`` makes it from an inertia, ``of`` from a linear or identified plant. It does not depend
-    on b0, and the observer knows it. The docstring of this module has the equations.
+    on b0, and the observer knows it; with a table of b0 the inertia is that for the observer's b0,
+    and follows 1/b0. The docstring of this module has the equations.
 
     Parameters
     ----------
@@ -219,6 +220,23 @@ class Feedforward:
         given = np.asarray(self.coefficients, dtype=np.float64)[: found.size]
         found[: given.size] = given
         return found
+
+    def fixed(self, observer: ESO) -> tuple[Vector, Vector]:
+        """Return the coefficients of forces that stay where b0 follows the inertia, (m + 1,) each.
+
+        They are those below r^(n), for the time when u acts and for the u that acts in the sample;
+        see ``controllers/schedule.py``.
+        """
+        model = self.design(observer)
+        own = self.series(model.control.size - 1)
+        own[observer.degree :] = 0.0
+        return shifted(own, model.lead), shifted(own, model.lead_acting)
+
+    def with_inertia(self, ratio: float, degree: int) -> Feedforward:
+        """Return it for ``ratio`` times the inertia of a plant of relative degree ``degree``."""
+        own = self.coefficients
+        heavier = tuple(ratio * c if i >= degree else c for i, c in enumerate(own))
+        return replace(self, coefficients=heavier)
 
     def linear_part(self, reference: Signal, t: Vector, dt: float) -> Vector:
         """Return u_ff without friction and constant at times (k,) [s], of a sampled controller.

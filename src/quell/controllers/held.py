@@ -32,8 +32,8 @@ that there is a brake. So learner and guard go on meanwhile: on the twin of EMPS
 (``benchmarks/stiction.py``), a ``Kalman`` that waited in all of these moments erred 2.4 times as
 much along a slow sinusoid.
 
-What can not be seen: a stop that gives by more than a count, noise that is not white and not known
-(``HeldPlant(noise=…)``), and what a u at its limit has done before y left the band.
+What can not be detected: a stop that gives by more than a count, noise that is not white and not
+known (``HeldPlant(noise=…)``), and what a u at its limit has done before y left the band.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _LEAST, _LEAST_FARTHER = 0.6, 0.35
 # less from sample to sample.
 _MOST = 4.0
 
-# Columns of the windows.
+# Columns of the windows; those from ``_CHANGED`` on are an f.
 _SAMPLES, _LOW, _HIGH, _Y, _STEPS, _MOVED, _CHANGED, _FIRST, _BEFORE = range(9)
 _COLUMNS = 9
 
@@ -129,7 +129,7 @@ class HeldMemory(NamedTuple):
     predicted: Vector  # state of a plant that is free since the band was left (n,)
     moved: Vector  # work space (n,)
     z: Vector  # state of an observer that rests with the f̂ of before until then
-    seen: Vector  # its estimates
+    estimates: Vector  # of the observer
     loop: NDArray[HeldLoop]  # (1,)
 
 
@@ -162,7 +162,7 @@ def f_before(design: Any, memory: Any) -> float:
 
 
 @generic_with_default
-def take_motion(design: Any, memory: Any, z: Vector, seen: Vector) -> None:
+def take_motion(design: Any, memory: Any, z: Vector, estimates: Vector) -> None:
     """Set the loop's observer to the estimates of a plant that was released."""
 
 
@@ -179,7 +179,12 @@ def miss(design: Any, memory: Any) -> None:
 
 @generic_with_default
 def look_anew(design: Any, memory: Any) -> None:
-    """Forget what was seen; what the sensor resolves is kept."""
+    """Forget the motion so far; what the sensor resolves is kept."""
+
+
+@generic_with_default
+def scale_loads(design: Any, memory: Any, ratio: float) -> None:
+    """Multiply all that is known of f: the loads stay, and the inertia has changed."""
 
 
 @kernel
@@ -341,9 +346,9 @@ def _follow(
     if abs(y - loop.centre) <= loop.band:
         for i in range(z.size):
             memory.z[i] = z[i]
-        begin_with(eso, memory.z, memory.seen, loop.centre, design.input.size, residual)
+        begin_with(eso, memory.z, memory.estimates, loop.centre, design.input.size, residual)
     else:
-        observe(eso, memory.z, memory.seen, y, u, fed)
+        observe(eso, memory.z, memory.estimates, y, u, fed)
 
 
 @f_before.register(HeldDesign)
@@ -352,11 +357,24 @@ def _f_before(design: HeldDesign, memory: HeldMemory) -> float:
 
 
 @take_motion.register(HeldDesign)
-def _take_motion(design: HeldDesign, memory: HeldMemory, z: Vector, seen: Vector) -> None:
+def _take_motion(design: HeldDesign, memory: HeldMemory, z: Vector, estimates: Vector) -> None:
     for i in range(z.size):
         z[i] = memory.z[i]
-    for i in range(seen.size):
-        seen[i] = memory.seen[i]
+    for i in range(estimates.size):
+        estimates[i] = memory.estimates[i]
+
+
+@scale_loads.register(HeldDesign)
+def _scale_loads(design: HeldDesign, memory: HeldMemory, ratio: float) -> None:
+    memory.loop[0].f *= ratio
+    memory.loop[0].peak *= ratio
+    for i in range(design.lengths.size):
+        for j in range(_CHANGED, _COLUMNS):
+            memory.windows[i, j] *= ratio
+    for i in range(design.input.size, memory.estimates.size):
+        change = (ratio - 1.0) * memory.estimates[i]
+        memory.estimates[i] += change
+        memory.z[i] += change
 
 
 @held_flag.register(HeldDesign)
@@ -437,7 +455,7 @@ class HeldPlant:
             predicted=np.zeros(n),
             moved=np.zeros(n),
             z=np.zeros(observer.states),
-            seen=np.zeros(observer.estimates),
+            estimates=np.zeros(observer.estimates),
             loop=HeldLoop.zeros(),
         )
 

@@ -54,6 +54,7 @@ from quell.controllers.base import (
     largest_magnitude,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
@@ -76,14 +77,23 @@ from quell.controllers.safe_set import (
     set_motion,
 )
 from quell.controllers.schedule import (
+    at_nominal,
+    at_present,
     control_as_observed,
+    control_at_nominal,
+    fixed_control,
     follow_signals,
     forget_signals,
     gain_in_use,
+    known_of_model,
     known_with_schedule,
+    safe_as_applied,
     scheduled_correction,
     scheduled_law,
     set_signals,
+    show_at_nominal,
+    show_at_present,
+    show_feedforward,
 )
 from quell.guard import (
     assess,
@@ -211,6 +221,21 @@ def control_by_model(feedforward: Any, r: float, reference: Vector) -> float:
 def _control_by_model(feedforward: ModelFeedforward, r: float, reference: Vector) -> float:
     force = _force(feedforward, reference, feedforward.lead)
     return _series(feedforward.control, r, reference) + force
+
+
+@fixed_control.register(ModelFeedforward)
+def _fixed_control(
+    feedforward: ModelFeedforward, coefficients: Vector, r: float, reference: Vector, acting: bool
+) -> float:
+    lead = feedforward.lead_acting if acting else feedforward.lead
+    return _series(coefficients, r, reference) + _force(feedforward, reference, lead)
+
+
+@fixed_control.register(ControlGiven)
+def _all_of_it(
+    feedforward: ControlGiven, coefficients: Vector, r: float, reference: Vector, acting: bool
+) -> float:
+    return coefficients[0] * r
 
 
 @generic_with_default
@@ -441,7 +466,10 @@ class AdrcState(NamedTuple):
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop[0], state.seen
     status = hold_last_good(loop, r, y)
-    see(design.safe_set, state.safe_set, y, loop.u)
+    see(
+        design.safe_set, state.safe_set, y,
+        control_at_nominal(design.schedule, state.schedule, loop.u),
+    )  # fmt: skip
     f_plain, continues = 0.0, loop.started != 0.0
     u_acting = acting_control(design.eso, state.z, loop.u)
     if loop.started == 0.0:
@@ -455,7 +483,10 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         if loop.held != 0.0:
             status |= _HELD
         else:
-            is_released(design.held, state.held, loop.y, u_acting, 0.0, 0.0, design.b0)
+            is_released(
+                design.held, state.held, loop.y,
+                control_at_nominal(design.schedule, state.schedule, u_acting), 0.0, 0.0, design.b0,
+            )  # fmt: skip
     else:
         _finish_sample(design, state, u_acting)
         if status & _MEASUREMENT_HELD != 0 and loop.held == 0.0:
@@ -467,18 +498,26 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             if is_usable(y):
                 loop.y = y
         status |= _estimate(design, state, u_acting, status & _MEASUREMENT_HELD == 0)
-        f_plain = seen[design.law.size] + loop.f_learned_shown
+        f_plain = (
+            at_nominal(design.schedule, state.schedule, seen[design.law.size])
+            + loop.f_learned_shown
+        )
         if loop.held == 0.0:
             assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
+            show_at_nominal(design.schedule, state.schedule, seen, design.law.size)
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
+            show_at_present(design.schedule, state.schedule, seen, design.law.size)
             status |= learner_flags(design.learner, state.learner)
     order = design.law.size
     status |= follow_signals(
         design.schedule, state.schedule, loop, state.z, seen, state.reference, order,
-        u_acting, continues,
+        u_acting, continues, design.safe_set, state.safe_set, design.held, state.held,
     )  # fmt: skip
-    loop.f_known = known_share(design.feedforward, loop.r, state.reference)
+    loop.f_known = known_of_model(
+        design.schedule, state.schedule, design.feedforward, loop.r, state.reference, design.b0,
+        known_share(design.feedforward, loop.r, state.reference),
+    )  # fmt: skip
     constant, slope = predict(design.learner, state.learner, seen, u_acting)
     output = constant + slope * u_acting
     constant, slope, was_cut = limit(
@@ -513,7 +552,13 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             loop.offset = 0.0
         unlimited += loop.offset
         loop.offset = loop.offset * design.fade if abs(loop.offset) > smallest else 0.0
-    safe, changed = nearest_safe(design.safe_set, state.safe_set, unlimited)
+    safe, changed = nearest_safe(
+        design.safe_set, state.safe_set,
+        control_at_nominal(design.schedule, state.schedule, unlimited),
+    )  # fmt: skip
+    safe = safe_as_applied(
+        design.schedule, state.schedule, safe, unlimited, design.safe_set, state.safe_set
+    )
     u, cut = apply_limits(design.limits, safe, loop.u)
     cut |= changed
     loop.u_limited = u
@@ -524,14 +569,21 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop.u = u
     status |= flags_of_applied(design.safe_set, state.safe_set, u)
     loop.constant, loop.slope = constant, slope
-    loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
+    loop.f_learned = at_present(
+        design.schedule, state.schedule, constant + slope * acting_control(design.eso, state.z, u)
+    )
     if design.learns and status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
         excessive = is_excessive(unlimited, u, smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
         lost = has_escaped(watch, output, excessive) or has_lost_range(
             watch, design.window, loop.y, f_plain, output, excessive, limited
         )
-        if design.forgets and does_harm(watch, design.window, seen[design.law.size], f_plain):
+        if design.forgets and does_harm(
+            watch,
+            design.window,
+            at_nominal(design.schedule, state.schedule, seen[design.law.size]),
+            f_plain,
+        ):
             lost = True
         if lost:
             status |= _OVERFLOWED
@@ -556,11 +608,19 @@ def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured
         return _HELD
     if is_measured:
         # A learner's share that follows u is right for any u.
-        known = fed - loop.slope * u_acting
+        known = fed - loop.slope * control_at_nominal(design.schedule, state.schedule, u_acting)
         residual = f_before(design.held, state.held) - known
-        follow(design.held, state.held, design.eso, z, loop.y, loop.u, fed, residual)
+        follow(
+            design.held, state.held, design.eso, z, loop.y,
+            control_as_observed(design.schedule, state.schedule, loop.u),
+            known_with_schedule(design.schedule, state.schedule, fed, design.b0, u_acting),
+            residual,
+        )  # fmt: skip
         f = seen[order] + known
-        if is_released(design.held, state.held, loop.y, u_acting, f, loop.slope, design.b0):
+        if is_released(
+            design.held, state.held, loop.y,
+            control_at_nominal(design.schedule, state.schedule, u_acting), f, loop.slope, design.b0,
+        ):  # fmt: skip
             take_motion(design.held, state.held, z, seen)
             set_motion(design.safe_set, state.safe_set, seen, seen[order] + fed)
     else:
@@ -576,8 +636,8 @@ def _start_learning_again(design: AdrcDesign, state: AdrcState) -> None:
     """
     loop, order = state.loop[0], design.law.size
     if is_in_proportion(state.watch[0], loop.f_learned_shown):
-        state.z[order] += loop.f_learned_shown
-        state.seen[order] += loop.f_learned_shown
+        state.z[order] += at_present(design.schedule, state.schedule, loop.f_learned_shown)
+        state.seen[order] += at_present(design.schedule, state.schedule, loop.f_learned_shown)
     else:
         begin(design.eso, state.z, state.seen, loop.y)
     loop.constant = loop.slope = loop.f_learned = 0.0
@@ -602,7 +662,7 @@ def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> Non
     f_learned = loop.constant + loop.slope * u_acting
     if loop.slope != 0.0:
         f_learned = nearest_permitted(design.guard, state.guard, f_learned)
-    loop.f_learned = f_learned
+    loop.f_learned = at_present(design.schedule, state.schedule, f_learned)
     loop.f_learned_shown = lag_push(design.lag, state.shadow, 0, f_learned)
     commit(design.learner, state.learner, state.seen, u_acting, f_learned)
     record_output(design.guard, state.guard, f_learned)
@@ -624,11 +684,18 @@ def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slo
     unlimited = reference_part(design.feedforward, design.law, r, reference)
     for i in range(order):
         unlimited += (design.cancel[i] - design.law[i]) * seen[i]
-    unlimited -= design.cancel_f * (seen[order] + constant)
+    unlimited -= design.cancel_f * (
+        seen[order] + at_present(design.schedule, state.schedule, constant)
+    )
     unlimited = nonlinear_part(design.feedback, design.law, seen, r, reference, unlimited)
     schedule, memory = design.schedule, state.schedule
-    unlimited = scheduled_law(schedule, memory, seen, r, reference, design.b0, unlimited)
-    return unlimited / (gain_in_use(schedule, memory, design.b0) + design.cancel_f * slope)
+    unlimited = scheduled_law(
+        schedule, memory, design.feedforward, seen, r, reference, design.b0, unlimited
+    )
+    return unlimited / (
+        gain_in_use(schedule, memory, design.b0)
+        + design.cancel_f * at_present(schedule, memory, slope)
+    )
 
 
 @kernel
@@ -652,6 +719,11 @@ def _set_schedule_signals(design: AdrcDesign, state: AdrcState, values: Vector) 
     set_signals(design.schedule, state.schedule, values, -1)
 
 
+@set_held.register(AdrcDesign)
+def _set_held(design: AdrcDesign, state: AdrcState, held: bool) -> None:
+    state.loop[0].held = 1.0 if held else 0.0
+
+
 @write_row.register(AdrcDesign)
 def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
     order = design.law.size
@@ -664,6 +736,7 @@ def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
         row[i + 2] = state.seen[i]
     r, reference = state.loop[0].r, state.reference
     forward = write_feedforward(design.feedforward, r, reference, row[after:])
+    show_feedforward(design.schedule, state.schedule, design.feedforward, r, reference, row[after:])
     written = write_channels(design.guard, state.guard, row[after + forward :])
     coefficients(design.learner, state.learner, row[after + forward + written :])
 

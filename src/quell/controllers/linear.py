@@ -32,9 +32,11 @@ from quell.controllers.base import (
     Limits,
     RateLimit,
     apply_limits,
+    change_parameters,
     checked_limits,
     control,
     control_at_rest,
+    hold_integrators,
     hold_last_good,
     is_usable_control,
     largest_wish,
@@ -44,8 +46,8 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.stateful import StatefulController
-from quell.kernels.dispatch import generic, kernel
-from quell.kernels.sized import Scalars, clear
+from quell.kernels.dispatch import generic, generic_with_default, kernel
+from quell.kernels.sized import Scalars, Size, clear
 from quell.lti.models import zero_order_hold
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -93,6 +95,13 @@ def _advance(law: LinearLaw, x: Vector, work: Vector, r: float, y: float, u: flo
         x[i] = work[i]
 
 
+@generic_with_default
+def correct_state(law: Any, x: Vector, work: Vector, change: float) -> None:
+    """Add ``B_u change`` to the state ``x`` (m,), as a change of the applied u."""
+    for i in range(x.size):
+        x[i] += law.B_u[i] * change
+
+
 def checked_law(law: Any) -> LinearLaw:
     """Return the law with checked, contiguous arrays that can't be written to."""
     if not isinstance(law, LinearLaw):
@@ -126,6 +135,26 @@ def rest_state(law: LinearLaw, y: float = 1.0, u: float = 0.0) -> Vector:
     if output @ output > 0.0:
         x = x - free.T @ output * ((law.C @ x + D * y - u) / (output @ output))
     return np.ascontiguousarray(x)
+
+
+def held_integrator(law: LinearLaw) -> tuple[int, Vector]:
+    """Return the number of modes of a law that do not decay, and the share of r and y in one (2,).
+
+    With the left eigenvector w of ``A + B_u C`` at one, scaled to ``w B_u = 1``, w x is what the
+    integrator holds, and a sample adds ``w (B_r + B_u D_r) r + w (B_y + B_u D_y) y`` to it. With
+    several modes, or one that B_u does not reach, the share is zero and the number at least two.
+    """
+    nothing = np.zeros(2)
+    values, vectors = np.linalg.eig((law.A + np.outer(law.B_u, law.C)).T)
+    marginal = np.flatnonzero(np.abs(values) > 1.0 - _MARGINAL)
+    if marginal.size != 1:
+        return marginal.size, nothing
+    w = np.real(vectors[:, marginal[0]])
+    reach = float(w @ law.B_u)
+    if abs(values[marginal[0]] - 1.0) > _RANK or abs(reach) <= _RANK * np.linalg.norm(law.B_u):
+        return 2, nothing
+    w = w / reach
+    return 1, np.array([w @ law.B_r + law.D_r, w @ law.B_y + law.D_y])
 
 
 # ---- A sampled linear law from a transfer function in s ----
@@ -325,6 +354,8 @@ class LinearDesign(NamedTuple):
     law: Any  # a LinearLaw or DeltaLaw
     start: Vector  # initial state for y = 1 (m,), see ``rest_state``
     limits: Limits
+    integrators: Size  # modes that do not decay
+    integrated: Vector  # what a sample adds to the only one for r = 1 and y = 1 (2,)
 
 
 class LinearLoop(Scalars):
@@ -414,6 +445,21 @@ def _set_applied_control(design: LinearDesign, state: LinearState, u: float) -> 
     for i in range(state.x.size):
         state.x[i] += design.law.B_u[i] * correction
     state.loop[0].u = u
+
+
+@hold_integrators.register(LinearDesign)
+def _hold_integrators(design: LinearDesign, state: LinearState, u_before: float) -> None:
+    loop = state.loop[0]
+    if design.integrators == 1:
+        added = design.integrated[0] * loop.r + design.integrated[1] * loop.y
+        correct_state(design.law, state.x, state.next, loop.u_unlimited - loop.u - added)
+    elif design.integrators > 1:
+        set_applied_control(design, state, u_before)
+
+
+@change_parameters.register(LinearDesign)
+def _keep_state(old: LinearDesign, new: LinearDesign, state: LinearState) -> None:
+    """Change nothing: the state of a linear law has the same meaning with other limits."""
 
 
 class LinearController(StatefulController):
@@ -528,7 +574,8 @@ class LinearController(StatefulController):
         return LinearController(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
 
     def _update_parameters(self) -> None:
-        self.parameters = LinearDesign(self.law, rest_state(self.law), self._limits)
+        rest, limits = rest_state(self.law), self._limits
+        self.parameters = LinearDesign(self.law, rest, limits, *held_integrator(self.law))
 
     def initial_state(self) -> LinearState:
         """Return a state before the first sample."""
@@ -597,6 +644,14 @@ def _advance_delta(law: DeltaLaw, x: Vector, work: Vector, r: float, y: float, u
         work[i] = total
     for i in range(x.size):
         before, increment = x[i], work[i]
+        x[i] = before + increment
+        work[i] = increment - (x[i] - before)
+
+
+@correct_state.register(DeltaLaw)
+def _correct_delta(law: DeltaLaw, x: Vector, work: Vector, change: float) -> None:
+    for i in range(x.size):
+        before, increment = x[i], work[i] + law.B_u[i] * change
         x[i] = before + increment
         work[i] = increment - (x[i] - before)
 

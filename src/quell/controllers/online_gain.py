@@ -158,7 +158,8 @@ def _moves(design: OnlineDesign, own: Any, energy: float) -> bool:
 @follow_signals.register(OnlineDesign)
 def _follow(
     design: OnlineDesign, memory: OnlineMemory, loop: Any, z: Vector, seen: Vector,
-    reference: Vector, at_f: int, u: float, continues: bool,
+    reference: Vector, at_f: int, u: float, continues: bool, safe_set: Any, set_memory: Any,
+    held: Any, held_memory: Any,
 ) -> int:  # fmt: skip
     own = memory.loop[0]
     if own.found == 0.0:
@@ -249,7 +250,8 @@ class OnlineGain:
     """b0 that follows an estimate from the reference's motion, for ``ADRC(…, schedule=…)``.
 
     The module's docstring has the equations. It is off unless it is given. For a plant of order 1
-    or 2 without zeros, whose reference moves; not together with a learner, which refers to one b0.
+    or 2 without zeros, whose reference moves; not together with a learner, to whom each step of b0
+    is a change of f.
 
     Parameters
     ----------

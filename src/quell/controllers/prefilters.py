@@ -37,8 +37,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -50,18 +51,20 @@ from quell.controllers.base import (
     Limits,
     RateLimit,
     bumpless_transfer,
+    change_parameters,
     check_controller,
     control,
     is_usable,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
     write_row,
 )
 from quell.controllers.compensator import Compensator, manual_operation
-from quell.controllers.stateful import StatefulController
+from quell.controllers.stateful import Retuning, StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.functions import copysign, sqrt
 from quell.kernels.sized import Scalars, clear
@@ -180,9 +183,45 @@ class Wrapper(StatefulController):
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, see ``ADRC.retune``."""
+        self._change_to(self._retuned(omega_c, observer), compiles=False)()
+
+    def prepare_retune(
+        self, *, omega_c: float | None = None, observer: ESO | None = None
+    ) -> Callable[[], None]:
+        """Return a function that does what ``retune`` does, see ``ADRC.prepare_retune``."""
+        return self._change_to(self._retuned(omega_c, observer), compiles=True)
+
+    def _retuned(self, omega_c: float | None, observer: ESO | None) -> Callable[[], Retuning]:
+        """Return a function that designs the parameters with other bandwidths."""
+        self._check_inner()
         given = {"omega_c": omega_c, "observer": observer}
-        self._inner.retune(**{name: value for name, value in given.items() if value is not None})
-        self._take_parameters()
+        return partial(
+            self._retuning, **{name: value for name, value in given.items() if value is not None}
+        )
+
+    def _check_inner(self) -> None:
+        """Raise a ``ValueError`` if the controller has no methods for hand-over and retuning."""
+        _ = self._inner
+
+    def _retuning(self, **given: Any) -> Retuning:
+        """Return the parameters with other bandwidths, and what sets the attributes for them."""
+        inner = self._retuned_part
+        new, take = inner._retuning(**given)
+
+        def take_all() -> None:
+            take()
+            inner.parameters, inner._packed = new, None
+
+        return Retuning(self._with_part(new), take_all)
+
+    @property
+    def _retuned_part(self) -> Any:
+        """The controller in this one whose bandwidths change."""
+        return self.controller
+
+    def _with_part(self, new: Any) -> Any:
+        """Return the parameters with others of the part whose bandwidths change."""
+        return self.parameters._replace(controller=new)
 
     @property
     def estimate(self) -> Any:
@@ -299,6 +338,11 @@ def _set_schedule_signals(
     set_schedule_signals(design.controller, state.controller, values)
 
 
+@set_held.register(PrefilteredDesign)
+def _set_held(design: PrefilteredDesign, state: PrefilteredState, held: bool) -> None:
+    set_held(design.controller, state.controller, held)
+
+
 @write_row.register(PrefilteredDesign)
 def _write_row(design: PrefilteredDesign, state: PrefilteredState, row: Vector) -> None:
     row[0] = state.loop[0].r_shaped
@@ -324,6 +368,13 @@ def _set_applied_control(design: PrefilteredDesign, state: PrefilteredState, u: 
 @bumpless_transfer.register(PrefilteredDesign)
 def _bumpless_transfer(design: PrefilteredDesign, state: PrefilteredState) -> None:
     bumpless_transfer(design.controller, state.controller)
+
+
+@change_parameters.register(PrefilteredDesign)
+def _change_parameters(
+    old: PrefilteredDesign, new: PrefilteredDesign, state: PrefilteredState
+) -> None:
+    change_parameters(old.controller, new.controller, state.controller)
 
 
 class Prefiltered(Wrapper):

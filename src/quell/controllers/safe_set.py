@@ -125,7 +125,7 @@ class SafeSetMemory(NamedTuple):
     """State of a safe set."""
 
     z: Vector  # state of the observer without learner (n + 1,)
-    seen: Vector  # its estimates (n + 1,)
+    estimates: Vector  # of the observer (n + 1,)
     loop: NDArray[SafeSetLoop]  # (1,)
 
 
@@ -156,7 +156,7 @@ def _see(design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float) -> No
     loop = memory.loop[0]
     if loop.started == 0.0:
         if is_usable(y):
-            begin(design.eso, memory.z, memory.seen, y)
+            begin(design.eso, memory.z, memory.estimates, y)
             loop.started = 1.0
         return
     expected = expected_measurement(design.eso, memory.z, u, 0.0)
@@ -167,17 +167,17 @@ def _see(design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float) -> No
         loop.samples += 1.0
     elif not abs(y - expected) <= design.surprise + _ROUNDING * abs(y):
         loop.surprised = 1.0
-    observe(design.eso, memory.z, memory.seen, y, u, 0.0)
-    if not is_finite(memory.seen[memory.seen.size - 1]):
+    observe(design.eso, memory.z, memory.estimates, y, u, 0.0)
+    if not is_finite(memory.estimates[memory.estimates.size - 1]):
         loop.started = loop.samples = 0.0
 
 
 @kernel
-def _bounds(band: Band, seen: Vector, low: float, high: float) -> tuple[float, float]:
+def _bounds(band: Band, estimates: Vector, low: float, high: float) -> tuple[float, float]:
     """Return the bounds of u within ``low`` … ``high`` that a band leaves, or its nearest ones."""
-    rest = band.f * seen[band.state.size]
+    rest = band.f * estimates[band.state.size]
     for i in range(band.state.size):
-        rest += band.state[i] * seen[i]
+        rest += band.state[i] * estimates[i]
     lowest = band.border * band.low - rest + band.margin
     highest = band.border * band.high - rest - band.margin
     if band.border < 0.0:
@@ -193,8 +193,8 @@ def _nearest_safe(design: SafeSetDesign, memory: SafeSetMemory, u: float) -> tup
     loop = memory.loop[0]
     if loop.started == 0.0:
         return u, 0
-    loop.low, loop.high = _bounds(design.position, memory.seen, -math.inf, math.inf)
-    low, high = _bounds(design.rate, memory.seen, loop.low, loop.high)
+    loop.low, loop.high = _bounds(design.position, memory.estimates, -math.inf, math.inf)
+    low, high = _bounds(design.rate, memory.estimates, loop.low, loop.high)
     safe = min(max(u, low), high)
     return safe, _SAFE_SET_ACTED if safe != u else 0
 
@@ -219,9 +219,33 @@ def shift_f(design: Any, memory: Any, change: float) -> None:
 
 @shift_f.register(SafeSetDesign)
 def _shift_f(design: SafeSetDesign, memory: SafeSetMemory, change: float) -> None:
-    last = memory.seen.size - 1
+    last = memory.estimates.size - 1
     memory.z[last] += change
-    memory.seen[last] += change
+    memory.estimates[last] += change
+
+
+@generic_with_default
+def scale_f(design: Any, memory: Any, ratio: float) -> None:
+    """Multiply the estimate of f: the loads stay, and the inertia has changed."""
+
+
+@scale_f.register(SafeSetDesign)
+def _scale_f(design: SafeSetDesign, memory: SafeSetMemory, ratio: float) -> None:
+    last = memory.estimates.size - 1
+    memory.z[last] *= ratio
+    memory.estimates[last] *= ratio
+
+
+@generic_with_default
+def divide_bounds(design: Any, memory: Any, ratio: float) -> None:
+    """Convert the bounds of ``ratio`` times u, which ``nearest_safe`` found, to those of u."""
+
+
+@divide_bounds.register(SafeSetDesign)
+def _divide_bounds(design: SafeSetDesign, memory: SafeSetMemory, ratio: float) -> None:
+    loop = memory.loop[0]
+    loop.low /= ratio
+    loop.high /= ratio
 
 
 @generic_with_default
@@ -233,9 +257,9 @@ def settle_at_rest(design: Any, memory: Any, y: float, u: float, samples: int) -
 def _settle_at_rest(
     design: SafeSetDesign, memory: SafeSetMemory, y: float, u: float, samples: int
 ) -> None:
-    begin(design.eso, memory.z, memory.seen, y)
+    begin(design.eso, memory.z, memory.estimates, y)
     for _ in range(samples):
-        observe(design.eso, memory.z, memory.seen, y, u, 0.0)
+        observe(design.eso, memory.z, memory.estimates, y, u, 0.0)
     memory.loop[0].started = 1.0
 
 
@@ -246,19 +270,19 @@ def set_motion(design: Any, memory: Any, x: Vector, f: float) -> None:
 
 @set_motion.register(SafeSetDesign)
 def _set_motion(design: SafeSetDesign, memory: SafeSetMemory, x: Vector, f: float) -> None:
-    last = memory.seen.size - 1
-    begin(design.eso, memory.z, memory.seen, x[0])
+    last = memory.estimates.size - 1
+    begin(design.eso, memory.z, memory.estimates, x[0])
     for i in range(1, last):
-        memory.z[i] = memory.seen[i] = x[i]
-    memory.z[last] = memory.seen[last] = f
+        memory.z[i] = memory.estimates[i] = x[i]
+    memory.z[last] = memory.estimates[last] = f
 
 
 def settle_safe_set(design: Any, memory: Any, x: Vector, f: float) -> None:
     """Set the observer of a safe set to given estimates, for a plant that is known there."""
     if isinstance(design, SafeSetDesign):
-        size = memory.seen.size
-        memory.seen[:] = np.append(x, f)
-        memory.z[:size], memory.z[size:] = memory.seen, 0.0
+        size = memory.estimates.size
+        memory.estimates[:] = np.append(x, f)
+        memory.z[:size], memory.z[size:] = memory.estimates, 0.0
         memory.loop[0].started = 1.0
 
 
@@ -280,7 +304,8 @@ class SafeSet:
         actuator.
     f_rate
         largest ``|f'|`` of the total disturbance [y-unit/s^(n+1)], of a plant with the observer's
-        b0. It says how wrong the estimate of f may be, and so how wide the margin is.
+        b0. It says how wrong the estimate of f may be, and so how wide the margin is. With a table
+        of b0 the margin is that of its largest one.
     noise
         largest error of the measurement [y-unit], half a step of an encoder for instance.
     gain_error
@@ -325,8 +350,12 @@ class SafeSet:
             rule = "must be below 1, or the sign of b is not known"
             raise ValueError(f"gain_error = {self.gain_error!r}: {rule}")
 
-    def design(self, observer: ESO, limits: Limits) -> SafeSetDesign:
-        """Return the parameters for an observer and limits of u."""
+    def design(self, observer: ESO, limits: Limits, ratio: float = 1.0) -> SafeSetDesign:
+        """Return the parameters for an observer and limits of u.
+
+        With a schedule b0 is up to ``ratio`` times that of the observer, and so is what f_rate and
+        gain_error do; the bounds are those of b0(σ)/b0 u.
+        """
         model, n = _plain(observer), observer.order
         if self.alpha * observer.dt > 0.5:
             rule = "alpha * dt must be at most 0.5, or u holds for too long before a border"
@@ -337,11 +366,12 @@ class SafeSet:
                 f"gain_error = {self.gain_error!r}: the largest |u| bounds what it does; give "
                 "u_min and u_max"
             )
-        position = self._band(observer, model, n, (self.y_min, self.y_max), largest)
-        rate = self._band(observer, model, n - 1, (self.rate_min, self.rate_max), largest)
+        how = (largest, ratio)
+        position = self._band(observer, model, n, (self.y_min, self.y_max), *how)
+        rate = self._band(observer, model, n - 1, (self.rate_min, self.rate_max), *how)
         # The expected measurement is wrong by C (Φ e + w) + v: the same with c = C, λ = 0 and v.
         first = np.eye(n)[0]
-        surprise = self._largest_error(observer, model, first, 0.0, largest) + self.noise
+        surprise = self._largest_error(observer, model, first, 0.0, *how) + self.noise
         settled = float(round(_SETTLED_LAGS * observer.lag_time / observer.dt))
         return SafeSetDesign(model, position, rate, surprise, settled)
 
@@ -356,7 +386,13 @@ class SafeSet:
         return self.design(observer, limits).position.margin
 
     def _band(
-        self, observer: ESO, model: EsoModel, degree: int, borders: tuple[float, float], most: float
+        self,
+        observer: ESO,
+        model: EsoModel,
+        degree: int,
+        borders: tuple[float, float],
+        most: float,
+        ratio: float,
     ) -> Band:
         """Return the band of the derivative of y that u reaches after ``degree`` integrations."""
         n, dt, (low, high) = observer.order, observer.dt, borders
@@ -371,7 +407,7 @@ class SafeSet:
                 c[n - degree + i] = math.comb(degree - 1, i) * self.alpha ** (degree - 1 - i)
             weight = (1.0 - decay) * self.alpha ** (degree - 1)
         gain = float(c @ control)
-        margin = self._largest_error(observer, model, c, decay, most) / abs(gain)
+        margin = self._largest_error(observer, model, c, decay, most, ratio) / abs(gain)
         state = c @ (phi - decay * np.eye(n)) / gain
         border = weight / gain
         if abs(border) * (high - low) <= 2.0 * margin:
@@ -384,7 +420,7 @@ class SafeSet:
         return Band(low, high, border, state, float(c @ feed) / gain, margin)
 
     def _largest_error(
-        self, observer: ESO, model: EsoModel, c: Vector, decay: float, most: float
+        self, observer: ESO, model: EsoModel, c: Vector, decay: float, most: float, ratio: float
     ) -> float:
         """Return δ: the largest |q| for all signals within their bounds."""
         size, dt = model.gain.size, observer.dt
@@ -397,14 +433,14 @@ class SafeSet:
             """Return the sum of |q| for a pulse that enters the state."""
             return peak_gain(System(N, correction @ entering, row, float(wide @ entering)))
 
-        total = 0.0
-        if self.f_rate > 0.0:
+        total, f_rate = 0.0, ratio * self.f_rate
+        if f_rate > 0.0:
             for node, weight in zip(_NODES, _WEIGHTS, strict=True):
                 moved = _moved_by_f(observer, 0.5 * dt * (1.0 + float(node)))
-                total += _BETWEEN_NODES * 0.5 * dt * float(weight) * self.f_rate * largest(moved)
+                total += _BETWEEN_NODES * 0.5 * dt * float(weight) * f_rate * largest(moved)
         if self.gain_error > 0.0:
             step = np.append(model.feed[:-1], 0.0)
-            total += self.gain_error * abs(observer.b0) * most * largest(step)
+            total += self.gain_error * abs(ratio * observer.b0) * most * largest(step)
         if self.noise > 0.0:
             total += self.noise * peak_gain(System(N, model.gain, row, 0.0))
         return total

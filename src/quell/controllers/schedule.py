@@ -13,17 +13,46 @@ is divided, so that in between they are those of a bandwidth within 1.3 %. The c
 a sample, so the time is constant; after a jump of the signal over many cells it arrives after as
 many samples.
 
-**b0 without a jump of u.** The observer keeps its b0. The difference is a known share of f,
+**b0: a load stays a load.** The observer keeps its b0, b_n. The difference is a known share of f,
 
-    y^(n) = b0(σ) u + f = b0 u + f + (b0(σ) − b0) u
+    y^(n) = b0(σ) u + f = b_n u + f + (b0(σ) − b_n) u
 
 that the observer receives with the applied u, as it receives a learner's, and the law divides by
-b0(σ). f is what b0(σ) u does not explain, so its estimate changes with b0(σ),
+b0(σ). f is what b0(σ) u does not explain: of an inertia with the loads d, in units of u,
+``y^(n) = b0(σ) (u + d)``, it is b0(σ) d. So f changes with b0(σ) and f/b0(σ) does not, and the
+estimate follows in the sample in which b0(σ) changes, with its derivatives if there are some,
 
-    Δf̂ ← Δf̂ + (b0_before − b0_now) u,
+    Δf̂ ← Δf̂ · b0_now/b0_before        (less a·x̂ if the observer has a model)
 
-and the law's u is the same before and after (``change_design`` has the same rule). Under a load at
-rest this is also what the machine does: f = b d, with the load d in units of u.
+At rest, and at constant speed, u is then the same before and after. In an acceleration u_0 it
+changes by ``u_0 (1/b0_now − 1/b0_before)``, which is what another inertia takes. This holds for an
+inertia. Where the actuator's gain changes and the loads do not, they are not constant in units of
+u: divide u by that gain outside of the controller, and b0 is constant.
+
+**A learner, and a guard,** know f for the observer's b0, so that what they learned at one inertia
+is right at another. With ``ρ = b0(σ)/b_n``::
+
+    g = f/ρ,    g_L = h + s u,    f_L = ρ g_L,    u = (u_0 − Δf̂ − ρ h) / (b_n ρ + ρ s)
+
+A gain of the plant that is wrong by a constant factor, ``b = β b0(σ)``, is a constant coefficient
+of u: ``g = b_n (β d + (β − 1) u)``; for f itself it would be (β − 1) b0(σ). The regression of
+``learners/base.py`` stays one without bias: the observer's error, in units of g, obeys the same
+equation as without a schedule, and a term (ρ'/ρ) (Δg − Δĝ) that comes from its own lag error. For
+the g_L that is right, Δg = g − g_L is zero, so is Δĝ = Δf̂/ρ, and
+
+    Δĝ + g_L^F = θ·φ^F        with the filter F of before, however quickly b0 changes.
+
+With the b0 of the moment in place of b_n the target would be ``(ρ g)^F``, and the learner, whose
+features are filtered without ρ, would take each change of the inertia for one of θ. The guard
+compares the same quantities, so its bounds are in units of the load, not of an acceleration.
+
+**omega_o** has no such form: each feature of a learner is filtered with the observer's lag, and a
+table of omega_o changes that filter with what is in it. It is refused with a learner.
+
+**The feedforward of a model** has the inertia of the observer's b0: the terms from r^(n) on follow
+1/b0(σ), the terms below, Coulomb friction and the constant are forces and stay, and f_m, what the
+model knows of f, follows both. **A safe set** has bounds for b0(σ) u in place of b_n u, with a
+margin for the largest b0. **HeldPlant** predicts the motion from ρ u, and keeps the load of before.
 
 **omega_c** adds ``(k(σ) − k)·(r − x̂)`` to the law; the jump that a change of k would make is added
 to u and decays as exp(−omega_c t), as after ``retune``. **omega_o** adds ``(L(σ) − L) e`` to the
@@ -50,6 +79,8 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import is_usable
+from quell.controllers.held import scale_loads
+from quell.controllers.safe_set import divide_bounds, scale_f
 from quell.kernels.dispatch import generic_with_default, kernel
 from quell.kernels.single import add_with_carry
 from quell.kernels.sized import Flag, Scalars, Size
@@ -107,7 +138,12 @@ class ScheduleDesign(NamedTuple):
     is_delayed: Flag  # whether the observer keeps the u that have not acted yet
     law: Size  # m, or zero without a table of omega_c
     gains: Size  # N, or zero without a table of omega_o
-    takes_u: Flag  # whether the reference is a control signal u_0
+    cancel: Vector  # a (n,) of the model that the law cancels
+    fixed: Vector  # c of what is fed forward and does not follow 1/b0, when u acts
+    fixed_acting: Vector  # of a model the same for the u that the observer receives in this sample
+    extended: Size  # m of the observer if there are b0 and a learner, else 0
+    has_safe_set: Flag  # beside b0
+    has_held: Flag  # whether there are b0 and a detection of holds
 
 
 class ScheduleLoop(Scalars):
@@ -132,6 +168,7 @@ class ScheduleMemory(NamedTuple):
     first: NDArray[AxisLoop]  # (1,)
     second: NDArray[AxisLoop]  # (1,)
     values: Vector  # k − k_base and (L − L_base)/(1 − L_1) in use
+    residual: Vector  # Δf̂, Δf̂', … while a learner is shown those for the observer's b0 (m,)
     loop: NDArray[ScheduleLoop]  # (1,)
 
 
@@ -151,6 +188,71 @@ def control_as_observed(design: Any, memory: Any, u: float) -> float:
 
 
 @generic_with_default
+def control_at_nominal(design: Any, memory: Any, u: float) -> float:
+    """Return what a control signal is for the observer's b0: ``b0(σ)/b0 u``."""
+    return u
+
+
+@generic_with_default
+def at_nominal(design: Any, memory: Any, f: float) -> float:
+    """Return g, what an f for b0(σ) is for the observer's b0."""
+    return f
+
+
+@generic_with_default
+def at_present(design: Any, memory: Any, g: float) -> float:
+    """Return f for b0(σ), of which ``g`` is the one for the observer's b0."""
+    return g
+
+
+@generic_with_default
+def show_at_nominal(design: Any, memory: Any, seen: Vector, at_f: int) -> None:
+    """Convert Δf̂ and its derivatives in ``seen`` to those for the observer's b0."""
+
+
+@generic_with_default
+def show_at_present(design: Any, memory: Any, seen: Vector, at_f: int) -> None:
+    """Undo ``show_at_nominal``."""
+
+
+@generic_with_default
+def fixed_control(
+    feedforward: Any, coefficients: Vector, r: float, reference: Vector, acting: bool
+) -> float:
+    """Return the part of a control signal fed forward that does not follow 1/b0.
+
+    ``coefficients`` are those of r, r', …; ``acting`` asks for the one that the observer receives.
+    """
+    return 0.0
+
+
+@generic_with_default
+def known_of_model(
+    design: Any, memory: Any, feedforward: Any, r: float, reference: Vector, b0: float, known: float
+) -> float:
+    """Return f_m, what a feedforward knows of f, for b0(σ); ``known`` is that for ``b0``."""
+    return known
+
+
+@generic_with_default
+def show_feedforward(
+    design: Any, memory: Any, feedforward: Any, r: float, reference: Vector, row: Vector
+) -> None:
+    """Convert u_ff in ``row``, which is that for the observer's b0."""
+
+
+@generic_with_default
+def safe_as_applied(
+    design: Any, memory: Any, safe: float, unlimited: float, safe_set: Any, set_memory: Any
+) -> float:
+    """Return the control signal for ``safe``, which a safe set found for the observer's b0.
+
+    Its bounds become those of that control signal; ``unlimited`` is what it was asked for.
+    """
+    return safe
+
+
+@generic_with_default
 def known_with_schedule(design: Any, memory: Any, known: float, b0: float, u: float) -> float:
     """Return ``known``, what is known of f, with the share of the schedule while u acts.
 
@@ -161,9 +263,16 @@ def known_with_schedule(design: Any, memory: Any, known: float, b0: float, u: fl
 
 @generic_with_default
 def scheduled_law(
-    design: Any, memory: Any, seen: Vector, r: float, reference: Vector, b0: float, total: float
+    design: Any,
+    memory: Any,
+    feedforward: Any,
+    seen: Vector,
+    r: float,
+    reference: Vector,
+    b0: float,
+    total: float,
 ) -> float:
-    """Return the law's numerator ``total`` with the gains that the schedule adds."""
+    """Return the law's numerator ``total`` with what the schedule adds to gains and feedforward."""
     return total
 
 
@@ -177,12 +286,13 @@ def scheduled_correction(
 @generic_with_default
 def follow_signals(
     design: Any, memory: Any, loop: Any, z: Vector, seen: Vector, reference: Vector, at_f: int,
-    u: float, continues: bool,
+    u: float, continues: bool, safe_set: Any, set_memory: Any, held: Any, held_memory: Any,
 ) -> int:  # fmt: skip
     """Take the signals of a sample, without a jump of u; return the status flags.
 
-    ``u`` is the control signal that acted, ``at_f`` the place of f. In the first sample of a loop,
-    which does not continue another one, u may jump.
+    ``u`` is the control signal that acted, ``at_f`` the place of f, which is estimated in a safe
+    set and in a detection, too. In the first sample of a loop, which does not continue another
+    one, u may jump.
     """
     return 0
 
@@ -212,6 +322,46 @@ def _as_observed(design: ScheduleDesign, memory: ScheduleMemory, u: float) -> fl
     return u
 
 
+@control_at_nominal.register(ScheduleDesign)
+def _control_at_nominal(design: ScheduleDesign, memory: ScheduleMemory, u: float) -> float:
+    if design.has_safe_set or design.has_held:
+        return u * _ratio(design, memory)
+    return u
+
+
+@kernel
+def _ratio(design: ScheduleDesign, memory: ScheduleMemory) -> float:
+    """Return ρ."""
+    return memory.loop[0].b0 * design.inverse_b0
+
+
+@at_nominal.register(ScheduleDesign)
+def _at_nominal(design: ScheduleDesign, memory: ScheduleMemory, f: float) -> float:
+    return f / _ratio(design, memory) if design.extended > 0 else f
+
+
+@at_present.register(ScheduleDesign)
+def _at_present(design: ScheduleDesign, memory: ScheduleMemory, g: float) -> float:
+    return g * _ratio(design, memory) if design.extended > 0 else g
+
+
+@show_at_nominal.register(ScheduleDesign)
+def _show_at_nominal(
+    design: ScheduleDesign, memory: ScheduleMemory, seen: Vector, at_f: int
+) -> None:
+    for i in range(design.extended):
+        memory.residual[i] = seen[at_f + i]
+        seen[at_f + i] = at_nominal(design, memory, seen[at_f + i])
+
+
+@show_at_present.register(ScheduleDesign)
+def _show_at_present(
+    design: ScheduleDesign, memory: ScheduleMemory, seen: Vector, at_f: int
+) -> None:
+    for i in range(design.extended):
+        seen[at_f + i] = memory.residual[i]
+
+
 @known_with_schedule.register(ScheduleDesign)
 def _known(
     design: ScheduleDesign, memory: ScheduleMemory, known: float, b0: float, u: float
@@ -221,10 +371,41 @@ def _known(
     return known
 
 
+@known_of_model.register(ScheduleDesign)
+def _known_of_model(
+    design: ScheduleDesign,
+    memory: ScheduleMemory,
+    feedforward: Any,
+    r: float,
+    reference: Vector,
+    b0: float,
+    known: float,
+) -> float:
+    if design.fixed_acting.size > 0:
+        fixed = fixed_control(feedforward, design.fixed_acting, r, reference, True)
+        known -= (memory.loop[0].b0 - b0) * fixed
+    return known
+
+
+@show_feedforward.register(ScheduleDesign)
+def _show_feedforward(
+    design: ScheduleDesign,
+    memory: ScheduleMemory,
+    feedforward: Any,
+    r: float,
+    reference: Vector,
+    row: Vector,
+) -> None:
+    if design.fixed_acting.size > 0:
+        fixed = fixed_control(feedforward, design.fixed, r, reference, False)
+        row[0] = fixed + (row[0] - fixed) / _ratio(design, memory)
+
+
 @scheduled_law.register(ScheduleDesign)
 def _scheduled_law(
     design: ScheduleDesign,
     memory: ScheduleMemory,
+    feedforward: Any,
     seen: Vector,
     r: float,
     reference: Vector,
@@ -233,8 +414,9 @@ def _scheduled_law(
 ) -> float:
     for i in range(design.law):
         total += memory.values[i] * (_wished(reference, r, i) - seen[i])
-    if design.takes_u and design.has_b0:
-        total += (memory.loop[0].b0 - b0) * r
+    if design.fixed.size > 0:
+        fixed = fixed_control(feedforward, design.fixed, r, reference, False)
+        total += (memory.loop[0].b0 - b0) * fixed
     return total
 
 
@@ -370,7 +552,8 @@ def _bilinear(
 @follow_signals.register(ScheduleDesign)
 def _follow(
     design: ScheduleDesign, memory: ScheduleMemory, loop: Any, z: Vector, seen: Vector,
-    reference: Vector, at_f: int, u: float, continues: bool,
+    reference: Vector, at_f: int, u: float, continues: bool, safe_set: Any, set_memory: Any,
+    held: Any, held_memory: Any,
 ) -> int:  # fmt: skip
     own, second, table = memory.loop[0], design.second, design.table
     given, is_known = _signal(design.first, memory, loop, seen), own.found != 0.0
@@ -383,10 +566,17 @@ def _follow(
     own.found = 1.0
     if design.has_b0:
         b0 = 1.0 / _blended(second, table, row, column, weight, other, 0)
-        change = (own.b0 - b0) * u
-        z[at_f] += change
-        seen[at_f] += change
+        ratio, model = b0 / own.b0, 0.0
         own.b0 = b0
+        for i in range(design.cancel.size):
+            model += design.cancel[i] * seen[i]
+        for i in range(at_f, seen.size):
+            change = (ratio - 1.0) * (seen[i] - model)
+            z[i] += change
+            seen[i] += change
+            model = 0.0
+        scale_f(safe_set, set_memory, ratio)
+        scale_loads(held, held_memory, ratio)
     jump = 0.0  # of the law's numerator
     for i in range(design.law):
         value = _blended(second, table, row, column, weight, other, 1 + i)
@@ -397,6 +587,22 @@ def _follow(
     for i in range(design.law, design.law + design.gains):
         memory.values[i] = _blended(second, table, row, column, weight, other, 1 + i)
     return status | more
+
+
+@safe_as_applied.register(ScheduleDesign)
+def _safe_as_applied(
+    design: ScheduleDesign,
+    memory: ScheduleMemory,
+    safe: float,
+    unlimited: float,
+    safe_set: Any,
+    set_memory: Any,
+) -> float:
+    if not design.has_safe_set:
+        return unlimited
+    ratio = _ratio(design, memory)
+    divide_bounds(safe_set, set_memory, ratio)
+    return safe / ratio
 
 
 @kernel
@@ -455,7 +661,9 @@ class Schedule:
         two of them for tables over two signals.
     b0
         nominal control gain at the points [y-unit/u-unit/s^n], all of one sign; of two signals a
-        list for each point of the first one. That of the observer by default.
+        list for each point of the first one. That of the observer by default. It is 1/J of an
+        inertia; a learner, and the inertia of a model's feedforward, refer to the observer's b0. A
+        learner's bounds of noise are those there: take a small one for a noisy y.
     omega_c
         controller bandwidth at the points [rad/s]; that of the controller by default.
     omega_o
@@ -530,6 +738,11 @@ class Schedule:
         given = (self.points,) if len(self.signals) == 1 else self.points
         return tuple(np.asarray(each, dtype=np.float64) for each in given)
 
+    def largest_ratio(self, observer: ESO) -> float:
+        """Return the largest b0 over that of the observer, which is in use before a signal."""
+        table = np.ravel([observer.b0] if self.b0 is None else self.b0)
+        return max(1.0, float(np.max(table / observer.b0)))
+
     @property
     def external(self) -> int:
         """Number of external signals."""
@@ -559,7 +772,10 @@ class Schedule:
     def design(
         self, observer: ESO, omega_c: float, law: Callable[[float], Vector] | None
     ) -> ScheduleDesign:
-        """Return the parameters; ``law`` gives the gains (m,) of a bandwidth, None without law."""
+        """Return the parameters; ``law`` gives the gains (m,) of a bandwidth, None without law.
+
+        They are those of a controller of observer and law alone: it sets what its other parts need.
+        """
         base = Point(observer.b0, omega_c, observer.omega_o)
         self._check(observer, law is not None)
         axes = [self._divided(i, axis) for i, axis in enumerate(self.axes)]
@@ -594,7 +810,12 @@ class Schedule:
             is_delayed=isinstance(observer.model, DelayedModel),
             law=0 if self.omega_c is None else int(columns[1].shape[1]),
             gains=gains,
-            takes_u=law is None,
+            cancel=np.zeros(0),
+            fixed=np.zeros(0),
+            fixed_acting=np.zeros(0),
+            extended=0,
+            has_safe_set=False,
+            has_held=False,
         )
 
     def memory(self, design: ScheduleDesign) -> ScheduleMemory:
@@ -607,6 +828,7 @@ class Schedule:
             first=AxisLoop.zeros(),
             second=AxisLoop.zeros(),
             values=np.zeros(design.law + design.gains),
+            residual=np.zeros(design.extended),
             loop=loop,
         )
 

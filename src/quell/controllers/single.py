@@ -22,17 +22,19 @@ from quell.controllers.axes import Axes, AxesDesign, AxisDesigns
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
+    change_parameters,
     check_controller,
     control,
     reset_loop,
     set_applied_control,
+    set_held,
     set_reference_derivatives,
     set_schedule_signals,
     status_flags,
     write_row,
 )
 from quell.controllers.compensated import Compensated, CompensatedDesign
-from quell.controllers.compensator import change_design, manual_operation
+from quell.controllers.compensator import manual_operation
 from quell.controllers.held import HeldDesign
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
@@ -49,7 +51,6 @@ from quell.kernels.single import in_single
 from quell.learners.base import Lag, NoiseGate, NoiseGateMemory
 from quell.learners.kalman import KalmanDesign, KalmanMemory, needs_carries
 from quell.learners.python_model import PythonDesign
-from quell.observers.eso import ESO
 from quell.observers.forms import delta_form
 from quell.types import Vector
 
@@ -156,7 +157,7 @@ def _with_longer(state: Any) -> Any:
         return state
     state = type(state)(*map(_with_longer, state))
     if isinstance(state, GuardMemory):
-        return state._replace(shown=np.append(state.shown, np.zeros(CARRIES)))
+        return state._replace(filtered=np.append(state.filtered, np.zeros(CARRIES)))
     if isinstance(state, KalmanMemory):
         state = state._replace(carry=np.zeros(state.theta.size))
     if isinstance(state, KalmanMemory | NoiseGateMemory):
@@ -191,6 +192,11 @@ def _set_schedule_signals(design: SingleDesign, state: Any, values: Vector) -> N
     set_schedule_signals(design.controller, state, values)
 
 
+@set_held.register(SingleDesign)
+def _set_held(design: SingleDesign, state: Any, held: bool) -> None:
+    set_held(design.controller, state, held)
+
+
 @write_row.register(SingleDesign)
 @in_both_precisions
 def _write_row(design: SingleDesign, state: Any, row: Vector) -> None:
@@ -216,6 +222,11 @@ def _set_applied_control(design: SingleDesign, state: Any, u: float) -> None:
 @bumpless_transfer.register(SingleDesign)
 def _bumpless_transfer(design: SingleDesign, state: Any) -> None:
     bumpless_transfer(design.controller, state)
+
+
+@change_parameters.register(SingleDesign)
+def _change_parameters(old: SingleDesign, new: SingleDesign, state: Any) -> None:
+    change_parameters(old.controller, new.controller, state)
 
 
 def check_compilable() -> None:
@@ -310,12 +321,8 @@ class SinglePrecision(Wrapper):
             self.step(r, y, *derivatives)
         return float(state.loop[0].u_limited)
 
-    def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
-        """Change bandwidths while running, see ``ADRC.retune``."""
-        before = self._adrc
-        self.controller.retune(omega_c=omega_c, observer=observer)
-        self._take_parameters()
-        change_design(before.parameters, self._adrc.parameters, before._state)
+    def _with_part(self, new: Any) -> Any:
+        return SingleDesign(single_design(new))
 
     def read(self, state: Any) -> Any:
         """Return the estimates and the status in ``state``."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types as nb_types
@@ -23,7 +23,14 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.checks import Described
-from quell.controllers.base import Limits, RateLimit, changed_limits, control, set_applied_control
+from quell.controllers.base import (
+    Limits,
+    RateLimit,
+    change_parameters,
+    changed_limits,
+    control,
+    set_applied_control,
+)
 from quell.controllers.memory import (
     Layout,
     images_of,
@@ -174,6 +181,29 @@ def _step_as_python(packed: Any, r: float, y: float) -> float:
 _NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
 
 
+@compiled_call
+def change_packed(old: Any, new: Any) -> None:
+    """Go over to other parameters; both controllers are packed with the same state."""
+    before, state = unpacked(old)
+    after, _ = unpacked(new)
+    change_parameters(before, after, state)
+
+
+def changing(dispatcher: Any, packed: PackedController) -> Callable[[Any, Any], None]:
+    """Return the compiled function of ``dispatcher`` for controllers of one type."""
+    if dispatch.interpret_all:
+        return lambda old, new: change_parameters(old.arrays[0], *new.arrays)
+    compiled: Callable[[Any, Any], None] = dispatcher.compile((packed.type, packed.type))
+    return compiled
+
+
+class Retuning(NamedTuple):
+    """Other parameters of a running controller, and what sets its attributes for them."""
+
+    parameters: Any
+    take: Callable[[], None]
+
+
 class StatefulController(Described):
     """A controller with its own running state, which ``simulate`` does not touch.
 
@@ -222,6 +252,42 @@ class StatefulController(Described):
             self._packed = PackedController(self.parameters, self._state, before)
         else:
             self._packed = None
+
+    def _change_to(self, design: Callable[[], Retuning], compiles: bool) -> Callable[[], None]:
+        """Return a function that goes over to the parameters that ``design`` returns.
+
+        If it ``compiles``, they are packed and the change is compiled beforehand. After new limits
+        they are designed again.
+        """
+        found, limits = design(), self.limits
+        ready: PackedController | None = None
+        change: Any = None
+        if compiles:
+            if self._packed is None:
+                self.prepare()
+            if layout_of(found.parameters) == layout_of(self.parameters):
+                ready = PackedController(found.parameters, self._state, self._packed)
+                change = changing(dispatcher_for(change_packed, found.parameters), ready)
+
+        def apply() -> None:
+            packed, same = self._packed, self.limits is limits
+            if (
+                same
+                and ready is not None
+                and packed is not None
+                and packed.arrays[1] is ready.arrays[1]
+            ):
+                change(packed, ready)
+                found.take()
+                self.parameters, self._packed = found.parameters, ready
+                return
+            now, old = found if same else design(), self.parameters
+            now.take()
+            self.parameters = now.parameters
+            change_parameters(old, self.parameters, self._state)
+            self._pack_again()
+
+        return apply
 
     def _update_parameters(self) -> None:
         raise NotImplementedError

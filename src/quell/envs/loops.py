@@ -134,7 +134,7 @@ class Policy:
 def _adapt(
     learner: PolicyDesign,
     memory: PolicyMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -144,14 +144,14 @@ def _adapt(
 
 @predict.register(PolicyDesign)
 def _predict(
-    learner: PolicyDesign, memory: PolicyMemory, seen: Vector, u_before: float
+    learner: PolicyDesign, memory: PolicyMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     return memory.output[0], 0.0
 
 
 @commit.register(PolicyDesign)
 def _commit(
-    learner: PolicyDesign, memory: PolicyMemory, seen: Vector, u: float, f_learned: float
+    learner: PolicyDesign, memory: PolicyMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     pass
 

@@ -79,7 +79,7 @@ STRUCTURES = {
     "tuned-lqg": "lqg",
     "tuned-p-pi-notch": "p-pi-notch",
     "tuned-bandwidths": "bandwidths",
-    "tuned-freed": "freed",
+    "tuned-poles": "poles",
     "tuned-mb-eso": "model-based",
 }
 """Structures of ``quell.tuning`` by their names in a comparison."""

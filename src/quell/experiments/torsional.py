@@ -113,10 +113,10 @@ def scenarios(settings: Settings, kind: str) -> list[Scenario]:
     return [replace(scenario, x0=part * rest) for part in parts]
 
 
-def model_off(share: float = 0.1) -> LinearPlant:
-    """Return the identified model with coefficients too large, and a gain too small, by a share."""
-    numerator = [4.6e4 * (1.0 - share)]
-    denominator = np.array([1.901, 1683.0, 1812.0, 0.1032]) * (1.0 + share)
+def model_off() -> LinearPlant:
+    """Return the identified model with coefficients 10 % too large, and a gain 10 % too small."""
+    numerator = [4.6e4 * (1.0 - 0.1)]
+    denominator = np.array([1.901, 1683.0, 1812.0, 0.1032]) * (1.0 + 0.1)
     return LinearPlant.of((numerator, [1.0, *denominator]), name="torsional plant, not quite")
 
 

@@ -29,6 +29,7 @@ from quell.controllers.axes import (
     tell_applied,
 )
 from quell.controllers.base import (
+    change_parameters,
     is_usable,
     reset_loop,
     set_reference_derivatives,
@@ -39,7 +40,7 @@ from quell.controllers.compensator import change_design, samples_to_settle
 from quell.controllers.held import rests_at_y
 from quell.controllers.memory import images_of, learned_state
 from quell.controllers.single import single_design, single_state
-from quell.export.c_files import CFiles, CSource, check_parts, retune, translated
+from quell.export.c_files import CFiles, CSource, check_parts, translated
 from quell.export.estimates import enums, estimate_lines, estimate_struct
 from quell.export.translate.structs import Findings, ascii_text
 from quell.export.translate.text import (
@@ -142,20 +143,20 @@ def set_held_of_axes(design: AxesDesign, state: AxesState, axis: int, held: bool
     set_axis_held(design.axes, state.axes, 0, axis, held)
 
 
-@retune.register(NoAxis)
+@change_parameters.register(NoAxis)
 def _retune_none(old: NoAxis, new: NoAxis, state: Any) -> None:
     pass
 
 
-@retune.register(AxisDesigns)
+@change_parameters.register(AxisDesigns)
 def _retune_axis(old: AxisDesigns, new: AxisDesigns, state: AxisStates) -> None:
     change_design(old.axis, new.axis, state.axis)
-    retune(old.others, new.others, state.others)
+    change_parameters(old.others, new.others, state.others)
 
 
-@retune.register(AxesDesign)
+@change_parameters.register(AxesDesign)
 def _retune_axes(old: AxesDesign, new: AxesDesign, state: AxesState) -> None:
-    retune(old.axes, new.axes, state.axes)
+    change_parameters(old.axes, new.axes, state.axes)
 
 
 # ---- The two C files ----
@@ -373,8 +374,8 @@ class _Writer:
             f"{self._parameter('r', n)})",
             "Start at a machine that rests at y under u: the next step continues from u.\n\n"
             "r are the references of the next step. What was learned is kept. The observers take\n"
-            f"{2 * sum(counts)} samples to settle: do not call this in an interrupt. If a y or u\n"
-            "is not finite nothing changes but the status; an r that is not finite is y.",
+            f"{2 * sum(counts)} samples to settle: do not call this in an interrupt. If a y or\n"
+            "a u is not finite nothing changes but the status; an r that is not finite is y.",
             f"    static const int samples[{n}] = {{{', '.join(map(str, counts))}}};",
             "",
             f"    {files.call(start_axes_from, *files.both, samples, *given)};",
@@ -418,7 +419,7 @@ class _Writer:
     def _add_retune(self) -> None:
         files = self.files
         new = Value(files.design.kind, "parameters", root="new")
-        call = files.call(retune, files.design, new, files.memory)
+        call = files.call(change_parameters, files.design, new, files.memory)
         files.add(
             "retune",
             f"void NAME({self.state}, const {self.name}_parameters *parameters)",

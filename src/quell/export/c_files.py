@@ -20,7 +20,7 @@ import numpy as np
 from quell import checks
 from quell.controllers.base import control, is_usable, reset_loop, set_applied_control
 from quell.controllers.compensated import CompensatedDesign, CompensatedState
-from quell.controllers.compensator import change_design, start_at_rest
+from quell.controllers.compensator import start_at_rest
 from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
 from quell.controllers.linear import LinearDesign, LinearState
 from quell.controllers.memory import Layout
@@ -645,27 +645,6 @@ def _hand_over_both(design: CompensatedDesign, state: CompensatedState) -> bool:
 
 
 @generic
-def set_held(design: Any, state: Any, held: bool) -> None:
-    """Set whether the plant is held: u does not act until it is not."""
-    raise TypeError
-
-
-@set_held.register(AdrcDesign)
-def _set_held(design: AdrcDesign, state: AdrcState, held: bool) -> None:
-    state.loop[0].held = 1.0 if held else 0.0
-
-
-@set_held.register(PrefilteredDesign)
-def _set_held_inside(design: PrefilteredDesign, state: PrefilteredState, held: bool) -> None:
-    set_held(design.controller, state.controller, held)
-
-
-@set_held.register(CompensatedDesign)
-def _set_held_of_both(design: CompensatedDesign, state: CompensatedState, held: bool) -> None:
-    set_held(design.compensator, state.compensator, held)
-
-
-@generic
 def move_origin(design: Any, state: Any, distance: float) -> None:
     """Count y and r from a point that is ``distance`` further on."""
     raise TypeError
@@ -683,30 +662,3 @@ def _move_origin(design: AdrcDesign, state: AdrcState, distance: float) -> None:
 def stop_of_move(design: PrefilteredDesign, state: PrefilteredState) -> float:
     """Return where the reference comes to rest soonest: as r of a step it stops there."""
     return stopping_point(design.prefilter, state.prefilter)
-
-
-@generic
-def retune(old: Any, new: Any, state: Any) -> None:
-    """Continue with other parameters of the same structure, without a jump of u."""
-    raise TypeError
-
-
-@retune.register(AdrcDesign)
-def _retune(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
-    change_design(old, new, state)
-
-
-@retune.register(PrefilteredDesign)
-def _retune_inside(old: PrefilteredDesign, new: PrefilteredDesign, state: PrefilteredState) -> None:
-    retune(old.controller, new.controller, state.controller)
-
-
-@retune.register(CompensatedDesign)
-def _retune_both(old: CompensatedDesign, new: CompensatedDesign, state: CompensatedState) -> None:
-    retune(old.controller, new.controller, state.controller)
-    retune(old.compensator, new.compensator, state.compensator)
-
-
-@retune.register(LinearDesign)
-def _keep_state(old: LinearDesign, new: LinearDesign, state: LinearState) -> None:
-    """Change nothing: the state of a linear law has the same meaning with other limits."""

@@ -10,9 +10,11 @@ from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import (
     Limits,
+    change_parameters,
     check_controller,
     control,
     reset_loop,
+    set_held,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -343,13 +345,13 @@ class _Writer:
             "Set whether the plant is held, by a brake for instance: u does not act until it is "
             "not.\n\nCall it when that changes. While it is held nothing winds up: the release "
             "makes no bump.",
-            f"    {files.call(c_files.set_held, *files.both, held)};",
+            f"    {files.call(set_held, *files.both, held)};",
         )
 
     def _add_retune(self) -> None:
         files = self.files
         new = Value(files.design.kind, "parameters", root="new")
-        call = files.call(c_files.retune, files.design, new, files.memory)
+        call = files.call(change_parameters, files.design, new, files.memory)
         files.add(
             "retune",
             f"void NAME({self.state}, const {self.name}_parameters *parameters)",

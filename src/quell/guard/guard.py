@@ -4,16 +4,16 @@ The guard as users make it; ``kernels.py`` has its equations.
 
 Effect of a learner's correction on the loop of a linear plant and the plain observer.
 
-A learner's feedforward f_L changes the estimates of the observer by the shadow s, its response to
+A learner's feedforward f_L changes the estimates of the observer by s, their response to
 f_L (``learners/base.py``); without f_L, the same y and u give the plain estimates x̂, f_plain. In
 the law the learner changes ``b0 u`` by −w,
 
     w = c_f (f_L + s_N) + Σ (k_i − a_i) s_i = c_f e_L + Σ (k_i − a_i) s_i,      e_L = f_L − f_L^F
 
 and nothing else, as the observer is told of u (c_f is 1 if f enters where u does, else 0). So the
-loop is the plain one with the input w, in which ``q = f_plain − f_plain^F``. Seen from e_L, f_L is
-``(1 − F)⁻¹ e_L``: its constant part is free, but the first n entries of s, the ones in w, do not
-depend on it (``state_path``). For an ESO in the current form they are
+loop is the plain one with the input w, in which ``q = f_plain − f_plain^F``. With the input e_L,
+f_L is ``(1 − F)⁻¹ e_L``: its constant part is free, but the first n entries of s, the ones in w, do
+not depend on it (``state_path``). For an ESO in the current form they are
 
     s_x⁺ = (I − L_x C)(Φ_x s_x + Γ_x e_L)
 
@@ -83,8 +83,8 @@ def correction_gains(plant: SampledPlant, observer: ESO, law: Vector) -> Correct
     check_one_state_of_f(observer)
     path = state_path(observer, law)
     to_error, to_output = plain_loop(plant, observer, law)
-    _check_stable(to_error, "the loop without learner")
-    _check_stable(path, "the observer's answer to a correction")
+    check_stable(to_error, "the loop without learner")
+    check_stable(path, "the observer's answer to a correction")
     return CorrectionGains(peak_gain(path.then(to_error)), peak_gain(path.then(to_output)))
 
 
@@ -102,7 +102,8 @@ def check_one_state_of_f(observer: ESO) -> None:
         )
 
 
-def _check_stable(system: System, what: str) -> None:
+def check_stable(system: System, what: str) -> None:
+    """Raise a ``ValueError`` for an unstable system; ``what`` names it."""
     pole = system.largest_pole
     if pole >= 1.0:
         raise ValueError(f"{what} is unstable, with a pole at |z| = {pole:.9g}: nothing is certain")
@@ -132,14 +133,14 @@ def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System,
     # The state: plant, observer, u before, lag filter of f_plain, and its output f_plain^F.
     sizes = (plant.B.size, whole.transition.shape[0], 1, M.shape[0], 1)
     edges = [0, *np.cumsum(sizes).tolist()]
-    x, z, before, lag, shown = (slice(*edge) for edge in pairwise(edges))
+    x, z, before, lag, filtered = (slice(*edge) for edge in pairwise(edges))
     y = np.zeros(edges[-1])
     y[x] = plant.C
-    seen = np.outer(whole.feedthrough[:, 0], y)
-    seen[:, z] += whole.output
-    seen[:, before] += whole.feedthrough[:, 1:2]
-    f_plain = seen[n]
-    u = np.append(observer.cancel - law, -observer.cancel_f) @ seen[: n + 1] / observer.b0
+    rows = np.outer(whole.feedthrough[:, 0], y)
+    rows[:, z] += whole.output
+    rows[:, before] += whole.feedthrough[:, 1:2]
+    f_plain = rows[n]
+    u = np.append(observer.cancel - law, -observer.cancel_f) @ rows[: n + 1] / observer.b0
     N, B = -np.eye(edges[-1]), np.zeros(edges[-1])
     N[x, x] = plant.N
     N[x] += np.outer(plant.B, u)
@@ -151,10 +152,10 @@ def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System,
     B[before] = 1.0
     N[lag, lag] += M
     N[lag] += np.outer(g, f_plain)
-    N[shown, lag] += c
-    N[shown] += d * f_plain
+    N[filtered, lag] += c
+    N[filtered] += d * f_plain
     q = f_plain.copy()
-    q[shown] -= 1.0
+    q[filtered] -= 1.0
     into = -B / observer.b0
     return System(N, into, q, 0.0), System(N, into, y, 0.0)
 
@@ -164,7 +165,7 @@ def state_path(observer: ESO, law: Vector) -> System:
     size = observer.order + 1
     found = scaled_response(observer.model, observer.units, observer.order)
     m = found.transition.shape[0]
-    # The state: the shadow, and the estimates that it causes, of which the last is −f_L^F.
+    # The state: s, and the estimates that it causes, of which the last is −f_L^F.
     A, B = np.zeros((m + size, m + size)), np.zeros(m + size)
     A[:m, :m], A[m:, :m] = found.transition, found.output
     B[:m], B[m:] = found.input[:, 2], found.feedthrough[:, 2]
@@ -173,8 +174,8 @@ def state_path(observer: ESO, law: Vector) -> System:
     w[m:-1] = law - observer.cancel
     N = A - np.eye(m + size)
     # A constant f_L is taken out of f̂ again, and moves nothing else.
-    shadow = np.linalg.solve(np.eye(m) - found.transition, found.input[:, 2])
-    constant = np.concatenate([shadow, np.zeros(observer.order), [-1.0]])
+    at_rest = np.linalg.solve(np.eye(m) - found.transition, found.input[:, 2])
+    constant = np.concatenate([at_rest, np.zeros(observer.order), [-1.0]])
     return _without_constant(System(N, B, w, observer.cancel_f), constant)
 
 
@@ -272,7 +273,7 @@ _LEAK_LAGS = 7.0
 _HOME_LAGS = 1000.0
 # Memory of the account.
 _ACCOUNT_LAGS = 300.0
-# Time over which ε compares p with q, over T: a learner that turns is seen within five lags.
+# Time over which ε compares p with q, over T: a learner that turns is noticed within five lags.
 _MATCH_TIME = 0.1
 # κ_0, for learners that leave a good part of the error. With 1 a perfect one is clipped at its
 # peaks, because e is a little less than those of what the plain observer misses.

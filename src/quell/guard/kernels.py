@@ -174,7 +174,7 @@ class GuardAverages(Scalars):
     gained: float  # A
     newest_error: float  # mean of q² over T/10 [(y-unit/s^n)²]
     newest_left: float  # the same of (q − p)²
-    seen: float  # mean of (ℓ q)² over T, as M
+    missed_recently: float  # mean of (ℓ q)² over T, as M
 
 
 class GuardSample(Scalars):
@@ -204,17 +204,17 @@ class GuardMemory(NamedTuple):
     chain: Matrix  # lag filters of f_plain, g and v (3, …)
     fed: Matrix  # lag filter of f_L (1, …), if it is not that of the observer, else (0, …)
     # Their outputs f_plain^F, g^F, p and f_L^F (4,); in single precision carries, too (7,).
-    shown: Vector
+    filtered: Vector
     effects: Matrix  # ℓ q, ℓ e_L and ℓ p̄, stage by stage (3, r) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
 
 
-# Rows of GuardMemory.chain and, with the last, entries of GuardMemory.shown.
+# Rows of GuardMemory.chain and, with the last, entries of GuardMemory.filtered.
 F_PLAIN, G, V, F_L = range(4)
 # Rows of GuardMemory.effects.
 MISSED, CORRECTED, EXPLAINED = range(3)
-# Carries of sums in single precision, the last entries of GuardMemory.shown there.
+# Carries of sums in single precision, the last entries of GuardMemory.filtered there.
 TARGET, SHARE, PEAK = 4, 5, 6
 CARRIES = 3
 
@@ -229,9 +229,9 @@ def carried_sum(
     speed.
     """
     if is_single(guard.forget):
-        increment += memory.shown[place]
+        increment += memory.filtered[place]
         total = value + increment
-        memory.shown[place] = increment - (total - value)
+        memory.filtered[place] = increment - (total - value)
         return total
     return value + increment
 
@@ -239,8 +239,8 @@ def carried_sum(
 @kernel
 def clear_carry(memory: GuardMemory, place: int) -> None:
     """Forget what rounding took from a sum, where that is kept."""
-    if place < memory.shown.size:
-        memory.shown[place] = 0.0
+    if place < memory.filtered.size:
+        memory.filtered[place] = 0.0
 
 
 @kernel
@@ -275,15 +275,15 @@ def limit(
     guard: Any,
     memory: Any,
     f_plain: float,
-    f_shown: float,
+    f_filtered: float,
     constant: float,
     slope: float,
     u_before: float,
 ) -> tuple[float, float, bool]:
     """Return the permitted ``(constant, slope)`` of the output ``constant + slope · u``.
 
-    ``f_shown`` is f_L^F. The third value is true if the output is not finite: then the learner has
-    to be restarted.
+    ``f_filtered`` is f_L^F. The third value is true if the output is not finite: then the learner
+    has to be restarted.
     """
     return constant, slope, False
 
@@ -409,8 +409,10 @@ def _earn_at_y(
 ) -> None:
     """Update the credit C_y with ℓ q and ℓ p̄: as C, but noise of y has little weight in it."""
     averages, sample = memory.averages[0], memory.sample[0]
-    averages.seen = _mean_square(guard, averages.seen, missed * missed, guard.forget, is_new)
-    earned = _earned(missed, explained, averages.seen, tiny(guard))
+    averages.missed_recently = _mean_square(
+        guard, averages.missed_recently, missed * missed, guard.forget, is_new
+    )
+    earned = _earned(missed, explained, averages.missed_recently, tiny(guard))
     sample.credit_at_y = min(max(sample.credit_at_y + guard.earn * earned, -1.0), 1.0)
 
 
@@ -422,7 +424,7 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new
     is_burst = not is_new and rate * (square - averages.missed) > guard.rise * averages.missed
     averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
     gain = (2.0 * missed - _OWN_SQUARES * own) * own
-    allowed = _LOAN * max(averages.missed, averages.seen)
+    allowed = _LOAN * max(averages.missed, averages.missed_recently)
     # What a learner did in a burst says nothing, as J does not follow it.
     gain = averages.gained + (0.0 if is_burst else rate * (gain - averages.gained))
     averages.gained = min(max(gain, -_LARGEST_DEBT * allowed), averages.missed)
@@ -472,7 +474,9 @@ def removed_share(guard: GuardDesign, memory: GuardMemory) -> float:
     """Return R."""
     averages = memory.averages[0]
     # J follows a load that begins only after ten lags: harm is compared with M_y until then.
-    past = averages.missed if averages.gained > 0.0 else max(averages.missed, averages.seen)
+    past = (
+        averages.missed if averages.gained > 0.0 else max(averages.missed, averages.missed_recently)
+    )
     return averages.gained / max(past, tiny(guard))
 
 
@@ -504,7 +508,7 @@ def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tup
     averages = memory.averages[0]
     if guard.stages < HIGHEST_ORDER and averages.square < (_GONE * then) ** 2:
         # The motion went with the learner: it was its own doing, whatever it explained of it.
-        averages.gained = -_LARGEST_DEBT * _LOAN * max(averages.missed, averages.seen)
+        averages.gained = -_LARGEST_DEBT * _LOAN * max(averages.missed, averages.missed_recently)
         return 0.0, _UNPROVEN
     scaled = _LOUDEST * (1.0 - loudness) / max(loudness, tiny(guard))
     if scaled < min(earned, 1.0):
@@ -620,15 +624,15 @@ _NOT_FINITE = int(Reason.NOT_FINITE)
 
 @assess.register(GuardDesign)
 def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
-    shown, sample = memory.shown, memory.sample[0]
-    q, p = f_plain - shown[F_PLAIN], shown[V]
+    filtered, sample = memory.filtered, memory.sample[0]
+    q, p = f_plain - filtered[F_PLAIN], filtered[V]
     if not is_finite(q * q + p * p):
         # For example after a measurement near the largest float: its filters hold nothing useful.
         target = sample.target
         reset_filters(guard, memory)
         sample.target, sample.unsettled = target, guard.settling
         return
-    shown[F_PLAIN] = lag_push(guard.lag, memory.chain, F_PLAIN, f_plain)
+    filtered[F_PLAIN] = lag_push(guard.lag, memory.chain, F_PLAIN, f_plain)
     if q * q + p * p < tiny(guard):
         # At rest nothing is judged: averages that began with zeros would take all that follows for
         # a burst.
@@ -646,7 +650,7 @@ def _limit(
     guard: GuardDesign,
     memory: GuardMemory,
     f_plain: float,
-    f_shown: float,
+    f_filtered: float,
     constant: float,
     slope: float,
     u_before: float,
@@ -655,17 +659,17 @@ def _limit(
     output = constant + slope * u_before
     most = _CUT_OFF * max(abs(f_plain), sample.peak)
     if guard.invertible:
-        memory.shown[F_L] = f_shown
-    f_shown = memory.shown[F_L]
+        memory.filtered[F_L] = f_filtered
+    f_filtered = memory.filtered[F_L]
     if not (abs(output) <= most and is_finite(slope)):
         finite = is_finite(output) and is_finite(slope)
         sample.output = min(max(output, -most), most) if finite else 0.0
         sample.reason = _EXPLODED if finite else _NOT_FINITE
         sample.authority = 0.0
-        sample.target = f_shown
+        sample.target = f_filtered
         clear_carry(memory, TARGET)
         withdraw_authority(memory)
-        return nearest_permitted(guard, memory, f_shown), 0.0, not finite
+        return nearest_permitted(guard, memory, f_filtered), 0.0, not finite
     before, sample.output = sample.output, output
     if sample.share < 0.0:
         before, sample.share = output, -sample.share
@@ -686,7 +690,7 @@ def _limit(
         base = sample.target - sample.share * before
         sample.target = base + sample.share * output
     least, largest = bounds_of(guard, memory, removed)
-    if not least <= sample.target - f_shown <= largest:
+    if not least <= sample.target - f_filtered <= largest:
         sample.reason = _OUT_OF_BOUNDS if authority > 0.0 else sample.reason
     elif guard.least_slope <= sample.share * slope <= guard.largest_slope:
         return base + sample.share * constant, sample.share * slope, False
@@ -696,19 +700,19 @@ def _limit(
 @nearest_permitted.register(GuardDesign)
 def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float:
     least, largest = bounds_of(guard, memory, removed_share(guard, memory))
-    shown = memory.shown[F_L]
-    return min(max(f_learned, shown + least), shown + largest)
+    filtered = memory.filtered[F_L]
+    return min(max(f_learned, filtered + least), filtered + largest)
 
 
 @record_output.register(GuardDesign)
 def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
-    shown, sample = memory.shown, memory.sample[0]
-    v = sample.output - shown[G]
-    shown[G] = lag_push(guard.lag, memory.chain, G, sample.output)
-    shown[V] = lag_push(guard.lag, memory.chain, V, v)
-    correction = f_learned - shown[F_L]
+    filtered, sample = memory.filtered, memory.sample[0]
+    v = sample.output - filtered[G]
+    filtered[G] = lag_push(guard.lag, memory.chain, G, sample.output)
+    filtered[V] = lag_push(guard.lag, memory.chain, V, v)
+    correction = f_learned - filtered[F_L]
     if not guard.invertible:
-        shown[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
+        filtered[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
     effect = respond(guard, memory, CORRECTED, correction)
     sample.late_effect += guard.within_lag * (effect - sample.late_effect)
     decay = guard.own_decay if sample.authority > 0.0 else 1.0 - guard.within_lag
@@ -742,8 +746,8 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     reset_lag(memory.chain)
     reset_lag(memory.fed)
     reset_lag(memory.effects)
-    for i in range(memory.shown.size):
-        memory.shown[i] = 0.0
+    for i in range(memory.filtered.size):
+        memory.filtered[i] = 0.0
     sample.output = sample.target = sample.unsettled = 0.0
     sample.own_peak = sample.late_effect = sample.taking_back = 0.0
     # The next output has none before it: it is a constant.

@@ -12,8 +12,11 @@ from quell.identification.excitation import (
     FrequencyResponse,
     excitation,
     frequency_response,
+    interleaved_excitations,
+    save_excitations,
 )
 from quell.identification.gain_by_signal import GainBin, identify_b0_by
+from quell.identification.gain_matrix import InputGainMatrix, identify_b0_matrix
 from quell.identification.identify import (
     Alternative,
     alternatives,
@@ -34,6 +37,7 @@ __all__ = [
     "GainBin",
     "Identified",
     "InputGain",
+    "InputGainMatrix",
     "MarginError",
     "Measured",
     "Residuals",
@@ -46,7 +50,10 @@ __all__ = [
     "identify",
     "identify_b0",
     "identify_b0_by",
+    "identify_b0_matrix",
+    "interleaved_excitations",
     "not_told_apart",
     "read_record",
+    "save_excitations",
     "simulated_plant",
 ]

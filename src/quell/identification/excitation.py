@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +31,9 @@ _HALF_POWER = 2.0 * math.pi * 0.443
 _LINES = 120
 # Rounds of clipping: chosen by hand; not tuned further.
 _ROUNDS = 400
+
+
+_Design = tuple[Signal, float, tuple[float, float], str, tuple[str, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +136,91 @@ def excitation(
     (23.506, 1.0)
     """
     checks.one_of("kind", kind, KINDS)
+    designs = {"multisine": _multisine, "prbs": _prbs, "chirp": _chirp}
+    return _designed(kind, designs[kind], band, duration, dt, u_min, u_max, seed)
+
+
+def interleaved_excitations(
+    actuators: int,
+    band: tuple[float, float],
+    duration: float,
+    dt: float,
+    u_min: float | Sequence[float] = -1.0,
+    u_max: float | Sequence[float] = 1.0,
+    *,
+    seed: int = 0,
+) -> tuple[Excitation, ...]:
+    """Design multisines for actuators that act at the same time, each with lines of its own.
+
+    The lines of the band are dealt out in turn, so no two actuators have one in common. Over whole
+    periods their signals are uncorrelated, at any delay, and the responses of coupled axes to each
+    can be told apart (Pintelon & Schoukens, *System Identification*, 2nd ed. 2012, sec. 3.7).
+
+    Parameters
+    ----------
+    actuators
+        number of actuators m.
+    band, duration, dt
+        as for ``excitation``.
+    u_min, u_max
+        limits, which are reached: one for all, or one for each.
+    seed
+        phase of the first line.
+
+    Raises
+    ------
+    ValueError
+        as ``excitation``; and for a band with fewer lines than actuators.
+
+    Examples
+    --------
+    >>> one, other = interleaved_excitations(2, band=(1.0, 50.0), duration=20.0, dt=1e-3)
+    >>> abs(one.u @ other.u) / one.u.size < 1e-2
+    True
+    """
+    m = checks.whole("actuators", actuators, 1)
+    low, high = (
+        checks.vector(name, given, m) if checks.is_sequence(given) else np.full(m, given)
+        for name, given in (("u_min", u_min), ("u_max", u_max))
+    )
+
+    def designed(i: int) -> Excitation:
+        design = partial(_multisine, part=(i, m))
+        limits = float(low[i]), float(high[i])
+        return _designed("multisine", design, band, duration, dt, *limits, seed)
+
+    return tuple(map(designed, range(m)))
+
+
+def save_excitations(
+    designs: Sequence[Excitation], path: str | os.PathLike[str], overwrite: bool = False
+) -> None:
+    """Write ``t,u1,u2,…`` of excitations of several actuators as CSV, or nothing at all.
+
+    Raises
+    ------
+    ValueError
+        if the file can't be written, or exists and ``overwrite`` is False.
+    """
+    columns = [designs[0].t, *(design.u for design in designs)]
+    samples = zip(*(column.tolist() for column in columns), strict=True)
+    rows = "".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in samples)
+    names = ",".join(["t", *(f"u{i + 1}" for i in range(len(designs)))])
+    with written_atomically(path, overwrite) as part:
+        part.write_text(f"{names}\n{rows}", encoding="utf-8")
+
+
+def _designed(
+    kind: str,
+    design: Callable[..., _Design],
+    band: tuple[float, float],
+    duration: float,
+    dt: float,
+    u_min: float,
+    u_max: float,
+    seed: int,
+) -> Excitation:
+    """Return a design that uses the whole range of u, with checked arguments."""
     dt, duration = checks.positive("dt", dt, "s"), checks.positive("duration", duration, "s")
     low, high = checks.vector("band", band, 2).tolist()
     if not 0.0 < low < high < math.pi / dt:
@@ -145,7 +235,6 @@ def excitation(
             f"duration = {duration!r} s: must be at least 16 samples and a tenth of the slowest "
             f"period, {2.0 * math.pi / low:.4g} s"
         )
-    design = {"multisine": _multisine, "prbs": _prbs, "chirp": _chirp}[kind]
     signal, period, reached, details, shortcomings = design(low, high, count, dt, seed)
     raw = signal(np.arange(count) * dt)
     bottom, top = float(np.min(raw)), float(np.max(raw))
@@ -158,9 +247,6 @@ def excitation(
         shortcomings = (*shortcomings, f"{short}; take longer, or begin the band higher")
     crest, signal = float(np.max(np.abs(away))) / rms, scale * signal + (u_min - scale * bottom)
     return Excitation(kind, signal, dt, u, period, reached, crest, rms, details, shortcomings)
-
-
-_Design = tuple[Signal, float, tuple[float, float], str, tuple[str, ...]]
 
 
 def _chirp(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
@@ -203,7 +289,10 @@ def _prbs(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
     return signal, signal.period, reached, details, tuple(short)
 
 
-def _multisine(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
+def _multisine(
+    low: float, high: float, count: int, dt: float, seed: int, part: tuple[int, int] = (0, 1)
+) -> _Design:
+    """Return the design of a multisine; of ``part`` (i, m) the lines of the i-th of m actuators."""
     # As many periods as the lowest frequency, which needs at least one period itself, allows.
     periods = max(1, math.floor(low * count * dt / (2.0 * math.pi) + 1e-9))
     length = count // periods
@@ -215,8 +304,15 @@ def _multisine(low: float, high: float, count: int, dt: float, seed: int) -> _De
             f"band = {(low, high)!r}: has no multiple of {base:.4g} rad/s, "
             "the lowest frequency of the duration; take longer"
         )
-    spread = np.geomspace(first, last, min(_LINES, last - first + 1))
-    lines = np.unique(np.round(spread).astype(int))
+    which, parts = part
+    spread = np.geomspace(first, last, min(_LINES * parts, last - first + 1))
+    every = np.unique(np.round(spread).astype(int))
+    if every.size < parts:
+        raise ValueError(
+            f"band = {(low, high)!r}: has {every.size} lines: must have one for each of {parts} "
+            "actuators at least; take longer, or a wider band"
+        )
+    lines = every[which::parts]
     phases = _flattened(lines, schroeder_phases(np.ones(lines.size)))
     phases = phases + float(seed % 360) * math.pi / 180.0 * (seed > 0)
     signal = Multisine(lines * base, np.ones(lines.size), np.mod(phases, 2.0 * math.pi))
@@ -228,8 +324,8 @@ def _multisine(low: float, high: float, count: int, dt: float, seed: int) -> _De
             "there is only one period, so the transient of the start is not separated from the "
             "response; take longer for two"
         )
-    if lines.size < last - first + 1:
-        gap = float(np.max(np.diff(lines))) * base
+    if every.size < last - first + 1:
+        gap = float(np.max(np.diff(lines), initial=0)) * base
         short.append(
             f"lines are up to {gap:.3g} rad/s apart: a narrower resonance may lie between; "
             "take a PRBS or a narrower band"

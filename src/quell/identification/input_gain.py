@@ -41,6 +41,7 @@ from quell.identification.model import Structure, autocorrelation, linear_column
 from quell.identification.result import residuals
 from quell.identification.running_loop import (
     Form,
+    Inputs,
     LoopFit,
     fit,
     is_exact,
@@ -65,7 +66,10 @@ _SEGMENTS = 16
 
 
 def _places(one: LoopFit) -> list[int]:
-    """Return the places of a, b, τ and T in the covariance of a fit; −1 for what it has not."""
+    """Return the places of a, b, τ and T in the covariance of a fit; −1 for what it has not.
+
+    Of several b it is the first.
+    """
     form = one.form
     first = form.times.start
     lag, delay = first if form.lag else -1, form.size - 1 if form.delay else -1
@@ -89,6 +93,12 @@ def gain(one: LoopFit) -> tuple[float, float]:
     return float(one.beta[0]), math.sqrt(max(float(one.covariance[place, place]), 0.0))
 
 
+def gains(one: LoopFit) -> tuple[Vector, Matrix]:
+    """Return all b (m,) and their covariance, in units of a sample."""
+    places = one.form.gains_of_u
+    return one.beta[: one.form.actuators], one.covariance[places, places]
+
+
 def total_delay(one: LoopFit) -> tuple[float, float]:
     """Return τ + T and its deviation [samples]."""
     if one.form.share is not None:
@@ -100,14 +110,14 @@ def total_delay(one: LoopFit) -> tuple[float, float]:
     return total, math.sqrt(max(variance, 0.0))
 
 
-def mean(estimates: list[tuple[float, float]], weights: Vector) -> tuple[float, float]:
+def mixture(estimates: list[tuple[float, float]], weights: Vector) -> tuple[float, float]:
     """Return mean and deviation of the mixture of values with deviations."""
     values, spreads = np.array(estimates).T
     mean = float(weights @ values)
     return mean, math.sqrt(float(weights @ (spreads**2 + (values - mean) ** 2)))
 
 
-def visible_up_to(best: LoopFit, u: Vector, dt: float) -> float:
+def visible_up_to(best: LoopFit, u: Matrix, dt: float) -> float:
     """Return the frequency up to which u moves y by more than the noise does [rad/s].
 
     It compares the spectrum of u behind the plant with that of the error behind the noise's model,
@@ -115,13 +125,13 @@ def visible_up_to(best: LoopFit, u: Vector, dt: float) -> float:
     """
     from scipy.signal import welch
 
-    length = min(max(64, u.size // _SEGMENTS), best.error.size)
-    frequency, moving = welch(u, nperseg=length)
+    length = min(max(64, u.shape[0] // _SEGMENTS), best.error.size)
+    frequency, moving = welch(u @ best.beta[: best.form.actuators], nperseg=length)
     _, disturbing = welch(best.error, nperseg=length)
     omega = 2.0 * math.pi * frequency[1:]
     of_u, of_error = responses(best.form, best.phi, best.error.size, omega)
     with np.errstate(all="ignore"):
-        moved = (best.beta[0] * of_u) ** 2 * moving[1:]
+        moved = of_u**2 * moving[1:]
         seen = np.flatnonzero(moved > _VISIBLE * of_error**2 * disturbing[1:])
     return float(omega[seen[-1]]) / dt if seen.size else 0.0
 
@@ -144,23 +154,24 @@ _FILTERS, _UNSTABLE = (0.003, 0.5, 6), 2
 _LAGS, _LEVEL = 50, 1e-3
 
 
-def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
+def fits(order: int, most: float, u: Inputs, y: Vector) -> list[LoopFit]:
     """Return the fits of all forms, for delays and lags of up to ``most`` samples at the start.
 
-    u may begin before y; see ``model``.
+    u may begin before y; see ``running_loop``.
     """
-    a = _denominators(order, most, u, y)
-    found = _family(order, [], [*a], most, u, y)
+    plant = Form(order, False, False, False, actuators=u.u.shape[1], couplings=couplings(order, u))
+    a = _denominators(plant, most, u, y)
+    found = _family(plant, [], [*a], most, u, y)
     best = min(found, key=lambda one: one.aic)
     if not (is_exact(best, y) or _white(best, y)):
         a = [best.phi[:order], *a]
         placed_ones = [placed(one, rate) for one, rate in product(a, _RATES)]
-        drifting = _family(order, found, placed_ones, most, u, y)
+        drifting = _family(plant, found, placed_ones, most, u, y)
         found += drifting + [_forgetting(one, u, y) for one in drifting]
     return found + _divided(found, u, y)
 
 
-def _divided(found: list[LoopFit], u: Vector, y: Vector) -> list[LoopFit]:
+def _divided(found: list[LoopFit], u: Inputs, y: Vector) -> list[LoopFit]:
     """Return fits with given shares of the lag in the sum of lag and delay, if data leave it open.
 
     How the sum is divided moves b. Where a lag alone or a delay alone fits nearly as well, neither
@@ -171,9 +182,10 @@ def _divided(found: list[LoopFit], u: Vector, y: Vector) -> list[LoopFit]:
     alike = [one for one in found if one.form[3:5] == form[3:5]]
     both = next(one for one in alike if one.form.lag and one.form.delay)
     ends = [one for one in alike if one.form.lag != one.form.delay]
-    near = [gain(one) for one in (both, *ends) if one.aic <= both.aic + _OPEN]
-    values = [value for value, _ in near]
-    if max(values) - min(values) <= _SAME * min(deviation for _, deviation in near):
+    near = [gains(one) for one in (both, *ends) if one.aic <= both.aic + _OPEN]
+    values = np.array([value for value, _ in near])
+    deviations = np.sqrt(np.maximum([np.diag(covariance) for _, covariance in near], 0.0))
+    if np.all(np.ptp(values, axis=0) <= _SAME * np.min(deviations, axis=0)):
         return []  # also if only the fit of both is near
     # A gain of u_l of one fit may have no stable predictor with the lag of another.
     of_lag = both.form.gains.stop - 1
@@ -194,28 +206,40 @@ def _divided(found: list[LoopFit], u: Vector, y: Vector) -> list[LoopFit]:
     return [at(share) for share in _DIVISIONS]
 
 
-def _denominators(order: int, most: float, u: Vector, y: Vector) -> list[Vector]:
-    structure = Structure(order, 0, (0, 0))
-    late = delayed(u, round(0.25 * most))[u.size - y.size :]
-    v = np.column_stack([late, np.ones(y.size)])
+def couplings(order: int, u: Inputs) -> tuple[tuple[int, int], ...]:
+    """Return number and derivative of the y of other axes, those below the order."""
+    return tuple(product(range(u.others.shape[1]), range(order)))
+
+
+def _late(u: Inputs, y: Vector, delay: int) -> Matrix:
+    """Return u later by some samples, y of the other axes, and a constant (N, all)."""
+    late = [delayed(each, delay)[each.size - y.size :] for each in u.u.T]
+    return np.column_stack([*late, u.others, np.ones(y.size)])
+
+
+def _denominators(plant: Form, most: float, u: Inputs, y: Vector) -> list[Vector]:
+    order = plant.order
+    degrees = (0,) * plant.actuators + (order - 1,) * u.others.shape[1] + (0,)
+    structure = Structure(order, 0, degrees)
+    v = _late(u, y, round(0.25 * most))
     estimates = filtered_estimates(structure, v, y)[:_DENOMINATORS]
     found = [structure.denominator(theta) for theta in estimates if np.all(np.isfinite(theta))]
     return [np.zeros(order), *found, *_unstable(structure, most, u, y)]
 
 
-def _unstable(structure: Structure, most: float, u: Vector, y: Vector) -> list[Vector]:
+def _unstable(structure: Structure, most: float, u: Inputs, y: Vector) -> list[Vector]:
     """Return the best unstable denominators by least squares on filtered signals.
 
     ``filtered_estimates`` mirrors unstable poles into the left half plane: in an open loop the
     noise is their reason. In a loop the plant may have them.
     """
-    form, n = Form(structure.order, False, True, False), structure.order
+    n, many = structure.order, u.u.shape[1]
+    form = Form(n, False, True, False, actuators=many, couplings=couplings(n, u))
     found = []
     for rate in np.geomspace(*_FILTERS):
         prefilter: Vector = np.poly(np.full(n, -rate)).real[:0:-1].astype(np.float64)
         for delay in (0, round(0.25 * most)):
-            late = delayed(u, delay)[u.size - y.size :]
-            v = np.column_stack([late, np.ones(y.size)])
+            v = _late(u, y, delay)
             target, regressors = equation(
                 structure, prefilter, linear_columns(structure, prefilter, v), y
             )
@@ -228,17 +252,17 @@ def _unstable(structure: Structure, most: float, u: Vector, y: Vector) -> list[V
 
 
 def _family(
-    order: int, steady: list[LoopFit], starts: list[Vector], most: float, u: Vector, y: Vector
+    plant: Form, steady: list[LoopFit], starts: list[Vector], most: float, u: Inputs, y: Vector
 ) -> list[LoopFit]:
     """Return the fits with neither, one and both of lag and delay.
 
     They have a load that drifts if the fits without loads, ``steady``, are given; each form then
     starts at its own of these, too.
     """
-    drift = bool(steady)
+    drift, order = bool(steady), plant.order
 
     def best(lag: bool, delay: bool, tried: list[Vector]) -> LoopFit:
-        form = Form(order, lag, delay, drift)
+        form = plant._replace(lag=lag, delay=delay, drift=drift)
         for one in steady:
             if one.form[1:3] == form[1:3]:
                 gains = [placed(one.phi[:order], rate)[order:] for rate in _RATES]
@@ -260,7 +284,7 @@ def _family(
     return [plain, late, slow, best(True, True, both)]
 
 
-def _forgetting(one: LoopFit, u: Vector, y: Vector) -> LoopFit:
+def _forgetting(one: LoopFit, u: Inputs, y: Vector) -> LoopFit:
     """Return the fit of the same form with a load that forgets."""
     form, place = one.form._replace(forgets=True), one.form.gains.stop
     tried = [np.insert(one.phi, place, rate) for rate in _FORGETTING]
@@ -619,8 +643,8 @@ class InputGain:
         unit = f"y-unit/u-unit/s^{self.order}" if self.order > 1 else "y-unit/u-unit/s"
         lines = [
             f"b0 = {self.b0:.5g} ± {self.b0_std:.2g} {unit}, 95 %: {low:.5g} to {high:.5g}",
-            _time_line("actuator's lag", self.lag, self.lag_std),
-            _time_line("delay", self.delay, self.delay_std),
+            time_line("actuator's lag", self.lag, self.lag_std),
+            time_line("delay", self.delay, self.delay_std),
             f"both together {1e3 * self.total_delay:.4g} ± {1e3 * self.total_delay_std:.2g} ms",
             f"the record shows the plant up to {self.omega_max:.4g} rad/s; "
             f"error of the prediction: RMS {self.noise:.3g}",
@@ -708,26 +732,14 @@ def identify_b0(
         rule = f"must have at least {least} for order {order}; record longer"
         raise ValueError(f"u has {u.size} samples: {rule}")
     for name, value in (("u", u), ("y", y)):
-        if np.ptp(value) == 0.0:
-            raise ValueError(f"{name} is {value[0]:g} all through: must move")
-        size = float(np.max(np.abs(value)))
-        if size > 1.0 / _LEAST_SIZE or float(np.ptp(value)) < _LEAST_SIZE:
-            rule = f"must move by at least {_LEAST_SIZE:g} and stay below {1.0 / _LEAST_SIZE:g}"
-            remedy = "check its unit, and that the loop is stable"
-            raise ValueError(f"{name} has values up to {size:.3g}: {rule}; {remedy}")
-    most = min(float(_MOST_DELAY), _MOST_SHARE * u.size)
-    if max_delay is not None:
-        most = checks.non_negative("max_delay", max_delay, "s") / dt
-        if most > 0.25 * u.size:
-            raise ValueError(
-                f"max_delay = {max_delay!r} s: must be at most a quarter of the record"
-            )
+        check_motion(name, value)
+    most = longest_delay(max_delay, u.size, dt)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
-    # The u before the record is not known: the first samples of y, which it reaches, are left out.
-    before = math.ceil(min(most, _MOST_SHARE * u.size)) + 1
+    before = samples_before(most, u.size)
     with one_blas_thread():
-        found = fits(order, most, u / scale_u, y[before:] / scale_y)
-    usable = [one for one in found if _is_usable(one)]
+        moved = y[before:] / scale_y
+        found = fits(order, most, Inputs.of(u / scale_u, moved), moved)
+    usable = [one for one in found if is_usable(one)]
     if not usable:
         raise ValueError(
             f"order = {order}: no model was found; check the order, and that u belongs to y"
@@ -735,29 +747,61 @@ def identify_b0(
     return _result(usable, u, y[before:], dt, scale_u, scale_y)
 
 
+def check_motion(name: str, value: Vector) -> None:
+    """Raise ``ValueError`` for a signal of a record that does not move, or whose size is absurd."""
+    if np.ptp(value) == 0.0:
+        raise ValueError(f"{name} is {value[0]:g} all through: must move")
+    size = float(np.max(np.abs(value)))
+    if size > 1.0 / _LEAST_SIZE or float(np.ptp(value)) < _LEAST_SIZE:
+        rule = f"must move by at least {_LEAST_SIZE:g} and stay below {1.0 / _LEAST_SIZE:g}"
+        remedy = "check its unit, and that the loop is stable"
+        raise ValueError(f"{name} has values up to {size:.3g}: {rule}; {remedy}")
+
+
+def longest_delay(max_delay: float | None, samples: int, dt: float) -> float:
+    """Return the longest delay to start the search at [samples]."""
+    if max_delay is None:
+        return min(float(_MOST_DELAY), _MOST_SHARE * samples)
+    most = checks.non_negative("max_delay", max_delay, "s") / dt
+    if most > 0.25 * samples:
+        raise ValueError(f"max_delay = {max_delay!r} s: must be at most a quarter of the record")
+    return most
+
+
+def samples_before(most: float, samples: int) -> int:
+    """Return how many samples of y are left out at the begin: u before the record reaches them."""
+    return math.ceil(min(most, _MOST_SHARE * samples)) + 1
+
+
 def least_samples(order: int) -> int:
     """Return how many samples a record needs for a plant of an order."""
     return _SAMPLES_PER_PARAMETER * (3 * order + 6)
 
 
-def _is_usable(one: LoopFit) -> bool:
+def is_usable(one: LoopFit) -> bool:
+    """Return whether a fit has a model."""
     return bool(np.isfinite(one.aic) and np.all(np.isfinite(one.covariance)))
+
+
+def weighted(found: list[LoopFit]) -> tuple[LoopFit, list[LoopFit], Vector]:
+    """Return the best fit, those that count beside it, and their weights in the mean."""
+    # What there is besides b0 is that of a model with free times.
+    best = min((one for one in found if one.form.share is None), key=lambda one: one.aic)
+    near = [one for one in found if one.aic - best.aic <= _MOST_DIFFERENCE]
+    scores = np.array([one.aic - 2.0 * one.form.of_times for one in near])
+    weights = np.exp(-0.5 * (scores - np.min(scores)))
+    return best, near, weights / np.sum(weights)
 
 
 def _result(
     found: list[LoopFit], u: Vector, y: Vector, dt: float, scale_u: float, scale_y: float
 ) -> InputGain:
     """Return the mean of the models, and what the best of them has besides b0."""
-    # What there is besides b0 is that of a model with free times.
-    best = min((one for one in found if one.form.share is None), key=lambda one: one.aic)
+    best, near, weights = weighted(found)
     form, n = best.form, best.form.order
-    near = [one for one in found if one.aic - best.aic <= _MOST_DIFFERENCE]
-    scores = np.array([one.aic - 2.0 * one.form.of_times for one in near])
-    weights = np.exp(-0.5 * (scores - np.min(scores)))
-    weights /= np.sum(weights)
     unit = scale_y / scale_u / dt**n
-    b0, b0_std = mean([gain(one) for one in near], weights)
-    total, total_std = mean([total_delay(one) for one in near], weights)
+    b0, b0_std = mixture([gain(one) for one in near], weights)
+    total, total_std = mixture([total_delay(one) for one in near], weights)
     scale, covariance = physical(best, unit, dt)
     spreads = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     lags = min(50, y.size // 4)
@@ -777,7 +821,7 @@ def _result(
         dt=dt,
         samples=u.size,
         noise=scale_y * float(np.sqrt(np.mean(best.error**2))),
-        omega_max=visible_up_to(best, u / scale_u, dt),
+        omega_max=visible_up_to(best, u[:, None] / scale_u, dt),
         white=tests.white,
         independent=tests.independent,
         converged=best.converged,
@@ -804,7 +848,8 @@ def _not_reached(asked: str, best: Reach, ratio: float | None, other: Reach | No
     return text + "; ask for less, or sample faster and make the delay or the lag shorter"
 
 
-def _time_line(name: str, value: float, spread: float) -> str:
+def time_line(name: str, value: float, spread: float) -> str:
+    """Return a lag or a delay with its deviation as text."""
     if value == 0.0:
         return f"{name}: none is visible"
     text = f"{name} {1e3 * value:.4g} ± {1e3 * spread:.2g} ms"

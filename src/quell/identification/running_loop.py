@@ -32,6 +32,14 @@ rest. For given a, l, τ and T, ŷ is linear in b and the initial state.
 u may begin before y: its last N samples belong to those of y. So a delay needs no u that is not
 known; before its own first sample u is taken to have had that value.
 
+One of several coupled axes is the same plant with several u, behind one lag and one delay, and
+with the measured y of the other axes as known inputs::
+
+    y_i^(n) + … + a_0 y_i = Σ_j b_j u_l,j + Σ_k Σ_p c_kp y_k^(p) + d + w,     p < n
+
+so that what couples the axes beyond B0, of friction or gravity for instance, is no load. In the
+observable form above ``c_kp y_k`` enters the state ``x_(n−p)``, so no y is differentiated.
+
 Prediction-error fits of the plant behind a lag and a delay.
 
 In a running loop u reacts to noise and loads. The *direct method* needs no knowledge of the
@@ -92,11 +100,24 @@ Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
 
+class Inputs(NamedTuple):
+    """What moves an axis and is known."""
+
+    u: Matrix  # of the actuators (N and more, m)
+    others: Matrix  # mean y of the other axes over each sample (N, number)
+
+    @classmethod
+    def of(cls, u: Vector, y: Vector) -> Inputs:
+        """Return those of a single axis."""
+        return cls(u[:, None], np.zeros((y.size, 0)))
+
+
 class Predictor(NamedTuple):
     """A sampled predictor ``x⁺ = Φ x + Γ v`` for the u before, the u after T's change, and y."""
 
     phi: Matrix  # Φ − K C (states, states)
     gamma: Matrix  # (states, 3)
+    integral: Matrix  # of the plant's Φ over a sample (states, states)
 
 
 class Form(NamedTuple):
@@ -109,6 +130,9 @@ class Form(NamedTuple):
     forgets: bool = False  #: whether λ is free; else it is 0
     share: float | None = None
     """The given share of τ in τ + T, which is then the only time that is free; None if both are."""
+    actuators: int = 1  #: m, the number of u
+    couplings: tuple[tuple[int, int], ...] = ()
+    """Number k and derivative p of the y of other axes that act on this one."""
 
     @property
     def gains(self) -> slice:
@@ -135,6 +159,16 @@ class Form(NamedTuple):
     def of_times(self) -> int:
         """Number of parameters that a form without lag and delay does not have."""
         return self.lag + self.delay + (self.lag and self.drift)
+
+    @property
+    def gains_of_u(self) -> slice:
+        """Places of b among all parameters, φ before β."""
+        return slice(self.size, self.size + self.actuators)
+
+    @property
+    def known(self) -> int:
+        """Number of linear parameters before the initial state: b and c."""
+        return self.actuators + len(self.couplings)
 
     @property
     def states(self) -> int:
@@ -226,28 +260,45 @@ def growth(form: Form, phi: Vector, samples: int) -> float:
     return 0.0 if form.drift else float(np.sum(rates[(rates > 0.0) & (rates <= _LARGEST_GROWTH)]))
 
 
-def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
-    """Return ŷ by b and by each initial state (N, 1 + states), and its part from y (N,)."""
-    system, count = _predictor(form, phi, y.size), form.states
-    gamma, start = np.zeros((count, 3, count + 2)), np.zeros((count, count + 2))
-    gamma[:, :2, 0], gamma[:, 2, -1] = system.gamma[:, :2], system.gamma[:, 2]
-    start[:, 1:-1] = np.eye(count)
-    phis = np.repeat(system.phi[:, :, None], count + 2, axis=2)
-    found = _simulated(phis, gamma, np.full(count + 2, _whole(form, phi)), start, u, y)
+def linear_columns(form: Form, phi: Vector, u: Inputs, y: Vector) -> tuple[Matrix, Vector]:
+    """Return ŷ by b, c and each initial state (N, known + states), and its part from y (N,)."""
+    system, count, known = _predictor(form, phi, y.size), form.states, form.known
+    size, m = known + count + 1, form.actuators
+    gamma, start = np.zeros((count, 3, size)), np.zeros((count, size))
+    gamma[:, :2, :m], gamma[:, 2, -1] = system.gamma[:, :2, None], system.gamma[:, 2]
+    of_u, of_y = np.zeros((2, size), dtype=np.int64)
+    of_u[:m] = np.arange(m)
+    for i, (k, p) in enumerate(form.couplings):
+        gamma[:, 2, m + i], of_y[m + i] = system.integral[:, form.order - 1 - p], k + 1
+    start[:, known:-1] = np.eye(count)
+    phis = np.repeat(system.phi[:, :, None], size, axis=2)
+    late = np.full(size, _whole(form, phi))
+    found = _simulated(phis, gamma, (late, of_u, of_y), start, u.u, np.column_stack([y, u.others]))
     return found[:, :-1], found[:, -1]
 
 
-def predicted(form: Form, phis: list[Vector], beta: Vector, u: Vector, y: Vector) -> Matrix:
-    """Return ŷ (N, number) for each phi and the linear parameters ``beta``: b, initial state."""
+def predicted(form: Form, phis: list[Vector], beta: Vector, u: Inputs, y: Vector) -> Matrix:
+    """Return ŷ (N, number) for each phi and the linear parameters ``beta``: b, c, initial state."""
     systems = [_predictor(form, phi, y.size) for phi in phis]
     gamma = np.stack([one.gamma for one in systems], axis=2)
-    gamma[:, :2] *= beta[0]
-    start = np.repeat(beta[1:, None], len(phis), axis=1)
+    start = np.repeat(beta[form.known :, None], len(phis), axis=1)
     late = np.array([_whole(form, phi) for phi in phis])
-    return _simulated(np.stack([one.phi for one in systems], axis=2), gamma, late, start, u, y)
+    phi = np.stack([one.phi for one in systems], axis=2)
+    moving = u.u @ beta[: form.actuators]
+    none = np.zeros(late.size, dtype=np.int64)
+    found = _simulated(phi, gamma, (late, none, none), start, moving[:, None], y[:, None])
+    for p in sorted({p for _, p in form.couplings}):
+        parts = zip(form.couplings, beta[form.actuators : form.known], strict=True)
+        acting = sum((c * u.others[:, k] for (k, q), c in parts if q == p), np.zeros(y.size))
+        gamma = np.zeros((form.states, 3, late.size))
+        gamma[:, 2] = np.stack([one.integral[:, form.order - 1 - p] for one in systems], axis=1)
+        found += _simulated(
+            phi, gamma, (late, none, none), 0.0 * start, moving[:, None], acting[:, None]
+        )
+    return found
 
 
-def derivatives(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Matrix:
+def derivatives(form: Form, phi: Vector, beta: Vector, u: Inputs, y: Vector) -> Matrix:
     """Return the derivatives (N, size) of ŷ by a, l, λ, τ and T, by central differences."""
     steps = np.diag(_steps(form, y))
     above, below = phi + steps, phi - steps
@@ -298,7 +349,8 @@ def _predictor(form: Form, phi: Vector, samples: int) -> Predictor:
         B[:, 1] = phi[form.gains]
     B[n + 1 if form.lag else n - 1, 0] = -A[n + 1, n + 1] if form.lag else 1.0
     if not (np.max(np.abs(A)) <= _LARGEST and np.all(np.isfinite(B))):
-        return Predictor(np.full((size, size), np.nan), np.full((size, 3), np.nan))
+        nothing = np.full((size, size), np.nan)
+        return Predictor(nothing, np.full((size, 3), np.nan), nothing)
     late = math.modf(form.delay_of(phi))[0]
     with np.errstate(all="ignore"):
         # The integral of Φ does not depend on l: most derivatives find it in the cache.
@@ -307,7 +359,7 @@ def _predictor(form: Form, phi: Vector, samples: int) -> Predictor:
         gamma, now = integral @ B, rest @ B[:, 0]
         K = gamma[:, 1] if form.drift else _mirroring(phi[:n], size, samples)
         whole[:, 0] -= K
-    return Predictor(whole, np.column_stack([gamma[:, 0] - now, now, K]))
+    return Predictor(whole, np.column_stack([gamma[:, 0] - now, now, K]), integral)
 
 
 def _motion(form: Form, phi: Vector) -> Matrix:
@@ -351,15 +403,22 @@ def _whole(form: Form, phi: Vector) -> int:
 
 
 def _simulated(
-    phis: Stack, gammas: Stack, late: Indices, start: Matrix, u: Vector, y: Vector
+    phis: Stack,
+    gammas: Stack,
+    places: tuple[Indices, Indices, Indices],
+    start: Matrix,
+    u: Matrix,
+    y: Matrix,
 ) -> Matrix:
     """Return x_1 (N, number) of systems, whose last axis is their number, that start at ``start``.
 
-    ``late`` is ⌊T⌋ of each. Their loop has the systems inside, so that they are computed together.
+    ``places`` has, of each, ⌊T⌋ and the columns of u and y that move it. Their loop has the
+    systems inside, so that they are computed together.
     """
-    out = np.empty((y.size, start.shape[1]))
-    states, inputs = np.stack([start, start]), np.empty((2, start.shape[1]))
-    _simulate(phis, gammas, late, states, inputs, np.ascontiguousarray(u), y.copy(), out)
+    out = np.empty((y.shape[0], start.shape[1]))
+    states, inputs = np.stack([start, start]), np.empty((3, start.shape[1]))
+    u, y = np.ascontiguousarray(u), np.ascontiguousarray(y)
+    _simulate(phis, gammas, *places, states, inputs, u, y, out)
     return out
 
 
@@ -368,23 +427,26 @@ def _simulate(
     phis: Stack,
     gammas: Stack,
     late: Indices,
+    of_u: Indices,
+    of_y: Indices,
     states: Stack,
     inputs: Matrix,
-    u: Vector,
-    y: Vector,
+    u: Matrix,
+    y: Matrix,
     out: Matrix,
 ) -> None:
     """Write x_1 into ``out``; ``states`` (2, states, number) and ``inputs`` are work space."""
     _, n, count = states.shape
-    first, now, then = u.size - y.size, 0, 1
-    for k in range(y.size):
+    first, now, then = u.shape[0] - y.shape[0], 0, 1
+    for k in range(y.shape[0]):
         for c in range(count):
             out[k, c] = states[now, 0, c]
             at = k + first - late[c]
-            inputs[0, c], inputs[1, c] = u[max(at - 1, 0)], u[max(at, 0)]
+            inputs[0, c], inputs[1, c] = u[max(at - 1, 0), of_u[c]], u[max(at, 0), of_u[c]]
+            inputs[2, c] = y[k, of_y[c]]
         for i in range(n):
             for c in range(count):
-                states[then, i, c] = gammas[i, 2, c] * y[k]
+                states[then, i, c] = gammas[i, 2, c] * inputs[2, c]
             for c in range(count):
                 states[then, i, c] += gammas[i, 0, c] * inputs[0, c]
             for c in range(count):
@@ -416,6 +478,8 @@ _ROUNDING = 1e-20
 # Least error of the prediction that counts, relative to y: that of the derivatives by differences.
 # A record without noise would be taken to determine everything otherwise.
 _LEAST_ERROR = 1e-7
+# Least variance that is divided by.
+_SMALLEST = float(np.finfo(np.float64).tiny)
 # Relative singular value that counts as zero, as in ``output_error``.
 _RANK = 1e-12
 
@@ -425,7 +489,7 @@ class LoopFit(NamedTuple):
 
     form: Form
     phi: Vector  # a, l, λ, τ, T in units of a sample
-    beta: Vector  # b, initial state
+    beta: Vector  # b, c, initial state
     covariance: Matrix  # of phi and beta
     error: Vector  # e (N,)
     aic: float  # N log Σ e² + 2 (number of parameters)
@@ -442,12 +506,12 @@ class _Point(NamedTuple):
     power: float  # Σ e²
 
 
-def power(form: Form, phi: Vector, u: Vector, y: Vector) -> float:
+def power(form: Form, phi: Vector, u: Inputs, y: Vector) -> float:
     """Return Σ e² with the best β for φ."""
     return _solved(form, phi, u, y).power
 
 
-def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
+def fit(form: Form, phi: Vector, u: Inputs, y: Vector) -> LoopFit:
     """Return the model of least prediction error near ``phi``."""
     at, converged = _descend(form, _solved(form, phi, u, y), u, y)
     if not math.isfinite(at.power):
@@ -469,8 +533,13 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     covariance = variance * rows @ rows.T
     half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
     robust = half @ half.T
-    if robust[form.size, form.size] > covariance[form.size, form.size]:
+    of_b = np.arange(count)[form.gains_of_u]
+    ratio = np.diag(covariance)[of_b] / np.maximum(np.diag(robust)[of_b], _SMALLEST)
+    if np.any(ratio < 1.0):
         covariance = robust
+        more = np.ones(count)  # of several b each has the larger deviation
+        more[of_b] = np.sqrt(np.maximum(ratio, 1.0))
+        covariance = covariance * np.outer(more, more)
     aic = y.size * math.log(max(at.power, y.size * least)) + 2.0 * count
     aic += 2.0 * growth(form, at.phi, y.size)
     return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
@@ -516,9 +585,10 @@ def _without_model(form: Form, at: _Point) -> LoopFit:
     return LoopFit(form, at.phi, at.beta, covariance, at.error, math.inf, False)
 
 
-def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
+def _solved(form: Form, phi: Vector, u: Inputs, y: Vector) -> _Point:
     """Return the model with the best β for φ; its power is infinite if it has none."""
-    nothing = _Point(phi, np.zeros(1 + form.states), y, np.empty((0, 0)), math.inf)
+    count = form.known + form.states
+    nothing = _Point(phi, np.zeros(count), y, np.empty((0, 0)), math.inf)
     if not is_stable(form, phi, y.size):
         return nothing
     with np.errstate(all="ignore"):
@@ -533,7 +603,7 @@ def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
     return _Point(phi, beta / size, error, columns, float(error @ error))
 
 
-def _gradient(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
+def _gradient(form: Form, at: _Point, u: Inputs, y: Vector) -> tuple[Matrix, Vector]:
     """Return the columns ψ of β and φ (N, all), scaled to length 1, and their lengths."""
     with np.errstate(all="ignore"):  # the caller sees numbers that are not finite
         psi = np.hstack([at.columns, derivatives(form, at.phi, at.beta, u, y)])
@@ -542,7 +612,7 @@ def _gradient(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[Matrix, Vec
     return psi, size
 
 
-def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool]:
+def _descend(form: Form, at: _Point, u: Inputs, y: Vector) -> tuple[_Point, bool]:
     """Return the model of least prediction error near ``at``, and whether the search converged."""
     mu, floor, small = _MU, _ROUNDING * float(y @ y), 0
     for _ in range(_STEPS):
@@ -610,7 +680,7 @@ def _damped_step(
     right: Vector,
     size: Vector,
     mu: float,
-    u: Vector,
+    u: Inputs,
     y: Vector,
 ) -> tuple[_Point | None, float]:
     """Return a better model by a damped step, None if there is none, and the next μ."""

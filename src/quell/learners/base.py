@@ -130,9 +130,9 @@ class Learner(Protocol):
 
 @generic
 def adapt(
-    learner: Any, memory: Any, seen: Vector, y: float, u_before: float, f_plain: float
+    learner: Any, memory: Any, estimates: Vector, y: float, u_before: float, f_plain: float
 ) -> None:
-    """Learn from the observer's estimates ``seen = (x̂_1 … x̂_n, Δf̂, Δf̂', …)``.
+    """Learn from the observer's ``estimates = (x̂_1 … x̂_n, Δf̂, Δf̂', …)``.
 
     They follow from the measurement ``y`` and from the u applied before it. An ESO without a
     learner would have estimated ``f_plain = Δf̂ + f_L^F``.
@@ -141,13 +141,13 @@ def adapt(
 
 
 @generic
-def predict(learner: Any, memory: Any, seen: Vector, u_before: float) -> tuple[float, float]:
+def predict(learner: Any, memory: Any, estimates: Vector, u_before: float) -> tuple[float, float]:
     """Return ``(constant, slope)`` of ``f_L = constant + slope · u`` [y-unit/s^n]."""
     raise TypeError
 
 
 @generic
-def commit(learner: Any, memory: Any, seen: Vector, u: float, f_learned: float) -> None:
+def commit(learner: Any, memory: Any, estimates: Vector, u: float, f_learned: float) -> None:
     """Store the ``u`` that was applied and the ``f_learned`` that the observer is given.
 
     A guard may have reduced ``f_learned``.
@@ -218,16 +218,16 @@ def checked_learner_design(learner: Learner, observer: ESO, omega_c: float) -> A
         what = f"{name}: {function.__name__}"
         return user_functions.attempt_kernel(what, rule, function, parameters, memory, *arguments)
 
-    seen = user_functions.sample_values(order + 1)
-    call(adapt, seen, 0.9, 0.5, 0.1)
-    predicted = call(predict, seen, 0.5)
+    estimates = user_functions.sample_values(order + 1)
+    call(adapt, estimates, 0.9, 0.5, 0.1)
+    predicted = call(predict, estimates, 0.5)
     if predicted is not user_functions.UNKNOWN:
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
             rule = "must return (constant, slope), two numbers"
             raise ValueError(f"{name}: predict returns {predicted!r}: {rule}")
         for label, value in zip(("constant", "slope"), predicted, strict=True):
             user_functions.check_number(f"{name}: predict, {label},", value)
-    call(commit, seen, 0.5, 0.1)
+    call(commit, estimates, 0.5, 0.1)
     call(coefficients, np.zeros(len(names)), rule=f"it has {len(names)} names")
     call(restart)
     return parameters
@@ -263,7 +263,7 @@ class NoLearnerMemory(NamedTuple):
 def _adapt(
     learner: NoLearnerDesign,
     memory: NoLearnerMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -273,14 +273,14 @@ def _adapt(
 
 @predict.register(NoLearnerDesign)
 def _predict(
-    learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_before: float
+    learner: NoLearnerDesign, memory: NoLearnerMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     return 0.0, 0.0
 
 
 @commit.register(NoLearnerDesign)
 def _commit(
-    learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float, f_learned: float
+    learner: NoLearnerDesign, memory: NoLearnerMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     pass
 
@@ -391,14 +391,16 @@ def follow_moments(mean: Vector, variance: Vector, i: int, value: float, forget:
 
 
 @kernel
-def update_gate(gate: NoiseGate, memory: NoiseGateMemory, seen: Vector, y: float, u: float) -> bool:
+def update_gate(
+    gate: NoiseGate, memory: NoiseGateMemory, estimates: Vector, y: float, u: float
+) -> bool:
     """Update the means with a sample; return whether any state moves."""
-    memory.noise[0] = follow_noise(memory.noise[0], gate.forget, y, y - seen[0])
+    memory.noise[0] = follow_noise(memory.noise[0], gate.forget, y, y - estimates[0])
     memory.noise[1] = grown(memory.noise[1], gate.forget)
     order = memory.variance.size - 1
     moves = False
     for i in range(order + 1):
-        value = seen[i] if i < order else u
+        value = estimates[i] if i < order else u
         follow_moments(memory.mean, memory.variance, i, value, gate.forget)
         # u alone does not count: without motion it is the answer to a load.
         moves = moves or (i < order and is_moving(gate, memory, i))
@@ -500,7 +502,7 @@ def has_escaped(watch: LearnerWatch, output: float, excessive: bool) -> bool:
         return False
     if abs(output) * _LEAST_SHARE <= watch.peak:
         return False
-    # The window before may have seen the beginning, but not the peak.
+    # The window before may contain the beginning, but not the peak.
     watch.most_before = min(watch.most_before, watch.peak)
     watch.most = watch.excessive = watch.limited = watch.samples = 0.0
     return True
@@ -689,10 +691,10 @@ def lag_push(lag: Any, memory: Matrix, i: int, value: float) -> float:
 
 @lag_push.register(Lag)
 def _push_chain(lag: Lag, chain: Matrix, i: int, value: float) -> float:
-    shown = 0.0
+    before = 0.0
     if lag.predictor:
         for j in range(lag.taps.size):
-            shown += lag.taps[j] * chain[i, j]
+            before += lag.taps[j] * chain[i, j]
     carry = lag.rise * value
     after = 0.0
     for j in range(lag.taps.size):
@@ -701,22 +703,22 @@ def _push_chain(lag: Lag, chain: Matrix, i: int, value: float) -> float:
         carry = lag.rise * old
         chain[i, j] = new
         after += lag.taps[j] * new
-    return shown if lag.predictor else after
+    return before if lag.predictor else after
 
 
 @lag_push.register(DenseLag)
 def _push_dense(lag: DenseLag, memory: Matrix, i: int, value: float) -> float:
     size = lag.taps.size
-    shown = lag.through * value
+    output = lag.through * value
     for j in range(size):
-        shown += lag.taps[j] * memory[i, j]
+        output += lag.taps[j] * memory[i, j]
         total = lag.input[j] * value
         for k in range(size):
             total += lag.transition[j, k] * memory[i, k]
         memory[i, size + j] = total
     for j in range(size):
         memory[i, j] = memory[i, size + j]
-    return shown
+    return output
 
 
 # ---- The common part of learners on features ----
@@ -744,15 +746,15 @@ def _meaning(inputs: Inputs) -> Any:
 
 
 @kernel
-def write_features(inputs: Inputs, memory: Any, seen: Vector, u: float, out: Vector) -> None:
-    """Write the features of the estimates ``seen`` (n + 1,) and ``u`` into ``out`` (p,).
+def write_features(inputs: Inputs, memory: Any, estimates: Vector, u: float, out: Vector) -> None:
+    """Write the features of ``estimates`` (n + 1,) and ``u`` into ``out`` (p,).
 
     A signal that does not move is replaced by its mean. ``memory`` is the learner's, with ``gate``,
     ``scale`` (n + 2,), which divides x_1 … x_n, u and f, ``sizes`` (k,), which divides the features
     of unknown size, and the work space ``scaled`` (n,).
     """
     scale, scaled = memory.scale, memory.scaled
-    moving_u = _write_physical(inputs, memory, seen, u, out)
+    moving_u = _write_physical(inputs, memory, estimates, u, out)
     scale_by_sizes(inputs.unscaled, memory.sizes, out)
     for i in range(scaled.size):
         scaled[i] /= scale[i]
@@ -760,25 +762,25 @@ def write_features(inputs: Inputs, memory: Any, seen: Vector, u: float, out: Vec
 
 
 @kernel
-def _write_physical(inputs: Inputs, memory: Any, seen: Vector, u: float, out: Vector) -> float:
+def _write_physical(inputs: Inputs, memory: Any, estimates: Vector, u: float, out: Vector) -> float:
     """Write the features of signals in the plant's units, and these signals into ``scaled``.
 
     Return the control signal, or its mean if it does not move.
     """
     gate, scaled = memory.gate, memory.scaled
     for i in range(scaled.size):
-        scaled[i] = gated(inputs.gate, gate, i, seen[i])
+        scaled[i] = gated(inputs.gate, gate, i, estimates[i])
     moving_u = gated(inputs.gate, gate, scaled.size, u)
     write_physical(inputs.features, scaled, moving_u, out)
     return moving_u
 
 
 @kernel
-def update_feature_sizes(inputs: Inputs, memory: Any, seen: Vector, u: float) -> bool:
+def update_feature_sizes(inputs: Inputs, memory: Any, estimates: Vector, u: float) -> bool:
     """Let ``memory.sizes`` cover the features of a sample; return whether one grew."""
     if inputs.unscaled.size == 0:
         return False
-    _write_physical(inputs, memory, seen, u, memory.features)
+    _write_physical(inputs, memory, estimates, u, memory.features)
     return update_sizes(inputs.unscaled, memory.sizes, memory.features)
 
 

@@ -188,33 +188,35 @@ class ScaledMemory(NamedTuple):
 def _adapt(
     learner: ScaledDesign,
     memory: ScaledMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
 ) -> None:
     if memory.loop[0].samples <= learner.startup:
         return
-    _rescale(learner, memory, seen, u_before, f_plain)
-    _write(learner, memory, seen, u_before)
-    residual = seen[memory.scaled.size] / memory.scale[memory.scale.size - 1]
+    _rescale(learner, memory, estimates, u_before, f_plain)
+    _write(learner, memory, estimates, u_before)
+    residual = estimates[memory.scaled.size] / memory.scale[memory.scale.size - 1]
     take_step(memory.buffers, residual, learner.rate)
 
 
 @kernel
-def _rescale(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float, f: float) -> None:
+def _rescale(
+    learner: ScaledDesign, memory: ScaledMemory, estimates: Vector, u: float, f: float
+) -> None:
     """Let the scales grow; if one does, convert θ and empty the buffers."""
     theta, current, scale = memory.buffers.theta, memory.buffers.current, memory.scale
     f_before = scale[scale.size - 1]
     before = after = 0.0
     for i in range(scale.size):
         before += scale[i]
-    update_scale(learner.scaling, scale, seen, u, f)
+    update_scale(learner.scaling, scale, estimates, u, f)
     for i in range(scale.size):
         after += scale[i]
     grown = after != before
     if learner.unscaled.size > 0:
-        write_physical(learner.features, seen[: memory.scaled.size], u, current)
+        write_physical(learner.features, estimates[: memory.scaled.size], u, current)
         grown = update_sizes(learner.unscaled, memory.sizes, current) or grown
     if not grown:
         return
@@ -234,23 +236,23 @@ def _meaning(learner: ScaledDesign) -> Any:
 
 
 @kernel
-def _write(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float) -> None:
+def _write(learner: ScaledDesign, memory: ScaledMemory, estimates: Vector, u: float) -> None:
     """Write the scaled features into the buffers' ``current``."""
     scale, scaled, current = memory.scale, memory.scaled, memory.buffers.current
-    write_physical(learner.features, seen[: scaled.size], u, current)
+    write_physical(learner.features, estimates[: scaled.size], u, current)
     scale_by_sizes(learner.unscaled, memory.sizes, current)
     for i in range(scaled.size):
-        scaled[i] = seen[i] / scale[i]
+        scaled[i] = estimates[i] / scale[i]
     write(learner.features, scaled, u / scale[scaled.size], current)
 
 
 @predict.register(ScaledDesign)
 def _predict(
-    learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u_before: float
+    learner: ScaledDesign, memory: ScaledMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     if memory.loop[0].has_scale == 0.0:
         return 0.0, 0.0
-    _write(learner, memory, seen, u_before)
+    _write(learner, memory, estimates, u_before)
     output = 0.0
     for i in range(memory.buffers.theta.size):
         output += memory.buffers.theta[i] * memory.buffers.current[i]
@@ -259,7 +261,7 @@ def _predict(
 
 @commit.register(ScaledDesign)
 def _commit(
-    learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float, f_learned: float
+    learner: ScaledDesign, memory: ScaledMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     memory.loop[0].samples += 1.0
 
@@ -301,31 +303,36 @@ class BatchDesign(NamedTuple):
 
 @adapt.register(BatchDesign)
 def _adapt_batch_gradient(
-    learner: BatchDesign, memory: Buffers, seen: Vector, y: float, u_before: float, f_plain: float
+    learner: BatchDesign,
+    memory: Buffers,
+    estimates: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
 ) -> None:
     for i in range(learner.order):
-        memory.current[i] = seen[i]
+        memory.current[i] = estimates[i]
     if learner.with_u:
         memory.current[learner.order] = u_before
     memory.current[memory.theta.size - 1] = 1.0
-    take_step(memory, seen[learner.order], learner.rate)
+    take_step(memory, estimates[learner.order], learner.rate)
 
 
 @predict.register(BatchDesign)
 def _predict_batch_gradient(
-    learner: BatchDesign, memory: Buffers, seen: Vector, u_before: float
+    learner: BatchDesign, memory: Buffers, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     output = memory.theta[memory.theta.size - 1]
     if learner.with_u:
         output = memory.theta[learner.order] * u_before + output
     for i in range(learner.order):
-        output += memory.theta[i] * seen[i]
+        output += memory.theta[i] * estimates[i]
     return output, 0.0
 
 
 @commit.register(BatchDesign)
 def _commit_batch_gradient(
-    learner: BatchDesign, memory: Buffers, seen: Vector, u: float, f_learned: float
+    learner: BatchDesign, memory: Buffers, estimates: Vector, u: float, f_learned: float
 ) -> None:
     pass
 

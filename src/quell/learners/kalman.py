@@ -179,7 +179,7 @@ class KalmanMemory(NamedTuple):
 def _adapt(
     learner: KalmanDesign,
     memory: KalmanMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -192,7 +192,7 @@ def _adapt(
     for i in range(size):
         explained += theta[i] * memory.filtered[i]
     innovation = f_plain - explained
-    noise, deviation = _update_averages(learner, averages, y, y - seen[0], innovation, f_plain)
+    noise, deviation = _update_averages(learner, averages, y, y - estimates[0], innovation, f_plain)
     if not is_finite(deviation):  # for example after a measurement near the largest float
         restart(learner, memory)
         return
@@ -307,12 +307,12 @@ def _scale_feature(
 
 @predict.register(KalmanDesign)
 def _predict(
-    learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before: float
+    learner: KalmanDesign, memory: KalmanMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     theta = memory.theta
     constant = 0.0
     for i in range(learner.states):
-        constant += theta[i] * learner.scale[i] * seen[i]
+        constant += theta[i] * learner.scale[i] * estimates[i]
     if learner.bias:
         constant += theta[learner.states]
     constant = combined(learner.oscillators, memory.phase, theta, constant)
@@ -323,11 +323,11 @@ def _predict(
 
 @commit.register(KalmanDesign)
 def _commit(
-    learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float, f_learned: float
+    learner: KalmanDesign, memory: KalmanMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     chain, filtered = memory.chain, memory.filtered
     for i in range(learner.states):
-        filtered[i] = lag_push(learner.lag, chain, i, learner.scale[i] * seen[i])
+        filtered[i] = lag_push(learner.lag, chain, i, learner.scale[i] * estimates[i])
     if learner.bias:
         filtered[learner.states] = lag_push(learner.lag, chain, learner.states, 1.0)
     push_pairs(learner.oscillators, learner.lag, chain, filtered, memory.phase)

@@ -192,17 +192,17 @@ def _row(learner: OnlineDesign, memory: OnlineMemory) -> int:
 def _adapt(
     learner: OnlineDesign,
     memory: OnlineMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
 ) -> None:
     inputs, scale, loop = learner.inputs, memory.scale, memory.loop[0]
-    moves = update_gate(inputs.gate, memory.gate, seen, y, u_before)
+    moves = update_gate(inputs.gate, memory.gate, estimates, y, u_before)
     if loop.samples <= inputs.startup:
         return
-    update_scale(inputs.scaling, scale, seen, u_before, f_plain)
-    update_feature_sizes(inputs, memory, seen, u_before)
+    update_scale(inputs.scaling, scale, estimates, u_before, f_plain)
+    update_feature_sizes(inputs, memory, estimates, u_before)
     if not has_pairs(learner, memory):
         return
     # The next row to be written is the oldest of the D + 1 rows: D samples older than the newest.
@@ -217,21 +217,21 @@ def _adapt(
 
 @predict.register(OnlineDesign)
 def _predict(
-    learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before: float
+    learner: OnlineDesign, memory: OnlineMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     if not has_pairs(learner, memory):
         return 0.0, 0.0
-    write_features(learner.inputs, memory, seen, u_before, memory.features)
+    write_features(learner.inputs, memory, estimates, u_before, memory.features)
     output = infer(learner.model, memory.model, memory.features)
     return memory.scale[memory.scale.size - 1] * output + memory.loop[0].bias, 0.0
 
 
 @commit.register(OnlineDesign)
 def _commit(
-    learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, f_learned: float
+    learner: OnlineDesign, memory: OnlineMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     row = _row(learner, memory)
-    write_features(learner.inputs, memory, seen, u, memory.ring[row])
+    write_features(learner.inputs, memory, estimates, u, memory.ring[row])
     memory.loop[0].row = 0.0 if row == learner.delay else row + 1
     memory.loop[0].samples += 1.0
 

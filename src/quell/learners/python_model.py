@@ -391,7 +391,7 @@ def _finite(values: Vector) -> bool:
 def _adapt(
     learner: PythonDesign,
     memory: PythonMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -401,7 +401,7 @@ def _adapt(
         answer[PREDICTION] = 0.0
         answer[STATUS] = _FAILED_KERNELS
         return
-    adapt(learner.online, online, seen, y, u_before, f_plain)
+    adapt(learner.online, online, estimates, y, u_before, f_plain)
     if not has_pairs(learner.online, online):
         answer[STATUS] = 0.0
         return
@@ -409,7 +409,7 @@ def _adapt(
     if answer[COUNTDOWN] > 0.0:
         return
     now, batch = online.features, online.model
-    write_features(learner.online.inputs, online, seen, u_before, now)
+    write_features(learner.online.inputs, online, estimates, u_before, now)
     if batch.filled[0] > 0.0 and _finite(now):
         address, filled = learner.address, int(batch.filled[0])
         call(address, memory.model, batch.features, batch.targets, filled, now.size, now, answer)
@@ -419,7 +419,7 @@ def _adapt(
 
 @predict.register(PythonDesign)
 def _predict(
-    learner: PythonDesign, memory: PythonMemory, seen: Vector, u_before: float
+    learner: PythonDesign, memory: PythonMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     scale = memory.online.scale
     return memory.answer[PREDICTION] * scale[scale.size - 1], 0.0
@@ -427,9 +427,9 @@ def _predict(
 
 @commit.register(PythonDesign)
 def _commit(
-    learner: PythonDesign, memory: PythonMemory, seen: Vector, u: float, f_learned: float
+    learner: PythonDesign, memory: PythonMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
-    commit(learner.online, memory.online, seen, u, f_learned)
+    commit(learner.online, memory.online, estimates, u, f_learned)
 
 
 @restart.register(PythonDesign)

@@ -183,16 +183,16 @@ class LinearMemory(NamedTuple):
 def _adapt(
     learner: LinearDesign,
     memory: LinearMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
 ) -> None:
     loop, theta, inputs = memory.loop[0], memory.theta, learner.inputs
-    moves = update_gate(inputs.gate, memory.gate, seen, y, u_before)
+    moves = update_gate(inputs.gate, memory.gate, estimates, y, u_before)
     if loop.samples <= inputs.startup:
         return
-    _rescale(learner, memory, seen, u_before, f_plain)
+    _rescale(learner, memory, estimates, u_before, f_plain)
     if loop.samples <= inputs.startup:
         return
     scale = memory.scale
@@ -214,14 +214,16 @@ def _adapt(
 
 
 @kernel
-def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f: float) -> None:
+def _rescale(
+    learner: LinearDesign, memory: LinearMemory, estimates: Vector, u: float, f: float
+) -> None:
     """Let the scales grow, and convert what is in their units."""
     theta, scale, old, units = memory.theta, memory.scale, memory.old_scale, memory.units
     loop, inputs, last = memory.loop[0], learner.inputs, scale.size - 1
     for i in range(scale.size):
         old[i] = scale[i]
-    update_scale(inputs.scaling, scale, seen, u, f)
-    grown = update_feature_sizes(inputs, memory, seen, u)
+    update_scale(inputs.scaling, scale, estimates, u, f)
+    grown = update_feature_sizes(inputs, memory, estimates, u)
     if loop.has_scale == 0.0:
         # There were no features before this sample: the filters have to settle once more.
         loop.has_scale = 1.0
@@ -263,12 +265,12 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
 
 @predict.register(LinearDesign)
 def _predict(
-    learner: LinearDesign, memory: LinearMemory, seen: Vector, u_before: float
+    learner: LinearDesign, memory: LinearMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     if memory.loop[0].has_scale == 0.0:
         return 0.0, 0.0
     theta, scale = memory.theta, memory.scale
-    write_features(learner.inputs, memory, seen, u_before, memory.features)
+    write_features(learner.inputs, memory, estimates, u_before, memory.features)
     size = theta.size - 1 if learner.with_u else theta.size
     constant = 0.0
     for i in range(size):
@@ -280,7 +282,7 @@ def _predict(
 
 @commit.register(LinearDesign)
 def _commit(
-    learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f_learned: float
+    learner: LinearDesign, memory: LinearMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     loop = memory.loop[0]
     if loop.samples < _MOST_SAMPLES:
@@ -289,7 +291,7 @@ def _commit(
         loop.learn_after -= 1.0
     if loop.has_scale == 0.0:
         return
-    write_features(learner.inputs, memory, seen, u, memory.features)
+    write_features(learner.inputs, memory, estimates, u, memory.features)
     for i in range(memory.filtered.size):
         memory.filtered[i] = lag_push(learner.lag, memory.chain, i, memory.features[i])
 

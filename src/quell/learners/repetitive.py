@@ -102,7 +102,7 @@ class RepetitiveMemory(NamedTuple):
 def _adapt(
     learner: RepetitiveDesign,
     memory: RepetitiveMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -122,7 +122,7 @@ def _adapt(
 
 @predict.register(RepetitiveDesign)
 def _predict(
-    learner: RepetitiveDesign, memory: RepetitiveMemory, seen: Vector, u_before: float
+    learner: RepetitiveDesign, memory: RepetitiveMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     loop = memory.loop[0]
     return memory.table[_place(memory)] - loop.level, 0.0
@@ -130,7 +130,11 @@ def _predict(
 
 @commit.register(RepetitiveDesign)
 def _commit(
-    learner: RepetitiveDesign, memory: RepetitiveMemory, seen: Vector, u: float, f_learned: float
+    learner: RepetitiveDesign,
+    memory: RepetitiveMemory,
+    estimates: Vector,
+    u: float,
+    f_learned: float,
 ) -> None:
     loop, size = memory.loop[0], memory.past.size
     half = size + learner.settling

@@ -344,7 +344,7 @@ class System(NamedTuple):
 
     @property
     def largest_pole(self) -> float:
-        """Largest |z| of all poles; 0 without states."""
+        """Largest size of all poles in the z-plane; 0 without states."""
         poles = 1.0 + np.linalg.eigvals(System.balanced(*self).N)
         return float(np.max(np.abs(poles), initial=0.0))
 
@@ -367,12 +367,6 @@ class MatrixSystem(NamedTuple):
     def entry(self, output: int, input: int) -> System:  # noqa: A002
         """Return the system from one input to one output."""
         return System(self.N, self.B[:, input], self.C[output], float(self.D[output, input]))
-
-    @property
-    def largest_pole(self) -> float:
-        """Largest |z| of all poles; 0 without states."""
-        size = self.N.shape[0]
-        return System(self.N, np.zeros(size), np.zeros(size), 0.0).largest_pole
 
 
 # ---- Exact sampling of linear models ----

@@ -421,8 +421,8 @@ class Existence:
             few = self.outputs < q
             found.append(
                 f"the disturbances cannot be told apart: from w to y the system {why}"
-                + (f" and {self.outputs} outputs" if few else "")
-                + f"; keep {zeros.rank} columns of E, or measure another output"
+                + (f" and {_count(self.outputs, 'output')}" if few else "")
+                + f"; keep {_count(zeros.rank, 'column')} of E, or measure another output"
             )
         near = _SAME * np.max(np.abs(zeros.values), initial=0.0)
         for which in _one_of_each_pair(zeros.values):
@@ -493,6 +493,10 @@ def _one_of_each_pair(values: Complex) -> list[int]:
 
 def _text(value: complex) -> str:
     return format_roots(np.array([value]))
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def _names(letter: str, indices: Sequence[int]) -> str:

@@ -28,6 +28,7 @@ from quell.observers.forms import (
     nonlinear_model,
     without_delay,
 )
+from quell.observers.multivariable import MultivariableESO
 from quell.types import Vector, warn
 
 
@@ -315,6 +316,110 @@ class ESO:
         gain, omega_o = kalman_gain(chain, n, dt, noise, drift, jitter)
         observer = cls.model_free(n, b0, omega_o, dt, form=form, disturbance_order=m)
         return observer._with_model(observer.model._replace(gain=gain), delay)
+
+    @staticmethod
+    def state_space(
+        A: Any,
+        B: Any,
+        C: Any,
+        E: Any,
+        dt: float,
+        *,
+        omega_o: float | None = None,
+        noise_variance: Any = None,
+        drift: Any = None,
+        jitter: Any = None,
+        D: Any = None,
+        disturbance_order: int = 1,
+        form: str = "current",
+        every: Sequence[int] | None = None,
+        time_varying: bool | None = None,
+        accept_zeros: bool = False,
+    ) -> MultivariableESO:
+        """Design an observer of a plant with several inputs, outputs and disturbances.
+
+        The plant is ``x' = A x + B u + E d``, ``y = C x + D u``; each d is a polynomial in time as
+        far as the observer knows (``observers/multivariable.py``).
+
+        Parameters
+        ----------
+        A, B, C, E, D
+            matrices (n, n), (n, m), (p, n), (n, q) and (p, m), or vectors where there is one
+            column or row; D is zero by default.
+        dt
+            sample time [s].
+        omega_o
+            gains by poles: all N poles at ``exp(−omega_o dt)`` [rad/s]. They do not know that one
+            sensor is better than another one, or faster; gains by noise do.
+        noise_variance, drift
+            gains by noise, the steady Kalman gain: the variance of the noise of each output in a
+            sample (p,) [y-unit²], an encoder's step squared over 12 for example; and for each
+            disturbance (q,) the density of the white noise whose integral it is [d-unit²/s]: in
+            the time T, d drifts by ``√(drift T)``. With ``disturbance_order`` m it drives the m-th
+            derivative [d-unit²/s^(2m−1)].
+        jitter
+            density (q,) of white noise in d itself [d-unit² s]; none by default.
+        disturbance_order
+            1 if d is constant, 2 for a ramp, 3 for a parabola.
+        form
+            ``"current"``, or ``"predictor"``, whose estimates do not use the newest y.
+        every
+            samples from one measurement of each output to the next, as (1, 4) for a second encoder
+            at a quarter of the rate; gains by noise only. Outputs are due together in the first
+            sample; what they say in between is ignored.
+        time_varying
+            gains by noise only: whether to calculate the covariance, and the gain from it, in each
+            sample, as by default. False makes the gain a fixed one for each set of sensors, in a
+            seventh of the time; samples that are missing may then let the error grow, see
+            ``MultivariableESO.rms_decay``.
+        accept_zeros
+            whether to design an observer although there are invariant zeros from d to y other than
+            at s = 0. It finds a constant d, but not one at the frequency of a zero.
+
+        Returns
+        -------
+        MultivariableESO
+            which observes, but is no observer for ``ADRC``.
+
+        Raises
+        ------
+        ValueError
+            if matrices do not fit; if no such observer exists, which names the mode that y does not
+            show, or the invariant zero, and says what to do; and naming any other argument.
+
+        Examples
+        --------
+        A motor and a load behind a coupling, with an encoder of 2²⁰ counts at each side, and a
+        torque on each:
+
+        >>> J, L, k, c = 1.2e-4, 0.8e-4, 60.0, 0.005
+        >>> A = [[0, 1, 0, 0], [-k/J, -c/J, k/J, c/J], [0, 0, 0, 1], [k/L, c/L, -k/L, -c/L]]
+        >>> E = [[0, 0], [1/J, 0], [0, 0], [0, 1/L]]
+        >>> count = 2 * math.pi / 2**20
+        >>> both = ESO.state_space(
+        ...     A, [0, 1/J, 0, 0], [[1, 0, 0, 0], [0, 0, 1, 0]], E, 0.25e-3,
+        ...     noise_variance=[count**2 / 12] * 2, drift=[1.0, 1.0],
+        ... )
+        >>> both
+        MultivariableESO(n=4, m=1, p=2, q=2, omega_o=7198.48, dt=0.00025, form='current') [Riccati]
+        >>> running = both.estimator()
+        >>> estimate = running.step(y=[0.0, 0.0], u=[0.0])
+        >>> running.d.tolist()
+        [0.0, 0.0]
+        """
+        return MultivariableESO.design(
+            *(A, B, C, E, dt),
+            omega_o=omega_o,
+            noise_variance=noise_variance,
+            drift=drift,
+            jitter=jitter,
+            D=D,
+            disturbance_order=disturbance_order,
+            form=form,
+            every=every,
+            time_varying=time_varying,
+            accept_zeros=accept_zeros,
+        )
 
     @classmethod
     def _design(

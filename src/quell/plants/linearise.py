@@ -15,18 +15,23 @@ from quell.lti.models import is_linear_model
 from quell.plants.base import labelled, signals_of
 from quell.plants.flexible import CubicSpringPlant
 from quell.plants.linear import DelayedPlant, EncodedPlant, LinearPlant
+from quell.plants.multivariable import (
+    EncodedOutputs,
+    MultivariableLinearPlant,
+    MultivariableNonlinearPlant,
+)
 from quell.plants.nonlinear import FrictionPlant, NonlinearPlant, checked_point, value_or_nan
 from quell.types import Matrix, Vector
 
 # Step of the central differences, absolute for values below 1, else relative. Its error is 1e-10 by
 # rounding and 1e-12 f'''/6 by truncation, which is 3e-7 of f' even for friction tanh(v/0.001).
 _STEP = 1e-6
-# Derivatives from the step and from twice the step that differ by more than this share belong to a
-# function with a jump or a corner. Chosen by hand; smooth functions agree to 1e-5.
-_SMOOTH = 1e-2
+# Slopes of four steps in a row that differ from a line by more than this share belong to a function
+# with a jump or a corner. Chosen by hand; those of smooth functions are a line to 1e-5.
+_SMOOTH, _PLACES = 1e-2, np.array([-1.5, -0.5, 0.5, 1.5])
 
 
-def linearised(plant: Any, x: Any, u: float = 0.0, *, w: Any = None, t: float = 0.0) -> LinearPlant:
+def linearised(plant: Any, x: Any, u: Any = 0.0, *, w: Any = None, t: float = 0.0) -> Any:
     """Return a plant linearised about a state and a control signal.
 
     Its states and signals are the differences from those of the operating point. The result
@@ -36,12 +41,13 @@ def linearised(plant: Any, x: Any, u: float = 0.0, *, w: Any = None, t: float = 
     ----------
     plant
         a ``NonlinearPlant``, whose derivatives are found by central differences with steps of 1e-6
-        (choose units in which states are of order one); a plant with a cubic spring; an encoded
-        plant, whose encoder is left out; a linear plant, which is returned as it is.
+        (choose units in which states are of order one); a ``MultivariableNonlinearPlant``; a plant
+        with a cubic spring; an encoded plant, whose encoders are left out; a linear plant, which is
+        returned as it is.
     x
         state (n,).
     u
-        control signal [u-unit].
+        control signal [u-unit]; of a plant with several, all of them (m,), or one for all.
     w
         disturbances (m,); zero by default.
     t
@@ -49,7 +55,7 @@ def linearised(plant: Any, x: Any, u: float = 0.0, *, w: Any = None, t: float = 
 
     Returns
     -------
-    LinearPlant
+    LinearPlant or MultivariableLinearPlant
 
     Raises
     ------
@@ -64,17 +70,22 @@ def linearised(plant: Any, x: Any, u: float = 0.0, *, w: Any = None, t: float = 
     >>> linearised(pendulum, x=[math.pi, 0.0]).A.round(6).tolist()
     [[0.0, 1.0], [9.81, 0.0]]
     """
-    while isinstance(plant, EncodedPlant):
+    while isinstance(plant, EncodedPlant | EncodedOutputs):
         plant = plant.plant
-    if isinstance(plant, LinearPlant):
+    if isinstance(plant, LinearPlant | MultivariableLinearPlant):
         return plant
     if isinstance(plant, CubicSpringPlant):
         return _with_spring_of(plant, checks.vector("x", x, plant.order))
-    if isinstance(plant, NonlinearPlant):
+    if isinstance(plant, NonlinearPlant | MultivariableNonlinearPlant):
         state = checks.vector("x", x, plant.order)
         loads = np.zeros(plant.disturbances) if w is None else w
         loads = checks.vector("w", loads, plant.disturbances)
-        return _differentiated(plant, state, checks.finite("u", u), loads, checks.finite("t", t))
+        t = checks.finite("t", t)
+        if isinstance(plant, MultivariableNonlinearPlant):
+            signals = np.full(plant.inputs, u) if np.ndim(u) == 0 else u
+            signals = checks.vector("u", signals, plant.inputs)
+            return _differentiated_all(plant, state, signals, loads, t)
+        return _differentiated(plant, state, checks.finite("u", u), loads, t)
     rule = "must be a NonlinearPlant, a plant with a cubic spring, or a linear plant"
     raise ValueError(f"plant = {getattr(plant, 'name', plant)!r}: {rule}")
 
@@ -100,6 +111,21 @@ def _differentiated(plant: NonlinearPlant, x: Vector, u: float, w: Vector, t: fl
     return LinearPlant(J[:, :n], J[:, n], C, J[:, n + 1 :], name=f"{plant.name}, linearised")
 
 
+def _differentiated_all(
+    plant: MultivariableNonlinearPlant, x: Vector, u: Vector, w: Vector, t: float
+) -> MultivariableLinearPlant:
+    model: Any = plant.sampled(1.0, interpret=True)
+    n, m = x.size, x.size + u.size
+
+    def rate(point: Vector) -> Any:
+        return model.rate(t, point[:n], point[n:m], point[m:])
+
+    J = _jacobian(rate, np.concatenate([x, u, w]), "f")
+    C = _jacobian(model.output, x, "output")
+    parts = (J[:, :n], J[:, n:m], C, J[:, m:])
+    return MultivariableLinearPlant(*parts, name=f"{plant.name}, linearised")
+
+
 def _jacobian(function: Callable[[Vector], Any], point: Vector, name: str) -> Matrix:
     """Return the derivatives (m, n) of m values by the n entries of ``point``."""
     columns = []
@@ -115,7 +141,9 @@ def _jacobian(function: Callable[[Vector], Any], point: Vector, name: str) -> Ma
         # Rounding errors of the values, divided by the step.
         size = np.max(np.abs(values), axis=0) * 1e-9 / step
         allowed = _SMOOTH * np.max(np.abs(slopes), axis=0) + size
-        if not np.all(np.ptp(slopes, axis=0) <= allowed):
+        # What is left of the slopes without their own trend, which a second derivative makes.
+        bend = np.tensordot(_PLACES, slopes, 1) / (_PLACES @ _PLACES)
+        if not np.all(np.ptp(slopes - np.multiply.outer(_PLACES, bend), axis=0) <= allowed):
             raise ValueError(
                 f"{name} has no derivative by entry {i} of (x, u, w) = {point.tolist()!r}, where "
                 "it jumps or has a corner (dry friction, a stop, the end of a range); take a point "

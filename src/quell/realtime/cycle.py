@@ -33,7 +33,7 @@ A control loop: device, controller, supervisor and reference, compiled before th
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -58,12 +58,14 @@ from quell.kernels.dispatch import (
     specialised,
 )
 from quell.realtime import recordings
+from quell.realtime.channels import ChannelInputs, channel_inputs, pass_channels
 from quell.realtime.devices import (
     Device,
     PythonHandle,
     Tick,
     ask,
     handle_of,
+    read_channels,
     read_measurement,
     read_tick,
     write_command,
@@ -100,10 +102,8 @@ from quell.types import Vector
 
 # ---- The loop by deadlines ----
 
-_MISSED, _OVERRAN, _CLIPPED, _UNSENT, _CHANGED = (
-    int(event)
-    for event in (Event.MISSED, Event.OVERRUN, Event.CLIPPED, Event.UNSENT, Event.CHANGED)
-)
+_MISSED, _OVERRAN, _CLIPPED = int(Event.MISSED), int(Event.OVERRUN), int(Event.CLIPPED)
+_UNSENT, _CHANGED, _CHANNEL = int(Event.UNSENT), int(Event.CHANGED), int(Event.CHANNEL)
 
 
 class CycleLog(NamedTuple):
@@ -113,6 +113,7 @@ class CycleLog(NamedTuple):
     row: Vector  #: work array: one row
     f_learned: int  #: index of the learned part of f̂ in a row; −1 if the controller reports none
     f_residual: int  #: index of the observer's part of f̂
+    channels: int  #: index of the device's channels, behind the controller's
     lateness: NDArray[np.int64]  #: histogram, see ``count_duration``
     step_time: NDArray[np.int64]  #: histogram
 
@@ -126,6 +127,7 @@ class SupervisedController(NamedTuple):
     supervisor: SupervisorState
     reference: ReferenceSamples
     log: CycleLog
+    inputs: ChannelInputs  #: what the device gives beside y
 
 
 @compiled
@@ -147,6 +149,7 @@ def run_cycles(handle: Any, clock: Any, period: float, controller: Any) -> None:
         k += overslept
         _count_skipped(supervisor, overslept)
         y, waited = read_measurement(handle, clock, woke)
+        _read_channels(handle, controller.inputs)
         changed, clipped = supervisor.changed[0], counters.clipped
         u = control_step(controller, k, left_out, y)
         fault = write_command(handle, u)
@@ -157,11 +160,25 @@ def run_cycles(handle: Any, clock: Any, period: float, controller: Any) -> None:
         overran = overslept + missed_next > 0
         count_cycle(supervisor, overran)
         events = cycle_events(supervisor, y, overran, fault, changed, clipped)
+        events += _channel_event(controller.inputs)
         fill_row(log, memory, k, lateness, written - woke - waited, events, y)
         push(log.ring, log.row)
         _count_skipped(supervisor, missed_next)
         left_out = missed_next
         k += 1 + missed_next
+
+
+@kernel
+def _read_channels(handle: Any, inputs: ChannelInputs) -> None:
+    """Take what the device gave beside the last measurement."""
+    if inputs.values.size > 0:
+        read_channels(handle, inputs.values)
+
+
+@kernel
+def _channel_event(inputs: ChannelInputs) -> int:
+    """Return the ``Event`` flag of a missing channel."""
+    return _CHANNEL if inputs.missing[1] != 0 else 0
 
 
 @kernel
@@ -246,6 +263,11 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
         memory.offset = y - reference.r[0]
         first = k
     awake = memory.mode != Mode.STOPPED and is_finite(memory.y)
+    inputs = controller.inputs
+    if inputs.values.size > 0:
+        pass_channels(inputs, design, state, rules.hold)
+        for i in range(inputs.values.size):
+            row[controller.log.channels + i] = inputs.values[i]
     r, wished, f_hat = 0.0, 0.0, 0.0
     for i in range(first, k + 1):
         r = _set_reference(design, state, reference, memory, i)
@@ -253,7 +275,7 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
             wished = control(design, state, r, y if i == k else np.nan)
             if i < k:
                 set_applied_control(design, state, memory.u)
-    write_row(design, state, row[LOOP_WIDTH:])
+    write_row(design, state, row[LOOP_WIDTH : controller.log.channels])
     if controller.log.f_learned >= 0:
         f_hat = row[controller.log.f_learned] + row[controller.log.f_residual]
     u = supervised_output(rules, supervisor, k, wished, r, f_hat)
@@ -335,6 +357,8 @@ def follow_ticks(handle: Any, clock: Any, period: float, controller: SupervisedC
                 invented += ahead
         ahead -= 1
         y = tick.y if ahead == 0 else np.nan
+        if ahead == 0:
+            _read_channels(handle, controller.inputs)
         superseded = ahead > 0 or tick.left > 0
         taken = now(clock)
         if k > 0:
@@ -354,6 +378,7 @@ def follow_ticks(handle: Any, clock: Any, period: float, controller: SupervisedC
         overran = overslept > 0 or written - taken >= period
         count_cycle(supervisor, overran)
         events = cycle_events(supervisor, y, overran, fault, changed, clipped)
+        events += _channel_event(controller.inputs)
         fill_row(log, memory, k, late, written - taken, events, y)
         k += 1
     if k > 0:
@@ -457,6 +482,7 @@ class CompiledController(NamedTuple):
 
     supervisor: SupervisorState
     log: CycleLog
+    inputs: ChannelInputs
     controller: SupervisedController
     step: Callable[[SupervisedController, int, int, float], float]
 
@@ -474,7 +500,8 @@ def _call_step(controller: CompiledController, k: int, left_out: int, y: float) 
 def compiled_controller(controller: SupervisedController) -> CompiledController:
     """Return the controller with its compiled control step."""
     step = specialised(_step, controller, 0, 0, 0.0)
-    return CompiledController(controller.supervisor, controller.log, controller, step)
+    inputs = controller.inputs
+    return CompiledController(controller.supervisor, controller.log, inputs, controller, step)
 
 
 # ---- A control loop ----
@@ -505,18 +532,20 @@ class ControlLoop:
         clock: Any,
         ring: Ring,
         *,
+        channels: Sequence[str] = (),
         state: Any = None,
         interpret: bool = False,
     ) -> ControlLoop:
         """Return the compiled loop of a device and a controller.
 
-        It runs on ``state``; by default on a new one with nothing learned.
+        It runs on ``state``; by default on a new one with nothing learned. ``channels`` are those
+        of the device, as ``checked_channels`` returns them.
         """
-        channels = row_channels(controller.channels)
-        row = np.zeros(sum(width for _, width in channels))
-        known = {name for name, width in channels if width}
+        columns = row_channels(controller.channels, channels)
+        row = np.zeros(sum(width for _, width in columns))
+        known = {name for name, width in columns if width}
         f_learned, f_residual = (
-            columns_of(channels, name).start if {"f_learned", "f_residual"} <= known else -1
+            columns_of(columns, name).start if {"f_learned", "f_residual"} <= known else -1
             for name in ("f_learned", "f_residual")
         )
         supervised = SupervisedController(
@@ -525,7 +554,16 @@ class ControlLoop:
             rules=rules,
             supervisor=initial_state(),
             reference=reference,
-            log=CycleLog(ring, row, f_learned, f_residual, empty_counts(), empty_counts()),
+            log=CycleLog(
+                ring=ring,
+                row=row,
+                f_learned=f_learned,
+                f_residual=f_residual,
+                channels=row.size - len(channels),
+                lateness=empty_counts(),
+                step_time=empty_counts(),
+            ),
+            inputs=channel_inputs(controller, channels),
         )
         handle = handle_of(device)
         paced = getattr(device, "paced", False) and not isinstance(handle, PythonHandle)

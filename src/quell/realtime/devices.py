@@ -9,6 +9,9 @@ from compiled code also has a ``handle``: a NamedTuple for whose type ``read_mea
 A device with its own clock sends a numbered measurement at each of its ticks; its attribute
 ``paced`` is True, and ``read_tick`` waits for the next one. Other devices answer at any time.
 
+A device that measures more than y has ``read_channels() -> numbers``, those of the last ``read``;
+for a handle ``read_channels`` is registered (``realtime/channels.py``).
+
 A plant in this process as a device: it has no clock, and advances by a sample at each write.
 """
 
@@ -32,7 +35,7 @@ from quell.plants.base import (
     measure,
     signals_of,
 )
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 # ---- The interface between the loop and a device ----
 
@@ -104,6 +107,16 @@ def ask(handle: Any) -> None:
     """Ask a paced device, which sends only as long as it hears from the loop, for measurements."""
 
 
+@generic_with_default
+def read_channels(handle: Any, values: Vector) -> None:
+    """Write what the device gave beside the last measurement into ``values``, in its order.
+
+    NaN for what has not come, or is too old. The default is a device that gives y only.
+    """
+    for i in range(values.size):
+        values[i] = math.nan
+
+
 class PythonHandle(NamedTuple):
     """A device that only Python can use."""
 
@@ -132,6 +145,17 @@ def _read_measurement(handle: PythonHandle, clock: Any, until: int) -> tuple[flo
         return math.nan, 0
 
 
+@read_channels.register(PythonHandle)
+def _read_channels(handle: PythonHandle, values: Vector) -> None:
+    values[:] = math.nan
+    try:
+        given: Any = handle.device
+        found = [float(value) for value in given.read_channels()][: values.size]
+        values[: len(found)] = found
+    except Exception as error:
+        _count_error(handle, error)
+
+
 @write_command.register(PythonHandle)
 def _write_command(handle: PythonHandle, u: float) -> int:
     try:
@@ -158,11 +182,19 @@ class TwinHandle(NamedTuple):
     scratch: Vector
     w: Vector  # disturbances: zero (m,)
     t: Vector  # samples since the start, and the sample time [s] (2,)
+    channels: Matrix  # of each sample; the last row holds for all later ones (N, c)
 
 
 @read_measurement.register(TwinHandle)
 def _read_measurement_twin(handle: TwinHandle, clock: Any, until: int) -> tuple[float, int]:
     return measure(handle.plant, handle.x), 0
+
+
+@read_channels.register(TwinHandle)
+def _read_channels_twin(handle: TwinHandle, values: Vector) -> None:
+    row = min(int(handle.t[0]), handle.channels.shape[0] - 1)
+    for i in range(values.size):
+        values[i] = handle.channels[row, i] if i < handle.channels.shape[1] else math.nan
 
 
 @write_command.register(TwinHandle)
@@ -186,12 +218,15 @@ class TwinDevice:
     """A simulated plant: ``read`` measures it, ``write(u)`` advances it by a sample ``dt`` [s].
 
     It starts from the state ``x0`` (n,), zero by default. u acts at once. Over a wire it acts a
-    sample later; ``quell.plants.delayed(plant, dt, dt)`` adds the same delay to this device.
+    sample later; ``quell.plants.delayed(plant, dt, dt)`` adds the same delay to this device. It
+    gives ``channels`` beside y: c constants, or a row for each sample (N, c), of which the last one
+    stays.
 
     Raises
     ------
     ValueError
-        if ``plant`` is not a plant, dt is not positive, or x0 has the wrong size.
+        if ``plant`` is not a plant, dt is not positive, x0 has the wrong size, or channels are no
+        numbers.
 
     Examples
     --------
@@ -206,7 +241,9 @@ class TwinDevice:
     paced = False
     lost = False
 
-    def __init__(self, plant: Plant, dt: float, x0: ArrayLike | None = None) -> None:
+    def __init__(
+        self, plant: Plant, dt: float, x0: ArrayLike | None = None, *, channels: ArrayLike = ()
+    ) -> None:
         check_plant(plant)
         self.dt = checks.positive("dt", dt, "s")
         order = plant.order
@@ -216,7 +253,8 @@ class TwinDevice:
         self._x0 = x.copy()
         self.signals = signals_of(plant)
         begin_run(model, x, scratch)
-        self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]))
+        given = _checked_rows(channels)
+        self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]), given)
         # Without a public handle the loop runs as Python.
         self.handle = self._handle if plant.compiled else None
 
@@ -236,6 +274,12 @@ class TwinDevice:
             return float(measure(self._handle.plant, self._handle.x))
         return float(call_specialised(_read, self.handle))
 
+    def read_channels(self) -> list[float]:
+        """Return the channels of this sample."""
+        rows = self._handle.channels
+        found: list[float] = rows[min(int(self._handle.t[0]), len(rows) - 1)].tolist()
+        return found
+
     def write(self, u: float) -> None:
         """Apply u [u-unit] for a sample."""
         if self.handle is None:
@@ -246,10 +290,22 @@ class TwinDevice:
 
     def close(self) -> None:
         """Put a plant whose state is destroyed back to ``x0``, so that the device can be reused."""
-        plant, x, scratch, _, t = self._handle
+        plant, x, scratch, _, t, _ = self._handle
         if is_destroyed(x, self._x0):
             x[:], t[0] = self._x0, 0.0
             begin_run(plant, x, scratch)
+
+
+def _checked_rows(channels: ArrayLike) -> Matrix:
+    """Return channels as rows of samples (N, c); NaN is a value that does not come."""
+    try:
+        rows = np.atleast_2d(np.array(channels, dtype=np.float64))
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
+    if rows.ndim != 2 or rows.shape[0] == 0:
+        rule = "must be numbers, or a row of numbers for each sample"
+        raise ValueError(f"channels = {channels!r:.60}: {rule}")
+    return np.ascontiguousarray(rows)
 
 
 def twin_device(url: str, dt: float, trust: bool = False) -> TwinDevice:

@@ -36,7 +36,7 @@ import operator
 import os
 import struct
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from enum import IntFlag
@@ -94,12 +94,13 @@ class Event(IntFlag):
     CLIPPED = 4  #: the supervisor's limits changed the controller's u
     UNSENT = 8  #: the command could not be sent
     CHANGED = 16  #: the mode changed
+    CHANNEL = 32  #: a channel that the controller uses was missing, and its last value was held
     GAP = 1 << 16  #: no recorded cycle: deadline skipped, or row lost; ``load`` filled it in
 
 
-def row_channels(controller_channels: Channels) -> Channels:
-    """Return the channels of a row for a controller with these channels."""
-    return (*LOOP_CHANNELS, *controller_channels)
+def row_channels(controller_channels: Channels, device_channels: Sequence[str] = ()) -> Channels:
+    """Return the channels of a row for a controller and a device with these channels."""
+    return (*LOOP_CHANNELS, *controller_channels, *((name, 1) for name in device_channels))
 
 
 # ---- Header of a recording ----

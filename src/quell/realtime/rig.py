@@ -75,7 +75,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
 from quell.files import check_writable
-from quell.kernels.dispatch import call_specialised, compiled, is_finite, kernel
+from quell.kernels.dispatch import (
+    call_specialised,
+    compiled,
+    generic_with_default,
+    is_finite,
+    kernel,
+)
 from quell.plants.base import Plant, advance, check_plant, is_destroyed, measure
 from quell.realtime import wire
 from quell.realtime.devices import Listener
@@ -130,14 +136,19 @@ LAST_WORDS = 10
 # plant was at rest, sessions, refused hellos, trips of the watchdog, clipped commands, late ticks,
 # destroyed states that were put back to rest, measurements that the other side has asked for.
 STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
-RESTORED, ASKED = 9, 10
-COUNTS = 11
+RESTORED, ASKED, TURN = 9, 10, 11
+COUNTS = 12
 # Entries of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
 APPLIED, COMMANDED, LARGEST = range(3)
 
 LOG = ("tick", "t", "session", "state", "y", "u", "command")
 """Columns of the log: number of the tick and its time [s], session, state (0 idle … 3 tripped), y,
 u as applied, and the command that came in this tick, NaN if none has."""
+
+
+@generic_with_default
+def measure_channels(plant: Any, x: Vector, values: Vector) -> None:
+    """Write what a plant gives beside y into ``values``; by default they stay as they are."""
 
 
 class RigModel(NamedTuple):
@@ -160,6 +171,7 @@ class RigModel(NamedTuple):
     w: Vector
     counts: NDArray[np.int64]
     signals: Vector
+    channels: Vector  # what is sent beside y (c,)
     row: Vector
     log: Ring
     logged: bool
@@ -177,8 +189,10 @@ def tick(rig: RigModel, time: int, fresh: bool) -> None:
     fresh |= _receive_command(rig, time)
     _update_watchdog(rig, fresh)
     y = measure(rig.plant, rig.x)
+    measure_channels(rig.plant, rig.x, rig.channels)
     if counts[STATE] != IDLE and counts[ASKED] > 0:
         counts[ASKED] -= 1
+        _send_channels(rig, time)
         state = wire.WATCHDOG_TRIPPED if counts[STATE] == TRIPPED else 0
         wire.write_next_frame(rig.outbox, rig.endpoint, wire.MEASUREMENT, time, y, state)
         if send(rig.transport, rig.outbox) != 0:
@@ -189,6 +203,30 @@ def tick(rig: RigModel, time: int, fresh: bool) -> None:
     advance(rig.plant, rig.x, rig.scratch, counts[SINCE_REST] * rig.dt, signals[APPLIED], rig.w)
     counts[SINCE_REST] += 1
     counts[TICKS] += 1
+
+
+@kernel
+def _send_channels(rig: RigModel, time: int) -> None:
+    """Send the channels of this tick before its measurement.
+
+    Before the first command the next one in turn takes the place of a measurement: an address that
+    has not proved that it receives gets no more frames than without channels.
+    """
+    counts, own = rig.counts, rig.endpoint
+    first, last = 0, rig.channels.size
+    if counts[STATE] == WAITING and last > 0:
+        if counts[ASKED] == 0:
+            return
+        counts[ASKED] -= 1
+        first = counts[TURN] % last
+        last = first + 1
+        counts[TURN] += 1
+    for i in range(first, last):
+        session, number = own.numbers[wire.SESSION], own.numbers[wire.SENT] + 1
+        answers, value = own.numbers[wire.RECEIVED], rig.channels[i]
+        wire.write_frame(rig.outbox, wire.TELEMETRY, session, number, answers, time, value, i)
+        if send(rig.transport, rig.outbox) != 0:
+            own.counters[wire.NOT_SENT] += 1
 
 
 @kernel
@@ -408,6 +446,9 @@ class Rig:
         ticks are shifted by that time. A loop that is late then has no effect on the motion.
     x0
         the plant's state at the start (n,); zero by default.
+    channels
+        numbers that are sent beside y, at most 8, for the loop's schedule for example; the
+        attribute ``channels`` is an array whose values may be changed while it runs.
     log
         CSV file for y, u, command and state of each tick (``quell.realtime.rig.LOG``).
     overwrite
@@ -430,6 +471,7 @@ class Rig:
         rest: bool = True,
         wait: float = 0.0,
         x0: ArrayLike | None = None,
+        channels: ArrayLike = (),
         log: str | Path | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -445,6 +487,7 @@ class Rig:
         watchdog = checks.whole("watchdog", watchdog, 1, _MOST_TICKS)
         start = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)
         rows = max(round(_BUFFERED / dt), _LEAST_ROWS)
+        self.channels = _checked_channels(plant, channels)
         self.listener = listener
         self.dt = dt
         self.model = RigModel(
@@ -465,6 +508,7 @@ class Rig:
             w=np.zeros(plant.disturbances),
             counts=np.zeros(COUNTS, dtype=np.int64),
             signals=np.array([0.0, np.nan, 0.0]),
+            channels=self.channels,
             row=np.zeros(len(LOG)),
             log=ring(1 if log is None else rows, len(LOG)),
             logged=log is not None,
@@ -627,6 +671,19 @@ class Rig:
             self._log_failure = f"the log was given up: {error.strerror}"
             with suppress(OSError):
                 self._file.close()
+
+
+def _checked_channels(plant: Any, channels: ArrayLike) -> Vector:
+    """Return the first values of the channels: those given, or as many as the plant has."""
+    own = len(getattr(plant, "channels", ()))
+    try:
+        values = np.full(own, np.nan) if own else np.array(channels, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros((0, 0))
+    if values.ndim != 1 or values.size > wire.MOST_CHANNELS:
+        rule = f"must be at most {wire.MOST_CHANNELS} numbers"
+        raise ValueError(f"channels = {channels!r:.60}: {rule}")
+    return values
 
 
 def _checked_wait(wait: float) -> float:

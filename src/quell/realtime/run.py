@@ -40,6 +40,13 @@ from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
 from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors
 from quell.quantities import UNKNOWN, Signals
+from quell.realtime.channels import (
+    ChannelInputs,
+    await_channels,
+    channel_inputs,
+    checked_channels,
+    pass_channels,
+)
 from quell.realtime.cycle import ControlLoop
 from quell.realtime.devices import Device, PythonHandle, handle_of
 from quell.realtime.memory_file import MemoryFile, memory_file
@@ -54,6 +61,7 @@ from quell.realtime.supervisor import (
     Safety,
     SupervisorState,
     as_scenario,
+    default_hold,
     reference_samples,
 )
 from quell.realtime.system import (
@@ -232,6 +240,20 @@ def silence_of(
     )
 
 
+def missing_channels(record: Trajectory, names: Sequence[str]) -> tuple[str, ...]:
+    """Return a note if channels that the controller uses were missing while it was in control."""
+    if not names:
+        return ()
+    flags = np.asarray(record["events"]).astype(np.int64) & Event.CHANNEL != 0
+    count = int(np.sum(flags & (record["mode"] == Mode.RUN)))
+    if not count:
+        return ()
+    return (
+        f"channels: in {count} samples under control one that the controller uses was missing, and "
+        "its last value was held; the record has them as nan and the event CHANNEL",
+    )
+
+
 def scenario_part(record: Trajectory, state: SupervisorState, samples: int) -> Trajectory:
     """Return the samples of a record that belong to the scenario."""
     k, began = record["k"], state.memory[0].began
@@ -265,6 +287,7 @@ def run_rig(
     overwrite: bool = False,
     signals: Signals | None = None,
     memory: MemoryFile | str | PathLike[str] | None = None,
+    channels: Sequence[str] = (),
 ) -> RigRun:
     """Close a controller's loop around a device in real time, at the controller's sample time.
 
@@ -315,13 +338,18 @@ def run_rig(
         controller begins with it, from rest; one that does not fit is an error, before anything
         moves. It is replaced when the run ends, whole or not at all, but not after a fault, to
         which what was learned may have contributed; and on ``MemoryFile.save()`` or SIGUSR1.
+    channels
+        names of the numbers that the device gives beside y, in its order: the external signals of
+        the controller's schedule first, ``held`` for whether the plant is held, others to be
+        recorded only. The last value of one that is missing is held (``realtime.channels``).
 
     Raises
     ------
     ValueError
-        for u without finite limits, a device of another dt, a reference that is not finite.
+        for u without finite limits, a device of another dt, a reference that is not finite, a
+        schedule without its signals, and channels that the device or the controller does not know.
     ConnectionError
-        if a call of the device's driver does not return.
+        if a call of the device's driver does not return, or a channel does not come.
     """
     handle = handle_of(device)
     with closing(device):
@@ -339,11 +367,7 @@ def run_rig(
             )
         scenario = as_scenario(scenario, duration)
         rules = (Safety() if safety is None else safety).rules(controller, scenario)
-        if getattr(controller, "external_signals", 0):
-            raise ValueError(
-                "controller has a schedule with signal = 'external': a device gives y only; follow "
-                "'reference', 'y' or 'speed', or take the controller at one point, controller.at(…)"
-            )
+        names = checked_channels(controller, channels)
         derivatives = getattr(controller, "derivatives", 0)
         reference = reference_samples(scenario, dt, derivatives, approach)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
@@ -352,12 +376,20 @@ def run_rig(
             state, learned = kept.start(controller)
         rows = MemorySink()
         writer = TelemetryWriter(
-            _header(device, controller, signals), [rows, *_sinks(telemetry, overwrite)]
+            _header(device, controller, signals, names), [rows, *_sinks(telemetry, overwrite)]
         )
         if isinstance(handle, PythonHandle):
             device.read()  # an error of the driver comes before compiling
+        await_channels(device, channel_inputs(controller, names), names, dt)
         loop = ControlLoop.of(
-            device, controller, reference, rules, system_clock(spin), writer.ring, state=state
+            device,
+            controller,
+            reference,
+            rules,
+            system_clock(spin),
+            writer.ring,
+            channels=names,
+            state=state,
         )
         supervisor = loop.controller.supervisor
         writer.urgent = loop.interpreted and priority > 1
@@ -376,6 +408,8 @@ def run_rig(
         notes.append(_last_save(kept, supervisor, dt))
     if scenario.disturbances or scenario.noise != 0.0:
         notes.append("disturbances and noise of the scenario are ignored: the rig has its own")
+    if scenario.schedule:
+        notes.append("schedule of the scenario is ignored: the device gives the signals")
     handle = loop.handle
     if isinstance(handle, PythonHandle) and handle.errors:
         count, last = int(handle.faults[0]), handle.errors[0]
@@ -383,7 +417,7 @@ def run_rig(
     notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
     record = replace(rows.trajectory(), u_limits=(rules.low, rules.high))
     counters, changes = dict(getattr(device, "counters", {})), mode_changes(supervisor, dt)
-    notes += silence_of(record, changes, before, counters)
+    notes += [*silence_of(record, changes, before, counters), *missing_channels(record, names)]
     return RigRun(
         trajectory=scenario_part(record, supervisor, reference.r.size),
         record=record,
@@ -407,12 +441,14 @@ def _last_save(kept: MemoryFile, supervisor: SupervisorState, dt: float) -> str:
     return kept.write(supervisor.steps)
 
 
-def _header(device: Device, controller: Controller, signals: Signals | None) -> Header:
+def _header(
+    device: Device, controller: Controller, signals: Signals | None, channels: Sequence[str]
+) -> Header:
     known = getattr(device, "signals", UNKNOWN) if signals is None else signals
     known = signals_of_loop(known, controller)
     units = {"y": known.y.unit, "u": known.u.unit}
     return Header(
-        channels=row_channels(controller.channels),
+        channels=row_channels(controller.channels, channels),
         dt=controller.dt,
         features=tuple(controller.features),
         device=getattr(device, "name", type(device).__name__),
@@ -511,7 +547,13 @@ _RECORDED = ("r", "y", "y_measured", "u")
 _NO_DERIVATIVES = np.zeros(0)
 
 
-def replay(run: Trajectory, controller: Controller, *, u_before: float | None = None) -> Trajectory:
+def replay(
+    run: Trajectory,
+    controller: Controller,
+    *,
+    u_before: float | None = None,
+    channels: Sequence[str] = (),
+) -> Trajectory:
     """Let a controller follow a recorded run.
 
     It starts with nothing learned, on a state of its own, as in ``simulate``. The controller that
@@ -531,6 +573,9 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     u_before
         control signal under which the plant rested before the first sample [u-unit]. The controller
         then starts as by ``controller.start(y, u_before)``; by default as by its first sample.
+    channels
+        names of the device's channels in the run, as for ``run_rig``; a missing ``held`` keeps its
+        state as long as by the default of ``Safety.hold_time``.
 
     Returns
     -------
@@ -541,7 +586,8 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     ------
     ValueError
         for a run without r, y, y_measured or u, with samples left out, without measurements, or
-        with another sample time; for ``u_before`` with a controller that can't start under load.
+        with another sample time; for ``u_before`` with a controller that can't start under load;
+        for a schedule without its signals, and channels that the run does not have.
     """
     check_controller(controller)
     if not isinstance(run, Trajectory):
@@ -564,19 +610,30 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     measured = np.flatnonzero(np.isfinite(recorded[:, 2]))
     if measured.size == 0:
         raise ValueError("run has no finite y_measured: there is nothing to observe")
+    names = checked_channels(controller, channels)
+    absent = [name for name in names if name not in run.names]
+    if absent:
+        raise ValueError(f"channels: the run has no {', '.join(absent)}; it has {run.names}")
+    given = np.zeros((len(run), len(names)))
+    for i, name in enumerate(names):
+        given[:, i] = run[name]
+    inputs = channel_inputs(controller, names)
+    hold = default_hold(controller.dt)
     design, state = controller.parameters, controller.initial_state()
     if u_before is not None:
         r, _, y, _ = recorded[measured[0]].tolist()
         design, state = _started(controller, y, checks.finite("u_before", u_before), r)
-    channels = (*((name, 1) for name in _RECORDED), ("u_wished", 1), *controller.channels)
-    log = np.empty((len(run), sum(width for _, width in channels)))
+    columns = (*((name, 1) for name in _RECORDED), ("u_wished", 1), *controller.channels)
+    log = np.empty((len(run), sum(width for _, width in columns)))
     log[:, : len(_RECORDED)] = recorded
     began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
     with np.errstate(over="ignore", invalid="ignore"), explain_compile_errors(design):
-        status = call_specialised(_follow, design, state, _NO_DERIVATIVES, began, log)
+        status = call_specialised(
+            _follow, design, state, _NO_DERIVATIVES, began, log, inputs, given, hold
+        )
     return Trajectory(
         log=log,
-        channels=channels,
+        channels=columns,
         dt=run.dt,
         status=Status(int(status)),
         ended=(len(run) - 1) * run.dt,
@@ -600,16 +657,29 @@ def _started(controller: Any, y: float, u: float, r: float) -> tuple[Any, Any]:
 
 
 @compiled
-def _follow(design: Any, state: Any, derivatives: Vector, began: int, log: Matrix) -> int:
+def _follow(
+    design: Any,
+    state: Any,
+    derivatives: Vector,
+    began: int,
+    log: Matrix,
+    inputs: ChannelInputs,
+    given: Matrix,
+    hold: int,
+) -> int:
     """Run the controller on the first columns of ``log``, write the others; return status flags.
 
-    From sample ``began`` on the controller was in control.
+    From sample ``began`` on the controller was in control. ``given`` are the device's channels.
     """
     status = 0
     for k in range(log.shape[0]):
         if k == began and k > 0:
             bumpless_transfer(design, state)
         set_reference_derivatives(design, state, derivatives)
+        if inputs.values.size > 0:
+            for i in range(inputs.values.size):
+                inputs.values[i] = given[k, i]
+            pass_channels(inputs, design, state, hold)
         wished = control(design, state, log[k, 0], log[k, 2])
         status |= status_flags(design, state)
         log[k, 4] = wished

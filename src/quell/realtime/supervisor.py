@@ -700,6 +700,11 @@ class Safety:
         )
 
 
+def default_hold(dt: float) -> int:
+    """Return the default of ``Safety.hold`` for a sample time ``dt`` [s]."""
+    return Safety()._samples(_COUNTS[0], dt)
+
+
 def _check_around_zero(low: float, high: float) -> None:
     if not low <= 0.0 <= high or low == high:
         raise ValueError(

@@ -8,7 +8,7 @@ offset  size  type     content
 0       2     bytes    ``QL``
 2       1     uint8    version of the protocol: 1
 3       1     uint8    kind: 1 measurement, 2 command, 3 hello, 4 welcome, 5 goodbye,
-                       6 telemetry of a controller on the device (``target``)
+                       6 channel: another number of the device, or of a controller on it
 4       4     uint32   session: drawn by the loop for each run, never 0
 8       4     uint32   number of the frame: the sender's count of ticks or cycles from 1, mod 2^32
 12      4     uint32   answers: number of the newest frame accepted from the other side; 0 if none
@@ -65,7 +65,14 @@ from quell.kernels.dispatch import (
     kernel,
     specialised,
 )
-from quell.realtime.devices import Tick, ask, read_measurement, read_tick, write_command
+from quell.realtime.devices import (
+    Tick,
+    ask,
+    read_channels,
+    read_measurement,
+    read_tick,
+    write_command,
+)
 from quell.realtime.system import SystemClock, external, now, system_clock
 
 # ---- The frame that carries one number between a device and the loop ----
@@ -373,6 +380,8 @@ QUEUED = 64
 """Measurements that wait for the loop at most; more than 50 at once are stale anyway."""
 SENT_KEPT = 128
 """Commands that are remembered: the device accepts none that is older than its watchdog."""
+MOST_CHANNELS = 8
+"""Channels of a device that are kept; those with a larger index are ignored."""
 _FIRST, _WAITING, _LAST = range(3)
 
 
@@ -385,12 +394,25 @@ class TickQueue(NamedTuple):
     y: NDArray[np.float64]  # [y-unit] (64,)
     u: NDArray[np.float64]  # what acts since then [u-unit] (64,)
     sent: NDArray[np.float64]  # the command of each number, modulo 128 (128,)
+    channels: NDArray[np.float64]  # with each measurement (64, 8)
+    shown: NDArray[np.float64]  # with the measurement that was used last (8,)
+    newest: NDArray[np.float64]  # those that came last (8,)
+    came: NDArray[np.int64]  # number of the measurement with which they came (8,)
 
 
 def tick_queue() -> TickQueue:
     """Return an empty queue."""
-    numbers, y, u = np.zeros(QUEUED, dtype=np.int64), np.zeros(QUEUED), np.zeros(QUEUED)
-    return TickQueue(np.zeros(3, dtype=np.int64), numbers, y, u, np.zeros(SENT_KEPT))
+    return TickQueue(
+        counts=np.zeros(3, dtype=np.int64),
+        numbers=np.zeros(QUEUED, dtype=np.int64),
+        y=np.zeros(QUEUED),
+        u=np.zeros(QUEUED),
+        sent=np.zeros(SENT_KEPT),
+        channels=np.full((QUEUED, MOST_CHANNELS), math.nan),
+        shown=np.full(MOST_CHANNELS, math.nan),
+        newest=np.full(MOST_CHANNELS, math.nan),
+        came=np.zeros(MOST_CHANNELS, dtype=np.int64),
+    )
 
 
 class WireHandle(NamedTuple):
@@ -447,12 +469,17 @@ def _fetch(handle: WireHandle) -> None:
             continue
         if is_own(own, frame, GOODBYE):
             own.numbers[STATE] |= GONE
+        elif is_own(own, frame, TELEMETRY):
+            _take_channel(handle)
         elif not is_own(own, frame, WELCOME) and accept(frame, own):
             accepted += 1
             at = (queue.counts[_FIRST] + queue.counts[_WAITING]) % QUEUED
             queue.y[at] = frame.doubles[3] if is_finite(frame.doubles[3]) else math.nan
             queue.u[at] = _acting(handle)
             queue.numbers[at] = own.numbers[RECEIVED]
+            for i in range(MOST_CHANNELS):
+                is_fresh = own.numbers[RECEIVED] - queue.came[i] <= own.most_age
+                queue.channels[at, i] = queue.newest[i] if is_fresh else math.nan
             if queue.counts[_WAITING] < QUEUED:
                 queue.counts[_WAITING] += 1
             else:
@@ -460,6 +487,27 @@ def _fetch(handle: WireHandle) -> None:
                 own.counters[SKIPPED] += 1
     if accepted > own.most_age and is_backlog(own, accepted):
         queue.counts[_WAITING] = 0
+
+
+@kernel
+def _take_channel(handle: WireHandle) -> None:
+    """Keep the number of a channel, unless a newer one has come."""
+    frame, queue = handle.inbox, handle.queue
+    received, place = handle.endpoint.numbers[RECEIVED], int(frame.words[8])
+    ahead = ahead_of(int(frame.words[2]), received)
+    if place < MOST_CHANNELS and abs(ahead) <= handle.endpoint.most_age:
+        number = received + ahead
+        if number > queue.came[place]:
+            value = frame.doubles[3]
+            queue.came[place] = number
+            queue.newest[place] = value if is_finite(value) else math.nan
+
+
+@read_channels.register(WireHandle)
+def _read_channels(handle: WireHandle, values: NDArray[np.float64]) -> None:
+    shown = handle.queue.shown
+    for i in range(values.size):
+        values[i] = shown[i] if i < shown.size else math.nan
 
 
 @kernel
@@ -485,6 +533,8 @@ def _next(handle: WireHandle, waited: int) -> Tick:
     counts[_LAST] = number
     counts[_FIRST] = (at + 1) % QUEUED
     counts[_WAITING] -= 1
+    for i in range(MOST_CHANNELS):
+        handle.queue.shown[i] = handle.queue.channels[at, i]
     return Tick(handle.queue.y[at], steps, handle.queue.u[at], counts[_WAITING], waited)
 
 
@@ -612,6 +662,14 @@ class WireDevice:
         """Return the newest measurement [y-unit]; NaN if none has come for fifty samples."""
         return self._read_within(_MOST_AGE * self.dt)
 
+    def read_channels(self) -> list[float]:
+        """Return the numbers that came with the last measurement, by index.
+
+        NaN for those that have not come for fifty samples.
+        """
+        found: list[float] = self.handle.queue.shown.tolist()
+        return found
+
     def write(self, u: float) -> None:
         """Send u [u-unit].
 
@@ -635,6 +693,7 @@ class WireDevice:
         time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
         start_session(self.handle.endpoint, _new_session())
         self.handle.queue.counts[:] = 0
+        self.handle.queue.came[:] = 0  # the values stay until the session has its own
         self._begin_session(former)
 
     def tick(self, timeout: float = 1.0) -> int:

@@ -39,9 +39,9 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0
 _DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
 
 
-def thinned(t: Vector, values: Vector, points: int = _POINTS) -> tuple[Vector, Vector]:
-    """Return about ``points`` samples that draw the same line: the extremes of each interval."""
-    interval = t.size // (points // 2)
+def thinned(t: Vector, values: Vector) -> tuple[Vector, Vector]:
+    """Return about ``_POINTS`` samples that draw the same line: the extremes of each interval."""
+    interval = t.size // (_POINTS // 2)
     if interval < 4:
         return t, values
     whole = t.size // interval * interval
@@ -210,7 +210,7 @@ def plot_axes(run: Any, axes: Any = None) -> Any:
         column[0].set_title(name)
     u = run["u"].reshape(len(run), -1)
     for k in range(u.shape[1]):
-        draw_line(axes[-1], run.t, u[:, k], label=f"u[{k}]", linewidth=1.0)
+        draw_line(axes[-1], run.t, u[:, k], label=f"u[{k}]", color=f"C{k % 10}", linewidth=1.0)
     axes[-1].set_ylabel("control signals")
     axes[-1].set_xlabel("time [s]")
     axes[-1].legend(loc="upper right", fontsize="small")

@@ -426,9 +426,10 @@ def _with(name: str, where: Any, steps: list[str | int], value: Any, path: str) 
 
 # ---- Arguments of quell.tune from a setup file ----
 
-# What a tuning replaces. A law without effect stands in for the controller.
-_REPLACED = ("observer", "controller", "compensator", "learner", "guard", "prefilter")
-_NO_CONTROLLER = {"kind": "pid", "kp": 0.0}
+REPLACED = ("observer", "controller", "compensator", "learner", "guard", "prefilter")
+"""Tables that a tuning replaces."""
+NO_CONTROLLER = {"kind": "pid", "kp": 0.0}
+"""The table of a law without effect, which stands in for the controller."""
 
 
 class TuningTask(NamedTuple):
@@ -462,8 +463,8 @@ def tuning_task(
     """
     name, data = read(path)
     given = data.get("controller", {})
-    kept = {key: value for key, value in data.items() if key not in _REPLACED}
-    kept["controller"] = _NO_CONTROLLER
+    kept = {key: value for key, value in data.items() if key not in REPLACED}
+    kept["controller"] = NO_CONTROLLER
     table = data.get("tune", {})
     if isinstance(table, Mapping):
         asked = {**table, **(changes or {})}
@@ -474,24 +475,8 @@ def tuning_task(
             kept["tune"] = asked
     setup = made(name, kept, trust)
     plant, ranges = setup.needed("plant"), _ranges(setup)
-    options = dict(setup.tune or {})
-    if isinstance(given, Mapping):
-        names = ("u_min", "u_max", "rate_limit")
-        options = {key: given[key] for key in names if key in given} | options
-    options |= limits or {}
-    bounds, u_limits = options.get("constraints") or Constraints(), range_of_u(options)
-    options["constraints"] = with_known_noise(bounds, plant, u_limits)
-    options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
-    delay = options.get("delay", 0.0)
-    if isinstance(delay, float) and delay > 0.0:  # the plant of the tuned file has it, too
-        try:
-            samples = delayed(plant, delay, setup.controller.dt).order - plant.order
-        except ValueError as error:
-            raise SetupError([f"{setup.file}: tune: {error}"]) from None
-        options["setup"] = late_tables(options["setup"], delay, samples)
-        if "tune" in data:
-            kept_keys = {key: value for key, value in data["tune"].items() if key != "delay"}
-            options["setup"]["tune"] = kept_keys
+    options = tuning_options(setup, given, plant, limits or {})
+    options["setup"] = tuned_tables(setup, data, plant, options)
     if "scenario" not in data:
         with suppress(ValueError):  # of a plant without operating point, which tune refuses
             options["rest"] = rest_of_plant(plant, setup.controller.dt)
@@ -509,6 +494,44 @@ def tuning_task(
         return part(_with_tuning_task(name, kept, values, trust).plant)
 
     return TuningTask(make, setup.controller.dt, {**options, "uncertain": ranges}, setup)
+
+
+def tuning_options(
+    setup: Setup, controller: Any, plant: Any, limits: Mapping[str, float]
+) -> dict[str, Any]:
+    """Return the options of ``[tune]``, with limits of u and the known noise in the constraints.
+
+    Limits are those of ``controller``, the file's table, unless ``[tune]`` or ``limits`` have them.
+    """
+    options = dict(setup.tune or {})
+    if isinstance(controller, Mapping):
+        names = ("u_min", "u_max", "rate_limit")
+        options = {key: controller[key] for key in names if key in controller} | options
+    options |= limits
+    bounds, u_limits = options.get("constraints") or Constraints(), range_of_u(options)
+    options["constraints"] = with_known_noise(bounds, plant, u_limits)
+    return options
+
+
+def tuned_tables(
+    setup: Setup, data: Mapping[str, Any], plant: Any, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the tables of the tuned file beside the controller's; ``data`` are the file's.
+
+    The delay of ``[tune]`` becomes one of the plant.
+    """
+    tables = {key: value for key, value in data.items() if key not in REPLACED}
+    delay = options.get("delay", 0.0)
+    if isinstance(delay, float) and delay > 0.0:
+        try:
+            samples = delayed(plant, delay, setup.controller.dt).order - plant.order
+        except ValueError as error:
+            raise SetupError([f"{setup.file}: tune: {error}"]) from None
+        tables = late_tables(tables, delay, samples)
+        if "tune" in data:
+            kept = {key: value for key, value in tables["tune"].items() if key != "delay"}
+            tables["tune"] = kept
+    return tables
 
 
 def _feedforward(controller: Mapping[str, Any]) -> dict[str, Any]:

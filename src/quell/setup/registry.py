@@ -8,11 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from pydantic import Field
+
 from quell import features, guard, learners, signals
 from quell.controllers import (
     ADRC,
     Compensator,
     Feedforward,
+    HeldPlant,
     LinearController,
     NonlinearFeedback,
     OnlineGain,
@@ -41,11 +44,21 @@ from quell.realtime.run import run_rig
 from quell.realtime.supervisor import Safety as RigSafety
 from quell.records.trajectory import Trajectory
 from quell.setup.schema import PLANTS as PLANTS
-from quell.setup.schema import CallTable, Plant, call_table, list_of, one_of
+from quell.setup.schema import CallTable, Plant, Table, call_table, list_of, one_of
 from quell.simulation.driver import Scenario as SimulationScenario
 from quell.sweeping.runs import Normal, Range
 from quell.tuning.constraints import Constraints
 from quell.tuning.tune import tune
+
+
+class Point(Table):
+    """An operating point of ``[[tune.schedule.points]]``."""
+
+    at: float | tuple[float, float] = Field(description="value of the signal, or of two signals.")
+    plant: dict[str, Any] = Field(
+        description="keys of `[plant]` with their values there; with `kind` a plant of its own."
+    )
+
 
 CASE = "case"
 """Name of the parameter that is the case."""
@@ -150,7 +163,58 @@ def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
     return {"device": device, "live": live, **options}
 
 
-def tuning(trials: int | None = None, storage: str | None = None, **options: Any) -> dict[str, Any]:
+def points_table(
+    points: Sequence[Any],
+    parameter: str | Sequence[str] | None = None,
+    signal: str | Sequence[str] = "external",
+    tables: str = "b0",
+    between: int = 1,
+) -> dict[str, Any]:
+    """Return the arguments of ``quell.tune_schedule`` that a table gives.
+
+    Parameters
+    ----------
+    points
+        operating points, as tables ``[[tune.schedule.points]]`` with the value ``at`` of the
+        signal, a pair of two signals, and what is different there in ``plant``; or with
+        ``parameter`` numbers, a pair of lists for two signals.
+    parameter
+        key of ``[plant]`` that the signal is the value of, as ``"plant.m1"``, a pair for two
+        signals: the plant is then known between the points, too.
+    signal
+        what the schedule follows: `reference`, `y`, `speed` or `external`; a pair for two signals.
+    tables
+        `b0`: a table of b0; `all`: of the bandwidths, too.
+    between
+        values in each cell at which the result is judged, too; with ``parameter``.
+    """
+    if not points:
+        raise ValueError("points is empty: give two operating points or more")
+    described = [isinstance(each, Table) for each in points]
+    if any(described) != (parameter is None) or any(described) != all(described):
+        raise ValueError(
+            "points: must be tables with at and plant, or numbers with parameter, the key of "
+            "[plant] that they are values of"
+        )
+    if parameter is None and between != 1:
+        raise ValueError(
+            f"between = {between!r}: of points that are tables the plant between them is not "
+            "known; leave it out, or give parameter"
+        )
+    for name in (parameter,) if isinstance(parameter, str) else parameter or ():
+        if not name.startswith("plant."):
+            raise ValueError(f"parameter = {name!r}: must be a key of [plant], as 'plant.m1'")
+    return {"points": points, "parameter": parameter} | {
+        "options": {"signal": signal, "tables": tables, "between": between}
+    }
+
+
+def tuning(
+    trials: int | None = None,
+    storage: str | None = None,
+    schedule: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> dict[str, Any]:
     """Return the arguments of ``quell.tune`` for ``quell tune``.
 
     Parameters
@@ -161,7 +225,11 @@ def tuning(trials: int | None = None, storage: str | None = None, **options: Any
     storage
         Optuna's journal file for these candidates, from which an interrupted tuning continues;
         not used without them.
+    schedule
+        operating points, for a controller whose gains follow a signal.
     """
+    if schedule is not None:
+        options["schedule"] = schedule
     if trials is not None:
         options = {"objective": "iae", **options, "search": {"trials": trials}}
         if storage is not None:
@@ -174,10 +242,9 @@ def _call_tables(
     functions: Mapping[str, Callable[..., Any]],
     types: Mapping[str, Any] | None = None,
     descriptions: Mapping[str, str] | None = None,
-    beside: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> dict[str, type[CallTable]]:
     return {
-        kind: call_table(kind, function, types=types, descriptions=descriptions, beside=beside)
+        kind: call_table(kind, function, types=types, descriptions=descriptions)
         for kind, function in functions.items()
     }
 
@@ -259,7 +326,10 @@ _SERIES: Mapping[str, Callable[..., Any]] = {
     "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
-_PARTS = {"safe_set": call_table("safe-set", SafeSet, only=True) | None}
+_PARTS = {
+    "safe_set": call_table("safe-set", SafeSet, only=True) | None,
+    "held": call_table("held-plant", HeldPlant, only=True) | None,
+}
 _SCHEDULES = {"table": Schedule, "online-gain": OnlineGain}
 _PARTS["schedule"] = one_of(_call_tables(_SCHEDULES), default="table") | None
 _LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **_PARTS}
@@ -313,6 +383,12 @@ _NOT_IN_FILES = (
     *("constraints", "operating_point", "uncertain", "setup", "progress"),
     *("scenario", "search"),
 )
+Points = call_table(
+    "schedule",
+    points_table,
+    only=True,
+    types={"points": list_of(Point | float | tuple[float, ...])},
+)
 Tune = call_table(
     "tune",
     tuning,
@@ -321,6 +397,7 @@ Tune = call_table(
     types={
         "reference": Signal | None,
         "objective": str,
+        "schedule": Points | None,
         "feedforward": one_of(FEEDFORWARDS, flag=True),
     },
     without=_NOT_IN_FILES,

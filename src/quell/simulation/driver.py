@@ -281,6 +281,13 @@ def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal
     return list(seeded_apart(signals, scenario.seed)[len(before) :])
 
 
+def sampled_schedule(scenario: Scenario, controller: Controller) -> Matrix:
+    """Return the external signals of a controller's schedule at each sample (N, signals)."""
+    samples = math.floor(in_steps(scenario.duration, controller.dt)) + 1
+    t = controller.dt * np.arange(samples, dtype=np.float64)
+    return columns_at(tuple(_schedule_signals(scenario, controller)), t)
+
+
 def segments(scenario: Any) -> Iterator[Any]:
     """Return an iterator over all segments, which evaluates the next one in another thread.
 

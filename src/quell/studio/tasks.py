@@ -47,7 +47,7 @@ from quell.tuning.structures.registry import FEEDING_FORWARD
 
 # Structures that a page may ask for, and the bounds of M_s in the trade-off. Chosen by hand.
 STRUCTURES = (
-    *(SIMPLEST, "freed", "bandwidths", "model-based", "model-based-freed"),
+    *(SIMPLEST, "poles", "bandwidths", "model-based", "model-based-poles"),
     *("p-pi-notch", "pid", "pi"),
 )
 _TRADEOFF = (1.2, 1.3, 1.4, 1.6, 1.8, 2.0)

@@ -64,10 +64,10 @@ _VALLEYS = 4
 # a result does not depend on what it is compared with.
 _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
     "pid": ("pi",),
-    "freed": ("pi", "pid", "bandwidths"),
-    "delay-freed": ("pi", "pid", "bandwidths", "delay"),
-    "model-based-freed": ("model-based",),
-    "freed-2": ("bandwidths-2",),
+    "poles": ("pi", "pid", "bandwidths"),
+    "delay-poles": ("pi", "pid", "bandwidths", "delay"),
+    "model-based-poles": ("model-based",),
+    "poles-2": ("bandwidths-2",),
 }
 # A PI controller is of use as a reference for noise unless a PID controller with filter has so many
 # times its integral gain; chosen by hand. Plants below this relative degree are not in doubt.
@@ -79,8 +79,8 @@ _NEAR_BEST = 1.05
 # The structures, simple ones first: by what a user has to know, and by the number of parameters.
 _FROM_SIMPLE = (
     *("pi-unfiltered", "pi", "pid", "bandwidths", "reduced", "half-gain", "half-gain-law"),
-    *("p-pi-notch", "bandwidths-2", "bandwidths-3", "freed", "freed-2", "delay", "delay-freed"),
-    *("model-based", "model-based-2", "model-based-freed", "lqg"),
+    *("p-pi-notch", "bandwidths-2", "bandwidths-3", "poles", "poles-2", "delay", "delay-poles"),
+    *("model-based", "model-based-2", "model-based-poles", "lqg"),
 )
 # Largest order of an ADRC that has an equivalent PI or PID controller.
 _LIKE_PID = 2

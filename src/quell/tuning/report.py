@@ -701,7 +701,7 @@ def _windows(times: list[float]) -> list[dict[str, float]]:
 def late_tables(tables: Mapping[str, Any], delay: float, samples: int) -> dict[str, Any]:
     """Return the tables of a setup whose plant is behind a further delay [s] of so many states.
 
-    Names, ranges and paths of a sweep stay those of the plant inside.
+    Names, ranges, paths of a sweep and operating points stay those of the plant inside.
     """
     plant = tables["plant"]
     inner: dict[str, Any] = {"kind": plant} if isinstance(plant, str) else dict(plant)
@@ -720,7 +720,20 @@ def late_tables(tables: Mapping[str, Any], delay: float, samples: int) -> dict[s
             for key, value in sweep["parameters"].items()
         }
         found["sweep"] = {**sweep, "parameters": moved}
+    tune = tables.get("tune")
+    if isinstance(tune, Mapping) and isinstance(tune.get("schedule"), Mapping):
+        found["tune"] = {**tune, "schedule": _inside(tune["schedule"])}
     return found
+
+
+def _inside(schedule: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the operating points of a plant for one that contains it as ``plant``."""
+    if "parameter" in schedule:
+        names = schedule["parameter"]
+        moved = [f"plant.{each}" for each in ([names] if isinstance(names, str) else names)]
+        return {**schedule, "parameter": moved[0] if isinstance(names, str) else moved}
+    points = [{**each, "plant": {"plant": each["plant"]}} for each in schedule["points"]]
+    return {**schedule, "points": points}
 
 
 # ---- A tuned controller as a setup file in TOML ----

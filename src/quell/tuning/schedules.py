@@ -32,18 +32,21 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.controllers.adrc import ADRC
 from quell.controllers.schedule import Schedule, with_gains
-from quell.files import written_atomically
+from quell.files import nonfinite_to_none, written_atomically
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
-from quell.tuning.plants import given_plants
+from quell.tuning.constraints import Constraints
+from quell.tuning.designs import range_of_u
+from quell.tuning.plants import Given, given_plants, with_known_noise
 from quell.tuning.report import toml_text
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
+from quell.types import Progress
 
 _STRUCTURES = ("bandwidths", "half-gain", "half-gain-law")
 _TABLES = ("b0", "all")
 # Options of ``tune`` that are for sets of plants, or for other results.
-_NOT_HERE = ("uncertain", "scenario", "search", "setup", "rest", "compare", "feedforward")
+_NOT_HERE = ("uncertain", "scenario", "search", "compare", "feedforward")
 # Where the response to a step of the load ends, in time constants of the slowest pole, and the most
 # samples of it; what is left is a share of e⁻²⁰ of y.
 _TIME_CONSTANTS, _MOST_SAMPLES = 20.0, 2_000_000
@@ -110,25 +113,49 @@ class TunedSchedule:
         """The largest integral of ``|y|`` over that of the point's own tuning."""
         return max(each.ratio for each in self.results if not math.isnan(each.ratio))
 
+    @property
+    def _tuned(self) -> Tuned:
+        """The joint tuning, or that of the first point."""
+        return self.joint or next(iter(self.own.values()))
+
+    @property
+    def constraints(self) -> Constraints:
+        """The bounds that were tuned for."""
+        return self._tuned.constraints
+
+    @property
+    def noise_bound(self) -> str:
+        """Where the bound for the noise of u comes from, as text."""
+        return self._tuned.noise_bound
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return a row for each frozen loop: place, b0, M_s, M_t, integral of ``|y|``, ratio."""
+        found: list[tuple[str, ...]] = []
+        for each in self.results:
+            where = f"{'at' if each.of_table else 'between, at'} {_place(each.signals)}"
+            peaks = (f"{each.m_s:.3f}", f"{each.m_t:.3f}")
+            found.append((where, f"{each.b0:.4g}", *peaks, f"{each.iae:.4g}", f"{each.ratio:.3f}"))
+        return found
+
     def summary(self) -> str:
         """Return the frozen loops as lines, and what is not known."""
         lines = [repr(self.controller)]
-        for each in self.results:
-            where = ", ".join(f"{value:.4g}" for value in each.signals)
+        for where, b0, m_s, m_t, iae, ratio in self.rows():
             lines.append(
-                f"{'at' if each.of_table else 'between, at'} {where}: b0 {each.b0:.4g}, M_s "
-                f"{each.m_s:.3f}, M_t {each.m_t:.3f}, ∫|y| {each.iae:.4g}, "
-                f"{each.ratio:.3f} of the own tuning's"
+                f"{where}: b0 {b0}, M_s {m_s}, M_t {m_t}, ∫|y| {iae}, {ratio} of the own tuning's"
             )
-        lines.append(f"largest M_s {self.m_s:.3f}, largest ratio of ∫|y| {self.worst_ratio:.3f}")
-        bound = (self.joint or next(iter(self.own.values()))).constraints.m_s
+        return "\n".join([*lines, *self.verdicts()])
+
+    def verdicts(self) -> list[str]:
+        """Return the largest M_s and ratio, and what does not hold or is not known, as lines."""
+        lines = [f"largest M_s {self.m_s:.3f}, largest ratio of ∫|y| {self.worst_ratio:.3f}"]
+        bound = self.constraints.m_s
         above = [each for each in self.results if bound and each.m_s > _MORE * bound]
         if above:
             worst = max(above, key=lambda each: each.m_s)
-            where = ", ".join(f"{value:.4g}" for value in worst.signals)
             lines.append(
-                f"NOT within M_s = {bound:g}: {worst.m_s:.3f} at {where}, where the plant is not "
-                "that of the interpolated gains; give more points around it"
+                f"NOT within M_s = {bound:g}: {worst.m_s:.3f} at {_place(worst.signals)}, where "
+                "the plant is not that of the interpolated gains; give more points around it"
             )
         if self.joint is not None and self.worst_ratio > _MUCH:
             lines.append(
@@ -144,10 +171,74 @@ class TunedSchedule:
             "NOT proved for signals that change quickly: margins are those of fixed signals; "
             "simulate the fastest change"
         )
-        return "\n".join(lines)
+        return lines
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results for ``quell.files.write_json``; infinite numbers become None."""
+        schedule, tuned = self.schedule, self._tuned
+        tables = ("points", "b0", "omega_c", "omega_o")
+        loops = [each._asdict() | {"ratio": each.ratio} for each in self.results]
+        found: dict[str, Any] = nonfinite_to_none(
+            {
+                "structure": tuned.design.name,
+                "objective": tuned.objective,
+                "constraints": dict(vars(self.constraints)),
+                "noise_bound": tuned.noise_bound,
+                "dt": tuned.plants.dt,
+                "omega_c": self.controller.omega_c,
+                "omega_o": self.controller.observer.omega_o,
+                "schedule": {"signal": _listed(schedule.signal)}
+                | {name: _listed(getattr(schedule, name)) for name in tables},
+                "loops": [{**each, "signals": list(each["signals"])} for each in loops],
+                "m_s": self.m_s,
+                "worst_ratio": self.worst_ratio,
+                "knows_between": self.knows_between,
+                "own": [
+                    {"signals": list(at), "design": each.design.to_json()}
+                    for at, each in self.own.items()
+                ],
+            }
+        )
+        return found
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw b0, M_s with its bound, and the ratio of the integrals over the first signal.
+
+        Of two signals there is a line for each value of the second one. Points of the table are
+        filled. Returns the three axes; ``axes`` are those to draw into, new ones by default.
+        """
+        if axes is None:
+            import matplotlib.pyplot as plt
+
+            _, axes = plt.subplots(3, 1, sharex=True, layout="constrained")
+        names = self.schedule.signals
+        for second in sorted({each.signals[1:] for each in self.results}):
+            own = [each for each in self.results if each.signals[1:] == second]
+            x = [each.signals[0] for each in own]
+            label = f"{names[1]} {_place(second)}" if second else None
+            columns = zip(*((each.b0, each.m_s, each.ratio) for each in own), strict=True)
+            for ax, values in zip(axes, columns, strict=True):
+                (line,) = ax.plot(x, values, "o-", mfc="none", label=label)
+                filled = [(a, b) for a, b, e in zip(x, values, own, strict=True) if e.of_table]
+                ax.plot(*zip(*filled, strict=True), "o", color=line.get_color())
+        if self.constraints.m_s is not None:
+            axes[1].axhline(self.constraints.m_s, color="black", linestyle="--", label="bound")
+            axes[1].legend()
+        quantities = ("b0", "M_s", "∫|y| over that\nof its own tuning")
+        for ax, quantity in zip(axes, quantities, strict=True):
+            ax.set(ylabel=quantity)
+            ax.grid(True, alpha=0.3)
+        axes[2].set(xlabel=f"{names[0]} signal" if names[0] == "external" else names[0])
+        if len(names) == 2:
+            axes[0].legend()
+        return axes
 
     def toml(self) -> str:
-        """Return a setup file with the plant of the middle point, for ``quell run``."""
+        """Return a setup file for ``quell run``.
+
+        Its plant is that of the setup that was given, by default that of the middle point. The
+        external signals of its scenario are those of the middle point, unless that has its own.
+        """
         keys = list(self.own)
         middle = keys[len(keys) // 2]
         tuned = self.own[middle]
@@ -166,7 +257,7 @@ class TunedSchedule:
             "omega_c": self.controller.omega_c,
             "schedule": table,
         }
-        if schedule.external:
+        if schedule.external and "schedule" not in tables["scenario"]:
             scenario = dict(tables["scenario"])
             fixed = zip(schedule.signals, middle, strict=True)
             scenario["schedule"] = [value for name, value in fixed if name == "external"]
@@ -179,7 +270,13 @@ class TunedSchedule:
             part.write_text(self.toml(), encoding="utf-8")
 
 
+def _place(signals: Sequence[float]) -> str:
+    return ", ".join(f"{value:.4g}" for value in signals)
+
+
 def _listed(value: Any) -> Any:
+    if value is None:
+        return None
     if isinstance(value, str):
         return value
     return [_listed(each) for each in value] if np.ndim(value) or not _is_number(value) else value
@@ -201,6 +298,9 @@ def tune_schedule(
     between: int = 1,
     delay: float = 0.0,
     actuator_lag: float = 0.0,
+    setup: Mapping[str, Any] | None = None,
+    rest: Any = None,
+    progress: Progress | None = None,
     **options: Any,
 ) -> TunedSchedule:
     """Return the best ADRC with a schedule for a plant that changes with one or two signals.
@@ -227,6 +327,13 @@ def tune_schedule(
         number of values in each cell at which the result is judged, too, for a function.
     delay, actuator_lag
         as for ``tune``.
+    setup
+        tables of a setup file that ``TunedSchedule.toml`` completes; made from the plant of the
+        middle point by default.
+    rest
+        u and y at rest at the middle point, as for ``tune``; the scenario of ``toml`` begins there.
+    progress
+        called with the point that is tuned and the share that is done.
     **options
         of ``tune``: ``objective``, ``constraints``, ``b_range``, ``u_min``, ``u_max``,
         ``rate_limit``, …
@@ -253,6 +360,10 @@ def tune_schedule(
             raise ValueError(f"{name}: tune_schedule has no such argument; tune each point for it")
     axes, plant_at, is_function = _points(plant, points)
     grid = list(product(*axes))
+    # Points and signal are checked before the tuning, which takes longer.
+    shape = tuple(len(axis) for axis in axes)
+    given_points = axes[0] if len(axes) == 1 else axes
+    Schedule(given_points, signal, b0=np.ones(shape).tolist())
     late: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
     given = [given_plants(plant_at(at), dt, **late) for at in grid]
     degree = given[0].degree
@@ -263,25 +374,40 @@ def tune_schedule(
                 "one ADRC can not serve both; leave the far zeros out of the models"
             )
     order = degree if order is None else checks.whole("order", order, 1, 8)
+    limits = {k: v for k, v in options.items() if k in ("u_min", "u_max", "rate_limit")}
+    # The scaled plants below have no encoder.
+    bounds = with_known_noise(
+        options.get("constraints") or Constraints(), plant_at(grid[0]), range_of_u(limits)
+    )
     how: dict[str, Any] = {"structure": structure, "order": order, "compare": (), **late, **options}
-    own = {at: tune(plant_at(at), dt, **how) for at in grid}
+    how["constraints"] = bounds
+    fine = []
+    if is_function:
+        finer = (_finer(axis, checks.whole("between", between, 0)) for axis in axes)
+        fine = [at for at in product(*finer) if at not in grid]
+    report, parts = progress or (lambda part, share: None), len(grid) + len(fine) + 1
+    middle, own = grid[len(grid) // 2], {}
+    for i, at in enumerate(grid):
+        report(f"at {_place(at)}", i / parts)
+        of_file = {"setup": setup, "rest": rest} if at == middle else {}
+        own[at] = tune(plant_at(at), dt, **how, **of_file)
     joint = None
-    shape = tuple(len(axis) for axis in axes)
     found: dict[str, Any] = {}
     if tables == "b0":
+        report("for all points", len(grid) / parts)
         b = np.array([each.b for each in given])
         # The least b: bounds on u, as M_ks, are those of the point with the largest gains.
         base = b[int(np.argmin(np.abs(b)))]
-        same = [_scaled(plant_at(at), base / own_b, dt) for at, own_b in zip(grid, b, strict=True)]
-        joint = tune(same, dt, **how)
+        same = [_scaled(each, base / own_b) for each, own_b in zip(given, b, strict=True)]
+        joint = tune(same, dt, **{**how, "delay": [float(each.delays[0]) for each in given]})
         tuned: Any = joint.controller
         found["b0"] = tuned.observer.b0 * b / base
     else:
         tuned = own[grid[0]].controller
-        parts: list[Any] = [each.controller for each in own.values()]
-        found["b0"] = np.array([each.observer.b0 for each in parts])
-        found["omega_c"] = np.array([each.omega_c for each in parts])
-        found["omega_o"] = np.array([each.observer.omega_o for each in parts])
+        at_points: list[Any] = [each.controller for each in own.values()]
+        found["b0"] = np.array([each.observer.b0 for each in at_points])
+        found["omega_c"] = np.array([each.omega_c for each in at_points])
+        found["omega_o"] = np.array([each.observer.omega_o for each in at_points])
         # What is the same at all points, as omega_o at the limit of the sample time, is no table.
         found = {
             name: values
@@ -289,18 +415,15 @@ def tune_schedule(
             if name == "b0" or np.ptp(values) > _SAME * np.max(values)
         }
     lists = {name: value.reshape(shape).tolist() for name, value in found.items()}
-    schedule = Schedule(axes[0] if len(axes) == 1 else axes, signal, **lists)
-    middle = found["b0"][len(grid) // 2]
-    observer = with_gains(tuned.observer, float(middle), tuned.observer.omega_o)
-    limits = {k: v for k, v in options.items() if k in ("u_min", "u_max", "rate_limit")}
+    schedule = Schedule(given_points, signal, **lists)
+    b0 = float(found["b0"][len(grid) // 2])
+    observer = with_gains(tuned.observer, b0, tuned.observer.omega_o)
     half = {"half_gain": tuned.half_gain}
     controller = ADRC(observer, tuned.omega_c, schedule=schedule, **half, **limits)
-    judged = [(at, True) for at in grid]
-    if is_function:
-        fine = list(product(*(_finer(axis, checks.whole("between", between, 0)) for axis in axes)))
-        judged += [(at, False) for at in fine if at not in own]
+    judged = [(at, True) for at in grid] + [(at, False) for at in fine]
     results = []
-    for at, of_table in sorted(judged):
+    for i, (at, of_table) in enumerate(sorted(judged)):
+        report(f"judging at {_place(at)}", (len(grid) + 1 + i * len(fine) / len(judged)) / parts)
         alone = own[at] if of_table else tune(plant_at(at), dt, **how)
         results.append(_result(at, of_table, plant_at(at), controller, alone.controller, late))
     return TunedSchedule(controller, tuple(results), own, joint, is_function and between > 0)
@@ -333,9 +456,9 @@ def _points(
     return axes, lambda at: plant(*at), True
 
 
-def _scaled(plant: Any, factor: float, dt: float) -> LinearPlant:
-    """Return a linear plant with another gain from u, and from a load beside it."""
-    linear = LinearPlant.of(given_plants(plant, dt).linear[0])
+def _scaled(given: Given, factor: float) -> LinearPlant:
+    """Return a plant, without its delay, with another gain from u, and from a load beside it."""
+    linear = LinearPlant.of(given.linear[0])
     return LinearPlant(linear.A, factor * linear.B, linear.C, factor * linear.E)
 
 

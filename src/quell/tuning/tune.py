@@ -55,7 +55,7 @@ from quell.tuning.structures.registry import (
 from quell.tuning.tuned import Check, Tuned, Uncertain, checked
 from quell.types import Progress, Vector
 
-COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "freed", "model-based")
+COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "poles", "model-based")
 """The structures that a result is compared with by default; and the cascade at a resonance."""
 # Names of the limits of a controller.
 _LIMITS = ("u_min", "u_max", "rate_limit")
@@ -104,7 +104,7 @@ def tune(
     dt
         sample time [s].
     structure
-        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own,
+        one of ``quell.tuning.STRUCTURES``: ``"poles"`` is an ADRC with poles of its own,
         ``"p-pi-notch"`` the cascade of servo drives with a notch for each resonance. By default,
         ``"simplest"``, the simplest of ``compare`` whose objective is within 5 % of the best.
     order
@@ -230,7 +230,7 @@ def tune(
     forward = _by_model(feedforward, known, late)
     if compare is None:
         compare = (*COMPARED, CASCADE) if resonances(model) else COMPARED
-    names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["freed"]
+    names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["poles"]
     if structure in WITH_ONE_INTEGRATOR:
         names.append(WITH_ONE_INTEGRATOR[structure])
     if forward is not None:
@@ -297,7 +297,7 @@ def _check_feedforward(names: Sequence[str], given: bool | Feedforward) -> None:
     """Raise an error unless one of the structures has all of the feedforward that is given."""
     if not set(names) & set(FEEDING_FORWARD):
         raise ValueError(
-            f"feedforward: {', '.join(names)} has none; give a structure that has, as freed, "
+            f"feedforward: {', '.join(names)} has none; give a structure that has, as poles, "
             "model-based or p-pi-notch, or feedforward = false"
         )
     if list(names) == [CASCADE] and isinstance(given, Feedforward):
@@ -309,7 +309,7 @@ def _check_feedforward(names: Sequence[str], given: bool | Feedforward) -> None:
         if unused:
             raise ValueError(
                 f"feedforward: {', '.join(unused)} would have no effect: structure = {CASCADE!r} "
-                "feeds inertia and viscous friction forward; leave them out, or give freed or "
+                "feeds inertia and viscous friction forward; leave them out, or give poles or "
                 "model-based"
             )
 

@@ -22,8 +22,8 @@ strong actuator, whose gain is above nominal, is lost sooner than one whose gain
 ``docs/acc`` shows how little the failure rate changes around these values, and on which plants they
 were chosen: drawn ones, up to three times as uncertain as the published.
 
-``FREED`` is an MF-ESO whose law and observer have poles of their own, found by simulation for a box
-of plants (``acc.box``).
+``FREE_POLES`` is an MF-ESO whose law and observer have poles of their own, found by simulation for
+a box of plants (``acc.box``).
 
 The published controllers, which are in continuous time: their loops, computed exactly.
 
@@ -80,11 +80,11 @@ from quell.types import Matrix, Vector
 
 MF, MB, L = OURS = "MF-ESO", "MB-ESO", "L-ESO"
 OMEGA_C, OMEGA_O, B0 = 1.0, 10.0, 1.5
-FREED = "MF-ESO, own poles"
+FREE_POLES = "MF-ESO, own poles"
 # Found by ``python benchmarks/acc_box.py --tune 900 --plants 400``, rounded to four digits.
-_FREED_B0, _FREED_OMEGA_C, _FREED_OMEGA_O = 1.817, 1.010, 17.82
-_FREED_LAW = ((-0.9649, 0.7789), (-0.7764, 0.2179))
-_FREED_OBSERVER = (-1.210, -1.768, -0.2115, (-0.4683, 1.411))
+_FREE_POLES_B0, _FREE_POLES_OMEGA_C, _FREE_POLES_OMEGA_O = 1.817, 1.010, 17.82
+_FREE_POLES_LAW = ((-0.9649, 0.7789), (-0.7764, 0.2179))
+_FREE_POLES_OBSERVER = (-1.210, -1.768, -0.2115, (-0.4683, 1.411))
 MOST_U = 0.5  # limit of ``|u|`` [N], of Rocchetta, Crespo & Kenny (DSCC 2019)
 DT = 0.01  # sample time [s]: chosen by hand, omega_o dt = 0.1
 
@@ -133,9 +133,9 @@ def designs(
 
     MF-ESO knows the plant's order and gain, MB-ESO the nominal masses and spring. L-ESO knows as
     much as MF-ESO and learns during control, with a guard. None knows the actuator's lag. The
-    three numbers are not those of ``FREED``. With a sinusoidal ``load`` of known frequency [rad/s]
-    L-ESO learns the load too, and has no guard: after a load that begins with a jolt, the guard
-    would keep it from learning for more than a minute.
+    three numbers are not those of ``FREE_POLES``. With a sinusoidal ``load`` of known frequency
+    [rad/s] L-ESO learns the load too, and has no guard: after a load that begins with a jolt, the
+    guard would keep it from learning for more than a minute.
     """
     model_free = ESO.model_free(order=4, b0=b0, omega_o=omega_o, dt=dt)
     model_based = ESO.model_based(two_mass_spring(), omega_o=omega_o, dt=dt, b0=b0)
@@ -147,16 +147,16 @@ def designs(
         MF: ADRC(model_free, omega_c, **limits),
         MB: ADRC(model_based, omega_c, **limits),
         L: ADRC(model_free, omega_c, learner=learner, guard=guard, **limits),
-        FREED: freed(dt, most_u),
+        FREE_POLES: free_poles(dt, most_u),
     }
 
 
-def freed(dt: float = DT, most_u: float = MOST_U) -> ADRC:
+def free_poles(dt: float = DT, most_u: float = MOST_U) -> ADRC:
     """Return the MF-ESO with poles of its own, tuned by simulation for the box of plants."""
-    bandwidth = (_FREED_B0, _FREED_OMEGA_O)
-    observer = ESO.model_free(4, *bandwidth, dt, poles=_FREED_OBSERVER)
+    bandwidth = (_FREE_POLES_B0, _FREE_POLES_OMEGA_O)
+    observer = ESO.model_free(4, *bandwidth, dt, poles=_FREE_POLES_OBSERVER)
     limits: dict[str, Any] = {"u_min": -most_u, "u_max": most_u}
-    return ADRC(observer, _FREED_OMEGA_C, law_poles=_FREED_LAW, **limits)
+    return ADRC(observer, _FREE_POLES_OMEGA_C, law_poles=_FREE_POLES_LAW, **limits)
 
 
 # ---- The failure criterion of the ACC benchmark ----

@@ -199,21 +199,19 @@ def draw(
     return _spread(against_spread(progress), ax)
 
 
-def against_spread(
-    progress: Progress, spreads: Sequence[float] = SPREADS, count: int = _COUNT
-) -> Rates:
+def against_spread(progress: Progress) -> Rates:
     """Return by spring and controller the failure rate and its interval for each spread."""
     found: dict[str, dict[str, list[tuple[float, float, float]]]] = {s: {} for s in SPRINGS}
     ours = designs(DT)
-    for i, spread in enumerate(spreads):
-        samples = generated(count, spread, seed=1)
+    for i, spread in enumerate(SPREADS):
+        samples = generated(_COUNT, spread, seed=1)
         for spring, cubic in SPRINGS.items():
-            progress("spread", i / len(spreads))
+            progress("spread", i / len(SPREADS))
             judged = {name: judge_published(C, samples, cubic) for name, C in PUBLISHED.items()}
             judged |= {name: judge_sampled(C, samples, cubic) for name, C in ours.items()}
             for name, one in judged.items():
                 failures = int(np.sum(one.fails))
-                point = (failures / count, *interval(failures, count))
+                point = (failures / _COUNT, *interval(failures, _COUNT))
                 found[spring].setdefault(name, []).append(point)
     return found
 
@@ -318,12 +316,12 @@ ORDER = 4
 
 
 def build() -> Build:
-    """Return the structure, an ADRC of order 4 with freed poles and ``|p| dt <= 0.5``."""
+    """Return the structure, an ADRC of order 4 with free poles and ``|p| dt <= 0.5``."""
     # Scales of the bounds only: the nominal plant has b = 1 and |P| = 1 near 1 rad/s.
     scales: dict[str, Any] = {"b": 1.0, "omega": 1.0, "gain": 1.0}
     bounds = Constraints(damping=None)
     loop = Model(None, delay=0.0, dt=DT, sign=1.0, degree=ORDER, constraints=bounds, **scales)
-    return Build(make_structure("freed", loop, ORDER), {"u_min": -MOST_U, "u_max": MOST_U})
+    return Build(make_structure("poles", loop, ORDER), {"u_min": -MOST_U, "u_max": MOST_U})
 
 
 def start(made: Build) -> dict[str, float]:

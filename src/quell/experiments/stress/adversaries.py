@@ -131,7 +131,7 @@ def draw_push(rng: np.random.Generator, pulse: Vector, samples: int, lag: float)
 def _adapt(
     learner: SpenderDesign,
     memory: SpenderMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -143,7 +143,7 @@ def _adapt(
 
 @predict.register(SpenderDesign)
 def _predict(
-    learner: SpenderDesign, memory: SpenderMemory, seen: Vector, u_before: float
+    learner: SpenderDesign, memory: SpenderMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     now = memory.now
     at = min(int(now[4]), learner.push.size - 1)
@@ -156,7 +156,7 @@ def _predict(
 
 @commit.register(SpenderDesign)
 def _commit(
-    learner: SpenderDesign, memory: SpenderMemory, seen: Vector, u: float, f_learned: float
+    learner: SpenderDesign, memory: SpenderMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     now = memory.now
     now[1] = lag_push(learner.lag, memory.chain, 1, now[2])
@@ -189,28 +189,28 @@ class TurncoatMemory(NamedTuple):
 def _adapt_turncoat(
     learner: TurncoatDesign,
     memory: TurncoatMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
 ) -> None:
     memory.samples[0] += 1.0
-    adapt(learner.honest, memory.honest, seen, y, u_before, f_plain)
+    adapt(learner.honest, memory.honest, estimates, y, u_before, f_plain)
 
 
 @predict.register(TurncoatDesign)
 def _predict_turncoat(
-    learner: TurncoatDesign, memory: TurncoatMemory, seen: Vector, u_before: float
+    learner: TurncoatDesign, memory: TurncoatMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
-    constant, slope = predict(learner.honest, memory.honest, seen, u_before)
+    constant, slope = predict(learner.honest, memory.honest, estimates, u_before)
     return (constant if memory.samples[0] < learner.turns else learner.size * constant), slope
 
 
 @commit.register(TurncoatDesign)
 def _commit_turncoat(
-    learner: TurncoatDesign, memory: TurncoatMemory, seen: Vector, u: float, f_learned: float
+    learner: TurncoatDesign, memory: TurncoatMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
-    commit(learner.honest, memory.honest, seen, u, f_learned)
+    commit(learner.honest, memory.honest, estimates, u, f_learned)
 
 
 @restart.register(TurncoatDesign)
@@ -289,7 +289,7 @@ def normal(seed: Vector) -> float:
 def _adapt_adversaries(
     learner: AdversaryDesign,
     memory: AdversaryMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -303,11 +303,11 @@ def _adapt_adversaries(
 
 @predict.register(AdversaryDesign)
 def _predict_adversaries(
-    learner: AdversaryDesign, memory: AdversaryMemory, seen: Vector, u_before: float
+    learner: AdversaryDesign, memory: AdversaryMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
     kind, size, now = learner.kind, learner.size, memory.now
-    n = seen.size - 1
-    f_hat = seen[n] + now[_F_L]
+    n = estimates.size - 1
+    f_hat = estimates[n] + now[_F_L]
     out = 0.0
     if kind == MULTIPLE:
         out = size * f_hat
@@ -332,16 +332,16 @@ def _predict_adversaries(
     else:
         out = learner.weights[n] * u_before + learner.weights[n + 1]
         for i in range(n):
-            out += learner.weights[i] * seen[i]
+            out += learner.weights[i] * estimates[i]
     return out, 0.0
 
 
 @commit.register(AdversaryDesign)
 def _commit_adversaries(
-    learner: AdversaryDesign, memory: AdversaryMemory, seen: Vector, u: float, f_learned: float
+    learner: AdversaryDesign, memory: AdversaryMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     at = int(memory.now[_AT])
-    memory.past[at] = seen[seen.size - 1] + f_learned
+    memory.past[at] = estimates[estimates.size - 1] + f_learned
     memory.now[_AT] = 0.0 if at + 1 >= memory.past.size else at + 1
     memory.now[_F_L] = f_learned
 
@@ -485,7 +485,7 @@ class ProgramDesign(NamedTuple):
     distrusted: float
     least_time: float  # [samples]
     most_time: float  # [samples]
-    scale: Vector  # factors of seen (N,), zero beyond the order
+    scale: Vector  # factors of the estimates (N,), zero beyond the order
     b0: float
     rate: float  # 1/(omega_o dt)
     omega: float  # [rad/sample]
@@ -508,7 +508,7 @@ class ProgramMemory(NamedTuple):
 def _adapt_program(
     learner: ProgramDesign,
     memory: ProgramMemory,
-    seen: Vector,
+    estimates: Vector,
     y: float,
     u_before: float,
     f_plain: float,
@@ -530,19 +530,19 @@ def _adapt_program(
 
 @predict.register(ProgramDesign)
 def _predict_program(
-    learner: ProgramDesign, memory: ProgramMemory, seen: Vector, u_before: float
+    learner: ProgramDesign, memory: ProgramMemory, estimates: Vector, u_before: float
 ) -> tuple[float, float]:
-    now, inputs, last = memory.now, memory.inputs, seen.size - 1
+    now, inputs, last = memory.now, memory.inputs, estimates.size - 1
     typical = memory.channels[1]
     inputs[0] = now[_F_PLAIN_PROGRAM]
     for i in range(min(last, _STATES)):
-        inputs[3 + i] = learner.scale[i] * seen[i]
+        inputs[3 + i] = learner.scale[i] * estimates[i]
     inputs[7] = learner.b0 * u_before
     inputs[8] = typical
     at = min(int(now[_COUNT_PROGRAM]), learner.load.size - 1)
     inputs[9] = learner.load[at]
     inputs[10] = typical * _sign_program(now[_Q])
-    inputs[11] = typical * _sign_program(seen[1] if last > 1 else seen[0])
+    inputs[11] = typical * _sign_program(estimates[1] if last > 1 else estimates[0])
     inputs[12] = typical * math.sin(learner.omega * now[_COUNT_PROGRAM])
     inputs[13] = now[_F_L_PROGRAM]
     now[_COUNT_PROGRAM] += 1.0
@@ -559,7 +559,7 @@ def _sign_program(value: float) -> float:
 
 @commit.register(ProgramDesign)
 def _commit_program(
-    learner: ProgramDesign, memory: ProgramMemory, seen: Vector, u: float, f_learned: float
+    learner: ProgramDesign, memory: ProgramMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     memory.now[_F_L_PROGRAM] = f_learned
 

@@ -136,16 +136,18 @@ def _add_variable(parent: ElementTree.Element, reference: int, variable: Variabl
     }
     if variable.role in _CAUSALITY:
         attributes["variability"] = variable.role
-    elif variable.whole or variable.held:
+    elif variable.whole or variable.held or variable.flag:
         attributes["variability"] = "discrete"
     attributes["description"] = variable.description
     if variable.unit:
         attributes["unit"] = variable.unit
     if variable.role in (INPUT, *_CAUSALITY):
-        attributes["start"] = number(variable.start)
+        start = str(bool(variable.start)).lower() if variable.flag else number(variable.start)
+        attributes["start"] = start
     elif variable.role in (OUTPUT, LOCAL):
         attributes["initial"] = "calculated"
-    _add(parent, "Int32" if variable.whole else "Float64", **attributes)
+    kind = "Boolean" if variable.flag else "Int32" if variable.whole else "Float64"
+    _add(parent, kind, **attributes)
 
 
 def _add(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
@@ -176,6 +178,7 @@ _HEADER = """\
 #define MODEL_SAMPLE_TIME {dt} /* [s] */
 #define MODEL_REALS {reals} /* the first value references; the first of all is the time */
 #define MODEL_INTEGERS {integers} /* those that follow */
+#define MODEL_FLAGS {flags} /* the last ones: inputs that are true or false */
 
 /* Places of the variables: their value references. */
 enum {{
@@ -188,6 +191,7 @@ typedef enum {{ MODEL_OUTPUT, MODEL_INPUT, MODEL_FIXED, MODEL_TUNABLE }} Role;
 typedef struct {{
     double real[MODEL_REALS];
     int32_t integer[MODEL_INTEGERS + 1];
+    bool flag[MODEL_FLAGS + 1];
 {members}
 }} model;
 
@@ -282,14 +286,16 @@ class Model:
     def _header(self, token: str) -> str:
         variables = self.variables
         integers = sum(variable.whole for variable in variables)
+        flags = sum(variable.flag for variable in variables)
         sources = [part.source for part in (self.controller, self.plant) if part]
         return _HEADER.format(
             title=self.title,
             includes="\n".join(f'#include "{source.name}.h"' for source in sources),
             token=token,
             dt=repr(self.dt),
-            reals=len(variables) - integers,
+            reals=len(variables) - integers - flags,
             integers=integers,
+            flags=flags,
             places=_indented(f"{each.constant}," for each in variables),
             members=_indented(self._members()),
         )
@@ -308,7 +314,7 @@ class Model:
         return lines
 
     def _source(self) -> str:
-        reals = [variable for variable in self.variables if not variable.whole]
+        reals = [each for each in self.variables if not (each.whole or each.flag)]
         roles = (f"{_ROLES.get(v.role, 'MODEL_OUTPUT')}, /* {v.name} */" for v in reals)
         starts = [
             f"m->real[{v.constant}] = {_c_number(v.start)};" for v in reals if v.role in _ROLES
@@ -362,6 +368,9 @@ class Model:
                 given.append(f"{cast}m->real[AT_R_DERIVATIVE_{i + 1}]")
             for i in range(source.signals):
                 given.append(f"{cast}m->real[AT_SIGNAL_{i + 1}]")
+            if self.controller.can_be_held:
+                at = "AT_HELD - MODEL_REALS - MODEL_INTEGERS"
+                lines.append(f"{source.name}_set_held({state}, m->flag[{at}]);")
             lines.append(f"m->real[AT_U] = {source.name}_step({', '.join(given)});")
         if self.plant:
             w = ", &m->real[AT_W_1]" if self.plant.disturbances else ""
@@ -527,11 +536,12 @@ def fmu(
     Notes
     -----
     Inputs are ``r`` with its derivatives, and ``y`` or, in a loop, ``noise``; for a plant ``u`` and
-    ``w[i]``. Outputs are ``u``, ``y`` and the controller's estimates; ``status`` and ``reason`` are
-    integers. Parameters ``u_min``, ``u_max``, ``omega_c`` and ``omega_o`` can be changed at any
-    time. A bandwidth is a parameter where it has a closed form: not for a controller that is no
-    ``ADRC``, in single precision, omega_o not with a learner, a delay, half gain, the reduced or
-    nonlinear form, and poles of another pattern.
+    ``w[i]``; ``signal[i]`` of a schedule; and ``held``, true or false, where the controller's
+    ``set_held`` has an effect. Outputs are ``u``, ``y`` and the controller's estimates; ``status``
+    and ``reason`` are integers. Parameters ``u_min``, ``u_max``, ``omega_c`` and ``omega_o`` can be
+    changed at any time. A bandwidth is a parameter where it has a closed form: not for a controller
+    that is no ``ADRC``, in single precision, omega_o not with a learner, a delay, half gain, the
+    reduced or nonlinear form, and poles of another pattern.
     """
     target = Path(path)
     if target.suffix != ".fmu":

@@ -166,6 +166,7 @@ class Variable(NamedTuple):
     unit: str = ""
     held: bool = False  # whether it is constant between samples
     whole: bool = False  # whether it is an integer
+    flag: bool = False  # whether it is true or false
 
     @property
     def constant(self) -> str:
@@ -177,9 +178,9 @@ TIME = Variable("time", "independent", "time", unit="s")
 
 
 def ordered(variables: Iterable[Variable]) -> tuple[Variable, ...]:
-    """Return the time and the variables, integers last."""
+    """Return the time and the variables: numbers, integers, and those that are true or false."""
     given = (TIME, *variables)
-    return tuple(sorted(given, key=lambda variable: variable.whole))
+    return tuple(sorted(given, key=lambda variable: (variable.flag, variable.whole)))
 
 
 def several(
@@ -267,13 +268,20 @@ class ControllerPart:
 
     @property
     def inputs(self) -> list[Variable]:
-        """Reference and its derivatives."""
+        """Reference and its derivatives, signals of the schedule, whether the plant is held."""
         described = "derivative {i} of the reference"
+        held = "whether the plant is held, by a brake for instance: u does not act until it is not"
         return [
             Variable("r", INPUT, "reference"),
             *several("r_derivative", self.source.derivatives, INPUT, described),
             *several("signal", self.source.signals, INPUT, "signal {i} that the gains follow"),
+            *([Variable("held", INPUT, held, flag=True)] if self.can_be_held else []),
         ]
+
+    @property
+    def can_be_held(self) -> bool:
+        """Whether the controller can be told that the plant is held."""
+        return "set_held" in self.source.operations
 
     @property
     def outputs(self) -> list[Variable]:

@@ -13,15 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.axes import Axes, control_all
+from quell.controllers.axes import Axes, control_all, hand_over_all
 from quell.controllers.base import (
+    change_parameters,
     reset_loop,
     set_reference_derivatives,
     status_flags,
     write_row,
 )
 from quell.controllers.compensator import samples_to_settle
-from quell.export import axes_source, c_files
+from quell.export import axes_source
 from quell.export.axes_source import AxesParts
 from quell.export.c_files import CSource
 from quell.export.library.vectors import (
@@ -138,10 +139,10 @@ class AxesPlayer:
             if action is Action.APPLIED:
                 axes_source.set_applied_controls(old, state, given)
             elif action is Action.HAND_OVER:
-                axes_source.hand_over_all(old, state)
+                hand_over_all(old, state)
             elif action in (Action.LIMIT, Action.FREE):
                 self.design = self.limited if action is Action.LIMIT else self.default
-                c_files.retune(old, self.design, state)
+                change_parameters(old, self.design, state)
             elif action in (Action.HELD, Action.RELEASED):
                 axes_source.set_held_of_axes(old, state, 0, action is Action.HELD)
             elif action is Action.RESET:

@@ -14,7 +14,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -185,7 +185,9 @@ def _values(source: CSource, dt: float, limit: str) -> dict[str, object]:
     }
 
 
-def _library(source: CSource, test: str, example: str, values: dict[str, object]) -> dict[str, str]:
+def _library(
+    source: CSource, test: str, example: str, values: Mapping[str, object]
+) -> dict[str, str]:
     """Return the text of all files of a library by path."""
     name = source.name
     return {

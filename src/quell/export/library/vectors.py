@@ -19,8 +19,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.controllers.base import (
+    change_parameters,
     control,
     reset_loop,
+    set_held,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -257,9 +259,9 @@ class Player:
                 c_files.hand_over(old, self.state)
             elif action in (Action.LIMIT, Action.FREE):
                 self.design = self.limited if action is Action.LIMIT else self.default
-                c_files.retune(old, self.design, self.state)
+                change_parameters(old, self.design, self.state)
             elif action in (Action.HELD, Action.RELEASED):
-                c_files.set_held(old, self.state, action is Action.HELD)
+                set_held(old, self.state, action is Action.HELD)
             elif action is Action.RESET:
                 reset_loop(old, self.state)
             elif action is Action.START:

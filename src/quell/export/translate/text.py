@@ -269,7 +269,7 @@ def _without(block: Block, unused: set[str]) -> Block:
             if item.target not in unused:
                 kept.append(item)
             elif item.calls:
-                code = f"(void){item.code}"
+                code = f"(void){item.code}" if _is_call(item.code) else f"(void)({item.code})"
                 kept.append(Line(code, comments=item.comments, behind=item.behind, calls=True))
         elif isinstance(item, Branch):
             body, orelse = _without(item.body, unused), _without(item.orelse, unused)
@@ -280,6 +280,18 @@ def _without(block: Block, unused: set[str]) -> Block:
             if body:
                 kept.append(Loop(item.header, item.variable, body, item.comments, item.behind))
     return kept
+
+
+def _is_call(code: str) -> bool:
+    """Return whether a piece of code is one call and nothing else."""
+    depth, name = 0, re.match(r"\w+(?=\()", code)
+    if name is None:
+        return False
+    for i in range(name.end(), len(code)):
+        depth += (code[i] == "(") - (code[i] == ")")
+        if depth == 0:
+            return i == len(code) - 1
+    return False
 
 
 def _has_call(code: str) -> bool:

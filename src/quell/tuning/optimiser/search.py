@@ -113,7 +113,7 @@ def limits(structure: Structure) -> tuple[Vector, Vector]:
 # ---- Constraints that are no bounds of a frequency response ----
 
 # Largest load response over frequency, in units of that at low ones, of structures whose integral
-# gain has no largest value: optimal PID and freed controllers have up to 2.1 on twenty plants.
+# gain has no largest value: optimal PID controllers and free poles have up to 2.1 on twenty plants.
 MOST_SWING = 2.0
 # It is found on each fourth point of the grid, 6 per decade: its peaks are wide.
 _SWING_STEP = 4

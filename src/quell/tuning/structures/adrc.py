@@ -2,13 +2,14 @@
 
 ADRC by bandwidths, with poles of its own, at half gain, of reduced order, with a model.
 
-The poles of the law and of the observer are each one number, the bandwidth, or *freed*: a factor
+The poles of the law and of the observer are each one number, the bandwidth, or *free*: a factor
 ``s² + 2 ζ ω s + ω²`` for each two of them, real or complex, and a real pole if their number is odd.
-A freed ADRC of order 1 has the feedback of a PI controller with a filter of first order, one of
-order 2 that of a PID controller with a filter of second order (``controllers/baselines/pid.py``),
-as long as the loop with its own nominal plant is stable. The search starts from these.
+An ADRC of order 1 with free poles has the feedback of a PI controller with a filter of first order,
+one of order 2 that of a PID controller with a filter of second order
+(``controllers/baselines/pid.py``), as long as the loop with its own nominal plant is stable. The
+search starts from these.
 
-The freed ADRC whose feedback is that of a given PI or PID controller with a filter.
+The ADRC with free poles whose feedback is that of a given PI or PID controller with a filter.
 
 In continuous time, with ``C = B(s)/(s A(s))``, A monic of degree n, and the nominal plant
 ``b0/s^n``, the poles of the law and of the observer are together the poles of the loop::
@@ -315,7 +316,7 @@ _LAWS, _LOWEST_OBSERVER, _OBSERVERS, _OFF = (0.5, 1.0, 2.0), 1e-3, 300, 0.1
 class Form:
     """Which kind of ADRC a structure has."""
 
-    freed: bool = False
+    free_poles: bool = False
     reduced: bool = False
     half_observer: bool = False
     half_law: bool = False
@@ -376,7 +377,7 @@ class AdrcStructure:
 
     def _pole_parameters(self, which: str, count: int) -> list[Parameter]:
         bounds = (min(_SLOWEST * self.model.omega, 0.1 * self._fastest), self._fastest)
-        if not self.form.freed:
+        if not self.form.free_poles:
             return [Parameter(f"omega_{which}", "rad/s", *bounds)]
         found = []
         for i in range(count // 2):
@@ -389,7 +390,7 @@ class AdrcStructure:
     # ---- poles from the parameters
 
     def _columns(self) -> int:
-        return 1 + (self.degree if self.form.freed else 1)
+        return 1 + (self.degree if self.form.free_poles else 1)
 
     def poles(self, values: Matrix) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return the poles of the law (m, r) and of the observer (m, N) [rad/s]."""
@@ -399,7 +400,7 @@ class AdrcStructure:
         return law, observer
 
     def _roots(self, values: Matrix, count: int) -> NDArray[np.complex128]:
-        if not self.form.freed:
+        if not self.form.free_poles:
             return np.repeat(-values[:, :1].astype(complex), count, axis=1)
         columns = []
         for i in range(count // 2):
@@ -427,7 +428,7 @@ class AdrcStructure:
         if other is self or same != own:
             return None
         law, observer = (poles[0] for poles in other.poles(values[None, :]))
-        if not self.form.freed:
+        if not self.form.free_poles:
             sizes = [float(np.exp(np.mean(np.log(np.abs(poles))))) for poles in (law, observer)]
             return np.array([float(values[0]), *sizes])
         if observer.size != self._observed:
@@ -437,7 +438,7 @@ class AdrcStructure:
     # ---- the structure
 
     def shapes(self) -> Matrix:
-        """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
+        """Return bandwidths in wide ranges; free poles start in one place, or in two."""
         omega, rows = self.model.omega, []
         b0 = self.model.b if self.degree == self.model.degree else 1.0
         ratios = (
@@ -447,7 +448,7 @@ class AdrcStructure:
             pair = (law * omega, law * ratio * omega)
             if max(pair) > 0.999 * self._fastest:
                 pair = (min(pair[0], 0.9 * self._fastest), 0.99 * self._fastest)
-            if not self.form.freed:
+            if not self.form.free_poles:
                 rows.append(np.array([b0, *pair]))
                 continue
             counts = (self.degree, self._observed)
@@ -480,11 +481,11 @@ class AdrcStructure:
     def grid(self) -> tuple[Matrix, float]:
         """Return pairs of bandwidths, the law's and the observer's, for structures with a model.
 
-        With freed poles they are those around the plant's resonances, without a spacing.
+        With free poles they are those around the plant's resonances, without a spacing.
         """
         if not self.form.based:
             return np.zeros((0, len(self.parameters))), 0.0
-        if self.form.freed:
+        if self.form.free_poles:
             around = [row for shape in self.shapes() for row in self._around_resonance(shape)]
             return np.array(around).reshape(-1, len(self.parameters)), 0.0
         low = max(_FROM * self.model.omega, self.parameters[1].low)
@@ -495,7 +496,7 @@ class AdrcStructure:
     def beside(self, values: Vector) -> Matrix:
         """Return values beside the bandwidths of the observer at which k_i is infinite."""
         found: list[list[float]] = []
-        if not self.form.based or self.form.freed:
+        if not self.form.based or self.form.free_poles:
             return np.zeros((0, len(self.parameters)))
         b0, law = values[:2].tolist()
         observers = np.geomspace(
@@ -560,7 +561,7 @@ class AdrcStructure:
         The bounds of the parameters keep ω below R.
         """
         columns, split = [], self._columns()
-        if self.form.freed:
+        if self.form.free_poles:
             for first, count in ((1, self.degree), (split, self._observed)):
                 for i in range(count // 2):
                     share = values[:, first + 2 * i] / self._fastest
@@ -573,7 +574,7 @@ class AdrcStructure:
     def _patterns(self, values: Vector) -> tuple[float, float, Any, Any]:
         """Return omega_c, omega_o and the patterns of poles in units of them."""
         law, observer = (poles[0] for poles in self.poles(values[None, :]))
-        if not self.form.freed:
+        if not self.form.free_poles:
             return float(-law[0].real), float(-observer[0].real), None, None
         omega_c, omega_o = (float(np.exp(np.mean(np.log(np.abs(p))))) for p in (law, observer))
         return omega_c, omega_o, _pattern(law / omega_c), _pattern(observer / omega_o)
@@ -677,7 +678,7 @@ def _factors(poles: NDArray[np.complex128]) -> list[float] | None:
     return found + [float(p) for p in single]
 
 
-# ---- The freed ADRC whose feedback is that of a given PI or PID controller with a filter ----
+# ---- The ADRC with free poles that is equal to a PI or PID controller with a filter ----
 
 # Damping of the law's poles that is enough; it is the least one of the structure.
 _LEAST = 0.6
@@ -688,7 +689,7 @@ _GAINS = np.logspace(-4.0, 4.0, 161)
 
 
 def equivalents(pid: FilteredPID, values: Vector, adrc: AdrcStructure, most: int = 3) -> Matrix:
-    """Return values (k, p) of a freed ADRC of order 1 or 2 with the same feedback, k ≤ ``most``.
+    """Return values (k, p) of an ADRC with free poles and the same feedback, k ≤ ``most``.
 
     Of a PID controller that stabilises no nominal plant ``b0/s^n``, the poles that are unstable or
     hardly damped are replaced by damped ones of the same size: that is near it only. There are none
@@ -697,7 +698,7 @@ def equivalents(pid: FilteredPID, values: Vector, adrc: AdrcStructure, most: int
     rows: list[tuple[float, Vector]] = []
     order = 2 if pid.derivative else 1
     form = adrc.form
-    usable = form.freed and not form.based and not form.reduced and form.extended == 1
+    usable = form.free_poles and not form.based and not form.reduced and form.extended == 1
     if not usable or adrc.order != order or not pid.filtered:
         return np.zeros((0, len(adrc.parameters)))
     kp, ki, kd, f1, f2 = (float(part[0]) for part in pid.parts(values[None, :]))

@@ -15,17 +15,17 @@ _PID = {
 }
 _ADRC = {
     "bandwidths": Form(),
-    "freed": Form(freed=True),
+    "poles": Form(free_poles=True),
     "half-gain": Form(half_observer=True),
     "half-gain-law": Form(half_law=True),
     "reduced": Form(reduced=True),
     "model-based": Form(based=True),
-    "model-based-freed": Form(based=True, freed=True),
+    "model-based-poles": Form(based=True, free_poles=True),
     "delay": Form(knows_delay=True),
-    "delay-freed": Form(knows_delay=True, freed=True),
+    "delay-poles": Form(knows_delay=True, free_poles=True),
     "bandwidths-2": Form(extended=2),
     "bandwidths-3": Form(extended=3),
-    "freed-2": Form(freed=True, extended=2),
+    "poles-2": Form(free_poles=True, extended=2),
     "model-based-2": Form(based=True, extended=2),
 }
 LQG, CASCADE = "lqg", "p-pi-notch"
@@ -34,7 +34,7 @@ STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE)
 WITH_ONE_INTEGRATOR = {
     "bandwidths-2": "bandwidths",
     "bandwidths-3": "bandwidths",
-    "freed-2": "freed",
+    "poles-2": "poles",
     "model-based-2": "model-based",
 }
 """The same with one integrator for each structure with several, whose k_i is infinite."""

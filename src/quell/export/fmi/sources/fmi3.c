@@ -17,6 +17,8 @@
 
 /* Part of a sample by which times may differ: far above rounding, far below any step. */
 #define TOLERANCE 1e-6
+/* Value reference of the first variable that is true or false. */
+#define FIRST_FLAG (MODEL_REALS + MODEL_INTEGERS)
 /* Longest message [characters]. */
 #define MESSAGE 200
 
@@ -262,6 +264,37 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference valueR
     return fmi3OK;
 }
 
+fmi3Status fmi3GetBoolean(fmi3Instance instance, const fmi3ValueReference valueReferences[],
+                          size_t nValueReferences, fmi3Boolean values[], size_t nValues) {
+    const Instance *self = instance;
+    size_t i;
+    if (self == NULL || nValues != nValueReferences) return fmi3Error;
+    for (i = 0; i < nValueReferences; i++) {
+        const fmi3ValueReference which = valueReferences[i];
+        if (which < FIRST_FLAG || which >= FIRST_FLAG + MODEL_FLAGS) {
+            return fail(self, "fmi3GetBoolean", "there is no such variable of this type");
+        }
+        values[i] = self->now.m.flag[which - FIRST_FLAG];
+    }
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetBoolean(fmi3Instance instance, const fmi3ValueReference valueReferences[],
+                          size_t nValueReferences, const fmi3Boolean values[], size_t nValues) {
+    Instance *self = instance;
+    size_t i;
+    if (!allowed(self, "fmi3SetBoolean", INSTANTIATED | INITIALISING | STEPPING)) return fmi3Error;
+    if (nValues != nValueReferences) return fmi3Error;
+    for (i = 0; i < nValueReferences; i++) {
+        const fmi3ValueReference which = valueReferences[i];
+        if (which < FIRST_FLAG || which >= FIRST_FLAG + MODEL_FLAGS) {
+            return fail(self, "fmi3SetBoolean", "there is no such variable of this type");
+        }
+        self->now.m.flag[which - FIRST_FLAG] = values[i];
+    }
+    return fmi3OK;
+}
+
 /* The other types have no variables: only empty lists are right. */
 static fmi3Status none(const Instance *instance, const char *function, size_t count) {
     if (instance != NULL && count == 0) return fmi3OK;
@@ -285,7 +318,6 @@ NONE(fmi3GetUInt16, fmi3UInt16)
 NONE(fmi3GetUInt32, fmi3UInt32)
 NONE(fmi3GetInt64, fmi3Int64)
 NONE(fmi3GetUInt64, fmi3UInt64)
-NONE(fmi3GetBoolean, fmi3Boolean)
 NONE(fmi3GetString, fmi3String)
 NONE(fmi3SetFloat32, const fmi3Float32)
 NONE(fmi3SetInt8, const fmi3Int8)
@@ -296,7 +328,6 @@ NONE(fmi3SetInt32, const fmi3Int32)
 NONE(fmi3SetUInt32, const fmi3UInt32)
 NONE(fmi3SetInt64, const fmi3Int64)
 NONE(fmi3SetUInt64, const fmi3UInt64)
-NONE(fmi3SetBoolean, const fmi3Boolean)
 NONE(fmi3SetString, const fmi3String)
 
 fmi3Status fmi3GetBinary(fmi3Instance instance, const fmi3ValueReference valueReferences[],

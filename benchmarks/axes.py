@@ -1,0 +1,340 @@
+"""Several axes: an arm with and without its mass matrix, arms of MuJoCo, a quadrotor, and the cost.
+
+    python benchmarks/axes.py [--part arm|mujoco|quadrotor|cost] [--draws 100] [--seed 7]
+
+*arm*: random rigid two-link arms (those of ``quell stress --loops axes``) that follow sines,
+ω_c/ω_o = 8/60: RMS error against the response that the design asks for, from 5 s on, with M(q),
+with M at the middle of the motion, and with two independent loops; without learner and with
+``Harmonic()`` and a guard.
+
+*mujoco*: arms of two and three joints, one joint elastic in half of them, simulated by MuJoCo; the
+model's masses, lengths and inertias are each up to 20 % off. Every run must be stable; the guarded
+learner over none.
+
+*quadrotor*: steps of the attitude to random targets, four rotors that meet their limits, inertias
+up to 30 % off. One ``Axes`` with B0 of the attitude, roll and pitch before yaw, against three
+single loops, each with the limits of its torque, whose torques are mixed and cut behind them. RMS
+of the error against the response that the design asks for, all angles.
+
+*cost*: ``step`` of three axes over three times ``step`` of one, and the compiled loop likewise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+from scipy.signal import lsim
+
+import quell as ql
+from quell.experiments.stress.axes import draw_arm
+from quell.plants.multibody import rotor_levers
+
+DT = 1e-3
+OMEGA_C, OMEGA_O = 8.0, 60.0
+NOISE = 2.0 * np.pi / 2**20  # of encoders with 20 bits [rad]
+
+
+def joint(learner: bool = False, omega_c: float = OMEGA_C, omega_o: float = OMEGA_O) -> ql.ADRC:
+    """Return the controller of an axis."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=omega_o, dt=DT)
+    parts: dict[str, Any] = {}
+    if learner:
+        parts = {"learner": ql.learners.Harmonic(), "guard": ql.Guard()}
+    return ql.ADRC(observer, omega_c, **parts)
+
+
+def asked_for(r: Any, t: Any) -> Any:
+    """Return the response that the design asks for, ω_c²/(s + ω_c)², of each reference."""
+    design = ([OMEGA_C**2], [1.0, 2.0 * OMEGA_C, OMEGA_C**2])
+    return np.stack([lsim(design, one - one[0], t)[1] + one[0] for one in r.T], axis=1)
+
+
+def rms(error: Any, t: Any, start: float = 5.0) -> Any:
+    """Return the RMS of each column from a time on."""
+    return np.sqrt(np.mean(error[t >= start] ** 2, axis=0))
+
+
+# ---- Random rigid arms ----
+
+
+def part_arm(draws: int, seed: int) -> None:
+    """Print errors of both joints, medians over the arms, with and without M(q)."""
+    kinds = ("M(q)", "M at the middle", "two loops")
+    found: dict[tuple[str, bool], list[Any]] = {}
+    for i in range(draws):
+        drawn = draw_arm(np.random.default_rng([seed, i]))
+        plant = ql.plants.arm(drawn.lengths, drawn.masses, gravity=drawn.gravity)
+        middle = np.array([0.0, drawn.elbow])
+        M = plant.mass_matrix(middle)
+        matrices = (plant.inertia, M, np.diag(1.0 / np.diag(np.linalg.inv(M))))
+        sines = [
+            ql.signals.Sum((ql.signals.Constant(at), ql.signals.Sinusoid(amplitude, omega)))
+            for at, amplitude, omega in zip(
+                middle, drawn.amplitudes, drawn.frequencies, strict=True
+            )
+        ]
+        noise = ql.signals.BandLimitedNoise(power=NOISE**2 * DT, sample_time=DT)
+        start = np.array([*middle, 0.0, 0.0])
+        scenario = ql.Scenario(sines, duration=40.0, noise=noise, x0=start, seed=i)
+        for kind, matrix in zip(kinds, matrices, strict=True):
+            for learns in (False, True):
+                run = ql.simulate(
+                    plant, ql.Axes([joint(learns), joint(learns)], M=matrix), scenario
+                )
+                error = np.full(2, np.inf)
+                if not run.diverged:
+                    error = rms(asked_for(run["r"], run.t) - run["y"], run.t)
+                found.setdefault((kind, learns), []).append(1e3 * error)
+    print(f"two-link arms, {draws}, RMS error [mrad], median of joint 1, joint 2")
+    for (kind, learns), errors in found.items():
+        one, two = np.median(errors, axis=0)
+        plain = np.array(found[kind, False])
+        worst = np.max(np.array(errors) / plain)
+        print(f"  {kind:16} {'Harmonic, guard' if learns else 'no learner':16} "
+              f"{one:7.2f} {two:7.2f}   worst over none {worst:.3f}")  # fmt: skip
+
+
+# ---- Arms in MuJoCo ----
+
+
+def mujoco_arm(lengths: Any, masses: Any, motors: Any, stiffness: Any) -> Any:
+    """Return a model of MuJoCo of a planar arm of rods; an elastic joint has a motor before it."""
+    import mujoco
+
+    body, end, actuators = "", "", ""
+    for i, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
+        about, at = mass * length**2 / 12.0, lengths[i - 1] if i else 0.0
+        joint = f'<joint name="j{i}" type="hinge" axis="0 -1 0" damping="0.05"'
+        inertia = f"{about} {about} {about}"
+        inertial = f'<inertial pos="{length / 2} 0 0" mass="{mass}" diaginertia="{inertia}"/>'
+        if np.isfinite(stiffness[i]):
+            k, d = stiffness[i], 0.01 * 2.0 * np.sqrt(stiffness[i] * motors[i])
+            small = "1e-6 1e-6 1e-6"
+            body += (
+                f'<body pos="{at} 0 0"><joint name="m{i}" type="hinge" axis="0 -1 0" '
+                f'armature="{motors[i]}"/><inertial pos="0 0 0" mass="1e-4" diaginertia="{small}"/>'
+                f'<body>{joint[:-15]} stiffness="{k}" damping="{d}"/>{inertial}'
+            )
+            end += "</body></body>"
+            actuators += f'<motor joint="m{i}"/>'
+        else:
+            body += f'<body pos="{at} 0 0">{joint} armature="{motors[i]}"/>{inertial}'
+            end += "</body>"
+            actuators += f'<motor joint="j{i}"/>'
+    xml = (
+        f'<mujoco><option gravity="0 0 -9.81" timestep="{DT}" integrator="implicitfast"/>'
+        f"<worldbody>{body}{end}</worldbody><actuator>{actuators}</actuator></mujoco>"
+    )
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def part_mujoco(draws: int, seed: int) -> None:
+    """Print how many runs are stable, and the guarded learner's RMS over none, worst joint."""
+    import mujoco
+
+    stable, ratios = 0, []
+    t = DT * np.arange(20000)
+    for i in range(draws):
+        rng = np.random.default_rng([seed, i])
+        n = 2 + i % 2
+        lengths, masses = rng.uniform(0.2, 0.5, n), rng.uniform(0.5, 3.0, n)
+        motors, stiffness = rng.uniform(0.02, 0.1, n), np.full(n, np.inf)
+        guess = ql.plants.arm(
+            lengths * rng.uniform(0.8, 1.2, n), masses * rng.uniform(0.8, 1.2, n),
+            motor_inertia=motors * rng.uniform(0.8, 1.2, n),
+        )  # fmt: skip
+        if (i // 2) % 2:
+            # The elastic joint is the last: its motor alone is at 25 to 60 Hz against the link.
+            link = masses[-1] * lengths[-1] ** 2 / 3.0
+            stiffness[-1] = link * (2.0 * np.pi * rng.uniform(25.0, 60.0)) ** 2
+        model = mujoco_arm(lengths, masses, motors, stiffness)
+        at = [
+            model.joint(f"m{j}" if np.isfinite(stiffness[j]) else f"j{j}").qposadr[0]
+            for j in range(n)
+        ]
+        omegas, sizes = rng.uniform(0.5, 4.0, n), rng.uniform(0.2, 0.8, n)
+        r = sizes * np.sin(np.outer(t, omegas))
+        errors = []
+        for learns in (False, True):
+            axes = ql.Axes([joint(learns) for _ in range(n)], M=guess.inertia)
+            data, noise = mujoco.MjData(model), np.random.default_rng(i)
+            y = np.empty_like(r)
+            for k in range(t.size):
+                y[k] = data.qpos[at]
+                data.ctrl[:] = axes.step(r[k], y[k] + NOISE * noise.standard_normal(n))
+                mujoco.mj_step(model, data)
+            errors.append(rms(asked_for(r, t) - y, t))
+        good = bool(np.all(np.isfinite(errors)) and np.max(errors) < 0.3)
+        stable += good
+        if good:
+            ratios.append(errors[1] / errors[0])
+    every = np.concatenate(ratios)
+    worst = np.array([each.max() for each in ratios])
+    print(f"MuJoCo, {draws} arms, model 20 % off: stable {stable}; guarded over none: median "
+          f"{np.median(every):.3f}, worst joint of the arms: 95 % {np.quantile(worst, 0.95):.3f}, "
+          f"largest {worst.max():.3f}")  # fmt: skip
+
+
+# ---- A quadrotor ----
+
+
+ATTITUDE = {"roll": (8.0, 40.0), "pitch": (8.0, 40.0), "yaw": (6.0, 30.0)}
+TARGETS = (0.7, 0.7, 0.8)  # largest angles [rad]
+
+
+def moves(rng: Any, size: float) -> Any:
+    """Return steps at eight random times to random targets within ±``size``."""
+    targets = rng.uniform(-size, size, 8)
+    times = np.sort(rng.uniform(0.0, 18.0, 8))
+    changes = np.diff(targets, prepend=0.0)
+    return ql.signals.Sum(
+        tuple(ql.signals.Step(float(c), float(at)) for c, at in zip(changes, times, strict=True))
+    )
+
+
+def part_quadrotor(draws: int, seed: int) -> None:
+    """Print the RMS of Axes over that of three single loops, all angles."""
+    ratios, roll_and_pitch = [], []
+    hover, most = 2.5, 6.0
+    for i in range(draws):
+        rng = np.random.default_rng([seed, i])
+        true = np.array([0.012, 0.012, 0.022])
+        craft = ql.plants.quadrotor_attitude(true)
+        level = rotor_levers(0.17, 0.015) / (true * rng.uniform(0.7, 1.3, 3))[:, None]
+        gusts = [ql.signals.Sinusoid(0.05, float(rng.uniform(2.0, 8.0))) for _ in range(2)]
+        scenario = ql.Scenario(
+            [moves(rng, size) for size in TARGETS], duration=20.0, disturbances=gusts,
+            x0=[0.0] * 6 + [hover] * 4, seed=i,
+        )  # fmt: skip
+        axes = {name: joint(omega_c=c, omega_o=o) for name, (c, o) in ATTITUDE.items()}
+        controller = ql.Axes(
+            axes, gain_of_attitude(level), saturation=["roll", "pitch", "yaw"],
+            u_min=0.2, u_max=most, wished=[hover] * 4,
+        )  # fmt: skip
+        run = ql.simulate(craft, controller, scenario)
+        asked = np.stack(
+            [
+                lsim(([c**2], [1.0, 2.0 * c, c**2]), one, run.t)[1]
+                for (c, _), one in zip(ATTITUDE.values(), run["r"].T, strict=True)
+            ],
+            axis=1,
+        )
+        ours = asked[: len(run)] - run["y"]
+        theirs = asked - single_loops(craft, level, run["r"], scenario, hover, most)
+        ratios.append(np.sqrt(np.mean(ours**2) / np.mean(theirs**2)))
+        roll_and_pitch.append(np.sqrt(np.mean(ours[:, :2] ** 2) / np.mean(theirs[:, :2] ** 2)))
+    print(f"quadrotor, {draws} draws: RMS of Axes over three single loops: median "
+          f"{np.median(ratios):.2f}, largest {np.max(ratios):.2f}; of roll and pitch "
+          f"{np.median(roll_and_pitch):.2f}, {np.max(roll_and_pitch):.2f}")  # fmt: skip
+
+
+def gain_of_attitude(level: Any) -> Any:
+    """Return B0 as a function of the angles, from that of the level craft (3, 4)."""
+
+    def gain(x):  # type: ignore[no-untyped-def]
+        roll, pitch = x[0, 0], x[1, 0]
+        W = np.zeros((3, 3))  # from rates of the body to rates of the angles
+        W[0, 0], W[0, 1], W[0, 2] = (
+            1.0,
+            math.sin(roll) * math.tan(pitch),
+            math.cos(roll) * math.tan(pitch),
+        )
+        W[1, 1], W[1, 2] = math.cos(roll), -math.sin(roll)
+        W[2, 1], W[2, 2] = math.sin(roll) / math.cos(pitch), math.cos(roll) / math.cos(pitch)
+        out = np.zeros((3, 4))
+        for i in range(3):
+            for j in range(4):
+                for k in range(3):
+                    out[i, j] += W[i, k] * level[k, j]
+        return out
+
+    return gain
+
+
+def single_loops(craft: Any, B0: Any, r: Any, scenario: Any, hover: float, most: float) -> Any:
+    """Return the angles under three ADRCs, each with the torque's limit of its own axis."""
+    from quell.plants.base import advance
+    from quell.plants.multivariable import measure_all
+
+    mixer = np.linalg.pinv(B0)
+    reach = [(most - hover) * np.sum(np.abs(row)) for row in B0]
+    loops = []
+    for a, (omega_c, omega_o) in zip(reach, ATTITUDE.values(), strict=True):
+        observer = ql.ESO.model_free(2, 1.0, omega_o, DT)
+        loops.append(ql.ADRC(observer, omega_c, u_min=-a, u_max=a))
+    model, x = craft.sampled(DT), np.array(scenario.x0)
+    t = DT * np.arange(len(r))
+    w = np.stack([*(d(t) for d in scenario.disturbances), np.zeros(t.size)], axis=1)
+    y, scratch, angles = np.zeros(3), np.zeros(60), np.empty_like(r)
+    for k in range(len(r)):
+        measure_all(model, x, y)
+        angles[k] = y
+        v = np.array([loop.step(r[k, i], y[i]) for i, loop in enumerate(loops)])
+        u = np.clip(hover + mixer @ v, 0.2, most)
+        advance(model, x, scratch, t[k], u, w[k])
+        if not np.all(np.abs(x) < 1e6):
+            angles[k:] = 10.0
+            break
+    return angles
+
+
+# ---- The cost ----
+
+
+def part_cost(draws: int, seed: int) -> None:
+    """Print the time of three axes over three times that of one, best of several."""
+    one, three = joint(learner=True), ql.Axes([joint(learner=True) for _ in range(3)])
+    plain_one, plain_three = joint(), ql.Axes([joint() for _ in range(3)])
+    r, y = np.array([0.1, 0.2, 0.3]), np.zeros(3)
+
+    def best(call: Any, count: int = 20000) -> float:
+        call()
+        found = []
+        for _ in range(9):
+            start = time.perf_counter()
+            for _ in range(count):
+                call()
+            found.append((time.perf_counter() - start) / count)
+        return min(found)
+
+    for name, single, several in (("plain", plain_one, plain_three), ("learner", one, three)):
+        a, b = best(lambda s=single: s.step(0.1, 0.0)), best(lambda s=several: s.step(r, y))
+        print(f"step, {name}: one {1e6 * a:.2f} us, three axes {1e6 * b:.2f} us, "
+              f"ratio to three {b / (3 * a):.2f}")  # fmt: skip
+    masses = ql.plants.MultivariableLinearPlant(
+        np.kron(np.eye(3), [[0, 1], [0, -1]]), np.kron(np.eye(3), [[0], [1]]),
+        np.kron(np.eye(3), [[1, 0]]),
+    )  # fmt: skip
+    mass = ql.plants.LinearPlant.of(([1.0], [1.0, 1.0, 0.0]))
+    sine = ql.signals.Sinusoid(0.5, 3.0)
+    scenario = ql.Scenario(sine, duration=100.0)
+    all_three = ql.Scenario((sine,) * 3, duration=100.0)
+    for name, single, several in (("plain", plain_one, plain_three), ("learner", one, three)):
+        a = best(lambda s=single: ql.simulate(mass, s, scenario, record_every=1000), 1)
+        b = best(lambda s=several: ql.simulate(masses, s, all_three, record_every=1000), 1)
+        print(f"loop, {name}: one {1e3 * a:.1f} ms, three axes {1e3 * b:.1f} ms, "
+              f"ratio to three {b / (3 * a):.2f}")  # fmt: skip
+
+
+PARTS = {"arm": part_arm, "mujoco": part_mujoco, "quadrotor": part_quadrotor, "cost": part_cost}
+
+
+def main() -> None:
+    """Run the parts."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--part", choices=PARTS, action="append")
+    parser.add_argument("--draws", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=7)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    for name in options.part or PARTS:
+        PARTS[name](options.draws, options.seed)
+
+
+if __name__ == "__main__":
+    main()
