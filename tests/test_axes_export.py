@@ -106,20 +106,18 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
 
 
 def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
-    """Held values, limits of magnitude and rate, and learners that act."""
+    """Held values, limits of magnitude and rate, a brake, and learners that learn."""
     axes = ROWS["each, with rates"]()
     found = golden_vectors_of_axes(axes, parts_of_axes(axes, False), ("set_held",))
     flags = ql.Status(int(np.bitwise_or.reduce([row.status for row in found.rows])))
     held = ql.Status.MEASUREMENT_HELD | ql.Status.REFERENCE_HELD | ql.Status.CONTROL_HELD
     assert held | ql.Status.SATURATED | ql.Status.RATE_LIMITED | ql.Status.HELD in flags
-    widths = [sum(width for _, width in axis.channels) for axis in axes.axes]
-    place, authorities = axes.outputs + 1, []
-    for axis, width in zip(axes.axes, widths, strict=True):
-        channels = dict(zip([name for name, _ in axis.channels], np.cumsum(
-            [0, *(size for _, size in axis.channels)])[:-1], strict=True))  # fmt: skip
-        authorities.append(found.estimate[place + channels["authority"]])
-        place += width
-    assert max(authorities) > 0.1
+    at = axes.outputs + 1  # behind v and status
+    for axis in axes.axes:
+        width = sum(size for _, size in axis.channels)
+        theta = found.estimate[at : at + width][-len(axis.features) :]
+        assert np.any(theta != 0.0)
+        at += width
 
 
 @needs_gcc
@@ -169,7 +167,7 @@ def learning() -> ql.Axes:
     return ql.Axes(two(), [[1.0, 0.3], [0.2, 1.0]], **LIMITS)
 
 
-def taught(axes: ql.Axes, samples: int = 400) -> ql.Axes:
+def taught(axes: ql.Axes, samples: int = 150) -> ql.Axes:
     """Return axes after some samples with the interpreted kernels."""
     with np.errstate(all="ignore"), as_python():
         for k in range(samples):
@@ -187,7 +185,7 @@ class TestMemory:
         """And each continues the loop of the other, bit by bit."""
         axes = learning()
         robot = RobotInC(source_of_axes(axes, "robot"), tmp_path)
-        for k in range(300):
+        for k in range(100):
             r, y = np.array([0.3, 0.1 * np.sin(0.1 * k)]), np.array([1e-3 * k, 0.05])
             u = np.zeros(2)
             with np.errstate(all="ignore"), as_python():
