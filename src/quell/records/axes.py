@@ -120,12 +120,12 @@ class AxesTrajectory(Record):
             for i, name in enumerate(self.axis_names)
         }
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw outputs with references, errors and estimates of each axis, and the actuators.
 
         Parameters
         ----------
-        axes
+        axes, ax
             matplotlib axes, three for each axis of the machine and one more: rows of output, error
             and estimated f, then all control signals. For a loop without axes three: outputs,
             control signals, estimated disturbances. A new figure by default.
@@ -135,9 +135,9 @@ class AxesTrajectory(Record):
         numpy.ndarray
             the matplotlib axes.
         """
-        from quell.records.plotting import plot_axes
+        from quell.records.plotting import given_axes, plot_axes
 
-        return plot_axes(self, axes)
+        return plot_axes(self, given_axes(axes, ax))
 
     def to_pandas(self) -> Any:
         """Return a ``pandas.DataFrame`` with a row for each sample; needs the extra ``pandas``."""
