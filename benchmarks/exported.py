@@ -141,11 +141,11 @@ def same_bits(one: np.ndarray, other: np.ndarray) -> bool:
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in NAMES)
 
 
-def branches(folder: Path) -> str:
-    """Return the share of the branches of servo.c that were taken, in per cent."""
-    command = ["gcov", "-b", "loop-servo.gcda"]
+def branches(folder: Path, name: str = "servo") -> str:
+    """Return the share of the branches of NAME.c that were taken, in per cent."""
+    command = ["gcov", "-b", f"loop-{name}.gcda"]
     text = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout
-    part = text.partition("servo.c'")[2]
+    part = text.partition(f"{name}.c'")[2]
     found = re.search(r"Taken at least once:(\d+\.\d+)% of (\d+)", part)
     return f"{float(found[1]):.0f} % of {found[2]}" if found else "–"
 

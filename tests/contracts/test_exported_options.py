@@ -29,6 +29,7 @@ from quell.features import RBF, Bias, Input, Periodic, State
 from quell.kernels.sized import constant_fields
 from quell.kernels.user_functions import origin_of
 from quell.observers.design import FORMS
+from tests import gain_functions
 from tests.in_c import built, needs_gcc
 
 from .examples import OwnModel
@@ -99,6 +100,11 @@ def _squares(x: Any, u: float) -> tuple[float, float]:
     return x[0] * x[0], u * u
 
 
+def _axis(order: int = 2, **parts: Any) -> Any:
+    return ql.ADRC(ql.ESO.model_free(order=order, b0=1.0, omega_o=12.0, dt=DT), 1.5, **parts)
+
+
+_WIDE = [[1.0, 0.3, 0.2], [0.2, 1.0, -0.3]]
 _RANGE: dict[str, Any] = {"u_min": -1.0, "u_max": 1.0, "rate_limit": Several((60.0, (-40.0, 60.0)))}
 _SCALED = {"frequency": 2.0, "scale": (1.0, 2.0, 5.0, 3.0), "bias_bandwidth": 0.2}
 _FEATURES = {"features": State() + Input()}
@@ -199,6 +205,12 @@ PARTS: dict[str, Part] = {
     "Compensated": Part(room.Compensated, _itself, {"controller": PID, "compensator": ql.Compensator(OBSERVER, **LIMITS)}, {
         "controller": baseline_room.LQG(PLANT, omega_c=3.0, omega_o=12.0, dt=DT),
         "compensator": ql.Compensator(OBSERVER, omega_c=1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), **LIMITS),
+    }),
+    "Axes": Part(ql.Axes, _itself, {"axes": [_axis(), _axis()], "u_min": -2.0, "u_max": 3.0}, {
+        "axes": Several(({"x": _axis(), "tool": _axis(3)}, [_axis(), _axis(learner=ql.learners.RLS(), guard=ql.Guard())])),
+        "B0": Several(([[1.0, 0.3], [0.2, 1.0]], gain_functions.nested_tuples)), "M": Several(([[1.0, 0.3], [0.3, 1.0]], gain_functions.array)),
+        "u_min": (-1.0, -2.0), "u_max": (1.0, 2.0), "rate_limit": Several((60.0, [60.0, (-40.0, 60.0)])), "saturation": Several(("direction", [1, 0])),
+        "weights": With([1.0, 2.0, 1.0], {"B0": _WIDE}), "wished": With([0.1, 0.0, -0.1], {"B0": _WIDE}),
     }),
     "SafeSet": Part(ql.SafeSet, lambda safe: ql.ADRC(OBSERVER, 1.5, safe_set=safe, **LIMITS), {"y_max": 0.9}, {
         "y_min": -0.9, "y_max": 0.5, "rate_min": -2.0, "rate_max": 2.0, "alpha": 5.0, "f_rate": 0.1, "noise": 1e-5, "gain_error": 0.1,

@@ -19,10 +19,11 @@ at end    uint64      check of all that is before it
 ========  ==========  =============================================================================
 
 *Layout*: what the numbers need so that they mean the same. Names and shapes of the arrays, kinds
-of controller, learner and guard, dt, b0, the model's coefficients a, and those parameters of the
-learner that ``learners.base.meaning`` returns: its features, scales and orders. Gains may change
-between two starts of a machine: omega_o, omega_c, limits, the guard and times of forgetting are not
-in it. So a product whose loop is tuned again keeps its map.
+of controller, learner and guard, dt, b0 (of several axes B0, of a function its name), the model's
+coefficients a, and those parameters of the learner that ``learners.base.meaning`` returns: its
+features, scales and orders. Gains may change between two starts of a machine: omega_o, omega_c,
+limits, the guard and times of forgetting are not in it. So a product whose loop is tuned again
+keeps its map.
 
 *Design*: all parameters but the limits of u. An image continues a running loop only where these are
 the same, too. Both hashes are of numbers with 9 digits (6 in single precision), because another
@@ -57,6 +58,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.controllers.allocation import ActuatorLimits
 from quell.controllers.base import Limits, reset_loop
 from quell.controllers.law import AdrcDesign, AdrcState
 from quell.kernels.dispatch import as_python
@@ -196,7 +198,7 @@ def _hash(value: Any, digits: int) -> int:
 
 def _text(value: Any, digits: int) -> str:
     """Return numbers, texts, arrays and tuples of them as a text that is the same everywhere."""
-    if isinstance(value, Limits):
+    if isinstance(value, Limits | ActuatorLimits):
         return "limits"
     if isinstance(value, np.ndarray):
         entries = ",".join(_text(entry, digits) for entry in value.ravel().tolist())

@@ -262,7 +262,7 @@ class _Writer:
         files.enums += enums(self.name, tuple(each for channels in own for each in channels))
         files.enums += self._enum_of_axes()
         files.structs += self._structs(own)
-        channels = [("v", self.n), ("status", 1)]
+        channels = [("v", self.n) if self.n > 1 else ("v[0]", 1), ("status", 1)]
         for member, each in zip(self.members, own, strict=True):
             channels += [(f"{member}.{channel}", width) for channel, width in each]
         source = files.write(self._title(), tuple(channels), self._defines(), self.derivatives)

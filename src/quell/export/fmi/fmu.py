@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
+from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
 from quell.export.c_files import plant_source
 from quell.export.controller_source import c_source
@@ -48,7 +49,7 @@ from quell.export.fmi.parts import (
     tuning_lines,
 )
 from quell.export.library.exported import FLAGS, NoCompilerError
-from quell.export.translate.text import checked_name
+from quell.export.translate.text import TranslationError, checked_name
 from quell.files import check_regular, check_writable, whole_text, written_atomically
 from quell.lti.models import is_linear_model
 from quell.plants.base import check_plant
@@ -575,6 +576,11 @@ def _parts(part: Any) -> tuple[Any, Any]:
         plant, controller = part, None
     if controller is not None:
         check_controller(controller)
+    if isinstance(controller, Axes):
+        raise TranslationError(
+            f"{controller.outputs} axes: an FMU is of one u and one y; write the axes as C by "
+            "quell.export.c, whose files can be linked into a block of your simulator"
+        )
     if plant is not None or controller is None:
         if not hasattr(plant, "sampled") and is_linear_model(plant):
             plant = LinearPlant.of(plant)

@@ -200,7 +200,12 @@ class Expressions:
             numbers = tuple(map(float, value))
             name = self.program.named_constant(node.id, numbers, self.module)
             return Value(Array((len(numbers),), Number.REAL), name)
-        raise self.fail(node, f"is {type(value).__name__}; only numbers can be constants")
+        is_array = isinstance(value, np.ndarray) and value.size and value.ndim in (1, 2)
+        if is_array and value.dtype.kind in "fiub":
+            name = self.program.named_constant(node.id, _as_tuples(value), self.module)
+            return Value(Array(value.shape, Number.REAL), name)
+        what = "numbers, and arrays of them with one or two dimensions, can be constants"
+        raise self.fail(node, f"is {type(value).__name__}; only {what}")
 
     def _attribute(self, node: ast.Attribute) -> Value:
         if isinstance(node.value, ast.Name) and node.value.id not in self.names:
@@ -252,15 +257,15 @@ class Expressions:
         return Value(kind, code, ATOM, root=base.root, mutable=base.mutable, calls=calls)
 
     def _slice(self, node: ast.Subscript, base: Value, part: ast.Slice) -> Value:
-        if part.step is not None or len(base.kind.shape) != 1:
-            raise self.fail(node, "a slice must be of one dimension, without a step")
+        if part.step is not None:
+            raise self.fail(node, "a slice must be without a step")
         size = base.kind.shape[0]
         lower = self.constant(0) if part.lower is None else self.translate(part.lower)
         upper = self.constant(size) if part.upper is None else self.translate(part.upper)
         length = self._length(node, part, lower, upper, size)
         code = base.code if lower.constant == 0 else f"&{base.at(ATOM)}[{lower.code}]"
         level = base.level if lower.constant == 0 else UNARY
-        kind = Array((length,), base.kind.element)
+        kind = Array((length, *base.kind.shape[1:]), base.kind.element)
         return Value(kind, code, level, root=base.root, mutable=base.mutable)
 
     def _length(
@@ -460,6 +465,13 @@ class Expressions:
                 return self.program.calls.builtin(self, node, name, arguments)
             return self.program.calls.function(self, node, function, arguments, names)
         raise self.fail(node, "this call can not be translated")
+
+
+def _as_tuples(array: Any) -> tuple[Any, ...]:
+    """Return an array of one or two dimensions as tuples of real numbers."""
+    if array.ndim > 1:
+        return tuple(map(_as_tuples, array))
+    return tuple(map(float, array))
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -112,7 +112,7 @@ class Program:
             if declaration is not None and not source.doc:
                 source = replace(source, doc=doc_of(declaration))
             if into_array:
-                source = into_procedure(source)
+                source = into_procedure(source, len(arguments[-1].kind.shape))
             found = Function(self, source, arguments, hints, key)
             self._found[key] = found
             if found.inline is None:
@@ -213,15 +213,22 @@ class Program:
         for name, (value, module) in self._constants.items():
             comment = f" /* {module} */"
             if isinstance(value, tuple):
-                numbers = ", ".join(map(self.literals.write_real, value))
-                head = f"static const {self.literals.real} {name}[{len(value)}]"
-                lines.append(f"{head} = {{{numbers}}};{comment}")
+                shape = f"[{len(value)}]"
+                if isinstance(value[0], tuple):
+                    shape += f"[{len(value[0])}]"
+                head = f"static const {self.literals.real} {name}{shape}"
+                lines.append(f"{head} = {self._braces(value)};{comment}")
             elif isinstance(value, int) and not isinstance(value, bool):
                 lines.append(f"static const int {name} = {value};{comment}")
             else:
                 number = self.literals.write(value)
                 lines.append(f"static const {self.literals.real} {name} = {number};{comment}")
         return lines
+
+    def _braces(self, value: Any) -> str:
+        if isinstance(value, tuple):
+            return "{" + ", ".join(map(self._braces, value)) + "}"
+        return self.literals.write_real(value)
 
     def helper_lines(self) -> list[str]:
         """Return the definitions of helper functions."""

@@ -228,32 +228,98 @@ def _read_lambda(function: Any) -> Source:
     return Source(definition, Comments(), "", function.__module__, "user_function", names)
 
 
-def into_procedure(source: Source) -> Source:
-    """Return a function that writes the numbers of its tuple to an array, its last argument."""
+def into_procedure(source: Source, dimensions: int = 1) -> Source:
+    """Return a function that writes the numbers it returns to an array, its last argument.
+
+    It returns a tuple of them, of tuples for an array of two dimensions; or an array that
+    ``np.zeros`` or ``np.empty`` has made, and that it has filled.
+    """
     tree = copy.deepcopy(source.tree)
     tree.args.args.append(ast.arg("out"))
-    _Returns(f"{source.module}.{source.name}").visit(tree)
+    where = f"{source.module}.{source.name}"
+    filled = _filled_array(tree)
+    (_Filled(filled, dimensions) if filled else _Returns(where, dimensions)).visit(tree)
     return replace(source, tree=ast.fix_missing_locations(tree))
+
+
+def _filled_array(tree: ast.FunctionDef) -> str | None:
+    """Return the name of the array that a function makes once, fills and returns; else None."""
+    returned = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
+    names = {getattr(value, "id", None) for value in returned}
+    name = names.pop() if len(names) == 1 else None
+    sets = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign)
+        and any(getattr(part, "id", None) == name for part in node.targets)
+    ]
+    is_made = len(sets) == 1 and sets[0] in tree.body and _is_array_maker(sets[0].value)
+    return name if name is not None and is_made else None
+
+
+def _is_array_maker(value: ast.expr) -> bool:
+    return isinstance(value, ast.Call) and getattr(value.func, "attr", "") in ("zeros", "empty")
+
+
+class _Filled(ast.NodeTransformer):
+    """Replacement of an array that a function makes, fills and returns, by the array ``out``."""
+
+    def __init__(self, name: str, dimensions: int) -> None:
+        self.name, self.dimensions = name, dimensions
+
+    def visit_Name(self, node: ast.Name) -> ast.Name:
+        return ast.copy_location(ast.Name("out", node.ctx), node) if node.id == self.name else node
+
+    def visit_Assign(self, node: ast.Assign) -> ast.AST:
+        if any(getattr(part, "id", None) == self.name for part in node.targets):
+            places = [f"place{i + 1}" for i in range(self.dimensions)]
+            line = f"out[{', '.join(places)}] = 0.0"
+            for i, place in reversed(list(enumerate(places))):
+                line = f"for {place} in range(out.shape[{i}]):\n" + textwrap.indent(line, "    ")
+            return ast.copy_location(ast.parse(line).body[0], node)
+        return self.generic_visit(node)
+
+    def visit_Return(self, node: ast.Return) -> ast.Return:
+        return ast.copy_location(ast.Return(None), node)
 
 
 class _Returns(ast.NodeTransformer):
     """Replacement of return statements by assignments to the array ``out``."""
 
-    def __init__(self, where: str) -> None:
-        self.where = where
+    def __init__(self, where: str, dimensions: int) -> None:
+        self.where, self.dimensions = where, dimensions
 
     def visit_Return(self, node: ast.Return) -> list[ast.stmt]:
         value = node.value
         is_array = isinstance(value, ast.Call) and getattr(value.func, "attr", "") == "array"
         if is_array and isinstance(value, ast.Call):
             value = value.args[0]
-        if not isinstance(value, ast.Tuple | ast.List):
-            raise TranslationError(f"{self.where}: must return a tuple of numbers, written as one")
         lines: list[ast.stmt] = []
-        for i, number in enumerate(value.elts):
-            place = ast.Subscript(ast.Name("out", ast.Load()), ast.Constant(i), ast.Store())
+        for places, number in self._numbers(value, ()):
+            index: ast.expr = ast.Constant(places[0])
+            if len(places) > 1:
+                index = ast.Tuple([ast.Constant(place) for place in places], ast.Load())
+            place = ast.Subscript(ast.Name("out", ast.Load()), index, ast.Store())
             lines.append(ast.copy_location(ast.Assign([place], number), node))
         return [*lines, ast.copy_location(ast.Return(None), node)]
+
+    def _numbers(
+        self, value: ast.expr | None, at: tuple[int, ...]
+    ) -> Iterator[tuple[tuple[int, ...], ast.expr]]:
+        """Yield place and expression of each number in nested tuples."""
+        if not isinstance(value, ast.Tuple | ast.List):
+            what = "a tuple of numbers, written as one"
+            if self.dimensions > 1:
+                what = (
+                    "a matrix written as nested tuples, as in return (a, b), (c, d), or an array "
+                    "that np.zeros has made and that it fills number by number"
+                )
+            raise TranslationError(f"{self.where}: must return {what}")
+        for i, part in enumerate(value.elts):
+            if len(at) + 1 < self.dimensions:
+                yield from self._numbers(part, (*at, i))
+            else:
+                yield (*at, i), part
 
 
 @functools.cache
