@@ -56,6 +56,8 @@ _WITHIN_95, _POOR = 1.96, 0.3
 _COLLINEAR, _TAKES_PART = 30.0, 0.3
 # Least ratio of eigenvalues that is more than rounding.
 _LEAST_SHARE = 1e-24
+# Factor of the deviations from which on they are said to be open: chosen by hand.
+_MUCH = 1.5
 # Rounds that scale the rows and columns of B0 to a largest entry of 1.
 _ROUNDS = 20
 # Least samples for each parameter, as in ``identify``.
@@ -157,7 +159,7 @@ class InputGainMatrix:
                     f"that changed): the deviations are enlarged by {self.enlarged[i]:.2g}, and "
                     "may be too small"
                 )
-            elif not self.white[i]:
+            elif self.enlarged[i] >= _MUCH:
                 found.append(
                     f"axis {axis}: the error is not white: the deviations are enlarged by "
                     f"{self.enlarged[i]:.2g}, and may be too small"
@@ -190,10 +192,15 @@ class InputGainMatrix:
             total, std = 1e3 * self.total_delay[i], 1e3 * self.total_delay_std[i]
             lag = time_line("lag", self.lag[i], self.lag_std[i])
             delay = time_line("delay", self.delay[i], self.delay_std[i])
+            of_error = ""
+            if self.enlarged[i] > 1.0:
+                of_error = (
+                    f"; deviations enlarged by {self.enlarged[i]:.3g}, as the error is not white"
+                )
             lines.append(
                 f"{axis}, order {self.orders[i]}: {lag}; {delay}; together {total:.4g} ± {std:.2g} "
                 f"ms; shown up to {self.omega_max[i]:.4g} rad/s; condition number of the "
-                f"excitation {self.condition[i]:.3g}"
+                f"excitation {self.condition[i]:.3g}{of_error}"
             )
         return "\n".join([*lines, *(f"NOT: {text}" for text in self.shortcomings)])
 
