@@ -175,7 +175,7 @@ def interleaved_excitations(
     Examples
     --------
     >>> one, other = interleaved_excitations(2, band=(1.0, 50.0), duration=20.0, dt=1e-3)
-    >>> abs(one.u @ other.u) / one.u.size < 1e-2
+    >>> bool(abs(one.u @ other.u) / one.u.size < 1e-2)
     True
     """
     m = checks.whole("actuators", actuators, 1)
