@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import hostile_exports
-from exported import earlier_rows, ready_row
-from exported_axes import cases
 from hostile_exports import SANITIZERS, SHARES, run, words_of_type
 from rich.console import Console
 from rich.table import Table
@@ -162,6 +160,9 @@ def row_of(name: str, axes: Any, precision: str, options: argparse.Namespace) ->
 
 def main() -> None:
     """Run the rows and print a table."""
+    from exported import earlier_rows, ready_row
+    from exported_axes import cases
+
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--calls", type=float, default=1e6, help="calls of each row")
     parser.add_argument("--rows", default="", help="axes whose name has this text")
