@@ -18,12 +18,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from quell.setup import EXAMPLES, SetupError
+from quell.setup import EXAMPLES, SetupError, made_axes
 from quell.setup.description import describe, parsed
 from quell.studio import messages
 from quell.studio.records import MOST_FILE, PageRecord
 from quell.tuning.report import toml_text
 
+from .setups import GANTRY
 from .studio_server import TABLES
 
 FUZZ = int(os.environ.get("QUELL_FUZZ", "0"))
@@ -133,6 +134,27 @@ def test_a_changed_setup_is_described_or_refused(path: tuple[Any, ...], value: A
     mistakes: tuple[str, ...] = ()
     try:
         describe("setup.toml", tables)
+    except SetupError as error:
+        mistakes = tuple(error.mistakes)
+    assert all(line.startswith("setup.toml: ") for line in mistakes)
+
+
+AXES = tomllib.loads(GANTRY)
+
+
+@fuzzed
+@pytest.mark.filterwarnings("ignore")  # of designs that are taken, but warned of
+@given(st.sampled_from(places(AXES)), VALUES)
+def test_a_changed_setup_of_several_axes_is_made_or_refused(
+    path: tuple[Any, ...], value: Any
+) -> None:
+    """The objects, too: each mistake is a line that begins with the file."""
+    tables = put(AXES, path, value)
+    if not isinstance(tables, dict):
+        return
+    mistakes: tuple[str, ...] = ()
+    try:
+        made_axes("setup.toml", tables)
     except SetupError as error:
         mistakes = tuple(error.mistakes)
     assert all(line.startswith("setup.toml: ") for line in mistakes)

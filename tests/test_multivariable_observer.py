@@ -266,6 +266,51 @@ def test_all_poles_of_random_plants_lie_in_one_place() -> None:
             assert np.max(error) < 1e-5 * np.max(wanted)
 
 
+def test_units_do_not_matter() -> None:
+    """States, outputs, disturbances and time in units of 1e-6 to 1e6: the same observers."""
+    random = np.random.default_rng(11)
+    for case in range(25):
+        (A, B, C, E, dt), options = draw(random)
+        (n, q), p, m = E.shape, C.shape[0], 1 + case % 3
+        x, y, d = (10.0 ** random.uniform(-6, 6, size) for size in (n, p, q))
+        t = 10.0 ** random.uniform(-4, 3)
+        units = np.concatenate([x, *(d / t**i for i in range(m))])
+        plant = (
+            A * x[:, None] / x / t,
+            B * x[:, None] / t,
+            C * y[:, None] / x,
+            E * x[:, None] / d / t,
+        )
+        noise, drift = options["noise_variance"], options["drift"]
+        more: dict[str, Any] = {"accept_zeros": True, "disturbance_order": m}
+        pairs = (
+            ({"omega_o": 3.0}, {"omega_o": 3.0 / t}),
+            (
+                {"noise_variance": noise, "drift": drift},
+                {"noise_variance": noise * y**2, "drift": drift * d**2 / t ** (2 * m - 1)},
+            ),
+        )
+        for one, other in pairs:
+            wanted = ESO.state_space(A, B, C, E, dt, **one, **more).gains[0]
+            found = ESO.state_space(*plant, dt * t, **other, **more).gains[0] * y / units[:, None]
+            size = np.max(np.abs(wanted), axis=1, keepdims=True)
+            assert np.max(np.abs(found - wanted) / size) < 1e-5
+
+
+def test_the_predictor_form_knows_the_measurements_up_to_the_sample_before() -> None:
+    """Its estimates are the current form's, moved by one sample of the model."""
+    random = np.random.default_rng(8)
+    y, u = 1e-3 * random.normal(size=(40, 2)), random.normal(size=(40, 1))
+    for options in ({"omega_o": 800.0}, {}, {"time_varying": True}):
+        current, late = servo(**options), servo(**options, form="predictor")
+        model = servo(omega_o=800.0).model
+        known = current.filter(y, u, start=np.zeros(6))
+        found = late.filter(y, u, start=np.zeros(6))
+        wanted = known[:-1] @ model.transition.T + u[1:] @ model.input.T
+        size = np.max(np.abs(wanted), axis=0)
+        assert np.max(np.abs(found[1:] - wanted) / size) < 1e-12
+
+
 # ---- Missing samples and several rates ----
 
 

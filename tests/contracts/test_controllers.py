@@ -134,7 +134,41 @@ def test_every_controller_has_an_example() -> None:
         and hasattr(thing, "initial_state")
         and not getattr(thing, "_is_protocol", False)
     }
-    assert found == {type(example).__name__ for example in CONTROLLERS.values()}
+    every = {**CONTROLLERS, **SEVERAL}
+    assert found == {type(example).__name__ for example in every.values()}
+
+
+def _axis(learner: Any = None) -> ql.ADRC:
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=DT)
+    return ql.ADRC(observer, 1.5, learner=learner, guard=learner and ql.Guard())
+
+
+_COUPLED = (np.kron(np.eye(2), [[0, 1], [0, -0.5]]), np.kron([[1, 0.3], [0.2, 1]], [[0], [1]]))
+_POSITIONS = np.eye(4)[[0, 2]]
+_OBSERVER = ql.ESO.state_space(*_COUPLED, _POSITIONS, _COUPLED[1], DT, omega_o=8.0)
+# Controllers with several control signals.
+SEVERAL: dict[str, Any] = {
+    "Axes": ql.Axes([_axis(), _axis(ql.learners.Harmonic())], [[1, 0.3], [0.2, 1]], u_max=2.0),
+    "StateFeedback": room.StateFeedback(
+        _OBSERVER, room.state_feedback(*_COUPLED, 1.5, DT), u_min=-2.0, u_max=2.0
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEVERAL)
+def test_several_signals_step_as_they_are_simulated(name: str) -> None:
+    """Compiled ``step`` with what was measured gives the u of an interpreted run but for rounding."""
+    plant = ql.plants.MultivariableLinearPlant(*_COUPLED, _POSITIONS)
+    noise = ql.signals.BandLimitedNoise(power=1e-6 * DT, sample_time=DT)
+    scenario = ql.Scenario((1.0, ql.signals.Sinusoid(0.5, 2.0)), 2.0, noise=noise)
+    run = ql.simulate(plant, SEVERAL[name], scenario, interpret=True)
+    one = copy.deepcopy(SEVERAL[name])
+    u = [one.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
+    np.testing.assert_allclose(u, run["u"], rtol=1e-9, atol=1e-9)
+    for label, array in named_arrays(run.final_state).items():
+        if "given" not in label:  # what Python handed over
+            np.testing.assert_allclose(one.state[label], array, rtol=1e-8, atol=1e-8, err_msg=label)
 
 
 # A controller that is stepped is not told of a start from rest.

@@ -41,6 +41,12 @@ OTHERS: dict[str, Any] = {
     "Shaper": baseline_room.Shaper([0.0, 0.25], [0.5, 0.5]),
     "in single precision": in_single_precision(CONTROLLERS["PID"]),
     "guard": ql.Guard(bound=2.25),
+    "Arm": plant_room.arm(),
+    "Craft": plant_room.quadrotor_attitude(),
+    "MultivariableLinearPlant": plant_room.MultivariableLinearPlant(
+        [[-1.25]], [[2.0, 3.0]], [[1.0]]
+    ),
+    "Axes": ql.Axes({"x": ql.ADRC(ql.ESO.model_free(2, 1.0, 12.0, 0.01), 1.75)}, [[2.25]]),
 }
 EXAMPLES: dict[str, Any] = {
     f"{type(thing).__name__}: {name}": thing

@@ -124,8 +124,15 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     omegas = [4.0, 8.0]
     pid = ql.baselines.PID(4.0, 1.0, 3.0, tf=0.05, dt=0.01)
     add_on = ql.tuning.tune_compensator(([1.0], [1.0, 1.0, 0.0]), pid, speeds=(1.0, 1.0))
+    axes = ql.Axes([adrc(), adrc()])
+    lags = ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2))
+    machine = ql.simulate(lags, axes, ql.Scenario((1.0, 0.5), duration=1.0))
+    points = {at: ql.plants.LinearPlant.of(([at], [1.0, 1.0])) for at in (1.0, 2.0)}
+    schedule = ql.tune_schedule(points, DT)
     plots = {
         "Trajectory": Case(run.plot, 5),
+        "axes": Case(machine.plot, 7),
+        "tuned schedule": Case(schedule.plot, 3),
         "BatchTrajectory": Case(batch.plot, 2),
         "Tuned": Case(tuned.plot, 4),
         "TunedCompensator": Case(add_on.plot, 1),
@@ -178,6 +185,8 @@ def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str
 _DRAWS = re.compile(r"^ *def (plot(?:_\w+)?|draw)\(", re.MULTILINE)
 # Files of functions that draw, and those that are drawn above.
 _PUBLIC = {
+    "records/axes.py plot": "axes",
+    "tuning/schedules.py plot": "tuned schedule",
     "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory
     "tuning/tuned.py plot": "Tuned",
     "tuning/compensator.py plot": "TunedCompensator",
@@ -201,6 +210,7 @@ _PUBLIC = {
 _INSIDE = {
     "records/plotting.py plot_run",
     "records/plotting.py plot_batch",
+    "records/plotting.py plot_axes",
     "sweeping/sweep.py plot_over",
     "tuning/report.py draw",
     "envs/loops.py draw",  # draws random numbers

@@ -24,7 +24,7 @@ from quell.cli.options import (
 from quell.cli.output import Console, check_outputs, print_line, table, write_results
 
 if TYPE_CHECKING:
-    from quell.identification import Alternative, Identified, Root
+    from quell.identification import Alternative, Identified, InputGain, Measured, Root
 
 # ---- quell identify ----
 
@@ -344,7 +344,7 @@ def _column(record: Path, by: str, read: ReadOptions, dt: float | None, size: in
 def _print_bins(
     console: Console,
     record: Path,
-    samples: Any,
+    samples: Measured,
     signal: Any,
     by: str,
     order: int,
@@ -402,7 +402,7 @@ def _of_loop(path: Path, dt: float, trust: bool) -> dict[str, Any]:
 
 
 def _print_bandwidth(
-    console: Console, found: Any, phase_margin: float, ratio: float | None
+    console: Console, found: InputGain, phase_margin: float, ratio: float | None
 ) -> dict[str, Any]:
     """Print and return the omega_c that keeps the phase margin, if b0 is known well enough."""
     from quell.identification.input_gain import MarginError

@@ -131,13 +131,43 @@ def _span(scores: dict[str, Any]) -> str:
     return f"{scores['start']:g} … {scores['stop']:g}"
 
 
+def print_axes(
+    console: Console, run: Any, setup: Setup
+) -> tuple[dict[str, list[dict[str, Any]]], dict[str, dict[str, float]]]:
+    """Print and return the metrics of each axis and what it learned; print the run's status.
+
+    ``run`` is an ``AxesTrajectory``. The variation of u of an axis is that of its v.
+    """
+    scores, learned = {}, {}
+    for name in run.axis_names:
+        axis = run.axis(name)
+        scores[name] = windowed_metrics(axis, setup)
+        for window in scores[name]:  # windows of several axes have no target
+            reasons = window["missing"].items()
+            window["missing"] = {key: text.partition(": give target")[0] for key, text in reasons}
+        print_metrics(console, f"{setup.title}: {name}, dt = {run.dt:g} s", scores[name])
+        learned[name] = _learned(axis)
+        if learned[name]:
+            print_line(console, f"{name} learned: {_listed(learned[name])}")
+    if run.diverged or run.status:
+        console.print(("[red]" if run.diverged else "") + escape(run.message), soft_wrap=True)
+    return scores, learned
+
+
+def _learned(run: Trajectory) -> dict[str, float]:
+    theta = run["theta"][-1] if "theta" in run.names and len(run) else ()
+    return {name: float(value) for name, value in zip(run.features, theta, strict=False)}
+
+
+def _listed(learned: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in learned.items())
+
+
 def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:
     """Print and return the learned coefficients; print the run's status if it is not OK."""
-    theta = run["theta"][-1] if "theta" in run.names and len(run) else ()
-    learned = {name: float(value) for name, value in zip(run.features, theta, strict=False)}
+    learned = _learned(run)
     if learned:
-        named = ", ".join(f"{name} {value:.4g}" for name, value in learned.items())
-        print_line(console, f"Learned: {named}")
+        print_line(console, f"Learned: {_listed(learned)}")
     if run.diverged or run.status:
         console.print(("[red]" if run.diverged else "") + escape(run.message), soft_wrap=True)
     return learned

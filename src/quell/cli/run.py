@@ -35,6 +35,7 @@ from quell.cli.output import (
     write_results,
 )
 from quell.cli.report import (
+    print_axes,
     print_metrics,
     print_outcome,
     print_summary,
@@ -59,7 +60,7 @@ def run(
     trust: Trust = False,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
-    """Simulate the plant, controller and scenario of a setup file.
+    """Simulate the plant, controller and scenario of a setup file, of one axis or several.
 
     If the run diverges the exit code is 4; the part before that is recorded and drawn.
 
@@ -70,7 +71,8 @@ def run(
     example
         Print such a file, and do no more.
     """
-    from quell.setup import EXAMPLES, SetupError, load
+    from quell.setup import EXAMPLES, SetupError, made, made_axes, read
+    from quell.setup.description import is_of_axes
     from quell.simulation import simulate
 
     if example:
@@ -80,7 +82,9 @@ def run(
         return
     if setup is None:
         raise ValueError("setup: missing; must be a TOML file, and quell run --example prints one")
-    given = load(setup, trust)
+    name, data = read(setup)
+    several = is_of_axes(data)
+    given = (made_axes if several else made)(name, data, trust)
     plant, scenario = given.needed("plant"), given.needed("scenario")
     late = [
         f"{given.file}: metrics[{i}].start = {window['start']:g}: "
@@ -98,11 +102,15 @@ def run(
             result = simulate(plant, given.controller, scenario, progress=progress)
         except ValueError as error:
             raise SetupError([f"{given.file}: {error}"]) from None
-    scores = windowed_metrics(result, given)
-    print_metrics(
-        console, f"{given.title}: {result.plant}, dt = {result.dt:g} s", scores, result.signals
-    )
-    learned = print_outcome(console, result)
+    scores: Any
+    learned: Any
+    if several:
+        scores, learned = print_axes(console, result, given)
+    else:
+        scores = windowed_metrics(result, given)
+        title = f"{given.title}: {result.plant}, dt = {result.dt:g} s"
+        print_metrics(console, title, scores, result.signals)
+        learned = print_outcome(console, result)
     paths = save_run_figure(result, given.title, outputs, setup.stem)
     write_record(console, result, outputs, "Record")
     results = {
@@ -310,7 +318,8 @@ def export(
         exit code is not 0.
     """
     from quell.export import c
-    from quell.setup import load
+    from quell.setup import load, made, made_axes, read
+    from quell.setup.description import is_of_axes
 
     if to == "fmu":
         if precision != "double" or accept or prove or resolution is not None:
@@ -326,8 +335,12 @@ def export(
         raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
     if precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
-    given = load(setup, trust)
-    if precision == "single" and not accept:
+    file, data = read(setup)
+    several = is_of_axes(data)
+    given = (made_axes if several else made)(file, data, trust)
+    # Single precision is compared with double in a simulated run, of one axis.
+    plant, scenario = (None, None) if several else (given.plant, given.scenario)
+    if precision == "single" and not (accept or several):
         given.needed("plant")
         given.needed("scenario")
     exported = c(
@@ -335,8 +348,8 @@ def export(
         out,
         name=name or "controller",
         precision=precision,
-        plant=given.plant,
-        scenario=given.scenario,
+        plant=plant,
+        scenario=scenario,
         resolution=resolution,
         accept=accept,
         proof=prove,

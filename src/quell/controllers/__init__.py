@@ -38,6 +38,7 @@ from quell.controllers.state_feedback import (
     regulator,
     state_feedback,
 )
+from quell.controllers.state_space import StateFeedback
 
 __all__ = [
     "ADRC",
@@ -62,6 +63,7 @@ __all__ = [
     "Regulator",
     "SafeSet",
     "Schedule",
+    "StateFeedback",
     "TrackingDifferentiator",
     "adrc_for_dead_time",
     "baselines",

@@ -412,9 +412,10 @@ class ADRC(Compensator):
         if derivatives or self.derivatives:
             self._set_derivatives(derivatives)
         try:
-            return self._step(self._packed, r, y)
+            u: float = self._step(self._packed, r, y)
         except TypeError:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
+        return u
 
     def _set_derivatives(self, derivatives: tuple[float, ...]) -> None:
         if len(derivatives) > self.derivatives:

@@ -541,6 +541,19 @@ def checked_actuator_limits(
     return ActuatorLimits(*(np.array(part, dtype=float) for part in zip(*found, strict=True)))
 
 
+def changed_actuator_limits(
+    old: ActuatorLimits, u_min: Any, u_max: Any, rate_limit: Any, count: int, dt: float
+) -> ActuatorLimits:
+    """Return limits with new values for what is not None."""
+    low = old.low if u_min is None else u_min
+    high = old.high if u_max is None else u_max
+    rates = np.inf if rate_limit is None else rate_limit
+    new = checked_actuator_limits(low, high, rates, count, dt)
+    if rate_limit is None:
+        new = new._replace(most_change=old.most_change, least_change=old.least_change)
+    return new
+
+
 def limits_of_actuator(limits: ActuatorLimits, i: int) -> Limits:
     """Return the limits of one actuator."""
     low, high, most, least = (float(part[i]) for part in limits)

@@ -35,6 +35,7 @@ from quell.controllers.allocation import (
     GainMemory,
     RangeMemory,
     allocate,
+    changed_actuator_limits,
     checked_actuator_limits,
     checked_gain,
     checked_rule,
@@ -425,6 +426,15 @@ def _step_as_python(packed: Any) -> None:
         control_all(design, state, state.r_given, state.y_given, state.u)
 
 
+def prepared_step(design: Any, state: Any) -> tuple[PackedController, Any]:
+    """Return a packed controller of several signals, and the compiled function that steps it."""
+    packed = PackedController(design, state)
+    if dispatch.interpret_all:
+        return packed, _step_as_python
+    with explain_compile_errors(design):
+        return packed, dispatcher_for(step_axes, design).compile((packed.type,))
+
+
 # ---- The controller ----
 
 
@@ -611,14 +621,7 @@ class Axes(StatefulController):
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
-        packed = PackedController(self.parameters, self._state)
-        if dispatch.interpret_all:
-            self._step: Any = _step_as_python
-        else:
-            with explain_compile_errors(self.parameters):
-                entry = dispatcher_for(step_axes, self.parameters)
-                self._step = entry.compile((packed.type,))
-        self._packed = packed
+        self._packed, self._step = prepared_step(self.parameters, self._state)
 
     def step(  # type: ignore[override]
         self, r: Sequence[float] | Vector, y: Sequence[float] | Vector, *derivatives: Any
@@ -746,14 +749,8 @@ class Axes(StatefulController):
 
         Parameters are those of ``Axes``. The next ``step`` is within the new limits of u.
         """
-        old, m, dt = self._actuators, self.inputs, self.dt
-        low = old.low if u_min is None else u_min
-        high = old.high if u_max is None else u_max
-        rates = np.inf if rate_limit is None else rate_limit
-        new = checked_actuator_limits(low, high, rates, m, dt)
-        if rate_limit is None:
-            new = new._replace(most_change=old.most_change, least_change=old.least_change)
-        self._actuators = new
+        given = (u_min, u_max, rate_limit)
+        self._actuators = changed_actuator_limits(self._actuators, *given, self.inputs, self.dt)
         self._update_parameters()
         self._pack_again()
 

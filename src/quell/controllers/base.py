@@ -110,10 +110,12 @@ def set_applied_control(controller: Any, state: Any, u: float) -> None:
     raise TypeError
 
 
-@generic
+@generic_with_default
 def change_parameters(old: Any, new: Any, state: Any) -> None:
-    """Continue with other parameters of the same structure, without a jump of u."""
-    raise TypeError
+    """Continue with other parameters of the same structure, without a jump of u.
+
+    By default the state stays as it is: its meaning does not depend on the parameters.
+    """
 
 
 @generic_with_default

@@ -77,7 +77,6 @@ from quell.controllers.schedule import (
     gain_in_use,
     known_of_model,
     set_signal,
-    with_gains,
 )
 from quell.controllers.stateful import Retuning, StatefulController
 from quell.guard import (
@@ -107,7 +106,7 @@ from quell.learners.base import (
     window_samples,
 )
 from quell.observers.design import scaled_response
-from quell.observers.eso import ESO
+from quell.observers.eso import ESO, with_gains
 from quell.observers.forms import (
     NonlinearModel,
     acting_control,
@@ -708,9 +707,10 @@ class Compensator(StatefulController):
         if self._packed is None:
             self.prepare()
         try:
-            return self._step(self._packed, u_0, y)
+            u: float = self._step(self._packed, u_0, y)
         except TypeError:
             raise TypeError(f"u_0 = {u_0!r}, y = {y!r}: must be numbers") from None
+        return u
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start at a plant that rests at ``y`` under ``u``: the next ``step`` continues from ``u``.

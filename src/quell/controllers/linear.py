@@ -32,7 +32,6 @@ from quell.controllers.base import (
     Limits,
     RateLimit,
     apply_limits,
-    change_parameters,
     checked_limits,
     control,
     control_at_rest,
@@ -455,11 +454,6 @@ def _hold_integrators(design: LinearDesign, state: LinearState, u_before: float)
         correct_state(design.law, state.x, state.next, loop.u_unlimited - loop.u - added)
     elif design.integrators > 1:
         set_applied_control(design, state, u_before)
-
-
-@change_parameters.register(LinearDesign)
-def _keep_state(old: LinearDesign, new: LinearDesign, state: LinearState) -> None:
-    """Change nothing: the state of a linear law has the same meaning with other limits."""
 
 
 class LinearController(StatefulController):

@@ -35,10 +35,10 @@ is right at another. With ``ρ = b0(σ)/b_n``::
     g = f/ρ,    g_L = h + s u,    f_L = ρ g_L,    u = (u_0 − Δf̂ − ρ h) / (b_n ρ + ρ s)
 
 A gain of the plant that is wrong by a constant factor, ``b = β b0(σ)``, is a constant coefficient
-of u: ``g = b_n (β d + (β − 1) u)``; for f itself it would be (β − 1) b0(σ). The regression of
-``learners/base.py`` stays one without bias: the observer's error, in units of g, obeys the same
-equation as without a schedule, and a term (ρ'/ρ) (Δg − Δĝ) that comes from its own lag error. For
-the g_L that is right, Δg = g − g_L is zero, so is Δĝ = Δf̂/ρ, and
+of u: ``g = b_n (β d + (β − 1) u)``; for f itself it would be (β − 1) b0(σ). The observer's error,
+in units of g, obeys the same equation as without a schedule but for a term (ρ'/ρ) (Δg − Δĝ), that
+of its own lag error. So the regression of ``learners/base.py`` has no bias at its solution: for the
+g_L that is right, Δg = g − g_L is zero, so is Δĝ = Δf̂/ρ, and
 
     Δĝ + g_L^F = θ·φ^F        with the filter F of before, however quickly b0 changes.
 
@@ -71,7 +71,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,9 +84,8 @@ from quell.controllers.safe_set import divide_bounds, scale_f
 from quell.kernels.dispatch import generic_with_default, kernel
 from quell.kernels.single import add_with_carry
 from quell.kernels.sized import Flag, Scalars, Size
-from quell.observers.design import design_model
-from quell.observers.eso import ESO
-from quell.observers.forms import DelayedModel, DeltaModel, EsoModel, without_delay
+from quell.observers.eso import ESO, redesign
+from quell.observers.forms import DelayedModel, DeltaModel
 from quell.types import Matrix, Status, Vector
 
 SIGNALS = ("reference", "y", "speed", "external")
@@ -263,15 +262,9 @@ def known_with_schedule(design: Any, memory: Any, known: float, b0: float, u: fl
 
 @generic_with_default
 def scheduled_law(
-    design: Any,
-    memory: Any,
-    feedforward: Any,
-    seen: Vector,
-    r: float,
-    reference: Vector,
-    b0: float,
-    total: float,
-) -> float:
+    design: Any, memory: Any, feedforward: Any, seen: Vector, r: float, reference: Vector,
+    b0: float, total: float,
+) -> float:  # fmt: skip
     """Return the law's numerator ``total`` with what the schedule adds to gains and feedforward."""
     return total
 
@@ -373,14 +366,9 @@ def _known(
 
 @known_of_model.register(ScheduleDesign)
 def _known_of_model(
-    design: ScheduleDesign,
-    memory: ScheduleMemory,
-    feedforward: Any,
-    r: float,
-    reference: Vector,
-    b0: float,
-    known: float,
-) -> float:
+    design: ScheduleDesign, memory: ScheduleMemory, feedforward: Any, r: float, reference: Vector,
+    b0: float, known: float,
+) -> float:  # fmt: skip
     if design.fixed_acting.size > 0:
         fixed = fixed_control(feedforward, design.fixed_acting, r, reference, True)
         known -= (memory.loop[0].b0 - b0) * fixed
@@ -389,13 +377,9 @@ def _known_of_model(
 
 @show_feedforward.register(ScheduleDesign)
 def _show_feedforward(
-    design: ScheduleDesign,
-    memory: ScheduleMemory,
-    feedforward: Any,
-    r: float,
-    reference: Vector,
+    design: ScheduleDesign, memory: ScheduleMemory, feedforward: Any, r: float, reference: Vector,
     row: Vector,
-) -> None:
+) -> None:  # fmt: skip
     if design.fixed_acting.size > 0:
         fixed = fixed_control(feedforward, design.fixed, r, reference, False)
         row[0] = fixed + (row[0] - fixed) / _ratio(design, memory)
@@ -403,15 +387,9 @@ def _show_feedforward(
 
 @scheduled_law.register(ScheduleDesign)
 def _scheduled_law(
-    design: ScheduleDesign,
-    memory: ScheduleMemory,
-    feedforward: Any,
-    seen: Vector,
-    r: float,
-    reference: Vector,
-    b0: float,
-    total: float,
-) -> float:
+    design: ScheduleDesign, memory: ScheduleMemory, feedforward: Any, seen: Vector, r: float,
+    reference: Vector, b0: float, total: float,
+) -> float:  # fmt: skip
     for i in range(design.law):
         total += memory.values[i] * (_wished(reference, r, i) - seen[i])
     if design.fixed.size > 0:
@@ -591,13 +569,9 @@ def _follow(
 
 @safe_as_applied.register(ScheduleDesign)
 def _safe_as_applied(
-    design: ScheduleDesign,
-    memory: ScheduleMemory,
-    safe: float,
-    unlimited: float,
-    safe_set: Any,
+    design: ScheduleDesign, memory: ScheduleMemory, safe: float, unlimited: float, safe_set: Any,
     set_memory: Any,
-) -> float:
+) -> float:  # fmt: skip
     if not design.has_safe_set:
         return unlimited
     ratio = _ratio(design, memory)
@@ -880,43 +854,6 @@ class Schedule:
             np.linspace(axis[j], axis[j + 1], int(n), endpoint=False) for j, n in enumerate(parts)
         ]
         return np.concatenate([*pieces, axis[-1:]])
-
-
-def redesign(observer: ESO) -> Callable[[float], Vector]:
-    """Return the gain L (N,) of an observer as a function of omega_o.
-
-    Raises ``ValueError`` for observers whose gain does not follow from omega_o.
-    """
-    model = without_delay(observer.model)
-    refusal = ValueError(
-        f"schedule.omega_o: the gain of {observer!r} does not follow from omega_o, or its "
-        "correction is of another kind; take ESO.model_free or ESO.model_based in the form "
-        "'current' or 'predictor', without keep_zeros"
-    )
-    if type(model) is not EsoModel or observer.form == "reduced":
-        raise refusal
-
-    def gain(omega_o: float, half_gain: bool = False) -> Vector:
-        how: dict[str, Any] = {"form": observer.form, "half_gain": half_gain}
-        how |= {"poles": observer.poles, "disturbance_order": observer.disturbance_order}
-        plant, b0, dt = observer.plant, observer.b0, observer.dt
-        return design_model(plant, b0, omega_o, dt, keep_zeros=False, **how).gain
-
-    for half in (False, True):
-        if np.allclose(gain(observer.omega_o, half), model.gain, rtol=1e-9, atol=0.0):
-            return lambda omega_o: gain(omega_o, half)
-    raise refusal
-
-
-def with_gains(observer: ESO, b0: float, omega_o: float) -> ESO:
-    """Return an observer with another b0 and bandwidth."""
-    delayed = observer.model
-    model = without_delay(delayed)
-    if omega_o != observer.omega_o:
-        model = model._replace(gain=redesign(observer)(omega_o))
-    model = model._replace(input=model.input * (b0 / observer.b0))
-    made = delayed._replace(inner=model) if isinstance(delayed, DelayedModel) else model
-    return replace(observer, b0=b0, omega_o=omega_o, model=made)
 
 
 def check_b0_of(observer: ESO) -> None:

@@ -217,7 +217,7 @@ class StatefulController(Described):
     _state: Any
     _limits: Limits
     _packed: Any
-    _step: Callable[[Any, float, float], float]
+    _step: Callable[..., Any]
 
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints: arguments by name, and finite limits of u and its rate."""
@@ -315,9 +315,10 @@ class StatefulController(Described):
         if self._packed is None:
             self.prepare()
         try:
-            return self._step(self._packed, r, y)
+            u: float = self._step(self._packed, r, y)
         except TypeError:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
+        return u
 
     def applied(self, u: float) -> None:
         """Set the control signal that was really applied since the last ``step`` [u-unit].

@@ -10,6 +10,12 @@ diagonal, and the root of the ratio of its eigenvalues is the condition number o
 (Belsley, Kuh & Welsch, *Regression Diagnostics*, 1980, sec. 3.2): 1 for u that have nothing in
 common, above 30 for u that hardly can be told apart. The eigenvector of the largest eigenvalue of
 ``S⁻¹ C S⁻¹``, the combination that is known least, names the actuators that moved together.
+
+Where the error is not white, or depends on past u, the model of the noise is not true, and in a
+loop the gains are biased. The deviations are then multiplied by the root of ζ over its limit, or by
+the largest correlation over its limit (``result.Residuals``), whichever is larger. That is by trial
+(``benchmarks/input_gain_matrix.py``): records whose only noise are the steps of an encoder, in
+which B0 is right to 1e-3, need it.
 """
 
 from __future__ import annotations
@@ -79,6 +85,7 @@ class InputGainMatrix:
     delay_std: Vector  #: their standard deviations (n,) [s]
     noise: Vector  #: RMS error of the prediction one sample ahead, of each axis (n,) [y-unit]
     omega_max: Vector  #: frequency up to which the record shows each axis (n,) [rad/s]
+    enlarged: Vector  #: factor of the deviations of each axis for an error that is not white (n,)
     white: tuple[bool, ...]  #: whether the error of each axis is white, at 99 %
     independent: tuple[bool, ...]  #: whether it is independent of the u before, at 99 %
     converged: tuple[bool, ...]  #: whether the search of each axis ended at a minimum
@@ -147,11 +154,13 @@ class InputGainMatrix:
                 found.append(
                     f"axis {axis}: the error depends on past u, so the axis is not of this form "
                     "(order, zeros, friction, limits that the recorded u does not have, a posture "
-                    "that changed): the deviations are too small"
+                    f"that changed): the deviations are enlarged by {self.enlarged[i]:.2g}, and "
+                    "may be too small"
                 )
             elif not self.white[i]:
                 found.append(
-                    f"axis {axis}: the error is not white: the deviations may be too small"
+                    f"axis {axis}: the error is not white: the deviations are enlarged by "
+                    f"{self.enlarged[i]:.2g}, and may be too small"
                 )
         return tuple(found)
 
@@ -329,7 +338,17 @@ def _row(
     late = u[u.shape[0] - size : -1]
     tests = [residuals(best.error[1:], column, lags) for column in late.T]
     condition, together = _excitation(covariance, names)
+    # Where the model of the noise is not true, its parameters are not either: quantization of slow
+    # motions is not white, for instance.
+    misfit = max(each.whiteness / each.whiteness_limit for each in tests)
+    dependence = max(
+        float(np.max(np.abs(each.cross_correlation[each.lags :]))) / each.cross_limit
+        for each in tests
+    )
+    enlarged = math.sqrt(max(1.0, misfit, dependence**2))
+    covariance = enlarged**2 * covariance
     return {
+        "enlarged": enlarged,
         "B0": unit * mean,
         "std": unit * np.sqrt(np.maximum(np.diag(covariance), 0.0)),
         "covariance": covariance * np.outer(unit, unit),

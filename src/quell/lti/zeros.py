@@ -199,7 +199,9 @@ def _dynamics_and_rows(A: Any, C: Any) -> tuple[Matrix, Matrix]:
 
 def _zeros(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> InvariantZeros:
     (n, m), p = B.shape, C.shape[0]
-    state, inputs, output, rate = _scales(A, B, C, D)
+    state, inputs, output, rate = (
+        np.exp2(np.round(np.log2(scale))) for scale in pencil_scales(A, B, C, D)
+    )
     rows, columns = np.append(rate / state, output), np.append(state, inputs)
     pencil = np.block([[A, B], [C, D]]) * rows[:, None] * columns
     norm = float(np.linalg.norm(pencil, 2))
@@ -328,8 +330,10 @@ def _largest(vector: Complex) -> tuple[int, ...]:
     return tuple(int(i) for i in order if size[i] >= _MOSTLY * size[order[0]])
 
 
-def _scales(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> tuple[Vector, Vector, Vector, float]:
-    """Return scales of states (n,), inputs (m,) and outputs (p,), and of A: powers of two.
+def pencil_scales(
+    A: Matrix, B: Matrix, C: Matrix, D: Matrix
+) -> tuple[Vector, Vector, Vector, float]:
+    """Return scales of states (n,), inputs (m,) and outputs (p,), and of A.
 
     With ``x = t x̃`` and so on, the entry ij of the pencil is multiplied by ``r_i c_j``, with ``r_i
     = rate/t_i`` or that of the output, and ``c_j = t_j`` or that of the input. The logarithms of
@@ -357,7 +361,7 @@ def _scales(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> tuple[Vector, Vector,
         if np.array_equal(now, used):
             break
         used = now
-    scale = np.exp2(np.round(found))
+    scale = np.exp2(found)
     return scale[:n], scale[n : n + m], scale[n + m : -1], float(scale[-1])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -21,6 +21,8 @@ from quell.observers.design import (
     total_time_constant,
 )
 from quell.observers.forms import (
+    DelayedModel,
+    EsoModel,
     NonlinearModel,
     cascade_model,
     delayed_model,
@@ -604,3 +606,43 @@ def _summed_noise_gains(observer: ESO) -> Vector:
             break
     variances: Vector = np.einsum("ij,jk,ik->i", found.output, total, found.output)
     return (variances + feedthrough**2)[: observer.order + 1]
+
+
+# ---- Other gains of an observer that is there ----
+
+
+def redesign(observer: ESO) -> Callable[[float], Vector]:
+    """Return the gain L (N,) of an observer as a function of omega_o.
+
+    Raises ``ValueError`` for observers whose gain does not follow from omega_o.
+    """
+    model = without_delay(observer.model)
+    refusal = ValueError(
+        f"schedule.omega_o: the gain of {observer!r} does not follow from omega_o, or its "
+        "correction is of another kind; take ESO.model_free or ESO.model_based in the form "
+        "'current' or 'predictor', without keep_zeros"
+    )
+    if type(model) is not EsoModel or observer.form == "reduced":
+        raise refusal
+
+    def gain(omega_o: float, half_gain: bool = False) -> Vector:
+        how: dict[str, Any] = {"form": observer.form, "half_gain": half_gain}
+        how |= {"poles": observer.poles, "disturbance_order": observer.disturbance_order}
+        plant, b0, dt = observer.plant, observer.b0, observer.dt
+        return design_model(plant, b0, omega_o, dt, keep_zeros=False, **how).gain
+
+    for half in (False, True):
+        if np.allclose(gain(observer.omega_o, half), model.gain, rtol=1e-9, atol=0.0):
+            return lambda omega_o: gain(omega_o, half)
+    raise refusal
+
+
+def with_gains(observer: ESO, b0: float, omega_o: float) -> ESO:
+    """Return an observer with another b0 and bandwidth."""
+    delayed = observer.model
+    model = without_delay(delayed)
+    if omega_o != observer.omega_o:
+        model = model._replace(gain=redesign(observer)(omega_o))
+    model = model._replace(input=model.input * (b0 / observer.b0))
+    made = delayed._replace(inner=model) if isinstance(delayed, DelayedModel) else model
+    return replace(observer, b0=b0, omega_o=omega_o, model=made)

@@ -15,7 +15,7 @@ from quell.plants.flexible import (
 from quell.plants.fmu import FMU
 from quell.plants.linear import LinearPlant, delayed, encoded
 from quell.plants.linearise import linearised
-from quell.plants.multibody import Arm, arm, quadrotor_attitude, rotor_levers
+from quell.plants.multibody import Arm, Craft, arm, quadrotor_attitude, rotor_levers
 from quell.plants.multivariable import (
     MultivariableLinearPlant,
     MultivariableNonlinearPlant,
@@ -26,7 +26,7 @@ from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.testbeds import DcMotor, TorsionalPlant, dc_motor, torsional, torsional_identified
 
 __all__ = [
-    "FMU", "Arm", "CubicSpringPlant", "DcMotor", "LinearPlant", "MultivariableLinearPlant",
+    "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "LinearPlant", "MultivariableLinearPlant",
     "MultivariableNonlinearPlant", "NMassPlant", "NonlinearPlant", "Plant", "PlantBatch",
     "TorsionalPlant", "arm", "batch", "dc_motor", "delayed", "delayed_inputs", "encoded",
     "encoded_outputs", "labelled", "lagged_two_mass_spring", "linearised", "n_mass",

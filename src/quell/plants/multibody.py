@@ -298,6 +298,18 @@ def _arm_rate(
 # ---- The attitude of a craft with rotors ----
 
 
+class Craft(MultivariableNonlinearPlant):
+    """The attitude of a craft; make it with ``quadrotor_attitude``.
+
+    Attributes
+    ----------
+    B0
+        the matrix from the thrusts to the angles near the horizontal, K/I (3, m) [rad/s² per N].
+    """
+
+    B0: Matrix
+
+
 def quadrotor_attitude(
     inertia: Sequence[float] = (0.012, 0.012, 0.022),
     arm: float = 0.17,
@@ -305,7 +317,7 @@ def quadrotor_attitude(
     drag: float = 0.015,
     motor_lag: float = 0.02,
     name: str = "quadrotor attitude",
-) -> MultivariableNonlinearPlant:
+) -> Craft:
     """Return the attitude of a quadrotor with rotors at the corners of a square.
 
     The outputs are roll, pitch and yaw [rad]; the control signals are the commanded thrusts of the
@@ -355,7 +367,9 @@ def quadrotor_attitude(
             dx[6 + j] = (u[j] - x[6 + j]) / lag
         return dx
 
-    return MultivariableNonlinearPlant(rate, 10, 4, np.eye(10)[:3], 3, None, name)
+    made = Craft(rate, 10, 4, np.eye(10)[:3], 3, None, name)
+    object.__setattr__(made, "B0", lever / np.array([[ixx], [iyy], [izz]]))
+    return made
 
 
 def rotor_levers(arm: float, drag: float) -> Matrix:

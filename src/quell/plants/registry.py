@@ -18,6 +18,12 @@ from quell.plants.base import Plant, check_plant
 from quell.plants.flexible import lagged_two_mass_spring, n_mass, two_mass_spring
 from quell.plants.fmu import FMU
 from quell.plants.linear import LinearPlant, delayed, encoded
+from quell.plants.multibody import arm, quadrotor_attitude
+from quell.plants.multivariable import (
+    MultivariableLinearPlant,
+    delayed_inputs,
+    encoded_outputs,
+)
 from quell.plants.nonlinear import NonlinearPlant, with_friction_and_delay
 from quell.plants.testbeds import dc_motor, torsional, torsional_identified
 from quell.types import warn
@@ -251,6 +257,19 @@ def linear(
     raise ValueError(f"given: {', '.join(given) or 'nothing'}; must be num and den, or A, B and C")
 
 
+def multivariable_linear(A: Any, B: Any, C: Any, E: Any = None) -> MultivariableLinearPlant:
+    """Return a linear plant with several control signals and outputs.
+
+    Parameters
+    ----------
+    A, B, C
+        matrices as lists of rows.
+    E
+        how disturbances enter, with a column for each; by default as the control signals do.
+    """
+    return MultivariableLinearPlant(A, B, C, E)
+
+
 TESTBEDS: Mapping[str, Callable[[], Plant]] = {
     "torsional": torsional,
     "torsional-identified": torsional_identified,
@@ -271,6 +290,16 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
     "python": python_plant,
 }
 """Plants that a setup file can have, by their ``kind``."""
+
+AXES_PLANTS: Mapping[str, Callable[..., Any]] = {
+    "arm": arm,
+    "multivariable-linear": multivariable_linear,
+    "quadrotor-attitude": quadrotor_attitude,
+    "encoded-outputs": encoded_outputs,
+    "delayed-inputs": delayed_inputs,
+    "python": python_plant,
+}
+"""Plants with several signals that a setup of several axes can have, by their ``kind``."""
 
 RUN_CODE: tuple[Callable[..., Plant], ...] = (FMU,)
 """Plants that are programs: a setup file can only have them if the user trusts it."""

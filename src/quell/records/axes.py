@@ -77,6 +77,11 @@ class AxesTrajectory(Record):
         which
             name or number, from 0.
         """
+        if not self.axis_names:
+            raise ValueError(
+                "this record is of one loop with several signals, which has no axes: take columns "
+                "of run['y'] and run['u']"
+            )
         if isinstance(which, str):
             which = self.axis_names.index(checks.one_of("axis", which, self.axis_names))
         i = checks.whole("axis", which, 0, len(self.axis_names) - 1)
@@ -115,23 +120,24 @@ class AxesTrajectory(Record):
             for i, name in enumerate(self.axis_names)
         }
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw outputs with references, errors and estimates of each axis, and the actuators.
 
         Parameters
         ----------
-        axes
+        axes, ax
             matplotlib axes, three for each axis of the machine and one more: rows of output, error
-            and estimated f, then all control signals; a new figure by default.
+            and estimated f, then all control signals. For a loop without axes three: outputs,
+            control signals, estimated disturbances. A new figure by default.
 
         Returns
         -------
         numpy.ndarray
             the matplotlib axes.
         """
-        from quell.records.plotting import plot_axes
+        from quell.records.plotting import given_axes, plot_axes
 
-        return plot_axes(self, axes)
+        return plot_axes(self, given_axes(axes, ax))
 
     def to_pandas(self) -> Any:
         """Return a ``pandas.DataFrame`` with a row for each sample; needs the extra ``pandas``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from quell.guard import Reason
 from quell.quantities import Quantity
 from quell.records.record import Record
 from quell.types import Status, Vector
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Share of the runs in a band [%], its label and opacity; chosen by hand.
 _BANDS = ((100.0, "all", 0.15), (90.0, "90 %", 0.25), (50.0, "50 %", 0.4))
@@ -52,7 +55,7 @@ def thinned(t: Vector, values: Vector) -> tuple[Vector, Vector]:
     return t[keep], np.asarray(values)[keep]
 
 
-def draw_line(ax: Any, t: Vector, values: Vector, **style: Any) -> None:
+def draw_line(ax: Axes, t: Vector, values: Vector, **style: Any) -> None:
     """Draw a thinned line into matplotlib axes."""
     ax.plot(*thinned(t, values), **style)
 
@@ -130,20 +133,20 @@ def plot_run(run: Any, diverged_at: float | None, axes: Any = None) -> Any:
     return axes
 
 
-def _draw_output(run: Any, ax: Any) -> None:
+def _draw_output(run: Any, ax: Axes) -> None:
     draw_line(ax, run.t, run["y"], label="y", color="C0")
     # Above y, so that it is seen where both are equal.
     draw_line(ax, run.t, run["r"], label="r", color="0.2", linestyle=(0, (4, 3)), linewidth=1.2)
     ax.set_ylabel(run.signals.y.label("output"))
 
 
-def _draw_error(run: Any, ax: Any) -> None:
+def _draw_error(run: Any, ax: Axes) -> None:
     draw_line(ax, run.t, run["r"] - run["y"], label="r − y", color="C3", linewidth=1.0)
     ax.axhline(0.0, color="0.6", linewidth=0.8)
     ax.set_ylabel(Quantity("error", run.signals.y.unit).label("error"))
 
 
-def _draw_control(run: Any, ax: Any) -> None:
+def _draw_control(run: Any, ax: Axes) -> None:
     u = run["u"]
     draw_line(ax, run.t, u, label="u", color="C1")
     reach = float(np.max(np.abs(u), initial=0.0))
@@ -158,7 +161,11 @@ def _draw_control(run: Any, ax: Any) -> None:
         if len(spans):
             step = run.every * run.dt
             bars = [(low * step, (high - low) * step) for low, high in _joined(spans, len(run))]
-            style = {"transform": ax.get_xaxis_transform(), "color": "C3", "alpha": 0.15}
+            style: dict[str, Any] = {
+                "transform": ax.get_xaxis_transform(),
+                "color": "C3",
+                "alpha": 0.15,
+            }
             ax.broken_barh(bars, (0.0, 1.0), label="saturated", linewidth=0.0, **style)
     ax.set_ylabel(run.signals.u.label("control signal"))
 
@@ -174,7 +181,7 @@ def _joined(spans: NDArray[np.int64], samples: int) -> list[tuple[int, int]]:
     return found
 
 
-def _draw_estimates(run: Any, ax: Any) -> None:
+def _draw_estimates(run: Any, ax: Axes) -> None:
     learner = "f_learned" in run.names and (bool(run.features) or np.any(run["f_learned"]))
     for name, label in _ESTIMATES.items():
         if name in run.names and (name == "f_hat" or learner):
@@ -189,6 +196,8 @@ def plot_axes(run: Any, axes: Any = None) -> Any:
     ``run`` is an ``AxesTrajectory``. Returns the matplotlib axes: a row of outputs, of errors, of
     estimates, and one for the control signals.
     """
+    if not run.axis_names:
+        return _plot_signals(run, axes)
     machine = [run.axis(i) for i in range(len(run.axis_names))]
     count = len(machine)
     if axes is None:
@@ -217,6 +226,26 @@ def plot_axes(run: Any, axes: Any = None) -> Any:
     axes[-1].grid(alpha=0.3)
     if run.diverged:
         axes[0].set_title(f"ended at {run.ended:.3g} s: diverged", color="C3")
+    return axes
+
+
+def _plot_signals(run: Any, axes: Any) -> Any:
+    """Draw outputs with references, control signals and disturbances of a loop without axes."""
+    axes = np.ravel(_new_axes(3, 2.5) if axes is None else axes)
+    if axes.size != 3:
+        raise ValueError(f"axes: must be 3 matplotlib axes, got {axes.size}")
+    rows = (("y", "outputs"), ("u", "control signals"), ("d_hat", "disturbances"))
+    for ax, (name, label) in zip(axes, rows, strict=True):
+        values = run[name].reshape(len(run), -1)
+        for k in range(values.shape[1]):
+            draw_line(ax, run.t, values[:, k], label=f"{name}[{k}]", color=f"C{k % 10}")
+        if name == "y":
+            for wanted in run["r"].reshape(len(run), -1).T:
+                draw_line(ax, run.t, wanted, color="0.2", linestyle=(0, (4, 3)), linewidth=1.2)
+        ax.set_ylabel(label)
+        ax.legend(loc="upper right", fontsize="small")
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]")
     return axes
 
 
@@ -263,13 +292,13 @@ def _new_axes(count: int, height: float) -> Any:
     return plt.subplots(count, 1, sharex=True, figsize=size, layout="constrained")[1]
 
 
-def _draw_bands(ax: Any, t: Vector, values: Vector, color: str) -> None:
+def _draw_bands(ax: Axes, t: Vector, values: Vector, color: str) -> None:
     """Draw the median of ``values`` (runs, samples) and the bands around it."""
     limits = [(50.0 - share / 2.0, 50.0 + share / 2.0) for share, _, _ in _BANDS]
     levels = sorted({50.0, *(level for pair in limits for level in pair)})
     at = dict(zip(levels, np.percentile(values, levels, axis=0), strict=True))
     for (low, high), (_, label, opacity) in zip(limits, _BANDS, strict=True):
-        style = {"color": color, "alpha": opacity, "linewidth": 0.0, "label": label}
+        style: dict[str, Any] = {"color": color, "alpha": opacity, "linewidth": 0.0, "label": label}
         ax.fill_between(t, at[low], at[high], **style)
     ax.plot(t, at[50.0], color=color, label="median")
     # A run that is about to diverge would hide all others.
@@ -278,7 +307,7 @@ def _draw_bands(ax: Any, t: Vector, values: Vector, color: str) -> None:
     ax.set_ylim(bottom - margin, top + margin)
 
 
-def _draw_guard(run: Any, ax: Any) -> None:
+def _draw_guard(run: Any, ax: Axes) -> None:
     """Draw the authority, the error left by the learner, and why the authority was reduced.
 
     The error is a share of that of an observer without learner.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # ---- The channels of a record ----
 
 # Channels that are vectors even if their width is one.
-_VECTORS = ("w", "x", "x_hat", "f_derivatives", "theta")
+_VECTORS = ("w", "x", "x_hat", "d_hat", "f_derivatives", "theta")
 # Description and unit.
 _DESCRIPTIONS = {
     "r": ("reference", "y-unit"),
@@ -41,6 +41,7 @@ _DESCRIPTIONS = {
     "w": ("disturbances", "w-unit"),
     "x": ("state of the plant", "state-unit"),
     "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),
+    "d_hat": ("estimated disturbances and their derivatives", "1"),
     "f_residual": ("residual total disturbance estimated by the observer", "y-unit/s^n"),
     "f_derivatives": ("estimated derivatives of f, from the first on", "y-unit/s^(n+i)"),
     "u_feedforward": ("feedforward of the model", "u-unit"),

@@ -12,18 +12,22 @@ from typing import TYPE_CHECKING
 from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
+    from quell.setup.axes import AxesDescription, load_axes, made_axes
     from quell.setup.description import Description
     from quell.setup.loading import EXAMPLES, Setup, controllers_of, load, made, varied
     from quell.setup.schema import SetupError, plant_given, plant_of, read
 
 _HOMES = {
+    "AxesDescription": "axes",
     "EXAMPLES": "loading",
     "Description": "description",
     "Setup": "loading",
     "SetupError": "schema",
     "controllers_of": "loading",
     "load": "loading",
+    "load_axes": "axes",
     "made": "loading",
+    "made_axes": "axes",
     "plant_given": "schema",
     "plant_of": "schema",
     "read": "schema",
@@ -32,12 +36,15 @@ _HOMES = {
 
 __all__ = [
     "EXAMPLES",
+    "AxesDescription",
     "Description",
     "Setup",
     "SetupError",
     "controllers_of",
     "load",
+    "load_axes",
     "made",
+    "made_axes",
     "plant_given",
     "plant_of",
     "read",

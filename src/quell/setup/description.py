@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import AfterValidator, Field, ValidationError
 
 from quell import checks
-from quell.setup.schema import Table, from_validation, immutable
+from quell.setup.schema import SetupError, Table, from_validation, immutable
 from quell.setup.schema import parsed as parsed
 from quell.setup.schema import read as read
 
@@ -43,37 +43,54 @@ else:
     )
 
 
-def _optional(description: str) -> Any:
+def optional(description: str) -> Any:
+    """Return the field of a table that may be missing."""
     return Field(None, description=description)
+
+
+Title = Annotated[str, AfterValidator(partial(checks.printable, "title"))]
+TITLE: Any = Field("", description="title of tables and figures; the file's name by default.")
+DT: Any = Field(description="sample time of the loop and all of its parts [s].")
 
 
 class Description(Table):
     """The tables and keys of a setup file."""
 
-    title: Annotated[str, AfterValidator(partial(checks.printable, "title"))] = Field(
-        "", description="title of tables and figures; the file's name by default."
-    )
-    dt: float = Field(description="sample time of the loop and all of its parts [s].")
-    plant: Plant | None = _optional("the plant, for `quell run` and observers with a model.")
-    observer: Observer | None = _optional("the observer of an `adrc` or a compensator.")
+    title: Title = TITLE
+    dt: float = DT
+    plant: Plant | None = optional("the plant, for `quell run` and observers with a model.")
+    observer: Observer | None = optional("the observer of an `adrc` or a compensator.")
     controller: Controller = Field(description="the controller.")
-    compensator: OnTop | None = _optional(
+    compensator: OnTop | None = optional(
         "a compensator on top of a controller without observer; none by default."
     )
-    learner: Learner | None = _optional("the learner; none by default.")
-    guard: Guard | None = _optional("the guard of the learner; none by default.")
-    prefilter: Prefilter | None = _optional("the prefilter of the reference; none by default.")
-    scenario: Scenario | None = _optional("the scenario.")
-    sweep: Sweep | None = _optional("many runs with other values, for `quell sweep`.")
-    rig: Rig | None = _optional("the device and its safety limits, for `quell run-rig`.")
-    tune: Tune | None = _optional("what `quell tune` optimises, and its constraints.")
+    learner: Learner | None = optional("the learner; none by default.")
+    guard: Guard | None = optional("the guard of the learner; none by default.")
+    prefilter: Prefilter | None = optional("the prefilter of the reference; none by default.")
+    scenario: Scenario | None = optional("the scenario.")
+    sweep: Sweep | None = optional("many runs with other values, for `quell sweep`.")
+    rig: Rig | None = optional("the device and its safety limits, for `quell run-rig`.")
+    tune: Tune | None = optional("what `quell tune` optimises, and its constraints.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which the response is judged."
     )
 
 
+def is_of_axes(data: Mapping[str, Any]) -> bool:
+    """Return whether the content of a file is a setup of several axes."""
+    return "axis" in data or "axes" in data
+
+
 def describe(name: str, data: Mapping[str, Any]) -> Description:
-    """Return the tables of ``data``, the content of the file ``name``."""
+    """Return the tables of ``data``, the content of the file ``name``, of one axis."""
+    if is_of_axes(data):
+        raise SetupError(
+            [
+                f"{name}: NOT for several axes yet: this works on one axis, and the file has "
+                "[[axis]]; quell run simulates it, quell export writes it as C, and in Python "
+                "quell.setup.load_axes reads it"
+            ]
+        )
     values = immutable(data)
     try:
         return Description.model_validate(values)

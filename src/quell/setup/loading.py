@@ -16,7 +16,7 @@ import re
 import threading
 import types
 import unicodedata
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -43,6 +43,7 @@ from quell.setup.schema import (
     CallTable,
     SetupError,
     Table,
+    check_single,
     contents_of,
     immutable,
     parameters_of,
@@ -69,7 +70,7 @@ _EXAMPLES = {
 }
 
 EXAMPLES = Path(__file__).parent / "examples"
-"""The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
+"""The folder of the files that come along: two_mass.toml, torsional_rig.toml and arm.toml."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ class Setup:
     rig: dict[str, Any] | None  #: arguments of ``run_rig``, and ``live``
     sweep: dict[str, Any] | None  #: what ``sweep_table`` returns
     windows: tuple[dict[str, Any], ...]  #: arguments of ``Trajectory.metrics`` for each window
-    description: Description  #: the file's own tables
+    description: Any  #: the file's own tables, a ``Description``, or ``AxesDescription``
     tune: dict[str, Any] | None = None  #: arguments of ``quell.tune``
     trust: bool = False  #: whether Python files that it names were run
 
@@ -109,7 +110,7 @@ class Setup:
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Setup:
-    r"""Read a TOML file and build the objects that it describes.
+    r"""Read a TOML file of one axis and build the objects that it describes.
 
     A plant of the kind ``python`` runs a Python file, which is refused without ``trust``. A
     ``SetupError`` has a line for each error: file, path of the key, value and rule, or the
@@ -167,6 +168,8 @@ def assembled(
 
     _check_ranges(name, tables.plant)
     plant = build("plant")
+    if plant is not None:
+        check_single(name, plant)
     model = None if plant is None else made_once("model", (plant,), partial(linear_model, plant))
     parts = {key: build(key, plant=model) for key in ("observer", "learner", "guard")}
     kind, used = tables.controller.kind_name, tables.controller.context
@@ -196,16 +199,27 @@ def assembled(
         check = partial(scenario.seeded_signals, count)
         attempt = partial(builder.attempt, "scenario", ("disturbances",), check)
         made_once("signals", (scenario, count), attempt)
-    windows = tuple(window.written() for window in tables.metrics)
-    for i, window in enumerate(windows):
-        builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
-    title = tables.title or "".join(
-        each if unicodedata.category(each)[0] != "C" else "?"
-        for each in name.removesuffix(".toml").replace("_", " ")
-    )
+    windows = windows_of(builder, tables.metrics)
+    title = tables.title or title_of(name)
     tune = build("tune")
     built = controller, plant, scenario, rig, sweep, windows
     return Setup(name, title, *built, tables, tune, trust)
+
+
+def windows_of(builder: Builder, tables: Sequence[Table]) -> tuple[dict[str, Any], ...]:
+    """Return the windows of [[metrics]], checked."""
+    windows = tuple(window.written() for window in tables)
+    for i, window in enumerate(windows):
+        builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
+    return windows
+
+
+def title_of(name: str) -> str:
+    """Return the title of a setup that has none: the name of its file."""
+    return "".join(
+        each if unicodedata.category(each)[0] != "C" else "?"
+        for each in name.removesuffix(".toml").replace("_", " ")
+    )
 
 
 def _check_ranges(name: str, plant: CallTable | None) -> None:

@@ -43,6 +43,7 @@ from quell.quantities import Signals
 from quell.realtime.run import run_rig
 from quell.realtime.supervisor import Safety as RigSafety
 from quell.records.trajectory import Trajectory
+from quell.setup.schema import AXES_PLANTS as AXES_PLANTS
 from quell.setup.schema import PLANTS as PLANTS
 from quell.setup.schema import CallTable, Plant, Table, call_table, list_of, one_of
 from quell.simulation.driver import Scenario as SimulationScenario
@@ -332,17 +333,17 @@ _PARTS = {
 }
 _SCHEDULES = {"table": Schedule, "online-gain": OnlineGain}
 _PARTS["schedule"] = one_of(_call_tables(_SCHEDULES), default="table") | None
-_LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **_PARTS}
+LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **_PARTS}
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
 _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)
 _CONTROLLERS = (
-    call_table("adrc", ADRC, types=_LAW),
-    call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=_LAW),
+    call_table("adrc", ADRC, types=LAW),
+    call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=LAW),
     call_table(
         "adrc-pid",
         ADRC.from_pid,
         forwards_to=(equal_to_pid, ADRC),
-        types=_LAW,
+        types=LAW,
         without=("half_gain", "feedback", "law_poles"),
     ),
     call_table("compensator", Compensator, types=_PARTS),

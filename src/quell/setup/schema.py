@@ -52,6 +52,7 @@ from quell.plants import registry as plants
 from quell.plants.base import Plant as AnyPlant
 from quell.plants.base import labelled
 from quell.plants.linearise import linear_model
+from quell.plants.multivariable import is_several
 from quell.plants.registry import RUN_CODE
 from quell.signals.shapes import Signal
 
@@ -321,6 +322,8 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
             lines.append(f"{path}: missing{remedy}")
         elif kind == "union_tag_invalid" and isinstance(value, Mapping):
             hint = nearest(str(value["kind"]), _tags(context))
+            if str(value["kind"]) in plants.AXES_PLANTS and path.rpartition(".")[2] == "plant":
+                hint = "it has several signals, and is for a setup with a table [[axis]] for each"
             lines.append(f"{path}.kind = {_short(value['kind'])}: unknown; {hint}")
         elif kind == "union_tag_not_found" and isinstance(value, Mapping):
             lines.append(f"{path}.kind: missing")
@@ -499,7 +502,7 @@ class Builder:
         }
         inner: dict[str, Any] = {key: context[key] for key in ("dt", "plant") if key in context}
         for key, value in table.written().items():
-            arguments[key] = self._value(value, f"{path}.{key}", key != "disturbances", inner)
+            arguments[key] = self.value(value, f"{path}.{key}", key != "disturbances", inner)
         for key, parameter in takes.items():
             needed = parameter.default is parameter.empty
             if needed and key not in arguments and parameter.kind is not parameter.VAR_KEYWORD:
@@ -522,7 +525,7 @@ class Builder:
             beyond = ValueError(f"these numbers are beyond what can be computed ({error})")
             raise with_path(self.name, path, beyond, keys) from None
 
-    def _value(self, value: Any, path: str, add_up: bool, context: dict[str, Any]) -> Any:
+    def value(self, value: Any, path: str, add_up: bool, context: dict[str, Any]) -> Any:
         """Build the tables in a value; add up the features or signals of a list if ``add_up``."""
         if isinstance(value, CallTable):
             built = self.build(value, path, **context)
@@ -530,7 +533,7 @@ class Builder:
         if not isinstance(value, tuple):
             return value
         entries = enumerate(value)
-        parts = tuple(self._value(part, f"{path}[{i}]", True, context) for i, part in entries)
+        parts = tuple(self.value(part, f"{path}[{i}]", True, context) for i, part in entries)
         if add_up and any(isinstance(part, Features | Signal) for part in parts):
             return self.attempt(path, (), reduce, add, parts)
         return parts
@@ -579,6 +582,16 @@ else:
     Plant: Any = one_of(PLANTS)
 for _model in PLANTS.values():
     _model.model_rebuild(_types_namespace={"Plant": Plant})
+AXES_PLANTS: dict[str, type[CallTable]] = {
+    kind: call_table(kind, function, types={**_TYPES_PLANTS, "plant": "AxesPlant"})
+    for kind, function in plants.AXES_PLANTS.items()
+}
+if TYPE_CHECKING:
+    AxesPlant = CallTable
+else:
+    AxesPlant: Any = one_of(AXES_PLANTS)
+for _model in AXES_PLANTS.values():
+    _model.model_rebuild(_types_namespace={"AxesPlant": AxesPlant})
 
 
 # Keys of plants that name a file, by kind.
@@ -623,7 +636,19 @@ def plant_of(
     builder = Builder(name, trust)
     dt = builder.attempt("", (), checks.positive, "dt", dt, "s")
     made: AnyPlant = builder.build(found.plant, "plant", dt=dt)
+    check_single(name, made)
     return made
+
+
+def check_single(name: str, plant: Any) -> None:
+    """Raise a ``SetupError`` for a plant with several signals where one axis is meant."""
+    if is_several(plant):
+        raise SetupError(
+            [
+                f"{name}: plant: has several signals: must have one u and one y; several axes have "
+                "a setup with a table [[axis]] for each, which quell run simulates"
+            ]
+        )
 
 
 def contents_of(tables: Any) -> Iterator[tuple[str, str]]:

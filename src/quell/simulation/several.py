@@ -69,9 +69,9 @@ class SampledAxes:
         """Sample a scenario for a plant and a controller; ``limit`` as in ``simulate``."""
         dt = controller.dt
         samples, x0 = samples_and_start(scenario, plant, dt)
-        axes, inputs = controller.outputs, plant.disturbances
+        axes, inputs = references_of(controller), plant.disturbances
         reference = _one_for_each("reference", scenario.reference, axes)
-        noise = _one_for_each("noise", scenario.noise, axes)
+        noise = _one_for_each("noise", scenario.noise, controller.outputs)
         given = tuple(map(as_signal, scenario.disturbances))
         if len(given) > inputs:
             raise ValueError(
@@ -106,12 +106,18 @@ class SampledAxes:
         return SegmentOfAxes(first, self.dt, first in self.rest_samples, *columns)
 
 
+def references_of(controller: Any) -> int:
+    """Return the number of references of a controller of several signals."""
+    return int(getattr(controller, "references", controller.outputs))
+
+
 def _one_for_each(name: str, given: Any, axes: int) -> tuple[Signal, ...]:
     """Return a signal for each axis, from one for all or one for each."""
     if not checks.is_sequence(given):
         return (as_signal(given, name),) * axes
     if len(given) != axes:
-        raise ValueError(f"{name} has {len(given)} signals: there are {axes} axes, give one each")
+        what = "axes" if name == "reference" else "outputs"
+        raise ValueError(f"{name} has {len(given)} signals: there are {axes} {what}, give one each")
     return tuple(as_signal(each, f"{name}[{i}]") for i, each in enumerate(given))
 
 
@@ -208,7 +214,7 @@ class LoopOfAxes(Loop):
     @property
     def first_state(self) -> int:
         """The first column of a log that has the plant's state."""
-        before = self.controller.outputs + 2 * self.plant.outputs + self.plant.inputs
+        before = references_of(self.controller) + 2 * self.plant.outputs + self.plant.inputs
         return int(before + self.plant.disturbances)
 
     def controls(self, log: Matrix) -> Any:
@@ -218,7 +224,7 @@ class LoopOfAxes(Loop):
 
     def is_usual(self, row: Vector) -> bool:
         """Return whether all outputs of a row of a log are in their usual range."""
-        first = self.controller.outputs
+        first = references_of(self.controller)
         y = row[first : first + self.plant.outputs]
         return bool(np.all(np.abs(y) <= self.scenario.range))
 
@@ -231,7 +237,7 @@ class LoopOfAxes(Loop):
 
 def logged_channels(plant: Any, controller: Any) -> Channels:
     """Return name and width of the columns that ``run_axes`` logs, in order."""
-    widths = (controller.outputs, plant.outputs, plant.outputs, plant.inputs)
+    widths = (references_of(controller), plant.outputs, plant.outputs, plant.inputs)
     signals = tuple(zip(("r", "y", "y_measured", "u"), widths, strict=True))
     return (*signals, ("w", plant.disturbances), ("x", plant.order), *controller.channels)
 

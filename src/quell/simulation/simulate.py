@@ -26,6 +26,7 @@ from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, check_controller, limits_of
 from quell.controllers.single import check_compilable, in_single_precision
+from quell.controllers.state_space import StateFeedback
 from quell.kernels import dispatch
 from quell.kernels.cache import cache_path
 from quell.kernels.sized import layout_of
@@ -273,7 +274,7 @@ def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
 @overload
 def simulate(
     plant: Any,
-    controller: Axes,
+    controller: Axes | StateFeedback,
     scenario: Scenario,
     *,
     record_every: int = 1,
@@ -347,7 +348,7 @@ def simulate(
     Returns
     -------
     Trajectory, BatchTrajectory or AxesTrajectory
-        the recorded samples, up to the end of the run; ``AxesTrajectory`` for ``quell.Axes``.
+        the recorded samples, up to the end of the run; ``AxesTrajectory`` for several signals.
 
     Raises
     ------
@@ -364,7 +365,7 @@ def simulate(
     interpret = interpret or dispatch.interpret_all
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
-    if isinstance(controller, Axes):
+    if isinstance(controller, Axes | StateFeedback):
         for name, value, usual in (
             ("precision", precision, "double"), ("record", record, None), ("workers", workers, None)
         ):  # fmt: skip

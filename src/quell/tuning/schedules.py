@@ -31,8 +31,9 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.controllers.adrc import ADRC
-from quell.controllers.schedule import Schedule, with_gains
+from quell.controllers.schedule import Schedule
 from quell.files import nonfinite_to_none, written_atomically
+from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
@@ -201,16 +202,18 @@ class TunedSchedule:
         )
         return found
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw b0, M_s with its bound, and the ratio of the integrals over the first signal.
 
         Of two signals there is a line for each value of the second one. Points of the table are
-        filled. Returns the three axes; ``axes`` are those to draw into, new ones by default.
+        filled. Returns the three axes; ``axes`` or ``ax`` are those to draw into, new ones by
+        default.
         """
-        if axes is None:
-            import matplotlib.pyplot as plt
+        from quell.records.plotting import given_axes, grid_of_axes, new_figure
 
-            _, axes = plt.subplots(3, 1, sharex=True, layout="constrained")
+        axes = grid_of_axes(given_axes(axes, ax), lambda: new_figure(6.4, 6.4), 3, sharex=True)[
+            :, 0
+        ]
         names = self.schedule.signals
         for second in sorted({each.signals[1:] for each in self.results}):
             own = [each for each in self.results if each.signals[1:] == second]

@@ -1,0 +1,331 @@
+"""Setups of several axes: a table ``[[axis]]`` for each, ``[axes]`` for B0 and the actuators.
+
+The keys of an axis are the tables that a setup of one axis has: its observer, of b0 = 1, its
+controller, learner and guard; and what it has to follow. The limits of the actuators are in
+``[axes]``, as no axis has one of its own.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial, wraps
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from quell import checks
+from quell.controllers.adrc import ADRC
+from quell.controllers.axes import Axes
+from quell.plants.base import PlantWrapper
+from quell.plants.multibody import Arm, Craft
+from quell.plants.multivariable import MultivariableLinearPlant, check_several
+from quell.records.axes import AxesTrajectory
+from quell.setup import registry
+from quell.setup.description import DT, TITLE, Title, optional
+from quell.setup.loading import Setup, title_of, windows_of
+from quell.setup.schema import (
+    Builder,
+    Plant,
+    SetupError,
+    Table,
+    call_table,
+    from_validation,
+    immutable,
+    list_of,
+    one_of,
+    read,
+)
+from quell.simulation.driver import Scenario
+from quell.types import Matrix
+
+if TYPE_CHECKING:  # these types are made at run time, which a type checker cannot follow
+    from quell.setup.schema import CallTable as AxesPlant
+    from quell.setup.schema import CallTable as AxesTable
+    from quell.setup.schema import CallTable as Controller
+    from quell.setup.schema import CallTable as Guard
+    from quell.setup.schema import CallTable as Learner
+    from quell.setup.schema import CallTable as Metrics
+    from quell.setup.schema import CallTable as Observer
+    from quell.setup.schema import CallTable as ScenarioTable
+
+# ---- B0 and the actuators ----
+
+
+def coupled(
+    axes: Mapping[str, ADRC],
+    plant: Any = None,
+    B0: Sequence[Sequence[float]] | str | None = None,
+    M: Sequence[Sequence[float]] | None = None,
+    u_min: float | Sequence[float] = -math.inf,
+    u_max: float | Sequence[float] = math.inf,
+    rate_limit: float | Sequence[float] | Sequence[Sequence[float]] = math.inf,
+    saturation: str | Sequence[str] = "each",
+    weights: Sequence[float] | None = None,
+    wished: Sequence[float] | None = None,
+) -> Axes:
+    """Return the controller of several axes: B0, or its inverse M, and limits of the actuators.
+
+    Parameters
+    ----------
+    axes, plant
+        the controllers of the axes by name, and the plant.
+    B0
+        from the control signals to the axes, a list of rows, with a row for each axis; ``"plant"``
+        takes that of the plant: of an arm the inverse of M(q), of a craft that near the horizontal,
+        of a linear plant ``C_i A^(n_i − 1) B``. By default the unit matrix.
+    M
+        the inverse of B0 instead, a list of rows.
+    u_min, u_max
+        limits of the actuators [u-unit]: one for all, or a list with one for each.
+    rate_limit
+        largest rates of the actuators [u-unit/s]: one for all, or a list with one for each, or with
+        `[lowest, highest]` for each.
+    saturation
+        what happens at the limits: `each` cuts each actuator, `direction` scales all, and a list of
+        all axes gives them what they ask for in this order.
+    weights
+        of the actuators, where there are more than axes.
+    wished
+        the control signals from which that is measured [u-unit]; zero by default.
+    """
+    inverse: Any = M
+    gain: Any = B0
+    if isinstance(B0, str):
+        checks.one_of("B0", B0, ("plant",))
+        if plant is None:
+            raise ValueError('B0 = "plant": there is no plant; give rows, or a table [plant]')
+        gain, inverse = _of_plant(plant, [axis.observer.order for axis in axes.values()], M)
+    limits: dict[str, Any] = {"u_min": u_min, "u_max": u_max, "rate_limit": rate_limit}
+    rest: dict[str, Any] = {"saturation": saturation, "weights": weights, "wished": wished}
+    return Axes(dict(axes), gain, M=inverse, **limits, **rest)
+
+
+def _of_plant(plant: Any, orders: Sequence[int], M: Any) -> tuple[Any, Any]:
+    """Return B0 and M of a plant; one of them is None."""
+    if M is not None:
+        raise ValueError('B0 = "plant" and M: are two of the same; give one')
+    inner = plant
+    while isinstance(inner, PlantWrapper):
+        inner = inner.plant
+    if isinstance(inner, Arm):
+        return None, inner.inertia
+    if isinstance(inner, Craft):
+        return inner.B0, None
+    if isinstance(inner, MultivariableLinearPlant):
+        return _markov(inner, orders), None
+    raise ValueError(
+        f'B0 = "plant": is not known of {plant.name!r}; give its rows, or M, or find it in a '
+        "record with quell b0"
+    )
+
+
+def _markov(plant: MultivariableLinearPlant, orders: Sequence[int]) -> Matrix:
+    """Return ``C_i A^(n_i − 1) B`` of a linear plant."""
+    if len(orders) != plant.outputs:
+        raise ValueError(
+            f'B0 = "plant": the plant has {plant.outputs} outputs, there are {len(orders)} axes: '
+            "must be as many"
+        )
+    rows = [
+        plant.C[i] @ np.linalg.matrix_power(plant.A, order - 1) @ plant.B
+        for i, order in enumerate(orders)
+    ]
+    return np.array(rows)
+
+
+# ---- The tables ----
+
+
+def _with_unit_gain(make: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that makes an observer with b0 = 1, whose input is v = B0 u."""
+    given = inspect.signature(make, eval_str=False)
+    if "b0" not in given.parameters:
+        return make
+
+    @wraps(make)
+    def made(**parameters: Any) -> Any:
+        return make(b0=1.0, **parameters)
+
+    kept = [each for name, each in given.parameters.items() if name != "b0"]
+    made.__signature__ = given.replace(parameters=kept)  # type: ignore[attr-defined]
+    return made
+
+
+OBSERVERS = {
+    kind: call_table(
+        kind,
+        _with_unit_gain(table.function),
+        types={"plant": Plant | None},
+        descriptions={"plant": "model of the axis, of b0 = 1.", "E": "how f enters; as u."},
+    )
+    for kind, table in registry.OBSERVERS.items()
+}
+_OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule", "safe_set")
+CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
+AXES = call_table("axes", coupled, only=True, without=("axes", "plant"))
+SCENARIO = call_table(
+    "scenario",
+    Scenario,
+    only=True,
+    types={"disturbances": list_of(registry.Signal)},
+    without=("reference", "noise", "schedule"),
+)
+METRICS = call_table("metrics", AxesTrajectory.metrics, only=True)
+if not TYPE_CHECKING:
+    AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
+    Observer, Learner = one_of(OBSERVERS), registry.Learner
+    AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
+
+
+class Axis(Table):
+    """A table ``[[axis]]``."""
+
+    name: str = Field("", description="its name; axis1 and so on by default.")
+    observer: Observer = Field(description="the observer; its b0 is 1.")
+    controller: Controller = Field(description="the ADRC, without limits of u.")
+    learner: Learner | None = optional("the learner; none by default.")
+    guard: Guard | None = optional("the guard of the learner; none by default.")
+    reference: registry.Signal = Field(0.0, description="signal that y has to follow [y-unit].")
+    noise: registry.Signal = Field(0.0, description="signal added to y before the controller.")
+
+
+class AxesDescription(Table):
+    """The tables and keys of a setup of several axes."""
+
+    title: Title = TITLE
+    dt: float = DT
+    plant: AxesPlant | None = optional("the plant with several signals, for `quell run`.")
+    axes: AxesTable | None = optional("B0 and the actuators; the unit matrix by default.")
+    axis: tuple[Axis, ...] = Field(description="[[axis]]: an axis, in the order of the outputs.")
+    scenario: ScenarioTable | None = optional("duration, disturbances and start.")
+    metrics: tuple[Metrics, ...] = Field(
+        (), description="[[metrics]]: windows of time in which all axes are judged."
+    )
+
+
+# ---- From a file to objects ----
+
+# Tables of a setup of one axis, and where they are here; what belongs to one axis only.
+_ELSEWHERE = {
+    **dict.fromkeys(("observer", "controller", "learner", "guard"), "belongs into each [[axis]]"),
+    **dict.fromkeys(
+        ("compensator", "prefilter", "sweep", "rig", "tune"), "NOT for several axes yet"
+    ),
+}
+
+
+def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
+    """Read a TOML file of several axes and build the objects that it describes.
+
+    The ``controller`` of the setup is a ``quell.Axes``; it has no rig, sweep and tuning. ``trust``
+    and errors are those of ``load``.
+
+    Examples
+    --------
+    >>> from quell.setup import EXAMPLES, load_axes
+    >>> load_axes(EXAMPLES / "arm.toml").controller.names
+    ('shoulder', 'elbow')
+    """
+    return made_axes(*read(path), trust)
+
+
+def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
+    """Build the objects that ``data`` describes: the content of a file of several axes.
+
+    Raises
+    ------
+    SetupError
+        as ``load``.
+    """
+    mistakes = [f"{name}: {key}: {rule}" for key, rule in _ELSEWHERE.items() if key in data]
+    if mistakes:
+        raise SetupError(mistakes)
+    values = immutable(data)
+    try:
+        tables = AxesDescription.model_validate(values)
+    except ValidationError as error:
+        raise _explained(from_validation(name, error, values)) from None
+    if not tables.axis:
+        raise SetupError([f"{name}: axis: is empty; give a table [[axis]] for each axis"])
+    builder = Builder(name, trust)
+    dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
+    plant = None
+    if tables.plant is not None:
+        plant = builder.build(tables.plant, "plant", dt=dt)
+        builder.attempt("", (), check_several, plant)
+    names = [axis.name or f"axis{i + 1}" for i, axis in enumerate(tables.axis)]
+    if len(set(names)) < len(names):
+        raise SetupError([f"{name}: axis: names {', '.join(names)} must be different"])
+    axes = {
+        key: _axis(builder, axis, f"axis[{i}]", dt)
+        for i, (key, axis) in enumerate(zip(names, tables.axis, strict=True))
+    }
+    table = AXES() if tables.axes is None else tables.axes
+    controller = builder.build(table, "axes", axes=axes, plant=plant)
+    scenario = _scenario(builder, tables, dt)
+    if plant is not None:
+        builder.attempt("plant", (), _check_fit, plant, controller, scenario)
+    windows = windows_of(builder, tables.metrics)
+    title = tables.title or title_of(name)
+    return Setup(name, title, controller, plant, scenario, None, None, windows, tables, trust=trust)
+
+
+def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> ADRC:
+    """Return the controller of an axis."""
+    parts = {
+        key: None if table is None else builder.build(table, f"{path}.{key}", dt=dt)
+        for key, table in (("observer", axis.observer), ("guard", axis.guard))
+    }
+    learner = None
+    if axis.learner is not None:
+        learner = builder.build(axis.learner, f"{path}.learner", dt=dt, **parts)
+    made: ADRC = builder.build(axis.controller, f"{path}.controller", learner=learner, **parts)
+    return made
+
+
+def _scenario(builder: Builder, tables: AxesDescription, dt: float) -> Scenario | None:
+    """Return the scenario, with the references and noises of the axes; None without one."""
+    if tables.scenario is None:
+        return None
+    made: Scenario = builder.build(tables.scenario, "scenario", dt=dt)
+    signals: dict[str, Any] = {
+        key: tuple(
+            builder.value(getattr(axis, key), f"axis[{i}].{key}", True, {"dt": dt})
+            for i, axis in enumerate(tables.axis)
+        )
+        for key in ("reference", "noise")
+    }
+    return builder.attempt("axis", (), partial(replace, made, **signals))
+
+
+def _check_fit(plant: Any, controller: Axes, scenario: Scenario | None) -> None:
+    """Check that plant, controller and scenario have the same signals."""
+    from quell.simulation.several import SampledAxes, check_fit
+
+    check_fit(plant, controller)
+    if scenario is not None:
+        SampledAxes.of(scenario, plant, controller, None)
+
+
+def _explained(error: SetupError) -> SetupError:
+    """Return the errors, with the rule of keys that axes do not have."""
+    rules = {
+        ".observer.b0: unknown": "is 1 for an axis; the gain of the actuators is B0 in [axes]",
+        "scenario.reference: unknown": "belongs into each [[axis]]",
+        "scenario.noise: unknown": "belongs into each [[axis]]",
+    }
+    for key in ("u_min", "u_max", "rate_limit"):
+        rules[f".controller.{key}: unknown"] = "belongs into [axes]: an actuator moves all axes"
+    lines = []
+    for line in error.mistakes:
+        for begin, rule in rules.items():
+            if begin in line:
+                line = f"{line.partition(': unknown')[0]}: {rule}"
+                break
+        lines.append(line)
+    return SetupError(lines)

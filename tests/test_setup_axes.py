@@ -1,0 +1,215 @@
+"""Setups with a table [[axis]] for each axis: the objects in Python, and errors that name key and rule."""
+
+from __future__ import annotations
+
+import copy
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.setup import EXAMPLES, SetupError, load, load_axes, made, made_axes
+from quell.tuning.report import toml_text
+
+from .commands import Shown
+from .setups import GANTRY
+
+
+def gantry(**changes: Any) -> dict[str, Any]:
+    """Return the tables of a gantry with other ones."""
+    data = copy.deepcopy(tomllib.loads(GANTRY))
+    return {key: value for key, value in (data | changes).items() if value is not None}
+
+
+@pytest.mark.compiled
+def test_the_run_of_a_file_is_that_of_the_objects_in_python() -> None:
+    """Plant, B0, limits of the actuators, references, noise and disturbances."""
+    setup = made_axes("gantry.toml", gantry())
+    plant = ql.plants.MultivariableLinearPlant(
+        [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]],
+        [[0, 0], [5, 0.5], [0, 0], [0.4, 6]],
+        [[1, 0, 0, 0], [0, 0, 1, 0]],
+    )
+    parts = [
+        ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3), 8.0) for _ in range(2)
+    ]
+    axes = ql.Axes(
+        {"x": parts[0], "y": parts[1]}, [[5, 0.5], [0.4, 6]], u_max=[20.0, 30.0], u_min=-25.0
+    )
+    scenario = ql.Scenario(
+        reference=(ql.signals.Step(0.1), 0.0),
+        noise=(0.0, ql.signals.BandLimitedNoise(1e-12, 1e-3)),
+        disturbances=(0.0, ql.signals.Step(at=0.2)),
+        duration=0.5,
+        seed=3,
+    )
+    assert (setup.title, setup.controller.names) == ("gantry", ("x", "y"))
+    ours = ql.simulate(setup.plant, setup.controller, setup.needed("scenario"))
+    theirs = ql.simulate(plant, axes, scenario)
+    np.testing.assert_array_equal(ours.log, theirs.log)
+    assert setup.windows == ({"start": 0.1},)
+
+
+def test_a_setup_is_made_again_of_its_tables() -> None:
+    """As dictionaries, as TOML and as JSON; so is the example that comes along."""
+    for setup in (made_axes("gantry.toml", gantry()), load_axes(EXAMPLES / "arm.toml")):
+        again = made_axes(setup.file, setup.tables())
+        assert again.description == setup.description
+        written = made_axes(setup.file, tomllib.loads(toml_text(setup.tables(), "again")))
+        assert written.description == setup.description
+        assert json.loads(json.dumps(setup.as_json()))["axis"][0]["controller"]
+        assert repr(written.controller) == repr(setup.controller)
+
+
+def test_b0_of_the_plant_is_that_of_each_kind() -> None:
+    """Of an arm M(q) in place of it, also behind encoders; of a craft that near the horizontal; of a linear plant C A B."""
+    linear = made_axes("a.toml", gantry()).controller
+    np.testing.assert_allclose(linear.B0, [[5, 0.5], [0.4, 6]])
+    arm = {"kind": "encoded-outputs", "resolution": 1e-5, "plant": {"kind": "arm"}}
+    found = made_axes("a.toml", gantry(plant=arm, scenario=None)).controller
+    np.testing.assert_allclose(
+        found.M(np.zeros((2, 2))), ql.plants.arm().mass_matrix([0.0, 0.0]), rtol=1e-12
+    )
+    axis = gantry()["axis"][0]
+    three = [axis | {"name": name} for name in ("roll", "pitch", "yaw")]
+    craft = gantry(
+        plant="quadrotor-attitude",
+        axis=three,
+        axes={"B0": "plant", "wished": [2.0] * 4},
+        scenario=None,
+    )
+    B0 = made_axes("a.toml", craft).controller.B0
+    expected = ql.plants.rotor_levers(0.17, 0.015) / np.array([[0.012], [0.012], [0.022]])
+    np.testing.assert_allclose(B0, expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"controller": {"omega_c": 1.0}}, "controller: belongs into each"),
+        ({"rig": {"device": "twin:"}}, "rig: NOT for several axes yet"),
+        ({"tune": {}}, "tune: NOT for several axes yet"),
+        ({"axes": {"B1": 1}}, "axes.B1: unknown; "),
+        ({"axes": {"B0": "model"}}, "axes.B0 = 'model'"),
+        ({"axes": {"B0": [[1, 2], [2, 4]]}}, "axes.*singular"),
+        ({"axes": {"B0": [[1, 0, 0], [0, 1, 0]]}}, "plant.*2 control signals, the controller 3"),
+        ({"axes": {"B0": "plant", "M": [[1, 0], [0, 1]]}}, 'B0 = "plant" and M'),
+        ({"axes": {"u_max": [1.0, 2.0, 3.0]}}, "axes.u_max"),
+        ({"plant": {"kind": "amr"}}, "plant.kind = 'amr': unknown; did you mean arm"),
+        ({"plant": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0]}}, "plant.kind = 'linear'"),
+        ({"scenario": {"reference": 1.0}}, r"scenario.reference: belongs into each \[\[axis\]\]"),
+        ({"scenario": {"disturbances": [0, 0, 1.0]}}, "disturbances has 3 signals"),
+        ({"axis": []}, "axis: is empty; give a table"),
+        ({"plant": None}, 'B0 = "plant": there is no plant'),
+        ({"metrics": [{"target": 1.0}]}, "metrics.0..target: unknown"),
+    ],
+)
+def test_a_mistake_is_named(change: dict[str, Any], message: str) -> None:
+    """One line with the file, the path of the key and the rule."""
+    with pytest.raises(SetupError, match=f"^a.toml: .*{message}"):
+        made_axes("a.toml", gantry(**change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"observer": {"kind": "model-free", "order": 2, "omega_o": 9.0, "b0": 2.0}}, r"axis\[1\].observer.b0: is 1 for an axis"),
+        ({"observer": {"kind": "model-free", "order": 2, "omega_0": 9.0}}, r"axis\[1\].observer.omega_0: unknown; did you mean omega_o"),
+        ({"controller": {"omega_c": 8.0, "u_max": 3.0}}, r"axis\[1\].controller.u_max: belongs into \[axes\]"),
+        ({"controller": {"omega_c": -8.0}}, r"axis\[1\].controller.omega_c"),
+        ({"learner": "kalmann"}, r"axis\[1\].learner.kind = 'kalmann': unknown; did you mean kalman"),
+        ({"guard": {"bund": 1.0}}, r"axis\[1\].guard.bund: unknown; did you mean bound"),
+        ({"reference": {"kind": "stepp"}}, r"axis\[1\].reference.kind = 'stepp'"),
+        ({"name": "x"}, "axis: names x, x must be different"),
+        ({"name": "a.b"}, "axes: name 'a.b' must be a text without a dot"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_an_axis_is_named(change: dict[str, Any], message: str) -> None:
+    """With the number of the axis."""
+    data = gantry()
+    data["axis"][1] |= change
+    with pytest.raises(SetupError, match=f"^a.toml: .*{message}"):
+        made_axes("a.toml", data)
+
+
+def test_one_axis_is_not_several() -> None:
+    """``load`` and ``made`` refuse a file of several axes, and a plant with several signals, and say what to use."""
+    with pytest.raises(SetupError, match="gantry.toml: NOT for several axes yet: .*load_axes"):
+        made("gantry.toml", gantry())
+    with pytest.raises(SetupError, match="arm.toml: NOT for several axes yet"):
+        load(EXAMPLES / "arm.toml")
+    single = "dt = 0.01\nplant = 'arm'\ncontroller = {kind = 'pid', kp = 1.0}"
+    with pytest.raises(SetupError, match=r"plant.kind = 'arm'.* a setup with a table \[\[axis\]\]"):
+        made("a.toml", tomllib.loads(single))
+    with pytest.raises(SetupError, match="axis: missing"):
+        made_axes("a.toml", {"dt": 0.01})
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("tune", "gantry.toml", "--no-figures"),
+        ("sweep", "gantry.toml"),
+        ("run-rig", "gantry.toml"),
+        ("replay", "run.csv", "--setup", "gantry.toml"),
+        ("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu"),
+        ("compare", "gantry.toml"),
+        ("studio", "gantry.toml", "--no-browser"),
+        ("proxy", "gantry.toml", "--host", "udp://127.0.0.1:0"),
+        ("b0", "run.csv", "--loop", "gantry.toml"),
+    ],
+)
+def test_a_command_of_one_axis_says_so(
+    quell: Callable[..., Shown], tmp_path: Path, arguments: tuple[str, ...]
+) -> None:
+    """In a line with NOT, with the exit code of a wrong input; no file is written."""
+    (tmp_path / "gantry.toml").write_text(GANTRY, encoding="utf-8")
+    t = np.arange(50) * 1e-3
+    np.savetxt(
+        tmp_path / "run.csv", np.column_stack([t, t, t]), delimiter=",", header="t,u,y", comments=""
+    )
+    shown = quell(*arguments)
+    assert shown.code == 2
+    assert "gantry.toml: NOT for several axes yet" in shown.err
+    assert {path.name for path in tmp_path.iterdir()} == {"gantry.toml", "run.csv"}
+
+
+def test_the_controller_of_several_axes_is_exported_to_c(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """``quell export`` takes its file; what C of several axes cannot have is refused by its name."""
+    (tmp_path / "gantry.toml").write_text(GANTRY, encoding="utf-8")
+    shown = quell("export", "gantry.toml", "--out", "c", "--name", "gantry")
+    assert shown.code == 0, shown.err
+    header = (tmp_path / "c" / "src" / "gantry.h").read_text()
+    assert "gantry_step" in header
+    single = quell("export", "gantry.toml", "--out", "d", "--precision", "single")
+    assert single.code == 2
+    assert "NOT compared with double precision" in single.err
+    assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.compiled
+def test_the_command_simulates_several_axes(quell: Callable[..., Shown], tmp_path: Path) -> None:
+    """Metrics of each axis, figure, record and JSON; the record is read back with its names."""
+    (tmp_path / "gantry.toml").write_text(GANTRY, encoding="utf-8")
+    shown = quell("run", "gantry.toml", "--json", "out.json", "--save", "run.nc", "--figures", "f")
+    assert shown.code == 0, shown.err
+    assert "gantry: x, dt = 0.001 s" in shown.out
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert told["metrics"]["x"][0]["rms"] > told["metrics"]["y"][0]["rms"] > 0.0
+    assert (tmp_path / "f" / "gantry.png").exists()
+    run = ql.AxesTrajectory.load(tmp_path / "run.nc")
+    assert run.axis_names == ("x", "y")
+    assert run["u"].shape == (501, 2)
+    (tmp_path / "late.toml").write_text(
+        GANTRY.replace("start = 0.1", "start = 0.7"), encoding="utf-8"
+    )
+    late = quell("run", "late.toml")
+    assert late.code == 2
+    assert "metrics[0].start = 0.7: must be less than the scenario's duration" in late.err
