@@ -253,13 +253,31 @@ CASES        {
 """
 
 
+def words_of_type(source: CSource, seed: int) -> dict[str, str]:
+    """Return what stands for the words of the program that depend on name and precision."""
+    name, single = source.name, source.precision == "single"
+    return {
+        "NAME": name,
+        "REAL_MAX": "FLT_MAX" if single else "DBL_MAX",
+        "REAL_MIN": "FLT_MIN" if single else "DBL_MIN",
+        "REAL": source.real,
+        "BITS": "uint32_t" if single else "uint64_t",
+        "EXPONENT": "0x7f800000u" if single else "UINT64_C(0x7ff0000000000000)",
+        "LARGEST": "1e12f" if single else "1e60",
+        "DIGITS": "60.0" if single else "300.0",
+        "MEMORY_SIZE": f"{name.upper()}_MEMORY_SIZE",
+        "SAMPLE_TIME": f"{name.upper()}_SAMPLE_TIME",
+        "SEED": f"UINT64_C({0x9E3779B97F4A7C15 + seed})",
+    }
+
+
 def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
     """Return a program in C that calls all functions of an exported controller by chance.
 
     It takes the number of calls as its argument, prints how often u was no number and how often it
     was beyond its limits, and a hash of all u and flags. It ends with 0 if both numbers are 0.
     """
-    name, real, path = source.name, source.real, limits_path(controller)
+    name, path = source.name, limits_path(controller)
     single = source.precision == "single"
     drawn = ", hostile()" * source.derivatives
     unknown = set(source.operations) - {*CALLS, "init", "retune"}
@@ -324,17 +342,7 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
     ]
     words = {
         "OTHER": "\n    ".join(others),
-        "NAME": name,
-        "REAL_MAX": "FLT_MAX" if single else "DBL_MAX",
-        "REAL_MIN": "FLT_MIN" if single else "DBL_MIN",
-        "REAL": real,
-        "BITS": "uint32_t" if single else "uint64_t",
-        "EXPONENT": "0x7f800000u" if single else "UINT64_C(0x7ff0000000000000)",
-        "LARGEST": "1e12f" if single else "1e60",
-        "DIGITS": "60.0" if single else "300.0",
-        "MEMORY_SIZE": f"{name.upper()}_MEMORY_SIZE",
-        "SAMPLE_TIME": f"{name.upper()}_SAMPLE_TIME",
-        "SEED": f"UINT64_C({0x9E3779B97F4A7C15 + seed})",
+        **words_of_type(source, seed),
         "LIMITS_CHECK": f"beyond += u < state->parameters->{path}.low || "
         f"u > state->parameters->{path}.high;" if path else "(void)beyond;",
         "NARROWER": f"narrower.{path}.high = {narrower};" if narrower else "",
@@ -362,9 +370,13 @@ def built(
     folder: Path, controller: Any, source: CSource, seed: int = 1, sanitizer: str = "address"
 ) -> Path:
     """Compile the hostile program of a controller with a sanitizer; return the program."""
+    return compiled(folder, source, hostile_program(controller, source, seed), sanitizer)
+
+
+def compiled(folder: Path, source: CSource, program: str, sanitizer: str) -> Path:
+    """Compile a program around exported code with a sanitizer; return the program."""
     (folder / f"{source.name}.h").write_text(source.header, encoding="utf-8")
     (folder / f"{source.name}.c").write_text(source.source, encoding="utf-8")
-    program = hostile_program(controller, source, seed)
     (folder / "hostile.c").write_text(program, encoding="utf-8")
     command = [
         *SANITIZERS[sanitizer],

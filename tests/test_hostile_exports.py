@@ -55,6 +55,23 @@ def test_any_calls_with_any_bits_leave_u_a_number_within_its_limits(
     assert hostile.run(hostile.built(tmp_path, shown, source), 2e5) == ("0", "0", "0")
 
 
+@needs_gcc
+@pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
+def test_any_calls_of_axes_leave_all_u_numbers_within_their_limits(
+    tmp_path: Path, hostile: Any, single: bool
+) -> None:
+    """Two axes with a learner and three actuators."""
+    axes, observer = benchmark("hostile_axes"), ql.ESO.model_free(2, 1.0, 30.0, 0.01)
+    learning = ql.ADRC(observer, 5.0, learner=ql.learners.RLS(), guard=ql.Guard())
+    wide, limits = [[1.0, 0.3, 0.2], [0.2, 1.0, -0.3]], {"u_min": -5.0, "u_max": 5.0}
+    rule = "direction" if single else "each"
+    controller = ql.Axes([learning, ql.ADRC(observer, 5.0)], wide, saturation=rule, **limits)
+    source = axes.source_of_axes(controller, "robot", single)
+    program = axes.hostile_program(source, 1)
+    made = hostile.compiled(tmp_path, source, program, "address")
+    assert hostile.run(made, 1e5) == ("0", "0", "0")
+
+
 WRONG = [
     pytest.param({"        applied = limits->high;\n": ""}, ("0", "0", 1), id="no upper limit"),
     pytest.param({

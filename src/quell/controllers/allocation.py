@@ -232,14 +232,14 @@ def range_memory(n: int, m: int) -> RangeMemory:
 class CutEach(NamedTuple):
     """Each actuator is cut by itself."""
 
-    wished: Vector  # u_r (m,)
+    wished: Vector  # u_r (m,), empty for as many actuators as axes: zero
     weights: Vector  # (m,)
 
 
 class KeepDirection(NamedTuple):
     """All actuators are scaled together."""
 
-    wished: Vector
+    wished: Vector  # as for CutEach
 
 
 class ByPriority(NamedTuple):
@@ -281,10 +281,10 @@ def _wish(memory: GainMemory, wished: Vector, v: Vector, rest: Vector, u: Vector
     n, m = memory.B.shape
     for i in range(n):
         rest[i] = v[i]
-        for k in range(m):
+        for k in range(wished.size):
             rest[i] -= memory.B[i, k] * wished[k]
     for k in range(m):
-        u[k] = wished[k]
+        u[k] = wished[k] if wished.size > 0 else 0.0
         for i in range(n):
             u[k] += memory.inverse[k, i] * rest[i]
 
@@ -481,7 +481,7 @@ def _keep_direction(
         if not is_finite(wish):
             wish = 0.0
             flags |= _OVERFLOWED
-        u[k], _ = _cut(memory, limits, k, rule.wished[k])
+        u[k], _ = _cut(memory, limits, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
         memory.step[k] = wish - u[k]
     return flags | _go(memory, limits, u)
 
@@ -499,7 +499,7 @@ def _by_priority(
     n, m = gain.B.shape
     set_range(limits, before, memory)
     for k in range(m):
-        u[k], _ = _cut(memory, limits, k, rule.wished[k])
+        u[k], _ = _cut(memory, limits, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
     flags = 0
     for i in range(n):
         memory.rest[i] = v[i]
@@ -698,7 +698,8 @@ def checked_rule(
 ) -> CutEach | KeepDirection | ByPriority:
     """Return what is done with u outside of its limits."""
     count = gain.shape[1]
-    point = np.zeros(count) if wished is None else checks.vector("wished", wished, count)
+    none = np.zeros(count if count > gain.shape[0] else 0)
+    point = none if wished is None else checks.vector("wished", wished, count)
     if wished is not None and count == gain.shape[0]:
         raise ValueError(
             f"wished = {wished!r}: there are as many actuators as axes, so u has no freedom for "

@@ -129,7 +129,8 @@ def c_source(
     ----------
     controller
         any controller whose kernels are compiled; its parameters and its state before the first
-        sample are written. One of ``controllers.in_single_precision`` becomes code in ``float``.
+        sample are written. One of ``controllers.in_single_precision`` becomes code in ``float``,
+        ``quell.Axes`` code in ``double`` whose functions take arrays.
     name
         begins all public names.
     resolution

@@ -616,7 +616,8 @@ def c(
     ----------
     controller
         any controller that does not call Python; its parameters and its state before the first
-        sample are written.
+        sample are written. Of several axes, ``quell.Axes``, the functions take arrays
+        (docs/axes).
     folder
         where to write; must be new or empty.
     name
