@@ -17,7 +17,7 @@ from quell.controllers import baselines as baseline_room
 from quell.controllers.single import in_single_precision
 
 from .examples import LEARNERS, OBSERVERS, PLANTS
-from .test_controllers import CONTROLLERS
+from .test_controllers import CONTROLLERS, SEVERAL
 
 _DEAD_TIME = controller_room.dead_time_tuning(2.0, 1.0, 0.25)
 OTHERS: dict[str, Any] = {
@@ -47,6 +47,9 @@ OTHERS: dict[str, Any] = {
         [[-1.25]], [[2.0, 3.0]], [[1.0]]
     ),
     "Axes": ql.Axes({"x": ql.ADRC(ql.ESO.model_free(2, 1.0, 12.0, 0.01), 1.75)}, [[2.25]]),
+    "StateFeedback": SEVERAL["StateFeedback"],
+    "MultivariableESO": SEVERAL["StateFeedback"].observer,
+    "Estimator": SEVERAL["StateFeedback"].observer.estimator(),
 }
 EXAMPLES: dict[str, Any] = {
     f"{type(thing).__name__}: {name}": thing
@@ -54,9 +57,9 @@ EXAMPLES: dict[str, Any] = {
     for name, thing in part.items()
 }
 ROOMS = (controller_room, baseline_room, observer_room, plant_room, learner_room)
-# Interfaces; an estimate belongs to a running loop, and an FMU and models of other libraries to
+# Interfaces; an estimate and a regulator's matrices belong to a running loop, and an FMU and models of other libraries to
 # files and packages that are not here.
-_WITHOUT = {"Estimate", "FMU", "GainEstimate", "JaxModel", "TorchModel"}
+_WITHOUT = {"Estimate", "FMU", "GainEstimate", "JaxModel", "Regulator", "TorchModel"}
 
 
 def public_classes() -> set[str]:
