@@ -213,6 +213,10 @@ class TestChannels:
         (lambda: ql.plants.delayed_inputs(ql.plants.two_mass_spring(), 0.1, 0.01),
          "has one control signal and one output; must be a plant with several"),
         (lambda: ql.plants.encoded_outputs(ql.plants.arm(), -1.0), "must not be negative"),
+        (lambda: ql.plants.delayed(ql.plants.arm(), 0.1, 0.01), "several: .*delayed_inputs"),
+        (lambda: ql.plants.encoded(ql.plants.arm(), 1024), "several: .*encoded_outputs"),
+        (lambda: ql.tune(ql.plants.arm(), 0.01),
+         "2 control signals and 2 outputs, here there is one of each"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_named(wrong, message: str) -> None:  # type: ignore[no-untyped-def]

@@ -142,6 +142,11 @@ class TestOperation:
         (lambda: ql.simulate(drive(), controller(), ql.Scenario((1.0, 2.0))),
          "reference has 2 signals"),
         (lambda: controller().memory(), "learns nothing"),
+        (lambda: ql.export.c_source(controller()), "NOT written as C yet"),
+        (lambda: ql.export.c(controller(), "firmware"), "NOT written as C yet"),
+        (lambda: ql.export.fmu(controller(), "law.fmu"), "NOT written as C yet"),
+        (lambda: ql.controllers.in_single_precision(controller()), "double precision only"),
+        (lambda: ql.analysis.analyse(drive(), controller()), "1 inputs and 2 outputs, here there is one of each; several: quell.plants"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_named(wrong, message: str) -> None:  # type: ignore[no-untyped-def]

@@ -274,7 +274,8 @@ PARTS: dict[str, Part] = {
     "ProfileGenerator": Part(room.ProfileGenerator, _shaped, {"v_max": 0.5, "a_max": 2.0, "j_max": 5.0}, {"v_max": 0.4, "a_max": 1.0, "j_max": 4.0}),
 }  # fmt: skip
 # Public classes that are no part of a controller: protocols and base classes, values that parts
-# return, sums of features (the rows of learners), and learners that call Python, which are refused.
+# return, sums of features (the rows of learners), learners that call Python and state feedback, which
+# are refused.
 NO_PARTS = {
     "Controller",
     "DeadTimeTuning",
@@ -288,6 +289,8 @@ NO_PARTS = {
     "Notch",
     "PidEqual",
     "Prefilter",
+    "Regulator",
+    "StateFeedback",
 }
 IN_PYTHON = {"JaxModel", "PythonModel", "RiverModel", "SklearnModel", "TorchModel"}
 # A function in C, with which Custom code is linked: ``test_export`` and ``test_plants_in_c`` have one.

@@ -159,7 +159,7 @@ def _what(design: Any) -> Any:
     if isinstance(design, AdrcDesign):
         kinds = (type(design.learner).__name__, type(design.guard).__name__)
         return kinds, meaning(design.learner), design.b0, design.cancel, design.cancel_f
-    if hasattr(design, "gain"):  # several axes: what they learn is relative to B0
+    if hasattr(design, "axes"):  # several axes: what they learn is relative to B0
         return type(design).__name__, meaning(design.gain), _what(design.axes)
     inner = tuple(_what(each) for each in _inside(design))
     return type(design).__name__, type(getattr(design, "prefilter", None)).__name__, inner

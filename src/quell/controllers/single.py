@@ -41,6 +41,7 @@ from quell.controllers.linear import LinearLaw, delta_law
 from quell.controllers.memory import Layout, images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper
 from quell.controllers.safe_set import SafeSetDesign
+from quell.controllers.state_space import StateFeedback
 from quell.features.base import CustomDesign
 from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels import dispatch
@@ -265,6 +266,8 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
             "controller = Axes(…): several axes run in Python in double precision only; "
             "quell.export.c(…, precision='single', accept=True) writes their C code in single"
         )
+    if isinstance(controller, StateFeedback):
+        raise ValueError("controller = StateFeedback(…): runs in double precision only")
     return SinglePrecision(controller)
 
 

@@ -25,6 +25,7 @@ from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
 from quell.controllers.linear import LinearDesign, LinearState
 from quell.controllers.memory import Layout
 from quell.controllers.prefilters import PrefilteredDesign, PrefilteredState, settle, stopping_point
+from quell.controllers.state_space import StateFeedback
 from quell.export.image_code import ImageCode
 from quell.export.translate.expressions import implementation_of
 from quell.export.translate.program import Program
@@ -339,6 +340,14 @@ def _struct(kind: Any) -> Struct:
     if not isinstance(kind, Struct):
         raise TypeError
     return kind
+
+
+def refuse_state_feedback(controller: Any) -> None:
+    """Raise a ``TranslationError`` for a controller that is not written as C."""
+    if isinstance(controller, StateFeedback):
+        raise TranslationError(
+            "controller = StateFeedback(…): NOT written as C yet; quell.ADRC and quell.Axes are"
+        )
 
 
 def check_parts(controller: Any) -> None:

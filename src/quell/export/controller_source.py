@@ -28,7 +28,7 @@ from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.single import SinglePrecision
 from quell.export import c_files
 from quell.export.axes_source import source_of_axes
-from quell.export.c_files import CFiles, CSource, check_parts, translated
+from quell.export.c_files import CFiles, CSource, check_parts, refuse_state_feedback, translated
 from quell.export.estimates import enums, estimate_lines, estimate_struct
 from quell.export.translate.structs import Findings
 from quell.export.translate.text import Array, Number, TranslationError, Value
@@ -146,6 +146,7 @@ def c_source(
         resolution, if the controller needs the position itself.
     """
     check_controller(controller)
+    refuse_state_feedback(controller)
     if isinstance(controller, Axes):
         if resolution is not None:
             raise TranslationError(

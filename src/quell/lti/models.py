@@ -104,6 +104,11 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
             raise ValueError(f"plant has {size} outputs and inputs: must have one of each")
         return _transfer_function(plant.num[0][0], plant.den[0][0])
     named = repr(getattr(plant, "name", None) or plant)
+    if hasattr(plant, "sampled") and hasattr(plant, "inputs"):
+        raise ValueError(
+            f"plant = {named} has {plant.inputs} control signals and {plant.outputs} outputs, here "
+            "there is one of each; several: quell.Axes and quell.analysis.analyse_axes"
+        )
     raise ValueError(
         f"plant = {named}: must be a linear plant or control.StateSpace (with A, B, C), matrices "
         "(A, B, C) or (A, B, E, C), a control.TransferFunction, (numerator, denominator) or "
@@ -165,6 +170,14 @@ def check_matrices(A: Any, B: Any, C: Any) -> tuple[Matrix, Matrix, Matrix]:
     A = checks.matrix("A", A)
     n = A.shape[0]
     checks.matrix("A", A, n, n)
+    inputs = np.shape(B)[1] if np.ndim(B) == 2 else 1
+    outputs = np.shape(C)[0] if np.ndim(C) == 2 else 1
+    if max(inputs, outputs) > 1:
+        raise ValueError(
+            f"B has shape {np.shape(B)}, C {np.shape(C)}: {inputs} inputs and {outputs} outputs, "
+            "here there is one of each; several: quell.plants.MultivariableLinearPlant, controlled "
+            "by quell.Axes and judged by quell.analysis.analyse_axes"
+        )
     B = checks.matrix("B", np.reshape(B, (-1, 1)) if np.ndim(B) == 1 else B, n, 1)
     C = checks.matrix("C", np.reshape(C, (1, -1)) if np.ndim(C) == 1 else C, 1, n)
     return A, B, C

@@ -82,6 +82,15 @@ def check_plant(value: Any, name: str = "plant") -> None:
         )
 
 
+def check_one_input(plant: Any, several: str, name: str = "plant") -> None:
+    """Raise a ``ValueError`` for a plant with several signals; ``several`` is what takes those."""
+    if hasattr(plant, "sampled") and hasattr(plant, "inputs"):
+        raise ValueError(
+            f"{name} = {plant.name!r} has {plant.inputs} control signals and {plant.outputs} "
+            f"outputs, here there is one of each; several: {several}"
+        )
+
+
 @generic
 def measure(plant: Any, x: Vector) -> float:
     """Return the output y for the state ``x`` (n,)."""

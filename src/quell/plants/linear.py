@@ -48,6 +48,7 @@ from quell.plants.base import (
     PlantWrapper,
     advance,
     begin_run,
+    check_one_input,
     check_plant,
     check_run,
     measure,
@@ -422,6 +423,7 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     6
     """
     check_plant(plant)
+    check_one_input(plant, "quell.plants.delayed_inputs")
     delay, dt = checks.positive("delay", delay, "s"), checks.positive("dt", dt, "s")
     if type(plant) is not LinearPlant:
         rule = ", for a plant that is not linear; or take a smaller dt"
@@ -523,5 +525,6 @@ def encoded(plant: Plant, counts: int, turn: float = math.tau) -> EncodedPlant:
     0.0003927
     """
     check_plant(plant)
+    check_one_input(plant, "quell.plants.encoded_outputs")
     counts = checks.whole("counts", counts, 1)
     return EncodedPlant(plant, counts, checks.positive("turn", turn, "y-unit"))

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike
 from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
-from quell.export.c_files import plant_source
+from quell.export.c_files import plant_source, refuse_state_feedback
 from quell.export.controller_source import c_source
 from quell.export.fmi.parts import (
     FIXED,
@@ -576,6 +576,7 @@ def _parts(part: Any) -> tuple[Any, Any]:
         plant, controller = part, None
     if controller is not None:
         check_controller(controller)
+        refuse_state_feedback(controller)
     if isinstance(controller, Axes):
         raise TranslationError(
             f"{controller.outputs} axes: an FMU is of one u and one y; write the axes as C by "

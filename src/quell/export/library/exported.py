@@ -27,7 +27,7 @@ from quell.controllers.base import check_controller
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.single import SinglePrecision, in_single_precision
 from quell.export.axes_source import parts_of_axes, source_of_axes
-from quell.export.c_files import CSource
+from quell.export.c_files import CSource, refuse_state_feedback
 from quell.export.controller_source import c_source, in_double_precision, limits_path
 from quell.export.library.axes_vectors import (
     AxesVectors,
@@ -659,6 +659,7 @@ def c(
     ['servo.h', 'servo.c', 'test_servo.c']
     """
     check_controller(controller)
+    refuse_state_feedback(controller)
     if checked_name(name).lower() in _CMAKE_TARGETS.split():
         rule = "is a target of CMake itself, so CMakeLists.txt can't have it; choose another name"
         raise ValueError(f"name = {name!r}: {rule}")
