@@ -85,7 +85,7 @@ def test_a_network_is_what_it_is_for_small_motions() -> None:
         [array.copy() for array in run.final_state.learner.model],
     )
     gain = analysis.frozen(controller, run).gain
-    seen, small = run.final_state.seen, np.array([1e-5, -2e-5, 0.0])
+    seen, small = run.final_state.estimates, np.array([1e-5, -2e-5, 0.0])
     moved = [
         predict(controller.parameters.learner, memory, seen + sign * small, 0.0)[0]
         for sign in (1.0, -1.0)

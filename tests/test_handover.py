@@ -181,7 +181,7 @@ def test_another_nominal_gain_counts_the_u_that_acts() -> None:
     assert abs(acting - state.loop[0].u) > 0.5
     controller.retune(observer=ESO.model_free(2, 1.2, 20.0, DT, delay=0.03))
     assert controller.estimate.f - before == pytest.approx((2.0 - 1.2) * acting, rel=1e-12)
-    assert state.z[2] == pytest.approx(state.seen[2], rel=1e-12)
+    assert state.z[2] == pytest.approx(state.estimates[2], rel=1e-12)
 
 
 def test_a_start_counts_what_a_learner_says_of_u() -> None:
@@ -652,7 +652,7 @@ def test_a_guard_starts_with_no_correction(said: float) -> None:
     controller.start_at([0.5, 0.0], 2.0)
     assert state.loop[0].f_learned == 0.0
     assert controller.estimate.f == pytest.approx(2.0, rel=1e-12)
-    assert state.seen[2] == pytest.approx(2.0, rel=1e-12)
+    assert state.estimates[2] == pytest.approx(2.0, rel=1e-12)
     assert state.guard.sample[0].output == said
 
 

@@ -51,7 +51,7 @@ def test_a_learner_does_not_learn_from_a_measurement_that_is_held() -> None:
     expected = copy.deepcopy(law._state.learner)
     # What the sample does before y comes: the last u has acted.
     loop = law._state.loop[0]
-    commit(law.parameters.learner, expected, law._state.seen, loop.u, loop.f_learned)
+    commit(law.parameters.learner, expected, law._state.estimates, loop.u, loop.f_learned)
     step(law, 0.3, math.nan)
     found = named_arrays(law._state.learner)
     for name, array in named_arrays(expected).items():
@@ -71,7 +71,7 @@ def test_f_is_cancelled_where_it_enters_as_u_does(
     law = ql.ADRC(observer, 3.0, learner=ql.learners.Kalman(u=True))
     state = law._state
     state.loop[0].r = r = 0.7
-    state.seen[:] = seen = rng.normal(size=3)
+    state.estimates[:] = seen = rng.normal(size=3)
     constant, slope = 0.9, 0.4
     if own_channel:  # of degree 1: y' = x̂_2 + b0 u
         wish = (3.0 * (r - seen[0]) - seen[1]) / 1.5
@@ -129,7 +129,7 @@ def test_an_overflow_starts_everything_again_but_u() -> None:
     np.testing.assert_array_equal(state.z, [0.25, 0.0, 0.0])
     loop = state.loop[0]
     assert (loop.offset, loop.constant, loop.slope, loop.f_learned) == (0.0, 0.0, 0.0, 0.0)
-    assert not np.any(state.shadow)
+    assert not np.any(state.lag_state)
     assert not np.any(state.guard.chain)
     assert not np.any(state.learner.chain)
     assert np.isfinite(step(law, 1.0, 0.25))
@@ -147,7 +147,7 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     reset_loop(design, state)
     assert not np.any(state.loop.view(float))
     filters = (state.guard.chain, state.guard.filtered, state.guard.effects, state.learner.chain)
-    for each in (state.shadow, *filters):
+    for each in (state.lag_state, *filters):
         assert not np.any(each)
     assert (guard.output, guard.target, guard.late_effect) == (0.0,) * 3
     assert guard.share == -share

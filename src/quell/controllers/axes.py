@@ -172,7 +172,7 @@ def _ask(
 ) -> int:
     v[i] = control(axes.axis, states.axis, r[i], y[i])
     for j in range(axes.axis.law.size):
-        x[i, j] = states.axis.seen[j]
+        x[i, j] = states.axis.estimates[j]
     flags = status_flags(axes.axis, states.axis)
     return flags | ask_axes(axes.others, states.others, i + 1, r, y, v, x)
 

@@ -157,14 +157,14 @@ def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...
     order = design.law.size
     theta = np.zeros(len(features))
     coefficients(design.learner, state.learner, theta)
-    learned, residual = float(state.loop[0].f_learned), float(state.seen[order])
+    learned, residual = float(state.loop[0].f_learned), float(state.estimates[order])
     guarded: dict[str, Any] = {}
     row = np.zeros(len(GUARD_CHANNELS))
     if write_channels(design.guard, state.guard, row):
         guarded = dict(zip((name for name, _ in GUARD_CHANNELS), row.tolist(), strict=True))
         guarded["reason"] = Reason(int(guarded["reason"]))
     return Estimate(
-        x=state.seen[:order].copy(),
+        x=state.estimates[:order].copy(),
         f=learned + residual,
         f_learned=learned,
         f_residual=residual,
@@ -172,7 +172,7 @@ def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...
         u=float(state.loop[0].u),
         status=Status(int(state.loop[0].status)),
         **guarded,
-        f_derivatives=state.seen[order + 1 :].copy(),
+        f_derivatives=state.estimates[order + 1 :].copy(),
     )
 
 
@@ -192,15 +192,15 @@ def start_at_rest(
     The numbers are in the precision of the state.
     """
     _start_loop(design, state, y, u, r)
-    begin(design.eso, state.z, state.seen, y)
+    begin(design.eso, state.z, state.estimates, y)
     settle_at_rest(design.safe_set, state.safe_set, y, u, samples)
     loop = state.loop[0]
-    model, z, seen = design.eso, state.z, state.seen
+    model, z, estimates = design.eso, state.z, state.estimates
     known = loop.f_learned + loop.f_known
-    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
+    call_specialised(_observe_at_rest, model, z, estimates, y, u, known, samples)
     _feed_forward(design, state, u)
     known = loop.f_learned + loop.f_known
-    call_specialised(_observe_at_rest, model, z, seen, y, u, known, samples)
+    call_specialised(_observe_at_rest, model, z, estimates, y, u, known, samples)
     loop.bumpless = 1.0
 
 
@@ -209,10 +209,10 @@ def start_in_motion(
 ) -> None:
     """Set the state to the estimates ``x`` (n,) and ``f`` (m,) under u, with the reference r."""
     _start_loop(design, state, float(x[0]), u, r)
-    state.seen[:] = np.append(x, f)
+    state.estimates[:] = np.append(x, f)
     _feed_forward(design, state, u)
-    state.seen[x.size] -= state.loop[0].f_learned + state.loop[0].f_known
-    state.z[:] = state_for(design.eso, x, state.seen[x.size :], u)
+    state.estimates[x.size] -= state.loop[0].f_learned + state.loop[0].f_known
+    state.z[:] = state_for(design.eso, x, state.estimates[x.size :], u)
     settle_safe_set(design.safe_set, state.safe_set, x, float(f[0]))
 
 
@@ -227,7 +227,7 @@ def _start_loop(design: AdrcDesign, state: AdrcState, y: float, u: float, r: flo
 def _feed_forward(design: AdrcDesign, state: AdrcState, u: float) -> None:
     """Set the learner's share of f for the estimates in ``state`` under u."""
     loop = state.loop[0]
-    constant, slope = predict(design.learner, state.learner, state.seen, u)
+    constant, slope = predict(design.learner, state.learner, state.estimates, u)
     constant, slope, _ = limit(design.guard, state.guard, 0.0, 0.0, constant, slope, u)
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * u
@@ -246,11 +246,11 @@ def samples_to_settle(observer: ESO) -> int:
 
 @compiled
 def _observe_at_rest(
-    model: Any, z: Vector, seen: Vector, y: float, u: float, f_learned: float, samples: int
+    model: Any, z: Vector, estimates: Vector, y: float, u: float, f_learned: float, samples: int
 ) -> None:
     """Update the observer with constant y, u and f_L."""
     for _ in range(samples):
-        observe(model, z, seen, y, u, f_learned)
+        observe(model, z, estimates, y, u, f_learned)
 
 
 @contextmanager
@@ -278,7 +278,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     change = gain_in_use(old.schedule, memory, old.b0) - gain_in_use(new.schedule, memory, new.b0)
     change *= acting
     for i in range(size):
-        change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
+        change += (new.cancel[i] - old.cancel[i]) * state.estimates[i]
     shift_f(new.safe_set, state.safe_set, change)
     # The model's share of f depends on them, too, and is not in the estimate.
     known = known_of_model(
@@ -288,7 +288,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     change -= known - loop.f_known
     loop.f_known = known
     state.z[size] += change
-    state.seen[size] += change
+    state.estimates[size] += change
     loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)
 
 
@@ -668,11 +668,11 @@ class Compensator(StatefulController):
         design, guard = self.parameters, UnguardedMemory(np.zeros(0))
         state = AdrcState(
             z=np.zeros(self.observer.states),
-            seen=np.zeros(self.observer.estimates),
+            estimates=np.zeros(self.observer.estimates),
             reference=np.zeros(self.derivatives),
             loop=AdrcLoop.zeros(),
             learner=self.learner.memory(design.learner),
-            shadow=lag_memory(design.lag, 1),
+            lag_state=lag_memory(design.lag, 1),
             guard=guard if self.guard is None else self.guard.memory(design.guard),
             watch=LearnerWatch.zeros(),
             safe_set=(

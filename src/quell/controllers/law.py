@@ -300,7 +300,7 @@ class FalFeedback(NamedTuple):
 
 @generic_with_default
 def nonlinear_part(
-    feedback: Any, law: Vector, seen: Vector, r: float, reference: Vector, linear: float
+    feedback: Any, law: Vector, estimates: Vector, r: float, reference: Vector, linear: float
 ) -> float:
     """Return ``linear``, the control law's numerator, with the nonlinear law in place of its sum.
 
@@ -311,14 +311,19 @@ def nonlinear_part(
 
 @nonlinear_part.register(FalFeedback)
 def _fal_part(
-    feedback: FalFeedback, law: Vector, seen: Vector, r: float, reference: Vector, linear: float
+    feedback: FalFeedback,
+    law: Vector,
+    estimates: Vector,
+    r: float,
+    reference: Vector,
+    linear: float,
 ) -> float:
     total = linear
     for i in range(feedback.alpha.size):
         wished = r if i == 0 else 0.0
         if reference.size > 0 and 0 < i <= reference.size:
             wished = reference[i - 1]
-        error, alpha, delta = wished - seen[i], feedback.alpha[i], feedback.delta[i]
+        error, alpha, delta = wished - estimates[i], feedback.alpha[i], feedback.delta[i]
         if abs(error) > delta:
             total += law[i] * (delta ** (1.0 - alpha) * fal(error, alpha, delta) - error)
     return total
@@ -407,7 +412,7 @@ class AdrcLoop(Scalars):
     u: float  # applied control signal
     f_learned: float  # f_L, as the observer receives it
     f_known: float  # f_m, what the model of the feedforward knows of f in this sample
-    f_learned_shown: float  # f_L^F: the share of f_L that Δf̂ lacks at the next sample
+    f_learned_filtered: float  # f_L^F: the share of f_L that Δf̂ lacks at the next sample
     r: float  # last finite reference
     y: float  # last finite measurement, or the one that the observer expected
     started: float  # 1 after the first finite measurement, else 0
@@ -450,11 +455,11 @@ class AdrcState(NamedTuple):
     """State of the controller."""
 
     z: Vector  # state of the observer
-    seen: Vector  # estimates (x̂_1 … x̂_n, Δf̂, Δf̂', …) of the observer (n + m,)
+    estimates: Vector  # estimates (x̂_1 … x̂_n, Δf̂, Δf̂', …) of the observer (n + m,)
     reference: Vector  # r', r'', … as used, zero if they are not given; empty without feedforward
     loop: NDArray[AdrcLoop]  # (1,)
     learner: Any
-    shadow: Matrix  # lag filter of f_L (1, …)
+    lag_state: Matrix  # lag filter of f_L (1, …)
     guard: Any
     watch: NDArray[LearnerWatch]  # (1,)
     safe_set: Any
@@ -464,7 +469,7 @@ class AdrcState(NamedTuple):
 
 @control.register(AdrcDesign)
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
-    loop, seen = state.loop[0], state.seen
+    loop, estimates = state.loop[0], state.estimates
     status = hold_last_good(loop, r, y)
     see(
         design.safe_set, state.safe_set, y,
@@ -473,7 +478,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     f_plain, continues = 0.0, loop.started != 0.0
     u_acting = acting_control(design.eso, state.z, loop.u)
     if loop.started == 0.0:
-        begin(design.eso, state.z, seen, loop.y)
+        begin(design.eso, state.z, estimates, loop.y)
         if status & _MEASUREMENT_HELD != 0:
             loop.u_limited = control_at_rest(design.limits)
             loop.u = loop.u_limited if loop.manual == 0.0 else loop.u_manual
@@ -499,29 +504,29 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
                 loop.y = y
         status |= _estimate(design, state, u_acting, status & _MEASUREMENT_HELD == 0)
         f_plain = (
-            at_nominal(design.schedule, state.schedule, seen[design.law.size])
-            + loop.f_learned_shown
+            at_nominal(design.schedule, state.schedule, estimates[design.law.size])
+            + loop.f_learned_filtered
         )
         if loop.held == 0.0:
             assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
-            show_at_nominal(design.schedule, state.schedule, seen, design.law.size)
-            adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
-            show_at_present(design.schedule, state.schedule, seen, design.law.size)
+            show_at_nominal(design.schedule, state.schedule, estimates, design.law.size)
+            adapt(design.learner, state.learner, estimates, loop.y, u_acting, f_plain)
+            show_at_present(design.schedule, state.schedule, estimates, design.law.size)
             status |= learner_flags(design.learner, state.learner)
     order = design.law.size
     status |= follow_signals(
-        design.schedule, state.schedule, loop, state.z, seen, state.reference, order,
+        design.schedule, state.schedule, loop, state.z, estimates, state.reference, order,
         u_acting, continues, design.safe_set, state.safe_set, design.held, state.held,
     )  # fmt: skip
     loop.f_known = known_of_model(
         design.schedule, state.schedule, design.feedforward, loop.r, state.reference, design.b0,
         known_share(design.feedforward, loop.r, state.reference),
     )  # fmt: skip
-    constant, slope = predict(design.learner, state.learner, seen, u_acting)
+    constant, slope = predict(design.learner, state.learner, estimates, u_acting)
     output = constant + slope * u_acting
     constant, slope, was_cut = limit(
-        design.guard, state.guard, f_plain, loop.f_learned_shown, constant, slope, u_acting
+        design.guard, state.guard, f_plain, loop.f_learned_filtered, constant, slope, u_acting
     )
     if was_cut:
         status |= _LEARNER_CUT
@@ -540,7 +545,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         _forget_learning(design, state)
         clear(state.watch)
         look_anew(design.held, state.held)
-        begin(design.eso, state.z, seen, loop.y)
+        begin(design.eso, state.z, estimates, loop.y)
         constant = slope = loop.offset = 0.0
         unlimited = loop.u
     smallest = _SMALLEST_OFFSET_SINGLE if is_single(design.b0) else _SMALLEST_OFFSET
@@ -581,7 +586,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         if design.forgets and does_harm(
             watch,
             design.window,
-            at_nominal(design.schedule, state.schedule, seen[design.law.size]),
+            at_nominal(design.schedule, state.schedule, estimates[design.law.size]),
             f_plain,
         ):
             lost = True
@@ -595,15 +600,15 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
 @kernel
 def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured: bool) -> int:
     """Update the observer; return the flag of a held plant."""
-    loop, z, seen, order = state.loop[0], state.z, state.seen, design.law.size
-    fed, before = loop.f_learned + loop.f_known, seen[order]
+    loop, z, estimates, order = state.loop[0], state.z, state.estimates, design.law.size
+    fed, before = loop.f_learned + loop.f_known, estimates[order]
     known = known_with_schedule(design.schedule, state.schedule, fed, design.b0, u_acting)
     u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
-    observe(design.eso, z, seen, loop.y, u_observed, known)
-    scheduled_correction(design.schedule, state.schedule, design.eso, z, seen, loop.y)
+    observe(design.eso, z, estimates, loop.y, u_observed, known)
+    scheduled_correction(design.schedule, state.schedule, design.eso, z, estimates, loop.y)
     if loop.held != 0.0:
-        begin_with(design.eso, z, seen, loop.y, order, before)
-        set_motion(design.safe_set, state.safe_set, seen, before + fed)
+        begin_with(design.eso, z, estimates, loop.y, order, before)
+        set_motion(design.safe_set, state.safe_set, estimates, before + fed)
         look_anew(design.held, state.held)
         return _HELD
     if is_measured:
@@ -616,13 +621,13 @@ def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured
             known_with_schedule(design.schedule, state.schedule, fed, design.b0, u_acting),
             residual,
         )  # fmt: skip
-        f = seen[order] + known
+        f = estimates[order] + known
         if is_released(
             design.held, state.held, loop.y,
             control_at_nominal(design.schedule, state.schedule, u_acting), f, loop.slope, design.b0,
         ):  # fmt: skip
-            take_motion(design.held, state.held, z, seen)
-            set_motion(design.safe_set, state.safe_set, seen, seen[order] + fed)
+            take_motion(design.held, state.held, z, estimates)
+            set_motion(design.safe_set, state.safe_set, estimates, estimates[order] + fed)
     else:
         miss(design.held, state.held)
     return held_flag(design.held, state.held)
@@ -635,11 +640,13 @@ def _start_learning_again(design: AdrcDesign, state: AdrcState) -> None:
     If that was out of all proportion, the whole estimate is useless, and the observer begins at y.
     """
     loop, order = state.loop[0], design.law.size
-    if is_in_proportion(state.watch[0], loop.f_learned_shown):
-        state.z[order] += at_present(design.schedule, state.schedule, loop.f_learned_shown)
-        state.seen[order] += at_present(design.schedule, state.schedule, loop.f_learned_shown)
+    if is_in_proportion(state.watch[0], loop.f_learned_filtered):
+        state.z[order] += at_present(design.schedule, state.schedule, loop.f_learned_filtered)
+        state.estimates[order] += at_present(
+            design.schedule, state.schedule, loop.f_learned_filtered
+        )
     else:
-        begin(design.eso, state.z, state.seen, loop.y)
+        begin(design.eso, state.z, state.estimates, loop.y)
     loop.constant = loop.slope = loop.f_learned = 0.0
     _forget_learning(design, state)
 
@@ -663,8 +670,8 @@ def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> Non
     if loop.slope != 0.0:
         f_learned = nearest_permitted(design.guard, state.guard, f_learned)
     loop.f_learned = at_present(design.schedule, state.schedule, f_learned)
-    loop.f_learned_shown = lag_push(design.lag, state.shadow, 0, f_learned)
-    commit(design.learner, state.learner, state.seen, u_acting, f_learned)
+    loop.f_learned_filtered = lag_push(design.lag, state.lag_state, 0, f_learned)
+    commit(design.learner, state.learner, state.estimates, u_acting, f_learned)
     record_output(design.guard, state.guard, f_learned)
 
 
@@ -672,25 +679,25 @@ def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> Non
 def reset_lag_filters(design: AdrcDesign, state: AdrcState) -> None:
     """Set the lag filters of f_L and of the guard to zero."""
     reset_filters(design.guard, state.guard)
-    state.loop[0].f_learned_shown = 0.0
-    reset_lag(state.shadow)
+    state.loop[0].f_learned_filtered = 0.0
+    reset_lag(state.lag_state)
 
 
 @kernel
 def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
     """Return the control signal before limits for ``f_L = constant + slope · u``."""
-    seen, reference, order = state.seen, state.reference, design.law.size
+    estimates, reference, order = state.estimates, state.reference, design.law.size
     r = state.loop[0].r
     unlimited = reference_part(design.feedforward, design.law, r, reference)
     for i in range(order):
-        unlimited += (design.cancel[i] - design.law[i]) * seen[i]
+        unlimited += (design.cancel[i] - design.law[i]) * estimates[i]
     unlimited -= design.cancel_f * (
-        seen[order] + at_present(design.schedule, state.schedule, constant)
+        estimates[order] + at_present(design.schedule, state.schedule, constant)
     )
-    unlimited = nonlinear_part(design.feedback, design.law, seen, r, reference, unlimited)
+    unlimited = nonlinear_part(design.feedback, design.law, estimates, r, reference, unlimited)
     schedule, memory = design.schedule, state.schedule
     unlimited = scheduled_law(
-        schedule, memory, design.feedforward, seen, r, reference, design.b0, unlimited
+        schedule, memory, design.feedforward, estimates, r, reference, design.b0, unlimited
     )
     return unlimited / (
         gain_in_use(schedule, memory, design.b0)
@@ -728,12 +735,12 @@ def _set_held(design: AdrcDesign, state: AdrcState, held: bool) -> None:
 def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
     order = design.law.size
     for i in range(order + 1):
-        row[i] = state.seen[i]
+        row[i] = state.estimates[i]
     row[order + 1] = state.loop[0].f_learned
     row[order + 2] = state.loop[0].status
-    after = state.seen.size + 2
-    for i in range(order + 1, state.seen.size):
-        row[i + 2] = state.seen[i]
+    after = state.estimates.size + 2
+    for i in range(order + 1, state.estimates.size):
+        row[i + 2] = state.estimates[i]
     r, reference = state.loop[0].r, state.reference
     forward = write_feedforward(design.feedforward, r, reference, row[after:])
     show_feedforward(design.schedule, state.schedule, design.feedforward, r, reference, row[after:])

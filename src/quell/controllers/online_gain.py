@@ -157,7 +157,7 @@ def _moves(design: OnlineDesign, own: Any, energy: float) -> bool:
 
 @follow_signals.register(OnlineDesign)
 def _follow(
-    design: OnlineDesign, memory: OnlineMemory, loop: Any, z: Vector, seen: Vector,
+    design: OnlineDesign, memory: OnlineMemory, loop: Any, z: Vector, estimates: Vector,
     reference: Vector, at_f: int, u: float, continues: bool, safe_set: Any, set_memory: Any,
     held: Any, held_memory: Any,
 ) -> int:  # fmt: skip
@@ -209,7 +209,7 @@ def _follow(
         b0 = min(max(own.estimate, design.low), design.high)
         change = (own.b0 - b0) * u
         z[at_f] += change
-        seen[at_f] += change
+        estimates[at_f] += change
         own.b0 = b0
     return 0
 

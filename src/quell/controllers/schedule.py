@@ -205,12 +205,12 @@ def at_present(design: Any, memory: Any, g: float) -> float:
 
 
 @generic_with_default
-def show_at_nominal(design: Any, memory: Any, seen: Vector, at_f: int) -> None:
-    """Convert Δf̂ and its derivatives in ``seen`` to those for the observer's b0."""
+def show_at_nominal(design: Any, memory: Any, estimates: Vector, at_f: int) -> None:
+    """Convert Δf̂ and its derivatives in ``estimates`` to those for the observer's b0."""
 
 
 @generic_with_default
-def show_at_present(design: Any, memory: Any, seen: Vector, at_f: int) -> None:
+def show_at_present(design: Any, memory: Any, estimates: Vector, at_f: int) -> None:
     """Undo ``show_at_nominal``."""
 
 
@@ -262,7 +262,7 @@ def known_with_schedule(design: Any, memory: Any, known: float, b0: float, u: fl
 
 @generic_with_default
 def scheduled_law(
-    design: Any, memory: Any, feedforward: Any, seen: Vector, r: float, reference: Vector,
+    design: Any, memory: Any, feedforward: Any, estimates: Vector, r: float, reference: Vector,
     b0: float, total: float,
 ) -> float:  # fmt: skip
     """Return the law's numerator ``total`` with what the schedule adds to gains and feedforward."""
@@ -271,14 +271,14 @@ def scheduled_law(
 
 @generic_with_default
 def scheduled_correction(
-    design: Any, memory: Any, eso: Any, z: Vector, seen: Vector, y: float
+    design: Any, memory: Any, eso: Any, z: Vector, estimates: Vector, y: float
 ) -> None:
     """Add to the observer's correction what the schedule adds to its gains."""
 
 
 @generic_with_default
 def follow_signals(
-    design: Any, memory: Any, loop: Any, z: Vector, seen: Vector, reference: Vector, at_f: int,
+    design: Any, memory: Any, loop: Any, z: Vector, estimates: Vector, reference: Vector, at_f: int,
     u: float, continues: bool, safe_set: Any, set_memory: Any, held: Any, held_memory: Any,
 ) -> int:  # fmt: skip
     """Take the signals of a sample, without a jump of u; return the status flags.
@@ -340,19 +340,19 @@ def _at_present(design: ScheduleDesign, memory: ScheduleMemory, g: float) -> flo
 
 @show_at_nominal.register(ScheduleDesign)
 def _show_at_nominal(
-    design: ScheduleDesign, memory: ScheduleMemory, seen: Vector, at_f: int
+    design: ScheduleDesign, memory: ScheduleMemory, estimates: Vector, at_f: int
 ) -> None:
     for i in range(design.extended):
-        memory.residual[i] = seen[at_f + i]
-        seen[at_f + i] = at_nominal(design, memory, seen[at_f + i])
+        memory.residual[i] = estimates[at_f + i]
+        estimates[at_f + i] = at_nominal(design, memory, estimates[at_f + i])
 
 
 @show_at_present.register(ScheduleDesign)
 def _show_at_present(
-    design: ScheduleDesign, memory: ScheduleMemory, seen: Vector, at_f: int
+    design: ScheduleDesign, memory: ScheduleMemory, estimates: Vector, at_f: int
 ) -> None:
     for i in range(design.extended):
-        seen[at_f + i] = memory.residual[i]
+        estimates[at_f + i] = memory.residual[i]
 
 
 @known_with_schedule.register(ScheduleDesign)
@@ -387,11 +387,11 @@ def _show_feedforward(
 
 @scheduled_law.register(ScheduleDesign)
 def _scheduled_law(
-    design: ScheduleDesign, memory: ScheduleMemory, feedforward: Any, seen: Vector, r: float,
+    design: ScheduleDesign, memory: ScheduleMemory, feedforward: Any, estimates: Vector, r: float,
     reference: Vector, b0: float, total: float,
 ) -> float:  # fmt: skip
     for i in range(design.law):
-        total += memory.values[i] * (_wished(reference, r, i) - seen[i])
+        total += memory.values[i] * (_wished(reference, r, i) - estimates[i])
     if design.fixed.size > 0:
         fixed = fixed_control(feedforward, design.fixed, r, reference, False)
         total += (memory.loop[0].b0 - b0) * fixed
@@ -408,43 +408,43 @@ def _wished(reference: Vector, r: float, i: int) -> float:
 
 
 @generic_with_default
-def add_to_state(eso: Any, z: Vector, seen: Vector, i: int, change: float) -> None:
+def add_to_state(eso: Any, z: Vector, estimates: Vector, i: int, change: float) -> None:
     """Add a correction of this sample to a state and to its estimate."""
     z[i] += change
     if not eso.predictor:
-        seen[i] += change
+        estimates[i] += change
 
 
 @add_to_state.register(DeltaModel)
-def _add_with_carry(eso: DeltaModel, z: Vector, seen: Vector, i: int, change: float) -> None:
-    add_with_carry(z, seen.size, i, z[seen.size + i] + change)
+def _add_with_carry(eso: DeltaModel, z: Vector, estimates: Vector, i: int, change: float) -> None:
+    add_with_carry(z, estimates.size, i, z[estimates.size + i] + change)
     if not eso.predictor:
-        seen[i] = z[i]
+        estimates[i] = z[i]
 
 
 @add_to_state.register(DelayedModel)
-def _add_to_inner(eso: DelayedModel, z: Vector, seen: Vector, i: int, change: float) -> None:
-    add_to_state(eso.inner, z, seen, i, change)
+def _add_to_inner(eso: DelayedModel, z: Vector, estimates: Vector, i: int, change: float) -> None:
+    add_to_state(eso.inner, z, estimates, i, change)
 
 
 @scheduled_correction.register(ScheduleDesign)
 def _correct(
-    design: ScheduleDesign, memory: ScheduleMemory, eso: Any, z: Vector, seen: Vector, y: float
+    design: ScheduleDesign, memory: ScheduleMemory, eso: Any, z: Vector, estimates: Vector, y: float
 ) -> None:
-    error = y - seen[0]
+    error = y - estimates[0]
     for i in range(design.gains):
-        add_to_state(eso, z, seen, i, memory.values[design.law + i] * error)
+        add_to_state(eso, z, estimates, i, memory.values[design.law + i] * error)
 
 
 @kernel
-def _signal(axis: Axis, memory: ScheduleMemory, loop: Any, seen: Vector) -> float:
+def _signal(axis: Axis, memory: ScheduleMemory, loop: Any, estimates: Vector) -> float:
     """Return the value of a signal in this sample."""
     if axis.signal == _REFERENCE:
         return loop.r
     if axis.signal == _Y:
         return loop.y
     if axis.signal == _SPEED:
-        return seen[1]
+        return estimates[1]
     return memory.given[axis.given] if memory.usable[axis.given] != 0.0 else math.inf
 
 
@@ -479,19 +479,19 @@ def _place(axis: Axis, own: Any, given: float, is_known: bool) -> tuple[int, flo
 
 
 @generic_with_default
-def _is_second_missing(second: Any, memory: ScheduleMemory, loop: Any, seen: Vector) -> bool:
+def _is_second_missing(second: Any, memory: ScheduleMemory, loop: Any, estimates: Vector) -> bool:
     """Return whether a second signal is not usable."""
     return False
 
 
 @_is_second_missing.register(Axis)
-def _is_missing_too(second: Axis, memory: ScheduleMemory, loop: Any, seen: Vector) -> bool:
-    return _is_missing(second, _signal(second, memory, loop, seen))
+def _is_missing_too(second: Axis, memory: ScheduleMemory, loop: Any, estimates: Vector) -> bool:
+    return _is_missing(second, _signal(second, memory, loop, estimates))
 
 
 @generic_with_default
 def _place_second(
-    second: Any, memory: ScheduleMemory, loop: Any, seen: Vector
+    second: Any, memory: ScheduleMemory, loop: Any, estimates: Vector
 ) -> tuple[int, float, int]:
     """Return cell, weight and status flags of a second signal."""
     return 0, 0.0, 0
@@ -499,9 +499,9 @@ def _place_second(
 
 @_place_second.register(Axis)
 def _place_in_second(
-    second: Axis, memory: ScheduleMemory, loop: Any, seen: Vector
+    second: Axis, memory: ScheduleMemory, loop: Any, estimates: Vector
 ) -> tuple[int, float, int]:
-    value, is_known = _signal(second, memory, loop, seen), memory.loop[0].found != 0.0
+    value, is_known = _signal(second, memory, loop, estimates), memory.loop[0].found != 0.0
     cell, weight, status = _place(second, memory.second[0], value, is_known)
     return cell, weight, status
 
@@ -529,36 +529,36 @@ def _bilinear(
 
 @follow_signals.register(ScheduleDesign)
 def _follow(
-    design: ScheduleDesign, memory: ScheduleMemory, loop: Any, z: Vector, seen: Vector,
+    design: ScheduleDesign, memory: ScheduleMemory, loop: Any, z: Vector, estimates: Vector,
     reference: Vector, at_f: int, u: float, continues: bool, safe_set: Any, set_memory: Any,
     held: Any, held_memory: Any,
 ) -> int:  # fmt: skip
     own, second, table = memory.loop[0], design.second, design.table
-    given, is_known = _signal(design.first, memory, loop, seen), own.found != 0.0
+    given, is_known = _signal(design.first, memory, loop, estimates), own.found != 0.0
     if not is_known and (
-        _is_missing(design.first, given) or _is_second_missing(second, memory, loop, seen)
+        _is_missing(design.first, given) or _is_second_missing(second, memory, loop, estimates)
     ):
         return _SCHEDULE_HELD
     row, weight, status = _place(design.first, memory.first[0], given, is_known)
-    column, other, more = _place_second(second, memory, loop, seen)
+    column, other, more = _place_second(second, memory, loop, estimates)
     own.found = 1.0
     if design.has_b0:
         b0 = 1.0 / _blended(second, table, row, column, weight, other, 0)
         ratio, model = b0 / own.b0, 0.0
         own.b0 = b0
         for i in range(design.cancel.size):
-            model += design.cancel[i] * seen[i]
-        for i in range(at_f, seen.size):
-            change = (ratio - 1.0) * (seen[i] - model)
+            model += design.cancel[i] * estimates[i]
+        for i in range(at_f, estimates.size):
+            change = (ratio - 1.0) * (estimates[i] - model)
             z[i] += change
-            seen[i] += change
+            estimates[i] += change
             model = 0.0
         scale_f(safe_set, set_memory, ratio)
         scale_loads(held, held_memory, ratio)
     jump = 0.0  # of the law's numerator
     for i in range(design.law):
         value = _blended(second, table, row, column, weight, other, 1 + i)
-        jump += (memory.values[i] - value) * (_wished(reference, loop.r, i) - seen[i])
+        jump += (memory.values[i] - value) * (_wished(reference, loop.r, i) - estimates[i])
         memory.values[i] = value
     if design.law > 0 and continues:
         loop.offset += jump / own.b0

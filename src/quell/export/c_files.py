@@ -663,7 +663,7 @@ def move_origin(design: Any, state: Any, distance: float) -> None:
 def _move_origin(design: AdrcDesign, state: AdrcState, distance: float) -> None:
     loop = state.loop[0]
     state.z[0] -= distance
-    state.seen[0] -= distance
+    state.estimates[0] -= distance
     loop.y -= distance
     loop.r -= distance
 
