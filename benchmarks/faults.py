@@ -46,7 +46,8 @@ from fault_relay import WIRES, relay, rig_url
 import quell as ql
 from quell.files import nonfinite_to_none, write_json
 from quell.realtime import LiveSink, open_device, run_rig
-from quell.realtime.rig import KINDS, LOG, Fault
+from quell.realtime.relay import KINDS, Fault
+from quell.realtime.rig import LOG
 from quell.realtime.supervisor import Cause
 
 SECONDS = 0.7

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quell.realtime import wire
-from quell.realtime.rig import KINDS, Fault, FaultInjector, Relay, random_faults
+from quell.realtime.relay import KINDS, Fault, FaultInjector, Relay, random_faults
 
 from .rig_bench import DT, Bench, packed
 
