@@ -101,7 +101,7 @@ def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() 
         ),
         (
             lambda: compare.compare(LAG, {"P": 1}, ql.Scenario()),
-            "controller = 1: must be a controller",
+            r"controllers\['P'\] = 1: must be a controller",
         ),
         (
             lambda: compare.controller("pdi", 0.01),

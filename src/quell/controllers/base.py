@@ -49,10 +49,19 @@ class Controller(Protocol):
         """Return the state before the first sample: a NamedTuple of arrays."""
 
 
-def check_controller(value: Any, name: str = "controller") -> None:
-    """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a controller."""
+def check_controller(value: Any, name: str = "controller", *, several: bool = False) -> None:
+    """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a controller.
+
+    It must have one control signal and one output, unless ``several`` are allowed.
+    """
     if isinstance(value, type) or not hasattr(value, "initial_state"):
         raise ValueError(f"{name} = {value!r}: must be a controller, for example quell.ADRC(...)")
+    if not several and hasattr(value, "inputs"):
+        raise ValueError(
+            f"{name} = {type(value).__name__}(…) has {value.inputs} control signals and "
+            f"{value.outputs} outputs: NOT possible here yet, one of each is; quell.simulate, "
+            "quell.analysis.analyse_axes and quell.export.c take several"
+        )
 
 
 @generic

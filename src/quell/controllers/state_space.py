@@ -36,7 +36,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.state_feedback import regulator
+from quell.controllers.feedback_gains import regulator
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Scalars, clear

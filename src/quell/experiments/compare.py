@@ -48,6 +48,7 @@ from quell.controllers import (
     Prefiltered,
     ReferenceModel,
 )
+from quell.controllers.base import check_controller
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
 from quell.controllers.prefilters import without_prefilters
 from quell.experiments.common import Scores, save_figures, step_scores
@@ -365,6 +366,8 @@ def compare(
         raise ValueError(
             f"load_at = {load_at!r}: must lie within (0, duration = {scenario.duration!r})"
         )
+    for name, controller in controllers.items():
+        check_controller(controller, f"controllers[{name!r}]")
     jobs = [
         partial(simulate, plant, controller, scenario, record_every=record_every)
         for controller in controllers.values()

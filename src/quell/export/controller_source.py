@@ -145,7 +145,7 @@ def c_source(
         naming a kernel, or a part of the parameters, that has no counterpart in C; and for a
         resolution, if the controller needs the position itself.
     """
-    check_controller(controller)
+    check_controller(controller, several=True)
     refuse_state_feedback(controller)
     if isinstance(controller, Axes):
         if resolution is not None:

@@ -371,6 +371,12 @@ def simulate(
         ):  # fmt: skip
             if value != usual:
                 raise ValueError(f"{name} = {value!r}: several axes are simulated without it")
+        for name, value in (("plant", plant), ("scenario", scenario)):
+            if checks.is_sequence(value):
+                raise ValueError(
+                    f"{name} has {len(value)} entries: batches of several axes are NOT possible "
+                    "yet; simulate one after the other"
+                )
         check_plant(plant)
         check_scenario(scenario)
         return simulate_axes(plant, controller, scenario, record_every, limit, interpret, progress)

@@ -575,7 +575,7 @@ def _parts(part: Any) -> tuple[Any, Any]:
     else:
         plant, controller = part, None
     if controller is not None:
-        check_controller(controller)
+        check_controller(controller, several=True)
         refuse_state_feedback(controller)
     if isinstance(controller, Axes):
         raise TranslationError(

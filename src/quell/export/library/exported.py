@@ -658,7 +658,7 @@ def c(
     ...     [path.name for path in exported.files[:3]]
     ['servo.h', 'servo.c', 'test_servo.c']
     """
-    check_controller(controller)
+    check_controller(controller, several=True)
     refuse_state_feedback(controller)
     if checked_name(name).lower() in _CMAKE_TARGETS.split():
         rule = "is a target of CMake itself, so CMakeLists.txt can't have it; choose another name"
