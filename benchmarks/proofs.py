@@ -37,7 +37,7 @@ def row_of(name: str, controller: Any, precision: str) -> list[str]:
             done = ql.export.c(
                 controller, folder, name="servo", precision=precision, accept=True, proof=True
             )
-        except TranslationError as error:
+        except (TranslationError, ValueError) as error:  # a learner in Python
             return [name, precision, "refused", "", "", str(error)[:60]]
     proof = done.proof
     assert proof is not None
