@@ -42,6 +42,7 @@ from quell.observers.forms import (
 )
 from quell.plants import registry
 from quell.plants.base import advance, begin_run, measure
+from quell.plants.multivariable import measure_all
 from quell.simulation.driver import run_block
 
 from .examples import (
@@ -106,14 +107,66 @@ def test_every_plant_has_an_example() -> None:
 
     Plants from files are tested in tests/test_fmu.py and tests/test_any_plant.py.
     """
-    no_plants = {"Plant", "PlantBatch", "batch", "labelled", "linearised", "signals_of"}
+    no_plants = {
+        *("Plant", "PlantBatch", "batch", "labelled", "linearised", "signals_of", "rotor_levers")
+    }
     public = {
         inspect.unwrap(getattr(plant_room, name)) for name in set(plant_room.__all__) - no_plants
     }
     classes = {thing for thing in public if isinstance(thing, type)}
-    made = {make for name, make in registry.PLANTS.items() if name not in FROM_FILES}
-    assert public - classes == made - {registry.linear}
-    assert classes <= {type(plant) for plant in PLANTS.values()} | {plant_room.FMU}
+    registered = [*registry.PLANTS.items(), *registry.AXES_PLANTS.items()]
+    made = {make for name, make in registered if name not in FROM_FILES}
+    assert public - classes == made - {registry.linear, registry.multivariable_linear}
+    examples = [*PLANTS.values(), *PLANTS_OF_AXES.values()]
+    assert classes <= {type(plant) for plant in examples} | {plant_room.FMU}
+
+
+# Plants with several control signals.
+PLANTS_OF_AXES: dict[str, Any] = {
+    "arm": plant_room.arm(motor_inertia=0.1, stiffness=(math.inf, 300.0), encoders="both"),
+    "quadrotor attitude": plant_room.quadrotor_attitude(),
+    "linear": plant_room.MultivariableLinearPlant(
+        [[0.0, 1.0], [-2.0, -0.3]], [[0.0, 0.0], [1.0, 0.5]], np.eye(2)
+    ),
+    "nonlinear": plant_room.MultivariableNonlinearPlant(
+        lambda t, x, u, w, a: (u[0] - a * x[0] ** 3, u[1] - x[1] + w[0]),
+        2, 2, np.eye(2), parameters={"a": 2.0},
+    ),
+    "encoded": plant_room.encoded_outputs(plant_room.arm(), 1e-4),
+    "delayed": plant_room.delayed_inputs(plant_room.arm(), [0.02, 0.0], 0.01),
+}  # fmt: skip
+
+
+@compiled
+def move_all(model: Any, x: Any, scratch: Any, u: Any, w: Any, y: Any) -> None:
+    """Move a plant with several signals, with no controller around it."""
+    for k in range(u.shape[0]):
+        measure_all(model, x, y[k])
+        advance(model, x, scratch, 0.01 * k, u[k], w[k])
+
+
+@pytest.mark.slow
+@pytest.mark.compiled
+@pytest.mark.parametrize("name", PLANTS_OF_AXES)
+def test_a_plant_of_several_signals_moves_the_same_again_and_interpreted(name: str) -> None:
+    """Same input, same output, to the last bit; interpreted = compiled, but for rounding."""
+    plant, t = PLANTS_OF_AXES[name], 0.01 * np.arange(100)
+    w = np.repeat(0.3 * (t[:, None] >= 0.5), plant.disturbances, axis=1)
+    u = np.sin(np.outer(t, 3.0 + np.arange(plant.inputs)))
+
+    def moved(interpret: bool) -> Any:
+        model, y = plant.sampled(0.01, interpret), np.empty((t.size, plant.outputs))
+        x, scratch = np.zeros(plant.order), np.zeros(6 * plant.order)
+        begin_run(model, x, scratch)
+        entry = interpreted(move_all) if interpret else partial(call_specialised, move_all)
+        entry(model, x, scratch, u, w, y)
+        return y
+
+    first = moved(False)
+    np.testing.assert_array_equal(moved(False), first)
+    assert np.all(np.isfinite(first))
+    assert np.all(np.any(first != 0.0, axis=0))
+    np.testing.assert_allclose(moved(True), first, rtol=1e-6, atol=1e-7)
 
 
 @compiled
