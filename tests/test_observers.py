@@ -228,7 +228,7 @@ def test_a_mistake_in_a_model_free_design_is_named(change: dict[str, object], me
         (control.ss([[-1.0]], [[1.0]], [[1.0]], [[1.0]]), "D = .*: must be zero"),
         (
             control.ss(np.eye(2), np.eye(2), np.eye(2), 0.0),
-            r"B has shape \(2, 2\): must be a matrix of shape \(2, 1\)",
+            r"B has shape \(2, 2\), C \(2, 2\): 2 inputs and 2 outputs, here there is one of each",
         ),
         (([1.0], 0.0), "b = 0.0: must not be zero"),
         (([-1e12], 1.0), "dt = 0.001 s: too long .* for the plant's fastest pole of 1e[+]12 rad/s"),
