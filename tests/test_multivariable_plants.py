@@ -59,6 +59,30 @@ def test_nonlinear_plant_with_the_same_equations_is_the_linear_one() -> None:
     assert abs(moved(other, *arguments)[0] - moved(linear, *arguments)[0]).max() > 1e-4
 
 
+@pytest.mark.parametrize("force", [0.0, 1.0])
+def test_sub_steps_are_chosen_as_for_one_input(force: float) -> None:
+    """A jump of f is resolved by no number of sub-steps; a stiff plant is warned of."""
+
+    def single(t, x, u, w):  # type: ignore[no-untyped-def]
+        return x[1], u - 1e4 * x[1] - force * np.sign(x[1])
+
+    def several(t, x, u, w):  # type: ignore[no-untyped-def]
+        return x[1], u[0] - 1e4 * x[1] - force * np.sign(x[1])
+
+    for dt in (1e-3, 1.0):
+        plants = (
+            ql.plants.NonlinearPlant(single, 2),
+            ql.plants.MultivariableNonlinearPlant(several, 2, 1, np.eye(2)),
+        )
+        if force == 0.0 and dt == 1.0:
+            for plant in plants:
+                with pytest.warns(ql.DesignWarning, match="stiff, it has an eigenvalue of 1e.04"):
+                    assert plant.sampled(dt, interpret=True).substeps == 1000
+            continue
+        one, other = (plant.sampled(dt, interpret=True).substeps for plant in plants)
+        assert one == other == (1 if force else 10)
+
+
 class TestArm:
     """The planar arm."""
 

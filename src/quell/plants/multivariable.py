@@ -12,7 +12,6 @@ state, newest first, channel after channel.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -38,32 +37,21 @@ from quell.plants.base import (
     check_plant,
     check_run,
 )
-from quell.plants.linear import quantized
+from quell.plants.linear import DelayedPlantModel, EncodedPlantModel, quantized
 from quell.plants.nonlinear import (
+    EquationPlant,
     as_array,
-    bound,
-    checked_parameters,
     derivatives,
     runge_kutta,
     value_or_nan,
 )
-from quell.types import Matrix, Vector, warn
+from quell.types import Matrix, Vector
 
 
 @generic
 def measure_all(plant: Any, x: Vector, y: Vector) -> None:
     """Write the outputs for the state ``x`` (n,) into ``y`` (p,)."""
     raise TypeError
-
-
-def inputs_of(plant: Any) -> int:
-    """Return the number of control signals of a plant."""
-    return int(getattr(plant, "inputs", 1))
-
-
-def outputs_of(plant: Any) -> int:
-    """Return the number of measured outputs of a plant."""
-    return int(getattr(plant, "outputs", 1))
 
 
 # ---- Linear plants ----
@@ -350,13 +338,8 @@ def _rows_output(rows: tuple[tuple[float, ...], ...]) -> Callable[[Vector], Any]
     return linear
 
 
-# Largest h |λ| of a sub-step h, and most sub-steps that are chosen, as for plants with one input.
-_LARGEST_STEP, _MOST_SUBSTEPS = 1.0, 1000
-_DIFFERENCE = 1e-6
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class MultivariableNonlinearPlant(Described):
+class MultivariableNonlinearPlant(EquationPlant):
     """A plant ``x' = f(t, x, u, w, …)``, ``y = h(x, …)`` with several inputs and outputs.
 
     Parameters
@@ -453,73 +436,48 @@ class MultivariableNonlinearPlant(Described):
         """Number of measured outputs."""
         return int(self._outputs)  # type: ignore[attr-defined]
 
-    @property
-    def _numbers(self) -> tuple[dict[str, float], dict[str, float]]:
-        """The numbers that f and the output take, in their order."""
-        if self.parameters is None:
-            return {}, {}
-        return checked_parameters(self.parameters, self.f, self.output)
-
-    @cached_property
-    def _rate(self) -> Callable[..., Any]:
-        return bound(self.f, self._numbers[0])
-
-    @cached_property
-    def _measured(self) -> Callable[..., Any]:
-        return bound(self._output_function, self._numbers[1])
-
     @cached_property
     def _output_function(self) -> Callable[..., Any]:
         if callable(self.output):
             return self.output
         return _rows_output(tuple(map(tuple, np.asarray(self.output, dtype=float).tolist())))
 
-    @cached_property
-    def _code(self) -> tuple[Any, Any] | None:
-        """The two compiled functions; None if Numba can't."""
+    @property
+    def _no_control(self) -> Vector:
+        return np.zeros(self.inputs)
+
+    def _machine_code_of_both(self) -> tuple[Any, Any]:
         own, more = (len(each) for each in self._numbers)
         sizes = _Sizes(self.order, self.inputs, self.outputs, self.disturbances, own, more)
-        try:
-            return _machine_code(self.f, self._output_function, sizes)
-        except user_functions.NotCompilableError as error:
-            warn(
-                f"{self.name}: f or output can't be compiled and runs as Python, which is slow "
-                f"({error})",
-                UserWarning,
-            )
-            return None
-
-    @property
-    def compiled(self) -> bool:
-        """Whether Numba could compile the functions."""
-        return self._code is not None
+        return _machine_code(self.f, self._output_function, sizes)
 
     def sampled(self, dt: float, interpret: bool = False) -> Any:
         """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
-        checks.positive("dt", dt, "s")
-        substeps = self._chosen_substeps(dt) if self.substeps is None else self.substeps
-        step = dt / substeps
-        if interpret or self._code is None:
+        step, substeps = self._step(dt)
+        if interpret or self._machine_code is None:
             return PythonMultivariable(self._rate, self._measured, step, substeps)
-        rate, output = self._code
+        rate, output = self._machine_code
         numbers = as_array(*self._numbers) if self.parameters else np.zeros(1)
         return CompiledMultivariable(rate.address, output.address, step, substeps, numbers)
 
-    def _chosen_substeps(self, dt: float) -> int:
-        """Return the number of sub-steps for which ``h |λ|`` is small enough at rest."""
-        n, u, w = self.order, np.zeros(self.inputs), np.zeros(self.disturbances)
-        slopes = np.zeros((n, n))
-        with np.errstate(all="ignore"):
-            for j, shift in enumerate(_DIFFERENCE * np.eye(n)):
-                ends = [value_or_nan(self._rate, 0.0, x, u, w) for x in (shift, -shift)]
-                slopes[:, j] = (np.asarray(ends[0]) - np.asarray(ends[1])) / (2.0 * _DIFFERENCE)
-        if not np.all(np.isfinite(slopes)):
-            return 1
-        wanted = dt * float(np.max(np.abs(np.linalg.eigvals(slopes)))) / _LARGEST_STEP
-        return min(max(math.ceil(wanted), 1), _MOST_SUBSTEPS)
-
 
 # ---- Encoders and delays of single channels ----
+
+
+class MultivariableWrapper(PlantWrapper):
+    """The properties that a wrapper takes over from the plant with several signals inside."""
+
+    plant: Any
+
+    @property
+    def inputs(self) -> int:
+        """Number of control signals."""
+        return int(self.plant.inputs)
+
+    @property
+    def outputs(self) -> int:
+        """Number of measured outputs."""
+        return int(self.plant.outputs)
 
 
 class EncodedOutputsModel(NamedTuple):
@@ -537,39 +495,18 @@ def _measure_encoders(plant: EncodedOutputsModel, x: Vector, y: Vector) -> None:
             y[i] = quantized(y[i], plant.resolution[i])
 
 
-@advance.register(EncodedOutputsModel)
-def _advance_encoders(
-    plant: EncodedOutputsModel, x: Vector, scratch: Vector, t: float, u: Any, w: Vector
-) -> None:
-    advance(plant.inner, x, scratch, t, u, w)
-
-
-@begin_run.register(EncodedOutputsModel)
-def _begin_encoders(plant: EncodedOutputsModel, x: Vector, scratch: Vector) -> None:
-    begin_run(plant.inner, x, scratch)
-
-
-@check_run.register(EncodedOutputsModel)
-def _check_encoders(plant: EncodedOutputsModel, scratch: Vector) -> None:
-    check_run(plant.inner, scratch)
+# They pass everything else on, as an encoder of one output does.
+advance.register(EncodedOutputsModel)(advance.implementations[EncodedPlantModel])
+begin_run.register(EncodedOutputsModel)(begin_run.implementations[EncodedPlantModel])
+check_run.register(EncodedOutputsModel)(check_run.implementations[EncodedPlantModel])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class EncodedOutputs(PlantWrapper):
+class EncodedOutputs(MultivariableWrapper):
     """A plant whose outputs are read by encoders; make it with ``encoded_outputs``."""
 
     plant: Any
     resolution: tuple[float, ...]  #: step of each output, zero without encoder [y-unit]
-
-    @property
-    def inputs(self) -> int:
-        """Number of control signals."""
-        return inputs_of(self.plant)
-
-    @property
-    def outputs(self) -> int:
-        """Number of measured outputs."""
-        return outputs_of(self.plant)
 
     @property
     def name(self) -> str:
@@ -598,7 +535,7 @@ def encoded_outputs(plant: Any, resolution: float | Sequence[float]) -> EncodedO
         for a negative step, or another number of them than the plant has outputs.
     """
     check_several(plant)
-    count = outputs_of(plant)
+    count = plant.outputs
     steps = np.full(count, resolution) if np.ndim(resolution) == 0 else resolution
     values = checks.vector("resolution", steps, count)
     if np.any(values < 0.0):
@@ -637,33 +574,17 @@ def _advance_late(
     advance(plant.inner, x[: plant.size], scratch, t, arriving, w)
 
 
-@begin_run.register(DelayedInputsModel)
-def _begin_late(plant: DelayedInputsModel, x: Vector, scratch: Vector) -> None:
-    begin_run(plant.inner, x[: plant.size], scratch)
-
-
-@check_run.register(DelayedInputsModel)
-def _check_late(plant: DelayedInputsModel, scratch: Vector) -> None:
-    check_run(plant.inner, scratch)
+begin_run.register(DelayedInputsModel)(begin_run.implementations[DelayedPlantModel])
+check_run.register(DelayedInputsModel)(check_run.implementations[DelayedPlantModel])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DelayedInputs(PlantWrapper):
+class DelayedInputs(MultivariableWrapper):
     """A plant that its control signals reach late; make it with ``delayed_inputs``."""
 
     plant: Any
     samples: tuple[int, ...]
     dt: float
-
-    @property
-    def inputs(self) -> int:
-        """Number of control signals."""
-        return inputs_of(self.plant)
-
-    @property
-    def outputs(self) -> int:
-        """Number of measured outputs."""
-        return outputs_of(self.plant)
 
     @property
     def order(self) -> int:
@@ -704,7 +625,7 @@ def delayed_inputs(plant: Any, delay: float | Sequence[float], dt: float) -> Del
         inputs.
     """
     check_several(plant)
-    dt, count = checks.positive("dt", dt, "s"), inputs_of(plant)
+    dt, count = checks.positive("dt", dt, "s"), plant.inputs
     given = np.full(count, delay) if np.ndim(delay) == 0 else delay
     values = checks.vector("delay", given, count).tolist()
     samples = tuple(

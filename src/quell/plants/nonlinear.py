@@ -297,8 +297,108 @@ _RATE_SIGNATURE_PLANT = nb_types.void(nb_types.float64, POINTER, nb_types.float6
 _OUTPUT_SIGNATURE_PLANT = nb_types.float64(POINTER)
 
 
+class EquationPlant(Described):
+    """What plants given by an equation have in common, with one control signal or several."""
+
+    f: Callable[..., Any]
+    order: int
+    output: Any
+    disturbances: int
+    substeps: int | None
+    name: str
+    parameters: Mapping[str, float] | None
+
+    @cached_property
+    def _output_function(self) -> Callable[..., Any]:
+        """The function h(x, …), also of rows."""
+        raise NotImplementedError
+
+    def _machine_code_of_both(self) -> tuple[Any, Any]:
+        """Return the two compiled functions; raise ``NotCompilableError`` if Numba can't."""
+        raise NotImplementedError
+
+    @property
+    def _no_control(self) -> Any:
+        """The control signal at rest, as f takes it."""
+        return 0.0
+
+    @property
+    def _numbers(self) -> tuple[dict[str, float], dict[str, float]]:
+        """The numbers that f and the output take, in their order."""
+        if self.parameters is None:
+            return {}, {}
+        return checked_parameters(self.parameters, self.f, self.output)
+
+    @cached_property
+    def _rate(self) -> Callable[..., Any]:
+        """The function f(t, x, u, w), with the parameters in it."""
+        return bound(self.f, self._numbers[0])
+
+    @cached_property
+    def _measured(self) -> Callable[..., Any]:
+        """The function h(x), with the parameters in it."""
+        return bound(self._output_function, self._numbers[1])
+
+    @cached_property
+    def _machine_code(self) -> tuple[Any, Any] | None:
+        """The two compiled functions, kept as long as their addresses; None if Numba can't."""
+        try:
+            return self._machine_code_of_both()
+        except user_functions.NotCompilableError as error:
+            warn(
+                f"{self.name}: f or output can't be compiled and runs as Python, which is slow "
+                f"({error})",
+                UserWarning,
+            )
+            return None
+
+    @property
+    def compiled(self) -> bool:
+        """Whether Numba could compile the functions."""
+        return self._machine_code is not None
+
+    def _step(self, dt: float) -> tuple[float, int]:
+        """Return length and number of the sub-steps in a sample."""
+        checks.positive("dt", dt, "s")
+        substeps = self._chosen_substeps(dt) if self.substeps is None else self.substeps
+        return dt / substeps, substeps
+
+    def _chosen_substeps(self, dt: float) -> int:
+        """Return the number of sub-steps for which ``h |λ|`` is small enough at rest."""
+        wanted = dt * self._largest_eigenvalue / _LARGEST_STEP
+        if wanted <= _MOST_SUBSTEPS:
+            return max(math.ceil(wanted), 1)
+        warn(
+            f"{self.name}: stiff, it has an eigenvalue of {self._largest_eigenvalue:.3g} 1/s at "
+            f"rest and would need {wanted:.3g} sub-steps in dt = {dt!r} s; it gets "
+            f"{_MOST_SUBSTEPS}: leave its fastest part out of f, or give substeps"
+        )
+        return _MOST_SUBSTEPS
+
+    @cached_property
+    def _largest_eigenvalue(self) -> float:
+        """Largest magnitude of the eigenvalues at rest [1/s]; zero if f has a jump there."""
+        slopes = [self._slopes_at_rest(by) for by in (_DIFFERENCE, _SMALL_DIFFERENCE)]
+        if not np.all(np.isfinite(slopes)):
+            return 0.0
+        largest, of_smaller = (float(np.max(np.abs(np.linalg.eigvals(m)))) for m in slopes)
+        return largest if of_smaller <= _JUMP * largest else 0.0
+
+    def _slopes_at_rest(self, by: float) -> Matrix:
+        """Return the derivatives of f by x (n, n) at rest, from central differences ``by``."""
+        n, w = self.order, np.zeros(self.disturbances)
+        slopes = np.full((n, n), np.nan)
+        with np.errstate(all="ignore"):
+            for j, shift in enumerate(by * np.eye(n)):
+                ends = [
+                    value_or_nan(self._rate, 0.0, x, self._no_control, w) for x in (shift, -shift)
+                ]
+                slopes[:, j] = (np.asarray(ends[0]) - np.asarray(ends[1])) / (2.0 * by)
+        return slopes
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class NonlinearPlant(Described):
+class NonlinearPlant(EquationPlant):
     """A plant ``x' = f(t, x, u, w, …)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
 
     Parameters
@@ -395,23 +495,6 @@ class NonlinearPlant(Described):
         return labelled(made, *signals[:3]) if signals.known else made
 
     @property
-    def _numbers(self) -> tuple[dict[str, float], dict[str, float]]:
-        """The numbers that f and the output take, in their order."""
-        if self.parameters is None:
-            return {}, {}
-        return checked_parameters(self.parameters, self.f, self.output)
-
-    @cached_property
-    def _rate(self) -> Callable[..., Any]:
-        """The function f(t, x, u, w), with the parameters in it."""
-        return bound(self.f, self._numbers[0])
-
-    @cached_property
-    def _measured(self) -> Callable[..., Any]:
-        """The function h(x), with the parameters in it."""
-        return bound(self._output_function, self._numbers[1])
-
-    @property
     def _row(self) -> Any:
         return np.eye(self.order)[0] if self.output is None else self.output
 
@@ -421,9 +504,7 @@ class NonlinearPlant(Described):
             return self.output
         return row_output(tuple(np.asarray(self._row, dtype=float).tolist()))
 
-    @cached_property
-    def _machine_code(self) -> tuple[Any, Any] | None:
-        """The two compiled functions, kept as long as their addresses; None if Numba can't."""
+    def _machine_code_of_both(self) -> tuple[Any, Any]:
         n, m = self.order, self.disturbances
 
         def rate(t, px, u, pw, pdx):  # type: ignore[no-untyped-def]
@@ -435,35 +516,20 @@ class NonlinearPlant(Described):
         def output(px):  # type: ignore[no-untyped-def]
             return h(numba.carray(px, (n,)))
 
-        try:
-            if self.parameters is not None:
-                own, more = self._numbers
-                both, counts = (self.f, self._output_function), (len(own), len(more))
-                return machine_code(*both, (n, m), counts)
-            f = user_functions.jit_user_function(self.f)
-            h = user_functions.jit_user_function(self._output_function)
-            compile_cfunc = user_functions.compile_cfunc
-            return compile_cfunc(_RATE_SIGNATURE_PLANT, rate), compile_cfunc(
-                _OUTPUT_SIGNATURE_PLANT, output
-            )
-        except user_functions.NotCompilableError as error:
-            warn(
-                f"{self.name}: f or output can't be compiled and runs as Python, which is slow "
-                f"({error})",
-                UserWarning,
-            )
-            return None
-
-    @property
-    def compiled(self) -> bool:
-        """Whether Numba could compile the functions."""
-        return self._machine_code is not None
+        if self.parameters is not None:
+            own, more = self._numbers
+            both, counts = (self.f, self._output_function), (len(own), len(more))
+            return machine_code(*both, (n, m), counts)
+        f = user_functions.jit_user_function(self.f)
+        h = user_functions.jit_user_function(self._output_function)
+        compile_cfunc = user_functions.compile_cfunc
+        return compile_cfunc(_RATE_SIGNATURE_PLANT, rate), compile_cfunc(
+            _OUTPUT_SIGNATURE_PLANT, output
+        )
 
     def sampled(self, dt: float, interpret: bool = False) -> Any:
         """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
-        checks.positive("dt", dt, "s")
-        substeps = self._chosen_substeps(dt) if self.substeps is None else self.substeps
-        step = dt / substeps
+        step, substeps = self._step(dt)
         if interpret or self._machine_code is None:
             return PythonNonlinear(self._rate, self._measured, step, substeps)
         rate, output = self._machine_code
@@ -477,37 +543,6 @@ class NonlinearPlant(Described):
         set_origin(output.address, self._output_function, numbers=(own, more))
         numbers = as_array(*self._numbers)
         return CompiledParametric(rate.address, output.address, step, substeps, numbers)
-
-    def _chosen_substeps(self, dt: float) -> int:
-        """Return the number of sub-steps for which ``h |λ|`` is small enough at rest."""
-        wanted = dt * self._largest_eigenvalue / _LARGEST_STEP
-        if wanted <= _MOST_SUBSTEPS:
-            return max(math.ceil(wanted), 1)
-        warn(
-            f"{self.name}: stiff, it has an eigenvalue of {self._largest_eigenvalue:.3g} 1/s at "
-            f"rest and would need {wanted:.3g} sub-steps in dt = {dt!r} s; it gets "
-            f"{_MOST_SUBSTEPS}: leave its fastest part out of f, or give substeps"
-        )
-        return _MOST_SUBSTEPS
-
-    @cached_property
-    def _largest_eigenvalue(self) -> float:
-        """Largest magnitude of the eigenvalues at rest [1/s]; zero if f has a jump there."""
-        slopes = [self._slopes_at_rest(by) for by in (_DIFFERENCE, _SMALL_DIFFERENCE)]
-        if not np.all(np.isfinite(slopes)):
-            return 0.0
-        largest, of_smaller = (float(np.max(np.abs(np.linalg.eigvals(m)))) for m in slopes)
-        return largest if of_smaller <= _JUMP * largest else 0.0
-
-    def _slopes_at_rest(self, by: float) -> Matrix:
-        """Return the derivatives of f by x (n, n) at rest, from central differences ``by``."""
-        n, w = self.order, np.zeros(self.disturbances)
-        slopes = np.full((n, n), np.nan)
-        with np.errstate(all="ignore"):
-            for j, shift in enumerate(by * np.eye(n)):
-                ends = [value_or_nan(self._rate, 0.0, x, 0.0, w) for x in (shift, -shift)]
-                slopes[:, j] = (np.asarray(ends[0]) - np.asarray(ends[1])) / (2.0 * by)
-        return slopes
 
 
 def checked_point(given: Any) -> tuple[Any, float]:
