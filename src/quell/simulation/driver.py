@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -652,6 +652,19 @@ class Loop:
         if self.integration.needed:
             self._check_integration(log[from_row:row], from_sample, every, dt)
         return int(row)
+
+    def run_through(self, every: int, progress: Callable[[float], None] | None) -> Matrix:
+        """Run the whole scenario, judge the integration, and return the log of a single run."""
+        samples = self.scenario.samples
+        log, row = np.empty(((samples - 1) // every + 1, self.width)), 0
+        for segment in segments(self.scenario):
+            row = self.run(segment, log, row, every)
+            if self.diverged:
+                break
+            if progress is not None:
+                progress(self.done / samples)
+        judge_integration(self.plant.name, [self])
+        return log[:row]
 
     def is_compiled(self, segment: Segment) -> bool:
         """Return whether its code is in this process, or in the disk cache."""

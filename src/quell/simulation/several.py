@@ -26,10 +26,8 @@ from quell.simulation.driver import (
     Loop,
     Scenario,
     columns_at,
-    judge_integration,
     rest_samples,
     samples_and_start,
-    segments,
     size_of,
 )
 from quell.types import Channels, Matrix, Vector
@@ -274,19 +272,11 @@ def simulate_axes(
     check_fit(plant, controller)
     every = checks.whole("record_every", record_every, 1)
     sampled = SampledAxes.of(scenario, plant, controller, limit)
-    dt, samples = sampled.dt, sampled.samples
+    dt = sampled.dt
     loop = LoopOfAxes(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
-    log = np.empty(((samples - 1) // every + 1, loop.width))
-    row = 0
-    for segment in segments(sampled):
-        row = loop.run(segment, log, row, every)
-        if loop.diverged:
-            break
-        if progress is not None:
-            progress(loop.done / samples)
-    judge_integration(plant.name, [loop])
+    log = loop.run_through(every, progress)
     return AxesTrajectory(
-        log=log[:row],
+        log=log,
         channels=logged_channels(plant, controller),
         dt=dt,
         every=every,

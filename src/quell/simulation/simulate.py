@@ -47,7 +47,6 @@ from quell.simulation.driver import (
     judge_integration,
     logged_channels,
     segment_bounds,
-    segments,
 )
 from quell.simulation.several import simulate_axes
 from quell.types import Channels
@@ -397,20 +396,12 @@ def simulate(
     check_scenario(scenario)
     every = checks.whole("record_every", record_every, 1)
     sampled = SampledScenario.of(scenario, plant, controller, limit)
-    dt, samples = sampled.dt, sampled.samples
+    dt = sampled.dt
     loop = Loop(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
     channels = logged_channels(plant, controller)
-    log = np.empty(((samples - 1) // every + 1, loop.width))
-    row = 0
-    for segment in segments(sampled):
-        row = loop.run(segment, log, row, every)
-        if loop.diverged:
-            break
-        if progress is not None:
-            progress(loop.done / samples)
-    judge_integration(plant.name, [loop])
+    log = loop.run_through(every, progress)
     return Trajectory(
-        log=log[:row],
+        log=log,
         channels=channels,
         dt=dt,
         every=every,
