@@ -234,6 +234,8 @@ class TestChannels:
         (lambda: ql.plants.arm((0.4, 0.3), (1.0,)), "masses"),
         (lambda: ql.plants.arm(stiffness=100.0), "an elastic joint needs a stiffness and a motor"),
         (lambda: ql.plants.arm(encoders="tool"), "encoders = 'tool'"),
+        (lambda: ql.plants.arm(stiffness="soft"), "stiffness = 'soft': must be one number, or one"),
+        (lambda: ql.plants.quadrotor_attitude((0.1, 0.1)), "inertia has shape"),
         (lambda: ql.plants.delayed_inputs(ql.plants.two_mass_spring(), 0.1, 0.01),
          "has one control signal and one output; must be a plant with several"),
         (lambda: ql.plants.encoded_outputs(ql.plants.arm(), -1.0), "must not be negative"),

@@ -138,6 +138,8 @@ class TestOperation:
         (lambda: StateFeedback(controller().observer, np.ones(4), controlled=ENCODERS),
          "no u keeps d2 from the outputs z = C x: there are 1 inputs for 2"),
         (lambda: controller().step([1.0, 2.0], [0.0, 0.0]), "must have 1 and 2 numbers"),
+        (lambda: controller().step(0.1, [0.0, 0.0]), "must have 1 and 2 numbers"),
+        (lambda: StateFeedback(controller().observer, "k"), "gain"),
         (lambda: controller(u_min=1.0, u_max=-1.0), "actuator 1: u_min"),
         (lambda: ql.simulate(drive(), controller(), ql.Scenario((1.0, 2.0))),
          "reference has 2 signals"),

@@ -523,7 +523,10 @@ def checked_actuator_limits(
     u_min: Any, u_max: Any, rate_limit: Any, count: int, dt: float
 ) -> ActuatorLimits:
     """Return the limits of ``count`` actuators: one value for all, or one for each."""
-    lows, highs = (np.full(count, each) if np.ndim(each) == 0 else each for each in (u_min, u_max))
+    lows, highs = (
+        [each] * count if np.ndim(each) == 0 else np.asarray(each).tolist()
+        for each in (u_min, u_max)
+    )
     rates: Sequence[RateLimit]
     rates = list(rate_limit) if checks.is_sequence(rate_limit) else [rate_limit] * count
     for name, values in (("u_min", lows), ("u_max", highs), ("rate_limit", rates)):

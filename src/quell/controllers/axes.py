@@ -435,6 +435,17 @@ def prepared_step(design: Any, state: Any) -> tuple[PackedController, Any]:
         return packed, dispatcher_for(step_axes, design).compile((packed.type,))
 
 
+def take_signals(state: Any, r: Any, y: Any) -> None:
+    """Write references and measurements of a call from Python into the state.
+
+    Raises ``TypeError`` or ``ValueError`` unless there is a number for each: NumPy would give one
+    number to all.
+    """
+    if len(r) != state.r_given.size or len(y) != state.y_given.size:
+        raise ValueError
+    state.r_given[:], state.y_given[:] = r, y
+
+
 # ---- The controller ----
 
 
@@ -509,6 +520,8 @@ class Axes(StatefulController):
         weights: Sequence[float] | None = None,
         wished: Sequence[float] | None = None,
     ) -> None:
+        if not isinstance(axes, dict) and not checks.is_sequence(axes):
+            raise ValueError(f"axes = {axes!r:.60}: must be an ADRC for each axis, in a list")
         given = axes if isinstance(axes, dict) else {}
         parts: list[Any] = list(given.values()) if given else list(axes)
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
@@ -640,7 +653,7 @@ class Axes(StatefulController):
             self.prepare()
         state = self._state
         try:
-            state.r_given[:], state.y_given[:] = r, y
+            take_signals(state, r, y)
         except (TypeError, ValueError):
             raise ValueError(
                 f"r = {r!r}, y = {y!r}: each must have {self.outputs} numbers, one for each axis "

@@ -25,7 +25,7 @@ from quell.controllers.allocation import (
     changed_actuator_limits,
     checked_actuator_limits,
 )
-from quell.controllers.axes import control_all, prepared_step
+from quell.controllers.axes import control_all, prepared_step, take_signals
 from quell.controllers.base import (
     Limits,
     RateLimit,
@@ -229,7 +229,7 @@ class StateFeedback(StatefulController):
             raise ValueError("observer has D other than zero: y must not follow u at once")
         self.observer = observer
         n, m = observer.B.shape
-        self.gain = checks.matrix("gain", np.atleast_2d(np.asarray(gain, dtype=float)))
+        self.gain = checks.matrix("gain", [gain] if np.ndim(gain) == 1 else gain)
         if self.gain.shape != (m, n):
             raise ValueError(
                 f"gain has shape {self.gain.shape}: must be ({m}, {n}), a row for each control "
@@ -329,7 +329,7 @@ class StateFeedback(StatefulController):
             self.prepare()
         state = self._state
         try:
-            state.r_given[:], state.y_given[:] = r, y
+            take_signals(state, r, y)
         except (TypeError, ValueError):
             raise ValueError(
                 f"r = {r!r}, y = {y!r}: must have {self.references} and {self.outputs} numbers"

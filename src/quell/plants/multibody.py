@@ -169,7 +169,11 @@ def arm(
 
 def _each(name: str, value: Any, count: int, *, finite: bool = True) -> Vector:
     """Return one value for each joint, not negative."""
-    values = np.full(count, value, dtype=float) if np.ndim(value) == 0 else np.array(value, float)
+    given = [value] * count if np.ndim(value) == 0 else value
+    try:
+        values = np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        values = np.full(count, np.nan)
     if values.shape != (count,) or not np.all(values >= 0.0) or (finite and np.any(values > 1e300)):
         raise ValueError(
             f"{name} = {value!r}: must be one number, or one for each of the {count} joints, not "
@@ -343,7 +347,7 @@ def quadrotor_attitude(
     >>> craft.order, craft.inputs, craft.outputs
     (10, 4, 3)
     """
-    ixx, iyy, izz = checks.positive_vector("inertia", inertia).tolist()
+    ixx, iyy, izz = checks.vector("inertia", checks.positive_vector("inertia", inertia), 3).tolist()
     lag = checks.positive("motor_lag", motor_lag, "s")
     lever = rotor_levers(arm, drag)
 
