@@ -45,7 +45,9 @@ _LAYOUT = """(narrow) => {
     const box = element.getBoundingClientRect();
     if (!box.width) continue;
     const inside = scrolls(element);
-    const wide = inside ? inside.scrollWidth - inside.clientWidth : box.right - right;
+    const own = element.matches("pre") ? element.scrollWidth - element.clientWidth : 0;
+    const past = inside ? inside.scrollWidth - inside.clientWidth : box.right - right;
+    const wide = Math.max(own, past);
     const free = narrow && inside && !element.matches("pre, img");
     if (wide > 1 && !free)
       found.push(["sticks out", `${element.tagName} by ${Math.round(wide)} px: ${name(element)}`]);
