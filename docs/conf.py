@@ -1,11 +1,13 @@
 """Sphinx configuration."""
 
+import importlib
 import os
 import runpy
 import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from sphinx.application import Sphinx
 
 import quell
 
@@ -26,7 +28,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
-    "sphinx-mathjax-offline",
 ]
 html_theme = "pydata_sphinx_theme"
 html_title = "quell"
@@ -74,3 +75,8 @@ def draw_gallery() -> None:
 
 
 draw_gallery()
+
+
+def setup(app: Sphinx) -> None:
+    """Take MathJax from its package, which does not say that pages may be read in parallel."""
+    importlib.import_module("sphinx-mathjax-offline").setup(app)
