@@ -426,3 +426,53 @@ def test_tuning_uses_the_noise_of_y_and_keeps_the_feedforward(client: Client) ->
     assert found["coefficients"] == pytest.approx([0.0, 4.0 / 50.0, 1.0 / 50.0])
     without = client.ask("tuned", **task | {"structure": "pid"})["tuned"][0]
     assert "feedforward" not in without["setup"]["controller"]
+
+
+def test_tuning_sends_the_runs_of_before_and_after(client: Client) -> None:
+    """Run and loop of the setup as it was, and of the tuned one; the tuned one is not applied."""
+    number = client.send(do="tune", structure="pi", setup=TABLES)
+    frames: list[dict[str, Any]] = []
+    while not frames or frames[-1]["kind"] not in ("done", "error"):
+        frames += [header for header in (client.next()[0],) if header.get("id") == number]
+    parts = [(each["pin"], each["kind"]) for each in frames if "pin" in each]
+    assert parts == [
+        ("before tuning", "run"),
+        ("before tuning", "loop"),
+        ("tuned", "run"),
+        ("tuned", "loop"),
+    ]
+    tuned = next(each for each in frames if each["kind"] == "tuned")
+    assert "--" not in tuned["noise_bound"]
+    loops = [each["loop"]["m_s"] for each in frames if each["kind"] == "loop"]
+    assert loops[1] == pytest.approx(1.6, rel=2e-3)  # the default bound, which is active
+
+
+def test_an_identified_model_is_opened_with_its_file(client: Client, tmp_path: Path) -> None:
+    """Its numbers stand in place of the path, also inside of a delay; friction keeps its width."""
+    model = {"num": [50.0], "den": [1.0, 3.0, 0.0], "delay": 0.01, "friction": 0.1}
+    table = {"kind": "identified", "path": "results\\model.json"}
+    text = toml_of(TABLES | {"plant": {"kind": "encoded", "counts": 4096, "plant": table}})
+    (reason,) = client.ask("opened", do="open", text=text)["error"][0]["text"]
+    assert "open the setup and model.json together" in reason
+    full = model | {"friction_width": 0.05}
+    for content in (model, full):
+        files = {"model.json": json.dumps({"model": content})}
+        opened = client.ask("opened", do="open", text=text, models=files)["opened"][0]["setup"]
+        width = {"friction_width"} <= content.keys()
+        wanted = full if width else {key: model[key] for key in ("num", "den", "delay")}
+        assert opened["plant"]["plant"] == {"kind": "identified"} | wanted
+        assert "run" in client.ask("loop", do="run", setup=opened)
+    for wrong, words in (
+        ({"model.json": "{}"}, "has no model"),
+        ({"model.json": "[1"}, "must be a file of results in JSON"),
+        ({"model.json": 3}, "models: must be texts"),
+        (["model.json"], "models: must be texts"),
+    ):
+        (reason,) = client.ask("opened", do="open", text=text, models=wrong)["error"][0]["text"]
+        assert words in reason
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(full))
+    read = messages.with_models({"plant": {"kind": "identified", "path": str(path)}})
+    assert read["plant"] == {"kind": "identified"} | full
+    with pytest.raises(ValueError, match="can't be read"):
+        messages.with_models({"plant": {"kind": "identified", "path": str(path) + "x"}})

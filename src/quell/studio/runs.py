@@ -22,7 +22,15 @@ from quell.setup.description import describe as tables_of
 from quell.setup.description import parsed
 from quell.setup.loading import Known, Setup, assembled
 from quell.simulation import simulate
-from quell.studio.messages import MOST_BYTES, Columns, Granted, checked, frame
+from quell.studio.messages import (
+    MOST_BYTES,
+    Columns,
+    Granted,
+    checked,
+    files_of,
+    frame,
+    with_models,
+)
 from quell.tuning.report import toml_text
 from quell.types import Vector
 
@@ -122,6 +130,7 @@ def run_frames(
         "kind": "run",
         "plant": run.plant,
         "status": int(run.status),
+        "diverged": bool(run.diverged),
         "message": run.message if run.diverged or run.status else "",
         "warnings": [*design_warnings, *caught],
         "metrics": _metrics(run, setup),
@@ -282,11 +291,20 @@ def _in_docstring(title: str) -> str:
     return " ".join(plain.replace('"', "'").replace("\\", "/").split())
 
 
-def tables_of_text(text: Any, granted: Granted) -> dict[str, Any]:
-    """Return the tables of the text of a setup file; raise a ``SetupError`` or ``ValueError``."""
+def tables_of_text(text: Any, granted: Granted, models: Any = None) -> dict[str, Any]:
+    """Return the tables of the text of a setup file; raise a ``SetupError`` or ``ValueError``.
+
+    ``models`` has the texts of files of identified models by name.
+    """
     if not isinstance(text, str) or len(text) > MOST_BYTES:
         raise ValueError(f"text: must be the content of a TOML file, at most {MOST_BYTES} bytes")
-    return checked(parsed(NAME, text), granted)
+    texts = models or {}
+    if not isinstance(texts, Mapping) or not all(isinstance(each, str) for each in texts.values()):
+        raise ValueError("models: must be texts of files by name")
+    tables = parsed(NAME, text)
+    if not files_of(tables) <= granted.files:
+        tables = with_models(tables, texts)
+    return checked(tables, granted)
 
 
 def _without_none(value: Any) -> Any:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -53,6 +54,7 @@ STRUCTURES = (
 _TRADEOFF = (1.2, 1.3, 1.4, 1.6, 1.8, 2.0)
 _COMPARED = {"tuned-pid": "PID", "tuned-lqg": "LQG"}
 _LIMITS = ("u_min", "u_max", "rate_limit")
+_WITH_OPTIONS = re.compile(r" \(--[^)]*\)")  # in a text for the command line
 # Plants of a band, and the most that their parameters change [%]. Chosen by hand: 24 runs take a
 # quarter of a second.
 _PLANTS, _MOST_PERCENT = 24, 50.0
@@ -70,8 +72,11 @@ def tuned_frames(
     message: Mapping[str, Any],
     stale: Stale,
     report: Report,
+    make: Maker,
 ) -> Iterator[bytes]:
     """Yield the tuned controller's tables, and then the trade-off between M_s and load rejection.
+
+    In between are run and loop of the setup as it was and of the tuned one, to compare them.
 
     The message has ``structure``, ``m_s``, ``m_t`` and, if noise is bounded, ``m_ks``, or the noise
     of y: ``noise_std`` and ``resolution``. A controller that feeds forward is tuned with the
@@ -109,11 +114,14 @@ def tuned_frames(
             "k_i": design.k_i,
             "active": list(best.active),
             "constraints": str(best.constraints),
-            "noise_bound": best.noise_bound,
+            "noise_bound": _WITH_OPTIONS.sub("", best.noise_bound),
             "step": _sentence(str(best.reference_step)),
             "plants": len(best.plants.plants),
         }
     )
+    wide = columns(message)
+    for pin, each in (("before tuning", setup), ("tuned", make(tables))):
+        yield from run_frames(each, wide, {"id": message["id"], "pin": pin}, stale)
     for at in sorted({*_TRADEOFF, bounds.m_s or _TRADEOFF[0]}):
         other = dataclasses.replace(best.constraints, m_s=at)
         try:
@@ -318,7 +326,7 @@ def frames_for(
     """
     task, about = message["do"], {"id": message["id"]}
     if task == "open":
-        tables = tables_of_text(message.get("text"), granted)
+        tables = tables_of_text(message.get("text"), granted, message.get("models"))
         make(tables)
         yield frame({"kind": "opened", "setup": tables, **about})
         return
@@ -332,8 +340,10 @@ def frames_for(
     elif task == "band":
         yield from band_frames(setup, tables, message, stale)
     elif task in ("compare", "tune"):
-        work = compared_frames if task == "compare" else tuned_frames
-        yield from work(setup, record, message, stale, report)
+        if task == "compare":
+            yield from compared_frames(setup, record, message, stale, report)
+        else:
+            yield from tuned_frames(setup, record, message, stale, report, make)
         yield frame({"kind": "done", **about})
     elif task == "export":
         name, content = exported(setup, message)

@@ -1,12 +1,13 @@
 // What the server last sent, drawn with the pins: a run, its loop, a band of runs, and their numbers.
 
 import { home, write } from "./dom.js";
-import { showNumbers, unit } from "./panels/numbers.js";
+import { inWords, numbersOf, showNumbers, unit } from "./panels/numbers.js";
 import { short } from "./plots/plots.js";
 import { Views } from "./plots/views.js";
 
 const MOST_TIMES = 10_000;
 const REST = 150; // the page is at rest when nothing has moved for this time [ms]
+const PAUSE = 700; // the numbers are said when they have not changed for this time [ms]
 
 export class Picture {
   // `state()` returns the state of the page, and `pins` has the designs to compare with.
@@ -50,6 +51,7 @@ export class Picture {
     const pin = asked.local?.pin;
     if (pin) {
       Object.assign(pin.arrays, arrays);
+      if (!this.watching) this.age(false); // a pin is asked for when the present curves are there
       this.draw();
       return;
     }
@@ -105,7 +107,10 @@ export class Picture {
     this.numbering ??= requestAnimationFrame(() => {
       this.numbering = null;
       const { bounds, setup } = this.state();
-      showNumbers(home("numbers"), this.run, this.loop, bounds, setup.dt);
+      const entries = numbersOf(this.run, this.loop, bounds, setup.dt);
+      showNumbers(home("numbers"), entries);
+      clearTimeout(this.sayTimer);
+      this.sayTimer = setTimeout(() => write(home("said"), { textContent: inWords(entries) }), PAUSE);
     });
   }
 }

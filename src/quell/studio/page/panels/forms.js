@@ -2,6 +2,8 @@
 
 import { element, field, input, select } from "../dom.js";
 import { at } from "../store.js";
+import { rovingSliders } from "./roving.js";
+import { takes, typedList, typedNumber } from "./typed.js";
 
 const TITLES = {
   plant: "Plant", observer: "Observer", controller: "Controller", learner: "Learner",
@@ -28,6 +30,7 @@ export class Forms {
     this.groups = null;
     this.anchors = new Map();
     this.unfolded = new Map();
+    this.rove = rovingSliders(home);
   }
 
   build(setup) {
@@ -41,6 +44,7 @@ export class Forms {
       const same = [...this.home.querySelectorAll("[data-path]")].filter((e) => e.dataset.path === focus);
       (same.find((e) => e.type === kind) ?? same[0])?.focus();
     }
+    this.rove();
   }
 
   // Show another value of a path in the same form, in all its controls but the one that set it.
@@ -49,13 +53,15 @@ export class Forms {
     for (const input of this.home.querySelectorAll("[data-path]")) {
       const own = input.dataset.path;
       const related = own.startsWith(path) || path.startsWith(own);
-      if (related && input !== except && input.showValue) input.showValue(at(setup, own));
+      if (!related || input === except || !input.showValue) continue;
+      input.showValue(at(setup, own));
+      input.recheck?.();
     }
   }
 
   sampling() {
     const entry = { key: "dt", type: "number", about: "sample time of the loop [s].", needed: true };
-    const box = element("div");
+    const box = element("div", "plain");
     box.append(this.number(entry, "dt", "sample time [s]", false));
     return box;
   }
@@ -217,16 +223,8 @@ export class Forms {
     box.placeholder = "[1, 2, 3]";
     box.showValue = (now) => (box.value = now === undefined ? "" : JSON.stringify(now));
     box.showValue(at(this.setup, path));
-    box.oninput = () => {
-      try {
-        const value = box.value.trim() ? JSON.parse(box.value) : undefined;
-        box.setCustomValidity("");
-        this.change(path, value, false, box);
-      } catch {
-        box.setCustomValidity("A number, or a list as [1, 2, 3]");
-      }
-    };
     const row = field(name, box, entry.about);
+    takes(box, typedList, (value) => this.change(path, value, false, box));
     if (!POLYNOMIALS.includes(entry.key)) return row;
     const shape = () => JSON.stringify([at(this.setup, path)].flat().map(Boolean));
     const before = shape();
@@ -250,9 +248,10 @@ export class Forms {
 
   // Return a number with, where it can slide, a slider: logarithmic for a positive one.
   number(entry, path, name, slides = entry.type === "number") {
-    const box = input("number", path, name);
-    box.step = entry.type === WHOLE ? "1" : "any";
-    if (RANGES[entry.key]) [box.min, box.max] = RANGES[entry.key];
+    const box = input("text", path, name);
+    box.inputMode = "decimal";
+    const [low, high] = RANGES[entry.key] ?? [];
+    const read = (text) => typedNumber(text, { whole: entry.type === WHOLE, low, high });
     box.showValue = (now) => {
       box.value = now ?? (Number.isFinite(entry.default) ? entry.default : "");
       if (now == null && entry.default === undefined) box.placeholder = "auto";
@@ -262,7 +261,7 @@ export class Forms {
     const isEntry = path.endsWith("]"); // of a list, which keeps its length
     const set = (number, source) => (number !== undefined || !isEntry) && this.change(path, number, false, source);
     if (!slides || value === null || typeof value !== "number") {
-      box.oninput = () => box.validity.valid && set(box.value === "" ? undefined : Number(box.value), box);
+      takes(box, read, (number) => set(number, box));
       return field(name, box, entry.about);
     }
     const slider = input("range", path, `${name}, slider`);
@@ -277,14 +276,14 @@ export class Forms {
     slider.oninput = () => {
       const number = scale.value(Number(slider.value));
       box.value = number;
+      box.recheck();
       slider.setAttribute("aria-valuetext", String(number));
       set(number, slider);
     };
-    box.oninput = () => {
-      if (!box.validity.valid) return;
-      set(box.value === "" ? undefined : Number(box.value), box);
-      if (box.value !== "") slider.showValue(Number(box.value));
-    };
+    takes(box, read, (number) => {
+      set(number, box);
+      if (number !== undefined) slider.showValue(number);
+    });
     const row = field(name, slider, entry.about);
     row.classList.add("slides");
     row.append(box);
