@@ -16,7 +16,7 @@ from quell.realtime import LiveSink
 from quell.realtime.recordings import LOOP_WIDTH, Header, K, R, U, Y, row_channels
 from quell.studio.runs import toml_of
 
-from .studio_server import TABLES, Client, running, step_test
+from .studio_server import AXES, TABLES, Client, running, step_test
 
 CHROMIUM = Path("/usr/bin/chromium")
 OPTIONS = [
@@ -417,3 +417,23 @@ def test_a_setup_with_an_identified_model_is_opened_with_its_file(page: Any) -> 
     wait_for(lambda: page.locator(den).count() and page.input_value(den) == "[1,3,0]")
     assert page.input_value('select[data-path="plant.kind"]') == "identified"
     wait_for(lambda: finished(page))
+
+
+def test_of_several_axes_one_is_chosen_and_each_has_its_sliders(page: Any) -> None:
+    """A pin's curves are those of the axis that is shown."""
+    drop(page, ("axes.toml", toml_of(AXES).encode()))
+    wait_for(lambda: page.is_visible("#axes"))
+    wait_for(lambda: finished(page))
+    assert page.locator("#axis option").all_inner_texts() == ["left", "right"]
+    left = curve(page, "y")
+    assert left.max() > 0.5
+    page.click("#pin")
+    page.select_option("#axis", index=1)
+    wait_for(lambda: finished(page) and np.abs(curve(page, "y")).max() < 0.3)
+    wait_for(lambda: page.evaluate("window.studio.pins()[0].arrays?.y?.length > 0"))
+    pinned = np.array(page.evaluate("Array.from(window.studio.pins()[0].arrays.y)"))
+    assert np.array_equal(pinned, curve(page, "y"))
+    page.locator('input[type=range][data-path="axis[1].observer.omega_o"]').press("PageDown")
+    wait_for(lambda: finished(page) and not np.array_equal(curve(page, "y"), pinned))
+    drop(page, ("setup.toml", toml_of(TABLES).encode()))
+    wait_for(lambda: page.is_hidden("#axes"))

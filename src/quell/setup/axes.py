@@ -27,7 +27,7 @@ from quell.plants.multivariable import MultivariableLinearPlant, check_several
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import Setup, title_of, windows_of
+from quell.setup.loading import Known, Setup, made_once, title_of, windows_of
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -234,8 +234,12 @@ def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     return made_axes(*read(path), trust)
 
 
-def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
+def made_axes(
+    name: str, data: Mapping[str, Any], trust: bool = False, known: Known | None = None
+) -> Setup:
     """Build the objects that ``data`` describes: the content of a file of several axes.
+
+    ``known`` has the plant of an earlier call, which is not built again if its table is the same.
 
     Raises
     ------
@@ -256,7 +260,8 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
     plant = None
     if tables.plant is not None:
-        plant = builder.build(tables.plant, "plant", dt=dt)
+        make = partial(builder.build, tables.plant, "plant", dt=dt)
+        plant = made_once({} if known is None else known, "plant", (tables.plant, dt), make)
         builder.attempt("", (), check_several, plant)
     names = [axis.name or f"axis{i + 1}" for i, axis in enumerate(tables.axis)]
     if len(set(names)) < len(names):

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from pydantic_core import PydanticUndefined
 from quell import checks
 from quell.files import nonfinite_to_none, whole_text
 from quell.plants.registry import IDENTIFIED_NUMBERS, identified_numbers
-from quell.setup import loading, registry
+from quell.setup import axes, loading, registry
 from quell.setup.schema import CallTable
 from quell.types import Vector
 
@@ -365,16 +365,14 @@ _HIDDEN_OF = {"identified": ("path",)}
 def forms(granted: Granted) -> dict[str, Any]:
     """Return for each group of tables its kinds, and for each kind its keys.
 
+    ``"one"`` has the groups of a setup of one axis, ``"several"`` those of one of several axes.
+
     Plants that are files are left out if they are not granted; an identified one has its numbers.
     """
     files = {each[0] for each in granted.files}
     without = {*FILE_KINDS, "no-learner"} - files - {"identified"}
-    groups: Mapping[str, Mapping[str, type[CallTable]]] = {
-        "plant": registry.PLANTS,
-        "observer": registry.OBSERVERS,
-        "controller": registry.CONTROLLERS,
+    shared: dict[str, Mapping[str, type[CallTable]]] = {
         "learner": registry.LEARNERS,
-        "prefilter": registry.PREFILTERS,
         "signal": registry.SIGNALS,
         "feature": registry.FEATURES,
         "notch": {"": registry.Notch},
@@ -382,9 +380,29 @@ def forms(granted: Granted) -> dict[str, Any]:
         "feedforward": registry.FEEDFORWARDS,
         "labels": {"": registry.Labels},
         "guard": {"": registry.Guard},
+    }
+    one = shared | {
+        "plant": registry.PLANTS,
+        "observer": registry.OBSERVERS,
+        "controller": registry.CONTROLLERS,
+        "prefilter": registry.PREFILTERS,
         "scenario": {"": registry.Scenario},
         "metrics": {"": registry.Metrics},
     }
+    several = shared | {
+        "plant": registry.AXES_PLANTS,
+        "observer": axes.OBSERVERS,
+        "controller": {"adrc": axes.CONTROLLER},
+        "axes": {"": axes.AXES},
+        "scenario": {"": axes.SCENARIO},
+        "metrics": {"": axes.METRICS},
+    }
+    return {"one": _described(one, without), "several": _described(several, without)}
+
+
+def _described(
+    groups: Mapping[str, Mapping[str, type[CallTable]]], without: Set[str]
+) -> dict[str, Any]:
     return {
         group: {
             kind: {"about": _plain(table.__doc__ or ""), "keys": _keys(table)}

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.controllers.axes import Axes
 from quell.controllers.prefilters import without_prefilters
 from quell.experiments.compare import tuned as tuned_references
 from quell.setup.loading import Setup
@@ -283,14 +284,11 @@ def _fmu(setup: Setup, folder: Path) -> tuple[str, bytes]:
 def _c(setup: Setup, folder: Path, precision: str) -> tuple[str, bytes]:
     from quell.export import c
 
-    found = c(
-        setup.controller,
-        folder,
-        name=C_NAME,
-        precision=precision,
-        plant=setup.plant,
-        scenario=setup.scenario,
-    )
+    # The run in which single precision is compared with double is one of one axis.
+    run: dict[str, Any] = {"plant": setup.plant, "scenario": setup.scenario}
+    if isinstance(setup.controller, Axes):
+        run = {}
+    found = c(setup.controller, folder, name=C_NAME, precision=precision, **run)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
         for path in sorted(found.files):
@@ -302,6 +300,12 @@ def _c(setup: Setup, folder: Path, precision: str) -> tuple[str, bytes]:
 
 
 # ---- Tasks that messages of the page ask for ----
+
+_OF_ONE_AXIS = {
+    "band": "the band of uncertain plants is drawn for one axis",
+    "compare": "the comparison with PID and LQG is of one axis",
+    "tune": "the page tunes one axis; choose omega_c and omega_o by the margins of each axis",
+}
 
 LONG = ("compare", "tune", "export", "record")
 """Tasks that take seconds: they have a thread of their own, so that sliders go on moving."""
@@ -335,8 +339,11 @@ def frames_for(
         return
     tables = setup_tables(message, granted)
     setup = make(tables)
+    if isinstance(setup.controller, Axes) and task in _OF_ONE_AXIS:
+        raise ValueError(f"NOT for several axes: {_OF_ONE_AXIS[task]}")
     if task == "run":
-        yield from run_frames(setup, columns(message), about, stale, make.warnings)
+        axis = checks.whole("axis", message.get("axis", 0), 0)
+        yield from run_frames(setup, columns(message), about, stale, make.warnings, axis)
     elif task == "band":
         yield from band_frames(setup, tables, message, stale)
     elif task in ("compare", "tune"):
@@ -350,5 +357,6 @@ def frames_for(
         yield file_frame({"kind": "file", "name": name, **about}, content)
     else:
         is_whole = not hasattr(setup.plant, "linear")
-        script = python_of(tables, setup.title, is_whole, delay_beside(setup))
+        delay = 0.0 if isinstance(setup.controller, Axes) else delay_beside(setup)
+        script = python_of(tables, setup.title, is_whole, delay)
         yield frame({"kind": "texts", "toml": toml_of(tables), "python": script, **about})

@@ -83,7 +83,8 @@ function send(task) {
 }
 
 function askRun(setup, local) {
-  server.run({ do: "run", setup, columns: picture.columns, local });
+  const axis = Math.min(picture.axis, (setup.axis?.length ?? 1) - 1);
+  server.run({ do: "run", setup, axis, columns: picture.columns, local });
 }
 
 function ask() {
@@ -211,7 +212,7 @@ function chooseTab(name) {
 // ---- beginning
 
 async function begin(hello) {
-  forms.groups = hello.forms;
+  forms.kinds = hello.forms;
   if (store) {
     server.flying = null;
     ask(); // the connection was lost
@@ -253,6 +254,11 @@ home("watch-go").onclick = () => portIsRight().value !== undefined && watch.star
 home("frequency").onchange = () => {
   picture.views.setFrequency(home("frequency").value);
   set({ frequency: home("frequency").value }, false, "choice");
+};
+home("axis").onchange = () => {
+  picture.axis = Number(home("axis").value);
+  pins.forget();
+  ask();
 };
 home("band").onchange = () => set({ band: home("band").checked }, false, "choice");
 takesNumber(home("percent"), (percent) => percent !== undefined && set({ percent }, false, "choice"));

@@ -13,7 +13,7 @@ export class Picture {
   // `state()` returns the state of the page, and `pins` has the designs to compare with.
   constructor(state, pins) {
     Object.assign(this, { state, pins, views: new Views(), watching: false });
-    Object.assign(this, { arrays: {}, loopArrays: {}, run: null, loop: null, band: null });
+    Object.assign(this, { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, axis: 0 });
     // For measurements from outside: times from an input to its pictures [ms], pictures, compilation [s].
     Object.assign(this, { firstTimes: [], times: [], frames: 0, compiled: 0 });
   }
@@ -41,10 +41,21 @@ export class Picture {
     if (!this.watching) this.age(false);
     this.arrays = arrays;
     this.run = header;
+    this.nameAxes(header.axes);
     this.compiled += header.compiled;
     this.message([header.message, ...header.warnings].filter(Boolean).join("\n"));
     if (!this.watching) this.drawRun();
     timed(this.firstTimes, asked);
+  }
+
+  // Offer the axes of the setup, of which one is shown; there is no choice of one.
+  nameAxes(names) {
+    const choice = home("axis");
+    if (names.join("\n") !== [...choice.options].map((each) => each.text).join("\n")) {
+      this.axis = Math.max(0, Math.min(this.axis, names.length - 1));
+      choice.replaceChildren(...names.map((name, i) => new Option(name, i, false, i === this.axis)));
+    }
+    write(home("axes"), { hidden: names.length < 2 });
   }
 
   takeLoop(header, arrays, asked) {

@@ -19,6 +19,7 @@ const SHOWN = ["disturbance_order"];
 const RANGES = { disturbance_order: [1, 3] };
 const OPTIONAL = ["observer", "learner", "guard", "prefilter"];
 const OPEN = ["plant", "observer", "controller"];
+const PARTS = ["observer", "controller", "learner", "guard"]; // of one of several axes
 const POLYNOMIALS = ["num", "den"];
 const WHOLE = "whole number";
 
@@ -27,7 +28,7 @@ export class Forms {
   constructor(home, change) {
     this.home = home;
     this.change = change;
-    this.groups = null;
+    this.kinds = null; // what the server says of the groups: of one axis, and of several
     this.anchors = new Map();
     this.unfolded = new Map();
     this.rove = rovingSliders(home);
@@ -37,8 +38,8 @@ export class Forms {
     this.setup = setup;
     const focus = document.activeElement?.dataset?.path;
     const kind = document.activeElement?.type;
-    const parts = [this.sampling()];
-    for (const [group, title] of Object.entries(TITLES)) parts.push(this.section(group, title));
+    this.groups = setup.axis ? this.kinds.several : this.kinds.one;
+    const parts = [this.sampling(), ...(setup.axis ? this.axes() : this.sections(Object.keys(TITLES)))];
     this.home.replaceChildren(...parts);
     if (focus) {
       const same = [...this.home.querySelectorAll("[data-path]")].filter((e) => e.dataset.path === focus);
@@ -66,17 +67,39 @@ export class Forms {
     return box;
   }
 
-  section(group, title) {
-    const table = at(this.setup, group);
-    const box = this.details(group, title, OPEN.includes(group) || (table != null && group !== "scenario"));
-    if (OPTIONAL.includes(group)) {
-      const on = input("checkbox", group + "!", `Use: ${title}`);
+  sections(groups) {
+    return groups.map((group) => this.section(group, TITLES[group], group, OPTIONAL.includes(group)));
+  }
+
+  section(group, title, path, optional) {
+    const table = at(this.setup, path);
+    const box = this.details(path, title, OPEN.includes(group) || (table != null && group !== "scenario"));
+    if (optional) {
+      const on = input("checkbox", path + "!", `Use: ${title}`);
       on.checked = table != null;
-      on.onchange = () => this.change(group, on.checked ? this.fresh(group) : undefined, true);
+      on.onchange = () => this.change(path, on.checked ? this.fresh(group) : undefined, true);
       box.append(field(`Use`, on));
     }
-    if (table != null) box.append(...this.table(group, table, group));
+    if (table != null) box.append(...this.table(group, table, path));
     return box;
+  }
+
+  // Return the sections of a setup of several axes: those of an axis are named after it.
+  axes() {
+    const ofAxis = (axis, i) => {
+      const name = axis.name || `axis${i + 1}`;
+      const parts = PARTS.map((group) => this.section(group, `${name}: ${TITLES[group].toLowerCase()}`, `axis[${i}].${group}`, ["learner", "guard"].includes(group)));
+      const box = this.details(`axis[${i}] signals`, `${name}: reference and noise`, false);
+      for (const key of ["reference", "noise"]) {
+        const about = key === "noise" ? "signal added to y before the controller." : "signal that y has to follow.";
+        box.append(this.signal({ key, about }, `axis[${i}].${key}`, key, axis[key]));
+      }
+      return [...parts, box];
+    };
+    return [
+      ...this.sections(["plant"]), this.section("axes", "B0 and actuators", "axes", true),
+      ...this.setup.axis.flatMap(ofAxis), ...this.sections(["scenario"]),
+    ];
   }
 
   details(path, title, open) {

@@ -106,8 +106,9 @@ function margins(loop, bounds, dt) {
     ["gain margin", low > 0 ? range(low, high) : short(high), high < bounds.gain || low > 1 / bounds.gain, "factor of the gain up to which the loop is stable"],
     ["phase margin", `${short(phase)}°`, phase < bounds.phase, ""],
     ["delay margin", delay >= 1 ? `${short(delay)} s` : `${short(1e3 * delay)} ms`, delay < bounds.samples * dt, "additional dead time up to which the loop is stable"],
-    ["stable for b/b0", b ? range(...b) : "–", false, "range of the plant's gain over b0"],
-    ["noise → u", short(loop.noise_to_control), false, "RMS of u for white noise of RMS 1 in y"],
+    ...(b ? [["stable for b/b0", range(...b), false, "range of the plant's gain over b0"]] : []),
+    ...(loop.noise_to_control === undefined ? [] : [["noise → u", short(loop.noise_to_control), false, "RMS of u for white noise of RMS 1 in y"]]),
+    ...(loop.gains_at_once ? [["all inputs at once", range(...loop.gains_at_once.map((each) => each ?? Infinity)), false, "gains of all actuators, each for itself, with which the loop is stable (disk margin)"]] : []),
   ];
 }
 
