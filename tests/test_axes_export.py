@@ -13,9 +13,10 @@ import pytest
 
 import quell as ql
 from quell.controllers.axes import control_all
-from quell.export import TranslationError
-from quell.export.axes_source import names_in_c, parts_of_axes, source_of_axes
-from quell.export.library.axes_vectors import golden_vectors_of_axes
+from quell.export import TranslationError, c_source
+from quell.export.axes_source import names_in_c
+from quell.export.controller_source import parts_of
+from quell.export.library.vectors import golden_vectors
 from quell.kernels.dispatch import as_python
 
 from . import gain_functions
@@ -108,7 +109,7 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
 def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
     """Held values, limits of magnitude and rate, a brake, and learners that learn."""
     axes = ROWS["each, with rates"]()
-    found = golden_vectors_of_axes(axes, parts_of_axes(axes, False), ("set_held",))
+    found = golden_vectors(axes, c_source(axes))
     flags = ql.Status(int(np.bitwise_or.reduce([row.status for row in found.rows])))
     held = ql.Status.MEASUREMENT_HELD | ql.Status.REFERENCE_HELD | ql.Status.CONTROL_HELD
     assert held | ql.Status.SATURATED | ql.Status.RATE_LIMITED | ql.Status.HELD in flags
@@ -184,7 +185,7 @@ class TestMemory:
     def test_images_of_python_and_c_are_the_same_bytes(self, tmp_path: Path) -> None:
         """And each continues the loop of the other, bit by bit."""
         axes = learning()
-        robot = RobotInC(source_of_axes(axes, "robot"), tmp_path)
+        robot = RobotInC(c_source(axes, "robot"), tmp_path)
         for k in range(100):
             r, y = np.array([0.3, 0.1 * np.sin(0.1 * k)]), np.array([1e-3 * k, 0.05])
             u = np.zeros(2)
@@ -193,7 +194,7 @@ class TestMemory:
             assert np.array_equal(robot.step(r, y, 2), u)
         image = axes.memory()
         assert robot.image(len(image)) == image
-        other, twin = RobotInC(source_of_axes(learning(), "robot"), tmp_path), learning()
+        other, twin = RobotInC(c_source(learning(), "robot"), tmp_path), learning()
         length = ctypes.c_size_t(len(image))
         assert other.call("load", ctypes.c_bool, image, length, ctypes.c_bool(True))
         twin.restore(image, running=True)
@@ -218,7 +219,7 @@ class TestMemory:
     def test_exports_begin_with_what_was_learned(self) -> None:
         """The coefficients are in the state before the first sample."""
         axes = taught(learning())
-        state = parts_of_axes(axes, False).state
+        state = parts_of(axes).state
         assert np.array_equal(state.axes.axis.learner.theta, axes.axes[0]._state.learner.theta)
         assert np.any(state.axes.axis.learner.theta != 0.0)
 
@@ -267,7 +268,7 @@ class TestMemory:
         with pytest.raises(ValueError, match="axis tool: .*learner is a Python object"):
             axes.memory()
         with pytest.raises(TranslationError, match="calls Python at each sample"):
-            source_of_axes(axes)
+            c_source(axes)
 
 
 class TestOperationsInC:
@@ -276,9 +277,7 @@ class TestOperationsInC:
     @needs_gcc
     def test_a_start_holds_the_machine(self, tmp_path: Path) -> None:
         """The next u is that of the start, as in Python; what is no number changes nothing."""
-        robot = RobotInC(
-            source_of_axes(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path
-        )
+        robot = RobotInC(c_source(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path)
         y, u = np.array([0.3, -0.2]), np.array([1.5, 0.7])
         robot.call("start", None, y, u, y)
         np.testing.assert_allclose(robot.step(y, y, 2), u, rtol=1e-9)
@@ -289,9 +288,7 @@ class TestOperationsInC:
     @needs_gcc
     def test_manual_operation_ends_without_a_bump(self, tmp_path: Path) -> None:
         """``hand_over`` needs a sample, and then u continues."""
-        robot = RobotInC(
-            source_of_axes(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path
-        )
+        robot = RobotInC(c_source(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path)
         assert not robot.call("hand_over", ctypes.c_bool)
         r, y, u = np.zeros(2), np.array([0.2, 0.1]), np.array([0.7, -0.3])
         for _ in range(50):
@@ -302,7 +299,7 @@ class TestOperationsInC:
     @needs_gcc
     def test_one_axis_is_held_by_its_place(self, tmp_path: Path) -> None:
         """A place that no axis has changes nothing."""
-        robot = RobotInC(source_of_axes(ql.Axes([joint(), joint()])), tmp_path)
+        robot = RobotInC(c_source(ql.Axes([joint(), joint()])), tmp_path)
         for place, flag in ((5, 0), (1, int(ql.Status.HELD))):
             robot.call("set_held", None, ctypes.c_int(place), ctypes.c_bool(True))
             robot.step([0.1, 0.1], [0.0, 0.0], 2)
@@ -312,7 +309,7 @@ class TestOperationsInC:
     def test_the_estimate_has_each_axis_by_name(self, tmp_path: Path) -> None:
         """Members of the struct are those of the estimates in Python."""
         axes = ql.Axes({"x": joint(), "y-2": joint()}, [[1, 0.3], [0.2, 1]])
-        source = source_of_axes(axes, "robot")
+        source = c_source(axes, "robot")
         more = (
             "double shown(robot_state *state, int i);\n"
             "double shown(robot_state *state, int i)\n{\n"

@@ -75,6 +75,22 @@ def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) ->
     raise TypeError
 
 
+@generic
+def start_all(controller: Any, state: Any, samples: Any, y: Vector, u: Vector, r: Vector) -> None:
+    """Start at a machine that rests at y under u: the next sample continues from there.
+
+    r are the references of the next sample. What was learned is kept. The observer of each axis
+    takes as many ``samples`` (n,) as it needs to settle.
+    """
+    raise TypeError
+
+
+@generic
+def tell_applied(controller: Any, state: Any) -> None:
+    """Tell observers that the control signals in the state were applied."""
+    raise TypeError
+
+
 # ---- The axes, one inside of the other, so that each may be of another kind ----
 
 
@@ -337,20 +353,16 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     loop.status, loop.started = flags, 1.0
 
 
-def tell_applied(design: AxesDesign, state: AxesState) -> None:
-    """Tell all axes what the control signals in the state do."""
+@tell_applied.register(AxesDesign)
+def _tell_applied(design: AxesDesign, state: AxesState) -> None:
     apply_to_axes(state.gain, state.u, state.v)
     tell_axes(design.axes, state.axes, 0, state.v)
 
 
-def start_all(
+@start_all.register(AxesDesign)
+def _start_all(
     design: AxesDesign, state: AxesState, samples: Any, y: Vector, u: Vector, r: Vector
 ) -> None:
-    """Start at a machine that rests at y under u: the next sample continues from there.
-
-    r are the references of the next sample; one that is no number is y. What was learned is kept.
-    Each observer takes as many ``samples`` (n,) as it needs to settle.
-    """
     reset_loop(design, state)
     for i in range(state.v.size):
         for j in range(state.x.shape[1]):

@@ -261,13 +261,12 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
     """
     if isinstance(controller, SinglePrecision):
         return controller
-    if isinstance(controller, Axes):
+    if isinstance(controller, Axes | StateFeedback):
+        what = "several axes run" if isinstance(controller, Axes) else "state feedback runs"
         raise ValueError(
-            "controller = Axes(…): several axes run in Python in double precision only; "
-            "quell.export.c(…, precision='single', accept=True) writes their C code in single"
+            f"controller = {type(controller).__name__}(…): {what} in Python in double precision "
+            "only; quell.export.c(…, precision='single', accept=True) writes the C code in single"
         )
-    if isinstance(controller, StateFeedback):
-        raise ValueError("controller = StateFeedback(…): runs in double precision only")
     return SinglePrecision(controller)
 
 
