@@ -10,12 +10,14 @@ from cyclopts import App, CycloptsError
 
 from quell import __version__
 from quell.cli.compare import compare
+from quell.cli.doctor import doctor
 from quell.cli.exit_codes import HELP, ExitCode
 from quell.cli.identify import b0, excite, identify
 from quell.cli.monitor import rank, watch
 from quell.cli.reproduce import acc, torsional, two_mass
 from quell.cli.rig import proxy, replay, rig, run_rig
 from quell.cli.run import export, run, studio, sweep
+from quell.cli.setup import setup
 from quell.cli.stress import stress
 from quell.cli.tune import tune
 
@@ -50,12 +52,14 @@ for _each in (
     watch,
     rig,
     proxy,
+    setup,
     run,
     run_rig,
     replay,
     sweep,
     export,
     studio,
+    doctor,
 ):
     app.command(_each, help_format="markdown")
 
