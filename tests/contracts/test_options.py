@@ -86,6 +86,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "export": (*_SETUP, "--out", "c"),
     "studio": (*_SETUP, "--no-browser"),
     "doctor": (),
+    "completion": ("bash",),
 }
 _RECORD = ("record.csv", *_FIGURES)
 _TWIN = (
@@ -174,7 +175,7 @@ CASES: dict[str, dict[str, Case]] = {
         "--prove": ("--prove",),
     },
     "studio": {"SETUP": (("--no-browser",), ("setup.toml", "--no-browser")), "--port": ("--port", "0"), "--browser": (_SETUP, (*_SETUP, "--no-browser"))},
-    "doctor": {},
+    "doctor": {}, "completion": {"SHELL": (("bash",), ("fish",))},
 }  # fmt: skip
 
 

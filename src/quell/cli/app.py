@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 from cyclopts import App, CycloptsError
 
@@ -41,6 +41,25 @@ reproduce = App(
 app.command(reproduce)
 for _command in (two_mass, torsional, acc):
     reproduce.command(_command)
+
+
+_completion_of = app.generate_completion
+
+
+def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
+    """Print the program with which a shell completes commands, options and files.
+
+    `quell completion bash >> ~/.bashrc`, or source it; of zsh a file `_quell` in a folder of
+    `fpath`, of fish `~/.config/fish/completions/quell.fish`.
+
+    Parameters
+    ----------
+    shell
+        The shell.
+    """
+    print(_completion_of(prog_name="quell", shell=shell), end="")
+
+
 for _each in (
     stress,
     compare,
@@ -60,6 +79,7 @@ for _each in (
     export,
     studio,
     doctor,
+    completion,
 ):
     app.command(_each, help_format="markdown")
 
