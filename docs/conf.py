@@ -4,10 +4,14 @@ import os
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 
 import quell
+
+sys.path.insert(0, str(Path(__file__).parent))
+import machine_texts
 
 # Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
@@ -74,3 +78,13 @@ def draw_gallery() -> None:
 
 
 draw_gallery()
+
+
+def setup(app: Any) -> None:
+    """Write the texts for machines beside the pages."""
+
+    def finish(app: Any, exception: Exception | None) -> None:
+        if exception is None and app.builder.format == "html":
+            machine_texts.write(Path(app.outdir))
+
+    app.connect("build-finished", finish)

@@ -297,8 +297,10 @@ def linear(
     E
         how disturbances enter, with a column for each; as u does by default.
     """
-    values = {"num": num, "den": den, "A": A, "B": B, "C": C}
-    given = [name for name, value in values.items() if value is not None]
+    values = {"num": num, "den": den, "A": A, "B": B, "C": C, "E": E}
+    for name, value in values.items():
+        checks.optional(checks.vector if name in ("num", "den") else checks.numbers, name, value)
+    given = [name for name, value in values.items() if value is not None and name != "E"]
     if given == ["num", "den"]:
         return LinearPlant.of((num, den), E)
     if given == ["A", "B", "C"]:

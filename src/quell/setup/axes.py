@@ -201,7 +201,10 @@ class AxesDescription(Table):
     dt: float = DT
     plant: AxesPlant | None = optional("the plant with several signals, for `quell run`.")
     axes: AxesTable | None = optional("B0 and the actuators; the unit matrix by default.")
-    axis: tuple[Axis, ...] = Field(description="[[axis]]: an axis, in the order of the outputs.")
+    axis: tuple[Axis, ...] = Field(
+        description="[[axis]]: an axis, in the order of the outputs.",
+        json_schema_extra={"minItems": 1},
+    )
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."

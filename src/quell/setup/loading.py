@@ -210,7 +210,7 @@ def windows_of(builder: Builder, tables: Sequence[Table]) -> tuple[dict[str, Any
     """Return the windows of [[metrics]], checked."""
     windows = tuple(window.written() for window in tables)
     for i, window in enumerate(windows):
-        builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
+        builder.attempt(f"metrics[{i}]", [*window], partial(check_window, **window))
     return windows
 
 
@@ -257,7 +257,7 @@ def _same(before: tuple[Any, ...], now: tuple[Any, ...]) -> bool:
     )
 
 
-def _check_window(
+def check_window(
     start: float = 0.0,
     stop: float | None = None,
     target: float | None = None,
