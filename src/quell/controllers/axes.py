@@ -42,6 +42,16 @@ from quell.controllers.allocation import (
     range_memory,
     update_gain,
 )
+from quell.controllers.axes_learning import (
+    AxisDesigns,
+    AxisStates,
+    LearningOfAxes,
+    NoAxis,
+    NoAxisMemory,
+    learn_of_all,
+    look_at_all,
+    restart_of_all,
+)
 from quell.controllers.base import (
     RateLimit,
     control,
@@ -92,30 +102,6 @@ def tell_applied(controller: Any, state: Any) -> None:
 
 
 # ---- The axes, one inside of the other, so that each may be of another kind ----
-
-
-class NoAxis(NamedTuple):
-    """The end of the axes."""
-
-
-class NoAxisMemory(NamedTuple):
-    """The end of the axes' states."""
-
-    nothing: Vector  # (0,)
-
-
-class AxisDesigns(NamedTuple):
-    """Parameters of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
-
-class AxisStates(NamedTuple):
-    """State of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
 
 
 @generic
@@ -306,6 +292,7 @@ class AxesDesign(NamedTuple):
     gain: Any  # B0
     rule: Any  # what is done at the limits
     limits: ActuatorLimits
+    learning: Any  # of learners that see all axes, see ``axes_learning``
     widths: Any  # channels of each axis (n,), integers
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
 
@@ -314,6 +301,7 @@ class AxesState(NamedTuple):
     """State of several axes."""
 
     axes: Any  # each axis with those behind it
+    learning: Any
     gain: GainMemory
     range: RangeMemory
     loop: NDArray[AxesLoop]  # (1,)
@@ -337,7 +325,9 @@ def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
 @control_all.register(AxesDesign)
 def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
     loop = state.loop[0]
+    look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags = ask_axes(design.axes, state.axes, 0, r, y, state.v, state.x)
+    learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
@@ -406,6 +396,7 @@ def _status_flags(design: AxesDesign, state: AxesState) -> int:
 @reset_loop.register(AxesDesign)
 def _reset_loop(design: AxesDesign, state: AxesState) -> None:
     reset_axes(design.axes, state.axes)
+    restart_of_all(design.learning, state.learning)
     clear(state.loop)
     for k in range(state.u.size):
         state.u[k] = 0.0
@@ -492,6 +483,12 @@ class Axes(StatefulController):
     wished
         the u from which that is measured (m,) [u-unit], as the thrusts that carry a craft; zero by
         default.
+    learner
+        one that sees the states of all axes, with features ``AllAxes(...)``: one for all axes,
+        which have one gain and θ of their own (``RLS``, ``NLMS``), or a list or dictionary with one
+        for each, None for an axis without. A learner that sees its own axis belongs into its ADRC.
+    guard
+        of these learners: a description, of which each axis has its own guard, or one for each.
 
     Raises
     ------
@@ -531,6 +528,8 @@ class Axes(StatefulController):
         saturation: str | Sequence[int | str] = "each",
         weights: Sequence[float] | None = None,
         wished: Sequence[float] | None = None,
+        learner: Any = None,
+        guard: Any = None,
     ) -> None:
         if not isinstance(axes, dict) and not checks.is_sequence(axes):
             raise ValueError(f"axes = {axes!r:.60}: must be an ADRC for each axis, in a list")
@@ -543,6 +542,8 @@ class Axes(StatefulController):
         self.B0, self.M, self.weights = B0, M, weights
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
+        self.learning.attach(self.axes)
         self._initialise()
 
     # ---- What simulation and real-time loop use ----
@@ -606,6 +607,7 @@ class Axes(StatefulController):
             self._gain.design,
             self._rule,
             self._actuators,
+            self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
             np.array(self.derivatives, dtype=np.int64),
         )
@@ -618,6 +620,7 @@ class Axes(StatefulController):
             states = AxisStates(axis.initial_state(), states)
         return AxesState(
             axes=states,
+            learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
             range=range_memory(n, m),
             loop=AxesLoop.zeros(),
@@ -765,7 +768,9 @@ class Axes(StatefulController):
         **changes
             ``omega_c`` and ``observer``, as for ``ADRC.retune``, with the same errors.
         """
+        self.learning.check_retuning(changes)
         self.axes[self.index(axis)].retune(**changes)
+        self.learning.update(self.axes)
         self._update_parameters()
         self._pack_again()
 
@@ -803,6 +808,9 @@ class Axes(StatefulController):
         for name in ("B0", "M"):
             if getattr(self, name) is not None:
                 found[name] = getattr(self, name)
+        for name in ("learner", "guard"):
+            if getattr(self.learning, name) is not None:
+                found[name] = getattr(self.learning, name)
         for name, values in (("u_min", self._actuators.low), ("u_max", self._actuators.high)):
             if np.all(np.isfinite(values)):
                 found[name] = values.tolist()
