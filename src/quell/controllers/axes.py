@@ -32,6 +32,7 @@ from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.allocation import (
     ActuatorLimits,
+    Gain,
     GainMemory,
     RangeMemory,
     allocate,
@@ -64,6 +65,15 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensator import Estimate, samples_to_settle, start_at_rest
 from quell.controllers.memory import Layout
+from quell.controllers.safe_axes import (
+    add_axes_flags,
+    check_safe_sets,
+    keep_in_bands,
+    safe_axes_design,
+    safe_axes_memory,
+    write_axes_bounds,
+)
+from quell.controllers.safe_set import write_bounds
 from quell.controllers.stateful import PackedController, StatefulController, unpacked
 from quell.kernels import dispatch
 from quell.kernels.dispatch import (
@@ -274,6 +284,19 @@ def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v:
     set_axes_manual(axes.others, states.others, manual, i + 1, v)
 
 
+@write_axes_bounds.register(AxisDesigns)
+def _write_bounds(axes: AxisDesigns, states: AxisStates, i: int, bounds: Matrix) -> None:
+    write_bounds(axes.axis.safe_set, states.axis.safe_set, bounds[i])
+    write_axes_bounds(axes.others, states.others, i + 1, bounds)
+
+
+@add_axes_flags.register(AxisDesigns)
+def _add_flags(axes: AxisDesigns, states: AxisStates, i: int, flags: Vector) -> None:
+    own = states.axis.loop[0]
+    own.status = int(own.status) | int(flags[i])
+    add_axes_flags(axes.others, states.others, i + 1, flags)
+
+
 # ---- A sample of all axes ----
 
 
@@ -295,6 +318,7 @@ class AxesDesign(NamedTuple):
     learning: Any  # of learners that see all axes, see ``axes_learning``
     widths: Any  # channels of each axis (n,), integers
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
+    safe: Any  # the safe sets of axes together, or none
 
 
 class AxesState(NamedTuple):
@@ -304,6 +328,7 @@ class AxesState(NamedTuple):
     learning: Any
     gain: GainMemory
     range: RangeMemory
+    safe: Any
     loop: NDArray[AxesLoop]  # (1,)
     x: Work  # estimates x[axis, derivative] (n, largest order)
     v: Vector  # what the axes asked for, then what was applied (n,)
@@ -335,6 +360,10 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     flags |= allocate(
         design.rule, design.limits, state.gain, state.range, state.v, state.u, state.u_limited
     )
+    flags |= keep_in_bands(
+        design.safe, state.safe, design.axes, state.axes, design.limits, state.gain, state.range,
+        state.u_limited,
+    )  # fmt: skip
     for k in range(u.size):
         state.u[k] = state.u_limited[k]
         u[k] = state.u[k]
@@ -479,7 +508,8 @@ class Axes(StatefulController):
         order.
     weights
         of the actuators, where there are more than axes: u is the smallest ``Σ W (u − wished)²``
-        that does what the axes ask for (m,).
+        that does what the axes ask for (m,). If an axis has a safe set, also of the change of u
+        that keeps v within the bounds of all axes (``controllers/safe_axes.py``).
     wished
         the u from which that is measured (m,) [u-unit], as the thrusts that carry a craft; zero by
         default.
@@ -538,8 +568,8 @@ class Axes(StatefulController):
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
         check_axes(parts, self.names)
         self.axes: tuple[ADRC, ...] = tuple(copy.copy(axis) for axis in parts)
-        self._gain = checked_gain(B0, M, weights, self.names, self._most)
         self.B0, self.M, self.weights = B0, M, weights
+        self._gain = self._checked_gain()
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
         self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
@@ -573,6 +603,14 @@ class Axes(StatefulController):
         return max(axis.observer.order for axis in self.axes)
 
     @property
+    def _has_bands(self) -> bool:
+        return any(axis.safe_set is not None for axis in self.axes)
+
+    def _checked_gain(self) -> Gain:
+        given = (self.B0, self.M, self.weights)
+        return checked_gain(*given, self.names, self._most, weighs_change=self._has_bands)
+
+    @property
     def derivatives(self) -> tuple[int, ...]:
         """Number of derivatives of the reference that each axis feeds forward."""
         return tuple(axis.derivatives for axis in self.axes)
@@ -598,6 +636,8 @@ class Axes(StatefulController):
         return self._actuators
 
     def _update_parameters(self) -> None:
+        safe_sets = [axis.safe_set for axis in self.axes]
+        check_safe_sets(safe_sets, self.names, self._gain.first, self._actuators)
         designs: Any = NoAxis()
         for axis in reversed(self.axes):
             designs = AxisDesigns(axis.parameters, designs)
@@ -610,6 +650,7 @@ class Axes(StatefulController):
             self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
             np.array(self.derivatives, dtype=np.int64),
+            safe_axes_design(self._has_bands, self._gain.weights),
         )
 
     def initial_state(self) -> AxesState:
@@ -623,6 +664,7 @@ class Axes(StatefulController):
             learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
             range=range_memory(n, m),
+            safe=safe_axes_memory(self.parameters.safe, n, m),
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
             v=np.zeros(n),
@@ -832,7 +874,7 @@ class Axes(StatefulController):
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
         self.axes = tuple(copy.copy(axis) for axis in self.axes)
-        self._gain = checked_gain(self.B0, self.M, self.weights, self.names, self._most)
+        self._gain = self._checked_gain()
         self._initialise()
         self.state = kept["state"]
 

@@ -95,7 +95,7 @@ def coupled(
         what happens at the limits: `each` cuts each actuator, `direction` scales all, and a list of
         all axes gives them what they ask for in this order.
     weights
-        of the actuators, where there are more than axes.
+        of the actuators, where there are more than axes or an axis has a safe set.
     wished
         the control signals from which that is measured [u-unit]; zero by default.
     learner, guard
@@ -182,7 +182,7 @@ OBSERVERS = {
     )
     for kind, table in registry.OBSERVERS.items()
 }
-_OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule", "safe_set")
+_OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule")
 CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
 AXES = call_table(
     "axes",
