@@ -90,7 +90,13 @@ ROWS: dict[str, Any] = {
     ),
     "mass matrix of the arm": lambda: ql.Axes([joint(), joint()], M=ARM.inertia, **LIMITS),
 }
-SINGLE = ("each, with rates", "safe sets, rates", "more actuators, direction", "priority", "orders 1, 3 and 2")
+SINGLE = (
+    "each, with rates",
+    "safe sets, rates",
+    "more actuators, direction",
+    "priority",
+    "orders 1, 3 and 2",
+)
 
 
 def outcome(folder: Path, *arguments: str) -> tuple[int, str]:
@@ -134,7 +140,7 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
 def test_the_run_of_the_golden_vectors_has_bands_that_are_kept_and_left() -> None:
     """Samples in which the safe sets act and all is well, and some where the limits are too narrow."""
     axes = ROWS["safe sets, more actuators, direction"]()
-    rows = golden_vectors_of_axes(axes, parts_of_axes(axes, False), ("set_held",)).rows
+    rows = golden_vectors(axes, c_source(axes)).rows
     flags = [ql.Status(row.status) for row in rows]
     acted = [each for each in flags if ql.Status.SAFE_SET_ACTED in each]
     assert any(ql.Status.UNSAFE in each for each in acted)
