@@ -11,6 +11,9 @@ from sphinx.application import Sphinx
 
 import quell
 
+sys.path.insert(0, str(Path(__file__).parent))
+import machine_texts
+
 # Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
 os.environ["QUELL_QUIET"] = "1"  # pages do not show what is compiled
@@ -78,5 +81,12 @@ draw_gallery()
 
 
 def setup(app: Sphinx) -> None:
-    """Take MathJax from its package, which does not say that pages may be read in parallel."""
+    """Write the texts for machines beside the pages, which are read in parallel."""
+    # MathJax comes from its package, which does not say that pages may be read in parallel.
     importlib.import_module("sphinx-mathjax-offline").setup(app)
+
+    def finish(app: Sphinx, exception: Exception | None) -> None:
+        if exception is None and app.builder.format == "html":
+            machine_texts.write(Path(app.outdir))
+
+    app.connect("build-finished", finish)

@@ -66,7 +66,7 @@ def test_any_calls_of_axes_leave_all_u_numbers_within_their_limits(
     wide, limits = [[1.0, 0.3, 0.2], [0.2, 1.0, -0.3]], {"u_min": -5.0, "u_max": 5.0}
     rule = "direction" if single else "each"
     controller = ql.Axes([learning, ql.ADRC(observer, 5.0)], wide, saturation=rule, **limits)
-    source = axes.source_of_axes(controller, "robot", single)
+    source = ql.export.c_source(controller, "robot", precision="single" if single else "double")
     program = axes.hostile_program(source, 1)
     made = hostile.compiled(tmp_path, source, program, "address")
     assert hostile.run(made, 1e5) == ("0", "0", "0")
