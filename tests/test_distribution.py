@@ -98,6 +98,8 @@ def test_doctor_asks_for_the_extras_of_users(project: Any, monkeypatch: Any) -> 
         lines += [f"{line} ; extra == '{extra}'" for line in needed]
     monkeypatch.setattr("importlib.metadata.requires", lambda name: lines)
     found = doctor.requirements()
-    assert {name for name, _ in found[""]} == {line.split(">=")[0] for line in project["dependencies"]}
+    assert {name for name, _ in found[""]} == {
+        line.split(">=")[0] for line in project["dependencies"]
+    }
     assert {"telemetry", "tuning", "envs", "studio"} <= set(found)
     assert all(name != DISTRIBUTION for parts in found.values() for name, _ in parts)
