@@ -1,12 +1,13 @@
 """Sphinx configuration."""
 
+import importlib
 import os
 import runpy
 import sys
 from pathlib import Path
-from typing import Any
 
 import matplotlib.pyplot as plt
+from sphinx.application import Sphinx
 
 import quell
 
@@ -30,7 +31,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
-    "sphinx-mathjax-offline",
 ]
 html_theme = "pydata_sphinx_theme"
 html_title = "quell"
@@ -80,10 +80,12 @@ def draw_gallery() -> None:
 draw_gallery()
 
 
-def setup(app: Any) -> None:
-    """Write the texts for machines beside the pages."""
+def setup(app: Sphinx) -> None:
+    """Write the texts for machines beside the pages, which are read in parallel."""
+    # MathJax comes from its package, which does not say that pages may be read in parallel.
+    importlib.import_module("sphinx-mathjax-offline").setup(app)
 
-    def finish(app: Any, exception: Exception | None) -> None:
+    def finish(app: Sphinx, exception: Exception | None) -> None:
         if exception is None and app.builder.format == "html":
             machine_texts.write(Path(app.outdir))
 
