@@ -85,6 +85,7 @@ class FunctionBlock:
         for section, declared in re.findall(
             r"(VAR\w*(?: CONSTANT)?)\n(.*?)(?:END_VAR|\Z)", head, re.S
         ):
+            declared = re.sub(r"\s+", " ", declared)
             for name, kind, value in re.findall(r"(\w+) : ([^;]*?)(?: := ([^;]*))?;", declared):
                 assert name.lower() not in self.v, f"{name} is declared twice"
                 self.v[name.lower()] = self._value(kind, value)
