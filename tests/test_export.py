@@ -114,7 +114,7 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
 
 def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
     """Held values, both limits, u beside manual operation, and a continuation without a jump."""
-    vectors = golden_vectors(ADRC, ("track", "start", "set_held"))
+    vectors = golden_vectors(ADRC, ql.export.c_source(ADRC))
     flags = Status(int(np.bitwise_or.reduce([row.status for row in vectors.rows])))
     held = Status.MEASUREMENT_HELD | Status.REFERENCE_HELD
     u = Status.SATURATED | Status.RATE_LIMITED | Status.CONTROL_HELD

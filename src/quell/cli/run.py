@@ -508,13 +508,14 @@ def studio(
         Open the page in the browser; otherwise only print its address.
     """
     from quell.setup import read
-    from quell.studio.messages import Granted, checked, files_of
+    from quell.studio.messages import Granted, checked, files_of, with_models
     from quell.studio.runs import Maker
     from quell.studio.server import serve
 
     tables = None
     if setup is not None:
         name, data = read(setup)
+        data = with_models(data)
         tables = checked(data, Granted(files_of(data), trust))
         tables.setdefault("title", name.removesuffix(".toml").replace("_", " "))
         Maker(name, trust)(tables)

@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from quell import checks
-from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
 from quell.controllers.compensated import takes_control
 from quell.controllers.single import SinglePrecision
-from quell.export.axes_source import parts_of_axes, source_of_axes
-from quell.export.c_files import CSource, refuse_state_feedback
+from quell.controllers.state_space import StateFeedback
+from quell.export.c_files import CSource
 from quell.export.controller_source import c_source, in_double_precision, limits_path
-from quell.export.library.axes_vectors import golden_vectors_of_axes, test_program_of_axes
 from quell.export.library.vectors import fill, golden_vectors, test_program
 from quell.export.translate.text import TranslationError, checked_name
 from quell.files import check_folder, write_folder
@@ -82,7 +80,11 @@ def ros2(
         or C (``TranslationError``). Nothing is written then.
     """
     check_controller(controller, several=True)
-    refuse_state_feedback(controller)
+    if isinstance(controller, StateFeedback):
+        raise TranslationError(
+            "controller is StateFeedback: a package is of one u and y, or of axes; write its C "
+            "with quell.export.c and call it in a controller of your own"
+        )
     _check_name(name)
     check_folder(folder, checks.flag("overwrite", overwrite))
     if isinstance(controller, SinglePrecision):
@@ -91,13 +93,8 @@ def ros2(
             "export the controller itself, without in_single_precision"
         )
     rate = _rate(float(controller.dt))
-    if isinstance(controller, Axes):
-        source, parts = source_of_axes(controller, name), parts_of_axes(controller, single=False)
-        vectors = golden_vectors_of_axes(controller, parts, source.operations)
-        test = test_program_of_axes(source, vectors)
-    else:
-        source = c_source(controller, name)
-        test = test_program(source, golden_vectors(controller, source.operations))
+    source = c_source(controller, name)
+    test = test_program(source, golden_vectors(controller, source))
     if source.externals:
         raise TranslationError(
             f"controller calls {', '.join(source.externals)} in C: a package needs the file, too; "
@@ -143,7 +140,7 @@ def _rate(dt: float) -> int:
 def _values(controller: Any, source: CSource, rate: int) -> dict[str, object]:
     """Return the values of the templates."""
     name, several = source.name, bool(source.axes)
-    axes, actuators = (len(source.axes), source.actuators) if several else (1, 1)
+    axes, actuators = (len(source.axes), source.sizes[2]) if source.sizes else (1, 1)
     references = axes * (1 + len(source.further))
     given = "u_0" if takes_control(in_double_precision(controller)) else "r"
     meaning = ", ".join(f"{each} of each axis" if several else each
