@@ -16,7 +16,7 @@ from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
 from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
-from quell.controllers.single import in_single_precision
+from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
 from quell.export.controller_source import (
     at_path,
@@ -106,6 +106,10 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
             f"controller has {controller.outputs} axes: a function block is of one u and one y; "
             "export each axis by itself as an ADRC"
         )
+    if isinstance(controller, StateFeedback):
+        raise TranslationError(
+            "controller is StateFeedback: a function block is of one u and one y; use --to c"
+        )
     _check_name(name)
     learner = getattr(without_prefilters(in_double_precision(controller)), "learner", None)
     if not isinstance(learner, NoLearner | None):
@@ -114,8 +118,7 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
             "(learner=None), or use --to c"
         )
     _check_limits(controller)
-    shown = in_single_precision(controller) if single else controller
-    source = c_source(shown, name)
+    source = c_source(controller, name, precision="single" if single else "double")
     if source.externals:
         raise TranslationError(
             f"controller calls {', '.join(source.externals)} in C: has no Structured Text; leave "

@@ -150,7 +150,9 @@ class Translator:
         before = len(self._lines)
         work()
         if len(self._lines) == before:
-            self.emit(";")
+            # Some compilers take no empty statement.
+            nothing = self._local_scalar("", "nothing", "bool")
+            self.emit(f"{nothing.text()} := FALSE;")
         self._depth -= depth
 
     def run(self, name: str, names: dict[str, Place], statements: tuple[Statement, ...]) -> None:
@@ -687,6 +689,8 @@ class Translator:
                 if isinstance(array, Array):
                     return self._moved(array, self._node(value.operand.at))
             return self.evaluate(value.operand)
+        if value.operator == "-" and value.operand in map(Name, ("INFINITY", "DBL_MAX", "FLT_MAX")):
+            return self.extreme(-math.inf)
         operand = self._node(value.operand)
         if value.operator == "!":
             return Node("bool", lambda: f"NOT {inside(operand, 8)}", 8)
