@@ -66,6 +66,21 @@ def test_a_setup_is_made_again_of_its_tables() -> None:
         assert repr(written.controller) == repr(setup.controller)
 
 
+def test_an_axis_has_a_safe_set() -> None:
+    """A table in its controller, with weights of the actuators beside it."""
+    data = gantry()
+    bands = {"y_min": -0.5, "y_max": 0.5, "alpha": 6.0, "gain_error": 0.01, "largest_u": 150.0}
+    data["axis"][0]["controller"]["safe_set"] = bands
+    data["axes"]["weights"] = [1.0, 2.0]
+    found = made_axes("a.toml", data).controller
+    assert found.axes[0].safe_set == ql.SafeSet(**bands)
+    assert found.axes[1].safe_set is None
+    assert found.parameters.safe.weights.tolist() == [1.0, 2.0]
+    del data["axis"][0]["controller"]["safe_set"]
+    with pytest.raises(SetupError, match="weights = .*leave them out"):
+        made_axes("a.toml", data)
+
+
 def test_b0_of_the_plant_is_that_of_each_kind() -> None:
     """Of an arm M(q) in place of it, also behind encoders; of a craft that near the horizontal; of a linear plant C A B."""
     linear = made_axes("a.toml", gantry()).controller

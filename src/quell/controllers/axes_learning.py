@@ -1,4 +1,4 @@
-"""Axes one inside of the other, and what their learners know of each other.
+"""What the learners of several axes know of each other.
 
 A learner that is given to ``Axes`` sees the states of all axes (``learners/all_axes.py``). At the
 beginning of a sample, before the axes run, all signals are gathered; a learner that all axes share
@@ -14,6 +14,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.adrc import ADRC
+from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.guard import Guard
 from quell.kernels.dispatch import generic, generic_with_default
 from quell.kernels.sized import Size, Work
@@ -41,33 +42,6 @@ from quell.learners.base import (
     restart,
 )
 from quell.types import Vector
-
-# ---- The axes, one inside of the other, so that each may be of another kind ----
-
-
-class NoAxis(NamedTuple):
-    """The end of the axes."""
-
-
-class NoAxisMemory(NamedTuple):
-    """The end of the axes' states."""
-
-    nothing: Vector  # (0,)
-
-
-class AxisDesigns(NamedTuple):
-    """Parameters of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
-
-class AxisStates(NamedTuple):
-    """State of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
 
 # ---- What the learners of all axes know together ----
 

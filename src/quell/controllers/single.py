@@ -19,7 +19,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.axes import Axes, AxesDesign
-from quell.controllers.axes_learning import AxisDesigns
+from quell.controllers.axes_chain import AxisDesigns
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
@@ -265,13 +265,12 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
     """
     if isinstance(controller, SinglePrecision):
         return controller
-    if isinstance(controller, Axes):
+    if isinstance(controller, Axes | StateFeedback):
+        what = "several axes run" if isinstance(controller, Axes) else "state feedback runs"
         raise ValueError(
-            "controller = Axes(…): several axes run in Python in double precision only; "
-            "quell.export.c(…, precision='single', accept=True) writes their C code in single"
+            f"controller = {type(controller).__name__}(…): {what} in Python in double precision "
+            "only; quell.export.c(…, precision='single', accept=True) writes the C code in single"
         )
-    if isinstance(controller, StateFeedback):
-        raise ValueError("controller = StateFeedback(…): runs in double precision only")
     return SinglePrecision(controller)
 
 

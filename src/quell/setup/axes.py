@@ -28,7 +28,7 @@ from quell.plants.multivariable import MultivariableLinearPlant, check_several
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import Setup, title_of, windows_of
+from quell.setup.loading import Known, Setup, made_once, title_of, windows_of
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -95,7 +95,7 @@ def coupled(
         what happens at the limits: `each` cuts each actuator, `direction` scales all, and a list of
         all axes gives them what they ask for in this order.
     weights
-        of the actuators, where there are more than axes.
+        of the actuators, where there are more than axes or an axis has a safe set.
     wished
         the control signals from which that is measured [u-unit]; zero by default.
     learner, guard
@@ -182,7 +182,7 @@ OBSERVERS = {
     )
     for kind, table in registry.OBSERVERS.items()
 }
-_OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule", "safe_set")
+_OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule")
 CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
 AXES = call_table(
     "axes",
@@ -236,7 +236,10 @@ class AxesDescription(Table):
     dt: float = DT
     plant: AxesPlant | None = optional("the plant with several signals, for `quell run`.")
     axes: AxesTable | None = optional("B0 and the actuators; the unit matrix by default.")
-    axis: tuple[Axis, ...] = Field(description="[[axis]]: an axis, in the order of the outputs.")
+    axis: tuple[Axis, ...] = Field(
+        description="[[axis]]: an axis, in the order of the outputs.",
+        json_schema_extra={"minItems": 1},
+    )
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."
@@ -269,8 +272,12 @@ def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     return made_axes(*read(path), trust)
 
 
-def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
+def made_axes(
+    name: str, data: Mapping[str, Any], trust: bool = False, known: Known | None = None
+) -> Setup:
     """Build the objects that ``data`` describes: the content of a file of several axes.
+
+    ``known`` has the plant of an earlier call, which is not built again if its table is the same.
 
     Raises
     ------
@@ -291,7 +298,8 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
     plant = None
     if tables.plant is not None:
-        plant = builder.build(tables.plant, "plant", dt=dt)
+        make = partial(builder.build, tables.plant, "plant", dt=dt)
+        plant = made_once({} if known is None else known, "plant", (tables.plant, dt), make)
         builder.attempt("", (), check_several, plant)
     names = [axis.name or f"axis{i + 1}" for i, axis in enumerate(tables.axis)]
     if len(set(names)) < len(names):
