@@ -23,7 +23,7 @@ from quell.controllers.axes import (
     start_all,
     tell_applied,
 )
-from quell.controllers.axes_learning import AxisDesigns, AxisStates, NoAxis
+from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.controllers.base import (
     change_parameters,
     is_usable,
