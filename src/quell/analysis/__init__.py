@@ -24,6 +24,7 @@ from quell.analysis.plots import (
     plot_nyquist,
     plot_root_locus,
 )
+from quell.analysis.points import LoopsAtPoints, analyse_points
 from quell.controllers.adrc import Finding
 from quell.lti.zeros import (
     Existence,
@@ -44,6 +45,7 @@ __all__ = [
     "Frozen",
     "InvariantZeros",
     "LoopAnalysis",
+    "LoopsAtPoints",
     "Margins",
     "MatrixLaw",
     "MultivariableLoop",
@@ -54,6 +56,7 @@ __all__ = [
     "advise",
     "analyse",
     "analyse_axes",
+    "analyse_points",
     "axes_law",
     "certify",
     "certify_axes",
