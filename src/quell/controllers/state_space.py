@@ -25,7 +25,6 @@ from quell.controllers.allocation import (
     changed_actuator_limits,
     checked_actuator_limits,
 )
-from quell.controllers.axes import control_all, prepared_step, take_signals
 from quell.controllers.base import (
     Limits,
     RateLimit,
@@ -37,6 +36,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.feedback_gains import regulator
+from quell.controllers.several import control_all, prepared_step, take_signals
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Scalars, clear

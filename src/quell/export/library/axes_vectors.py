@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.axes import Axes, control_all, hand_over_all
+from quell.controllers.axes import Axes, hand_over_all
 from quell.controllers.base import (
     change_parameters,
     reset_loop,
@@ -22,6 +22,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.compensator import samples_to_settle
+from quell.controllers.several import control_all
 from quell.export import axes_source
 from quell.export.axes_source import AxesParts
 from quell.export.c_files import CSource
