@@ -279,6 +279,17 @@ def _cut(memory: RangeMemory, limits: ActuatorLimits, i: int, wish: float) -> tu
 
 
 @kernel
+def cut_to_range(limits: ActuatorLimits, before: Vector, memory: RangeMemory, u: Vector) -> int:
+    """Cut each control signal in ``u`` to its range after ``before``; return the flags."""
+    set_range(limits, before, memory)
+    flags = 0
+    for k in range(u.size):
+        u[k], cut = _cut(memory, limits, k, u[k])
+        flags |= cut
+    return flags
+
+
+@kernel
 def _wish(memory: GainMemory, wished: Vector, v: Vector, rest: Vector, u: Vector) -> None:
     """Write ``u_r + B0⁺ (v − B0 u_r)`` into ``u`` (m,)."""
     n, m = memory.B.shape
@@ -317,12 +328,8 @@ def _cut_each(
     u: Vector,
 ) -> int:
     n, m = gain.B.shape
-    set_range(limits, before, memory)
     _wish(gain, rule.wished, v, memory.rest, u)
-    flags = 0
-    for k in range(m):
-        u[k], cut = _cut(memory, limits, k, u[k])
-        flags |= cut
+    flags = cut_to_range(limits, before, memory, u)
     usable = flags & _OVERFLOWED == 0
     for i in range(n):
         usable = usable and is_finite(v[i])

@@ -41,6 +41,16 @@ from quell.controllers.allocation import (
     range_memory,
     update_gain,
 )
+from quell.controllers.axes_learning import (
+    AxisDesigns,
+    AxisStates,
+    LearningOfAxes,
+    NoAxis,
+    NoAxisMemory,
+    learn_of_all,
+    look_at_all,
+    restart_of_all,
+)
 from quell.controllers.base import (
     Controller,
     RateLimit,
@@ -71,20 +81,21 @@ from quell.controllers.given_controls import (
     start_given,
     take_references,
     tell_given,
-    write_unlimited,
 )
-from quell.controllers.law import unlimited_control
 from quell.controllers.memory import Layout
 from quell.controllers.safe_axes import (
-    add_axes_flags,
     check_safe_sets,
     keep_in_bands,
     safe_axes_design,
     safe_axes_memory,
-    write_axes_bounds,
 )
-from quell.controllers.safe_set import write_bounds
-from quell.controllers.several import control_all, prepared_step, take_signals
+from quell.controllers.several import (
+    control_all,
+    prepared_step,
+    start_all,
+    take_signals,
+    tell_applied,
+)
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import (
     generic,
@@ -94,30 +105,6 @@ from quell.kernels.sized import Scalars, Work, clear
 from quell.types import Channels, Matrix, Status, Vector
 
 # ---- The axes, one inside of the other, so that each may be of another kind ----
-
-
-class NoAxis(NamedTuple):
-    """The end of the axes."""
-
-
-class NoAxisMemory(NamedTuple):
-    """The end of the axes' states."""
-
-    nothing: Vector  # (0,)
-
-
-class AxisDesigns(NamedTuple):
-    """Parameters of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
-
-class AxisStates(NamedTuple):
-    """State of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
 
 
 @generic
@@ -290,29 +277,6 @@ def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v:
     set_axes_manual(axes.others, states.others, manual, i + 1, v)
 
 
-@write_axes_bounds.register(AxisDesigns)
-def _write_bounds(axes: AxisDesigns, states: AxisStates, i: int, bounds: Matrix) -> None:
-    write_bounds(axes.axis.safe_set, states.axis.safe_set, bounds[i])
-    write_axes_bounds(axes.others, states.others, i + 1, bounds)
-
-
-@write_unlimited.register(AxisDesigns)
-def _write_unlimited(
-    axes: AxisDesigns, states: AxisStates, i: int, v: Vector, held: Vector
-) -> None:
-    own = states.axis.loop[0]
-    held[i] = own.held
-    v[i] = unlimited_control(axes.axis, states.axis, own.constant, own.slope) + own.offset
-    write_unlimited(axes.others, states.others, i + 1, v, held)
-
-
-@add_axes_flags.register(AxisDesigns)
-def _add_flags(axes: AxisDesigns, states: AxisStates, i: int, flags: Vector) -> None:
-    own = states.axis.loop[0]
-    own.status = int(own.status) | int(flags[i])
-    add_axes_flags(axes.others, states.others, i + 1, flags)
-
-
 # ---- A sample of all axes ----
 
 
@@ -331,6 +295,7 @@ class AxesDesign(NamedTuple):
     gain: Any  # B0
     rule: Any  # what is done at the limits
     limits: ActuatorLimits
+    learning: Any  # of learners that see all axes, see ``axes_learning``
     widths: Any  # channels of each axis (n,), integers
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
     safe: Any  # the safe sets of axes together, or none
@@ -341,6 +306,7 @@ class AxesState(NamedTuple):
     """State of several axes."""
 
     axes: Any  # each axis with those behind it
+    learning: Any
     gain: GainMemory
     range: RangeMemory
     safe: Any
@@ -368,7 +334,9 @@ def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
 def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
     loop = state.loop[0]
     flags = take_references(design.given, state.given, state.gain, r, y, state.wish)
+    look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags |= ask_axes(design.axes, state.axes, 0, state.wish, y, state.v, state.x)
+    learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
@@ -390,21 +358,17 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     loop.status, loop.started = flags, 1.0
 
 
-def tell_applied(design: AxesDesign, state: AxesState) -> None:
-    """Tell all axes what the control signals in the state do."""
+@tell_applied.register(AxesDesign)
+def _tell_applied(design: AxesDesign, state: AxesState) -> None:
     apply_to_axes(state.gain, state.u, state.v)
     tell_given(design.given, state.given, design.axes, state.axes, state.gain, state.u, ANY_CUT)
     tell_axes(design.axes, state.axes, 0, state.v)
 
 
-def start_all(
+@start_all.register(AxesDesign)
+def _start_all(
     design: AxesDesign, state: AxesState, samples: Any, y: Vector, u: Vector, r: Vector
 ) -> None:
-    """Start at a machine that rests at y under u: the next sample continues from there.
-
-    r are the references of the next sample; one that is no number is y. What was learned is kept.
-    Each observer takes as many ``samples`` (n,) as it needs to settle.
-    """
     reset_loop(design, state)
     for i in range(state.v.size):
         for j in range(state.x.shape[1]):
@@ -450,6 +414,7 @@ def _status_flags(design: AxesDesign, state: AxesState) -> int:
 def _reset_loop(design: AxesDesign, state: AxesState) -> None:
     reset_axes(design.axes, state.axes)
     reset_given(design.given, state.given)
+    restart_of_all(design.learning, state.learning)
     clear(state.loop)
     for k in range(state.u.size):
         state.u[k] = 0.0
@@ -509,6 +474,12 @@ class Axes(StatefulController):
     drives
         controllers that give u_0 where the axes are compensators, one for each axis and for the
         actuator of its place, as ``PID``; r are then their references. They are copied.
+    learner
+        one that sees the states of all axes, with features ``AllAxes(...)``: one for all axes,
+        which have one gain and θ of their own (``RLS``, ``NLMS``), or a list or dictionary with one
+        for each, None for an axis without. A learner that sees its own axis belongs into its ADRC.
+    guard
+        of these learners: a description, of which each axis has its own guard, or one for each.
 
     Raises
     ------
@@ -549,6 +520,8 @@ class Axes(StatefulController):
         weights: Sequence[float] | None = None,
         wished: Sequence[float] | None = None,
         drives: Sequence[Controller] | None = None,
+        learner: Any = None,
+        guard: Any = None,
     ) -> None:
         if not isinstance(axes, dict) and not checks.is_sequence(axes):
             raise ValueError(f"axes = {axes!r:.60}: must be an ADRC for each axis, in a list")
@@ -559,10 +532,12 @@ class Axes(StatefulController):
         self.axes: tuple[Any, ...] = tuple(copy.copy(axis) for axis in parts)
         self.B0, self.M, self.weights = B0, M, weights
         self._gain = self._checked_gain()
-        check_compensates(self.takes_u_0, drives, wished)
+        check_compensates(self.compensates, drives, wished)
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self.drives = checked_drives(drives, self.names, self.inputs, self.dt)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
+        self.learning.attach(self.axes)
         self._initialise()
 
     # ---- What simulation and real-time loop use ----
@@ -585,10 +560,15 @@ class Axes(StatefulController):
     @property
     def references(self) -> int:
         """Number of references, or of control signals u_0 in their place."""
-        return self.inputs if self.takes_u_0 and not self.drives else self.outputs
+        return self.inputs if self.takes_u_0 else self.outputs
 
     @property
     def takes_u_0(self) -> bool:
+        """Whether control signals take the place of references: of compensators without drives."""
+        return self.compensates and not self.drives
+
+    @property
+    def compensates(self) -> bool:
         """Whether the axes are compensators."""
         return takes_control(self.axes[0])
 
@@ -646,10 +626,11 @@ class Axes(StatefulController):
             self._gain.design,
             self._rule,
             self._actuators,
+            self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
             np.array(self.derivatives, dtype=np.int64),
             safe_axes_design(self._has_bands, self._gain.weights),
-            given_design(self.takes_u_0, self.drives),
+            given_design(self.compensates, self.drives),
         )
 
     def initial_state(self) -> AxesState:
@@ -660,6 +641,7 @@ class Axes(StatefulController):
             states = AxisStates(axis.initial_state(), states)
         return AxesState(
             axes=states,
+            learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
             range=range_memory(n, m),
             safe=safe_axes_memory(self.parameters.safe, n, m),
@@ -715,7 +697,7 @@ class Axes(StatefulController):
         except (TypeError, ValueError):
             n, m, names = self.outputs, self.references, ", ".join(self.names)
             rule = f"each must have {n} numbers, one for each axis ({names})"
-            if self.takes_u_0 and not self.drives:
+            if self.takes_u_0:
                 rule = f"u_0 must have {m} numbers, one for each actuator, y {n} ({names})"
             raise ValueError(f"r = {r!r}, y = {y!r}: {rule}") from None
         if derivatives:
@@ -762,7 +744,7 @@ class Axes(StatefulController):
         """
         rest = checks.vector("y", y, self.outputs)
         given = np.zeros(self.inputs) if u is None else checks.vector("u", u, self.inputs)
-        usual = given if self.takes_u_0 and not self.drives else rest
+        usual = given if self.takes_u_0 else rest
         goals = usual if r is None else checks.vector("r", r, self.references)
         samples = [samples_to_settle(axis.observer) for axis in self.axes]
         start_all(self.parameters, self._state, samples, rest, given, goals)
@@ -813,10 +795,12 @@ class Axes(StatefulController):
         **changes
             ``omega_c`` and ``observer``, as for ``ADRC.retune``, with the same errors.
         """
-        if self.takes_u_0 and "omega_c" in changes:
+        if self.compensates and "omega_c" in changes:
             omega_c = changes["omega_c"]
             raise ValueError(f"omega_c = {omega_c!r}: a compensator has no law; give an observer")
+        self.learning.check_retuning(changes)
         self.axes[self.index(axis)].retune(**changes)
+        self.learning.update(self.axes)
         self._update_parameters()
         self._pack_again()
 
@@ -854,6 +838,9 @@ class Axes(StatefulController):
         for name in ("B0", "M"):
             if getattr(self, name) is not None:
                 found[name] = getattr(self, name)
+        for name in ("learner", "guard"):
+            if getattr(self.learning, name) is not None:
+                found[name] = getattr(self.learning, name)
         for name, values in (("u_min", self._actuators.low), ("u_max", self._actuators.high)):
             if np.all(np.isfinite(values)):
                 found[name] = values.tolist()

@@ -36,6 +36,7 @@ from quell.controllers.allocation import (
     allocate,
     set_range,
 )
+from quell.controllers.axes_learning import AxisDesigns, AxisStates
 from quell.controllers.base import (
     check_controller,
     control,
@@ -47,6 +48,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensated import check_takes_compensator, takes_control
 from quell.controllers.compensator import Compensator
+from quell.controllers.law import unlimited_control
 from quell.kernels.dispatch import generic, generic_with_default, kernel
 from quell.kernels.sized import Work
 from quell.types import Status, Vector
@@ -186,12 +188,22 @@ class GivenMemory(NamedTuple):
     before: Work  # last u less u_0 (m,)
     told: Vector  # what the drives were told (m,)
     held: Work  # 1 for axes that are held, else 0 (m,)
-    limits: LimitsOfChange
+    limits: Any  # LimitsOfChange, in the place of ActuatorLimits
 
 
 @generic_with_default
 def write_unlimited(axes: Any, states: Any, i: int, v: Vector, held: Vector) -> None:
     """Write what the axes from the i-th on ask for before limits and bands, and who is held."""
+
+
+@write_unlimited.register(AxisDesigns)
+def _write_unlimited(
+    axes: AxisDesigns, states: AxisStates, i: int, v: Vector, held: Vector
+) -> None:
+    own = states.axis.loop[0]
+    held[i] = own.held
+    v[i] = unlimited_control(axes.axis, states.axis, own.constant, own.slope) + own.offset
+    write_unlimited(axes.others, states.others, i + 1, v, held)
 
 
 @generic_with_default

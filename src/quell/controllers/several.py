@@ -23,6 +23,22 @@ def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) ->
     raise TypeError
 
 
+@generic
+def start_all(controller: Any, state: Any, samples: Any, y: Vector, u: Vector, r: Vector) -> None:
+    """Start at a machine that rests at y under u: the next sample continues from there.
+
+    r are the references of the next sample. What was learned is kept. The observer of each axis
+    takes as many ``samples`` (n,) as it needs to settle.
+    """
+    raise TypeError
+
+
+@generic
+def tell_applied(controller: Any, state: Any) -> None:
+    """Tell observers that the control signals in the state were applied."""
+    raise TypeError
+
+
 @compiled_call
 def step_all(packed: Any) -> None:
     """Take one sample with the references and measurements that are in the state."""

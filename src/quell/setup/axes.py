@@ -22,13 +22,14 @@ from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
 from quell.controllers.compensator import Compensator
+from quell.features.all_axes import sees_all_axes
 from quell.plants.base import PlantWrapper
 from quell.plants.multibody import Arm, Craft
 from quell.plants.multivariable import MultivariableLinearPlant, check_several
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import Setup, title_of, windows_of
+from quell.setup.loading import Known, Setup, made_once, title_of, windows_of
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -71,6 +72,9 @@ def coupled(
     saturation: str | Sequence[str] = "each",
     weights: Sequence[float] | None = None,
     wished: Sequence[float] | None = None,
+    learner: Any = None,
+    guard: Any = None,
+    of_axes: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> Axes:
     """Return the controller of several axes: B0, or its inverse M, and limits of the actuators.
 
@@ -78,6 +82,8 @@ def coupled(
     ----------
     axes, plant, drives
         the controllers of the axes by name, the plant, and the controllers below compensators.
+    of_axes
+        learners with features of all axes, each with its guard, by the name of the axis.
     B0
         from the control signals to the axes, a list of rows, with a row for each axis; ``"plant"``
         takes that of the plant: of an arm the inverse of M(q), of a craft that near the horizontal,
@@ -96,7 +102,18 @@ def coupled(
         of the actuators, where there are more than axes or an axis has a safe set.
     wished
         the control signals from which that is measured [u-unit]; zero by default.
+    learner, guard
+        one learner for all axes, and its guard, of which each axis has its own.
     """
+    of_axes = of_axes or {}
+    if of_axes and learner is not None:
+        raise ValueError(
+            f"learner: {', '.join(of_axes)} have learners with features of all axes, too; give "
+            "one for all, or one for each"
+        )
+    if of_axes:
+        learner = {name: parts[0] for name, parts in of_axes.items()}
+        guard = {name: parts[1] for name, parts in of_axes.items() if parts[1] is not None}
     inverse: Any = M
     gain: Any = B0
     if isinstance(B0, str):
@@ -106,7 +123,7 @@ def coupled(
         gain, inverse = _of_plant(plant, [axis.observer.order for axis in axes.values()], M)
     limits: dict[str, Any] = {"u_min": u_min, "u_max": u_max, "rate_limit": rate_limit}
     rest: dict[str, Any] = {"saturation": saturation, "weights": weights, "wished": wished}
-    rest["drives"] = drives
+    rest |= {"learner": learner, "guard": guard, "drives": drives}
     return Axes(dict(axes), gain, M=inverse, **limits, **rest)
 
 
@@ -178,7 +195,25 @@ ON_TOP = call_table(
 # Controllers without observer, that are not designed for the linear part of a plant.
 _DRIVES = ("pid", "pid-simc", "notch-pid", "p-pi", "resonance-ratio")
 DRIVES = {kind: registry.CONTROLLERS[kind] for kind in _DRIVES}
-AXES = call_table("axes", coupled, only=True, without=("axes", "plant", "drives"))
+AXES = call_table(
+    "axes",
+    coupled,
+    only=True,
+    without=("axes", "plant", "drives", "of_axes"),
+    beside={
+        "learner": (
+            registry.Learner | None,
+            optional(
+                "one learner for all axes, `rls` or `nlms`, with features of kind `all-axes`; one "
+                "that learns from its own axis belongs into its `[[axis]]`."
+            ),
+        ),
+        "guard": (
+            registry.Guard | None,
+            optional("the guard of this learner, of which each axis has its own."),
+        ),
+    },
+)
 SCENARIO = call_table(
     "scenario",
     Scenario,
@@ -215,7 +250,10 @@ class AxesDescription(Table):
     dt: float = DT
     plant: AxesPlant | None = optional("the plant with several signals, for `quell run`.")
     axes: AxesTable | None = optional("B0 and the actuators; the unit matrix by default.")
-    axis: tuple[Axis, ...] = Field(description="[[axis]]: an axis, in the order of the outputs.")
+    axis: tuple[Axis, ...] = Field(
+        description="[[axis]]: an axis, in the order of the outputs.",
+        json_schema_extra={"minItems": 1},
+    )
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."
@@ -248,8 +286,12 @@ def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     return made_axes(*read(path), trust)
 
 
-def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
+def made_axes(
+    name: str, data: Mapping[str, Any], trust: bool = False, known: Known | None = None
+) -> Setup:
     """Build the objects that ``data`` describes: the content of a file of several axes.
+
+    ``known`` has the plant of an earlier call, which is not built again if its table is the same.
 
     Raises
     ------
@@ -270,12 +312,13 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
     plant = None
     if tables.plant is not None:
-        plant = builder.build(tables.plant, "plant", dt=dt)
+        make = partial(builder.build, tables.plant, "plant", dt=dt)
+        plant = made_once({} if known is None else known, "plant", (tables.plant, dt), make)
         builder.attempt("", (), check_several, plant)
     names = [axis.name or f"axis{i + 1}" for i, axis in enumerate(tables.axis)]
     if len(set(names)) < len(names):
         raise SetupError([f"{name}: axis: names {', '.join(names)} must be different"])
-    axes = {
+    made = {
         key: _axis(builder, axis, f"axis[{i}]", dt)
         for i, (key, axis) in enumerate(zip(names, tables.axis, strict=True))
     }
@@ -284,8 +327,15 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
         for i, axis in enumerate(tables.axis)
         if axis.drive is not None
     ]
-    table = AXES() if tables.axes is None else tables.axes
-    controller = builder.build(table, "axes", axes=axes, plant=plant, drives=drives or None)
+    table: Any = AXES() if tables.axes is None else tables.axes
+    of_axes = {key: parts for key, (_, *parts) in made.items() if parts}
+    axes = {key: parts[0] for key, parts in made.items()}
+    shared = {
+        key: None if part is None else builder.build(part, f"axes.{key}", dt=dt)
+        for key, part in (("learner", table.learner), ("guard", table.guard))
+    }
+    context = {"axes": axes, "plant": plant, "drives": drives or None, "of_axes": of_axes}
+    controller = builder.build(table, "axes", **context, **shared)
     scenario = _scenario(builder, tables, dt)
     if plant is not None:
         builder.attempt("plant", (), _check_fit, plant, controller, scenario)
@@ -294,8 +344,8 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     return Setup(name, title, controller, plant, scenario, None, None, windows, tables, trust=trust)
 
 
-def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> Compensator:
-    """Return the controller of an axis."""
+def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:
+    """Return the controller of an axis; with its learner and guard if they are of all axes."""
     if (axis.controller is None) == (axis.compensator is None):
         has = "neither" if axis.controller is None else "both"
         rule = f"has {has}; give a controller, which is an ADRC, or a compensator"
@@ -307,10 +357,13 @@ def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> Compensator:
     learner = None
     if axis.learner is not None:
         learner = builder.build(axis.learner, f"{path}.learner", dt=dt, **parts)
+    outside: tuple[Any, ...] = ()
+    if sees_all_axes(learner):
+        outside, learner = (learner, parts.pop("guard")), None
     key = "controller" if axis.compensator is None else "compensator"
     table: Any = getattr(axis, key)
     made: Compensator = builder.build(table, f"{path}.{key}", learner=learner, **parts)
-    return made
+    return made, *outside
 
 
 def _scenario(builder: Builder, tables: AxesDescription, dt: float) -> Scenario | None:
