@@ -36,7 +36,7 @@ from quell.controllers.allocation import (
     allocate,
     set_range,
 )
-from quell.controllers.axes_learning import AxisDesigns, AxisStates
+from quell.controllers.axes_chain import AxisDesigns, AxisStates
 from quell.controllers.base import (
     check_controller,
     control,

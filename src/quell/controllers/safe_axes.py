@@ -63,8 +63,7 @@ from quell.controllers.allocation import (
     RangeMemory,
     solve_free,
 )
-from quell.controllers.axes_learning import AxisDesigns, AxisStates
-from quell.controllers.safe_set import BOUNDS, write_bounds
+from quell.controllers.safe_set import BOUNDS
 from quell.kernels.dispatch import generic_with_default, is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.sized import Work
@@ -162,19 +161,6 @@ def write_axes_bounds(axes: Any, states: Any, i: int, bounds: Matrix) -> None:
 @generic_with_default
 def add_axes_flags(axes: Any, states: Any, i: int, flags: Vector) -> None:
     """Add flags to the status of the axes from the i-th on."""
-
-
-@write_axes_bounds.register(AxisDesigns)
-def _write_axes_bounds(axes: AxisDesigns, states: AxisStates, i: int, bounds: Matrix) -> None:
-    write_bounds(axes.axis.safe_set, states.axis.safe_set, bounds[i])
-    write_axes_bounds(axes.others, states.others, i + 1, bounds)
-
-
-@add_axes_flags.register(AxisDesigns)
-def _add_flags(axes: AxisDesigns, states: AxisStates, i: int, flags: Vector) -> None:
-    own = states.axis.loop[0]
-    own.status = int(own.status) | int(flags[i])
-    add_axes_flags(axes.others, states.others, i + 1, flags)
 
 
 @generic_with_default
