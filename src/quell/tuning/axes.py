@@ -41,7 +41,6 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quell import checks
 from quell.analysis.coupling import Coupling, coupling
@@ -591,7 +590,7 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
     return [_off_by(nominal, B0, off * signs) for signs in patterns]
 
 
-def _off_by(nominal: Plant, B0: Matrix, shares: NDArray[np.floating[Any]]) -> Plant:
+def _off_by(nominal: Plant, B0: Matrix, shares: Any) -> Plant:
     """Return the plant with the entries of B0 that are not zero off by shares."""
     error = np.zeros(B0.shape)
     error[B0 != 0.0] = shares * B0[B0 != 0.0]
@@ -868,7 +867,7 @@ def _check(
     for k in range(samples):
         one = nominal[k % len(nominal)]
         B0 = np.linalg.pinv(one.R)
-        drawn.append(_off_by(one, B0, rng.uniform(-off, off, np.count_nonzero(B0))))
+        drawn.append(_off_by(one, B0, rng.uniform(-off, off, int(np.count_nonzero(B0)))))
     measured = loops(drawn).measured(found.values)
     ratios = np.exp(-np.min(measured.slacks, axis=1))
     stable = measured.slacks[:, -1] > UNSTABLE
