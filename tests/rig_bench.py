@@ -97,7 +97,7 @@ class Bench:
     @property
     def applied(self) -> float:
         """The u that acts on the plant."""
-        return float(self.rig.model.signals[APPLIED])
+        return float(self.rig.model.signals[APPLIED, 0])
 
     def open(
         self,

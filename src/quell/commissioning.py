@@ -41,7 +41,8 @@ from quell.identification.result import Identified, nrmse, simulated_plant
 from quell.realtime.devices import Device, TwinDevice
 from quell.realtime.recordings import Event
 from quell.realtime.run import RigRun, run_rig
-from quell.realtime.supervisor import Cause, Safety
+from quell.realtime.safety import Safety
+from quell.realtime.supervisor import Cause
 from quell.records.axes import AxesTrajectory
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory

@@ -77,8 +77,8 @@ def rig(
     Parameters
     ----------
     plant
-        The plant: a name as torsional or two-mass, a setup file with [plant] (setup.toml), an
-        identified model (model.json), an FMU (motor.fmu), a Python function that returns a plant
+        The plant: a name as torsional or two-mass, a setup file with [plant] (setup.toml), also of
+        several axes, an identified model (model.json), an FMU (motor.fmu), a Python function that returns a plant
         (file.py:name, with --trust), or a table, '{kind = "linear", num = [1], den = [1, 1]}'.
     dt
         Length of a tick [s].
@@ -106,11 +106,12 @@ def rig(
     cpu
         Number of the processor for the ticks; any by default.
     """
+    from quell.realtime.devices import counts_text
     from quell.realtime.registry import listen
     from quell.realtime.rig import Rig
     from quell.setup.schema import plant_given
 
-    model = plant_given(plant, dt, argument="--plant", trust=trust)
+    model = plant_given(plant, dt, argument="--plant", trust=trust, several=True)
     _check_pace(seconds, priority, cpu)
     limits: dict[str, Any] = {
         "watchdog": watchdog,
@@ -125,10 +126,12 @@ def rig(
         with exit_on_signal(listener.close):  # compiling may take a minute the first time
             server.prepare()
         limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
+        counts = server.signal_counts
+        several = "" if counts is None else f", with {counts_text(counts)}"
         rules = f"u = 0 after {watchdog} ticks without a command{limit}"
         start = ", from rest" if rest else ""
         start += f", waits up to {wait:g} s for each command" if wait > 0.0 else ""
-        line = f"{plant} at {listener.url}: a tick every {dt:g} s, {rules}{start}"
+        line = f"{plant} at {listener.url}{several}: a tick every {dt:g} s, {rules}{start}"
         notes = _served(server, line, seconds, priority, cpu)
     _print_counters(server)
     for note in notes:

@@ -44,6 +44,7 @@ from quell.controllers.allocation import (
 )
 from quell.controllers.base import (
     RateLimit,
+    bumpless_transfer,
     control,
     is_usable,
     reset_loop,
@@ -337,10 +338,19 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     loop.status, loop.started = flags, 1.0
 
 
+@kernel
 def tell_applied(design: AxesDesign, state: AxesState) -> None:
     """Tell all axes what the control signals in the state do."""
     apply_to_axes(state.gain, state.u, state.v)
     tell_axes(design.axes, state.axes, 0, state.v)
+
+
+@kernel
+def set_applied_controls(design: AxesDesign, state: AxesState, u: Vector) -> None:
+    """Set the control signals that were applied since the last sample (m,)."""
+    for k in range(u.size):
+        state.u[k] = u[k]
+    tell_applied(design, state)
 
 
 def start_all(
@@ -384,6 +394,11 @@ def hand_over_all(design: AxesDesign, state: AxesState) -> bool:
         return False
     continue_axes(design.axes, state.axes)
     return True
+
+
+@bumpless_transfer.register(AxesDesign)
+def _bumpless_transfer(design: AxesDesign, state: AxesState) -> None:
+    continue_axes(design.axes, state.axes)
 
 
 @status_flags.register(AxesDesign)

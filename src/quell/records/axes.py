@@ -88,7 +88,8 @@ class AxesTrajectory(Record):
         prefix = f"{self.axis_names[i]}."
         own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
         own = [each for each in own if each[2].startswith(prefix)]
-        whole = [(name, width, name) for name, width in self.channels if name in ("w", "x")]
+        shared = ("w", "x", "k", "lateness", "step_time", "mode", "events")
+        whole = [(name, width, name) for name, width in self.channels if name in shared]
         singles = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
         columns = [columns_of(self.channels, source).start + i for _, source in singles]
         for _, _, source in (*whole, *own):

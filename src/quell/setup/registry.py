@@ -41,7 +41,7 @@ from quell.controllers.baselines import (
 from quell.observers import ESO
 from quell.quantities import Signals
 from quell.realtime.run import run_rig
-from quell.realtime.supervisor import Safety as RigSafety
+from quell.realtime.safety import Safety as RigSafety
 from quell.records.trajectory import Trajectory
 from quell.setup.schema import AXES_PLANTS as AXES_PLANTS
 from quell.setup.schema import PLANTS as PLANTS
