@@ -92,7 +92,11 @@ def test_b0_of_the_plant_is_that_of_each_kind() -> None:
     ("change", "message"),
     [
         ({"controller": {"omega_c": 1.0}}, "controller: belongs into each"),
-        ({"rig": {"device": "twin:"}}, "rig: NOT for several axes yet"),
+        ({"rig": {"device": "twin:", "channels": ["load"]}}, "rig.channels: unknown"),
+        (
+            {"axes": {"actuators": ["force [N]"]}},
+            "axes.actuators = .*there are 2; give one for each",
+        ),
         ({"tune": {}}, "tune: NOT for several axes yet"),
         ({"axes": {"B1": 1}}, "axes.B1: unknown; "),
         ({"axes": {"B0": "model"}}, "axes.B0 = 'model'"),
@@ -155,8 +159,6 @@ def test_one_axis_is_not_several() -> None:
     [
         ("tune", "gantry.toml", "--no-figures"),
         ("sweep", "gantry.toml"),
-        ("run-rig", "gantry.toml"),
-        ("replay", "run.csv", "--setup", "gantry.toml"),
         ("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu"),
         ("compare", "gantry.toml"),
         ("studio", "gantry.toml", "--no-browser"),

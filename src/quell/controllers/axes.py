@@ -157,6 +157,12 @@ def continue_axes(axes: Any, states: Any) -> None:
 
 
 @generic
+def transfer_axes(axes: Any, states: Any) -> None:
+    """Continue each axis from what was applied, as if it had been at rest until now."""
+    raise TypeError
+
+
+@generic
 def set_axes_manual(axes: Any, states: Any, manual: float, i: int, v: Vector) -> None:
     """Begin or end manual operation under v of the axes from the i-th on."""
     raise TypeError
@@ -260,6 +266,17 @@ def _continue_none(axes: NoAxis, states: Any) -> None:
 def _continue(axes: AxisDesigns, states: AxisStates) -> None:
     states.axis.loop[0].bumpless = 1.0
     continue_axes(axes.others, states.others)
+
+
+@transfer_axes.register(NoAxis)
+def _transfer_none(axes: NoAxis, states: Any) -> None:
+    pass
+
+
+@transfer_axes.register(AxisDesigns)
+def _transfer(axes: AxisDesigns, states: AxisStates) -> None:
+    bumpless_transfer(axes.axis, states.axis)
+    transfer_axes(axes.others, states.others)
 
 
 @set_axes_manual.register(NoAxis)
@@ -398,7 +415,7 @@ def hand_over_all(design: AxesDesign, state: AxesState) -> bool:
 
 @bumpless_transfer.register(AxesDesign)
 def _bumpless_transfer(design: AxesDesign, state: AxesState) -> None:
-    continue_axes(design.axes, state.axes)
+    transfer_axes(design.axes, state.axes)
 
 
 @status_flags.register(AxesDesign)

@@ -441,7 +441,7 @@ def _finish_all(controller: SupervisedAxes, handle: Any, u: float) -> None:
 
 @kernel
 def _fill_v(controller: SupervisedAxes, u: Vector) -> None:
-    """Write ``v = B0 u`` of what is applied into the row, the first of the controller's channels."""
+    """Write ``v = B0 u`` of what is applied into the row: the controller's first channel."""
     at = controller.log.controller
     apply_to_axes(controller.state.gain, u, controller.log.row[at : at + controller.axes.y.size])
 

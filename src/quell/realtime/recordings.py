@@ -53,10 +53,10 @@ from quell.files import (
     whole_text,
     written_atomically,
 )
-from quell.quantities import Signals, signals_from
+from quell.quantities import OF_AXES, AxesSignals, signals_from
 from quell.realtime.mcap_reader import MAGIC, MARK, RECORD, SCHEMA, TOPIC, read_mcap
 from quell.records.axes import AxesTrajectory
-from quell.records.record import check_times, columns_of, describe, is_vector
+from quell.records.record import check_times, columns_of, describe, is_vector, units_of
 from quell.records.trajectory import Trajectory
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -162,7 +162,7 @@ class Header:
             raise ValueError(f"axes = {self.axis_names!r}: must be {outputs}, as many as y has")
 
     @property
-    def signals(self) -> Signals:
+    def signals(self) -> Any:
         """Names and units of y and u, which ``notes`` may have."""
         return signals_from(self.notes.get("signals"))
 
@@ -195,9 +195,11 @@ class Header:
 
     def labels(self, name: str, width: int) -> list[str]:
         """Return what the entries of a channel are called: axes by name, others by number."""
-        if name in OF_AXES and len(self.axis_names) == width:
-            return [in_column(axis) for axis in self.axis_names]
-        return [str(i) for i in range(width)]
+        if not self.axis_names:
+            return [str(i) for i in range(width)]
+        of_axes = AxesSignals(self.axis_names, (), ())
+        known = self.signals if isinstance(self.signals, AxesSignals) else of_axes
+        return [in_column(each) for each in known.labels(name, width)]
 
     def to_json(self) -> str:
         """Return the header as JSON."""
@@ -224,10 +226,6 @@ class Header:
             raise ValueError("its header is nested too deeply") from None
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"its header is not that of a quell recording ({error!r})") from None
-
-
-OF_AXES = ("r", "y", "y_measured", "v")
-"""Channels that have a number for each axis."""
 
 
 def in_column(name: str) -> str:
@@ -404,11 +402,12 @@ def definition(header: Header) -> str:
         if not width:
             continue
         text, unit = describe(name, header.signals)
+        units = units_of(name, width, header.signals)
         unit, own = header.units.get(name, unit), _field_name(name)
         if header.axis_names and width > 1 and name in (*OF_AXES, "u"):
             # A field for each signal, with its name: the same bytes as an array.
-            for label in header.labels(name, width):
-                lines.append(f"float64 {own}_{_field_name(label)}  # {text}, {label} [{unit}]")
+            for label, of_it in zip(header.labels(name, width), units, strict=True):
+                lines.append(f"float64 {own}_{_field_name(label)}  # {text}, {label} [{of_it}]")
         else:
             kind = f"float64[{width}]" if is_vector(name, width) else "float64"
             lines.append(f"{kind} {own}  # {text} [{unit}]")

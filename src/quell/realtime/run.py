@@ -21,7 +21,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
-from quell.quantities import UNKNOWN, Signals
+from quell.quantities import UNKNOWN, AxesSignals, Signals
 from quell.realtime.channels import (
     await_channels,
     channel_inputs,
@@ -305,7 +305,7 @@ def run_rig(
     cpu: int | None = None,
     on_change: Callable[[ModeChange], None] | None = None,
     overwrite: bool = False,
-    signals: Signals | None = None,
+    signals: Signals | AxesSignals | None = None,
     memory: MemoryFile | str | PathLike[str] | None = None,
     channels: Sequence[str] = (),
 ) -> RigRun:
@@ -353,7 +353,8 @@ def run_rig(
         whether files of ``telemetry`` that exist are replaced; they are refused otherwise.
     signals
         names and units of y and u for records, telemetry and plots, `{y = "angle [rad]", u =
-        "voltage [V]"}`; those of the device, or of the plant in the setup, by default.
+        "voltage [V]"}`; those of the device, or of the plant in the setup, by default. Of several
+        axes a ``quell.quantities.AxesSignals``.
     memory
         file, or a ``MemoryFile``, in which what was learned outlives the run. If it exists, the
         controller begins with it, from rest; one that does not fit is an error, before anything
@@ -392,6 +393,9 @@ def run_rig(
         scenario = as_scenario(scenario, duration)
         rules = (Safety() if safety is None else safety).rules(controller, scenario)
         names = checked_channels(controller, channels)
+        if axes is not None and names:
+            rule = "are NOT for several axes yet; leave them out"
+            raise ValueError(f"channels = {list(names)!r}: {rule}")
         reference: Any
         if axes is not None:
             reference = axes_reference(scenario, axes, approach)
@@ -481,7 +485,7 @@ def _last_save(kept: MemoryFile, supervisor: SupervisorState, dt: float) -> str:
 
 
 def _header(
-    device: Device, controller: Any, signals: Signals | None, channels: Sequence[str]
+    device: Device, controller: Any, signals: Signals | AxesSignals | None, channels: Sequence[str]
 ) -> Header:
     counts, notes = (1, 1), {}
     if isinstance(controller, Axes):
@@ -490,7 +494,9 @@ def _header(
         notes = {"axes": {name: list(axis.features) for name, axis in pairs}}
     known = getattr(device, "signals", UNKNOWN) if signals is None else signals
     known = signals_of_loop(known, controller)
-    units = {"y": known.y.unit, "u": known.u.unit}
+    units = {}
+    if isinstance(known, Signals):
+        units = {"y": known.y.unit, "u": known.u.unit}
     return Header(
         channels=row_channels(controller.channels, channels, *counts),
         dt=controller.dt,

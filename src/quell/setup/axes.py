@@ -24,6 +24,7 @@ from quell.controllers.axes import Axes
 from quell.plants.base import PlantWrapper
 from quell.plants.multibody import Arm, Craft
 from quell.plants.multivariable import MultivariableLinearPlant, check_several
+from quell.quantities import AxesSignals
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
@@ -51,6 +52,7 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Learner
     from quell.setup.schema import CallTable as Metrics
     from quell.setup.schema import CallTable as Observer
+    from quell.setup.schema import CallTable as Rig
     from quell.setup.schema import CallTable as ScenarioTable
 
 # ---- B0 and the actuators ----
@@ -167,7 +169,14 @@ OBSERVERS = {
 }
 _OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule", "safe_set")
 CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
-AXES = call_table("axes", coupled, only=True, without=("axes", "plant"))
+_ACTUATORS = "names and units of the control signals, `torque [N m]`, for files."
+AXES = call_table(
+    "axes",
+    coupled,
+    only=True,
+    without=("axes", "plant"),
+    beside={"actuators": (list_of(str), Field((), description=_ACTUATORS))},
+)
 SCENARIO = call_table(
     "scenario",
     Scenario,
@@ -180,6 +189,7 @@ if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
     Observer, Learner = one_of(OBSERVERS), registry.Learner
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
+    Rig = registry.AxesRig
 
 
 class Axis(Table):
@@ -190,6 +200,7 @@ class Axis(Table):
     controller: Controller = Field(description="the ADRC, without limits of u.")
     learner: Learner | None = optional("the learner; none by default.")
     guard: Guard | None = optional("the guard of the learner; none by default.")
+    signal: str = Field("", description="name and unit of its y, `angle [rad]`, for files.")
     reference: registry.Signal = Field(0.0, description="signal that y has to follow [y-unit].")
     noise: registry.Signal = Field(0.0, description="signal added to y before the controller.")
 
@@ -203,6 +214,7 @@ class AxesDescription(Table):
     axes: AxesTable | None = optional("B0 and the actuators; the unit matrix by default.")
     axis: tuple[Axis, ...] = Field(description="[[axis]]: an axis, in the order of the outputs.")
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
+    rig: Rig | None = optional("the device and its safety limits, for `quell run-rig`.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."
     )
@@ -213,17 +225,15 @@ class AxesDescription(Table):
 # Tables of a setup of one axis, and where they are here; what belongs to one axis only.
 _ELSEWHERE = {
     **dict.fromkeys(("observer", "controller", "learner", "guard"), "belongs into each [[axis]]"),
-    **dict.fromkeys(
-        ("compensator", "prefilter", "sweep", "rig", "tune"), "NOT for several axes yet"
-    ),
+    **dict.fromkeys(("compensator", "prefilter", "sweep", "tune"), "NOT for several axes yet"),
 }
 
 
 def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     """Read a TOML file of several axes and build the objects that it describes.
 
-    The ``controller`` of the setup is a ``quell.Axes``; it has no rig, sweep and tuning. ``trust``
-    and errors are those of ``load``.
+    The ``controller`` of the setup is a ``quell.Axes``; it has no sweep and tuning. ``trust`` and
+    errors are those of ``load``.
 
     Examples
     --------
@@ -272,7 +282,27 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
         builder.attempt("plant", (), _check_fit, plant, controller, scenario)
     windows = windows_of(builder, tables.metrics)
     title = tables.title or title_of(name)
-    return Setup(name, title, controller, plant, scenario, None, None, windows, tables, trust=trust)
+    rig = None if tables.rig is None else builder.build(tables.rig, "rig", dt=dt)
+    signals = builder.attempt("", (), signals_in, tables, controller)
+    if rig is not None and signals.known:
+        rig = {"signals": signals, **rig}
+    return Setup(name, title, controller, plant, scenario, rig, None, windows, tables, trust=trust)
+
+
+def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:
+    """Return names and units of the signals of a setup of several axes.
+
+    Raises ``ValueError`` for a text that is no name and unit, and another number of actuators than
+    there are.
+    """
+    given: Any = tables.axes
+    actuators = [] if given is None else list(given.actuators)
+    if actuators and len(actuators) != axes.inputs:
+        rule = f"there are {axes.inputs}; give one for each"
+        raise ValueError(f"axes.actuators = {actuators!r:.60}: {rule}")
+    return AxesSignals.of(
+        axes.names, [axis.signal for axis in tables.axis], actuators or [""] * axes.inputs
+    )
 
 
 def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> ADRC:
