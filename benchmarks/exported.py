@@ -161,7 +161,7 @@ def replayed(
         action = available(Action(int(rows[k, 0])), names, path)
         player.play(action, row["r"], row["y"], row["given"])
     status = np.array([row.status for row in player.rows])
-    same = (player.u_of(slice(None)) == given["u"]) & (status == given["status"])
+    same = (player.u_of(slice(None))[:, 0] == given["u"]) & (status == given["status"])
     return same.size, int(np.sum(~same))
 
 

@@ -30,10 +30,8 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.export import TranslationError
-from quell.export.axes_source import parts_of_axes, source_of_axes
-from quell.export.library.axes_vectors import AxesPlayer
-from quell.export.library.vectors import Action
+from quell.export import TranslationError, c_source
+from quell.export.library.vectors import Action, Player
 
 HERE = Path(__file__).resolve().parent
 SQUARE = np.array([[1.0, 0.3, 0.1], [0.2, 2.0, 0.1], [0.0, 0.3, 0.5]])
@@ -162,8 +160,8 @@ def replayed(
     axes: ql.Axes, rows: np.ndarray, given: np.ndarray, single: bool
 ) -> tuple[int, int, ql.Status, float]:
     """Return the samples that were replayed, those that differ, all flags, largest authority."""
-    player = AxesPlayer(axes, parts_of_axes(axes, single))
-    player.limit_at(np.full(axes.inputs, 0.5))
+    player = Player(axes, "single" if single else "double")
+    player.limit_at("limits", 0.5)
     authority = 0.0
     for k, row in enumerate(given):
         authority = max(authority, *authorities(player.state.axes))
@@ -179,7 +177,7 @@ def judged(name: str, axes: ql.Axes, precision: str, samples: int) -> list[str]:
     """Return a row of the table."""
     single = precision == "single"
     try:
-        source = source_of_axes(axes, "robot", single)
+        source = c_source(axes, "robot", precision=precision)
     except TranslationError as error:
         return [name, precision, "refused", "0", "0", "", "", str(error)[24:80]]
     rows = script(samples, axes.outputs, single)

@@ -25,8 +25,7 @@ from hostile_exports import SANITIZERS, SHARES, run, words_of_type
 from rich.console import Console
 from rich.table import Table
 
-from quell.export import CSource, TranslationError
-from quell.export.axes_source import source_of_axes
+from quell.export import CSource, TranslationError, c_source
 
 HEADS = ("axes", "precision", "functions", "calls", "reports", "u not finite", "u beyond limits",
          "time [s]")  # fmt: skip
@@ -95,7 +94,7 @@ CASES        {
 """
 _CALLS = {
     "applied": ("applied(state, given);",),
-    "track": ("track(state, r, yFURTHER, given);",),
+    "track": ("track(state, r, y, givenFURTHER);",),
     "hand_over": ("hand_over(state);",),
     "start": ("start(state, y, given, r);",),
     "reset": ("reset(state);",),
@@ -147,7 +146,7 @@ def row_of(name: str, axes: Any, precision: str, options: argparse.Namespace) ->
     """Return a row of the table."""
     begin = time.monotonic()
     try:
-        source = source_of_axes(axes, "robot", precision == "single")
+        source = c_source(axes, "robot", precision=precision)
     except TranslationError as error:
         return [name, precision, "refused", "", "0", "0", "0", str(error)[24:80]]
     with tempfile.TemporaryDirectory() as place:

@@ -275,7 +275,7 @@ def _repeat(
 def export(
     setup: Path,
     *,
-    to: Literal["c", "fmu"] = "c",
+    to: Literal["c", "fmu", "ros2"] = "c",
     out: Path,
     name: str | None = None,
     precision: Literal["double", "single"] = "double",
@@ -287,20 +287,21 @@ def export(
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write the controller of a setup for another machine: as C files, or as an FMU.
+    """Write the controller of a setup for another machine: in C, as an FMU, or for ROS 2.
 
-    The C files (C99) are a library for CMake, Arduino and PlatformIO with golden vectors and a
-    README. In single precision the scenario of the setup is simulated in both precisions before,
-    and nothing is written if they differ too much.
+    The C files (C99) are a library for CMake, Arduino, PlatformIO and ESP-IDF with golden vectors
+    and a README. In single precision the scenario of the setup is simulated in both precisions
+    before, and nothing is written if they differ too much.
 
     Parameters
     ----------
     setup
         The file, in TOML; docs/setup has all keys.
     to
-        c or fmu, which is an FMU of FMI 3.0 for co-simulation.
+        c; fmu, which is an FMU of FMI 3.0 for co-simulation; or ros2, a package with a chainable
+        controller of ros2_control.
     out
-        The folder for the C files, or the file .fmu.
+        The folder, or the file .fmu.
     name
         Begins all names in C; controller by default, and for an FMU the name of the file.
     precision
@@ -335,7 +336,13 @@ def export(
         _to_fmu(given, what, out, name or "", overwrite)
         return
     if what != "controller":
-        raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
+        raise ValueError(f"--what = {what}: is for --to fmu; {to} is of the controller")
+    if to == "ros2":
+        if precision != "double" or accept or prove or resolution is not None:
+            rule = "are for --to c; a package of ROS 2 is in double"
+            raise ValueError(f"--precision, --resolution, --accept and --prove: {rule}")
+        _to_ros2(setup, memory, out, name or "controller", trust, overwrite)
+        return
     if precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
     file, data = read(setup)
@@ -394,6 +401,20 @@ def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> N
     x0 = None if what == "controller" or scenario is None else scenario.x0
     fmu(part, out, name=name, dt=dt, x0=x0, overwrite=overwrite)
     print_line(Console(), f"FMU of the {what}: {out}")
+
+
+def _to_ros2(
+    setup: Path, memory: Path | None, out: Path, name: str, trust: bool, overwrite: bool
+) -> None:
+    from quell.export import ros2
+    from quell.setup import made, made_axes, read
+    from quell.setup.description import is_of_axes
+
+    file, data = read(setup)
+    given = (made_axes if is_of_axes(data) else made)(file, data, trust)
+    ros2(_learned(given.controller, memory, "double"), out, name=name, overwrite=overwrite)
+    print_line(Console(), f"{given.title}: package {name} of ROS 2 Jazzy in {out}")
+    print_line(Console(), "NOT built with ROS here: run colcon build and colcon test")
 
 
 def _print(title: str, exported: Exported) -> None:
@@ -465,13 +486,14 @@ def studio(
         Open the page in the browser; otherwise only print its address.
     """
     from quell.setup import read
-    from quell.studio.messages import Granted, checked, files_of
+    from quell.studio.messages import Granted, checked, files_of, with_models
     from quell.studio.runs import Maker
     from quell.studio.server import serve
 
     tables = None
     if setup is not None:
         name, data = read(setup)
+        data = with_models(data)
         tables = checked(data, Granted(files_of(data), trust))
         tables.setdefault("title", name.removesuffix(".toml").replace("_", " "))
         Maker(name, trust)(tables)

@@ -32,6 +32,7 @@ from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.allocation import (
     ActuatorLimits,
+    Gain,
     GainMemory,
     RangeMemory,
     allocate,
@@ -42,9 +43,18 @@ from quell.controllers.allocation import (
     range_memory,
     update_gain,
 )
+from quell.controllers.axes_learning import (
+    AxisDesigns,
+    AxisStates,
+    LearningOfAxes,
+    NoAxis,
+    NoAxisMemory,
+    learn_of_all,
+    look_at_all,
+    restart_of_all,
+)
 from quell.controllers.base import (
     RateLimit,
-    bumpless_transfer,
     control,
     is_usable,
     reset_loop,
@@ -55,6 +65,15 @@ from quell.controllers.base import (
 )
 from quell.controllers.compensator import Estimate, samples_to_settle, start_at_rest
 from quell.controllers.memory import Layout
+from quell.controllers.safe_axes import (
+    add_axes_flags,
+    check_safe_sets,
+    keep_in_bands,
+    safe_axes_design,
+    safe_axes_memory,
+    write_axes_bounds,
+)
+from quell.controllers.safe_set import write_bounds
 from quell.controllers.stateful import PackedController, StatefulController, unpacked
 from quell.kernels import dispatch
 from quell.kernels.dispatch import (
@@ -76,31 +95,23 @@ def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) ->
     raise TypeError
 
 
+@generic
+def start_all(controller: Any, state: Any, samples: Any, y: Vector, u: Vector, r: Vector) -> None:
+    """Start at a machine that rests at y under u: the next sample continues from there.
+
+    r are the references of the next sample. What was learned is kept. The observer of each axis
+    takes as many ``samples`` (n,) as it needs to settle.
+    """
+    raise TypeError
+
+
+@generic
+def tell_applied(controller: Any, state: Any) -> None:
+    """Tell observers that the control signals in the state were applied."""
+    raise TypeError
+
+
 # ---- The axes, one inside of the other, so that each may be of another kind ----
-
-
-class NoAxis(NamedTuple):
-    """The end of the axes."""
-
-
-class NoAxisMemory(NamedTuple):
-    """The end of the axes' states."""
-
-    nothing: Vector  # (0,)
-
-
-class AxisDesigns(NamedTuple):
-    """Parameters of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
-
-class AxisStates(NamedTuple):
-    """State of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
 
 
 @generic
@@ -153,12 +164,6 @@ def have_started(axes: Any, states: Any) -> bool:
 @generic
 def continue_axes(axes: Any, states: Any) -> None:
     """Let the next sample of each axis continue from what was applied."""
-    raise TypeError
-
-
-@generic
-def transfer_axes(axes: Any, states: Any) -> None:
-    """Continue each axis from what was applied, as if it had been at rest until now."""
     raise TypeError
 
 
@@ -268,17 +273,6 @@ def _continue(axes: AxisDesigns, states: AxisStates) -> None:
     continue_axes(axes.others, states.others)
 
 
-@transfer_axes.register(NoAxis)
-def _transfer_none(axes: NoAxis, states: Any) -> None:
-    pass
-
-
-@transfer_axes.register(AxisDesigns)
-def _transfer(axes: AxisDesigns, states: AxisStates) -> None:
-    bumpless_transfer(axes.axis, states.axis)
-    transfer_axes(axes.others, states.others)
-
-
 @set_axes_manual.register(NoAxis)
 def _set_none_manual(axes: NoAxis, states: Any, manual: float, i: int, v: Any) -> None:
     pass
@@ -288,6 +282,19 @@ def _set_none_manual(axes: NoAxis, states: Any, manual: float, i: int, v: Any) -
 def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v: Vector) -> None:
     states.axis.loop[0].manual, states.axis.loop[0].u_manual = manual, v[i]
     set_axes_manual(axes.others, states.others, manual, i + 1, v)
+
+
+@write_axes_bounds.register(AxisDesigns)
+def _write_bounds(axes: AxisDesigns, states: AxisStates, i: int, bounds: Matrix) -> None:
+    write_bounds(axes.axis.safe_set, states.axis.safe_set, bounds[i])
+    write_axes_bounds(axes.others, states.others, i + 1, bounds)
+
+
+@add_axes_flags.register(AxisDesigns)
+def _add_flags(axes: AxisDesigns, states: AxisStates, i: int, flags: Vector) -> None:
+    own = states.axis.loop[0]
+    own.status = int(own.status) | int(flags[i])
+    add_axes_flags(axes.others, states.others, i + 1, flags)
 
 
 # ---- A sample of all axes ----
@@ -308,16 +315,20 @@ class AxesDesign(NamedTuple):
     gain: Any  # B0
     rule: Any  # what is done at the limits
     limits: ActuatorLimits
+    learning: Any  # of learners that see all axes, see ``axes_learning``
     widths: Any  # channels of each axis (n,), integers
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
+    safe: Any  # the safe sets of axes together, or none
 
 
 class AxesState(NamedTuple):
     """State of several axes."""
 
     axes: Any  # each axis with those behind it
+    learning: Any
     gain: GainMemory
     range: RangeMemory
+    safe: Any
     loop: NDArray[AxesLoop]  # (1,)
     x: Work  # estimates x[axis, derivative] (n, largest order)
     v: Vector  # what the axes asked for, then what was applied (n,)
@@ -339,7 +350,9 @@ def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
 @control_all.register(AxesDesign)
 def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
     loop = state.loop[0]
+    look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags = ask_axes(design.axes, state.axes, 0, r, y, state.v, state.x)
+    learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
@@ -347,6 +360,10 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     flags |= allocate(
         design.rule, design.limits, state.gain, state.range, state.v, state.u, state.u_limited
     )
+    flags |= keep_in_bands(
+        design.safe, state.safe, design.axes, state.axes, design.limits, state.gain, state.range,
+        state.u_limited,
+    )  # fmt: skip
     for k in range(u.size):
         state.u[k] = state.u_limited[k]
         u[k] = state.u[k]
@@ -355,29 +372,16 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     loop.status, loop.started = flags, 1.0
 
 
-@kernel
-def tell_applied(design: AxesDesign, state: AxesState) -> None:
-    """Tell all axes what the control signals in the state do."""
+@tell_applied.register(AxesDesign)
+def _tell_applied(design: AxesDesign, state: AxesState) -> None:
     apply_to_axes(state.gain, state.u, state.v)
     tell_axes(design.axes, state.axes, 0, state.v)
 
 
-@kernel
-def set_applied_controls(design: AxesDesign, state: AxesState, u: Vector) -> None:
-    """Set the control signals that were applied since the last sample (m,)."""
-    for k in range(u.size):
-        state.u[k] = u[k]
-    tell_applied(design, state)
-
-
-def start_all(
+@start_all.register(AxesDesign)
+def _start_all(
     design: AxesDesign, state: AxesState, samples: Any, y: Vector, u: Vector, r: Vector
 ) -> None:
-    """Start at a machine that rests at y under u: the next sample continues from there.
-
-    r are the references of the next sample; one that is no number is y. What was learned is kept.
-    Each observer takes as many ``samples`` (n,) as it needs to settle.
-    """
     reset_loop(design, state)
     for i in range(state.v.size):
         for j in range(state.x.shape[1]):
@@ -413,11 +417,6 @@ def hand_over_all(design: AxesDesign, state: AxesState) -> bool:
     return True
 
 
-@bumpless_transfer.register(AxesDesign)
-def _bumpless_transfer(design: AxesDesign, state: AxesState) -> None:
-    transfer_axes(design.axes, state.axes)
-
-
 @status_flags.register(AxesDesign)
 def _status_flags(design: AxesDesign, state: AxesState) -> int:
     return int(state.loop[0].status)
@@ -426,6 +425,7 @@ def _status_flags(design: AxesDesign, state: AxesState) -> int:
 @reset_loop.register(AxesDesign)
 def _reset_loop(design: AxesDesign, state: AxesState) -> None:
     reset_axes(design.axes, state.axes)
+    restart_of_all(design.learning, state.learning)
     clear(state.loop)
     for k in range(state.u.size):
         state.u[k] = 0.0
@@ -508,10 +508,17 @@ class Axes(StatefulController):
         order.
     weights
         of the actuators, where there are more than axes: u is the smallest ``Σ W (u − wished)²``
-        that does what the axes ask for (m,).
+        that does what the axes ask for (m,). If an axis has a safe set, also of the change of u
+        that keeps v within the bounds of all axes (``controllers/safe_axes.py``).
     wished
         the u from which that is measured (m,) [u-unit], as the thrusts that carry a craft; zero by
         default.
+    learner
+        one that sees the states of all axes, with features ``AllAxes(...)``: one for all axes,
+        which have one gain and θ of their own (``RLS``, ``NLMS``), or a list or dictionary with one
+        for each, None for an axis without. A learner that sees its own axis belongs into its ADRC.
+    guard
+        of these learners: a description, of which each axis has its own guard, or one for each.
 
     Raises
     ------
@@ -551,6 +558,8 @@ class Axes(StatefulController):
         saturation: str | Sequence[int | str] = "each",
         weights: Sequence[float] | None = None,
         wished: Sequence[float] | None = None,
+        learner: Any = None,
+        guard: Any = None,
     ) -> None:
         if not isinstance(axes, dict) and not checks.is_sequence(axes):
             raise ValueError(f"axes = {axes!r:.60}: must be an ADRC for each axis, in a list")
@@ -559,10 +568,12 @@ class Axes(StatefulController):
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
         check_axes(parts, self.names)
         self.axes: tuple[ADRC, ...] = tuple(copy.copy(axis) for axis in parts)
-        self._gain = checked_gain(B0, M, weights, self.names, self._most)
         self.B0, self.M, self.weights = B0, M, weights
+        self._gain = self._checked_gain()
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
+        self.learning.attach(self.axes)
         self._initialise()
 
     # ---- What simulation and real-time loop use ----
@@ -592,6 +603,14 @@ class Axes(StatefulController):
         return max(axis.observer.order for axis in self.axes)
 
     @property
+    def _has_bands(self) -> bool:
+        return any(axis.safe_set is not None for axis in self.axes)
+
+    def _checked_gain(self) -> Gain:
+        given = (self.B0, self.M, self.weights)
+        return checked_gain(*given, self.names, self._most, weighs_change=self._has_bands)
+
+    @property
     def derivatives(self) -> tuple[int, ...]:
         """Number of derivatives of the reference that each axis feeds forward."""
         return tuple(axis.derivatives for axis in self.axes)
@@ -617,6 +636,8 @@ class Axes(StatefulController):
         return self._actuators
 
     def _update_parameters(self) -> None:
+        safe_sets = [axis.safe_set for axis in self.axes]
+        check_safe_sets(safe_sets, self.names, self._gain.first, self._actuators)
         designs: Any = NoAxis()
         for axis in reversed(self.axes):
             designs = AxisDesigns(axis.parameters, designs)
@@ -626,8 +647,10 @@ class Axes(StatefulController):
             self._gain.design,
             self._rule,
             self._actuators,
+            self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
             np.array(self.derivatives, dtype=np.int64),
+            safe_axes_design(self._has_bands, self._gain.weights),
         )
 
     def initial_state(self) -> AxesState:
@@ -638,8 +661,10 @@ class Axes(StatefulController):
             states = AxisStates(axis.initial_state(), states)
         return AxesState(
             axes=states,
+            learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
             range=range_memory(n, m),
+            safe=safe_axes_memory(self.parameters.safe, n, m),
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
             v=np.zeros(n),
@@ -785,7 +810,9 @@ class Axes(StatefulController):
         **changes
             ``omega_c`` and ``observer``, as for ``ADRC.retune``, with the same errors.
         """
+        self.learning.check_retuning(changes)
         self.axes[self.index(axis)].retune(**changes)
+        self.learning.update(self.axes)
         self._update_parameters()
         self._pack_again()
 
@@ -823,6 +850,9 @@ class Axes(StatefulController):
         for name in ("B0", "M"):
             if getattr(self, name) is not None:
                 found[name] = getattr(self, name)
+        for name in ("learner", "guard"):
+            if getattr(self.learning, name) is not None:
+                found[name] = getattr(self.learning, name)
         for name, values in (("u_min", self._actuators.low), ("u_max", self._actuators.high)):
             if np.all(np.isfinite(values)):
                 found[name] = values.tolist()
@@ -844,7 +874,7 @@ class Axes(StatefulController):
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
         self.axes = tuple(copy.copy(axis) for axis in self.axes)
-        self._gain = checked_gain(self.B0, self.M, self.weights, self.names, self._most)
+        self._gain = self._checked_gain()
         self._initialise()
         self.state = kept["state"]
 

@@ -39,7 +39,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quell.export.c_files import CSource
-from quell.export.controller_source import at_path, limits_path, parameters_of
+from quell.export.controller_source import at_path, limits_path, parts_of
 from quell.export.translate.text import Literals
 from quell.files import written_atomically
 
@@ -433,7 +433,7 @@ def _program(controller: Any, source: CSource, path: str) -> str:
                           "                image[k] = any_byte;", "            }"]  # fmt: skip
             cases += [f"            {call}", "            break;"]
     counts = "step_counts" in source.operations
-    narrower = narrower_limit(controller, path, source.precision == "single")
+    narrower = narrower_limit(controller, path, source.precision)
     retuning = [
         f"    narrower = {name}_default_parameters;",
         *([f"    narrower.{path}.high = {narrower};"] if narrower else []),
@@ -479,13 +479,13 @@ def _program(controller: Any, source: CSource, path: str) -> str:
     ])  # fmt: skip
 
 
-def narrower_limit(controller: Any, path: str, single: bool) -> str:
+def narrower_limit(controller: Any, path: str, precision: str) -> str:
     """Return an upper limit below that of the controller, as C code; nothing without limits."""
     if not path:
         return ""
-    limits = at_path(parameters_of(controller), path)
+    limits = at_path(parts_of(controller, precision).parameters, path)
     low, high = float(limits.low), float(limits.high)
-    write = Literals(single).write_real
+    write = Literals(precision == "single").write_real
     if math.isfinite(low) and math.isfinite(high):
         return write(0.5 * low + 0.5 * high)
     if math.isfinite(low):

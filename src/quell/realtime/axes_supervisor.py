@@ -8,12 +8,15 @@ names the signal to which it is due: ``Memory.culprit``.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.kernels.dispatch import is_finite, kernel
+from quell.controllers.axes import AxesDesign, AxesState, tell_applied
+from quell.controllers.axes_learning import AxisDesigns, AxisStates, NoAxis
+from quell.controllers.base import bumpless_transfer
+from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.sized import Work
 from quell.realtime.supervisor import (
     AxesLimits,
@@ -28,6 +31,41 @@ from quell.realtime.supervisor import (
     widen_rest,
 )
 from quell.types import Vector
+
+# ---- What the loop tells several axes ----
+
+
+@generic
+def transfer_axes(axes: Any, states: Any) -> None:
+    """Continue each axis from what was applied, as if it had been at rest until now."""
+    raise TypeError
+
+
+@transfer_axes.register(NoAxis)
+def _transfer_none(axes: NoAxis, states: Any) -> None:
+    pass
+
+
+@transfer_axes.register(AxisDesigns)
+def _transfer(axes: AxisDesigns, states: AxisStates) -> None:
+    bumpless_transfer(axes.axis, states.axis)
+    transfer_axes(axes.others, states.others)
+
+
+@kernel
+def set_applied_controls(design: AxesDesign, state: AxesState, u: Vector) -> None:
+    """Set the control signals that were applied since the last sample (m,)."""
+    for k in range(u.size):
+        state.u[k] = u[k]
+    tell_applied(design, state)
+
+
+@bumpless_transfer.register(AxesDesign)
+def _bumpless_transfer(design: AxesDesign, state: AxesState) -> None:
+    transfer_axes(design.axes, state.axes)
+
+
+# ---- The supervisor ----
 
 
 class AxesMemory(NamedTuple):

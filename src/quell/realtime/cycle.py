@@ -40,7 +40,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.axes import Axes, apply_to_axes, control_all, set_applied_controls
+from quell.controllers.axes import Axes, apply_to_axes, control_all
 from quell.controllers.base import (
     bumpless_transfer,
     control,
@@ -64,6 +64,7 @@ from quell.realtime.axes_supervisor import (
     AxesMemory,
     all_measured,
     axes_memory,
+    set_applied_controls,
     supervise_outputs,
     update_axes_mode,
 )
