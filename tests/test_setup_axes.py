@@ -135,7 +135,11 @@ def test_b0_of_the_plant_is_that_of_each_kind() -> None:
     ("change", "message"),
     [
         ({"controller": {"omega_c": 1.0}}, "controller: belongs into each"),
-        ({"rig": {"device": "twin:"}}, "rig: NOT for several axes yet"),
+        ({"rig": {"device": "twin:", "channels": ["load"]}}, "rig.channels: unknown"),
+        (
+            {"axes": {"actuators": ["force [N]"]}},
+            "axes.actuators = .*there are 2; give one for each",
+        ),
         ({"tune": {"m_s": 0.5}}, "tune.m_s = 0.5: must be above 1"),
         ({"tune": {"B0_of": 0.1}}, "tune.B0_of: unknown; did you mean B0_off"),
         ({"axes": {"B1": 1}}, "axes.B1: unknown; "),
@@ -197,11 +201,8 @@ def test_one_axis_is_not_several() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("run-rig", "gantry.toml"),
-        ("replay", "run.csv", "--setup", "gantry.toml"),
         ("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu"),
         ("compare", "gantry.toml"),
-        ("studio", "gantry.toml", "--no-browser"),
         ("proxy", "gantry.toml", "--host", "udp://127.0.0.1:0"),
         ("b0", "run.csv", "--loop", "gantry.toml"),
     ],

@@ -72,6 +72,7 @@ def run(
         Print such a file, and do no more.
     """
     from quell.setup import EXAMPLES, SetupError, made, made_axes, read
+    from quell.setup.axes import signals_in
     from quell.setup.description import is_of_axes
     from quell.simulation import simulate
 
@@ -105,6 +106,8 @@ def run(
     scores: Any
     learned: Any
     if several:
+        signals = signals_in(given.description, given.controller)
+        result = replace(result, signals=signals) if signals.known else result
         scores, learned = print_axes(console, result, given)
     else:
         scores = windowed_metrics(result, given)

@@ -30,6 +30,7 @@ from quell.plants.multivariable import (
     MultivariableNonlinearPlant,
     check_several,
 )
+from quell.quantities import AxesSignals
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
@@ -71,6 +72,7 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Metrics
     from quell.setup.schema import CallTable as Observer
     from quell.setup.schema import CallTable as OnTop
+    from quell.setup.schema import CallTable as Rig
     from quell.setup.schema import CallTable as ScenarioTable
     from quell.setup.schema import CallTable as Sweep
     from quell.setup.schema import CallTable as Tune
@@ -292,12 +294,14 @@ ON_TOP = call_table(
 # Controllers without observer, that are not designed for the linear part of a plant.
 _DRIVES = ("pid", "pid-simc", "notch-pid", "p-pi", "resonance-ratio")
 DRIVES = {kind: registry.CONTROLLERS[kind] for kind in _DRIVES}
+_ACTUATORS = "names and units of the control signals, `torque [N m]`, for files."
 AXES = call_table(
     "axes",
     coupled,
     only=True,
     without=("axes", "plant", "drives", "of_axes"),
     beside={
+        "actuators": (list_of(str), Field((), description=_ACTUATORS)),
         "learner": (
             registry.Learner | None,
             optional(
@@ -325,7 +329,7 @@ if not TYPE_CHECKING:
     Observer, Learner = one_of(OBSERVERS), registry.Learner
     AxisDrive, OnTop = one_of(DRIVES, default="pid"), ON_TOP
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
-    Sweep, Tune = registry.Sweep, TUNE
+    Rig, Sweep, Tune = registry.AxesRig, registry.Sweep, TUNE
 
 
 class Axis(Table):
@@ -338,6 +342,7 @@ class Axis(Table):
     drive: AxisDrive | None = optional("the controller that gives u_0 below a compensator.")
     learner: Learner | None = optional("the learner; none by default.")
     guard: Guard | None = optional("the guard of the learner; none by default.")
+    signal: str = Field("", description="name and unit of its y, `angle [rad]`, for files.")
     reference: registry.Signal = Field(0.0, description="signal that y has to follow [y-unit].")
     noise: registry.Signal = Field(0.0, description="signal added to y before the controller.")
 
@@ -356,6 +361,7 @@ class AxesDescription(Table):
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
     tune: Tune | None = optional("what `quell tune` bounds.")
     sweep: Sweep | None = optional("many runs with other values, for `quell sweep`.")
+    rig: Rig | None = optional("the device and its safety limits, for `quell run-rig`.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."
     )
@@ -368,15 +374,14 @@ _ELSEWHERE = {
     **dict.fromkeys(
         ("observer", "controller", "compensator", "learner", "guard"), "belongs into each [[axis]]"
     ),
-    **dict.fromkeys(("prefilter", "rig"), "NOT for several axes yet"),
+    "prefilter": "NOT for several axes yet",
 }
 
 
 def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     """Read a TOML file of several axes and build the objects that it describes.
 
-    The ``controller`` of the setup is a ``quell.Axes``; it has no rig. ``trust``
-    and errors are those of ``load``.
+    The ``controller`` of the setup is a ``quell.Axes``. ``trust`` and errors are those of ``load``.
 
     Examples
     --------
@@ -444,8 +449,28 @@ def made_axes(
     title = tables.title or title_of(name)
     tune = None if tables.tune is None else builder.build(tables.tune, "tune")
     sweep = None if tables.sweep is None else builder.build(tables.sweep, "sweep")
-    parts = (controller, plant, scenario, None, sweep, windows)
+    rig = None if tables.rig is None else builder.build(tables.rig, "rig", dt=dt)
+    signals = builder.attempt("", (), signals_in, tables, controller)
+    if rig is not None and signals.known:
+        rig = {"signals": signals, **rig}
+    parts = (controller, plant, scenario, rig, sweep, windows)
     return Setup(name, title, *parts, tables, tune, trust)
+
+
+def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:
+    """Return names and units of the signals of a setup of several axes.
+
+    Raises ``ValueError`` for a text that is no name and unit, and another number of actuators than
+    there are.
+    """
+    given: Any = tables.axes
+    actuators = [] if given is None else list(given.actuators)
+    if actuators and len(actuators) != axes.inputs:
+        rule = f"there are {axes.inputs}; give one for each"
+        raise ValueError(f"axes.actuators = {actuators!r:.60}: {rule}")
+    return AxesSignals.of(
+        axes.names, [axis.signal for axis in tables.axis], actuators or [""] * axes.inputs
+    )
 
 
 def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:

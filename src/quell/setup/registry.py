@@ -41,7 +41,7 @@ from quell.controllers.baselines import (
 from quell.observers import ESO
 from quell.quantities import Signals
 from quell.realtime.run import run_rig
-from quell.realtime.supervisor import Safety as RigSafety
+from quell.realtime.safety import Safety as RigSafety
 from quell.records.trajectory import Trajectory
 from quell.setup.schema import AXES_PLANTS as AXES_PLANTS
 from quell.setup.schema import PLANTS as PLANTS
@@ -408,3 +408,7 @@ Tune = call_table(
 _NO_KEYS = ("duration", "on_change", "overwrite")
 Sweep = call_table("sweep", sweep_table, only=True)
 Rig = call_table("rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NO_KEYS)
+_NOT_OF_AXES = (*_NO_KEYS, "signals", "channels")
+AxesRig = call_table(
+    "rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NOT_OF_AXES
+)

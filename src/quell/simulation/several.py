@@ -109,6 +109,15 @@ def references_of(controller: Any) -> int:
     return int(getattr(controller, "references", controller.outputs))
 
 
+def references_in(
+    scenario: Scenario, controller: Any
+) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
+    """Return the references of a scenario for a controller, seeded, and their derivatives."""
+    given = _one_for_each("reference", scenario.reference, references_of(controller))
+    reference = tuple(seeded_apart(given, scenario.seed))
+    return reference, tuple(_derivatives(reference, controller.derivatives))
+
+
 def _one_for_each(name: str, given: Any, axes: int) -> tuple[Signal, ...]:
     """Return a signal for each axis, from one for all or one for each."""
     if not checks.is_sequence(given):

@@ -580,7 +580,7 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
     """Return the plants whose B0 differs from the controller's by a share."""
     if off == 0.0:
         return []
-    B0 = np.linalg.pinv(nominal.R)
+    B0 = np.asarray(np.linalg.pinv(nominal.R), dtype=np.float64)
     entries = int(np.count_nonzero(B0))
     if 2**entries <= _MOST_PATTERNS:
         patterns = np.array(list(itertools.product((-1.0, 1.0), repeat=entries)))
@@ -590,7 +590,7 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
     return [_off_by(nominal, B0, off * signs) for signs in patterns]
 
 
-def _off_by(nominal: Plant, B0: Matrix, shares: Any) -> Plant:
+def _off_by(nominal: Plant, B0: Matrix, shares: Vector) -> Plant:
     """Return the plant with the entries of B0 that are not zero off by shares."""
     error = np.zeros(B0.shape)
     error[B0 != 0.0] = shares * B0[B0 != 0.0]
@@ -866,7 +866,7 @@ def _check(
     drawn = []
     for k in range(samples):
         one = nominal[k % len(nominal)]
-        B0 = np.linalg.pinv(one.R)
+        B0 = np.asarray(np.linalg.pinv(one.R), dtype=np.float64)
         drawn.append(_off_by(one, B0, rng.uniform(-off, off, int(np.count_nonzero(B0)))))
     measured = loops(drawn).measured(found.values)
     ratios = np.exp(-np.min(measured.slacks, axis=1))
