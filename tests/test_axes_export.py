@@ -369,16 +369,10 @@ def test_what_has_no_counterpart_is_named(
 
 
 def test_other_forms_name_axes() -> None:
-    """Single precision in Python, and FMUs."""
+    """Single precision in Python."""
     axes = ql.Axes([joint(), joint()])
     with pytest.raises(ValueError, match="several axes run in Python in double precision only"):
         ql.controllers.in_single_precision(axes)
-
-
-def test_an_fmu_of_axes_is_refused(tmp_path: Path) -> None:
-    """It says what can be done."""
-    with pytest.raises(TranslationError, match="2 axes: an FMU is of one u and one y"):
-        ql.export.fmu(ql.Axes([joint(), joint()]), tmp_path / "robot.fmu")
 
 
 @needs_gcc
