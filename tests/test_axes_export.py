@@ -49,6 +49,12 @@ def plain() -> dict[str, ql.ADRC]:
     return {"shoulder": joint(feedforward=True), "elbow": joint(), "wrist": joint()}
 
 
+def guarded() -> list[ql.ADRC]:
+    """Return axes with bands, so that y leaves those of the first two, and one without."""
+    wide, narrow = (ql.SafeSet(-y, y, -3.0 * y, 3.0 * y, alpha=8.0, f_rate=1.0) for y in (1.0, 0.3))
+    return [joint(safe_set=wide), joint(1, safe_set=narrow), joint()]
+
+
 def two() -> list[ql.ADRC]:
     """Return two axes with learners and guards."""
     learners = (ql.learners.Kalman(), ql.learners.Harmonic())
@@ -68,6 +74,10 @@ ROWS: dict[str, Any] = {
         plain(), WIDE, saturation="direction", rate_limit=5000.0, **LIMITS
     ),
     "more actuators, priority": lambda: ql.Axes(plain(), WIDE, saturation=RANKED, **LIMITS),
+    "safe sets, rates": lambda: ql.Axes(guarded(), SQUARE, rate_limit=8000.0, **LIMITS),
+    "safe sets, more actuators, direction": lambda: ql.Axes(
+        guarded(), WIDE, saturation="direction", weights=[1, 2, 3, 4], **LIMITS
+    ),
     "orders 1, 3 and 2": lambda: ql.Axes([joint(1), joint(3), joint(2)], SQUARE, u_max=5.0),
     "one axis": lambda: ql.Axes([joint()]),
     "nested tuples": lambda: ql.Axes([joint(), joint()], gain_functions.nested_tuples, **LIMITS),
@@ -80,7 +90,13 @@ ROWS: dict[str, Any] = {
     ),
     "mass matrix of the arm": lambda: ql.Axes([joint(), joint()], M=ARM.inertia, **LIMITS),
 }
-SINGLE = ("each, with rates", "more actuators, direction", "priority", "orders 1, 3 and 2")
+SINGLE = (
+    "each, with rates",
+    "safe sets, rates",
+    "more actuators, direction",
+    "priority",
+    "orders 1, 3 and 2",
+)
 
 
 def outcome(folder: Path, *arguments: str) -> tuple[int, str]:
@@ -119,6 +135,16 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
         theta = found.estimate[at : at + width][-len(axis.features) :]
         assert np.any(theta != 0.0)
         at += width
+
+
+def test_the_run_of_the_golden_vectors_has_bands_that_are_kept_and_left() -> None:
+    """Samples in which the safe sets act and all is well, and some where the limits are too narrow."""
+    axes = ROWS["safe sets, more actuators, direction"]()
+    rows = golden_vectors(axes, c_source(axes)).rows
+    flags = [ql.Status(row.status) for row in rows]
+    acted = [each for each in flags if ql.Status.SAFE_SET_ACTED in each]
+    assert any(ql.Status.UNSAFE in each for each in acted)
+    assert any(ql.Status.UNSAFE not in each for each in acted)
 
 
 @needs_gcc

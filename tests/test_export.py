@@ -246,7 +246,8 @@ def test_the_folder_has_all_files_and_no_placeholder(tmp_path: Path) -> None:
     found = {str(p.relative_to(result.folder)) for p in result.folder.rglob("*") if p.is_file()}
     assert names == found == {
         "src/servo.h", "src/servo.c", "test_servo.c", "CMakeLists.txt", "README.md",
-        "library.properties", "library.json", "examples/servo/servo.ino",
+        "library.properties", "library.json", "idf_component.yml", "keywords.txt", "LICENSE",
+        "examples/servo/servo.ino",
     }  # fmt: skip
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     for path in result.files:

@@ -16,9 +16,6 @@ from quell.controllers.axes import (
     Axes,
     AxesDesign,
     AxesState,
-    AxisDesigns,
-    AxisStates,
-    NoAxis,
     apply_to_axes,
     begin_manual,
     control_all,
@@ -26,6 +23,7 @@ from quell.controllers.axes import (
     start_all,
     tell_applied,
 )
+from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.controllers.base import (
     change_parameters,
     is_usable,

@@ -29,6 +29,7 @@ from quell.controllers.single import SinglePrecision
 from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
 from quell.export.controller_source import c_source, in_double_precision, limits_path
+from quell.export.library.packages import package_files, package_note
 from quell.export.library.vectors import (
     TOLERANCE_REASON,
     Vectors,
@@ -79,7 +80,7 @@ _OPERATIONS = {
     "status": ("status(s)", "after the step: flags, see the enum in the header"),
     "get_estimate": ("get_estimate(s)", "after the step: what the controller knows, for telemetry"),
 }
-_TEXTS = ("CMakeLists.txt", "library.json", "library.properties", "README.md")
+_TEXTS = ("CMakeLists.txt", "README.md")
 _RETUNING = """## Other limits
 
 Parameters are constants. To change a limit while running, change a copy:
@@ -147,6 +148,7 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         f"test_{name}.c": test_program(source, vectors),
         f"examples/{name}/{name}.ino": filled(f"example{kind}.ino", values),
         **{each: filled(each, values) for each in _TEXTS},
+        **package_files(source, values),
     }
 
 
@@ -191,6 +193,7 @@ def _values(source: CSource, dt: float, limit: str) -> dict[str, object]:
         "external_note": " # and your functions" if functions else "",
         "link": " YOUR_FILES" if functions else "",
         "tolerance_reason": TOLERANCE_REASON,
+        "package_note": package_note(source),
     }
 
 
@@ -616,10 +619,11 @@ def c(
 ) -> Exported:
     """Write a controller as a library in C99, translated from the kernels that simulate it.
 
-    The folder is a project for CMake, and a library for Arduino and PlatformIO: ``src/NAME.h`` and
-    ``src/NAME.c``, a test with golden vectors ``test_NAME.c``, and ``README.md``. Without
-    contraction to FMA the code gives, in double precision, the bits of the interpreted kernels, and
-    in single precision those of ``simulate(..., precision="single", interpret=True)``.
+    The folder is a project for CMake, a library for Arduino and PlatformIO, and a component for
+    ESP-IDF (docs/ecosystems): ``src/NAME.h`` and ``src/NAME.c``, a test with golden vectors
+    ``test_NAME.c``, and ``README.md``. Without contraction to FMA the code gives, in double
+    precision, the bits of the interpreted kernels, and in single precision those of
+    ``simulate(..., precision="single", interpret=True)``.
 
     Parameters
     ----------
