@@ -360,6 +360,7 @@ def test_names_of_axes_become_names_in_c() -> None:
     """Signs that C does not know go; keywords, doubles and members of the struct get another name."""
     names = ("x", "x", "Achse 2", "2", "v", "int", "φ")
     assert names_in_c(names) == ("x", "x_2", "Achse_2", "axis4", "v_2", "int_", "phi")
+    assert names_in_c(("x", "X", "Status")) == ("x", "X_2", "Status_2")  # enum robot_axis
 
 
 REFUSED: tuple[tuple[dict[str, Any], str], ...] = (

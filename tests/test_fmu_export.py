@@ -283,6 +283,14 @@ def test_fmpy_finds_no_fault_in_several_signals(name: str, tmp_path: Path) -> No
     assert validate_fmu(str(tmp_path / "several.fmu")) == []
 
 
+def test_axes_whose_variables_have_one_name_in_c_are_named(tmp_path: Path) -> None:
+    """Nothing is written."""
+    axis = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=30.0, dt=DT), 5.0)
+    with pytest.raises(TranslationError, match=r"r\.x_hat_1 and r\.x_hat\[1\]: these variables"):
+        fmu(ql.Axes({"r": axis, "x_hat_1": axis}), tmp_path / "axes.fmu")
+    assert not any(tmp_path.iterdir())
+
+
 def test_several_signals_with_a_plant_are_refused(tmp_path: Path) -> None:
     """The message says what to do."""
     with pytest.raises(TranslationError, match="2 axes: an FMU with a plant is of one u and one y"):

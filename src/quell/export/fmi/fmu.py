@@ -673,7 +673,16 @@ def _model(
         plant_part = PlantPart(translated, plant.order, plant.disturbances, start.tolist())
     what = [type(each).__name__ for each in (controller, plant) if each is not None]
     title = " with ".join(what) + (controller_part.fixed if controller_part else "")
-    return Model(controller_part, plant_part, float(dt or 0.0), title), files
+    model = Model(controller_part, plant_part, float(dt or 0.0), title)
+    places: dict[str, str] = {}
+    for variable in model.variables:
+        other = places.setdefault(variable.constant, variable.name)
+        if other != variable.name:
+            raise TranslationError(
+                f"{other} and {variable.name}: these variables would have one name in C; give the "
+                "axis another name"
+            )
+    return model, files
 
 
 def _content(
