@@ -142,10 +142,14 @@ class Driven:
 
     def step(self, length: float, **inputs: float) -> float:
         """Set inputs, advance by a communication step [s], and return the first output."""
+        self.advance(length, inputs)
+        return self.get("u" if "u" not in inputs else "y")
+
+    def advance(self, length: float, inputs: Mapping[str, float]) -> None:
+        """Set inputs, and advance by a communication step [s]."""
         self.set(inputs)
         self.fmu.doStep(self.time, length)
         self.time += length
-        return self.get("u" if "u" not in inputs else "y")
 
     def free(self) -> None:
         """Free the instance."""

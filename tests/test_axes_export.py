@@ -382,6 +382,7 @@ def test_names_of_axes_become_names_in_c() -> None:
     """Signs that C does not know go; keywords, doubles and members of the struct get another name."""
     names = ("x", "x", "Achse 2", "2", "v", "int", "φ")
     assert names_in_c(names) == ("x", "x_2", "Achse_2", "axis4", "v_2", "int_", "phi")
+    assert names_in_c(("x", "X", "Status")) == ("x", "X_2", "Status_2")  # enum robot_axis
 
 
 REFUSED: tuple[tuple[dict[str, Any], str], ...] = (
@@ -417,16 +418,10 @@ def test_what_has_no_counterpart_is_named(
 
 
 def test_other_forms_name_axes() -> None:
-    """Single precision in Python, and FMUs."""
+    """Single precision in Python."""
     axes = ql.Axes([joint(), joint()])
     with pytest.raises(ValueError, match="several axes run in Python in double precision only"):
         ql.controllers.in_single_precision(axes)
-
-
-def test_an_fmu_of_axes_is_refused(tmp_path: Path) -> None:
-    """It says what can be done."""
-    with pytest.raises(TranslationError, match="2 axes: an FMU is of one u and one y"):
-        ql.export.fmu(ql.Axes([joint(), joint()]), tmp_path / "robot.fmu")
 
 
 @needs_gcc

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import math
 import shutil
@@ -16,10 +17,14 @@ import pytest
 
 import quell as ql
 from quell.controllers import in_single_precision
+from quell.controllers.axes import control_all
+from quell.controllers.base import set_reference_derivatives
 from quell.export import TranslationError, fmu
 from quell.export.fmi.parts import bandwidths, gain_coefficients
+from quell.kernels.dispatch import as_python
 from quell.simulation.driver import SampledScenario
 
+from .contracts.test_controllers import SEVERAL
 from .fmus import Driven
 from .in_c import STRICT, needs_gcc
 
@@ -220,6 +225,76 @@ def test_a_held_plant_is_a_boolean_input(made: Maker, tmp_path: Path) -> None:
     fmu(pid, tmp_path / "pid.fmu", binary=False)
     with zipfile.ZipFile(tmp_path / "pid.fmu") as archive:
         assert b"<Boolean" not in archive.read("modelDescription.xml")
+
+
+def several_signals() -> dict[str, Any]:
+    """Return axes with feedforward, a learner and a guard, and state feedback."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=30.0, dt=DT)
+    axes = {
+        "shoulder": ql.ADRC(observer, 5.0, feedforward=True),
+        "elbow": ql.ADRC(observer, 5.0, learner=ql.learners.RLS(), guard=ql.Guard()),
+    }
+    return {
+        "axes": ql.Axes(axes, [[1.0, 0.3], [0.2, 1.0]], u_min=-4.0, u_max=4.0),
+        "feedback": copy.deepcopy(SEVERAL["StateFeedback"]),
+    }
+
+
+@pytest.mark.parametrize("name", ["axes", "feedback"])
+def test_several_signals_have_a_variable_each(name: str, made: Maker, tmp_path: Path) -> None:
+    """U, estimates and flags are the bits of the kernels, also with a missing y and other limits."""
+    law, random = several_signals()[name], np.random.default_rng(1)
+    fmu(law, tmp_path / f"{name}.fmu")
+    running, (n, m) = made(name).begin(), (law.outputs, law.inputs)
+    signals = [f".{each}" for each in law.names] or [f"[{i + 1}]" for i in range(n)]
+    u = np.zeros(m)
+    for k in range(120):
+        r, y = np.sin(0.1 * k + np.arange(n)), 0.3 * random.standard_normal(n)
+        y[k % n] = np.nan if k % 7 == 3 else y[k % n]
+        given = {f"r{each}": r[i] for i, each in enumerate(signals)}
+        given |= {f"y{each}": y[i] for i, each in enumerate(signals)}
+        if k == 60:
+            law.set_limits(u_max=0.5)
+            given |= {f"u_max[{i + 1}]": 0.5 for i in range(m)}
+        with np.errstate(all="ignore"), as_python():
+            if name == "axes":
+                given["r_derivative.shoulder[1]"] = 0.5 * r[0]
+                half = np.array([0.5 * r[0], 0.0])
+                set_reference_derivatives(law.parameters, law._state, half)
+            control_all(law.parameters, law._state, r, y, u)
+        running.advance(DT, given)
+        assert [running.get(f"u[{i + 1}]") for i in range(m)] == u.tolist()
+        assert running.get("status") == int(law.status)
+    if name == "axes":
+        assert running.get("elbow.x_hat[2]") == law.estimates["elbow"].x[1]
+        assert running.get("elbow.f_hat") == law.estimates["elbow"].f
+        assert running.get("v[2]") == law._state.v[1]
+    else:
+        assert running.get("d_hat[1]") == law.estimate[1][0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["axes", "feedback"])
+def test_fmpy_finds_no_fault_in_several_signals(name: str, tmp_path: Path) -> None:
+    """Names, structure and start values."""
+    from fmpy.validation import validate_fmu
+
+    fmu(several_signals()[name], tmp_path / "several.fmu")
+    assert validate_fmu(str(tmp_path / "several.fmu")) == []
+
+
+def test_axes_whose_variables_have_one_name_in_c_are_named(tmp_path: Path) -> None:
+    """Nothing is written."""
+    axis = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=30.0, dt=DT), 5.0)
+    with pytest.raises(TranslationError, match=r"r\.x_hat_1 and r\.x_hat\[1\]: these variables"):
+        fmu(ql.Axes({"r": axis, "x_hat_1": axis}), tmp_path / "axes.fmu")
+    assert not any(tmp_path.iterdir())
+
+
+def test_several_signals_with_a_plant_are_refused(tmp_path: Path) -> None:
+    """The message says what to do."""
+    with pytest.raises(TranslationError, match="2 axes: an FMU with a plant is of one u and one y"):
+        fmu((MASS, several_signals()["axes"]), tmp_path / "loop.fmu")
 
 
 def test_parameters_are_checked_when_they_act(made: Maker) -> None:

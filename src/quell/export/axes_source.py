@@ -173,12 +173,16 @@ def check_single(controller: Axes) -> None:
 
 
 def names_in_c(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of axes as members of a struct in C, in their order."""
-    taken, found = {"v", "status"}, []
+    """Return the names of axes as members of a struct in C, in their order.
+
+    They differ in more than capitals, because constants are named after them.
+    """
+    taken, found = {"V", "STATUS"}, []
     for i, name in enumerate(names):
         plain = re.sub(r"\W+", "_", ascii_text(name)).strip("_")
         usable = re.fullmatch(r"[A-Za-z]\w*", plain) is not None
-        found.append(identifier(unique(plain if usable else f"axis{i + 1}", taken)))
+        own = plain if usable else f"axis{i + 1}"
+        found.append(identifier(own + unique(own.upper(), taken)[len(own) :]))
     return tuple(found)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -44,6 +45,7 @@ from quell.export.fmi.parts import (
     ControllerPart,
     PlantPart,
     Variable,
+    constant_of,
     number,
     ordered,
     several,
@@ -269,8 +271,11 @@ class Model:
             found += several("w", plant.disturbances, INPUT, "disturbance {i}")
         if controller:
             noise = Variable("noise", INPUT, "what is added to y before the controller sees it")
-            found.append(noise if plant else Variable("y", INPUT, "measurement"))
-            found.append(Variable("u", OUTPUT, "control signal", held=True))
+            measured = [Variable(name, INPUT, "measurement") for name in controller.measurements]
+            found += [noise] if plant else measured
+            found += [
+                Variable(name, OUTPUT, "control signal", held=True) for name in controller.controls
+            ]
         if plant:
             found.append(Variable("y", OUTPUT, "output of the plant"))
         if controller:
@@ -359,6 +364,8 @@ class Model:
         if self.plant and self.controller:
             lines.append(f"const double y = {self.plant.source.name}_measure(&m->plant);")
             y = "y + m->real[AT_NOISE]"
+        if self.controller and self.controller.source.sizes is not None:
+            return [*lines, *_several_lines(self.controller)]
         if self.controller:
             source = self.controller.source
             real, state = source.real, "&m->controller"
@@ -380,6 +387,31 @@ class Model:
         return lines
 
 
+def _several_lines(controller: ControllerPart) -> list[str]:
+    """Return the lines of a sample of a controller of several signals, which takes arrays."""
+    source = controller.source
+    real, cast = source.real, "" if source.real == "double" else f"({source.real})"
+
+    def filled(array: str, names: Iterable[str]) -> str:
+        values = (f"{cast}m->real[{constant_of(name)}]" if name else "0" for name in names)
+        return f"const {real} {array}[] = {{{', '.join(values)}}};"
+
+    lines = [filled("r", controller.references), filled("y", controller.measurements)]
+    each = [controller.derivatives_of(i) for i in range(len(controller.derivatives))]
+    for i in range(source.derivatives):
+        lines.append(filled(f"r{i + 1}", (names[i] if i < len(names) else "" for names in each)))
+    lines.append(f"{real} u[{len(controller.controls)}];")
+    for i, name in enumerate(controller.held):
+        at = f"{constant_of(name)} - MODEL_REALS - MODEL_INTEGERS"
+        lines.append(f"{source.name}_set_held(&m->controller, {i}, m->flag[{at}]);")
+    more = "".join(f", {each}" for each in source.further)
+    lines.append(f"{source.name}_step(&m->controller, r, y{more}, u);")
+    return [
+        *lines,
+        *(f"m->real[{constant_of(name)}] = u[{k}];" for k, name in enumerate(controller.controls)),
+    ]
+
+
 def _plant_outputs(plant: PlantPart) -> list[str]:
     lines = [f"m->real[AT_Y] = {plant.source.name}_measure(&m->plant);"]
     return [*lines, *(f"m->real[AT_X_{i + 1}] = m->plant.x[{i}];" for i in range(plant.order))]
@@ -391,7 +423,7 @@ def _estimate_function(controller: ControllerPart) -> str:
     lines = [f"const {name}_estimate estimate = {name}_get_estimate(&m->controller);"]
     has_status = "status" in dict(controller.source.channels)
     fields = (
-        f"estimate.{'f' if channel == 'f_hat' else channel}" + (f"[{i}]" if width > 1 else "")
+        f"estimate.{re.sub(r'f_hat$', 'f', channel)}" + (f"[{i}]" if width > 1 else "")
         for channel, width in controller.channels
         for i in range(width)
     )
@@ -512,7 +544,8 @@ def fmu(
     ----------
     part
         a controller, a plant, or the two as ``(plant, controller)``, which become one loop. The
-        kernels are translated to C, see ``quell.export.c_source``.
+        kernels are translated to C, see ``quell.export.c_source``. ``quell.Axes`` and
+        ``StateFeedback`` have a variable for each of their signals, and stand without a plant.
     path
         the file, ending in ``.fmu``.
     name
@@ -577,11 +610,11 @@ def _parts(part: Any) -> tuple[Any, Any]:
         plant, controller = part, None
     if controller is not None:
         check_controller(controller, several=True)
-    if isinstance(controller, Axes | StateFeedback):
+    if isinstance(controller, Axes | StateFeedback) and plant is not None:
         what = f"{controller.outputs} axes" if controller.axes else "StateFeedback"
         raise TranslationError(
-            f"{what}: an FMU is of one u and one y; write the controller as C by "
-            "quell.export.c, whose files can be linked into a block of your simulator"
+            f"{what}: an FMU with a plant is of one u and one y; write the FMU of the controller "
+            "alone, and connect it to the plant in your simulator"
         )
     if plant is not None or controller is None:
         if not hasattr(plant, "sampled") and is_linear_model(plant):
@@ -640,7 +673,16 @@ def _model(
         plant_part = PlantPart(translated, plant.order, plant.disturbances, start.tolist())
     what = [type(each).__name__ for each in (controller, plant) if each is not None]
     title = " with ".join(what) + (controller_part.fixed if controller_part else "")
-    return Model(controller_part, plant_part, float(dt or 0.0), title), files
+    model = Model(controller_part, plant_part, float(dt or 0.0), title)
+    places: dict[str, str] = {}
+    for variable in model.variables:
+        other = places.setdefault(variable.constant, variable.name)
+        if other != variable.name:
+            raise TranslationError(
+                f"{other} and {variable.name}: these variables would have one name in C; give the "
+                "axis another name"
+            )
+    return model, files
 
 
 def _content(

@@ -156,6 +156,11 @@ def _equal(one: Any, other: Any) -> bool:
 INPUT, OUTPUT, LOCAL, FIXED, TUNABLE = "input", "output", "local", "fixed", "tunable"
 
 
+def constant_of(name: str) -> str:
+    """Return the C constant for the place of a variable: ``AT_X_HAT_1`` for ``x_hat[1]``."""
+    return "AT_" + re.sub(r"\W+", "_", name).strip("_").upper()
+
+
 class Variable(NamedTuple):
     """A variable; its value reference is its place in the list of all."""
 
@@ -170,8 +175,8 @@ class Variable(NamedTuple):
 
     @property
     def constant(self) -> str:
-        """Name of the C constant for its place: ``AT_X_HAT_1`` for ``x_hat[1]``."""
-        return "AT_" + re.sub(r"\W+", "_", self.name).strip("_").upper()
+        """Name of the C constant for its place."""
+        return constant_of(self.name)
 
 
 TIME = Variable("time", "independent", "time", unit="s")
@@ -214,6 +219,8 @@ def number(value: float) -> str:
 # ---- The parts of a model ----
 
 _DESCRIPTIONS = {
+    "v": "input of an axis, B0 u as it was applied",
+    "d_hat": "estimate of a disturbance, or of its derivatives",
     "x_hat": "estimate of y and its derivatives",
     "f_hat": "estimate of the total disturbance: f_residual + f_learned",
     "f_residual": "the observer's share of it",
@@ -237,10 +244,11 @@ class ControllerPart:
     """A controller in C."""
 
     source: CSource
-    limits: tuple[float, float]  # of u
+    limits: tuple[Any, Any]  # of u, or of each u
     limits_path: str  # of ``Limits`` in its parameters
     bandwidths: Bandwidths | None
     features: tuple[str, ...]
+    derivatives: tuple[int, ...]  # of each reference, that are fed forward
 
     @classmethod
     def of(cls, controller: Any, source: CSource) -> ControllerPart:
@@ -256,26 +264,67 @@ class ControllerPart:
             path,
             bandwidths(controller),
             tuple(controller.features),
+            controller.derivatives if source.sizes else (source.derivatives,),
         )
 
     @property
     def channels(self) -> tuple[tuple[str, int], ...]:
         """Name and width of what its estimate has."""
-        channels = self.source.channels
-        if {"f_residual", "f_learned"} <= dict(channels).keys():
-            channels = (("f_hat", 1), *channels)
-        return channels if "status" in dict(channels) else (*channels, ("status", 1))
+        found: list[tuple[str, int]] = []
+        known = dict(self.source.channels)
+        for prefix in ("", *(f"{member}." for member in self.source.axes)):
+            own = [each for each in known if each.rpartition(".")[0] == prefix[:-1]]
+            if {f"{prefix}f_residual", f"{prefix}f_learned"} <= known.keys():
+                found.append((f"{prefix}f_hat", 1))
+            found += [(each, known[each]) for each in own]
+        return (*found, *(() if "status" in known else (("status", 1),)))
+
+    def _names(self, signal: str, place: int) -> list[str]:
+        """Return the names of signals: of each axis, or counted."""
+        if self.source.sizes is None:
+            return [signal]
+        if self.source.axes and signal != "u":
+            return [f"{signal}.{member}" for member in self.source.axes]
+        return [f"{signal}[{i + 1}]" for i in range(self.source.sizes[place])]
+
+    @property
+    def references(self) -> list[str]:
+        """Names of the references."""
+        return self._names("r", 0)
+
+    @property
+    def measurements(self) -> list[str]:
+        """Names of the measurements."""
+        return self._names("y", 1)
+
+    @property
+    def controls(self) -> list[str]:
+        """Names of the control signals."""
+        return self._names("u", 2)
+
+    @property
+    def held(self) -> list[str]:
+        """Names of the inputs that say whether the plant, or an axis, is held."""
+        return self._names("held", 0) if self.can_be_held else []
+
+    def derivatives_of(self, place: int) -> list[str]:
+        """Return the names of the derivatives of a reference."""
+        member = f".{self.source.axes[place]}" if self.source.axes else ""
+        return [f"r_derivative{member}[{i + 1}]" for i in range(self.derivatives[place])]
 
     @property
     def inputs(self) -> list[Variable]:
         """Reference and its derivatives, signals of the schedule, whether the plant is held."""
-        described = "derivative {i} of the reference"
         held = "whether the plant is held, by a brake for instance: u does not act until it is not"
         return [
-            Variable("r", INPUT, "reference"),
-            *several("r_derivative", self.source.derivatives, INPUT, described),
+            *(Variable(name, INPUT, "reference") for name in self.references),
+            *(
+                Variable(name, INPUT, f"derivative {i + 1} of the reference")
+                for place in range(len(self.derivatives))
+                for i, name in enumerate(self.derivatives_of(place))
+            ),
             *several("signal", self.source.signals, INPUT, "signal {i} that the gains follow"),
-            *([Variable("held", INPUT, held, flag=True)] if self.can_be_held else []),
+            *(Variable(name, INPUT, held, flag=True) for name in self.held),
         ]
 
     @property
@@ -288,14 +337,17 @@ class ControllerPart:
         """Results of the controller after a sample, without u."""
         found = []
         for name, width in self.channels:
-            text = _DESCRIPTIONS.get(name, name)
-            if name == "theta":
+            own = name.rpartition(".")[2]
+            text = _DESCRIPTIONS.get(own, own)
+            if name == "v[0]":
+                found += several("v", 1, OUTPUT, _DESCRIPTIONS["v"], held=True)
+            elif name == "theta":
                 found += [
                     Variable(f"theta[{i + 1}]", OUTPUT, f"{text} for {feature}", held=True)
                     for i, feature in enumerate(self.features)
                 ]
-            elif width == 1 and name not in ("x_hat", "f_derivatives"):
-                found.append(Variable(name, OUTPUT, text, held=True, whole=name in WHOLE))
+            elif width == 1 and own not in ("x_hat", "f_derivatives", "d_hat", "theta"):
+                found.append(Variable(name, OUTPUT, text, held=True, whole=own in WHOLE))
             else:
                 found += several(name, width, OUTPUT, f"{text}, {{i}}", held=True)
         return found
@@ -303,12 +355,15 @@ class ControllerPart:
     @property
     def tunables(self) -> list[Variable]:
         """The parameters that can be changed while the FMU runs."""
-        found = [
-            Variable(name, TUNABLE, f"{which} limit of u", start)
-            for name, which, start in zip(
-                ("u_min", "u_max"), ("lower", "upper"), self.limits, strict=True
-            )
-        ]
+        found = []
+        for signal, which, starts in zip(
+            ("u_min", "u_max"), ("lower", "upper"), self.limits, strict=True
+        ):
+            text = f"{which} limit of u"
+            if self.source.sizes is None:
+                found.append(Variable(signal, TUNABLE, text, starts))
+            else:
+                found += several(signal, len(starts), TUNABLE, text, starts.tolist())
         known = self.bandwidths
         if known is not None and known.weights is not None:
             text = "bandwidth of the controller"
@@ -358,11 +413,19 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
     source, path = controller.source, controller.limits_path
     name, real = source.name, source.real
     cast = "" if real == "double" else f"({real})"
-    lines = [
-        "if (!(m->real[AT_U_MIN] < m->real[AT_U_MAX])) {",
-        '    return "u_min must be less than u_max";',
-        "}",
-    ]
+    lines, limits = [], []
+    places = [""] if source.sizes is None else [f"_{k + 1}" for k in range(source.sizes[2])]
+    for k, place in enumerate(places):
+        lines += [
+            f"if (!(m->real[AT_U_MIN{place}] < m->real[AT_U_MAX{place}])) {{",
+            '    return "u_min must be less than u_max";',
+            "}",
+        ]
+        at = f"[{k}]" if place else ""
+        limits += [
+            f"next->{path}.low{at} = {cast}m->real[AT_U_MIN{place}];",
+            f"next->{path}.high{at} = {cast}m->real[AT_U_MAX{place}];",
+        ]
     known = controller.bandwidths
     offered = [variable for variable in controller.tunables if variable.unit == "rad/s"]
     for variable in offered:
@@ -375,8 +438,7 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
     lines += [
         f"{name}_parameters *next = &m->parameters[1 - m->acting];",
         f"*next = {name}_default_parameters;",
-        f"next->{path}.low = {cast}m->real[AT_U_MIN];",
-        f"next->{path}.high = {cast}m->real[AT_U_MAX];",
+        *limits,
     ]
     if known is not None:
         if known.weights is not None:
