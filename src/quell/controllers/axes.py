@@ -66,6 +66,7 @@ from quell.controllers.axes_learning import (
 )
 from quell.controllers.base import (
     RateLimit,
+    check_controller,
     reset_loop,
     set_reference_derivatives,
     status_flags,
@@ -708,6 +709,7 @@ def check_axes(axes: Sequence[Any], names: Sequence[str]) -> None:
         checks.printable("axes", name)
         if not isinstance(axis, ADRC):
             raise ValueError(f"axes: {name} = {axis!r:.60}: must be an ADRC")
+        check_controller(axis, f"axes: {name}")
         if axis.dt != axes[0].dt:
             raise ValueError(
                 f"axes: {name} has dt = {axis.dt!r} s, {names[0]} {axes[0].dt!r} s: must be one dt"
