@@ -343,6 +343,20 @@ def test_what_does_not_fit_is_named(name: str) -> None:
         make()
 
 
+def test_an_axis_does_not_run_alone() -> None:
+    """Neither in a simulation nor in C nor in other axes: its learner would see no other axis."""
+    plant = ql.plants.LinearPlant.of(([1.0], [1.0, 0.0, 0.0]))
+    for learner in (RLS(coupled()), [RLS(coupled()), RLS(coupled())]):
+        axis = axes_with(learner).axes[0]
+        for use in (
+            lambda axis=axis: ql.simulate(plant, axis, ql.Scenario(1.0, duration=0.01)),
+            lambda axis=axis: c_source(axis, "axis"),
+            lambda axis=axis: ql.Axes([axis, joint()]),
+        ):
+            with pytest.raises(ValueError, match="needs the signals of all axes"):
+                use()
+
+
 def test_a_dictionary_gives_learners_and_guards_by_name() -> None:
     """An axis that is not in it has none; its own learner stays."""
     axes = ql.Axes(

@@ -62,6 +62,11 @@ def check_controller(value: Any, name: str = "controller", *, several: bool = Fa
             f"{value.outputs} outputs: NOT possible here yet, one of each is; quell.simulate, "
             "quell.analysis.analyse_axes and quell.export.c take several"
         )
+    if hasattr(getattr(value, "learner", None), "of_axes"):
+        raise ValueError(
+            f"{name}: is an axis of quell.Axes, whose learner needs the signals of all axes: NOT "
+            "possible alone; give the Axes, or an ADRC with a learner of its own"
+        )
 
 
 @generic

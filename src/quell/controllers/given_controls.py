@@ -353,6 +353,7 @@ def check_axes(axes: Sequence[Any], names: Sequence[str]) -> None:
         checks.printable("axes", name)
         if not isinstance(axis, Compensator):
             raise ValueError(f"axes: {name} = {axis!r:.60}: must be an ADRC, or a Compensator")
+        check_controller(axis, f"axes: {name}")
         if takes_control(axis) != takes_control(axes[0]):
             raise ValueError(
                 f"axes: {name} is of another kind than {names[0]}: all must be ADRCs, or all "

@@ -355,6 +355,8 @@ def _meaning(learner: SeeingDesign) -> Any:
 class SeeingLearner:
     """A learner of one axis of several, with features of all of them; ``Axes`` makes it."""
 
+    of_axes = True  # the controller of its axis does not run alone
+
     def __init__(self, learner: Any, view: AxesView, axis: int) -> None:
         self.learner, self.view, self.axis = learner, view, axis
         self.inputs = asks_for_inputs(learner.features)
@@ -646,7 +648,9 @@ def forget_uncertainty(shared: SharedDesign, memory: SharedMemory, output: Outpu
 
 
 class OneOutput:
-    """An output of a shared learner, as the learner of one axis; ``SharedLearner`` makes it."""
+    """An output of a shared learner, as the learner of one axis; ``LearningOfAxes`` makes it."""
+
+    of_axes = True
 
     def __init__(self, shared: SharedLearner, axis: int) -> None:
         self.shared, self.axis = shared, axis
