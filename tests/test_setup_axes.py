@@ -136,7 +136,8 @@ def test_b0_of_the_plant_is_that_of_each_kind() -> None:
     [
         ({"controller": {"omega_c": 1.0}}, "controller: belongs into each"),
         ({"rig": {"device": "twin:"}}, "rig: NOT for several axes yet"),
-        ({"tune": {}}, "tune: NOT for several axes yet"),
+        ({"tune": {"m_s": 0.5}}, "tune.m_s = 0.5: must be above 1"),
+        ({"tune": {"B0_of": 0.1}}, "tune.B0_of: unknown; did you mean B0_off"),
         ({"axes": {"B1": 1}}, "axes.B1: unknown; "),
         ({"axes": {"B0": "model"}}, "axes.B0 = 'model'"),
         ({"axes": {"B0": [[1, 2], [2, 4]]}}, "axes.*singular"),
@@ -196,8 +197,6 @@ def test_one_axis_is_not_several() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("tune", "gantry.toml", "--no-figures"),
-        ("sweep", "gantry.toml"),
         ("run-rig", "gantry.toml"),
         ("replay", "run.csv", "--setup", "gantry.toml"),
         ("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu"),

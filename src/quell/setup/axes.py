@@ -25,11 +25,25 @@ from quell.controllers.compensator import Compensator
 from quell.features.all_axes import sees_all_axes
 from quell.plants.base import PlantWrapper
 from quell.plants.multibody import Arm, Craft
-from quell.plants.multivariable import MultivariableLinearPlant, check_several
+from quell.plants.multivariable import (
+    MultivariableLinearPlant,
+    MultivariableNonlinearPlant,
+    check_several,
+)
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import Known, Setup, made_once, title_of, windows_of
+from quell.setup.loading import (
+    Known,
+    Setup,
+    Variation,
+    changed,
+    made_once,
+    sweep_of,
+    title_of,
+    windows_of,
+)
+from quell.setup.registry import CASE
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -43,6 +57,8 @@ from quell.setup.schema import (
     read,
 )
 from quell.simulation.driver import Scenario
+from quell.tuning.axes import OBJECTIVES
+from quell.tuning.constraints import Constraints
 from quell.types import Matrix
 
 if TYPE_CHECKING:  # these types are made at run time, which a type checker cannot follow
@@ -56,6 +72,8 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Observer
     from quell.setup.schema import CallTable as OnTop
     from quell.setup.schema import CallTable as ScenarioTable
+    from quell.setup.schema import CallTable as Sweep
+    from quell.setup.schema import CallTable as Tune
 
 # ---- B0 and the actuators ----
 
@@ -131,9 +149,7 @@ def _of_plant(plant: Any, orders: Sequence[int], M: Any) -> tuple[Any, Any]:
     """Return B0 and M of a plant; one of them is None."""
     if M is not None:
         raise ValueError('B0 = "plant" and M: are two of the same; give one')
-    inner = plant
-    while isinstance(inner, PlantWrapper):
-        inner = inner.plant
+    inner = _inner(plant)
     if isinstance(inner, Arm):
         return None, inner.inertia
     if isinstance(inner, Craft):
@@ -158,6 +174,87 @@ def _markov(plant: MultivariableLinearPlant, orders: Sequence[int]) -> Matrix:
         for i, order in enumerate(orders)
     ]
     return np.array(rows)
+
+
+# ---- Tuning ----
+
+
+def tuning_of_axes(
+    m_s: float | None = 1.6,
+    m_t: float | None = 1.6,
+    m_ks: float | None = None,
+    damping: float | None = 0.4,
+    noise_over_pi: float | None = 10.0,
+    omega_o_dt: float = 0.5,
+    disk: float | None = None,
+    B0_off: float = 0.0,
+    operating_points: Sequence[Sequence[float]] | None = None,
+    objective: str = "load-iae",
+) -> dict[str, Any]:
+    """Return the arguments of ``quell.tuning.tune_axes``.
+
+    Parameters
+    ----------
+    m_s, m_t
+        largest sensitivity and complementary sensitivity of each channel, all others closed.
+    m_ks
+        largest gain from y to v of each axis [1/s^n]; by default from its own tuning.
+    damping
+        least damping of the closed loop's poles.
+    noise_over_pi, omega_o_dt
+        as in `[tune]` of one axis.
+    disk
+        least disk margin of all inputs, and of all outputs, at once; by default what a single loop
+        has with these m_s and m_t.
+    B0_off
+        share by which each entry of B0 may be off.
+    operating_points
+        states of a nonlinear plant at rest, in each of which the bounds hold; by default the start
+        of the scenario alone.
+    objective
+        `load-iae` or `load`.
+    """
+    bounds: dict[str, Any] = {"m_s": m_s, "m_t": m_t, "m_ks": m_ks, "damping": damping}
+    limits: dict[str, Any] = {"noise_over_pi": noise_over_pi, "omega_o_dt": omega_o_dt}
+    return {
+        "constraints": Constraints(**bounds, **limits),
+        "disk": disk,
+        "B0_off": B0_off,
+        "operating_points": operating_points,
+        "objective": checks.one_of("objective", objective, OBJECTIVES),
+    }
+
+
+def axes_task(
+    path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None, trust: bool = False
+) -> tuple[Setup, dict[str, Any]]:
+    """Read a setup file of several axes; return it and the arguments of ``tune_axes``.
+
+    ``changes`` are values of ``[tune]`` by name. Raises ``SetupError`` as ``load_axes``, and for a
+    file without plant.
+    """
+    name, data = read(path)
+    tables = dict(data)
+    if changes:
+        tables["tune"] = {**data.get("tune", {}), **changes}
+    setup = made_axes(name, tables, trust)
+    plant = setup.needed("plant")
+    options = dict(setup.tune or tuning_of_axes())
+    if options["operating_points"] is None and _is_nonlinear(plant):
+        x0 = None if setup.scenario is None else setup.scenario.x0
+        order = getattr(_inner(plant), "order", 0)
+        options["operating_points"] = [np.zeros(order) if x0 is None else np.asarray(x0)[:order]]
+    return setup, options | {"setup": dict(data)}
+
+
+def _inner(plant: Any) -> Any:
+    while isinstance(plant, PlantWrapper):
+        plant = plant.plant
+    return plant
+
+
+def _is_nonlinear(plant: Any) -> bool:
+    return isinstance(_inner(plant), MultivariableNonlinearPlant)
 
 
 # ---- The tables ----
@@ -221,12 +318,14 @@ SCENARIO = call_table(
     types={"disturbances": list_of(registry.Signal)},
     without=("reference", "noise", "schedule"),
 )
+TUNE = call_table("tune", tuning_of_axes, only=True)
 METRICS = call_table("metrics", AxesTrajectory.metrics, only=True)
 if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
     Observer, Learner = one_of(OBSERVERS), registry.Learner
     AxisDrive, OnTop = one_of(DRIVES, default="pid"), ON_TOP
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
+    Sweep, Tune = registry.Sweep, TUNE
 
 
 class Axis(Table):
@@ -255,6 +354,8 @@ class AxesDescription(Table):
         json_schema_extra={"minItems": 1},
     )
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
+    tune: Tune | None = optional("what `quell tune` bounds.")
+    sweep: Sweep | None = optional("many runs with other values, for `quell sweep`.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."
     )
@@ -267,14 +368,14 @@ _ELSEWHERE = {
     **dict.fromkeys(
         ("observer", "controller", "compensator", "learner", "guard"), "belongs into each [[axis]]"
     ),
-    **dict.fromkeys(("prefilter", "sweep", "rig", "tune"), "NOT for several axes yet"),
+    **dict.fromkeys(("prefilter", "rig"), "NOT for several axes yet"),
 }
 
 
 def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     """Read a TOML file of several axes and build the objects that it describes.
 
-    The ``controller`` of the setup is a ``quell.Axes``; it has no rig, sweep and tuning. ``trust``
+    The ``controller`` of the setup is a ``quell.Axes``; it has no rig. ``trust``
     and errors are those of ``load``.
 
     Examples
@@ -341,7 +442,10 @@ def made_axes(
         builder.attempt("plant", (), _check_fit, plant, controller, scenario)
     windows = windows_of(builder, tables.metrics)
     title = tables.title or title_of(name)
-    return Setup(name, title, controller, plant, scenario, None, None, windows, tables, trust=trust)
+    tune = None if tables.tune is None else builder.build(tables.tune, "tune")
+    sweep = None if tables.sweep is None else builder.build(tables.sweep, "sweep")
+    parts = (controller, plant, scenario, None, sweep, windows)
+    return Setup(name, title, *parts, tables, tune, trust)
 
 
 def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:
@@ -408,3 +512,25 @@ def _explained(error: SetupError) -> SetupError:
                 break
         lines.append(line)
     return SetupError(lines)
+
+
+# ---- Sweeps ----
+
+
+class AxesVariation(Variation):
+    """A function of values by path that returns a setup of several axes with these values."""
+
+    def __call__(self, **values: Any) -> Setup:
+        """Return the setup; values are by path, and ``case`` is the name of a case."""
+        case = values.pop(CASE, None)
+        changes = {**({} if case is None else self.cases[case]), **values}
+        return made_axes(self.name, changed(self.name, self.data, changes), self.trust)
+
+
+def sweep_of_axes(setup: Setup) -> dict[str, Any]:
+    """Return the arguments of ``quell.sweep`` for a setup of several axes, except the folder.
+
+    Each measure is taken of each axis, as ``elbow.rms``; a limit of ``rms`` holds for all. Errors
+    are those of ``sweep_of``.
+    """
+    return sweep_of(setup, AxesVariation)
