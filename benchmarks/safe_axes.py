@@ -262,10 +262,12 @@ def main() -> None:
                     state = setup.axes.initial_state()._replace(safe=NoSafeAxesMemory(np.zeros(0)))
                     is_outside, _, y, rate = run(setup, apart, state, seed)
                     alone, left, far = alone + 1, left + is_outside, max(far, y, rate)
-        table.add_row(
+        cells = (
             name, str(total), str(unsafe), str(outside), f"{most:.6f}", f"{quick:.6f}",
             str(alone), str(left), f"{far:.2f}",
         )  # fmt: skip
+        print(" | ".join(cells), flush=True)
+        table.add_row(*cells)
     Console(width=150).print(table)
     print(f"{time.perf_counter() - began:.0f} s")
 

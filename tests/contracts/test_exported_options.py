@@ -229,6 +229,7 @@ PARTS: dict[str, Part] = {
         "B0": Several(([[1.0, 0.3], [0.2, 1.0]], gain_functions.nested_tuples)), "M": Several(([[1.0, 0.3], [0.3, 1.0]], gain_functions.array)),
         "u_min": (-1.0, -2.0), "u_max": (1.0, 2.0), "rate_limit": Several((60.0, [60.0, (-40.0, 60.0)])), "saturation": Several(("direction", [1, 0])),
         "weights": With([1.0, 2.0, 1.0], {"B0": _WIDE}), "wished": With([0.1, 0.0, -0.1], {"B0": _WIDE}),
+        "drives": With([baseline_room.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT), baseline_room.PPI(3.0, 2.0, 0.5, dt=DT)], {"axes": [ql.Compensator(_axis().observer)] * 2}),
         "learner": Several((_OF_ALL, [_OF_ALL, None], ql.learners.NLMS(_OF_ALL.features))), "guard": With(ql.Guard(), {"learner": _OF_ALL}),
     }),
     "SafeSet": Part(ql.SafeSet, lambda safe: ql.ADRC(OBSERVER, 1.5, safe_set=safe, **(LIMITS if safe.largest_u == np.inf else {})), {"y_max": 0.9}, {

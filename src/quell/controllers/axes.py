@@ -668,6 +668,8 @@ class Axes(StatefulController):
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints."""
         found: dict[str, Any] = {"axes": dict(zip(self.names, self.axes, strict=True))}
+        if self.drives:
+            found["drives"] = list(self.drives)
         for name in ("B0", "M"):
             if getattr(self, name) is not None:
                 found[name] = getattr(self, name)
