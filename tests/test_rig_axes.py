@@ -633,6 +633,30 @@ def test_a_run_of_missing_measurements_says_what_came() -> None:
 # ---- Commands ----
 
 
+def test_a_simulated_run_is_written_as_csv_or_netcdf(quell: Callable[..., Shown]) -> None:
+    """By the suffix, with names and units for each signal; a text that is no unit is refused."""
+    text = GANTRY.replace('name = "x"', 'name = "x"\nsignal = "way [mm]"')
+    text = text.replace("dt = 1e-3", "dt = 0.02").replace("omega_o = 60.0", "omega_o = 15.0")
+    text = text.replace("omega_c = 8.0", "omega_c = 2.0").replace("= 1e-3 }", "= 0.02 }")
+    text = text.replace('B0 = "plant"', 'B0 = "plant", actuators = ["left [N]", "right [N]"]')
+    Path("g.toml").write_text(text, encoding="utf-8")
+    for name in ("run.csv", "run.nc"):
+        assert quell("run", "g.toml", "--no-figures", "--save", name).code == 0
+    lines = Path("run.csv").read_text().splitlines()
+    assert {"time [s]", "y[x] [mm]", "y[y]", "u[left] [N]", "v[x] [mm/s^n]"} <= {
+        *lines[0].split(",")
+    }
+    run = AxesTrajectory.load("run.nc")
+    assert len(lines) == len(run) + 1
+    assert float(lines[-1].split(",")[0]) == run.t[-1]
+    assert run.signals.u[1].unit == "N"
+    shown = quell("run", "g.toml", "--no-figures", "--save", "run.csv")
+    assert (shown.code, "run.csv" in shown.err) == (2, True)
+    Path("bad.toml").write_text(text.replace("way [mm]", "way [mm"), encoding="utf-8")
+    shown = quell("run", "bad.toml", "--no-figures")
+    assert (shown.code, "must be a name and a unit" in shown.err) == (2, True)
+
+
 def slow_gantry(**rig: Any) -> str:
     """Return the gantry's setup at 50 Hz, with a device."""
     options = {"hold_time": 1.0, "overrun_time": 10.0, "settle_time": 0.1}

@@ -105,7 +105,8 @@ class RunOutputs(Outputs):
         Put the figures into this folder, as PNG, SVG and PDF; by default into quell-figures, or
         quell-figures-2 and so on if that exists.
     save
-        Write the whole record to this file, which `Trajectory.load` reads.
+        Write the whole record to this file: as NetCDF, which `Trajectory.load` reads (of several
+        axes `AxesTrajectory.load`), or as CSV with names and units if it ends in .csv.
     """
 
     save: Path | None = None

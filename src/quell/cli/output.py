@@ -151,7 +151,8 @@ def progress_bar(
 def write_record(console: Console, run: Trajectory, outputs: RunOutputs, name: str) -> None:
     """Write a record where that is asked for, and print where it is."""
     if outputs.save is not None and len(run):
-        run.save(outputs.save, outputs.overwrite)
+        is_text = outputs.save.suffix.lower() == ".csv"
+        (run.to_csv if is_text else run.save)(outputs.save, outputs.overwrite)
         print_line(console, f"{name}: {outputs.save}")
 
 
