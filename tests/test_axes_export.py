@@ -363,7 +363,6 @@ def test_names_of_axes_become_names_in_c() -> None:
 
 
 REFUSED: tuple[tuple[dict[str, Any], str], ...] = (
-    ({"proof": True}, "the proof is of controllers with one u and one y, these are 2 axes"),
     ({"resolution": 1e-4}, "several axes take y in its unit"),
     ({"precision": "single"}, "NOT compared with double precision"),
     ({"plant": ql.plants.two_mass_spring()}, "plant, scenario: the comparison"),
