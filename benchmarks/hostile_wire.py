@@ -113,7 +113,7 @@ class Session:
         """Let the rig tick, read, answer; the attacks were sent before."""
         self.rig.tick()
         y = self.loop.read() if self.exact else self._read_soon()
-        applied = float(self.rig.model.signals[APPLIED])
+        applied = float(self.rig.model.signals[APPLIED, 0])
         rig_numbers = self.rig.model.endpoint.numbers
         self._check(abs(applied) <= LIMIT, f"u = {applied!r}")
         self._check(rig_numbers[frames.SESSION] == self.number, "a foreign session")

@@ -37,9 +37,9 @@ def url_of(wire: str) -> str:
     return {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}[wire]
 
 
-def connect(url: str, dt: float = DT, timeout: float = 30.0) -> Any:
+def connect(url: str, dt: float = DT, timeout: float = 30.0, signals: Any = None) -> Any:
     """Return the device at a URL."""
-    return DEVICES[url.partition(":")[0]](url, dt, timeout)
+    return DEVICES[url.partition(":")[0]](url, dt, timeout, signals)
 
 
 def law(y: float) -> float:
@@ -97,7 +97,7 @@ class Bench:
     @property
     def applied(self) -> float:
         """The u that acts on the plant."""
-        return float(self.rig.model.signals[APPLIED])
+        return float(self.rig.model.signals[APPLIED, 0])
 
     def open(
         self,
@@ -105,13 +105,14 @@ class Bench:
         dt: float = DT,
         timeout: float = 30.0,
         meanwhile: Callable[[], Any] = lambda: None,
+        signals: Any = None,
     ) -> Any:
         """Return a device; the rig ticks until it is open, or raise what it raised."""
         made: list[Any] = []
 
         def work() -> None:
             try:
-                made.append(connect(url or self.url, dt, timeout))
+                made.append(connect(url or self.url, dt, timeout, signals))
             except Exception as error:
                 made.append(error)
 
@@ -129,7 +130,7 @@ class Bench:
         y, sent = math.nan, self.rig.model.endpoint.numbers
         while device.handle.endpoint.numbers[RECEIVED] < sent[SENT]:
             y = device.read()
-            if math.isnan(y):
+            if np.any(np.isnan(y)):
                 self.rig.tick()
         return y
 

@@ -13,7 +13,7 @@ from quell.plants.base import advance, measure
 from quell.realtime.cycle import ControlLoop
 from quell.realtime.devices import read_measurement, write_command
 from quell.realtime.recordings import row_channels
-from quell.realtime.supervisor import Safety, as_scenario, reference_samples
+from quell.realtime.safety import Safety, as_scenario, reference_samples
 from quell.realtime.system import pass_time, virtual_clock
 from quell.realtime.telemetry import drain, ring
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from quell.cli.rig import rig as run_rig
-from quell.realtime import wire as wire_device
+from quell.realtime import wire_device
 from quell.realtime.registry import listen, open_device
 
 from .commands import Shown

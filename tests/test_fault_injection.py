@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from quell.realtime import wire
+from quell.realtime import wire, wire_device
 from quell.realtime.relay import KINDS, Fault, FaultInjector, Relay, random_faults
 
 from .rig_bench import DT, Bench, packed
@@ -80,7 +80,7 @@ def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through
     ]
     with Relay("udp://127.0.0.1:0", here.url, plan) as relay:
         device = here.open(relay.url)
-        monkeypatch.setattr(wire, "_MOST_AGE", 10)  # how long it waits for a lost frame
+        monkeypatch.setattr(wire_device, "_MOST_AGE", 10)  # how long it waits for a lost frame
         sent, applied = {0.0}, set()
         for k in range(100):
             here.rig.tick()

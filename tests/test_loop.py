@@ -16,7 +16,8 @@ from quell.realtime.cycle import ControlLoop, run_cycles
 from quell.realtime.devices import PythonHandle, Tick, read_measurement, read_tick, write_command
 from quell.realtime.recordings import LOOP_WIDTH, Event, row_channels
 from quell.realtime.run import mode_changes
-from quell.realtime.supervisor import Cause, Safety, approach_curve, as_scenario, reference_samples
+from quell.realtime.safety import Safety, approach_curve, as_scenario, reference_samples
+from quell.realtime.supervisor import Cause
 from quell.realtime.system import now, pass_time, virtual_clock
 from quell.realtime.telemetry import drain, ring
 

@@ -15,7 +15,7 @@ from quell.controllers.prefilters import Prefiltered
 from quell.plants.base import advance, measure
 from quell.realtime import CsvSink, McapSink
 from quell.realtime.recordings import Event, Header, load, row_channels, trajectory_of
-from quell.realtime.run import replay
+from quell.realtime.replaying import replay
 from quell.realtime.supervisor import Mode
 from tests import scripted
 from tests.recordings import DT, OBSERVER, PLANT, controller, header_of, rows_of, simulated

@@ -12,6 +12,7 @@ import pytest
 import quell as ql
 from quell.realtime import Safety
 from quell.realtime.run import mode_changes
+from quell.realtime.safety import plausible_range
 from quell.realtime.supervisor import (
     ARMED,
     OFF,
@@ -20,7 +21,6 @@ from quell.realtime.supervisor import (
     Mode,
     Rules,
     initial_state,
-    plausible_range,
     runs_away,
 )
 from quell.setup import load

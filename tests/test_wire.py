@@ -14,6 +14,7 @@ import pytest
 import quell as ql
 from quell.kernels.dispatch import call_specialised, compiled
 from quell.realtime import wire as frames
+from quell.realtime import wire_device
 from quell.realtime.devices import TwinDevice, read_measurement
 from quell.realtime.registry import listen
 from quell.realtime.system import system_clock
@@ -137,7 +138,7 @@ def test_the_rigs_end_is_told(bench: Callable[..., Bench], monkeypatch: pytest.M
     device = here.open()
     here.cycle(device, law, 2)
     here.rig.close()
-    monkeypatch.setattr(frames, "_MOST_AGE", 10)  # how long it waits for a measurement
+    monkeypatch.setattr(wire_device, "_MOST_AGE", 10)  # how long it waits for a measurement
     assert np.isnan(device.read())
     assert device.lost
     with pytest.raises(ConnectionError):

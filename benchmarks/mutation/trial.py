@@ -70,7 +70,7 @@ AREAS = {
     "observers": ("observers/*.py", "lti/models.py"),
     "precision": ("kernels/single.py", "controllers/single.py"),
     "limits": ("controllers/base.py",),
-    "supervisor": ("realtime/supervisor.py",),
+    "supervisor": ("realtime/supervisor.py", "realtime/safety.py"),
     "metrics": ("records/metrics.py",),
     "margins": ("analysis/margins.py",),
 }

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,9 +39,10 @@ from quell.files import MAX_SIZE, nonfinite_to_none
 from quell.identification import Measured, excitation
 from quell.identification.result import Identified, nrmse, simulated_plant
 from quell.realtime.devices import Device, TwinDevice
-from quell.realtime.recordings import Event
+from quell.realtime.recordings import Event, header_path, load, load_one
 from quell.realtime.run import RigRun, run_rig
-from quell.realtime.supervisor import Cause, Safety
+from quell.realtime.safety import Safety
+from quell.realtime.supervisor import Cause
 from quell.records.axes import AxesTrajectory
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory
@@ -181,14 +182,16 @@ def measured_axes(
     time_unit: str | None = None,
     max_size: float = MAX_SIZE,
 ) -> MeasuredAxes:
-    """Read the inputs and outputs of several axes from a table in text, or a saved run of them.
+    """Read the inputs and outputs of several axes from a table in text, or a run of them.
+
+    A run is a file that ``AxesTrajectory.save`` wrote, or a recording of ``quell run-rig``.
 
     Parameters
     ----------
     path
         the file.
     axes, actuators
-        columns of the y and of the u of a table; names of the axes of a saved run, which has all u.
+        columns of the y and of the u of a table; names of the axes of a run, which has all u.
     columns
         column of its times; t by default. There is none with ``dt``.
     dt, time_unit, max_size
@@ -199,8 +202,10 @@ def measured_axes(
     ValueError
         as ``measured``; and for a table without names of both.
     """
-    if path.suffix.lower() == ".nc":
-        return _of_run(path, axes, actuators or columns or dt or time_unit, max_size)
+    given = actuators or columns or dt or time_unit
+    is_recording = path.suffix.lower() == ".mcap" or header_path(path).is_file()
+    if path.suffix.lower() == ".nc" or (is_recording and not given):
+        return _of_run(path, axes, given, max_size)
     for name, value in (("axes", axes), ("actuators", actuators)):
         if not value:
             signals = "y of each axis" if name == "axes" else "u of each actuator"
@@ -235,7 +240,16 @@ def _of_run(path: Path, axes: Sequence[str] | None, given: Any, max_size: float)
             "actuators, columns, dt, time_unit: have no effect on a saved run, which has times and "
             "all u; give its axes only"
         )
-    run = AxesTrajectory.load(path, max_size)
+    if path.suffix.lower() == ".nc":
+        run = AxesTrajectory.load(path, max_size)
+    else:
+        recording = load(path, max_size)
+        if not isinstance(recording, AxesTrajectory):
+            raise ValueError(
+                f"{path.name} has one y and one u: must be a run of several axes; leave --axes out"
+            )
+        run, part = recording, controlled(recording)
+        run = replace(run, log=np.ascontiguousarray(run.log[part]))
     wanted = run.axis_names if axes is None else tuple(axes)
     places = [run.axis_names.index(checks.one_of("axes", name, run.axis_names)) for name in wanted]
     u, y = run["u"].copy(), run["y_measured"][:, places].copy()
@@ -248,15 +262,13 @@ def recorded_run(
     path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
 ) -> Trajectory | None:
     """Return the run in a file that quell wrote; None for a table in text."""
-    from quell.realtime import load
-
     if columns or dt is not None or time_unit is not None:
         return None
     if path.suffix.lower() == ".nc":
         return Trajectory.load(path, max_size)
     header = path.with_name(path.name + ".json")
     if path.suffix.lower() == ".mcap" or header.is_file():
-        return load(path, max_size)
+        return load_one(path, max_size)
     return None
 
 
@@ -293,7 +305,7 @@ def measured_records(
     return [record._replace(dt=mean) for record in records]
 
 
-def controlled(run: Trajectory) -> slice:
+def controlled(run: Trajectory | AxesTrajectory) -> slice:
     """Return the samples in which the loop ran; all of a run without modes."""
     from quell.realtime.supervisor import Mode
 

@@ -106,9 +106,76 @@ UNKNOWN = Signals()
 """The signals of a plant that has no names and units."""
 
 
-def signals_from(texts: Any) -> Signals:
-    """Return the signals that ``Signals.texts`` gave; ``UNKNOWN`` for anything else."""
+class AxesSignals(NamedTuple):
+    """Names and units of the signals of several axes.
+
+    ``AxesSignals.of(["x", "y"], y=["way [mm]", ""], u=["force [N]", "force [N]"])`` makes it of
+    texts.
+    """
+
+    axes: tuple[str, ...]  #: names of the axes
+    y: tuple[Quantity, ...]  #: of each axis
+    u: tuple[Quantity, ...]  #: of each actuator
+
+    @classmethod
+    def of(cls, axes: Any, y: Any, u: Any) -> AxesSignals:
+        """Return the signals of names of axes and texts ``name [unit]``; empty ones are unknown.
+
+        Raises
+        ------
+        ValueError
+            for a text that is not like ``name [unit]``, or another number of them than of axes.
+        """
+        names = tuple(map(str, axes))
+        if len(y) != len(names):
+            raise ValueError(f"y = {y!r:.60}: must be one for each axis ({', '.join(names)})")
+        pairs = zip(names, y, strict=True)
+        many = tuple(_quantity(f"signal of {name}", each) for name, each in pairs)
+        of_u = tuple(_quantity(f"actuators[{k}]", each) for k, each in enumerate(u))
+        return cls(names, many, of_u)
+
+    @property
+    def known(self) -> bool:
+        """Whether any name or unit is given."""
+        return any(each != Quantity() for each in (*self.y, *self.u))
+
+    def labels(self, name: str, width: int) -> list[str]:
+        """Return what the entries of a channel are called: of axes and actuators by their names."""
+        if name in OF_AXES and len(self.axes) == width:
+            return list(self.axes)
+        names = [each.name for each in self.u] if name in ("u", "u_wished") else []
+        if len(names) != width or not all(names) or len(set(names)) < width:
+            return [str(i) for i in range(width)]
+        return names
+
+    def units(self, name: str, unit: str, width: int) -> list[str]:
+        """Return the unit of each entry of a channel, in which ``y-unit`` is that of its axis."""
+        axis, _, channel = name.rpartition(".")
+        if axis in self.axes and axis:
+            own = Signals(self.y[self.axes.index(axis)])
+            if channel == "x_hat" and own.y.unit:
+                return [own.derivative(i) for i in range(width)]
+            return [own.unit(unit)] * width
+        if name in OF_AXES and len(self.y) == width:
+            return [Signals(each).unit(unit) for each in self.y]
+        if name in ("u", "u_wished") and len(self.u) == width:
+            return [each.unit or unit for each in self.u]
+        return [unit] * width
+
+    def texts(self) -> dict[str, Any]:
+        """Return the arguments of ``of``."""
+        return {"axes": list(self.axes), "y": [*map(str, self.y)], "u": [*map(str, self.u)]}
+
+
+OF_AXES = ("r", "y", "y_measured", "v")
+"""Channels of several axes that have a number for each of them."""
+
+
+def signals_from(texts: Any) -> Any:
+    """Return the signals that ``texts`` gave; ``UNKNOWN`` for anything else."""
     try:
+        if isinstance(texts, Mapping) and "axes" in texts:
+            return AxesSignals.of(**texts)
         return Signals.of(**texts) if isinstance(texts, Mapping) else UNKNOWN
     except (ValueError, TypeError):
         return UNKNOWN

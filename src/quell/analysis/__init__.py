@@ -30,6 +30,7 @@ from quell.analysis.plots import (
     plot_nyquist,
     plot_root_locus,
 )
+from quell.analysis.points import LoopsAtPoints, analyse_points
 from quell.controllers.adrc import Finding
 from quell.lti.zeros import (
     Existence,
@@ -51,6 +52,7 @@ __all__ = [
     "Frozen",
     "InvariantZeros",
     "LoopAnalysis",
+    "LoopsAtPoints",
     "Margins",
     "MatrixLaw",
     "MultivariableLoop",
@@ -62,6 +64,7 @@ __all__ = [
     "analyse",
     "analyse_axes",
     "analyse_feedback",
+    "analyse_points",
     "axes_law",
     "certify",
     "certify_axes",

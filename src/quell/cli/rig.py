@@ -33,7 +33,13 @@ from quell.cli.output import (
     write_record,
     write_results,
 )
-from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
+from quell.cli.report import (
+    print_axes,
+    print_metrics,
+    print_outcome,
+    save_run_figure,
+    windowed_metrics,
+)
 from quell.files import MAX_SIZE
 from quell.realtime.registry import examples
 
@@ -79,7 +85,8 @@ def rig(
     plant
         The plant: a name as torsional or two-mass, a setup file with [plant] (setup.toml), an
         identified model (model.json), an FMU (motor.fmu), a Python function that returns a plant
-        (file.py:name, with --trust), or a table, '{kind = "linear", num = [1], den = [1, 1]}'.
+        (file.py:name, with --trust), or a table, '{kind = "linear", num = [1], den = [1, 1]}'. It
+        may have several signals, as that of a setup with [[axis]].
     dt
         Length of a tick [s].
     watchdog
@@ -106,11 +113,12 @@ def rig(
     cpu
         Number of the processor for the ticks; any by default.
     """
+    from quell.realtime.devices import counts_text
     from quell.realtime.registry import listen
     from quell.realtime.rig import Rig
     from quell.setup.schema import plant_given
 
-    model = plant_given(plant, dt, argument="--plant", trust=trust)
+    model = plant_given(plant, dt, argument="--plant", trust=trust, several=True)
     _check_pace(seconds, priority, cpu)
     limits: dict[str, Any] = {
         "watchdog": watchdog,
@@ -125,10 +133,12 @@ def rig(
         with exit_on_signal(listener.close):  # compiling may take a minute the first time
             server.prepare()
         limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
+        counts = server.signal_counts
+        several = "" if counts is None else f", with {counts_text(counts)}"
         rules = f"u = 0 after {watchdog} ticks without a command{limit}"
         start = ", from rest" if rest else ""
         start += f", waits up to {wait:g} s for each command" if wait > 0.0 else ""
-        line = f"{plant} at {listener.url}: a tick every {dt:g} s, {rules}{start}"
+        line = f"{plant} at {listener.url}{several}: a tick every {dt:g} s, {rules}{start}"
         notes = _served(server, line, seconds, priority, cpu)
     _print_counters(server)
     for note in notes:
@@ -280,6 +290,9 @@ def run_rig(
 ) -> None:
     """Run a setup in real time around a device, for instance the twin that quell rig is.
 
+    A setup with [[axis]] runs several axes around a device with as many measurements and control
+    signals.
+
     The exit code is 0 where the scenario was run to its end, 3 where a limit or a fault ended it,
     130 after Ctrl-C; u was ramped to zero in each case. It is 2 for an error in the arguments.
 
@@ -318,7 +331,8 @@ def run_rig(
         while it runs: an alarm is printed at once. A new file is a new state; make it with quell
         watch for other windows.
     """
-    from quell.setup import EXAMPLES, made, read
+    from quell.setup import EXAMPLES, made, made_axes, read
+    from quell.setup.description import is_of_axes
 
     numbers: dict[str, Any] = {
         "seconds": seconds,
@@ -354,7 +368,13 @@ def run_rig(
     }
     files = [path for path in (mcap, csv) if path is not None]
     name, data = read(file)
-    given = made(name, _changed(data, changes), trust)
+    several = is_of_axes(data)
+    if several:
+        rule = "is for one axis; change the bandwidths of each [[axis]] in the file"
+        refuse({"omega_c": (omega_c, None), "omega_o": (omega_o, None)}, rule)
+        rule = "is of one axis; record the run, and watch one axis of it"
+        refuse({"watch": (watch, None)}, rule)
+    given = (made_axes if several else made)(name, _changed(data, changes), trust)
     if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
 
@@ -368,6 +388,7 @@ def _run(
 ) -> int:
     """Run the loop, print and write its results; return the exit code."""
     from quell.realtime import LiveSink
+    from quell.records.axes import AxesTrajectory
 
     scenario, options = setup.needed("scenario"), dict(setup.needed("rig"))
     files = [*map(Path, options.pop("telemetry", ())), *files]
@@ -390,10 +411,15 @@ def _run(
     if run is None:
         return ExitCode.ENDED_BY_SAFETY
     record = run.trajectory
-    scores = windowed_metrics(record, setup)
     _print_timing(console, run)
-    print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
-    learned = print_outcome(console, record)
+    scores: Any
+    learned: Any
+    if isinstance(record, AxesTrajectory):
+        scores, learned = print_axes(console, record, setup)
+    else:
+        scores = windowed_metrics(record, setup)
+        print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
+        learned = print_outcome(console, record)
     code = exit_code(run)
     if watching is not None:
         print_line(console, watching.describe())
@@ -486,7 +512,10 @@ def _device(url: str, setup: Setup) -> Any:
         if scenario is not None and scenario.schedule:
             rows = sampled_schedule(scenario, setup.controller)
         return realtime.TwinDevice(setup.needed("plant"), dt, channels=rows)
-    return realtime.open_device(url, setup.controller.dt, *((True,) if setup.trust else ()))
+    controller: Any = setup.controller
+    several = hasattr(controller, "inputs")
+    counts = (controller.outputs, controller.inputs) if several else None
+    return realtime.open_device(url, controller.dt, setup.trust, counts)
 
 
 def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
@@ -562,7 +591,11 @@ def _as_json(run: RigRun) -> dict[str, Any]:
         "timing": timing,
         "tally": run.tally._asdict(),
         "counters": run.counters,
-        "changes": [{"t": c.t, "mode": c.mode.name, "cause": c.cause.text} for c in run.changes],
+        "changes": [
+            {"t": c.t, "mode": c.mode.name, "cause": c.cause.text}
+            | ({"signal": c.signal} if c.signal else {})
+            for c in run.changes
+        ],
         "notes": list(run.notes),
     }
     return dict(nonfinite_to_none(results))
@@ -584,6 +617,8 @@ def replay(
 ) -> None:
     """Run a setup's observer and learner on a recorded run, and compare the estimates.
 
+    A record of several axes needs a setup with as many [[axis]].
+
     Parameters
     ----------
     record
@@ -593,38 +628,51 @@ def replay(
         `quell run-rig`.
     """
     from quell.commissioning import controlled
-    from quell.controllers import ADRC
     from quell.realtime import load as load_record
     from quell.realtime import replay as replay_record
     from quell.records import metrics
-    from quell.setup import EXAMPLES, load
+    from quell.setup import EXAMPLES, made, made_axes, read
+    from quell.setup.description import is_of_axes
     from quell.setup.schema import with_path
 
-    given = load(setup or EXAMPLES / "torsional_rig.toml", trust)
+    file, data = read(setup or EXAMPLES / "torsional_rig.toml")
+    several = is_of_axes(data)
+    given = (made_axes if several else made)(file, data, trust)
     name = f"{record.stem}-replayed"
     outputs = check_outputs(outputs, [name])
     recorded = load_record(record, max_size)
     try:  # replay refuses a controller that is no ADRC
         names = (given.rig or {}).get("channels", ())
-        replayed = replay_record(recorded, cast(ADRC, given.controller), channels=names)
+        replayed = replay_record(recorded, given.controller, channels=names)
     except ValueError as error:
         raise with_path(given.file, "", error, ()) from None
     console = Console()
     part = controlled(recorded)
-    scores = {"recorded": _scores(recorded, part), "replayed": _scores(replayed, part)}
-    rows = table(f"{record.name} through {given.title}", "", *_HEADINGS)
-    for name, values in scores.items():
-        pairs = zip(values.values(), _FACTORS, strict=True)
-        rows.add_row(name, *(number(value, ".4g", factor) for value, factor in pairs))
-    console.print(rows)
+    scores: Any
+    learned: Any
+    if several:
+        title = f"{record.name} through {given.title}"
+        scores, learned = {}, {}
+        for axis in replayed.axis_names:
+            pair = recorded.axis(replayed.axis_names.index(axis)), replayed.axis(axis)
+            scores[axis] = _print_scores(console, f"{title}: {axis}", *pair, part)
+            learned[axis] = print_outcome(console, pair[1])
+    else:
+        title = f"{record.name} through {given.title}"
+        scores = _print_scores(console, title, recorded, replayed, part)
     _print_gaps(console, recorded)
-    difference = metrics.rms((replayed["u_wished"] - replayed["u"])[part])
+    apart = (replayed["u_wished"] - replayed["u"])[part]
+    each_u = [metrics.rms(u) for u in apart.reshape(len(apart), -1).T]
+    difference: Any = each_u[0] if apart.ndim == 1 else each_u
+    text = ", ".join(f"{each:.4g}" for each in each_u)
     console.print(
-        f"Wished u less applied u, RMS: {difference:.4g}. Judged: the {part.stop - part.start} "
+        f"Wished u less applied u, RMS: {text}. Judged: the {part.stop - part.start} "
         "samples under control."
     )
-    learned = print_outcome(console, replayed)
-    paths = save_run_figure(replayed, given.title, outputs, name, _draw_wished)
+    if not several:
+        learned = print_outcome(console, replayed)
+    draw = None if several else _draw_wished
+    paths = save_run_figure(replayed, given.title, outputs, name, draw)
     write_record(console, replayed, outputs, "Replay")
     results = {
         "record": str(record),
@@ -636,6 +684,19 @@ def replay(
         "setup": given.as_json(),
     }
     write_results(console, results, outputs, paths)
+
+
+def _print_scores(
+    console: Console, title: str, recorded: Trajectory, replayed: Trajectory, part: slice
+) -> dict[str, dict[str, float | None]]:
+    """Print and return the measures of a recorded run and of its replay."""
+    scores = {"recorded": _scores(recorded, part), "replayed": _scores(replayed, part)}
+    rows = table(title, "", *_HEADINGS)
+    for name, values in scores.items():
+        pairs = zip(values.values(), _FACTORS, strict=True)
+        rows.add_row(name, *(number(value, ".4g", factor) for value, factor in pairs))
+    console.print(rows)
+    return scores
 
 
 def _scores(run: Trajectory, part: slice) -> dict[str, float | None]:

@@ -72,6 +72,7 @@ def run(
         Print such a file, and do no more.
     """
     from quell.setup import EXAMPLES, SetupError, made, made_axes, read
+    from quell.setup.axes import signals_in
     from quell.setup.description import is_of_axes
     from quell.simulation import simulate
 
@@ -105,6 +106,8 @@ def run(
     scores: Any
     learned: Any
     if several:
+        signals = signals_in(given.description, given.controller)
+        result = replace(result, signals=signals) if signals.known else result
         scores, learned = print_axes(console, result, given)
     else:
         scores = windowed_metrics(result, given)
@@ -164,11 +167,15 @@ def sweep(
     worst
         Number of worst runs to print.
     """
-    from quell.setup import load
+    from quell.setup import made, made_axes, read
+    from quell.setup.axes import sweep_of_axes
+    from quell.setup.description import is_of_axes
     from quell.setup.loading import sweep_of
 
-    given = load(setup, trust)
-    plan = sweep_of(given)
+    name, data = read(setup)
+    several = is_of_axes(data)
+    given = (made_axes if several else made)(name, data, trust)
+    plan = (sweep_of_axes if several else sweep_of)(given)
     where = Path(f"{setup.stem}-sweep") if folder is None else folder
     console = Console()
     if repeat is not None:
@@ -253,9 +260,15 @@ def _repeat(
     outputs = check_outputs(outputs, [name])
     with progress_bar(console, COMPILING) as report:
         run = simulate(*parts, progress=partial(report, COMPILING))
-    scores = windowed_metrics(run, replace(given, scenario=parts.scenario, plant=parts.plant))
-    print_metrics(console, f"{given.title}, {text}", scores)
-    learned = print_outcome(console, run)
+    of_run = replace(given, scenario=parts.scenario, plant=parts.plant)
+    scores: Any
+    learned: Any
+    if hasattr(parts.controller, "inputs"):
+        scores, learned = print_axes(console, run, replace(of_run, title=f"{given.title}, {text}"))
+    else:
+        scores = windowed_metrics(run, of_run)
+        print_metrics(console, f"{given.title}, {text}", scores)
+        learned = print_outcome(console, run)
     same = stored_alike(folder, number, text, run, arguments["metrics"])
     if same is not None:
         print_line(console, f"In {folder}/: {'the same, bit for bit' if same else 'other values'}.")

@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from quell.realtime.proxy import CompensatedDrive
     from quell.realtime.recordings import CsvSink, McapSink, load
     from quell.realtime.registry import open_device
+    from quell.realtime.replaying import replay
     from quell.realtime.rig import Rig
-    from quell.realtime.run import RigRun, replay, run_rig
-    from quell.realtime.supervisor import Safety
+    from quell.realtime.run import RigRun, run_rig
+    from quell.realtime.safety import Safety
     from quell.realtime.target import record_target
 
 _HOMES = {
@@ -39,12 +40,12 @@ _HOMES = {
     "MemoryFile": "memory_file",
     "Rig": "rig",
     "RigRun": "run",
-    "Safety": "supervisor",
+    "Safety": "safety",
     "TwinDevice": "devices",
     "load": "recordings",
     "open_device": "registry",
     "record_target": "target",
-    "replay": "run",
+    "replay": "replaying",
     "run_rig": "run",
 }
 

@@ -40,43 +40,59 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.controllers.axes import Axes, apply_to_axes
 from quell.controllers.base import (
-    Controller,
     bumpless_transfer,
     control,
     set_applied_control,
     set_reference_derivatives,
     write_row,
 )
+from quell.controllers.several import control_all
 from quell.kernels.dispatch import (
     compiled,
     explain_compile_errors,
     generic,
+    generic_with_default,
     interpreted,
     is_finite,
     kernel,
     specialised,
 )
+from quell.kernels.sized import Size
 from quell.realtime import recordings
+from quell.realtime.axes_supervisor import (
+    AxesMemory,
+    all_measured,
+    axes_memory,
+    set_applied_controls,
+    supervise_outputs,
+    update_axes_mode,
+)
 from quell.realtime.channels import ChannelInputs, channel_inputs, pass_channels
 from quell.realtime.devices import (
     Device,
     PythonHandle,
     Tick,
     ask,
+    drop_signals,
     handle_of,
+    read_acting,
     read_channels,
     read_measurement,
+    read_signals,
     read_tick,
     write_command,
+    write_signals,
 )
-from quell.realtime.recordings import LOOP_WIDTH, Event, row_channels
+from quell.realtime.recordings import Event, loop_channels, row_channels
+from quell.realtime.safety import AxesReference, ReferenceSamples
 from quell.realtime.supervisor import (
     FLUSH,
+    AxesLimits,
     Cause,
     Memory,
     Mode,
-    ReferenceSamples,
     Request,
     Rules,
     SupervisorState,
@@ -98,7 +114,7 @@ from quell.realtime.system import (
 )
 from quell.realtime.telemetry import Ring, push
 from quell.records.record import columns_of
-from quell.types import Vector
+from quell.types import Channels, Vector
 
 # ---- The loop by deadlines ----
 
@@ -114,6 +130,7 @@ class CycleLog(NamedTuple):
     f_learned: int  #: index of the learned part of f̂ in a row; −1 if the controller reports none
     f_residual: int  #: index of the observer's part of f̂
     channels: int  #: index of the device's channels, behind the controller's
+    controller: Size  #: index of the controller's channels
     lateness: NDArray[np.int64]  #: histogram, see ``count_duration``
     step_time: NDArray[np.int64]  #: histogram
 
@@ -149,10 +166,10 @@ def run_cycles(handle: Any, clock: Any, period: float, controller: Any) -> None:
         k += overslept
         _count_skipped(supervisor, overslept)
         y, waited = read_measurement(handle, clock, woke)
-        _read_channels(handle, controller.inputs)
+        take_inputs(controller, handle)
         changed, clipped = supervisor.changed[0], counters.clipped
         u = control_step(controller, k, left_out, y)
-        fault = write_command(handle, u)
+        fault = send_control(controller, handle, u)
         count_fault(supervisor, fault)
         written = now(clock)
         due = origin + int((k + 1) * period)
@@ -161,18 +178,73 @@ def run_cycles(handle: Any, clock: Any, period: float, controller: Any) -> None:
         count_cycle(supervisor, overran)
         events = cycle_events(supervisor, y, overran, fault, changed, clipped)
         events += _channel_event(controller.inputs)
-        fill_row(log, memory, k, lateness, written - woke - waited, events, y)
+        fill_row(log, memory, k, lateness, written - woke - waited, events)
+        fill_signals(controller, y)
         push(log.ring, log.row)
         _count_skipped(supervisor, missed_next)
         left_out = missed_next
         k += 1 + missed_next
 
 
-@kernel
-def _read_channels(handle: Any, inputs: ChannelInputs) -> None:
-    """Take what the device gave beside the last measurement."""
+@generic
+def take_inputs(controller: Any, handle: Any) -> None:
+    """Take what the device gave beside the number that the loop has: channels, or all signals."""
+    raise TypeError
+
+
+@generic_with_default
+def skip_inputs(controller: Any) -> None:
+    """Take a sample without measurements."""
+
+
+@generic
+def send_control(controller: Any, handle: Any, u: float) -> int:
+    """Let the device apply u, or all control signals; return what ``write_command`` does."""
+    raise TypeError
+
+
+@generic
+def fill_signals(controller: Any, y: float) -> None:
+    """Write y and u of this cycle into the row; ``y`` is as the device gave it."""
+    raise TypeError
+
+
+@generic
+def finish_signals(controller: Any, handle: Any, u: float) -> None:
+    """Correct u of the row before by what acts since then, ``u``; NaN if it is not known.
+
+    If it is not the u of that step, tell the controller, before it takes the next one.
+    """
+    raise TypeError
+
+
+@take_inputs.register(SupervisedController)
+def _take_channels(controller: SupervisedController, handle: Any) -> None:
+    inputs = controller.inputs
     if inputs.values.size > 0:
         read_channels(handle, inputs.values)
+
+
+@send_control.register(SupervisedController)
+def _send_control(controller: SupervisedController, handle: Any, u: float) -> int:
+    return write_command(handle, u)
+
+
+@fill_signals.register(SupervisedController)
+def _fill_signals(controller: SupervisedController, y: float) -> None:
+    row, memory = controller.log.row, controller.supervisor.memory[0]
+    row[recordings.Y] = memory.y
+    row[recordings.Y_MEASURED] = y
+    row[recordings.U] = memory.u
+
+
+@finish_signals.register(SupervisedController)
+def _finish_signals(controller: SupervisedController, handle: Any, u: float) -> None:
+    row = controller.log.row
+    if is_finite(u) and u != row[recordings.U]:
+        row[recordings.U] = u
+        if controller.supervisor.memory[0].mode != Mode.STOPPED:
+            set_applied_control(controller.design, controller.state, u)
 
 
 @kernel
@@ -215,18 +287,15 @@ def cycle_events(
 
 @kernel
 def fill_row(
-    log: CycleLog, memory: Memory, k: int, lateness: int, step_time: int, events: int, y: float
+    log: CycleLog, memory: Memory, k: int, lateness: int, step_time: int, events: int
 ) -> None:
-    """Complete the row, in which reference and controller's channels are already."""
+    """Write time, mode and events into the row."""
     row = log.row
     row[recordings.K] = k
     row[recordings.LATENESS] = 1e-9 * lateness
     row[recordings.STEP_TIME] = 1e-9 * step_time
     row[recordings.MODE] = memory.mode
     row[recordings.EVENTS] = events
-    row[recordings.Y] = memory.y
-    row[recordings.Y_MEASURED] = y
-    row[recordings.U] = memory.u
     count_duration(log.lateness, lateness)
     count_duration(log.step_time, step_time)
 
@@ -275,7 +344,7 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
             wished = control(design, state, r, y if i == k else np.nan)
             if i < k:
                 set_applied_control(design, state, memory.u)
-    write_row(design, state, row[LOOP_WIDTH : controller.log.channels])
+    write_row(design, state, row[controller.log.controller : controller.log.channels])
     if controller.log.f_learned >= 0:
         f_hat = row[controller.log.f_learned] + row[controller.log.f_residual]
     u = supervised_output(rules, supervisor, k, wished, r, f_hat)
@@ -306,6 +375,149 @@ def _set_reference(
                 reference.current[j] += offset * reference.approach[i, 1 + j]
         set_reference_derivatives(design, state, reference.current)
     return r
+
+
+# ---- The control step of several axes ----
+
+
+class SupervisedAxes(NamedTuple):
+    """Several axes with their supervisor; the numbers y and u of the loop stand for all of them.
+
+    y is the first measurement if all came, else NaN, and u the first control signal.
+    """
+
+    design: Any  #: parameters of the controller
+    state: Any  #: state of the controller
+    rules: AxesLimits
+    supervisor: SupervisorState
+    reference: AxesReference
+    log: CycleLog
+    inputs: ChannelInputs  #: none
+    axes: AxesMemory
+    f_hat: NDArray[np.int64]
+    """Places in a row of the learned and of the observer's part of f̂ of each axis; −1 (n, 2)."""
+
+
+@take_inputs.register(SupervisedAxes)
+def _take_signals(controller: SupervisedAxes, handle: Any) -> None:
+    read_signals(handle, controller.axes.y)
+
+
+@skip_inputs.register(SupervisedAxes)
+def _skip_signals(controller: SupervisedAxes) -> None:
+    for i in range(controller.axes.y.size):
+        controller.axes.y[i] = np.nan
+
+
+@send_control.register(SupervisedAxes)
+def _send_all(controller: SupervisedAxes, handle: Any, u: float) -> int:
+    return write_signals(handle, controller.axes.u)
+
+
+@fill_signals.register(SupervisedAxes)
+def _fill_all(controller: SupervisedAxes, y: float) -> None:
+    row, axes = controller.log.row, controller.axes
+    count, at = axes.y.size, recordings.R
+    for i in range(count):
+        row[at + i] = axes.r[i]
+        row[at + count + i] = axes.good[i]
+        row[at + 2 * count + i] = axes.y[i]
+    for c in range(axes.u.size):
+        row[at + 3 * count + c] = axes.u[c]
+
+
+@finish_signals.register(SupervisedAxes)
+def _finish_all(controller: SupervisedAxes, handle: Any, u: float) -> None:
+    if not is_finite(u):
+        return
+    axes, row, different = controller.axes, controller.log.row, False
+    at = recordings.R + 3 * axes.y.size
+    read_acting(handle, axes.acting)
+    for c in range(axes.u.size):
+        different |= axes.acting[c] != row[at + c]
+        row[at + c] = axes.acting[c]
+    if different and controller.supervisor.memory[0].mode != Mode.STOPPED:
+        set_applied_controls(controller.design, controller.state, axes.acting)
+        _fill_v(controller, axes.acting)
+
+
+@kernel
+def _fill_v(controller: SupervisedAxes, u: Vector) -> None:
+    """Write ``v = B0 u`` of what is applied into the row: the controller's first channel."""
+    at = controller.log.controller
+    apply_to_axes(controller.state.gain, u, controller.log.row[at : at + controller.axes.y.size])
+
+
+@control_step.register(SupervisedAxes)
+def _control_axes(controller: SupervisedAxes, k: int, left_out: int, y: float) -> float:
+    design, state, rules = controller.design, controller.state, controller.rules
+    supervisor, reference, row = controller.supervisor, controller.reference, controller.log.row
+    memory, axes = supervisor.memory[0], controller.axes
+    store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
+    update_axes_mode(rules, supervisor, axes, k, reference.r.shape[0])
+    first = k - min(left_out, rules.hold)
+    if memory.mode == Mode.RUN and memory.began == k:
+        bumpless_transfer(design, state)
+        for i in range(axes.y.size):
+            axes.offset[i] = axes.y[i] - reference.r[0, i]
+        first = k
+    awake = memory.mode != Mode.STOPPED and all_measured(axes)
+    for c in range(axes.u.size):
+        axes.wished[c] = 0.0
+    for i in range(first, k + 1):
+        _set_references(design, state, reference, memory, axes, i)
+        for j in range(axes.y.size):
+            axes.measured[j] = axes.y[j] if i == k else np.nan
+        if awake:
+            control_all(design, state, axes.r, axes.measured, axes.wished)
+            if i < k:
+                set_applied_controls(design, state, axes.u)
+    write_row(design, state, row[controller.log.controller : controller.log.channels])
+    for i in range(axes.f_hat.size):
+        learned, residual = controller.f_hat[i, 0], controller.f_hat[i, 1]
+        axes.f_hat[i] = row[learned] + row[residual] if learned >= 0 else 0.0
+    supervise_outputs(rules, supervisor, axes, k)
+    different = False
+    for c in range(axes.u.size):
+        different |= axes.u[c] != axes.wished[c]
+    if awake and different:
+        set_applied_controls(design, state, axes.u)
+        supervisor.counters[0].clipped += 1 if memory.mode == Mode.RUN else 0
+    _fill_v(controller, axes.u)
+    for i in range(axes.watched.size):
+        axes.watched[i].u = row[controller.log.controller + i]
+    store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
+    return axes.u[0]
+
+
+@kernel
+def _set_references(
+    design: Any,
+    state: Any,
+    reference: AxesReference,
+    memory: Memory,
+    axes: AxesMemory,
+    k: int,
+) -> None:
+    """Write the references of sample k (y before the scenario begins); pass derivatives on."""
+    if memory.began < 0:
+        for i in range(axes.r.size):
+            axes.r[i] = axes.good[i]
+        return
+    at = min(k - memory.began, reference.r.shape[0] - 1)
+    approaches, place = at < reference.approach.shape[0], 0
+    for i in range(axes.r.size):
+        offset = axes.offset[i] if approaches else 0.0
+        axes.r[i] = reference.r[at, i]
+        if offset != 0.0:
+            axes.r[i] += offset * reference.approach[at, 0]
+        for j in range(reference.counts[i]):
+            reference.current[place] = reference.derivatives[at, place]
+            if offset != 0.0:
+                reference.current[place] += offset * reference.approach[at, 1 + j]
+            place += 1
+    if place > 0:
+        set_reference_derivatives(design, state, reference.current)
 
 
 # ---- The loop around a device with a clock of its own ----
@@ -358,11 +570,14 @@ def follow_ticks(handle: Any, clock: Any, period: float, controller: SupervisedC
         ahead -= 1
         y = tick.y if ahead == 0 else np.nan
         if ahead == 0:
-            _read_channels(handle, controller.inputs)
+            take_inputs(controller, handle)
+        else:
+            skip_inputs(controller)
         superseded = ahead > 0 or tick.left > 0
         taken = now(clock)
         if k > 0:
-            _finish_row(controller, tick.u)
+            finish_signals(controller, handle, tick.u)
+            push(log.ring, log.row)
         if overslept > 0:
             memory.skipped_in_row = overslept
             memory.missed_in_row += overslept
@@ -372,14 +587,15 @@ def follow_ticks(handle: Any, clock: Any, period: float, controller: SupervisedC
         if superseded:
             counters.skipped += 1
         else:
-            fault = write_command(handle, u)
+            fault = send_control(controller, handle, u)
             count_fault(supervisor, fault)
         written = now(clock)
         overran = overslept > 0 or written - taken >= period
         count_cycle(supervisor, overran)
         events = cycle_events(supervisor, y, overran, fault, changed, clipped)
         events += _channel_event(controller.inputs)
-        fill_row(log, memory, k, late, written - taken, events, y)
+        fill_row(log, memory, k, late, written - taken, events)
+        fill_signals(controller, y)
         k += 1
     if k > 0:
         push(log.ring, log.row)
@@ -394,20 +610,6 @@ def _overslept(controller: SupervisedController, period: float, late: int, silen
     """
     waited = int(silent / period)
     return max(int(late / period), waited if waited > controller.rules.hold + 1 else 0, 0)
-
-
-@kernel
-def _finish_row(controller: SupervisedController, u: float) -> None:
-    """Push the row of the step before; ``u`` is what acts since then, if it is known.
-
-    If it is not the u of that step, tell the controller, before it takes the next one.
-    """
-    row = controller.log.row
-    if is_finite(u) and u != row[recordings.U]:
-        row[recordings.U] = u
-        if controller.supervisor.memory[0].mode != Mode.STOPPED:
-            set_applied_control(controller.design, controller.state, u)
-    push(controller.log.ring, row)
 
 
 @kernel
@@ -466,11 +668,12 @@ def _next_tick(
         asked = load_acquire(supervisor.requests, 0)
         if time >= until or (asked != Request.NONE and memory.mode <= Mode.HOLD):
             break
-        fault = write_command(handle, memory.u)
+        fault = send_control(controller, handle, memory.u)
         count_fault(supervisor, fault)
         if fault > 1 or memory.unsent_in_row > controller.rules.hold:
             break
         samples = 1 + max(int((time - expected) / period), samples)
+    drop_signals(handle)
     return Tick(np.nan, behind, np.nan, 0, waited)
 
 
@@ -483,13 +686,28 @@ class CompiledController(NamedTuple):
     supervisor: SupervisorState
     log: CycleLog
     inputs: ChannelInputs
-    controller: SupervisedController
-    step: Callable[[SupervisedController, int, int, float], float]
+    controller: Any  #: a ``SupervisedController``, or ``SupervisedAxes``
+    step: Callable[[Any, int, int, float], float]
 
 
 @compiled
-def _step(controller: SupervisedController, k: int, left_out: int, y: float) -> float:
+def _step(controller: Any, k: int, left_out: int, y: float) -> float:
     return control_step(controller, k, left_out, y)
+
+
+@take_inputs.register(CompiledController)
+def _take_inputs_of(controller: CompiledController, handle: Any) -> None:
+    take_inputs(controller.controller, handle)
+
+
+@send_control.register(CompiledController)
+def _send_control_of(controller: CompiledController, handle: Any, u: float) -> int:
+    return send_control(controller.controller, handle, u)
+
+
+@fill_signals.register(CompiledController)
+def _fill_signals_of(controller: CompiledController, y: float) -> None:
+    fill_signals(controller.controller, y)
 
 
 @control_step.register(CompiledController)
@@ -497,7 +715,7 @@ def _call_step(controller: CompiledController, k: int, left_out: int, y: float) 
     return float(controller.step(controller.controller, k, left_out, y))
 
 
-def compiled_controller(controller: SupervisedController) -> CompiledController:
+def compiled_controller(controller: Any) -> CompiledController:
     """Return the controller with its compiled control step."""
     step = specialised(_step, controller, 0, 0, 0.0)
     inputs = controller.inputs
@@ -518,7 +736,7 @@ class ControlLoop:
     handle: Any
     clock: Any
     period: float  # sample time [ns]
-    controller: SupervisedController
+    controller: Any  # a ``SupervisedController``, or ``SupervisedAxes``
     paced: bool  # whether the device's ticks pace the loop, and not the loop's own deadlines
     interpret: bool = False
 
@@ -526,9 +744,9 @@ class ControlLoop:
     def of(
         cls,
         device: Device,
-        controller: Controller,
-        reference: ReferenceSamples,
-        rules: Rules,
+        controller: Any,
+        reference: Any,
+        rules: Any,
         clock: Any,
         ring: Ring,
         *,
@@ -539,32 +757,39 @@ class ControlLoop:
         """Return the compiled loop of a device and a controller.
 
         It runs on ``state``; by default on a new one with nothing learned. ``channels`` are those
-        of the device, as ``checked_channels`` returns them.
+        of the device, as ``checked_channels`` returns them. Reference and rules of several axes are
+        an ``AxesReference`` and ``AxesRules``.
         """
-        columns = row_channels(controller.channels, channels)
+        axes = isinstance(controller, Axes)
+        counts = (controller.outputs, controller.inputs) if axes else (1, 1)
+        columns = row_channels(controller.channels, channels, *counts)
         row = np.zeros(sum(width for _, width in columns))
-        known = {name for name, width in columns if width}
-        f_learned, f_residual = (
-            columns_of(columns, name).start if {"f_learned", "f_residual"} <= known else -1
-            for name in ("f_learned", "f_residual")
+        f_learned, f_residual = _places_of_f(columns)
+        log = CycleLog(
+            ring=ring,
+            row=row,
+            f_learned=f_learned,
+            f_residual=f_residual,
+            channels=row.size - len(channels),
+            controller=sum(width for _, width in loop_channels(*counts)),
+            lateness=empty_counts(),
+            step_time=empty_counts(),
         )
-        supervised = SupervisedController(
-            design=controller.parameters,
-            state=controller.initial_state() if state is None else state,
-            rules=rules,
-            supervisor=initial_state(),
-            reference=reference,
-            log=CycleLog(
-                ring=ring,
-                row=row,
-                f_learned=f_learned,
-                f_residual=f_residual,
-                channels=row.size - len(channels),
-                lateness=empty_counts(),
-                step_time=empty_counts(),
-            ),
-            inputs=channel_inputs(controller, channels),
-        )
+        common: dict[str, Any] = {
+            "design": controller.parameters,
+            "state": controller.initial_state() if state is None else state,
+            "supervisor": initial_state(),
+            "reference": reference,
+            "log": log,
+            "inputs": channel_inputs(controller, channels),
+        }
+        supervised: Any
+        if axes:
+            places = np.array([_places_of_f(columns, f"{name}.") for name in controller.names])
+            memory = axes_memory(*counts)
+            supervised = SupervisedAxes(rules=rules.limits, axes=memory, f_hat=places, **common)
+        else:
+            supervised = SupervisedController(rules=rules, **common)
         handle = handle_of(device)
         paced = getattr(device, "paced", False) and not isinstance(handle, PythonHandle)
         loop = cls(handle, clock, controller.dt * 1e9, supervised, paced, interpret)
@@ -604,3 +829,12 @@ class ControlLoop:
             replace(self, controller=over).run()
             if self.interpreted and not self.interpret:
                 control_step(compiled_controller(over), 0, 0, 0.0)
+
+
+def _places_of_f(columns: Channels, prefix: str = "") -> tuple[int, int]:
+    """Return the places in a row of the learned and of the observer's part of f̂; −1 without."""
+    names, known = ("f_learned", "f_residual"), {name for name, width in columns if width}
+    if not {f"{prefix}{name}" for name in names} <= known:
+        return -1, -1
+    learned, residual = (columns_of(columns, f"{prefix}{name}").start for name in names)
+    return learned, residual

@@ -9,6 +9,11 @@ from compiled code also has a ``handle``: a NamedTuple for whose type ``read_mea
 A device with its own clock sends a numbered measurement at each of its ticks; its attribute
 ``paced`` is True, and ``read_tick`` waits for the next one. Other devices answer at any time.
 
+A device of several axes has an attribute ``signal_counts``; its ``read`` returns an array (p,), its
+``write`` takes one (m,). For a handle ``read_measurement`` and ``read_tick`` then return the first
+number if all are finite and NaN if one is not, ``read_signals`` gives them all, and
+``write_signals`` takes the place of ``write_command``.
+
 A device that measures more than y has ``read_channels() -> numbers``, those of the last ``read``;
 for a handle ``read_channels`` is registered (``realtime/channels.py``).
 
@@ -24,7 +29,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
-from quell.kernels.dispatch import call_specialised, compiled, generic, generic_with_default
+from quell.kernels.dispatch import (
+    call_specialised,
+    compiled,
+    generic,
+    generic_with_default,
+    is_finite,
+    kernel,
+)
 from quell.plants.base import (
     Plant,
     advance,
@@ -35,9 +47,17 @@ from quell.plants.base import (
     measure,
     signals_of,
 )
+from quell.plants.multivariable import is_several, measure_all
 from quell.types import Matrix, Vector
 
 # ---- The interface between the loop and a device ----
+
+
+class SignalCounts(NamedTuple):
+    """How many signals a device of several axes has."""
+
+    outputs: int  #: measurements p
+    inputs: int  #: control signals m
 
 
 @runtime_checkable
@@ -117,12 +137,79 @@ def read_channels(handle: Any, values: Vector) -> None:
         values[i] = math.nan
 
 
+@generic
+def read_signals(handle: Any, y: Vector) -> None:
+    """Write all measurements of the last read or tick into ``y`` (p,); NaN for one without."""
+    raise TypeError
+
+
+@generic
+def write_signals(handle: Any, u: Vector) -> int:
+    """Apply ``u`` (m,) [u-unit]; return what ``write_command`` does."""
+    raise TypeError
+
+
+@generic
+def read_acting(handle: Any, u: Vector) -> None:
+    """Write the control signals from the last tick of a paced device on into ``u`` (m,)."""
+    raise TypeError
+
+
+@generic_with_default
+def drop_signals(handle: Any) -> None:
+    """Forget the measurements of the last tick: it is an old one."""
+
+
+def counts_of(plant: Any) -> SignalCounts | None:
+    """Return how many signals a plant has; None for one y and one u."""
+    return SignalCounts(plant.outputs, plant.inputs) if is_several(plant) else None
+
+
+def checked_counts(signals: Any, most: int) -> SignalCounts | None:
+    """Return numbers of signals if they are from 1 to ``most``; None as it is."""
+    if signals is None:
+        return None
+    if not checks.is_sequence(signals) or len(signals) != 2:
+        rule = "must be the numbers of measurements and of control signals"
+        raise ValueError(f"signals = {signals!r:.60}: {rule}")
+    names = ("signals[0]", "signals[1]")
+    return SignalCounts(*map(checks.whole, names, signals, (1, 1), (most, most)))
+
+
+def counts_text(counts: SignalCounts | None) -> str:
+    """Return numbers of signals as words."""
+    if counts is None or counts == (1, 1):
+        return "one measurement and one control signal"
+    outputs = "one measurement" if counts.outputs == 1 else f"{counts.outputs} measurements"
+    inputs = "one control signal" if counts.inputs == 1 else f"{counts.inputs} control signals"
+    return f"{outputs} and {inputs}"
+
+
+def other_counts(device: str, theirs: SignalCounts | None, ours: SignalCounts | None) -> str:
+    """Return the message for a device with other numbers of signals than the controller."""
+    return (
+        f"device = {device}: has {counts_text(theirs)}, the controller {counts_text(ours)}: must "
+        "be as many; take the device of this machine, or a setup with a table [[axis]] for each "
+        "measurement and limits in [axes] for each actuator"
+    )
+
+
+@kernel
+def first_if_finite(y: Vector) -> float:
+    """Return the first number if all are finite, else NaN."""
+    for i in range(y.size):
+        if not is_finite(y[i]):
+            return math.nan
+    return y[0]
+
+
 class PythonHandle(NamedTuple):
     """A device that only Python can use."""
 
     device: Device
     errors: list[Exception]  #: the exception that it raised last, if any
     faults: NDArray[np.int64]  #: number of exceptions that it raised (1,)
+    y: Vector  #: last measurements of a device of several axes (p,); (0,) for one y and one u
 
 
 def handle_of(device: Device) -> Any:
@@ -133,13 +220,22 @@ def handle_of(device: Device) -> Any:
             "for example quell.realtime.TwinDevice(plant, dt)"
         )
     handle = getattr(device, "handle", None)
-    return PythonHandle(device, [], np.zeros(1, dtype=np.int64)) if handle is None else handle
+    if handle is not None:
+        return handle
+    counts = getattr(device, "signal_counts", None)
+    room = np.full(0 if counts is None else counts[0], math.nan)
+    return PythonHandle(device, [], np.zeros(1, dtype=np.int64), room)
 
 
 @read_measurement.register(PythonHandle)
 def _read_measurement(handle: PythonHandle, clock: Any, until: int) -> tuple[float, int]:
+    handle.y[:] = math.nan
     try:
-        return float(handle.device.read()), 0
+        found: Any = handle.device.read()
+        if not handle.y.size:
+            return float(found), 0
+        handle.y[:] = [float(value) for value in found]
+        return first_if_finite(handle.y), 0
     except Exception as error:  # whatever a driver raises, the loop must go on to its safe action
         _count_error(handle, error)
         return math.nan, 0
@@ -166,6 +262,22 @@ def _write_command(handle: PythonHandle, u: float) -> int:
     return 0
 
 
+@read_signals.register(PythonHandle)
+def _read_signals(handle: PythonHandle, y: Vector) -> None:
+    y[:] = handle.y
+
+
+@write_signals.register(PythonHandle)
+def _write_signals(handle: PythonHandle, u: Vector) -> int:
+    try:
+        given: Any = handle.device
+        given.write(u.copy())
+    except Exception as error:
+        _count_error(handle, error)
+        return 1
+    return 0
+
+
 def _count_error(handle: PythonHandle, error: Exception) -> None:
     handle.faults[0] += 1
     handle.errors[:] = [error]
@@ -180,7 +292,7 @@ class TwinHandle(NamedTuple):
     plant: Any
     x: Vector  # state of the plant (n,)
     scratch: Vector
-    w: Vector  # disturbances: zero (m,)
+    w: Vector  # disturbances: zero (q,)
     t: Vector  # samples since the start, and the sample time [s] (2,)
     channels: Matrix  # of each sample; the last row holds for all later ones (N, c)
 
@@ -204,9 +316,49 @@ def _write_command_twin(handle: TwinHandle, u: float) -> int:
     return 0
 
 
+class AxesTwinHandle(NamedTuple):
+    """A sampled plant of several signals and its state."""
+
+    plant: Any
+    x: Vector  # state of the plant (n,)
+    scratch: Vector
+    w: Vector  # disturbances: zero (q,)
+    t: Vector  # samples since the start, and the sample time [s] (2,)
+    y: Vector  # last measurements (p,)
+
+
+@read_measurement.register(AxesTwinHandle)
+def _read_measurement_of_axes(handle: AxesTwinHandle, clock: Any, until: int) -> tuple[float, int]:
+    measure_all(handle.plant, handle.x, handle.y)
+    return first_if_finite(handle.y), 0
+
+
+@read_signals.register(AxesTwinHandle)
+def _read_signals_of_axes(handle: AxesTwinHandle, y: Vector) -> None:
+    for i in range(y.size):
+        y[i] = handle.y[i]
+
+
+@write_signals.register(AxesTwinHandle)
+def _write_signals_of_axes(handle: AxesTwinHandle, u: Vector) -> int:
+    advance(handle.plant, handle.x, handle.scratch, handle.t[0] * handle.t[1], u, handle.w)
+    handle.t[0] += 1.0
+    return 0
+
+
 @compiled
 def _read(handle: TwinHandle) -> float:
     return measure(handle.plant, handle.x)
+
+
+@compiled
+def _read_all(handle: AxesTwinHandle) -> None:
+    measure_all(handle.plant, handle.x, handle.y)
+
+
+@compiled
+def _write_all(handle: AxesTwinHandle, u: Vector) -> None:
+    write_signals(handle, u)
 
 
 @compiled
@@ -216,6 +368,8 @@ def _write(handle: TwinHandle, u: float) -> None:
 
 class TwinDevice:
     """A simulated plant: ``read`` measures it, ``write(u)`` advances it by a sample ``dt`` [s].
+
+    A plant of several signals is measured as an array (p,), and takes one (m,).
 
     It starts from the state ``x0`` (n,), zero by default. u acts at once. Over a wire it acts a
     sample later; ``quell.plants.delayed(plant, dt, dt)`` adds the same delay to this device. It
@@ -253,8 +407,12 @@ class TwinDevice:
         self._x0 = x.copy()
         self.signals = signals_of(plant)
         begin_run(model, x, scratch)
-        given = _checked_rows(channels)
-        self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]), given)
+        given, t = _checked_rows(channels), np.array([0.0, dt])
+        self.signal_counts, self._channels = counts_of(plant), given
+        self._handle: Any = TwinHandle(model, x, scratch, w, t, given)
+        if self.signal_counts is not None:
+            y = np.full(self.signal_counts.outputs, np.nan)
+            self._handle = AxesTwinHandle(model, x, scratch, w, t, y)
         # Without a public handle the loop runs as Python.
         self.handle = self._handle if plant.compiled else None
 
@@ -268,21 +426,33 @@ class TwinDevice:
         """State of the plant, as a copy (n,)."""
         return self._handle.x.copy()
 
-    def read(self) -> float:
+    def read(self) -> Any:
         """Return y [y-unit]."""
+        if self.signal_counts is not None:
+            if self.handle is None:
+                measure_all(self._handle.plant, self._handle.x, self._handle.y)
+            else:
+                call_specialised(_read_all, self.handle)
+            return self._handle.y.copy()
         if self.handle is None:
             return float(measure(self._handle.plant, self._handle.x))
         return float(call_specialised(_read, self.handle))
 
     def read_channels(self) -> list[float]:
         """Return the channels of this sample."""
-        rows = self._handle.channels
+        rows = self._channels
         found: list[float] = rows[min(int(self._handle.t[0]), len(rows) - 1)].tolist()
         return found
 
-    def write(self, u: float) -> None:
+    def write(self, u: Any) -> None:
         """Apply u [u-unit] for a sample."""
-        if self.handle is None:
+        if self.signal_counts is not None:
+            values = checks.vector("u", u, self.signal_counts.inputs)
+            if self.handle is None:
+                write_signals(self._handle, values)
+            else:
+                call_specialised(_write_all, self.handle, values)
+        elif self.handle is None:
             write_command(self._handle, float(u))
         else:
             call_specialised(_write, self.handle, float(u))
@@ -313,4 +483,5 @@ def twin_device(url: str, dt: float, trust: bool = False) -> TwinDevice:
     from quell.setup.schema import plant_given
 
     text = url.partition(":")[2]
-    return TwinDevice(plant_given(text, dt, argument="device", trust=trust), dt)
+    plant = plant_given(text, dt, argument="device", trust=trust, several=True)
+    return TwinDevice(plant, dt)

@@ -41,7 +41,7 @@ from quell.realtime.devices import (
     write_command,
 )
 from quell.realtime.rig import measure_channels
-from quell.realtime.supervisor import default_hold
+from quell.realtime.safety import default_hold
 from quell.realtime.system import now, system_clock
 from quell.types import Vector
 

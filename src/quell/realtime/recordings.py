@@ -14,12 +14,6 @@ chunks. A finished chunk is on disk; here chunks are finished twice a second. Th
 compressed: the values of a loop are mostly noise, of which compression saves about a tenth
 for milliseconds of work. The log time of a message is its deadline.
 
-Recordings in MCAP, read within a limit of size.
-
-The records of the file (mcap.dev/spec) and of its chunks are taken apart here, and the package
-``mcap`` reads the fields of the few that a recording needs. Its own reader takes each length in the
-file for true, and expands a chunk to any size.
-
 Rows as ROS 2 messages, which PlotJuggler and Foxglove read without configuration.
 
 The definition (``ros2msg``) has a line for each channel. The message in plain CDR, little endian
@@ -29,22 +23,20 @@ nothing is padded, and arrays of fixed length have no count.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 import operator
 import os
-import struct
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from enum import IntFlag
 from functools import partial
-from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
@@ -56,14 +48,15 @@ from quell.files import (
     byte_lines,
     bytes_of,
     check_regular,
-    check_settings,
     check_size,
     check_writable,
     whole_text,
     written_atomically,
 )
-from quell.quantities import Signals, signals_from
-from quell.records.record import check_times, columns_of, describe, is_vector
+from quell.quantities import OF_AXES, AxesSignals, signals_from
+from quell.realtime.mcap_reader import MAGIC, MARK, RECORD, SCHEMA, TOPIC, read_mcap
+from quell.records.axes import AxesTrajectory
+from quell.records.record import check_times, columns_of, describe, is_vector, units_of
 from quell.records.trajectory import Trajectory
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -80,7 +73,8 @@ LOOP_CHANNELS = (
     ("y_measured", 1),  # as received; NaN if nothing was
     ("u", 1),  # applied from this cycle to the next
 )
-"""Names and widths of the first channels of every row; ``controller.channels`` follow."""
+"""Names and widths of the first channels of every row; ``controller.channels`` follow. Of several
+axes r, y and y_measured have a number for each axis, u one for each actuator."""
 
 K, LATENESS, STEP_TIME, MODE, EVENTS, R, Y, Y_MEASURED, U = range(len(LOOP_CHANNELS))
 LOOP_WIDTH = len(LOOP_CHANNELS)
@@ -98,9 +92,21 @@ class Event(IntFlag):
     GAP = 1 << 16  #: no recorded cycle: deadline skipped, or row lost; ``load`` filled it in
 
 
-def row_channels(controller_channels: Channels, device_channels: Sequence[str] = ()) -> Channels:
+def loop_channels(outputs: int, inputs: int) -> Channels:
+    """Return the first channels of a row of a loop with so many signals."""
+    widths = {"r": outputs, "y": outputs, "y_measured": outputs, "u": inputs}
+    return tuple((name, widths.get(name, 1)) for name, _ in LOOP_CHANNELS)
+
+
+def row_channels(
+    controller_channels: Channels,
+    device_channels: Sequence[str] = (),
+    outputs: int = 1,
+    inputs: int = 1,
+) -> Channels:
     """Return the channels of a row for a controller and a device with these channels."""
-    return (*LOOP_CHANNELS, *controller_channels, *((name, 1) for name in device_channels))
+    own = tuple((name, 1) for name in device_channels)
+    return (*loop_channels(outputs, inputs), *controller_channels, *own)
 
 
 # ---- Header of a recording ----
@@ -147,14 +153,30 @@ class Header:
             raise ValueError(
                 f"channels: a row of {self.width} numbers; must be at most {_MOST_COLUMNS}"
             )
-        if tuple(self.channels[: len(LOOP_CHANNELS)]) != LOOP_CHANNELS:
+        widths = dict(self.channels)
+        outputs, inputs = (max(widths.get(name, 1), 1) for name in ("y", "u"))
+        if tuple(self.channels[: len(LOOP_CHANNELS)]) != loop_channels(outputs, inputs):
             first = ", ".join(name for name, _ in LOOP_CHANNELS)
             raise ValueError(f"channels = {self.channels!r}: must begin with {first}")
+        if self.axis_names and len(self.axis_names) != outputs:
+            raise ValueError(f"axes = {self.axis_names!r}: must be {outputs}, as many as y has")
 
     @property
-    def signals(self) -> Signals:
+    def signals(self) -> Any:
         """Names and units of y and u, which ``notes`` may have."""
         return signals_from(self.notes.get("signals"))
+
+    @property
+    def axis_names(self) -> tuple[str, ...]:
+        """Names of several axes, which ``notes`` have as ``axes``; none for one y and one u."""
+        axes = self.notes.get("axes")
+        return tuple(axes) if isinstance(axes, Mapping) else ()
+
+    @property
+    def axis_features(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the features of each axis."""
+        axes = self.notes.get("axes", {})
+        return tuple(tuple(map(str, axes[name])) for name in self.axis_names)
 
     @property
     def width(self) -> int:
@@ -166,9 +188,18 @@ class Header:
         """Name of each value in a row; ``x_hat[0]`` is the first entry of a vector channel."""
         names: list[str] = []
         for name, width in self.channels:
+            own, labels = in_column(name), self.labels(name, width)
             vector = is_vector(name, width)
-            names += [f"{name}[{i}]" for i in range(width)] if vector else [name] * width
+            names += [f"{own}[{each}]" for each in labels] if vector else [own] * width
         return tuple(names)
+
+    def labels(self, name: str, width: int) -> list[str]:
+        """Return what the entries of a channel are called: axes by name, others by number."""
+        if not self.axis_names:
+            return [str(i) for i in range(width)]
+        of_axes = AxesSignals(self.axis_names, (), ())
+        known = self.signals if isinstance(self.signals, AxesSignals) else of_axes
+        return [in_column(each) for each in known.labels(name, width)]
 
     def to_json(self) -> str:
         """Return the header as JSON."""
@@ -187,11 +218,22 @@ class Header:
                 raise ValueError(f"its layout has version {version!r}, this quell reads {VERSION}")
             if not isinstance(fields.get("notes", {}), dict):
                 raise TypeError("notes")
+            axes = fields.get("notes", {}).get("axes", {})
+            if not isinstance(axes, dict) or not all(isinstance(v, list) for v in axes.values()):
+                raise TypeError("axes")
             return cls(**fields)
         except RecursionError:
             raise ValueError("its header is nested too deeply") from None
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"its header is not that of a quell recording ({error!r})") from None
+
+
+def in_column(name: str) -> str:
+    """Return a name as it stands in the first line of a CSV file, where some signs separate."""
+    return name.translate(_NOT_IN_COLUMNS)
+
+
+_NOT_IN_COLUMNS = str.maketrans(dict.fromkeys(',"[]\r\n', "_"))
 
 
 def _channel(name: Any, width: Any) -> tuple[str, int]:
@@ -279,7 +321,8 @@ def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
     table = _table(lines, len(names), most)
     time, rows = table[:, 0], np.ascontiguousarray(table[:, 1:])
     if header is None:
-        header = Header(channels, _sample_time(time, rows[:, K]), started=0)
+        dt = _sample_time(time, rows[:, K])
+        header = Header(channels, dt, notes=_axes_in(names[1:], channels), started=0)
     if header.columns != tuple(names[1:]):
         raise ValueError(f"its columns differ from those in {beside.name}")
     return header, rows
@@ -322,6 +365,18 @@ def _channels(columns: list[str]) -> Channels:
     return tuple(widths.items())
 
 
+def _axes_in(columns: list[str], channels: Channels) -> dict[str, Any]:
+    """Return the names of several axes in columns, as ``Header.notes`` has them.
+
+    Their features are unknown.
+    """
+    dotted = [name.partition(".")[0] for name, _ in channels if "." in name]
+    if not dotted:
+        return {}
+    labels = [each[2:].rstrip("]") for each in columns if each.startswith("y[")]
+    return {"axes": {name: [] for name in labels or dict.fromkeys(dotted)}}
+
+
 def _sample_time(time: Vector, k: Vector) -> float:
     """Return the dt with the fewest digits for which all rows have exactly ``time = k dt``."""
     later = np.flatnonzero(k > 0)
@@ -339,20 +394,29 @@ def _sample_time(time: Vector, k: Vector) -> float:
 
 # ---- Rows as ROS 2 messages, which PlotJuggler and Foxglove read without configuration ----
 
-SCHEMA = "quell/msg/Cycle"
-TOPIC = "/loop"
-MARK = b"\x00\x01\x00\x00"  # first bytes of a message: plain CDR, little endian, no options
-
 
 def definition(header: Header) -> str:
     """Return the definition of a row's message, with meanings and units as comments."""
     lines = []
     for name, width in header.channels:
-        if width:
-            text, unit = describe(name, header.signals)
+        if not width:
+            continue
+        text, unit = describe(name, header.signals)
+        units = units_of(name, width, header.signals)
+        unit, own = header.units.get(name, unit), _field_name(name)
+        if header.axis_names and width > 1 and name in (*OF_AXES, "u"):
+            # A field for each signal, with its name: the same bytes as an array.
+            for label, of_it in zip(header.labels(name, width), units, strict=True):
+                lines.append(f"float64 {own}_{_field_name(label)}  # {text}, {label} [{of_it}]")
+        else:
             kind = f"float64[{width}]" if is_vector(name, width) else "float64"
-            lines.append(f"{kind} {name}  # {text} [{header.units.get(name, unit)}]")
+            lines.append(f"{kind} {own}  # {text} [{unit}]")
     return "\n".join(lines) + "\n"
+
+
+def _field_name(name: str) -> str:
+    """Return a name as a field of a ROS message may have it."""
+    return re.sub(r"\W|_+(?=_)", "_", name, flags=re.ASCII).strip("_").lower() or "signal"
 
 
 def advertised(header: Header) -> dict[str, Any]:
@@ -385,8 +449,6 @@ def log_rows(topic: Any, header: Header, rows: Matrix) -> None:
 
 # ---- Recordings as MCAP ----
 
-MAGIC = b"\x89MCAP0\r\n"
-RECORD = "quell"  # name of the metadata record with the header
 
 # Time between two chunks [s]: with the writer's 0.25 s a killed process loses less than 1 s.
 _CHUNK_TIME = 0.5
@@ -497,179 +559,13 @@ class McapSink:
             raise self._file.error
 
 
-# ---- Recordings in MCAP, read within a limit of size ----
-
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA = 0x03, 0x04, 0x05, 0x06, 0x0C
-_START = struct.Struct("<BQ")  # opcode and length of a record
-_MESSAGE_START = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
-# Messages that are converted to an array at once; chosen by hand, not tuned further.
-_BLOCK_MCAP_READER = 4096
-# A record counts as at least so many bytes, however short it is: about what it takes in memory, and
-# a limit of the time that many empty records can take. Chosen by hand.
-_LEAST_RECORD = 64
-
-
-class _DamagedError(Exception):
-    """The records end here: cut short, or no MCAP."""
-
-
-class _Record(NamedTuple):
-    opcode: int
-    body: bytes
-
-
-def read_mcap(path: Path, most: int) -> tuple[Header, Matrix]:
-    """Return header and rows of a ``McapSink``'s file, up to its last complete chunk.
-
-    The contents may take ``most`` bytes.
-    """
-    import_extra("mcap", "telemetry", "reading an MCAP file")
-    header: Header | None = None
-    schemas: dict[int, str] = {}
-    ours: set[int] = set()  # numbers of the channels that have the rows
-    messages: list[bytes] = []
-    blocks: list[Matrix] = []
-    with contextlib.suppress(_DamagedError):  # all up to there is good
-        for opcode, body in _records(path, most):
-            if opcode == _MESSAGE:
-                if int.from_bytes(body[:2], "little") in ours and len(body) >= _MESSAGE_START.size:
-                    messages.append(body[_MESSAGE_START.size :])
-                    if len(messages) == _BLOCK_MCAP_READER:
-                        blocks.append(_rows(messages))
-                        messages = []
-            elif opcode == _SCHEMA:
-                schema = _fields("Schema", body)
-                schemas[schema.id] = schema.name
-            elif opcode == _CHANNEL:
-                channel = _fields("Channel", body)
-                if (channel.topic, schemas.get(channel.schema_id)) == (TOPIC, SCHEMA):
-                    ours.add(channel.id)
-                else:
-                    ours.discard(channel.id)
-            elif opcode == _METADATA:
-                check_settings(len(body))
-                metadata = _fields("Metadata", body)
-                if metadata.name == RECORD:
-                    header = Header.from_json(metadata.metadata.get("header", ""))
-    if header is None:
-        raise ValueError(f"it has no metadata record {RECORD!r}: it was not recorded by quell")
-    blocks = [block for block in (*blocks, _rows(messages)) if block.size]
-    if any(block.shape[1] != header.width for block in blocks):
-        raise ValueError(f"a message on {TOPIC} is not a row of {header.width} numbers")
-    return header, np.concatenate(blocks) if blocks else np.empty((0, header.width))
-
-
-def _rows(messages: list[bytes]) -> Matrix:
-    """Return the rows (messages, width) of messages."""
-    if not messages:
-        return np.empty((0, 0))
-    size = len(messages[0])
-    if size % 8 != len(MARK) or not all(
-        len(message) == size and message.startswith(MARK) for message in messages
-    ):
-        raise ValueError(f"the messages on {TOPIC} are not rows of the same width")
-    values = np.frombuffer(b"".join(message[len(MARK) :] for message in messages), dtype="<f8")
-    return values.reshape(len(messages), -1).astype(np.float64)
-
-
-def _records(path: Path, most: int) -> Iterator[_Record]:
-    """Yield the records that matter; a ``_DamagedError`` ends them."""
-    size = 0
-    with path.open("rb") as file:
-        file.seek(len(MAGIC))
-        for record in _top_level(file, os.fstat(file.fileno()).st_size, most):
-            in_chunk = record.opcode == _CHUNK
-            for each in _split(_expanded(record.body, most)) if in_chunk else (record,):
-                size += max(len(each.body), _LEAST_RECORD)
-                check_size(size, most)
-                yield each
-
-
-def _top_level(file: BinaryIO, end: int, most: int) -> Iterator[_Record]:
-    """Yield the records of a file of ``end`` bytes; others than ours are not read."""
-    while len(start := file.read(_START.size)) == _START.size:
-        opcode, length = _START.unpack(start)
-        if length > end - file.tell():
-            return
-        if opcode in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA):
-            check_size(length, most)
-            yield _Record(opcode, file.read(length))
-        else:
-            file.seek(length, os.SEEK_CUR)
-
-
-def _split(content: bytes) -> Iterator[_Record]:
-    """Yield the records of a chunk."""
-    at, end = 0, len(content)
-    while at + _START.size <= end:
-        opcode, length = _START.unpack_from(content, at)
-        at += _START.size
-        if length > end - at:
-            raise _DamagedError
-        if opcode in (_SCHEMA, _CHANNEL, _MESSAGE):
-            yield _Record(opcode, content[at : at + length])
-        else:
-            yield _Record(0, b"")
-        at += length
-
-
-def _expanded(body: bytes, most: int) -> bytes:
-    """Return the content of a chunk, of at most ``most`` bytes."""
-    chunk = _fields("Chunk", body)
-    if not chunk.compression:
-        return chunk.data
-    size = chunk.uncompressed_size
-    check_size(size, most)
-    if chunk.compression not in _DECOMPRESS:
-        raise ValueError(f"its compression {chunk.compression!r} is unknown; must be zstd or lz4")
-    content = _DECOMPRESS[chunk.compression](chunk.data, size + 1)
-    if len(content) != size:
-        raise _DamagedError
-    return content
-
-
-def _from_zstd(data: bytes, most: int) -> bytes:
-    zstandard = import_extra("zstandard", "telemetry", "reading a compressed MCAP file")
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
-            content: bytes = reader.read(most)
-            return content
-    except zstandard.ZstdError:
-        raise _DamagedError from None
-
-
-def _from_lz4(data: bytes, most: int) -> bytes:
-    lz4 = import_extra("lz4.frame", "telemetry", "reading a compressed MCAP file")
-    try:
-        content: bytes = lz4.LZ4FrameDecompressor().decompress(data, max_length=most)
-        return content
-    except (RuntimeError, EOFError):
-        raise _DamagedError from None
-
-
-# The functions that expand a chunk to at most so many bytes, by the name of its compression.
-_DECOMPRESS = {"zstd": _from_zstd, "lz4": _from_lz4}
-
-
-def _fields(kind: str, body: bytes) -> Any:
-    """Return the fields of a record, as the package ``mcap`` reads them."""
-    from mcap import records
-    from mcap.data_stream import ReadDataStream
-    from mcap.exceptions import McapError
-
-    try:
-        return getattr(records, kind).read(ReadDataStream(BytesIO(body)))
-    except (McapError, struct.error, UnicodeDecodeError, OverflowError):
-        raise _DamagedError from None
-
-
 # ---- Recordings as trajectories ----
 
 # Up to here whole numbers are exact in a row of floats.
 _LAST = 2.0**53
 
 
-def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory:
+def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Any:
     """Read a recorded run, CSV or MCAP, also if its process was killed.
 
     A sample of the trajectory is a deadline; time counts from the first one in the file. If
@@ -683,6 +579,11 @@ def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory
         the file.
     max_size
         limit of what the file may unpack to, gaps filled in [MB].
+
+    Returns
+    -------
+    Trajectory
+        of several axes an ``AxesTrajectory``.
 
     Raises
     ------
@@ -700,8 +601,14 @@ def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory
         raise ValueError(str(error)) from None
     try:
         with file.open("rb") as opened:
-            read = read_mcap if opened.read(len(MAGIC)) == MAGIC else read_csv
-        return trajectory_of(*read(file, most), most)
+            is_mcap = opened.read(len(MAGIC)) == MAGIC
+        if not is_mcap:
+            return trajectory_of(*read_csv(file, most), most)
+        text, rows = read_mcap(file, most)
+        header = Header.from_json(text)
+        if rows.size and rows.shape[1] != header.width:
+            raise ValueError(f"a message on {TOPIC} is not a row of {header.width} numbers")
+        return trajectory_of(header, rows.reshape(-1, header.width), most)
     except OSError as error:
         raise ValueError(f"{where}: can't be read ({error.strerror})") from None
     except TooLargeError as error:
@@ -710,26 +617,48 @@ def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory
         raise ValueError(f"{where}: must be a recording by quell, CSV or MCAP: {error}") from None
 
 
-def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE)) -> Trajectory:
+def load_one(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory:
+    """Read a recorded run of one y and one u; a ``ValueError`` refuses one of several axes."""
+    return check_one(load(path, max_size), f"path = {os.fspath(path)!r}")
+
+
+def check_one(run: Any, where: str) -> Trajectory:
+    """Return a record of one y and one u; a ``ValueError`` says what to do with several axes."""
+    if isinstance(run, AxesTrajectory):
+        raise ValueError(
+            f"{where}: has several axes ({', '.join(run.axis_names)}): NOT possible here, it must "
+            "be of one y and one u; quell.realtime.load(path).axis(name) is one axis, and quell "
+            "replay and quell b0 --axes take several"
+        )
+    found: Trajectory = run
+    return found
+
+
+def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE)) -> Any:
     """Return rows (rows, width) as a trajectory with gaps filled in, see ``load``.
 
     It may take ``most`` bytes.
     """
     if rows.shape[0] == 0:
         raise ValueError("it has no row")
-    log, status = _filled(rows, most), 0
+    log, status = _filled(header.channels, rows, most), 0
     check_times(log.shape[0], header.dt)
     if any(name == "status" for name, _ in header.channels):
         status = _all_flags(rows[:, columns_of(header.channels, "status").start])
-    return Trajectory(
-        log=log,
-        channels=header.channels,
-        dt=header.dt,
-        status=Status(status),
-        ended=(log.shape[0] - 1) * header.dt,
-        plant=header.device,
-        features=header.features,
-        signals=header.signals,
+    common: dict[str, Any] = {
+        "log": log,
+        "channels": header.channels,
+        "dt": header.dt,
+        "status": Status(status),
+        "ended": (log.shape[0] - 1) * header.dt,
+        "plant": header.device,
+        "features": header.features,
+        "signals": header.signals,
+    }
+    if not header.axis_names:
+        return Trajectory(**common)
+    return AxesTrajectory(
+        **common, axis_names=header.axis_names, axis_features=header.axis_features
     )
 
 
@@ -740,7 +669,7 @@ def _all_flags(column: Vector) -> int:
     return int(np.bitwise_or.reduce(valid.astype(np.int64)))
 
 
-def _filled(rows: Matrix, most: int) -> Matrix:
+def _filled(channels: Channels, rows: Matrix, most: int) -> Matrix:
     """Return rows whose k increases by one, of at most ``most`` bytes."""
     k = rows[:, K]
     if not (np.all(np.abs(k) <= _LAST) and np.all(k == np.rint(k)) and np.all(np.diff(k) >= 1.0)):
@@ -754,8 +683,8 @@ def _filled(rows: Matrix, most: int) -> Matrix:
     gaps = np.ones(every.size, dtype=bool)
     gaps[recorded] = False
     filled[:, K] = k[0] + every
-    for column in (Y_MEASURED, LATENESS, STEP_TIME):
-        filled[gaps, column] = np.nan
+    for name in ("y_measured", "lateness", "step_time"):
+        filled[gaps, columns_of(channels, name)] = np.nan
     filled[gaps, EVENTS] = Event.GAP
     return filled
 
@@ -804,7 +733,7 @@ class MemorySink:
     def close(self) -> None:
         """Do nothing."""
 
-    def trajectory(self) -> Trajectory:
+    def trajectory(self) -> Any:
         """Return the recording as ``load`` does for a file."""
         if self._header is None:
             raise ValueError("nothing was recorded yet")

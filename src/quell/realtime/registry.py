@@ -40,7 +40,12 @@ def examples(listening: bool = False) -> str:
     return ", ".join(f"{scheme.example} ({scheme.description})" for scheme in schemes)
 
 
-def open_device(device: str | Device, dt: float, trust: bool = False) -> Any:
+def open_device(
+    device: str | Device,
+    dt: float,
+    trust: bool = False,
+    signals: tuple[int, int] | None = None,
+) -> Any:
     """Return the device of a URL.
 
     Parameters
@@ -54,11 +59,15 @@ def open_device(device: str | Device, dt: float, trust: bool = False) -> Any:
         sample time [s].
     trust
         whether the Python file of ``twin:file.py:name`` may be run.
+    signals
+        numbers of measurements and of control signals of a device of several axes, as many as the
+        controller has: ``signals=(axes.outputs, axes.inputs)``. A twin has those of its plant.
 
     Raises
     ------
     ValueError
-        for a URL of no known device, or an object that is not a device.
+        for a URL of no known device, an object that is not a device, and a device with other
+        numbers of signals, or one that can have one of each only.
     ConnectionError
         if the device does not answer.
     """
@@ -67,8 +76,16 @@ def open_device(device: str | Device, dt: float, trust: bool = False) -> Any:
     if not isinstance(device, str):
         handle_of(device)
         return device
-    more = (trust,) if device.startswith("twin:") else ()
-    return _end(device, listening=False)(device, dt, *more)
+    more: dict[str, Any] = {"trust": trust} if device.startswith("twin:") else {}
+    made = _end(device, listening=False)
+    if signals is not None and not more:
+        if not SCHEMES[device.partition(":")[0]].listener:
+            raise ValueError(
+                f"device = {device!r}: has one y and one u, NOT {signals[0]} and {signals[1]}: "
+                "several axes need a wire, udp:// or serial://, or a device of your own"
+            )
+        more = {"signals": signals}
+    return made(device, dt, **more)
 
 
 def listen(url: str) -> Listener:

@@ -31,6 +31,10 @@ motion can go on from there.
 Commands, goodbyes and repeated hellos of a session are accepted only from the address that
 opened it.
 
+A plant of several signals sends all its measurements in one frame, and takes all control signals of
+one: if one of them is not finite, none is applied. A hello for another number of signals is
+refused.
+
 Measurements are sent only as long as the other side asks for them, so that nobody can direct an
 endless stream to an address: a hello is worth ``HELLO_WORTH`` measurements, an accepted command
 those of the watchdog's time and ``LAST_WORDS`` more, which report that it has tripped. After that
@@ -55,13 +59,14 @@ from quell.files import check_writable
 from quell.kernels.dispatch import (
     call_specialised,
     compiled,
+    generic,
     generic_with_default,
-    is_finite,
     kernel,
 )
 from quell.plants.base import Plant, advance, check_plant, is_destroyed, measure
+from quell.plants.multivariable import measure_all
 from quell.realtime import wire
-from quell.realtime.devices import Listener
+from quell.realtime.devices import Listener, counts_of
 from quell.realtime.system import (
     Histogram,
     checked_cpu,
@@ -88,7 +93,7 @@ from quell.realtime.wire import (
     send,
     wait_for_frame,
 )
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 # ---- The device's side of a wire ----
 
@@ -111,17 +116,77 @@ LAST_WORDS = 10
 STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
 RESTORED, ASKED, TURN = 9, 10, 11
 COUNTS = 12
-# Entries of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
+# Rows of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
 APPLIED, COMMANDED, LARGEST = range(3)
 
 LOG = ("tick", "t", "session", "state", "y", "u", "command")
 """Columns of the log: number of the tick and its time [s], session, state (0 idle … 3 tripped), y,
-u as applied, and the command that came in this tick, NaN if none has."""
+u as applied, and the command that came in this tick, NaN if none has. A plant of several signals
+has ``y[0]``, ``y[1]`` and so on."""
+
+
+def log_columns(outputs: int, inputs: int) -> tuple[str, ...]:
+    """Return the columns of the log of a plant with so many signals."""
+    if outputs == inputs == 1:
+        return LOG
+    counts = {"y": outputs, "u": inputs, "command": inputs}
+    return (
+        *LOG[:4],
+        *(f"{name}[{i}]" for name, count in counts.items() for i in range(count)),
+    )
 
 
 @generic_with_default
 def measure_channels(plant: Any, x: Vector, values: Vector) -> None:
     """Write what a plant gives beside y into ``values``; by default they stay as they are."""
+
+
+class OneSignal(NamedTuple):
+    """A plant with one y and one u."""
+
+    plant: Any
+
+
+class SeveralSignals(NamedTuple):
+    """A plant with several y and u."""
+
+    plant: Any
+
+
+@generic
+def measure_into(plant: Any, x: Vector, y: Vector) -> None:
+    """Write the outputs for the state ``x`` (n,) into ``y`` (p,)."""
+    raise TypeError
+
+
+@generic
+def advance_under(plant: Any, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector) -> None:
+    """Advance the state ``x`` (n,) by a sample with held u (m,)."""
+    raise TypeError
+
+
+@measure_into.register(OneSignal)
+def _measure_one(plant: OneSignal, x: Vector, y: Vector) -> None:
+    y[0] = measure(plant.plant, x)
+
+
+@measure_into.register(SeveralSignals)
+def _measure_several(plant: SeveralSignals, x: Vector, y: Vector) -> None:
+    measure_all(plant.plant, x, y)
+
+
+@advance_under.register(OneSignal)
+def _advance_one(
+    plant: OneSignal, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
+) -> None:
+    advance(plant.plant, x, scratch, t, u[0], w)
+
+
+@advance_under.register(SeveralSignals)
+def _advance_several(
+    plant: SeveralSignals, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
+) -> None:
+    advance(plant.plant, x, scratch, t, u, w)
 
 
 class RigModel(NamedTuple):
@@ -133,7 +198,7 @@ class RigModel(NamedTuple):
     inbox: Buffer
     outbox: Buffer
     dt: float  # time between ticks [s]
-    u_max: float  # largest |u| that is applied [u-unit]
+    u_max: Vector  # largest |u| that is applied [u-unit] (m,)
     watchdog: int  # ticks without a fresh command before u is set to zero
     patience: int  # ticks that a session has for its first command before another may replace it
     wait: int  # how long a tick waits for the answer to the measurement before it [ns]
@@ -143,7 +208,9 @@ class RigModel(NamedTuple):
     scratch: Vector
     w: Vector
     counts: NDArray[np.int64]
-    signals: Vector
+    y: Vector  # of this tick (p,)
+    received: Vector  # work array: a command (m,)
+    signals: Matrix  # (3, m)
     channels: Vector  # what is sent beside y (c,)
     row: Vector
     log: Ring
@@ -161,19 +228,21 @@ def tick(rig: RigModel, time: int, fresh: bool) -> None:
     counts, signals = rig.counts, rig.signals
     fresh |= _receive_command(rig, time)
     _update_watchdog(rig, fresh)
-    y = measure(rig.plant, rig.x)
-    measure_channels(rig.plant, rig.x, rig.channels)
+    measure_into(rig.plant, rig.x, rig.y)
+    measure_channels(rig.plant.plant, rig.x, rig.channels)
     if counts[STATE] != IDLE and counts[ASKED] > 0:
         counts[ASKED] -= 1
         _send_channels(rig, time)
         state = wire.WATCHDOG_TRIPPED if counts[STATE] == TRIPPED else 0
-        wire.write_next_frame(rig.outbox, rig.endpoint, wire.MEASUREMENT, time, y, state)
+        wire.write_next_numbers(rig.outbox, rig.endpoint, wire.MEASUREMENT, time, rig.y, state)
         if send(rig.transport, rig.outbox) != 0:
             rig.endpoint.counters[wire.NOT_SENT] += 1
     if rig.logged:
-        _log(rig, y)
-    signals[COMMANDED] = np.nan
-    advance(rig.plant, rig.x, rig.scratch, counts[SINCE_REST] * rig.dt, signals[APPLIED], rig.w)
+        _log(rig)
+    for k in range(signals.shape[1]):
+        signals[COMMANDED, k] = np.nan
+    t, u = counts[SINCE_REST] * rig.dt, signals[APPLIED]
+    advance_under(rig.plant, rig.x, rig.scratch, t, u, rig.w)
     counts[SINCE_REST] += 1
     counts[TICKS] += 1
 
@@ -205,8 +274,8 @@ def _send_channels(rig: RigModel, time: int) -> None:
 @kernel
 def _receive_command(rig: RigModel, time: int) -> bool:
     """Read all frames that have come; return whether a fresh, finite command was among them."""
-    own, frame, signals = rig.endpoint, rig.inbox, rig.signals
-    u, accepted = 0.0, 0
+    own, frame, signals, u = rig.endpoint, rig.inbox, rig.signals, rig.received
+    accepted = 0
     for _ in range(MOST_AT_ONCE):
         size = receive(rig.transport, frame)
         if size < 0:
@@ -215,7 +284,7 @@ def _receive_command(rig: RigModel, time: int) -> bool:
             continue
         kind = frame.bytes[3]
         if kind == wire.HELLO:
-            if _answer_hello(rig, time):
+            if _answer_hello(rig, time, size):
                 accepted = 0
         elif kind == wire.GOODBYE:
             _end_session(rig)
@@ -225,18 +294,20 @@ def _receive_command(rig: RigModel, time: int) -> bool:
             own.counters[wire.ADDRESS] += 1
         elif wire.accept(frame, own):
             rig.counts[ASKED] = rig.watchdog + LAST_WORDS
-            value = frame.doubles[3]
-            if is_finite(value):
-                u = value
+            if wire.are_finite(frame, own.signals):
                 accepted += 1
-                signals[LARGEST] = max(signals[LARGEST], abs(value))
+                for k in range(own.signals):
+                    u[k] = frame.doubles[3 + k]
+                    signals[LARGEST, k] = max(signals[LARGEST, k], abs(u[k]))
     if wire.is_backlog(own, accepted) or accepted == 0 or rig.counts[STATE] == IDLE:
         return False
-    signals[COMMANDED] = u
-    if rig.counts[STATE] != TRIPPED:
-        signals[APPLIED] = min(max(u, -rig.u_max), rig.u_max)
-        if abs(u) > rig.u_max:
-            rig.counts[CLIPPED] += 1
+    clipped = False
+    for k in range(own.signals):
+        signals[COMMANDED, k] = u[k]
+        if rig.counts[STATE] != TRIPPED:
+            signals[APPLIED, k] = min(max(u[k], -rig.u_max[k]), rig.u_max[k])
+            clipped |= abs(u[k]) > rig.u_max[k]
+    rig.counts[CLIPPED] += 1 if clipped else 0
     return True
 
 
@@ -250,13 +321,22 @@ def _update_watchdog(rig: RigModel, fresh: bool) -> None:
         counts[STATE] = TRIPPED
         counts[TRIPS] += 1
     if counts[STATE] != LIVE:
-        rig.signals[APPLIED] = 0.0
+        _apply_zero(rig)
 
 
 @kernel
-def _answer_hello(rig: RigModel, time: int) -> bool:
-    """Answer a hello; return whether it begins a session."""
+def _apply_zero(rig: RigModel) -> None:
+    for k in range(rig.signals.shape[1]):
+        rig.signals[APPLIED, k] = 0.0
+
+
+@kernel
+def _answer_hello(rig: RigModel, time: int, size: int) -> bool:
+    """Answer a hello of so many bytes; return whether it begins a session."""
     counts, own = rig.counts, rig.endpoint
+    outputs = rig.y.size
+    word = wire.signals_word(outputs, own.signals)
+    fits = size == wire.LENGTH + 8 * (outputs - 1) and int(rig.inbox.words[size // 4 - 2]) == word
     session, dt = int(rig.inbox.words[1]), rig.inbox.doubles[3]
     known = session == own.numbers[wire.SESSION]
     state, begins = 0, False
@@ -267,7 +347,9 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
         own.counters[wire.ADDRESS] += 1
         return False
     if not known:
-        if not abs(dt - rig.dt) <= 1e-9 * rig.dt:  # a tolerance for rounding; also refuses NaN
+        if not fits:
+            state = wire.OTHER_SIGNALS
+        elif not abs(dt - rig.dt) <= 1e-9 * rig.dt:  # a tolerance for rounding; also refuses NaN
             state = wire.OTHER_DT
         elif counts[STATE] == LIVE or (counts[STATE] == WAITING and counts[SILENT] < rig.patience):
             state = wire.BUSY
@@ -279,7 +361,7 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
         counts[STATE] = WAITING
         counts[SILENT] = counts[ASKED] = 0
         counts[SESSIONS] += 1
-        rig.signals[APPLIED] = 0.0
+        _apply_zero(rig)
         destroyed = is_destroyed(rig.x, rig.x0)
         counts[RESTORED] += 1 if destroyed else 0
         if rig.rest or destroyed:
@@ -288,9 +370,9 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
                 rig.x[i] = rig.x0[i]
     elif state != 0:
         counts[REFUSED] += 1
-    if state == 0:
+    if state == 0 and fits:
         counts[ASKED] = max(counts[ASKED], HELLO_WORTH)
-    wire.write_frame(rig.outbox, wire.WELCOME, session, 0, 0, time, rig.dt, state)
+    wire.write_frame(rig.outbox, wire.WELCOME, session, 0, 0, time, rig.dt, state | word)
     reply(rig.transport, rig.outbox)
     return begins
 
@@ -315,16 +397,19 @@ def _is_foreign(rig: RigModel) -> bool:
 
 
 @kernel
-def _log(rig: RigModel, y: float) -> None:
+def _log(rig: RigModel) -> None:
     """Write the tick's row to the log."""
-    counts, row = rig.counts, rig.row
+    counts, row, signals = rig.counts, rig.row, rig.signals
+    outputs, inputs = rig.y.size, signals.shape[1]
     row[0] = counts[TICKS]
     row[1] = counts[TICKS] * rig.dt
     row[2] = rig.endpoint.numbers[wire.SESSION]
     row[3] = counts[STATE]
-    row[4] = y
-    row[5] = rig.signals[APPLIED]
-    row[6] = rig.signals[COMMANDED]
+    for i in range(outputs):
+        row[4 + i] = rig.y[i]
+    for k in range(inputs):
+        row[4 + outputs + k] = signals[APPLIED, k]
+        row[4 + outputs + inputs + k] = signals[COMMANDED, k]
     push(rig.log, row)
 
 
@@ -402,7 +487,7 @@ class Rig:
     Parameters
     ----------
     plant
-        any compiled plant.
+        any compiled plant, of one or of several signals.
     dt
         time between ticks [s].
     listener
@@ -410,7 +495,7 @@ class Rig:
     watchdog
         ticks in a row without a fresh, finite command after which u is zero until a new session.
     u_max
-        larger commands are cut to it [u-unit].
+        larger commands are cut to it [u-unit]; one for all control signals, or one for each.
     rest
         whether each session starts from ``x0``, or from where the last one left the plant. If that
         state is not finite, or beyond 10⁹, the session starts from ``x0`` in any case.
@@ -440,7 +525,7 @@ class Rig:
         listener: Listener,
         *,
         watchdog: int = 20,
-        u_max: float = np.inf,
+        u_max: ArrayLike = np.inf,
         rest: bool = True,
         wait: float = 0.0,
         x0: ArrayLike | None = None,
@@ -456,21 +541,28 @@ class Rig:
             raise ValueError(
                 f"plant = {plant!r}: must be a compiled plant; this one runs only as Python"
             )
-        u_max = u_max if u_max == np.inf else checks.positive("u_max", u_max)
+        several = counts_of(plant)
+        outputs, inputs = several or (1, 1)
+        if max(outputs, inputs) > wire.MOST_SIGNALS:
+            rule = f"must have at most {wire.MOST_SIGNALS} of each, for a frame of the wire"
+            raise ValueError(f"plant: {outputs} outputs and {inputs} control signals; {rule}")
+        largest = _checked_limits(u_max, inputs)
         watchdog = checks.whole("watchdog", watchdog, 1, _MOST_TICKS)
         start = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)
         rows = max(round(_BUFFERED / dt), _LEAST_ROWS)
         self.channels = _checked_channels(plant, channels)
+        self._columns, model = log_columns(outputs, inputs), plant.sampled(dt)
+        room = 1 if outputs == inputs == 1 else wire.MOST_SIGNALS
         self.listener = listener
-        self.dt = dt
+        self.dt, self.signal_counts = dt, several
         self.model = RigModel(
-            plant=plant.sampled(dt),
+            plant=OneSignal(model) if several is None else SeveralSignals(model),
             transport=listener.transport,
-            endpoint=wire.endpoint(wire.COMMAND, 0, watchdog),
-            inbox=wire.buffer(),
-            outbox=wire.buffer(),
+            endpoint=wire.endpoint(wire.COMMAND, 0, watchdog, inputs),
+            inbox=wire.buffer(room),
+            outbox=wire.buffer(room),
             dt=dt,
-            u_max=u_max,
+            u_max=largest,
             watchdog=watchdog,
             patience=max(round(_PATIENCE / dt), 1),
             wait=round(1e9 * _checked_wait(wait)),
@@ -480,15 +572,17 @@ class Rig:
             scratch=np.zeros(6 * plant.order),
             w=np.zeros(plant.disturbances),
             counts=np.zeros(COUNTS, dtype=np.int64),
-            signals=np.array([0.0, np.nan, 0.0]),
+            y=np.zeros(outputs),
+            received=np.zeros(inputs),
+            signals=np.repeat([[0.0], [np.nan], [0.0]], inputs, axis=1),
             channels=self.channels,
-            row=np.zeros(len(LOG)),
-            log=ring(1 if log is None else rows, len(LOG)),
+            row=np.zeros(len(self._columns)),
+            log=ring(1 if log is None else rows, len(self._columns)),
             logged=log is not None,
             lateness=empty_counts(),
             stop=np.zeros(1, dtype=np.int64),
         )
-        self._file = None if log is None else _opened(log, overwrite)
+        self._file = None if log is None else _opened(log, overwrite, self._columns)
         self._log_failure = ""
         self._clock = system_clock()
         self._open = True
@@ -521,8 +615,8 @@ class Rig:
 
     @property
     def largest(self) -> float:
-        """Largest ``|command|`` received [u-unit], applied or not."""
-        return float(self.model.signals[LARGEST])
+        """Largest ``|command|`` received [u-unit], applied or not, of all control signals."""
+        return float(np.max(self.model.signals[LARGEST]))
 
     @property
     def lateness(self) -> Histogram:
@@ -659,6 +753,17 @@ def _checked_channels(plant: Any, channels: ArrayLike) -> Vector:
     return values
 
 
+def _checked_limits(u_max: ArrayLike, inputs: int) -> Vector:
+    """Return the largest |u| of each control signal; infinite for no limit."""
+    given: Any = u_max
+    if isinstance(given, float | int) and given == np.inf:
+        return np.full(inputs, np.inf)
+    limits = checks.positive_vector("u_max", given)
+    if limits.size not in (1, inputs):
+        raise ValueError(f"u_max = {given!r:.60}: must be one number, or {inputs}, one for each u")
+    return np.full(inputs, limits[0]) if limits.size == 1 else limits
+
+
 def _checked_wait(wait: float) -> float:
     if checks.non_negative("wait", wait, "s") > _LONGEST:
         raise ValueError(f"wait = {wait!r} s: must be at most {_LONGEST:g} s")
@@ -672,7 +777,7 @@ def checked_seconds(name: str, seconds: float) -> float:
     return seconds
 
 
-def _opened(path: str | Path, overwrite: bool) -> TextIO:
+def _opened(path: str | Path, overwrite: bool, columns: tuple[str, ...]) -> TextIO:
     """Return the open log, with its header written; a device like /dev/null may be one, too."""
     target = Path(path)
     if target.is_file():
@@ -683,5 +788,5 @@ def _opened(path: str | Path, overwrite: bool) -> TextIO:
         file = target.open("w" if target.exists() else "x", encoding="utf-8", newline="")
     except OSError as error:
         raise ValueError(f"log = {str(path)!r}: can't be written ({error.strerror})") from None
-    file.write(",".join(LOG) + "\n")
+    file.write(",".join(columns) + "\n")
     return file

@@ -1,18 +1,7 @@
-"""``run_rig`` and ``replay``: a run at a rig, its result, and the same through another controller.
-
-A run at a rig: from a device and a controller to a record.
-
-Replay of a recorded run through another controller: its estimates and the u it wishes.
-
-The controller gets the recorded reference and measurements, sample by sample, and the recorded u as
-the applied one. So its observer and its learner run on what really happened. Its own u is recorded
-as ``u_wished`` but never acts: how *the loop* would have behaved is a question for ``simulate``.
-"""
+"""A run at a rig: from a device and a controller to a record."""
 
 from __future__ import annotations
 
-import copy
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,44 +14,51 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell import checks
+from quell.controllers.axes import Axes
 from quell.controllers.base import (
     Controller,
-    bumpless_transfer,
     check_controller,
-    control,
-    set_applied_control,
-    set_reference_derivatives,
-    status_flags,
-    write_row,
 )
 from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
-from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors
-from quell.quantities import UNKNOWN, Signals
+from quell.quantities import UNKNOWN, AxesSignals, Signals
 from quell.realtime.channels import (
-    ChannelInputs,
     await_channels,
     channel_inputs,
     checked_channels,
-    pass_channels,
 )
 from quell.realtime.cycle import ControlLoop
-from quell.realtime.devices import Device, PythonHandle, handle_of
+from quell.realtime.devices import (
+    Device,
+    PythonHandle,
+    SignalCounts,
+    handle_of,
+    other_counts,
+)
 from quell.realtime.memory_file import MemoryFile, memory_file
-from quell.realtime.recordings import Event, Header, MemorySink, Sink, file_sink, row_channels
+from quell.realtime.recordings import (
+    Event,
+    Header,
+    MemorySink,
+    Sink,
+    file_sink,
+    row_channels,
+)
+from quell.realtime.safety import (
+    Safety,
+    as_scenario,
+    axes_reference,
+    reference_samples,
+)
 from quell.realtime.supervisor import (
     RESERVED,
+    AxesRules,
     Cause,
     Ending,
     Mode,
     Request,
     Rules,
-    Safety,
     SupervisorState,
-    as_scenario,
-    default_hold,
-    reference_samples,
 )
 from quell.realtime.system import (
     Timing,
@@ -75,12 +71,10 @@ from quell.realtime.system import (
     termination_handler,
 )
 from quell.realtime.telemetry import TelemetryWriter
-from quell.records.metrics import Metrics
+from quell.records.axes import AxesTrajectory
 from quell.records.record import signals_of_loop
-from quell.records.trajectory import Trajectory
 from quell.signals import Signal
 from quell.simulation.driver import Scenario
-from quell.types import Matrix, Status, Vector
 
 # ---- The result of a run at a rig ----
 
@@ -91,10 +85,12 @@ class ModeChange(NamedTuple):
     t: float  # time since the loop's first cycle [s]
     mode: Mode
     cause: Cause
+    signal: str = ""  # axis or actuator to which it is due; empty if there is one y and one u
 
     def __str__(self) -> str:
         """Return the change as a sentence."""
-        return f"{self.t:9.3f} s  {self.mode.name}: {self.cause.text}"
+        due = f"{self.signal}: " if self.signal else ""
+        return f"{self.t:9.3f} s  {self.mode.name}: {due}{self.cause.text}"
 
 
 class Tally(NamedTuple):
@@ -113,14 +109,17 @@ class Tally(NamedTuple):
 class RigRun:
     """The record of one run at a rig."""
 
-    trajectory: Trajectory  #: the samples of the scenario; ``ended`` is zero if it did not begin
-    record: Trajectory  #: all cycles, also before the scenario (START) and after it (RAMP, STOPPED)
+    #: the samples of the scenario; ``ended`` is zero if it did not begin; of several axes an
+    #: ``AxesTrajectory``
+    trajectory: Any
+    record: Any  #: all cycles, also before the scenario (START) and after it (RAMP, STOPPED)
     timing: Timing  #: histograms of lateness and step time
     changes: tuple[ModeChange, ...]  #: changes of the supervisor's mode and their causes
     tally: Tally  #: numbers of cycles, overruns, missed samples and so on
     counters: dict[str, int]  #: the device's counters, of frames for instance
     notes: tuple[str, ...]  #: remarks, for example on permitted real-time scheduling
-    rules: Rules  #: safety rules of the run, with those that were derived; ``rules.text(dt)``
+    #: safety rules of the run, with those that were derived; ``rules.text(dt)``
+    rules: Rules | AxesRules
 
     @property
     def overruns(self) -> int:
@@ -138,8 +137,10 @@ class RigRun:
         changes = (change for change in reversed(self.changes) if change.cause is not Cause.RAMPED)
         return str(next(changes, "it never began")).strip()
 
-    def metrics(self, start: float = 0.0, stop: float | None = None, **options: Any) -> Metrics:
+    def metrics(self, start: float = 0.0, stop: float | None = None, **options: Any) -> Any:
         """Return ``Trajectory.metrics``; times count from the scenario's first sample [s].
+
+        Of several axes they are a dictionary by the axis' name.
 
         If the run was ended early, there are no measures of a step in the window in which it ended,
         and ``missing`` says why, as does the error about a window without samples.
@@ -153,6 +154,8 @@ class RigRun:
             raise ValueError(f"{error}; {why}") from None
         if self.completed or (stop is not None and stop <= run.ended):
             return found
+        if isinstance(run, AxesTrajectory):
+            return {name: each.without_step(why) for name, each in found.items()}
         return found.without_step(why)
 
     def text(self) -> str:
@@ -179,10 +182,27 @@ def tally(state: SupervisorState, rows_lost: int) -> Tally:
     return Tally._make([*state.counters.view(np.int64).tolist(), rows_lost])
 
 
-def mode_changes(state: SupervisorState, dt: float, first: int = 0) -> tuple[ModeChange, ...]:
-    """Return the changes of mode from number ``first`` on; the loop may be running meanwhile."""
+_OF_AXIS = (Cause.MISSED, Cause.LOST, Cause.IMPLAUSIBLE, Cause.TRACKING_ERROR, Cause.F_HAT)
+_OF_ACTUATOR = (Cause.SATURATED, Cause.NOT_A_NUMBER)
+
+
+def mode_changes(
+    state: SupervisorState, dt: float, first: int = 0, axis_names: Sequence[str] = ()
+) -> tuple[ModeChange, ...]:
+    """Return the changes of mode from number ``first`` on; the loop may be running meanwhile.
+
+    Of several axes they name the axis or the actuator.
+    """
     rows = state.changes[first : load_acquire(state.changed, 0)]
-    return tuple(ModeChange(k * dt, Mode(mode), Cause(cause)) for k, mode, cause in rows.tolist())
+    changes = []
+    for k, mode, cause, signal in rows.tolist():
+        name = ""
+        if axis_names and signal and cause in (*_OF_AXIS, Cause.WRONG_WAY):
+            name = axis_names[signal - 1]
+        elif axis_names and signal and cause in _OF_ACTUATOR:
+            name = f"u[{signal - 1}]"
+        changes.append(ModeChange(k * dt, Mode(mode), Cause(cause), name))
+    return tuple(changes)
 
 
 def lost_changes(state: SupervisorState, dt: float) -> tuple[str, ...]:
@@ -195,7 +215,7 @@ def lost_changes(state: SupervisorState, dt: float) -> tuple[str, ...]:
 
 
 def silence_of(
-    record: Trajectory,
+    record: Any,
     changes: Sequence[ModeChange],
     before: Mapping[str, int],
     after: Mapping[str, int],
@@ -240,7 +260,7 @@ def silence_of(
     )
 
 
-def missing_channels(record: Trajectory, names: Sequence[str]) -> tuple[str, ...]:
+def missing_channels(record: Any, names: Sequence[str]) -> tuple[str, ...]:
     """Return a note if channels that the controller uses were missing while it was in control."""
     if not names:
         return ()
@@ -254,7 +274,7 @@ def missing_channels(record: Trajectory, names: Sequence[str]) -> tuple[str, ...
     )
 
 
-def scenario_part(record: Trajectory, state: SupervisorState, samples: int) -> Trajectory:
+def scenario_part(record: Any, state: SupervisorState, samples: int) -> Any:
     """Return the samples of a record that belong to the scenario."""
     k, began = record["k"], state.memory[0].began
     inside = (k >= began) & (k < began + samples) & (began >= 0)
@@ -285,7 +305,7 @@ def run_rig(
     cpu: int | None = None,
     on_change: Callable[[ModeChange], None] | None = None,
     overwrite: bool = False,
-    signals: Signals | None = None,
+    signals: Signals | AxesSignals | None = None,
     memory: MemoryFile | str | PathLike[str] | None = None,
     channels: Sequence[str] = (),
 ) -> RigRun:
@@ -303,10 +323,11 @@ def run_rig(
     device
         see ``quell.realtime.Device``; ``open_device(url, dt)`` makes one.
     controller
-        any controller with finite ``u_min`` and ``u_max``, here or in ``safety``.
+        any controller with finite ``u_min`` and ``u_max``, here or in ``safety``; ``quell.Axes``
+        for a device of several axes, which is opened with ``signals``.
     scenario
         a reference, or a ``Scenario``, of which reference, duration and seed count: the rig has its
-        own disturbances and noise.
+        own disturbances and noise. Of several axes a reference for each, or one for all.
     duration
         duration [s]; the scenario's own by default.
     safety
@@ -332,7 +353,8 @@ def run_rig(
         whether files of ``telemetry`` that exist are replaced; they are refused otherwise.
     signals
         names and units of y and u for records, telemetry and plots, `{y = "angle [rad]", u =
-        "voltage [V]"}`; those of the device, or of the plant in the setup, by default.
+        "voltage [V]"}`; those of the device, or of the plant in the setup, by default. Of several
+        axes a ``quell.quantities.AxesSignals``.
     memory
         file, or a ``MemoryFile``, in which what was learned outlives the run. If it exists, the
         controller begins with it, from rest; one that does not fit is an error, before anything
@@ -346,14 +368,16 @@ def run_rig(
     Raises
     ------
     ValueError
-        for u without finite limits, a device of another dt, a reference that is not finite, a
-        schedule without its signals, and channels that the device or the controller does not know.
+        for u without finite limits, a device of another dt or with other numbers of signals, a
+        reference that is not finite, a schedule without its signals, and channels that the device
+        or the controller does not know.
     ConnectionError
         if a call of the device's driver does not return, or a channel does not come.
     """
     handle = handle_of(device)
     with closing(device):
-        check_controller(controller)
+        axes = controller if isinstance(controller, Axes) else None
+        check_controller(controller, several=axes is not None)
         if takes_control(without_prefilters(getattr(controller, "controller", controller))):
             raise ValueError(
                 "controller = Compensator: takes u_0 of a host, not a reference; run it between "
@@ -365,11 +389,19 @@ def run_rig(
             raise ValueError(
                 f"device has dt = {own!r} s, the controller {dt!r} s: must be the same"
             )
+        check_counts(device, axes)
         scenario = as_scenario(scenario, duration)
         rules = (Safety() if safety is None else safety).rules(controller, scenario)
         names = checked_channels(controller, channels)
-        derivatives = getattr(controller, "derivatives", 0)
-        reference = reference_samples(scenario, dt, derivatives, approach)
+        if axes is not None and names:
+            rule = "are NOT for several axes yet; leave them out"
+            raise ValueError(f"channels = {list(names)!r}: {rule}")
+        reference: Any
+        if axes is not None:
+            reference = axes_reference(scenario, axes, approach)
+        else:
+            derivatives = getattr(controller, "derivatives", 0)
+            reference = reference_samples(scenario, dt, derivatives, approach)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
         kept, state, learned = memory_file(memory), None, ""
         if kept is not None:
@@ -402,7 +434,7 @@ def run_rig(
         by_signal = nullcontext() if kept is None else kept.saved_by_signal()
         with _requests_by_signals(supervisor.requests), by_signal, writer, real_time as notes:
             notes += [learned] if learned else []
-            _run_thread(loop, dt, priority, cpu, notes, on_change, kept)
+            _run_thread(loop, controller, priority, cpu, notes, on_change, kept)
             device.close()  # before the record is finished, which may take time
     if kept is not None:
         notes.append(_last_save(kept, supervisor, dt))
@@ -415,11 +447,14 @@ def run_rig(
         count, last = int(handle.faults[0]), handle.errors[0]
         notes.append(f"the device raised {count} errors, the last of them: {last!r}")
     notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
-    record = replace(rows.trajectory(), u_limits=(rules.low, rules.high))
-    counters, changes = dict(getattr(device, "counters", {})), mode_changes(supervisor, dt)
+    record = rows.trajectory()
+    if axes is None:
+        record = replace(record, u_limits=(rules.low, rules.high))
+    counters = dict(getattr(device, "counters", {}))
+    changes = mode_changes(supervisor, dt, axis_names=getattr(controller, "names", ()))
     notes += [*silence_of(record, changes, before, counters), *missing_channels(record, names)]
     return RigRun(
-        trajectory=scenario_part(record, supervisor, reference.r.size),
+        trajectory=scenario_part(record, supervisor, reference.r.shape[0]),
         record=record,
         timing=loop.timing,
         changes=changes,
@@ -428,6 +463,14 @@ def run_rig(
         notes=tuple(notes),
         rules=rules,
     )
+
+
+def check_counts(device: Any, axes: Axes | None) -> None:
+    """Raise a ``ValueError`` unless a device has as many signals as the controller."""
+    theirs = getattr(device, "signal_counts", None)
+    ours = None if axes is None else SignalCounts(axes.outputs, axes.inputs)
+    if (theirs is None) != (ours is None) or tuple(theirs or ()) != tuple(ours or ()):
+        raise ValueError(other_counts(type(device).__name__, theirs, ours))
 
 
 def _last_save(kept: MemoryFile, supervisor: SupervisorState, dt: float) -> str:
@@ -442,19 +485,26 @@ def _last_save(kept: MemoryFile, supervisor: SupervisorState, dt: float) -> str:
 
 
 def _header(
-    device: Device, controller: Controller, signals: Signals | None, channels: Sequence[str]
+    device: Device, controller: Any, signals: Signals | AxesSignals | None, channels: Sequence[str]
 ) -> Header:
+    counts, notes = (1, 1), {}
+    if isinstance(controller, Axes):
+        counts = controller.outputs, controller.inputs
+        pairs = zip(controller.names, controller.axes, strict=True)
+        notes = {"axes": {name: list(axis.features) for name, axis in pairs}}
     known = getattr(device, "signals", UNKNOWN) if signals is None else signals
     known = signals_of_loop(known, controller)
-    units = {"y": known.y.unit, "u": known.u.unit}
+    units = {}
+    if isinstance(known, Signals):
+        units = {"y": known.y.unit, "u": known.u.unit}
     return Header(
-        channels=row_channels(controller.channels, channels),
+        channels=row_channels(controller.channels, channels, *counts),
         dt=controller.dt,
         features=tuple(controller.features),
         device=getattr(device, "name", type(device).__name__),
         controller=getattr(controller, "name", type(controller).__name__),
         units={name: unit for name, unit in units.items() if unit},
-        notes={"signals": known.texts()} if known.known else {},
+        notes=notes | ({"signals": known.texts()} if known.known else {}),
     )
 
 
@@ -475,7 +525,7 @@ def _sinks(telemetry: Sequence[str | PathLike[str] | Sink], overwrite: bool) -> 
 
 def _run_thread(
     loop: ControlLoop,
-    dt: float,
+    controller: Any,
     priority: int,
     cpu: int | None,
     notes: list[str],
@@ -483,6 +533,7 @@ def _run_thread(
     memory: MemoryFile | None,
 ) -> None:
     """Run the loop on a thread of its own; report changes of mode, give up a driver that hangs."""
+    dt, names = controller.dt, getattr(controller, "names", ())
     raised: list[BaseException] = []
 
     def work() -> None:
@@ -491,7 +542,8 @@ def _run_thread(
             if isinstance(loop.handle, PythonHandle):
                 # The driver may set itself up with the first write, and start a watchdog: not
                 # before the loop is ready.
-                loop.handle.device.write(0.0)
+                at_rest: Any = np.zeros(controller.inputs) if names else 0.0
+                loop.handle.device.write(at_rest)
             loop.run()
         except BaseException as error:
             raised.append(error)
@@ -504,7 +556,7 @@ def _run_thread(
     try:
         while thread.is_alive() and not hung:
             thread.join(_LOOK)
-            for change in mode_changes(supervisor, dt, seen):
+            for change in mode_changes(supervisor, dt, seen, names):
                 seen += 1
                 if on_change is not None:
                     on_change(change)
@@ -539,151 +591,3 @@ def _requests_by_signals(requests: NDArray[np.int64]) -> Iterator[None]:
             yield
     else:
         yield
-
-
-# ---- Replay of a recorded run through another controller ----
-
-_RECORDED = ("r", "y", "y_measured", "u")
-_NO_DERIVATIVES = np.zeros(0)
-
-
-def replay(
-    run: Trajectory,
-    controller: Controller,
-    *,
-    u_before: float | None = None,
-    channels: Sequence[str] = (),
-) -> Trajectory:
-    """Let a controller follow a recorded run.
-
-    It starts with nothing learned, on a state of its own, as in ``simulate``. The controller that
-    made the run gives the recorded estimates again, to rounding. Skipped deadlines are samples
-    without measurement, as they were on the rig, whose loop passes on ``Safety.hold`` of them at
-    once at most: if it skipped more, the run ended, and its last estimates differ. Derivatives of
-    the reference are not recorded: a controller with feedforward gets none, which changes
-    ``u_wished`` only.
-
-    Parameters
-    ----------
-    run
-        a run with all its samples: recorded on a rig (``load``, or ``RigRun.record``), or from
-        ``simulate`` with ``record_every=1``.
-    controller
-        any controller with the run's sample time.
-    u_before
-        control signal under which the plant rested before the first sample [u-unit]. The controller
-        then starts as by ``controller.start(y, u_before)``; by default as by its first sample.
-    channels
-        names of the device's channels in the run, as for ``run_rig``; a missing ``held`` keeps its
-        state as long as by the default of ``Safety.hold_time``.
-
-    Returns
-    -------
-    Trajectory
-        ``r``, ``y``, ``y_measured``, ``u`` of the run; ``u_wished``; the controller's channels.
-
-    Raises
-    ------
-    ValueError
-        for a run without r, y, y_measured or u, with samples left out, without measurements, or
-        with another sample time; for ``u_before`` with a controller that can't start under load;
-        for a schedule without its signals, and channels that the run does not have.
-    """
-    check_controller(controller)
-    if not isinstance(run, Trajectory):
-        raise ValueError(
-            f"run = {run!r}: must be a Trajectory, for example quell.realtime.load('run.mcap')"
-        )
-    recorded = np.column_stack([run[name] for name in _RECORDED])
-    u = recorded[:, 3]
-    if run.every != 1:
-        raise ValueError(
-            f"run has every {run.every}th sample: a replay needs all; record with record_every=1"
-        )
-    if run.dt != controller.dt:
-        raise ValueError(
-            f"controller has dt = {controller.dt!r} s: must have that of the run, {run.dt!r} s"
-        )
-    if not np.all(np.isfinite(u)):
-        time = run.t[np.argmin(np.isfinite(u))]
-        raise ValueError(f"run has no finite u at {time:.6g} s: the applied u must be known")
-    measured = np.flatnonzero(np.isfinite(recorded[:, 2]))
-    if measured.size == 0:
-        raise ValueError("run has no finite y_measured: there is nothing to observe")
-    names = checked_channels(controller, channels)
-    absent = [name for name in names if name not in run.names]
-    if absent:
-        raise ValueError(f"channels: the run has no {', '.join(absent)}; it has {run.names}")
-    given = np.zeros((len(run), len(names)))
-    for i, name in enumerate(names):
-        given[:, i] = run[name]
-    inputs = channel_inputs(controller, names)
-    hold = default_hold(controller.dt)
-    design, state = controller.parameters, controller.initial_state()
-    if u_before is not None:
-        r, _, y, _ = recorded[measured[0]].tolist()
-        design, state = _started(controller, y, checks.finite("u_before", u_before), r)
-    columns = (*((name, 1) for name in _RECORDED), ("u_wished", 1), *controller.channels)
-    log = np.empty((len(run), sum(width for _, width in columns)))
-    log[:, : len(_RECORDED)] = recorded
-    began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
-    with np.errstate(over="ignore", invalid="ignore"), explain_compile_errors(design):
-        status = call_specialised(
-            _follow, design, state, _NO_DERIVATIVES, began, log, inputs, given, hold
-        )
-    return Trajectory(
-        log=log,
-        channels=columns,
-        dt=run.dt,
-        status=Status(int(status)),
-        ended=(len(run) - 1) * run.dt,
-        plant=run.plant,
-        features=controller.features,
-        signals=signals_of_loop(run.signals, controller),
-        u_limits=run.u_limits,
-        final_state=state,
-    )
-
-
-def _started(controller: Any, y: float, u: float, r: float) -> tuple[Any, Any]:
-    """Return parameters and initial state for a plant that rests at ``y`` under ``u``."""
-    if not hasattr(controller, "start"):
-        kind = type(controller).__name__
-        raise ValueError(f"u_before = {u!r}: {kind} has no start under load; leave it out")
-    follower = copy.copy(controller)
-    follower.reset()
-    follower.start(y, u, r if math.isfinite(r) else None)
-    return follower.parameters, follower._state
-
-
-@compiled
-def _follow(
-    design: Any,
-    state: Any,
-    derivatives: Vector,
-    began: int,
-    log: Matrix,
-    inputs: ChannelInputs,
-    given: Matrix,
-    hold: int,
-) -> int:
-    """Run the controller on the first columns of ``log``, write the others; return status flags.
-
-    From sample ``began`` on the controller was in control. ``given`` are the device's channels.
-    """
-    status = 0
-    for k in range(log.shape[0]):
-        if k == began and k > 0:
-            bumpless_transfer(design, state)
-        set_reference_derivatives(design, state, derivatives)
-        if inputs.values.size > 0:
-            for i in range(inputs.values.size):
-                inputs.values[i] = given[k, i]
-            pass_channels(inputs, design, state, hold)
-        wished = control(design, state, log[k, 0], log[k, 2])
-        status |= status_flags(design, state)
-        log[k, 4] = wished
-        write_row(design, state, log[k, 5:])
-        if log[k, 3] != wished:
-            set_applied_control(design, state, log[k, 3])
-    return status

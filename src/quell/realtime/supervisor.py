@@ -34,33 +34,21 @@ plane and noise move y against u as well, but not so far. So the run ends only i
 
 The numbers come from random honest loops with loads, friction, delays, zeros in the right half
 plane and learners, and the same loops with a wrong sign: ``benchmarks/direction.py``.
-
-Safety rules: when a running loop goes to its safe state, and how.
-
-The reference of a run: its samples, and the approach to it from the first y.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from quell import checks
-from quell.controllers import ADRC
-from quell.controllers.base import Controller
 from quell.kernels.dispatch import is_finite, kernel
-from quell.kernels.sized import Buffer, Scalars
+from quell.kernels.sized import Scalars
 from quell.realtime.system import load_acquire, store_release
-from quell.records.record import in_steps
-from quell.signals import Signal, as_signal
-from quell.signals.shapes import check_derivative
-from quell.simulation.driver import Scenario
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 # ---- Modes of the supervisor, causes of a change of mode, and requests to the loop ----
 
@@ -139,7 +127,7 @@ class Cause(IntEnum):
 
 # ---- Rules and state of the supervisor ----
 
-# Number of changes of mode that are kept (96 KiB). The last ones are reserved for the end of the
+# Number of changes of mode that are kept (128 KiB). The last ones are reserved for the end of the
 # run, which takes two: RAMP and STOPPED.
 _KEPT, RESERVED = 4096, 4
 
@@ -164,19 +152,81 @@ class Rules(NamedTuple):
 
     def text(self, dt: float) -> str:
         """Return the rules as a line of text, for a sample time ``dt`` [s]."""
-        parts = [f"u from {self.low:.6g} to {self.high:.6g}"]
+        parts = [f"u from {self.low:.6g} to {self.high:.6g}", *self.bounds_text()]
+        parts.append("first motion checked" if self.direction else "first motion not checked")
+        return ", ".join([*parts, *counts_of_samples(self, dt)])
+
+    def bounds_text(self) -> list[str]:
+        """Return the bounds of y, of the error and of f̂ as text, where there are some."""
+        parts = []
         if np.isfinite([self.y_low, self.y_high]).any():
             parts.append(f"y from {self.y_low:.6g} to {self.y_high:.6g}")
         if np.isfinite(self.most_error):
             parts.append(f"|r − y| up to {self.most_error:.6g}")
         if np.isfinite(self.most_f):
             parts.append(f"|f̂| up to {self.most_f:.6g}")
-        parts.append("first motion checked" if self.direction else "first motion not checked")
-        for name in ("settle", "hold", "ramp", "most_overruns", "most_saturated"):
-            samples = getattr(self, name)
-            if samples * dt < 1e9:
-                parts.append(f"{name} {samples} samples ({samples * dt:.6g} s)")
-        return ", ".join(parts)
+        return parts
+
+
+class AxesLimits(NamedTuple):
+    """The supervisor's rules for several axes, for kernels; names are those of ``Rules``."""
+
+    low: Vector  #: (m,)
+    high: Vector
+    most_error: Vector  #: (n,)
+    most_f: Vector
+    y_low: Vector
+    y_high: Vector
+    direction: Vector  #: 1, or 0 for no check of the first motion
+    reach: Vector
+    push: Vector  #: largest ``|v|`` within the limits of u, with the first B0 [y-unit/s^n]
+    hold: int
+    ramp: int
+    settle: int
+    most_saturated: int
+    most_overruns: int
+    longest_start: int
+
+
+@dataclass(frozen=True, eq=False)
+class AxesRules:
+    """The supervisor's rules for several axes; ``Safety.rules`` makes them."""
+
+    names: tuple[str, ...]  #: of the axes
+    limits: AxesLimits  #: numbers for all, and arrays with one for each axis or actuator
+
+    def text(self, dt: float) -> str:
+        """Return the rules as a line of text, for a sample time ``dt`` [s]."""
+        limits, parts = self.limits, []
+        for k, (low, high) in enumerate(zip(limits.low, limits.high, strict=True)):
+            parts.append(f"u[{k}] from {low:.6g} to {high:.6g}")
+        for i, name in enumerate(self.names):
+            own = Rules(
+                *(0.0, 0.0, limits.most_error[i], limits.most_f[i]),
+                *(limits.hold, limits.ramp, limits.settle),
+                *(limits.most_saturated, limits.most_overruns),
+                *(limits.y_low[i], limits.y_high[i]),
+            )
+            parts += [f"{name}: {part}" for part in own.bounds_text()]
+        checked = "checked" if np.any(limits.direction) else "not checked"
+        return ", ".join([*parts, f"first motion {checked}", *counts_of_samples(limits, dt)])
+
+    def _asdict(self) -> dict[str, Any]:
+        """Return the rules by name, as ``Rules`` does; lists have one for each signal."""
+        found = {"axes": list(self.names)}
+        for name, value in self.limits._asdict().items():
+            found[name] = value.tolist() if isinstance(value, np.ndarray) else value
+        return found
+
+
+def counts_of_samples(rules: Any, dt: float) -> list[str]:
+    """Return the rules that are numbers of samples as text, with their times."""
+    parts = []
+    for name in ("settle", "hold", "ramp", "most_overruns", "most_saturated"):
+        samples = getattr(rules, name)
+        if samples * dt < 1e9:
+            parts.append(f"{name} {samples} samples ({samples * dt:.6g} s)")
+    return parts
 
 
 class Memory(Scalars):
@@ -200,6 +250,7 @@ class Memory(Scalars):
     y_began: float  #: y at the scenario's first sample [y-unit]
     pushed: float  #: sum of u since then, with the sign of b0 [u-unit]
     watching: int  #: how the first motion is judged, see ``quell.realtime.supervisor``
+    culprit: int  #: number of the signal, from 1, to which the next change is due; 0 if to none
 
 
 class Counters(Scalars):
@@ -218,7 +269,8 @@ class SupervisorState(NamedTuple):
 
     memory: NDArray[Memory]
     counters: NDArray[Counters]
-    changes: NDArray[np.int64]  #: k, mode and cause of each change of mode (·, 3)
+    #: k, mode, cause and number of the signal from 1, or 0, of each change of mode (·, 4)
+    changes: NDArray[np.int64]
     changed: NDArray[np.int64]  #: number of changes of mode that are kept (1,), an atomic word
     requests: NDArray[np.int64]  #: a ``Request`` (1,), an atomic word that another thread writes
     #: twice the number of control steps, odd during one (1,): an atomic word
@@ -230,7 +282,7 @@ def initial_state() -> SupervisorState:
     memory, (changed, requests, steps) = Memory.zeros(), np.zeros((3, 1), np.int64)
     memory[0].began, memory[0].y = -1, np.nan
     memory[0].y_rest_low, memory[0].y_rest_high = np.inf, -np.inf
-    changes = np.zeros((_KEPT, 3), np.int64)
+    changes = np.zeros((_KEPT, 4), np.int64)
     return SupervisorState(memory, Counters.zeros(), changes, changed, requests, steps)
 
 
@@ -249,8 +301,10 @@ _STRONG = 0.5  # share of a limit of u
 
 
 @kernel
-def runs_away(rules: Rules, memory: Memory, r: float) -> bool:
+def runs_away(rules: Any, memory: Memory, r: float) -> bool:
     """Return whether y runs away against u, in a sample of RUN with the reference ``r``.
+
+    ``rules`` are ``Rules``, or have their ``low``, ``high``, ``direction`` and ``reach``.
 
     ``memory.u`` is the u that acted until this sample.
     """
@@ -295,7 +349,9 @@ def change_mode(state: SupervisorState, k: int, mode: int, cause: int) -> None:
         state.changes[number, 0] = k
         state.changes[number, 1] = mode
         state.changes[number, 2] = cause
+        state.changes[number, 3] = memory.culprit
         store_release(state.changed, 0, number + 1)
+    memory.culprit = 0
 
 
 @kernel
@@ -305,10 +361,42 @@ def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples:
     ``y`` is the measurement, ``samples`` the number of samples of the scenario.
     """
     memory = state.memory[0]
-    good = is_finite(y)
+    good, settling = is_finite(y), memory.mode == Mode.START
     if good:
         memory.y = y
-    else:
+    outside = memory.y < rules.y_low or memory.y > rules.y_high
+    choose_mode(rules, state, k, good, 1 if outside else 0, samples)
+    if settling and memory.mode == Mode.RUN:
+        begin_watch(memory, y, rules.direction)
+    elif settling and good and memory.mode == Mode.START:
+        widen_rest(memory, y)
+
+
+@kernel
+def begin_watch(memory: Memory, y: float, direction: float) -> None:
+    """Begin to judge the first motion, from y on, unless ``direction`` is 0."""
+    memory.y_began = y
+    memory.watching = ARMED if direction != 0.0 else OFF
+
+
+@kernel
+def widen_rest(memory: Memory, y: float) -> None:
+    """Take y into the range before the scenario."""
+    memory.y_rest_low = min(memory.y_rest_low, y)
+    memory.y_rest_high = max(memory.y_rest_high, y)
+
+
+@kernel
+def choose_mode(
+    rules: Any, state: SupervisorState, k: int, good: bool, outside: int, samples: int
+) -> None:
+    """Choose the mode of cycle ``k``; ``rules`` are those of one axis or of several.
+
+    ``good`` says whether all measurements came, ``outside`` is the number, from 1, of one beyond
+    its plausible range, 0 if there is none.
+    """
+    memory = state.memory[0]
+    if not good:
         memory.missed_in_row += 1
         state.counters[0].missed += 1
     mode = memory.mode
@@ -316,7 +404,7 @@ def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples:
     if request == Request.ZERO and mode != Mode.STOPPED:
         change_mode(state, k, Mode.STOPPED, Cause.ZERO_REQUESTED)
     elif mode <= Mode.HOLD:
-        cause = _cause_to_end(rules, memory, k, request, samples)
+        cause = _cause_to_end(rules, memory, k, request, outside, samples)
         if cause != Cause.NONE:
             change_mode(state, k, Mode.RAMP, cause)
         elif mode == Mode.START:
@@ -324,12 +412,9 @@ def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples:
                 memory.samples = 0
             elif memory.samples >= rules.settle:
                 change_mode(state, k, Mode.RUN, Cause.SETTLED)
-                memory.began, memory.y_began = k, y
-                memory.watching = ARMED if rules.direction != 0.0 else OFF
+                memory.began = k
             else:
                 memory.samples += 1
-                memory.y_rest_low = min(memory.y_rest_low, y)
-                memory.y_rest_high = max(memory.y_rest_high, y)
         elif good and mode == Mode.HOLD:
             change_mode(state, k, Mode.RUN, Cause.RECOVERED)
         elif not good and mode == Mode.RUN:
@@ -340,7 +425,9 @@ def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples:
 
 
 @kernel
-def _cause_to_end(rules: Rules, memory: Memory, k: int, request: int, samples: int) -> int:
+def _cause_to_end(
+    rules: Any, memory: Memory, k: int, request: int, outside: int, samples: int
+) -> int:
     """Return the cause to end the run, as far as it is known before the controller's step."""
     cause = Cause.NONE
     if request == Request.RAMP:
@@ -353,8 +440,8 @@ def _cause_to_end(rules: Rules, memory: Memory, k: int, request: int, samples: i
         cause = Cause.OVERRUN
     elif memory.tripped != 0:
         cause = Cause.WATCHDOG
-    elif memory.y < rules.y_low or memory.y > rules.y_high:
-        cause = Cause.IMPLAUSIBLE
+    elif outside != 0:
+        cause, memory.culprit = Cause.IMPLAUSIBLE, outside
     elif memory.mode == Mode.START and k > rules.longest_start:
         cause = Cause.UNSETTLED
     elif memory.began >= 0 and k - memory.began >= samples:
@@ -406,307 +493,3 @@ def supervised_output(
 def finished(state: SupervisorState) -> bool:
     """Return whether u is zero and was written often enough."""
     return state.memory[0].mode == Mode.STOPPED and state.memory[0].samples > FLUSH
-
-
-# ---- Default bounds of y, derived from the reference and from what the control signal can do ----
-
-# Default distance from the reference's range to a bound of y, in units of that range plus the reach
-# of u. In 1500 random stable loops with loads of up to 0.9 of u's limit, y left the range by at
-# most 6.5 of these units (two seeds of benchmarks/direction.py).
-_MARGIN = 10.0
-# The same without a known b0, times the largest of 1 and |r|: as the limit of ``simulate``.
-_MARGIN_WITHOUT_MODEL = 1e6
-
-
-def reach(controller: Controller, low: float, high: float) -> float:
-    """Return the error at which the law ``k1 e / b0`` alone puts u to its limit [y-unit].
-
-    With all poles at −omega_c it is ``b0 max|u| / omega_c^m``. It is the scale of motions of y that
-    are within the power of u: a load that u can hold moves y by a part of it. NaN for a controller
-    that is not an ADRC, possibly behind prefilters.
-    """
-    adrc = inner_adrc(controller)
-    if adrc is None:
-        return float("nan")
-    design = adrc.parameters
-    return float(abs(design.b0) * max(abs(low), abs(high)) / design.law[0])
-
-
-def inner_adrc(controller: Any) -> ADRC | None:
-    """Return the ADRC behind all prefilters; None for another controller."""
-    while not isinstance(controller, ADRC):
-        controller = getattr(controller, "controller", None)
-        if controller is None:
-            return None
-    return controller
-
-
-def plausible_range(reference: ArrayLike, reach: float) -> tuple[float, float]:
-    """Return bounds of y that a good run does not come near to [y-unit].
-
-    ``reference`` are the samples of the reference, and ``reach`` is that of ``reach``. Zero counts
-    as a value of the reference because a run usually begins there.
-    """
-    r = np.append(np.asarray(reference, dtype=float), 0.0)
-    low, high = float(np.min(r)), float(np.max(r))
-    if np.isfinite(reach):
-        margin = _MARGIN * (high - low + reach)
-    else:
-        margin = _MARGIN_WITHOUT_MODEL * max(1.0, -low, high)
-    return low - margin, high + margin
-
-
-# ---- The reference of a run ----
-
-# A record of so many samples with twenty channels takes 1.6 GB.
-_MOST_SAMPLES = 10_000_000
-# s(τ) of the least jerk from rest at 0 to rest at 1 (Flash & Hogan, J. Neuroscience 5, 1985, (3)).
-_LEAST_JERK = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
-
-
-class ReferenceSamples(NamedTuple):
-    """The reference for all samples of a run: code is not compiled for each duration."""
-
-    r: Buffer  # (samples,) [y-unit]
-    derivatives: Buffer  # (samples, d): r', r'', …, as many as the controller uses
-    approach: Buffer  # (·, 1 + d): ``approach_curve`` and its derivatives for a distance of 1
-    current: Vector  # work array: derivatives of one sample (d,)
-
-
-def as_scenario(value: Scenario | Signal | float, duration: float | None) -> Scenario:
-    """Return a scenario, or make one of a reference that takes ``duration`` [s]."""
-    if not isinstance(value, Scenario):
-        if duration is None:
-            raise ValueError("duration = None: give the duration [s], or a quell.Scenario")
-        return Scenario(as_signal(value, "scenario"), duration)
-    if value.rest_at:
-        raise ValueError(
-            f"rest_at = {value.rest_at!r}: a real plant can't be put back to rest; leave it out"
-        )
-    return value if duration is None else Scenario(value.reference, duration, seed=value.seed)
-
-
-def reference_samples(
-    scenario: Scenario, dt: float, derivatives: int, approach: float
-) -> ReferenceSamples:
-    """Return the reference for every sample, and its approach within ``approach`` [s]."""
-    if scenario.duration / dt > _MOST_SAMPLES:
-        times = f"duration = {scenario.duration!r} s with dt = {dt!r} s"
-        raise ValueError(f"{times}: must be at most {_MOST_SAMPLES:.0e} samples")
-    t = np.arange(math.floor(in_steps(scenario.duration, dt)) + 1) * dt
-    signals = [scenario.seeded_signals(len(scenario.disturbances))[0]]
-    for _ in range(derivatives):
-        check_derivative(signals[-1])
-        signals.append(signals[-1].derivative())
-    columns = np.column_stack([signal(t) for signal in signals])
-    finite = np.isfinite(columns).all(axis=1)
-    if not finite.all():
-        raise ValueError(
-            f"reference: it or one of its derivatives is not finite at {t[np.argmin(finite)]:.6g} s"
-        )
-    curve = approach_curve(dt, checks.non_negative("approach", approach, "s"), derivatives)
-    return ReferenceSamples(
-        columns[:, 0].copy(), columns[:, 1:].copy(), curve, np.zeros(derivatives)
-    )
-
-
-def approach_curve(dt: float, time: float, derivatives: int) -> Matrix:
-    """Return ``1 − s(t / time)`` and its derivatives before ``time`` [s], (·, 1 + derivatives)."""
-    scale = time or 1.0
-    tau = np.arange(math.ceil(in_steps(time, dt)) if time else 0) * dt / scale
-    rest = 1.0 - _LEAST_JERK
-    return np.column_stack(
-        [(rest.deriv(i) if i else rest)(tau) / scale**i for i in range(derivatives + 1)]
-    )
-
-
-# ---- Safety rules ----
-
-# More samples than any run has.
-_NEVER = 1 << 60
-
-
-class _Count(NamedTuple):
-    """A number of samples that is also given, by another field, as a time."""
-
-    samples: str  # field that counts samples
-    time: str  # field in seconds
-    default: float  # [s]
-    least: int  # least samples of the default
-    fewest: int  # least value of the field that counts samples
-
-
-# Defaults chosen by hand for 1 kHz: hold must be shorter than the device's watchdog (20 ticks for a
-# rig), and settle as long as the observer needs. A slower loop gets at least so many samples that
-# one late cycle ends no run (hold, most_overruns), u goes down in small steps (ramp), and an
-# observer with omega_o dt = 0.3 has settled (settle).
-_COUNTS = (
-    _Count("hold", "hold_time", 0.005, 5, 0),
-    _Count("most_overruns", "overrun_time", 0.005, 5, 0),
-    _Count("ramp", "ramp_time", 0.05, 10, 1),
-    _Count("settle", "settle_time", 0.2, 20, 1),
-    _Count("most_saturated", "saturated_time", math.inf, _NEVER, 1),
-)
-# START may take ten times as long as settle and a second more, or ten samples: enough for a device
-# that misses some. Chosen by hand; not tuned further.
-_START_FACTOR, _START_MORE, _START_SAMPLES = 10, 1.0, 10
-
-
-@dataclass(frozen=True)
-class Safety:
-    """Safety rules of a loop; ``quell.realtime.supervisor`` describes its states.
-
-    Times are rounded to whole samples, at least one. Their defaults are for 1 kHz and hold down to
-    a number of samples, so that slow loops get enough of them.
-
-    Parameters
-    ----------
-    u_min, u_max
-        limits of the u that is sent to the device [u-unit], with zero, the safe u, between them;
-        the controller's own by default. If both are given, the narrower ones hold. A loop without
-        any limit is refused.
-    most_error
-        largest ``|r − y|`` [y-unit]; beyond it u is ramped to zero.
-    most_f
-        largest ``|f̂|`` [y-unit/s^n], if the controller reports one; beyond it u is ramped to zero.
-    most_saturated
-        number of samples in a row for which u may lie at one of its limits; any by default.
-    hold
-        number of samples in a row for which u is held if no good measurement comes, the loop itself
-        stands still, or the device can't be reached; after that u is ramped to zero.
-    most_overruns
-        number of cycles in a row that may take longer than a sample.
-    ramp
-        number of samples in which u goes to zero.
-    settle
-        number of samples for which the controller observes, with u at zero, before it takes over.
-    y_min, y_max
-        plausible range of y [y-unit]; beyond it u is ramped to zero. By default the range of the
-        reference and zero, wider by ten times the sum of that range and of the error at which the
-        law puts u to its limit, ``b0 max|u| / omega_c^m``; for a controller without b0 by a million
-        times the largest ``|r|`` or 1. Infinite for no limit.
-    hold_time
-        ``hold`` in seconds; 0.005 s by default, at least five samples.
-    overrun_time
-        ``most_overruns`` as the time that so many samples take [s]; 0.005 s by default, at least
-        five samples.
-    ramp_time
-        ``ramp`` in seconds; 0.05 s by default, at least ten samples.
-    settle_time
-        ``settle`` in seconds; 0.2 s by default, at least twenty samples.
-    saturated_time
-        ``most_saturated`` in seconds; any time by default.
-    check_direction
-        whether u is ramped to zero if y first moves, and runs away, against the sign of b0 u
-        (``quell.realtime.supervisor``); only for controllers with a b0.
-
-    Raises
-    ------
-    ValueError
-        for limits without zero between them, numbers out of range, or a number given both in
-        samples and in seconds.
-    """
-
-    u_min: float = -math.inf
-    u_max: float = math.inf
-    most_error: float = math.inf
-    most_f: float = math.inf
-    most_saturated: int | None = None
-    hold: int | None = None
-    most_overruns: int | None = None
-    ramp: int | None = None
-    settle: int | None = None
-    y_min: float | None = None
-    y_max: float | None = None
-    hold_time: float | None = None
-    overrun_time: float | None = None
-    ramp_time: float | None = None
-    settle_time: float | None = None
-    saturated_time: float | None = None
-    check_direction: bool = True
-
-    def __post_init__(self) -> None:
-        _check_around_zero(*checks.interval("u_min", self.u_min, "u_max", self.u_max))
-        checks.interval(
-            *("y_min", -math.inf if self.y_min is None else self.y_min),
-            *("y_max", math.inf if self.y_max is None else self.y_max),
-        )
-        for name in ("most_error", "most_f"):
-            value = getattr(self, name)
-            if value != math.inf:
-                checks.positive(name, value)
-        for count in _COUNTS:
-            samples, time = getattr(self, count.samples), getattr(self, count.time)
-            checks.optional(checks.whole, count.samples, samples, count.fewest)
-            checks.optional(checks.positive, count.time, time, "s")
-            if samples is not None and time is not None:
-                raise ValueError(
-                    f"{count.samples} = {samples!r}, {count.time} = {time!r}: give one of them, "
-                    f"{count.samples} in samples or {count.time} in seconds"
-                )
-        checks.flag("check_direction", self.check_direction)
-
-    def rules(self, controller: Controller, scenario: Scenario | None = None) -> Rules:
-        """Return the supervisor's rules for a controller, with the narrower limits of both.
-
-        The default bounds of y come from the reference of ``scenario``; without one there are none.
-
-        Raises
-        ------
-        ValueError
-            if u has no finite limits, or zero is not between them.
-        """
-        own = getattr(controller, "limits", None)
-        low = max(float(self.u_min), -math.inf if own is None else own.low)
-        high = min(float(self.u_max), math.inf if own is None else own.high)
-        if not (math.isfinite(low) and math.isfinite(high)):
-            raise ValueError(
-                f"u_min = {low!r}, u_max = {high!r}: must be finite for a real device; "
-                "give u_min and u_max to the controller or to quell.realtime.Safety"
-            )
-        _check_around_zero(low, high)
-        scale = reach(controller, low, high)
-        y_low, y_high = -math.inf, math.inf
-        if scenario is not None:
-            r = reference_samples(scenario, controller.dt, 0, 0.0).r
-            y_low, y_high = plausible_range(r, scale)
-        adrc = inner_adrc(controller) if self.check_direction else None
-        counts = {count.samples: self._samples(count, controller.dt) for count in _COUNTS}
-        more = max(round(_START_MORE / controller.dt), _START_SAMPLES)
-        return Rules(
-            low=low,
-            high=high,
-            most_error=float(self.most_error),
-            most_f=float(self.most_f),
-            **counts,
-            y_low=y_low if self.y_min is None else float(self.y_min),
-            y_high=y_high if self.y_max is None else float(self.y_max),
-            longest_start=_START_FACTOR * counts["settle"] + more,
-            direction=0.0 if adrc is None else math.copysign(1.0, adrc.parameters.b0),
-            reach=scale,
-        )
-
-    def _samples(self, count: _Count, dt: float) -> int:
-        """Return a number of samples for the sample time ``dt`` [s]."""
-        samples, time = getattr(self, count.samples), getattr(self, count.time)
-        if samples is not None:
-            return int(samples)
-        if time is not None:
-            return min(max(round(time / dt), 1), _NEVER)
-        return (
-            count.least
-            if math.isinf(count.default)
-            else max(round(count.default / dt), count.least)
-        )
-
-
-def default_hold(dt: float) -> int:
-    """Return the default of ``Safety.hold`` for a sample time ``dt`` [s]."""
-    return Safety()._samples(_COUNTS[0], dt)
-
-
-def _check_around_zero(low: float, high: float) -> None:
-    if not low <= 0.0 <= high or low == high:
-        raise ValueError(
-            f"u_min = {low!r}, u_max = {high!r}: must have zero, the safe u, between them"
-        )

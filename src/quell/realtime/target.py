@@ -18,7 +18,8 @@ import numpy as np
 from quell import checks
 from quell.kernels.dispatch import compiled, specialised
 from quell.realtime import wire
-from quell.realtime.wire import WireDevice, WireHandle, is_own, receive, wait_for_frame
+from quell.realtime.wire import WireHandle, is_own, receive, wait_for_frame
+from quell.realtime.wire_device import WireDevice
 from quell.records.trajectory import Trajectory
 from quell.signals.shapes import Signal, as_signal
 from quell.types import Channels, Matrix, Status

@@ -5,7 +5,8 @@ Frames over UDP: one datagram each.
 ``frames`` handles datagrams that are lost, duplicated or overtaken. The device listens at
 ``udp://HOST:PORT``; the loop uses any free port.
 
-Frames over a serial line: 40 bytes, framed by ``cobs`` with a final zero, so 42 bytes per frame.
+Frames over a serial line: 40 bytes, framed by ``cobs`` with a final zero, so 42 bytes per frame;
+8 more for each further signal.
 
 A byte takes 10 bits on the line (8N1: no parity, one stop bit), a frame 420: 0.46 ms at 921600
 baud. The measurement arrives later by this time, and so does the command. A frame must fit into a
@@ -44,9 +45,9 @@ from quell.kernels.dispatch import kernel
 from quell.realtime.system import external
 from quell.realtime.wire import (
     LENGTH,
+    MOST_SIGNALS,
     Buffer,
     Descriptor,
-    WireDevice,
     connect_to_sender,
     descriptor,
     is_from_other_side,
@@ -58,6 +59,7 @@ from quell.realtime.wire import (
     wait_for_frame,
     wait_readable,
 )
+from quell.realtime.wire_device import WireDevice
 from quell.types import warn
 
 # ---- Frames over UDP ----
@@ -101,15 +103,17 @@ def _receive(udp: UdpTransport, frame: Buffer) -> int:
 @send.register(UdpTransport)
 def _send(udp: UdpTransport, frame: Buffer) -> int:
     size = udp.other[_ADDRESS // 4]
-    sent = _sendto(udp.socket.fd, frame.address, LENGTH, 0, udp.other_at if size > 0 else 0, size)
-    return 0 if sent == LENGTH else 1
+    length = frame.length[0]
+    sent = _sendto(udp.socket.fd, frame.address, length, 0, udp.other_at if size > 0 else 0, size)
+    return 0 if sent == length else 1
 
 
 @reply.register(UdpTransport)
 def _reply(udp: UdpTransport, frame: Buffer) -> int:
     size = udp.sender[_ADDRESS // 4]
-    sent = _sendto(udp.socket.fd, frame.address, LENGTH, 0, udp.sender_at, size)
-    return 0 if sent == LENGTH else 1
+    length = frame.length[0]
+    sent = _sendto(udp.socket.fd, frame.address, length, 0, udp.sender_at, size)
+    return 0 if sent == length else 1
 
 
 @connect_to_sender.register(UdpTransport)
@@ -262,8 +266,8 @@ def decode(packet: NDArray[np.uint8], size: int, out: NDArray[np.uint8]) -> int:
 BAUD = 921600
 # The bits of a framed frame on the line: 42 bytes with start and stop bit.
 FRAME_BITS = 10 * (LENGTH + 2)
-# Size of ``frames.Buffer.bytes``: a longer packet is not a frame.
-_LONGEST_SERIAL_LINE = 48
+# A longer packet is not a frame: the longest one, with a byte of COBS, and one more.
+_LONGEST_SERIAL_LINE = LENGTH + 8 * MOST_SIGNALS
 # Bytes per read from the system, and reads at once: a sender that floods the line can't keep the
 # loop from its cycle. Chosen by hand; not tuned further.
 _READ_SIZE = 256
@@ -296,7 +300,8 @@ def serial_transport(fd: int) -> SerialTransport:
     """Return the transport of the file descriptor of a serial line in raw mode."""
     os.set_blocking(fd, False)
     raw, packet, out = (
-        np.zeros(size, dtype=np.uint8) for size in (_READ_SIZE, _LONGEST_SERIAL_LINE, LENGTH + 3)
+        np.zeros(size, dtype=np.uint8)
+        for size in (_READ_SIZE, _LONGEST_SERIAL_LINE, _LONGEST_SERIAL_LINE + 3)
     )
     coded, state = out[1:], np.array([0, 0, 0, 1])
     return SerialTransport(
@@ -318,7 +323,7 @@ def _receive_serial_line(serial: SerialTransport, frame: Buffer) -> int:
             elif state[_SIZE] > 0:
                 size = state[_SIZE]
                 state[_SIZE] = 0
-                if size > _LONGEST_SERIAL_LINE:
+                if size > frame.bytes.size:
                     return 0
                 return max(decode(serial.packet, size, frame.bytes), 0)
         state[_NEXT] = 0
@@ -332,7 +337,7 @@ def _receive_serial_line(serial: SerialTransport, frame: Buffer) -> int:
 def _send_serial_line(serial: SerialTransport, frame: Buffer) -> int:
     """Send a frame; a zero precedes the first one, and one that follows a partial packet."""
     lead = int(serial.state[_PARTIAL])
-    size = encode(frame.bytes, LENGTH, serial.coded) + lead
+    size = encode(frame.bytes, frame.length[0], serial.coded) + lead
     sent = _write(serial.port.fd, serial.coded_at - lead, size)
     serial.state[_PARTIAL] = 0 if sent == size else 1
     return int(serial.state[_PARTIAL])
@@ -362,7 +367,8 @@ class SerialDevice(WireDevice):
 
     def _connect(self) -> SerialTransport:
         path, baud = _parsed(self.url)
-        _check_rate(baud, self.dt)
+        outputs, inputs = self.signal_counts or (1, 1)
+        _check_rate(baud, self.dt, max(outputs, inputs))
         self._port = _opened(self.url, path, baud)
         return serial_transport(self._port.fileno())
 
@@ -419,18 +425,19 @@ def _parsed(url: str) -> tuple[str, int]:
     return path, int(rate)
 
 
-def _check_rate(baud: int, dt: float) -> None:
-    frame = FRAME_BITS / baud
+def _check_rate(baud: int, dt: float, signals: int) -> None:
+    bits = FRAME_BITS + 80 * (signals - 1)
+    frame = bits / baud
     needs = f"dt = {dt!r} s: a frame takes {frame * 1e3:.3g} ms at {baud} baud"
     if frame > dt:
         raise ValueError(
-            f"{needs}, which is longer than a sample; give at least {FRAME_BITS / dt:.0f} baud, "
+            f"{needs}, which is longer than a sample; give at least {bits / dt:.0f} baud, "
             f"or dt from {frame:.3g} s on"
         )
     if 2.0 * frame > dt:
         warn(
             f"{needs}, each way; that is longer than a sample: u acts a sample later "
-            f"than it could; it does not from {2.0 * FRAME_BITS / dt:.0f} baud on"
+            f"than it could; it does not from {2.0 * bits / dt:.0f} baud on"
         )
 
 

@@ -1,6 +1,8 @@
 """Devices at the other end of a wire: frames, sessions, reading and writing in ticks.
 
-The frame that carries one number between a device and the loop: 40 bytes on every wire.
+The frame that carries one number between a device and the loop: 40 bytes on every wire. Several
+measurements, or several control signals, are numbers of one frame, 8 bytes longer for each further
+one: state flags and CRC are behind the last number.
 
 ======  ====  =======  ==========================================================================
 offset  size  type     content
@@ -15,17 +17,23 @@ offset  size  type     content
 16      8     int64    time: the sender's monotonic clock [ns]
 24      8     float64  value: y [y-unit], u [u-unit]; in hello and welcome the sample time [s]
 32      4     uint32   state flags of the sender: 1 its watchdog has set u to zero (measurement);
-                       2 another session is active, 4 the sample time differs (welcome); 8 the
-                       device has ended the session (goodbye); index of the channel (telemetry)
+                       2 another session is active, 4 the sample time differs, 16 the number of
+                       signals differs (welcome); 8 the device has ended the session (goodbye);
+                       index of the channel (telemetry). In a hello and a welcome for several
+                       signals the second byte is the number of measurements, the third that of
+                       control signals; zero for one of each
 36      4     uint32   CRC-32 of the 36 bytes before it (IEEE 802.3, as in zlib, Ethernet and PNG)
 ======  ====  =======  ==========================================================================
 
-All numbers are little-endian. Hello, welcome and goodbye have the number 0 and answer nothing.
+All numbers are little-endian. Hello, welcome and goodbye have the number 0 and answer nothing. A
+hello is as long as a measurement, the numbers behind the sample time are zero: so what answers it
+is three times its bytes at most. Welcome, goodbye and channel have one number.
 
 A receiver accepts a measurement or a command if its length, its first three bytes and its CRC are
-right, its kind is the expected one, its session is the receiver's, its number is newer than the
-last accepted one (modulo 2^32, RFC 1982), and the frame it answers was sent at most ``most_age``
-frames ago. Each rejected frame is counted under the first rule that it breaks.
+right (there are as many numbers as the session has), its kind is the expected one, its session is
+the receiver's, its number is newer than the last accepted one (modulo 2^32, RFC 1982), and the
+frame it answers was sent at most ``most_age`` frames ago. Each rejected frame is counted under the
+first rule that it breaks.
 
 Functions that carry frames: each kind of wire implements them for its transport.
 
@@ -33,8 +41,6 @@ A transport is a NamedTuple; ``receive``, ``send`` and ``wait_for_frame`` are re
 type, and ``reply``, ``connect_to_sender`` and ``is_from_other_side`` if anyone can send to it. See
 ``realtime/transports.py`` for a complete example. None of these functions allocates memory, and
 only ``wait_for_frame`` waits.
-
-The base class of devices at the other end of a wire: sessions, reading and writing in Python.
 
 The loop's access to a device at the other end of a wire, the same for every transport.
 
@@ -47,40 +53,36 @@ from its tick on.
 from __future__ import annotations
 
 import math
-import secrets
-import time
-from collections.abc import Iterator
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quell import checks
-from quell.kernels.dispatch import (
-    call_specialised,
-    compiled,
-    generic,
-    generic_with_default,
-    is_finite,
-    kernel,
-    specialised,
-)
+from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
+from quell.kernels.sized import Size
 from quell.realtime.devices import (
     Tick,
     ask,
+    drop_signals,
+    read_acting,
     read_channels,
     read_measurement,
+    read_signals,
     read_tick,
     write_command,
+    write_signals,
 )
-from quell.realtime.system import SystemClock, external, now, system_clock
+from quell.realtime.system import SystemClock, external, now
 
 # ---- The frame that carries one number between a device and the loop ----
 
 LENGTH = 40
+"""Bytes of a frame with one number; a further one has eight."""
+MOST_SIGNALS = 16
+"""Most measurements of a device, and most control signals."""
 VERSION = 1
 MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE, TELEMETRY = range(1, 7)
-WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE = 1, 2, 4, 8
+WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE, OTHER_SIGNALS = 1, 2, 4, 8, 16
 
 REFUSALS = (
     *("malformed", "version", "kind", "session", "duplicated", "reordered", "stale"),
@@ -111,7 +113,7 @@ _CRC = _crc_table()
 
 
 class Buffer(NamedTuple):
-    """Memory for a frame as bytes and as numbers; all arrays share it."""
+    """Memory for a frame as bytes and as numbers; all arrays share it, except ``length``."""
 
     bytes: NDArray[np.uint8]  # (48,): longer than a frame, to notice a datagram that is too long
     shorts: NDArray[np.uint16]
@@ -119,13 +121,15 @@ class Buffer(NamedTuple):
     longs: NDArray[np.int64]
     doubles: NDArray[np.float64]
     address: int  # address of the first byte
+    length: NDArray[np.int64]  # bytes of the frame, once written or found well-formed (1,)
 
 
-def buffer() -> Buffer:
-    """Return an empty buffer for a frame."""
-    raw = np.zeros(LENGTH // 8 + 1).view(np.uint8)
+def buffer(signals: int = 1) -> Buffer:
+    """Return an empty buffer for a frame of so many numbers."""
+    raw = np.zeros(LENGTH // 8 + signals).view(np.uint8)
     shorts, words = raw.view("<u2"), raw.view("<u4")
-    return Buffer(raw, shorts, words, raw.view("<i8"), raw.view("<f8"), raw.ctypes.data)
+    longs, doubles, length = raw.view("<i8"), raw.view("<f8"), np.full(1, LENGTH)
+    return Buffer(raw, shorts, words, longs, doubles, raw.ctypes.data, length)
 
 
 class Endpoint(NamedTuple):
@@ -137,15 +141,16 @@ class Endpoint(NamedTuple):
     """Session, number of the last frame sent, number of the last one accepted, the number that this
     one answered, and its state flags (5,)."""
     counters: NDArray[np.int64]  # number of frames for each name in ``COUNTERS`` (12,)
+    signals: Size  # numbers of the frames that it accepts
 
 
 SESSION, SENT, RECEIVED, ANSWERED, STATE = range(5)
 
 
-def endpoint(expects: int, session: int, most_age: int) -> Endpoint:
+def endpoint(expects: int, session: int, most_age: int, signals: int = 1) -> Endpoint:
     """Return an endpoint that has neither sent nor received a frame."""
     numbers = np.array([session, 0, 0, 0, 0], dtype=np.int64)
-    return Endpoint(expects, most_age, numbers, np.zeros(len(COUNTERS), dtype=np.int64))
+    return Endpoint(expects, most_age, numbers, np.zeros(len(COUNTERS), dtype=np.int64), signals)
 
 
 @kernel
@@ -168,7 +173,17 @@ def write_frame(
     value: float,
     state: int,
 ) -> None:
-    """Write a frame to ``out``."""
+    """Write a frame of one number to ``out``."""
+    _begin_frame(out, kind, session, number, answers, time)
+    out.doubles[3] = value
+    _end_frame(out, 1, state)
+
+
+@kernel
+def _begin_frame(
+    out: Buffer, kind: int, session: int, number: int, answers: int, time: int
+) -> None:
+    """Write what is before the numbers of a frame."""
     out.shorts[0] = _MAGIC
     out.bytes[2] = VERSION
     out.bytes[3] = kind
@@ -176,34 +191,72 @@ def write_frame(
     out.words[2] = number % _MODULUS
     out.words[3] = answers % _MODULUS
     out.longs[2] = time
-    out.doubles[3] = value
-    out.words[8] = state
-    out.words[9] = crc32(out.bytes, LENGTH - 4)
+
+
+@kernel
+def _end_frame(out: Buffer, signals: int, state: int) -> None:
+    """Write what is behind the ``signals`` numbers of a frame."""
+    size = LENGTH + 8 * (signals - 1)
+    out.length[0] = size
+    out.words[size // 4 - 2] = state
+    out.words[size // 4 - 1] = crc32(out.bytes, size - 4)
 
 
 @kernel
 def write_next_frame(
     out: Buffer, own: Endpoint, kind: int, time: int, value: float, state: int
 ) -> None:
-    """Write the next frame of the session to ``out``."""
+    """Write the next frame of the session, of one number, to ``out``."""
     numbers = own.numbers
     numbers[SENT] += 1
     write_frame(out, kind, numbers[SESSION], numbers[SENT], numbers[RECEIVED], time, value, state)
 
 
 @kernel
+def write_next_numbers(
+    out: Buffer, own: Endpoint, kind: int, time: int, values: NDArray[np.float64], state: int
+) -> None:
+    """Write the next frame of the session, with these numbers, to ``out``."""
+    numbers = own.numbers
+    numbers[SENT] += 1
+    _begin_frame(out, kind, numbers[SESSION], numbers[SENT], numbers[RECEIVED], time)
+    for i in range(values.size):
+        out.doubles[3 + i] = values[i]
+    _end_frame(out, values.size, state)
+
+
+@kernel
+def write_hello(out: Buffer, session: int, time: int, dt: float, outputs: int, inputs: int) -> None:
+    """Write a hello for so many measurements and control signals to ``out``."""
+    _begin_frame(out, HELLO, session, 0, 0, time)
+    out.doubles[3] = dt
+    for i in range(1, outputs):
+        out.doubles[3 + i] = 0.0
+    _end_frame(out, outputs, signals_word(outputs, inputs))
+
+
+@kernel
+def signals_word(outputs: int, inputs: int) -> int:
+    """Return what the state of hello and welcome says of the signals; 0 for one of each."""
+    return 0 if outputs == 1 and inputs == 1 else outputs << 8 | inputs << 16
+
+
+@kernel
 def is_well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> bool:
     """Return whether the first ``size`` bytes are a frame of this version; count them if not."""
     if (
-        size != LENGTH
+        size < LENGTH
+        or size % 8 != 0
+        or size >= frame.bytes.size
         or frame.shorts[0] != _MAGIC
-        or int(frame.words[9]) != crc32(frame.bytes, LENGTH - 4)
+        or int(frame.words[size // 4 - 1]) != crc32(frame.bytes, size - 4)
     ):
         counters[MALFORMED] += 1
         return False
     if frame.bytes[2] != VERSION:
         counters[WRONG_VERSION] += 1
         return False
+    frame.length[0] = size
     return True
 
 
@@ -217,12 +270,15 @@ def ahead_of(number: int, of: int) -> int:
 def accept(frame: Buffer, own: Endpoint) -> bool:
     """Return whether a well-formed frame is a new one of the expected kind; count it in any case.
 
-    A frame whose value is not finite is accepted, because it shows that the other side is alive. It
-    is also counted as ``not_finite``.
+    A frame with a number that is not finite is accepted, because it shows that the other side is
+    alive. It is also counted as ``not_finite``.
     """
-    counters, numbers = own.counters, own.numbers
+    counters, numbers, size = own.counters, own.numbers, frame.length[0]
     if frame.bytes[3] != own.expects:
         counters[WRONG_KIND] += 1
+        return False
+    if size != LENGTH + 8 * (own.signals - 1):
+        counters[MALFORMED] += 1
         return False
     if int(frame.words[1]) != numbers[SESSION]:
         counters[WRONG_SESSION] += 1
@@ -239,11 +295,20 @@ def accept(frame: Buffer, own: Endpoint) -> bool:
     numbers[RECEIVED] += ahead
     numbers[ANSWERED] = int(frame.words[3])
     # GONE stays set: frames that were sent before a goodbye may be read after it.
-    numbers[STATE] = int(frame.words[8]) | (numbers[STATE] & GONE)
+    numbers[STATE] = int(frame.words[size // 4 - 2]) | (numbers[STATE] & GONE)
     counters[ACCEPTED] += 1
-    if not is_finite(frame.doubles[3]):
+    if not are_finite(frame, own.signals):
         counters[NOT_FINITE] += 1
     return True
+
+
+@kernel
+def are_finite(frame: Buffer, signals: int) -> bool:
+    """Return whether all numbers of a frame are finite."""
+    count = 0
+    for i in range(signals):
+        count += 1 if is_finite(frame.doubles[3 + i]) else 0
+    return count == signals
 
 
 @kernel
@@ -391,23 +456,27 @@ class TickQueue(NamedTuple):
     counts: NDArray[np.int64]
     """Index of the oldest, how many wait, number of the last one used (3,)."""
     numbers: NDArray[np.int64]  # (64,)
-    y: NDArray[np.float64]  # [y-unit] (64,)
-    u: NDArray[np.float64]  # what acts since then [u-unit] (64,)
-    sent: NDArray[np.float64]  # the command of each number, modulo 128 (128,)
+    y: NDArray[np.float64]  # [y-unit] (64, p)
+    u: NDArray[np.float64]  # what acts since then [u-unit] (64, m)
+    sent: NDArray[np.float64]  # the command of each number, modulo 128 (128, m)
+    used_y: NDArray[np.float64]  # those of the measurement that was used last (p,)
+    used_u: NDArray[np.float64]  # (m,)
     channels: NDArray[np.float64]  # with each measurement (64, 8)
     shown: NDArray[np.float64]  # with the measurement that was used last (8,)
     newest: NDArray[np.float64]  # those that came last (8,)
     came: NDArray[np.int64]  # number of the measurement with which they came (8,)
 
 
-def tick_queue() -> TickQueue:
+def tick_queue(outputs: int = 1, inputs: int = 1) -> TickQueue:
     """Return an empty queue."""
     return TickQueue(
         counts=np.zeros(3, dtype=np.int64),
         numbers=np.zeros(QUEUED, dtype=np.int64),
-        y=np.zeros(QUEUED),
-        u=np.zeros(QUEUED),
-        sent=np.zeros(SENT_KEPT),
+        y=np.zeros((QUEUED, outputs)),
+        u=np.zeros((QUEUED, inputs)),
+        sent=np.zeros((SENT_KEPT, inputs)),
+        used_y=np.full(outputs, math.nan),
+        used_u=np.full(inputs, math.nan),
         channels=np.full((QUEUED, MOST_CHANNELS), math.nan),
         shown=np.full(MOST_CHANNELS, math.nan),
         newest=np.full(MOST_CHANNELS, math.nan),
@@ -474,8 +543,10 @@ def _fetch(handle: WireHandle) -> None:
         elif not is_own(own, frame, WELCOME) and accept(frame, own):
             accepted += 1
             at = (queue.counts[_FIRST] + queue.counts[_WAITING]) % QUEUED
-            queue.y[at] = frame.doubles[3] if is_finite(frame.doubles[3]) else math.nan
-            queue.u[at] = _acting(handle)
+            for i in range(own.signals):
+                value = frame.doubles[3 + i]
+                queue.y[at, i] = value if is_finite(value) else math.nan
+            _put_acting(handle, at)
             queue.numbers[at] = own.numbers[RECEIVED]
             for i in range(MOST_CHANNELS):
                 is_fresh = own.numbers[RECEIVED] - queue.came[i] <= own.most_age
@@ -511,14 +582,15 @@ def _read_channels(handle: WireHandle, values: NDArray[np.float64]) -> None:
 
 
 @kernel
-def _acting(handle: WireHandle) -> float:
-    """Return the u that acts since the measurement accepted last, NaN if it is not known."""
-    own = handle.endpoint
+def _put_acting(handle: WireHandle, at: int) -> None:
+    """Put the u that acts since the measurement accepted last; NaN if it is not known."""
+    own, queue = handle.endpoint, handle.queue
     sent, answered = own.numbers[SENT], own.numbers[ANSWERED]
-    if answered == 0 or own.numbers[STATE] != 0:  # before the first command, or tripped
-        return 0.0
+    idle = answered == 0 or own.numbers[STATE] != 0  # before the first command, or tripped
     age = ahead_of(sent, answered)
-    return handle.queue.sent[(sent - age) % SENT_KEPT] if age < SENT_KEPT else math.nan
+    for i in range(queue.used_u.size):
+        value = queue.sent[(sent - age) % SENT_KEPT, i] if age < SENT_KEPT else math.nan
+        queue.u[at, i] = 0.0 if idle else value
 
 
 @kernel
@@ -526,6 +598,7 @@ def _next(handle: WireHandle, waited: int) -> Tick:
     """Take the oldest measurement from the queue."""
     counts = handle.queue.counts
     if counts[_WAITING] == 0:
+        drop_signals(handle)
         return Tick(math.nan, 0, math.nan, 0, waited)
     at = counts[_FIRST]
     number = handle.queue.numbers[at]
@@ -533,31 +606,73 @@ def _next(handle: WireHandle, waited: int) -> Tick:
     counts[_LAST] = number
     counts[_FIRST] = (at + 1) % QUEUED
     counts[_WAITING] -= 1
+    queue = handle.queue
     for i in range(MOST_CHANNELS):
-        handle.queue.shown[i] = handle.queue.channels[at, i]
-    return Tick(handle.queue.y[at], steps, handle.queue.u[at], counts[_WAITING], waited)
+        queue.shown[i] = queue.channels[at, i]
+    y = queue.y[at, 0]
+    for i in range(queue.used_y.size):
+        queue.used_y[i] = queue.y[at, i]
+        y = y if is_finite(queue.y[at, i]) else math.nan
+    for i in range(queue.used_u.size):
+        queue.used_u[i] = queue.u[at, i]
+    return Tick(y, steps, queue.used_u[0], counts[_WAITING], waited)
+
+
+@read_signals.register(WireHandle)
+def _read_signals(handle: WireHandle, y: NDArray[np.float64]) -> None:
+    for i in range(y.size):
+        y[i] = handle.queue.used_y[i]
+
+
+@drop_signals.register(WireHandle)
+def _drop_signals(handle: WireHandle) -> None:
+    for i in range(handle.queue.used_y.size):
+        handle.queue.used_y[i] = math.nan
+
+
+@read_acting.register(WireHandle)
+def _read_acting(handle: WireHandle, u: NDArray[np.float64]) -> None:
+    for i in range(u.size):
+        u[i] = handle.queue.used_u[i]
 
 
 @ask.register(WireHandle)
 def _ask(handle: WireHandle) -> None:
     """Repeat the hello of the session: a device is silent if it hears nothing."""
     own, time = handle.endpoint, now(handle.watch)
-    session = own.numbers[SESSION]
-    write_frame(handle.outbox, HELLO, session, 0, 0, time, handle.dt, 0)
+    outputs, inputs = handle.queue.used_y.size, handle.queue.used_u.size
+    write_hello(handle.outbox, own.numbers[SESSION], time, handle.dt, outputs, inputs)
     send(handle.transport, handle.outbox)
 
 
 @kernel
 def is_own(own: Endpoint, frame: Buffer, kind: int) -> bool:
-    """Return whether a frame is of this kind and of the endpoint's session."""
-    return frame.bytes[3] == kind and int(frame.words[1]) == own.numbers[SESSION]
+    """Return whether a frame of one number is of this kind and of the endpoint's session."""
+    fits = frame.bytes[3] == kind and frame.length[0] == LENGTH
+    return fits and int(frame.words[1]) == own.numbers[SESSION]
 
 
 @write_command.register(WireHandle)
 def _write_command(handle: WireHandle, u: float) -> int:
     own = handle.endpoint
     write_next_frame(handle.outbox, own, COMMAND, now(handle.watch), u, 0)
-    handle.queue.sent[own.numbers[SENT] % SENT_KEPT] = u
+    handle.queue.sent[own.numbers[SENT] % SENT_KEPT, 0] = u
+    return _send_command(handle)
+
+
+@write_signals.register(WireHandle)
+def _write_signals(handle: WireHandle, u: NDArray[np.float64]) -> int:
+    own = handle.endpoint
+    write_next_numbers(handle.outbox, own, COMMAND, now(handle.watch), u, 0)
+    for i in range(u.size):
+        handle.queue.sent[own.numbers[SENT] % SENT_KEPT, i] = u[i]
+    return _send_command(handle)
+
+
+@kernel
+def _send_command(handle: WireHandle) -> int:
+    """Send the command in the outbox; return a fault, 0 if there is none."""
+    own = handle.endpoint
     failed = send(handle.transport, handle.outbox) != 0
     if failed:
         own.counters[NOT_SENT] += 1
@@ -567,238 +682,3 @@ def _write_command(handle: WireHandle, u: float) -> int:
     if state & WATCHDOG_TRIPPED:
         return TRIPPED
     return COMMAND_NOT_SENT if failed else 0
-
-
-# ---- The base class of devices at the other end of a wire ----
-
-# A measurement is stale if it answers a command older than this number of samples, or if more than
-# this number came at once. Chosen by hand; not tuned further.
-_MOST_AGE = 50
-# Time between two hellos [s]. Chosen by hand; not tuned further.
-_HELLO_EVERY = 0.05
-# A device that has not fallen silent sends within so many samples. Chosen by hand.
-_SPEAKS_WITHIN = 3
-
-_FAULTS = {
-    COMMAND_NOT_SENT: "the command could not be sent",
-    TRIPPED: "the device's watchdog has set u to zero; begin a new session",
-    SESSION_GONE: "the device has ended the session",
-}
-
-
-@compiled
-def _read(handle: WireHandle, clock: SystemClock, until: int) -> tuple[float, int]:
-    return read_measurement(handle, clock, until)
-
-
-@compiled
-def _write(handle: WireHandle, u: float) -> int:
-    return write_command(handle, u)
-
-
-class WireDevice:
-    """A device at the other end of a wire; a subclass opens the wire and releases it.
-
-    ``paced`` is True: the device has its own clock, and ``read`` waits for the next measurement.
-
-    Parameters
-    ----------
-    url
-        URL of the device.
-    dt
-        sample time [s]; the device must have the same.
-    timeout
-        longest time until the device answers [s].
-
-    Raises
-    ------
-    ValueError
-        for a wrong URL, a wire that can't be opened, or if the device has another sample time.
-    ConnectionError
-        if no device answers, or if it has another session.
-    """
-
-    paced = True
-    _hint = "start one with: quell rig --device {url}"  # advice if no device answers
-
-    def __init__(self, url: str, dt: float, timeout: float = 3.0) -> None:
-        self.url = url
-        self.dt = checks.positive("dt", dt, "s")
-        own = endpoint(MEASUREMENT, _new_session(), _MOST_AGE)
-        inbox, outbox, watch = buffer(), buffer(), system_clock()
-        self.handle = WireHandle(self._connect(), own, inbox, outbox, watch, self.dt, tick_queue())
-        # Not the handle's: compiled code takes it that its arguments share no memory.
-        self._clock = system_clock()
-        self._timeout = timeout
-        self._open, self._compiled = True, False
-        self._answered = 0  # commands sent before the last reading
-        try:
-            self._begin_session()
-        except BaseException:
-            # A device that receives the hello later must not wait for a loop that has gone.
-            self.close()
-            raise
-
-    def _connect(self) -> Any:
-        """Open the wire; return its transport."""
-        raise NotImplementedError
-
-    def _release(self) -> None:
-        """Release the wire."""
-        raise NotImplementedError
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """Number of frames from the device by result, see ``quell.realtime.wire``."""
-        return counts_by_name(self.handle.endpoint.counters)
-
-    @property
-    def lost(self) -> bool:
-        """Whether the device's watchdog has set u to zero, or the device has ended the session."""
-        state = self.handle.endpoint.numbers[STATE]
-        return bool(state & (WATCHDOG_TRIPPED | GONE))
-
-    def read(self) -> float:
-        """Return the newest measurement [y-unit]; NaN if none has come for fifty samples."""
-        return self._read_within(_MOST_AGE * self.dt)
-
-    def read_channels(self) -> list[float]:
-        """Return the numbers that came with the last measurement, by index.
-
-        NaN for those that have not come for fifty samples.
-        """
-        found: list[float] = self.handle.queue.shown.tolist()
-        return found
-
-    def write(self, u: float) -> None:
-        """Send u [u-unit].
-
-        Raises
-        ------
-        ConnectionError
-            if u could not be sent, or the device will not apply it: its watchdog has set u to zero,
-            or it has ended the session.
-        """
-        self._check_open()
-        fault = call_specialised(_write, self.handle, float(u))
-        if fault:
-            raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
-
-    def restart_session(self) -> None:
-        """Replace this session by a new one: a device waits only so long for the first command."""
-        self._check_open()
-        former = self._session
-        self._send(GOODBYE, 0.0, former)
-        # If a frame replaces the one before it, the device must have time to read the goodbye.
-        time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
-        start_session(self.handle.endpoint, _new_session())
-        self.handle.queue.counts[:] = 0
-        self.handle.queue.came[:] = 0  # the values stay until the session has its own
-        self._begin_session(former)
-
-    def tick(self, timeout: float = 1.0) -> int:
-        """Wait for the next measurement; return the monotonic time of its arrival [ns].
-
-        Raise a ``ConnectionError`` if none has come for ``timeout`` [s].
-        """
-        counters = self.handle.endpoint.counters
-        self._read_within(0.0)
-        before = counters[ACCEPTED]
-        self._read_within(timeout)
-        if counters[ACCEPTED] == before:
-            raise ConnectionError(f"{self.url}: no measurement has come for {timeout:g} s")
-        return time.monotonic_ns()
-
-    def close(self) -> None:
-        """Send a goodbye, after which the device sets u to zero; a second call does nothing."""
-        if self._open:
-            self._open = False
-            self._send(GOODBYE, 0.0, self._session)
-            self._release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @property
-    def _session(self) -> int:
-        return int(self.handle.endpoint.numbers[SESSION])
-
-    def _begin_session(self, former: int = 0) -> None:
-        """Send hellos until a welcome comes.
-
-        If the device is busy, the goodbye of the session ``former`` may have been lost; repeat it.
-        """
-        refusal = 0
-        apart = max(_HELLO_EVERY, 2.0 * self.dt)
-        deadline = time.monotonic() + max(self._timeout, 2.0 * apart)
-        while time.monotonic() < deadline:
-            self._send(HELLO, self.dt, self._session)
-            for state in self._welcomes(apart):
-                if state == 0:
-                    return
-                refusal = state
-                if former:
-                    self._send(GOODBYE, 0.0, former)
-        if refusal & BUSY:
-            raise ConnectionError(
-                f"{self.url}: another session is active there; end it first; "
-                "a session whose loop was killed ends after a minute"
-            )
-        raise ConnectionError(f"{self.url}: no device answers; {self._hint.format(url=self.url)}")
-
-    def _welcomes(self, seconds: float) -> Iterator[int]:
-        """Yield the state flags of each welcome that comes within ``seconds``."""
-        handle, end = self.handle, time.monotonic() + seconds
-        frame, own = handle.inbox, handle.endpoint
-        while (left := end - time.monotonic()) > 0.0:
-            wait_for_frame(handle.transport, round(1e9 * left))
-            while (size := receive(handle.transport, frame)) >= 0:
-                if not is_well_formed(frame, size, own.counters):
-                    continue
-                if not is_own(own, frame, WELCOME):
-                    continue
-                state, dt = int(frame.words[8]), float(frame.doubles[3])
-                if state & OTHER_DT:
-                    raise ValueError(
-                        f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; "
-                        "both must be the same"
-                    )
-                yield state
-
-    def _send(self, kind: int, value: float, session: int) -> None:
-        out = self.handle.outbox
-        write_frame(out, kind, session, 0, 0, time.monotonic_ns(), value, 0)
-        send(self.handle.transport, out)
-
-    def _read_within(self, seconds: float) -> float:
-        """Return the newest measurement, or the first that comes within ``seconds``.
-
-        If there was no command since the last reading, the device must be asked for one.
-        """
-        self._check_open()
-        handle, clock = self.handle, self._clock
-        if not self._compiled:  # this may take seconds and must not count as waiting
-            self._compiled = True
-            for entry, arguments in ((_read, (clock, 0)), (_write, (0.0,))):
-                specialised(entry, handle, *arguments)
-        read = specialised(_read, handle, clock, 0)
-        numbers, counters = handle.endpoint.numbers, handle.endpoint.counters
-        unanswered, self._answered = self._answered == numbers[SENT], numbers[SENT]
-        accepted, begin = counters[ACCEPTED], time.monotonic_ns()
-        soon = min(seconds, _SPEAKS_WITHIN * self.dt) if unanswered else seconds
-        y = float(read(handle, clock, begin + round(1e9 * soon))[0])
-        if counters[ACCEPTED] > accepted or soon == seconds:
-            return y
-        ask(handle)
-        return float(read(handle, clock, begin + round(1e9 * seconds))[0])
-
-    def _check_open(self) -> None:
-        if not self._open:
-            raise ValueError(f"{self.url}: is closed; make a new device")
-
-
-def _new_session() -> int:
-    return secrets.randbelow((1 << 32) - 1) + 1

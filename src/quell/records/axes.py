@@ -12,7 +12,7 @@ import numpy as np
 
 from quell import checks
 from quell.files import MAX_SIZE
-from quell.quantities import UNKNOWN, Signals
+from quell.quantities import UNKNOWN, AxesSignals, Signals
 from quell.records.metrics import SETTLING_BAND, Metrics
 from quell.records.netcdf import Stored, load_record
 from quell.records.record import Record, columns_of
@@ -47,7 +47,7 @@ class AxesTrajectory(Record):
     axis_names: tuple[str, ...] = ()
     axis_features: tuple[tuple[str, ...], ...] = ()  #: names of each axis' features
     final_state: Any = None
-    signals: Signals = UNKNOWN
+    signals: Any = UNKNOWN  #: names and units, ``quell.quantities.AxesSignals`` if they are known
     features: tuple[str, ...] = ()
 
     @property
@@ -69,6 +69,18 @@ class AxesTrajectory(Record):
         """Return the number of samples."""
         return int(self.log.shape[0])
 
+    def labels(self, name: str, width: int) -> list[str]:
+        """Return the names of the entries of a channel; none if they have numbers."""
+        axis, _, channel = name.rpartition(".")
+        if channel == "theta" and axis in self.axis_names and self.axis_features:
+            return list(self.axis_features[self.axis_names.index(axis)])
+        if not self.axis_names:
+            return []
+        of_axes = AxesSignals(self.axis_names, (), ())
+        known = self.signals if isinstance(self.signals, AxesSignals) else of_axes
+        labels = known.labels(name, width)
+        return [] if labels == [str(i) for i in range(width)] else labels
+
     def axis(self, which: int | str) -> Trajectory:
         """Return one axis as a record of its own: its u is v_i [y-unit/s^n].
 
@@ -88,7 +100,8 @@ class AxesTrajectory(Record):
         prefix = f"{self.axis_names[i]}."
         own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
         own = [each for each in own if each[2].startswith(prefix)]
-        whole = [(name, width, name) for name, width in self.channels if name in ("w", "x")]
+        shared = ("w", "x", "k", "lateness", "step_time", "mode", "events")
+        whole = [(name, width, name) for name, width in self.channels if name in shared]
         singles = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
         columns = [columns_of(self.channels, source).start + i for _, source in singles]
         for _, _, source in (*whole, *own):
@@ -104,8 +117,15 @@ class AxesTrajectory(Record):
             ended=self.ended,
             limit=self.limit,
             plant=f"{self.plant}, {self.axis_names[i]}",
+            signals=self._signals_of(i),
             features=self.axis_features[i] if self.axis_features else (),
         )
+
+    def _signals_of(self, i: int) -> Signals:
+        """Return names and units of one axis: its u is v."""
+        if not isinstance(self.signals, AxesSignals):
+            return UNKNOWN
+        return Signals(self.signals.y[i])
 
     def metrics(
         self,

@@ -19,7 +19,7 @@ import numpy as np
 
 from quell import checks
 from quell.files import check_writable, written_atomically
-from quell.quantities import UNKNOWN, Signals
+from quell.quantities import UNKNOWN, AxesSignals
 from quell.types import Channels, Matrix, Vector
 
 if TYPE_CHECKING:
@@ -73,8 +73,14 @@ _NAMED = {
 }
 
 
-def describe(name: str, signals: Signals = UNKNOWN) -> tuple[str, str]:
-    """Return a channel's description and unit, those of the plant's ``signals`` if known."""
+def describe(name: str, signals: Any = UNKNOWN) -> tuple[str, str]:
+    """Return a channel's description and unit, those of the plant's ``signals`` if known.
+
+    Of several axes the unit is that of the first number, in ``units_of`` of each.
+    """
+    if isinstance(signals, AxesSignals):
+        text, unit = describe(name)
+        return text, units_of_axes(name, 1, signals)[0] if "." in name else unit
     axis, _, channel = name.rpartition(".")  # an estimate of one of several axes
     if axis and channel in _DESCRIPTIONS:
         text, unit = _DESCRIPTIONS[channel]
@@ -88,8 +94,15 @@ def describe(name: str, signals: Signals = UNKNOWN) -> tuple[str, str]:
     return text, signals.unit(unit)
 
 
-def units_of(name: str, width: int, signals: Signals = UNKNOWN) -> list[str]:
+def units_of_axes(name: str, width: int, signals: AxesSignals) -> list[str]:
+    """Return the unit of each entry of a channel of several axes."""
+    return signals.units(name, describe(name)[1], width)
+
+
+def units_of(name: str, width: int, signals: Any = UNKNOWN) -> list[str]:
     """Return the unit of each entry of a channel with ``width`` entries."""
+    if isinstance(signals, AxesSignals):
+        return units_of_axes(name, width, signals)
     if name == "x_hat" and signals.y.unit:
         return [signals.derivative(i) for i in range(width)]
     if name == "w" and len(signals.w) == width:
@@ -97,8 +110,10 @@ def units_of(name: str, width: int, signals: Signals = UNKNOWN) -> list[str]:
     return [describe(name, signals)[1]] * width
 
 
-def signals_of_loop(signals: Signals, controller: Any) -> Signals:
+def signals_of_loop(signals: Any, controller: Any) -> Any:
     """Return the plant's signals with the unit of the controller's f, if it has an observer."""
+    if isinstance(signals, AxesSignals):
+        return signals
     while controller is not None:
         observer = getattr(controller, "observer", None)
         if observer is not None:
@@ -168,7 +183,7 @@ class Record:
     dt: float
     every: int
     features: tuple[str, ...]
-    signals: Signals
+    signals: Any  # ``Signals``, of several axes ``AxesSignals`` if they are known
 
     @property
     def t(self) -> Vector:
@@ -192,6 +207,10 @@ class Record:
         """Return the samples with ``start <= t < stop`` as a slice."""
         samples, step = self.log.shape[-2], self.every * self.dt
         return slice(first_sample_at(start, step, samples), first_sample_at(stop, step, samples))
+
+    def labels(self, name: str, width: int) -> list[str]:
+        """Return the names of the entries of a channel; none if they have numbers."""
+        return list(self.features) if name == "theta" else []
 
     def to_xarray(self) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
@@ -219,7 +238,7 @@ class Record:
             of_channel = axes
             if values.ndim > len(axes):
                 axis = f"{name}_index"
-                labels: list[Any] = list(self.features) if name == "theta" else []
+                labels: list[Any] = self.labels(name, values.shape[-1])
                 coordinates[axis] = (axis, labels or list(range(1, values.shape[-1] + 1)), {})
                 of_channel = (*axes, axis)
                 units = units_of(name, values.shape[-1], self.signals)
@@ -294,7 +313,7 @@ def columns(run: Record) -> tuple[list[str], list[str], Matrix]:
         if values.ndim == 1:
             values, own = values[:, None], [name]
         else:
-            labels = run.features if name == "theta" else ()
+            labels = run.labels(name, values.shape[1])
             entries = range(values.shape[1])
             own = [f"{name}[{labels[i] if i < len(labels) else i}]" for i in entries]
         names += own

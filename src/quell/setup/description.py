@@ -91,7 +91,7 @@ def describe(name: str, data: Mapping[str, Any]) -> Description:
         raise SetupError(
             [
                 f"{name}: NOT for several axes yet: this works on one axis, and the file has "
-                "[[axis]]; quell run simulates it, quell export writes it as C, and in Python "
+                "[[axis]]; quell run, run-rig, tune, sweep, studio and export take it, and in Python "
                 "quell.setup.load_axes reads it"
             ]
         )

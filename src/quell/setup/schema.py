@@ -603,8 +603,17 @@ class _File(Table):
     plant: Plant
 
 
+class _FileOfAxes(Table):
+    plant: AxesPlant
+
+
 def plant_of(
-    table: Mapping[str, Any] | str, dt: float, *, name: str = "plant", trust: bool = False
+    table: Mapping[str, Any] | str,
+    dt: float,
+    *,
+    name: str = "plant",
+    trust: bool = False,
+    several: bool = False,
 ) -> AnyPlant:
     """Return the plant that a table describes, as ``[plant]`` of a setup file does.
 
@@ -618,6 +627,8 @@ def plant_of(
         of the file, for messages.
     trust
         whether Python files that the table names may be run.
+    several
+        whether it may be a plant of several signals, as in a file with [[axis]].
 
     Raises
     ------
@@ -631,14 +642,21 @@ def plant_of(
     """
     values = immutable({"plant": table})
     try:
-        found = _File.model_validate(values)
+        found = (_FileOfAxes if several and _is_of_axes(table) else _File).model_validate(values)
     except ValidationError as error:
         raise from_validation(name, error, values) from None
     builder = Builder(name, trust)
     dt = builder.attempt("", (), checks.positive, "dt", dt, "s")
     made: AnyPlant = builder.build(found.plant, "plant", dt=dt)
-    check_single(name, made)
+    if not several:
+        check_single(name, made)
     return made
+
+
+def _is_of_axes(table: Any) -> bool:
+    """Return whether a plant is of a kind that has several signals only."""
+    kind = table.get("kind") if isinstance(table, Mapping) else None
+    return isinstance(kind, str) and kind in AXES_PLANTS and kind not in PLANTS
 
 
 def check_single(name: str, plant: Any) -> None:
@@ -666,7 +684,9 @@ def contents_of(tables: Any) -> Iterator[tuple[str, str]]:
             yield from contents_of(part)
 
 
-def plant_given(text: str, dt: float, *, argument: str = "plant", trust: bool = False) -> AnyPlant:
+def plant_given(
+    text: str, dt: float, *, argument: str = "plant", trust: bool = False, several: bool = False
+) -> AnyPlant:
     """Return the plant that a text on the command line stands for.
 
     Parameters
@@ -684,7 +704,7 @@ def plant_given(text: str, dt: float, *, argument: str = "plant", trust: bool = 
         sample time [s].
     argument
         what messages call the text.
-    trust
+    trust, several
         as for ``plant_of``.
 
     Raises
@@ -711,4 +731,4 @@ def plant_given(text: str, dt: float, *, argument: str = "plant", trust: bool = 
             "(.toml), an identified model (.json), an FMU (.fmu), file.py:name, or a table "
             "{kind = ...}"
         )
-    return plant_of(table, dt, name=name, trust=trust)
+    return plant_of(table, dt, name=name, trust=trust, several=several)

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.axes import control_all
 from quell.controllers.base import set_reference_derivatives, status_flags, write_row
+from quell.controllers.several import control_all
 from quell.kernels.dispatch import compiled_loop
 from quell.plants.base import advance
 from quell.plants.multivariable import is_several, measure_all
@@ -107,6 +107,15 @@ class SampledAxes:
 def references_of(controller: Any) -> int:
     """Return the number of references of a controller of several signals."""
     return int(getattr(controller, "references", controller.outputs))
+
+
+def references_in(
+    scenario: Scenario, controller: Any
+) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
+    """Return the references of a scenario for a controller, seeded, and their derivatives."""
+    given = _one_for_each("reference", scenario.reference, references_of(controller))
+    reference = tuple(seeded_apart(given, scenario.seed))
+    return reference, tuple(_derivatives(reference, controller.derivatives))
 
 
 def _one_for_each(name: str, given: Any, axes: int) -> tuple[Signal, ...]:

@@ -1,0 +1,466 @@
+"""Safety rules of a run, its default bounds, and the samples of its reference.
+
+Safety rules: when a running loop goes to its safe state, and how.
+
+The reference of a run: its samples, and the approach to it from the first y.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quell import checks
+from quell.controllers import ADRC, Axes
+from quell.controllers.base import Controller
+from quell.kernels.sized import Buffer
+from quell.realtime.supervisor import AxesLimits, AxesRules, Rules
+from quell.records.record import in_steps
+from quell.signals import as_signal
+from quell.signals.shapes import check_derivative
+from quell.simulation.driver import Scenario
+from quell.simulation.several import references_in
+from quell.types import Matrix, Vector
+
+# ---- Default bounds of y, derived from the reference and from what the control signal can do ----
+
+# Default distance from the reference's range to a bound of y, in units of that range plus the reach
+# of u. In 1500 random stable loops with loads of up to 0.9 of u's limit, y left the range by at
+# most 6.5 of these units (two seeds of benchmarks/direction.py).
+_MARGIN = 10.0
+# The same without a known b0, times the largest of 1 and |r|: as the limit of ``simulate``.
+_MARGIN_WITHOUT_MODEL = 1e6
+
+
+def reach(controller: Controller, low: float, high: float) -> float:
+    """Return the error at which the law ``k1 e / b0`` alone puts u to its limit [y-unit].
+
+    With all poles at −omega_c it is ``b0 max|u| / omega_c^m``. It is the scale of motions of y that
+    are within the power of u: a load that u can hold moves y by a part of it. NaN for a controller
+    that is not an ADRC, possibly behind prefilters.
+    """
+    adrc = inner_adrc(controller)
+    if adrc is None:
+        return float("nan")
+    design = adrc.parameters
+    return float(abs(design.b0) * max(abs(low), abs(high)) / design.law[0])
+
+
+def inner_adrc(controller: Any) -> ADRC | None:
+    """Return the ADRC behind all prefilters; None for another controller."""
+    while not isinstance(controller, ADRC):
+        controller = getattr(controller, "controller", None)
+        if controller is None:
+            return None
+    return controller
+
+
+def plausible_range(reference: ArrayLike, reach: float) -> tuple[float, float]:
+    """Return bounds of y that a good run does not come near to [y-unit].
+
+    ``reference`` are the samples of the reference, and ``reach`` is that of ``reach``. Zero counts
+    as a value of the reference because a run usually begins there.
+    """
+    r = np.append(np.asarray(reference, dtype=float), 0.0)
+    low, high = float(np.min(r)), float(np.max(r))
+    if np.isfinite(reach):
+        margin = _MARGIN * (high - low + reach)
+    else:
+        margin = _MARGIN_WITHOUT_MODEL * max(1.0, -low, high)
+    return low - margin, high + margin
+
+
+# ---- The reference of a run ----
+
+# A record of so many samples with twenty channels takes 1.6 GB.
+_MOST_SAMPLES = 10_000_000
+# s(τ) of the least jerk from rest at 0 to rest at 1 (Flash & Hogan, J. Neuroscience 5, 1985, (3)).
+_LEAST_JERK = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
+
+
+class ReferenceSamples(NamedTuple):
+    """The reference for all samples of a run: code is not compiled for each duration."""
+
+    r: Buffer  # (samples,) [y-unit]
+    derivatives: Buffer  # (samples, d): r', r'', …, as many as the controller uses
+    approach: Buffer  # (·, 1 + d): ``approach_curve`` and its derivatives for a distance of 1
+    current: Vector  # work array: derivatives of one sample (d,)
+
+
+class AxesReference(NamedTuple):
+    """The references of several axes for all samples of a run."""
+
+    r: Buffer  # (samples, n) [y-unit]
+    derivatives: Buffer  # (samples, d): those of the first axis, then of the second …
+    approach: Buffer  # (·, 1 + most of an axis)
+    current: Vector  # work array: derivatives of one sample (d,)
+    counts: NDArray[np.int64]  # derivatives of each axis (n,)
+
+
+def axes_reference(scenario: Scenario, axes: Axes, approach: float) -> AxesReference:
+    """Return the references of several axes for every sample, and their approach [s]."""
+    r, derivatives = axes_reference_columns(scenario, axes)
+    counts = np.array(axes.derivatives, dtype=np.int64)
+    time = checks.non_negative("approach", approach, "s")
+    curve = approach_curve(axes.dt, time, int(np.max(counts)))
+    return AxesReference(r, derivatives, curve, np.zeros(derivatives.shape[1]), counts)
+
+
+def axes_reference_columns(scenario: Scenario, axes: Axes) -> tuple[Matrix, Matrix]:
+    """Return the references of several axes (samples, n), and their derivatives (samples, d)."""
+    t = _sample_times(scenario, axes.dt)
+    signals, derivatives = references_in(scenario, axes)
+    columns = [
+        np.column_stack([each(t) for each in part]) if part else np.zeros((t.size, 0))
+        for part in (signals, derivatives)
+    ]
+    for i, name in enumerate(axes.names):
+        _check_finite(f"reference of {name}", columns[0][:, i : i + 1], t)
+    _check_finite("reference", columns[1], t)
+    return columns[0], columns[1]
+
+
+def _sample_times(scenario: Scenario, dt: float) -> Vector:
+    if scenario.duration / dt > _MOST_SAMPLES:
+        times = f"duration = {scenario.duration!r} s with dt = {dt!r} s"
+        raise ValueError(f"{times}: must be at most {_MOST_SAMPLES:.0e} samples")
+    return np.asarray(np.arange(math.floor(in_steps(scenario.duration, dt)) + 1) * dt)
+
+
+def _check_finite(name: str, columns: Matrix, t: Vector) -> None:
+    finite = np.isfinite(columns).all(axis=1)
+    if not finite.all():
+        raise ValueError(
+            f"{name}: it or one of its derivatives is not finite at {t[np.argmin(finite)]:.6g} s"
+        )
+
+
+def as_scenario(value: Any, duration: float | None) -> Scenario:
+    """Return a scenario, or make one of a reference that takes ``duration`` [s]."""
+    if not isinstance(value, Scenario):
+        if duration is None:
+            raise ValueError("duration = None: give the duration [s], or a quell.Scenario")
+        if checks.is_sequence(value):
+            many = tuple(as_signal(each, f"scenario[{i}]") for i, each in enumerate(value))
+            return Scenario(many, duration)
+        return Scenario(as_signal(value, "scenario"), duration)
+    if value.rest_at:
+        raise ValueError(
+            f"rest_at = {value.rest_at!r}: a real plant can't be put back to rest; leave it out"
+        )
+    return value if duration is None else Scenario(value.reference, duration, seed=value.seed)
+
+
+def reference_samples(
+    scenario: Scenario, dt: float, derivatives: int, approach: float
+) -> ReferenceSamples:
+    """Return the reference for every sample, and its approach within ``approach`` [s]."""
+    t = _sample_times(scenario, dt)
+    signals = [scenario.seeded_signals(len(scenario.disturbances))[0]]
+    for _ in range(derivatives):
+        check_derivative(signals[-1])
+        signals.append(signals[-1].derivative())
+    columns = np.column_stack([signal(t) for signal in signals])
+    _check_finite("reference", columns, t)
+    curve = approach_curve(dt, checks.non_negative("approach", approach, "s"), derivatives)
+    return ReferenceSamples(
+        columns[:, 0].copy(), columns[:, 1:].copy(), curve, np.zeros(derivatives)
+    )
+
+
+def approach_curve(dt: float, time: float, derivatives: int) -> Matrix:
+    """Return ``1 − s(t / time)`` and its derivatives before ``time`` [s], (·, 1 + derivatives)."""
+    scale = time or 1.0
+    tau = np.arange(math.ceil(in_steps(time, dt)) if time else 0) * dt / scale
+    rest = 1.0 - _LEAST_JERK
+    return np.column_stack(
+        [(rest.deriv(i) if i else rest)(tau) / scale**i for i in range(derivatives + 1)]
+    )
+
+
+# ---- Safety rules ----
+
+# More samples than any run has.
+_NEVER = 1 << 60
+
+
+class _Count(NamedTuple):
+    """A number of samples that is also given, by another field, as a time."""
+
+    samples: str  # field that counts samples
+    time: str  # field in seconds
+    default: float  # [s]
+    least: int  # least samples of the default
+    fewest: int  # least value of the field that counts samples
+
+
+# Defaults chosen by hand for 1 kHz: hold must be shorter than the device's watchdog (20 ticks for a
+# rig), and settle as long as the observer needs. A slower loop gets at least so many samples that
+# one late cycle ends no run (hold, most_overruns), u goes down in small steps (ramp), and an
+# observer with omega_o dt = 0.3 has settled (settle).
+_COUNTS = (
+    _Count("hold", "hold_time", 0.005, 5, 0),
+    _Count("most_overruns", "overrun_time", 0.005, 5, 0),
+    _Count("ramp", "ramp_time", 0.05, 10, 1),
+    _Count("settle", "settle_time", 0.2, 20, 1),
+    _Count("most_saturated", "saturated_time", math.inf, _NEVER, 1),
+)
+# START may take ten times as long as settle and a second more, or ten samples: enough for a device
+# that misses some. Chosen by hand; not tuned further.
+_START_FACTOR, _START_MORE, _START_SAMPLES = 10, 1.0, 10
+
+
+# Fields of ``Safety`` that may have a number for each signal, in the order of their checks.
+_FOR_EACH = ("u_min", "u_max", "most_error", "most_f", "y_min", "y_max")
+Limit: TypeAlias = float | Sequence[float]
+"""A number, or of several axes a list of numbers."""
+
+
+@dataclass(frozen=True)
+class Safety:
+    """Safety rules of a loop; ``quell.realtime.supervisor`` describes its states.
+
+    Of several axes, limits of u may be lists with one for each actuator, and those of y, of the
+    error and of f̂ lists with one for each axis; a number holds for all.
+
+    Times are rounded to whole samples, at least one. Their defaults are for 1 kHz and hold down to
+    a number of samples, so that slow loops get enough of them.
+
+    Parameters
+    ----------
+    u_min, u_max
+        limits of the u that is sent to the device [u-unit], with zero, the safe u, between them;
+        the controller's own by default. If both are given, the narrower ones hold. A loop without
+        any limit is refused.
+    most_error
+        largest ``|r − y|`` [y-unit]; beyond it u is ramped to zero.
+    most_f
+        largest ``|f̂|`` [y-unit/s^n], if the controller reports one; beyond it u is ramped to zero.
+    most_saturated
+        number of samples in a row for which u may lie at one of its limits; any by default.
+    hold
+        number of samples in a row for which u is held if no good measurement comes, the loop itself
+        stands still, or the device can't be reached; after that u is ramped to zero.
+    most_overruns
+        number of cycles in a row that may take longer than a sample.
+    ramp
+        number of samples in which u goes to zero.
+    settle
+        number of samples for which the controller observes, with u at zero, before it takes over.
+    y_min, y_max
+        plausible range of y [y-unit]; beyond it u is ramped to zero. By default the range of the
+        reference and zero, wider by ten times the sum of that range and of the error at which the
+        law puts u to its limit, ``b0 max|u| / omega_c^m``; for a controller without b0 by a million
+        times the largest ``|r|`` or 1. Infinite for no limit.
+    hold_time
+        ``hold`` in seconds; 0.005 s by default, at least five samples.
+    overrun_time
+        ``most_overruns`` as the time that so many samples take [s]; 0.005 s by default, at least
+        five samples.
+    ramp_time
+        ``ramp`` in seconds; 0.05 s by default, at least ten samples.
+    settle_time
+        ``settle`` in seconds; 0.2 s by default, at least twenty samples.
+    saturated_time
+        ``most_saturated`` in seconds; any time by default.
+    check_direction
+        whether u is ramped to zero if y first moves, and runs away, against the sign of b0 u
+        (``quell.realtime.supervisor``); only for controllers with a b0.
+
+    Raises
+    ------
+    ValueError
+        for limits without zero between them, numbers out of range, or a number given both in
+        samples and in seconds.
+    """
+
+    u_min: Limit = -math.inf
+    u_max: Limit = math.inf
+    most_error: Limit = math.inf
+    most_f: Limit = math.inf
+    most_saturated: int | None = None
+    hold: int | None = None
+    most_overruns: int | None = None
+    ramp: int | None = None
+    settle: int | None = None
+    y_min: Limit | None = None
+    y_max: Limit | None = None
+    hold_time: float | None = None
+    overrun_time: float | None = None
+    ramp_time: float | None = None
+    settle_time: float | None = None
+    saturated_time: float | None = None
+    check_direction: bool = True
+
+    def __post_init__(self) -> None:
+        for name in _FOR_EACH:
+            if checks.is_sequence(value := getattr(self, name)):
+                object.__setattr__(self, name, tuple(value))  # lists have no hash
+        lists = [value for name in _FOR_EACH if isinstance(value := getattr(self, name), tuple)]
+        for i in range(max(map(len, lists), default=1)):
+            u_min, u_max, most_error, most_f, y_min, y_max = (
+                self._of(i, name) for name in _FOR_EACH
+            )
+            _check_around_zero(*checks.interval("u_min", u_min, "u_max", u_max))
+            checks.interval(
+                *("y_min", -math.inf if y_min is None else y_min),
+                *("y_max", math.inf if y_max is None else y_max),
+            )
+            for name, value in (("most_error", most_error), ("most_f", most_f)):
+                if value != math.inf:
+                    checks.positive(name, value)
+        for count in _COUNTS:
+            samples, time = getattr(self, count.samples), getattr(self, count.time)
+            checks.optional(checks.whole, count.samples, samples, count.fewest)
+            checks.optional(checks.positive, count.time, time, "s")
+            if samples is not None and time is not None:
+                raise ValueError(
+                    f"{count.samples} = {samples!r}, {count.time} = {time!r}: give one of them, "
+                    f"{count.samples} in samples or {count.time} in seconds"
+                )
+        checks.flag("check_direction", self.check_direction)
+
+    def _of(self, i: int, name: str) -> Any:
+        """Return a limit of the i-th signal; a list that is shorter says no more there."""
+        value = getattr(self, name)
+        if not isinstance(value, tuple):
+            return value
+        return value[min(i, len(value) - 1)] if value else getattr(type(self), name)
+
+    def rules(self, controller: Any, scenario: Scenario | None = None) -> Any:
+        """Return the supervisor's rules for a controller, with the narrower limits of both.
+
+        The default bounds of y come from the reference of ``scenario``; without one there are none.
+
+        Returns
+        -------
+        Rules
+            ``AxesRules`` for several axes.
+
+        Raises
+        ------
+        ValueError
+            if u has no finite limits, zero is not between them, or a list is not as long as there
+            are signals.
+        """
+        if isinstance(controller, Axes):
+            return self._rules_of_axes(controller, scenario)
+        for name in _FOR_EACH:
+            if isinstance(value := getattr(self, name), tuple):
+                raise ValueError(
+                    f"{name} = {list(value)!r}: must be one number; lists are for several axes"
+                )
+        own = getattr(controller, "limits", None)
+        limits: Any = self
+        low = max(float(limits.u_min), -math.inf if own is None else own.low)
+        high = min(float(limits.u_max), math.inf if own is None else own.high)
+        if not (math.isfinite(low) and math.isfinite(high)):
+            raise ValueError(
+                f"u_min = {low!r}, u_max = {high!r}: must be finite for a real device; "
+                "give u_min and u_max to the controller or to quell.realtime.Safety"
+            )
+        _check_around_zero(low, high)
+        scale = reach(controller, low, high)
+        y_low, y_high = -math.inf, math.inf
+        if scenario is not None:
+            r = reference_samples(scenario, controller.dt, 0, 0.0).r
+            y_low, y_high = plausible_range(r, scale)
+        adrc = inner_adrc(controller) if self.check_direction else None
+        return Rules(
+            low=low,
+            high=high,
+            most_error=float(limits.most_error),
+            most_f=float(limits.most_f),
+            y_low=y_low if limits.y_min is None else float(limits.y_min),
+            y_high=y_high if limits.y_max is None else float(limits.y_max),
+            direction=0.0 if adrc is None else math.copysign(1.0, adrc.parameters.b0),
+            reach=scale,
+            **self._counts(controller.dt),
+        )
+
+    def _counts(self, dt: float) -> dict[str, int]:
+        """Return the rules that are numbers of samples."""
+        counts = {count.samples: self._samples(count, dt) for count in _COUNTS}
+        more = max(round(_START_MORE / dt), _START_SAMPLES)
+        return counts | {"longest_start": _START_FACTOR * counts["settle"] + more}
+
+    def _rules_of_axes(self, axes: Axes, scenario: Scenario | None) -> AxesRules:
+        outputs, inputs = axes.outputs, axes.inputs
+        low = np.maximum(self._each("u_min", inputs, "actuators"), axes.limits.low)
+        high = np.minimum(self._each("u_max", inputs, "actuators"), axes.limits.high)
+        if not np.all(np.isfinite([low, high])):
+            raise ValueError(
+                f"u_min = {low.tolist()!r}, u_max = {high.tolist()!r}: must be finite for a real "
+                "device; give u_min and u_max to Axes or to quell.realtime.Safety"
+            )
+        for pair in zip(low.tolist(), high.tolist(), strict=True):
+            _check_around_zero(*pair)
+        push = np.abs(axes.first_gain) @ np.maximum(np.abs(low), np.abs(high))
+        pairs = zip(axes.axes, push, strict=True)
+        scale = np.array([reach(axis, 0.0, most) for axis, most in pairs])
+        bounds = np.tile([[-math.inf], [math.inf]], outputs)
+        if scenario is not None:
+            columns = axes_reference_columns(scenario, axes)[0].T
+            ranges = [plausible_range(*pair) for pair in zip(columns, scale, strict=True)]
+            bounds = np.array(ranges).T
+        y_low, y_high = (
+            bounds[i] if getattr(self, name) is None else self._each(name, outputs, "axes")
+            for i, name in enumerate(("y_min", "y_max"))
+        )
+        return AxesRules(
+            axes.names,
+            AxesLimits(
+                low=low,
+                high=high,
+                most_error=self._each("most_error", outputs, "axes"),
+                most_f=self._each("most_f", outputs, "axes"),
+                y_low=y_low,
+                y_high=y_high,
+                direction=np.full(outputs, 1.0 if self.check_direction else 0.0),
+                reach=scale,
+                push=push,
+                **self._counts(axes.dt),
+            ),
+        )
+
+    def _each(self, name: str, count: int, what: str) -> Vector:
+        """Return a limit of each signal."""
+        value = getattr(self, name)
+        if not isinstance(value, tuple):
+            return np.full(count, float(value))
+        if len(value) != count:
+            raise ValueError(
+                f"{name} = {list(value)!r}: there are {count} {what}; must be one number for all, "
+                "or one for each"
+            )
+        return np.array(value, dtype=float)
+
+    def _samples(self, count: _Count, dt: float) -> int:
+        """Return a number of samples for the sample time ``dt`` [s]."""
+        samples, time = getattr(self, count.samples), getattr(self, count.time)
+        if samples is not None:
+            return int(samples)
+        if time is not None:
+            return min(max(round(time / dt), 1), _NEVER)
+        return (
+            count.least
+            if math.isinf(count.default)
+            else max(round(count.default / dt), count.least)
+        )
+
+
+def default_hold(dt: float) -> int:
+    """Return the default of ``Safety.hold`` for a sample time ``dt`` [s]."""
+    return Safety()._samples(_COUNTS[0], dt)
+
+
+def _check_around_zero(low: float, high: float) -> None:
+    if not low <= 0.0 <= high or low == high:
+        raise ValueError(
+            f"u_min = {low!r}, u_max = {high!r}: must have zero, the safe u, between them"
+        )
