@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(
 )
 _FROM_FILES = {"fmu", "identified", "python"}
 # Names of files, not of modules.
-_SUFFIXES = {"toml", "py", "json", "csv", "md", "mcap", "nc", "fmu", "html", "conf"}
+_SUFFIXES = {"toml", "py", "json", "csv", "md", "mcap", "nc", "fmu", "html", "conf", "fish"}
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
