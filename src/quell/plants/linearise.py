@@ -132,7 +132,7 @@ def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
 
     first = rate(np.zeros(plant.inputs))
     columns = np.column_stack([rate(row) - first for row in np.eye(plant.inputs)])
-    u: Vector = np.linalg.lstsq(columns, -first, rcond=None)[0]
+    u: Vector = np.asarray(np.linalg.lstsq(columns, -first, rcond=None)[0], dtype=np.float64)
     left = float(np.max(np.abs(rate(u))))
     if not left <= _AT_REST * (1.0 + float(np.max(np.abs(first)))):
         raise ValueError(

@@ -31,7 +31,7 @@ from quell.plants.multivariable import (
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import CASE, Setup, Variation, changed, sweep_of, title_of, windows_of
+from quell.setup.loading import Setup, Variation, changed, sweep_of, title_of, windows_of
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -58,6 +58,7 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Metrics
     from quell.setup.schema import CallTable as Observer
     from quell.setup.schema import CallTable as ScenarioTable
+    from quell.setup.schema import CallTable as Sweep
     from quell.setup.schema import CallTable as Tune
 
 # ---- B0 and the actuators ----
@@ -181,7 +182,7 @@ def tuning_of_axes(
     objective
         `load-iae` or `load`.
     """
-    bounds = {"m_s": m_s, "m_t": m_t, "m_ks": m_ks, "damping": damping}
+    bounds: dict[str, Any] = {"m_s": m_s, "m_t": m_t, "m_ks": m_ks, "damping": damping}
     limits: dict[str, Any] = {"noise_over_pi": noise_over_pi, "omega_o_dt": omega_o_dt}
     return {
         "constraints": Constraints(**bounds, **limits),
@@ -267,7 +268,7 @@ if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
     Observer, Learner = one_of(OBSERVERS), registry.Learner
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
-    Tune = TUNE
+    Sweep, Tune = registry.Sweep, TUNE
 
 
 class Axis(Table):
@@ -292,7 +293,7 @@ class AxesDescription(Table):
     axis: tuple[Axis, ...] = Field(description="[[axis]]: an axis, in the order of the outputs.")
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
     tune: Tune | None = optional("what `quell tune` bounds.")
-    sweep: registry.Sweep | None = optional("many runs with other values, for `quell sweep`.")
+    sweep: Sweep | None = optional("many runs with other values, for `quell sweep`.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."
     )
@@ -430,7 +431,7 @@ class AxesVariation(Variation):
 
     def __call__(self, **values: Any) -> Setup:
         """Return the setup; values are by path, and ``case`` is the name of a case."""
-        case = values.pop(CASE, None)
+        case = values.pop(registry.CASE, None)
         changes = {**({} if case is None else self.cases[case]), **values}
         return made_axes(self.name, changed(self.name, self.data, changes), self.trust)
 

@@ -614,8 +614,9 @@ def built(job: Job, part: Part, run: int) -> Parts:
 def is_random(scenario: Scenario) -> bool:
     """Return whether the signals of a scenario depend on its seed."""
     given: list[Any] = [*scenario.disturbances]
-    for each in (scenario.reference, scenario.noise):  # of several axes one for each
-        given += each if checks.is_sequence(each) else [each]
+    for one in (scenario.reference, scenario.noise):  # of several axes one for each
+        several: Any = one if checks.is_sequence(one) else [one]
+        given += several
     return any(each.seeded(0) != each.seeded(1) for each in given if isinstance(each, Signal))
 
 
@@ -787,7 +788,7 @@ def describe_measures(measures: Measures) -> dict[str, Any]:
     for name, each in measures.items():
         if isinstance(each, Measure):
             about, unit = UNITS[each.name]
-            window = {"start": each.start, "stop": each.stop, "target": each.target}
+            window: dict[str, Any] = {"start": each.start, "stop": each.stop, "target": each.target}
             window |= {"axis": each.axis or None}
             given = {key: value for key, value in window.items() if value is not None}
             found[name] = {"long_name": about, "units": unit, **given, "band": each.band}

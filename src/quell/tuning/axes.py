@@ -580,7 +580,7 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
     """Return the plants whose B0 differs from the controller's by a share."""
     if off == 0.0:
         return []
-    B0 = np.linalg.pinv(nominal.R)
+    B0 = np.asarray(np.linalg.pinv(nominal.R), dtype=np.float64)
     entries = int(np.count_nonzero(B0))
     if 2**entries <= _MOST_PATTERNS:
         patterns = np.array(list(itertools.product((-1.0, 1.0), repeat=entries)))
@@ -699,7 +699,7 @@ def _each_alone(
         best = min(ends, key=lambda each: each.rank)
         rows.append(best.values[0])
         costs.append(best.measured.costs[0])
-    of_noise = None if None in known else tuple(known)
+    of_noise = None if None in known else tuple(float(each) for each in known if each)
     limits = Limits(bounds.m_s, bounds.m_t, of_noise, least, bounds.damping)
     return limits, np.array(rows), np.array(costs)
 
@@ -841,7 +841,8 @@ def _results(
         rows.append(
             AxisResult(
                 name,
-                *found.values[i].tolist(),
+                float(found.values[i, 0]),
+                float(found.values[i, 1]),
                 float(found.measured.costs[i]),
                 float(alone[i]),
                 max(float(each.outputs[0, i]) for each in peaks),
@@ -865,7 +866,7 @@ def _check(
     drawn = []
     for k in range(samples):
         one = nominal[k % len(nominal)]
-        B0 = np.linalg.pinv(one.R)
+        B0 = np.asarray(np.linalg.pinv(one.R), dtype=np.float64)
         drawn.append(_off_by(one, B0, rng.uniform(-off, off, np.count_nonzero(B0))))
     measured = loops(drawn).measured(found.values)
     ratios = np.exp(-np.min(measured.slacks, axis=1))
