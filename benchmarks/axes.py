@@ -1,11 +1,16 @@
 """Several axes: an arm with and without its mass matrix, arms of MuJoCo, a quadrotor, and the cost.
 
-    python benchmarks/axes.py [--part arm|mujoco|quadrotor|cost] [--draws 100] [--seed 7]
+    python benchmarks/axes.py [--part arm|learners|mujoco|quadrotor|cost] [--draws 100] [--seed 7]
 
 *arm*: random rigid two-link arms (those of ``quell stress --loops axes``) that follow sines,
 ω_c/ω_o = 8/60: RMS error against the response that the design asks for, from 5 s on, with M(q),
 with M at the middle of the motion, and with two independent loops; without learner and with
 ``Harmonic()`` and a guard.
+
+*learners*: the same arms with M at the middle of the motion, and references of three sines each, so
+that no motion repeats: RMS error from 20 s on, and over that without learner, of learners that see
+their own axis, of ones that see both, and of one that serves both, all with guards. ``--motion
+sines`` is the motion of *arm*, in which each joint follows one sine.
 
 *mujoco*: arms of two and three joints, one joint elastic in half of them, simulated by MuJoCo; the
 model's masses, lengths and inertias are each up to 20 % off. Every run must be stable; the guarded
@@ -16,7 +21,8 @@ up to 30 % off. One ``Axes`` with B0 of the attitude, roll and pitch before yaw,
 single loops, each with the limits of its torque, whose torques are mixed and cut behind them. RMS
 of the error against the response that the design asks for, all angles.
 
-*cost*: ``step`` of three axes over three times ``step`` of one, and the compiled loop likewise.
+*cost*: ``step`` of three axes over three times ``step`` of one, and the compiled loop likewise; and
+the loop of three axes with one learner for all over that with one for each.
 """
 
 from __future__ import annotations
@@ -97,6 +103,87 @@ def part_arm(draws: int, seed: int) -> None:
         worst = np.max(np.array(errors) / plain)
         print(f"  {kind:16} {'Harmonic, guard' if learns else 'no learner':16} "
               f"{one:7.2f} {two:7.2f}   worst over none {worst:.3f}")  # fmt: skip
+
+
+# ---- Learners that see both joints ----
+
+
+def forces(x, u):  # type: ignore[no-untyped-def]
+    """Return the functions in the equations of a two-link arm, of its angles, rates and v."""
+    c, s = math.cos(x[2]), math.sin(x[2])
+    return (
+        math.cos(x[0]), math.cos(x[0] + x[2]),
+        s * x[1] * x[1], s * x[1] * x[3], s * x[3] * x[3],
+        x[1], x[3], c * x[4], c * x[5],
+    )  # fmt: skip
+
+
+FORCES = ("g1", "g2", "s v1^2", "s v1 v2", "s v2^2", "d1", "d2", "c a1", "c a2")
+
+
+def learners() -> dict[str, Any]:
+    """Return for each name the learner of an axis, and that of ``Axes``."""
+    F, L = ql.features, ql.learners
+    plain = F.State() + F.Polynomial(2)
+    both, cubes = F.AllAxes(plain) + F.Bias(), F.AllAxes(F.State() + F.Polynomial(3)) + F.Bias()
+    known = F.AllAxes(F.Custom(forces, FORCES), inputs=True) + F.Bias()
+    return {
+        "none": (None, None),
+        "Harmonic, own": (L.Harmonic(), None),
+        "RLS, own, monomials to 2": (L.RLS(plain + F.Bias()), None),
+        "RLS, both, monomials to 2": (None, [L.RLS(both), L.RLS(both)]),
+        "RLS, one for both, to 2": (None, L.RLS(both)),
+        "RLS, one for both, to 3": (None, L.RLS(cubes)),
+        "RLS, one for both, functions": (None, L.RLS(known)),
+        "NLMS, own, monomials to 2": (L.NLMS(plain + F.Bias()), None),
+        "NLMS, one for both, to 2": (None, L.NLMS(both)),
+        "GaussianProcess, own": (L.GaussianProcess(F.State()), None),
+        "GaussianProcess, both": (
+            None, [L.GaussianProcess(F.AllAxes(F.State()), length=1.0) for _ in range(2)],
+        ),
+    }  # fmt: skip
+
+
+def part_learners(draws: int, seed: int, motion: str = "three") -> None:
+    """Print errors of both joints, medians over the arms, for each learner."""
+    found: dict[str, list[Any]] = {}
+    for i in range(draws):
+        rng = np.random.default_rng([seed, i])
+        drawn = draw_arm(rng)
+        plant = ql.plants.arm(drawn.lengths, drawn.masses, gravity=drawn.gravity)
+        middle = np.array([0.0, drawn.elbow])
+        M = plant.mass_matrix(middle)
+        references = []
+        for at, amplitude, omega in zip(middle, drawn.amplitudes, drawn.frequencies, strict=True):
+            omegas = (omega, *rng.uniform(0.5, 4.0, 2)) if motion == "three" else (omega,)
+            sizes = (0.5, 0.25, 0.25) if motion == "three" else (1.0,)
+            waves = [
+                ql.signals.Sinusoid(amplitude * size, each)
+                for size, each in zip(sizes, omegas, strict=True)
+            ]
+            references.append(ql.signals.Sum((ql.signals.Constant(at), *waves)))
+        noise = ql.signals.BandLimitedNoise(power=NOISE**2 * DT, sample_time=DT)
+        scenario = ql.Scenario(
+            references, duration=40.0, noise=noise, x0=np.array([*middle, 0.0, 0.0]), seed=i
+        )
+        for name, (own, of_axes) in learners().items():
+            guard = None if own is None else ql.Guard()
+            joints = [
+                ql.ADRC(joint().observer, OMEGA_C, learner=own, guard=guard) for _ in range(2)
+            ]
+            watch = None if of_axes is None else ql.Guard()
+            run = ql.simulate(plant, ql.Axes(joints, M=M, learner=of_axes, guard=watch), scenario)
+            error = np.full(2, np.inf)
+            if not run.diverged:
+                error = rms(asked_for(run["r"], run.t) - run["y"], run.t, 20.0)
+            found.setdefault(name, []).append(1e3 * error)
+    print(f"learners, {draws} arms, seed {seed}, motion {motion}: RMS error [mrad] of joint 1, "
+          "joint 2; over none, median and largest")  # fmt: skip
+    plain = np.array(found["none"])
+    for name, errors in found.items():
+        one, two = np.median(errors, axis=0)
+        ratios = np.array(errors) / plain
+        print(f"  {name:30} {one:7.2f} {two:7.2f}   {np.median(ratios):6.3f} {np.max(ratios):6.3f}")
 
 
 # ---- Arms in MuJoCo ----
@@ -306,6 +393,12 @@ def part_cost(draws: int, seed: int) -> None:
         a, b = best(lambda s=single: s.step(0.1, 0.0)), best(lambda s=several: s.step(r, y))
         print(f"step, {name}: one {1e6 * a:.2f} us, three axes {1e6 * b:.2f} us, "
               f"ratio to three {b / (3 * a):.2f}")  # fmt: skip
+    seen = ql.features.AllAxes(ql.features.State() + ql.features.Polynomial(2)) + ql.features.Bias()
+    for_each = ql.Axes([joint() for _ in range(3)], learner=[ql.learners.RLS(seen)] * 3)
+    for_all = ql.Axes([joint() for _ in range(3)], learner=ql.learners.RLS(seen))
+    a, b = best(lambda: for_each.step(r, y)), best(lambda: for_all.step(r, y))
+    print(f"step, three axes, RLS of 28 features: one for each {1e6 * a:.2f} us, "
+          f"one for all {1e6 * b:.2f} us, ratio {b / a:.2f}")  # fmt: skip
     masses = ql.plants.MultivariableLinearPlant(
         np.kron(np.eye(3), [[0, 1], [0, -1]]), np.kron(np.eye(3), [[0], [1]]),
         np.kron(np.eye(3), [[1, 0]]),
@@ -321,7 +414,13 @@ def part_cost(draws: int, seed: int) -> None:
               f"ratio to three {b / (3 * a):.2f}")  # fmt: skip
 
 
-PARTS = {"arm": part_arm, "mujoco": part_mujoco, "quadrotor": part_quadrotor, "cost": part_cost}
+PARTS: dict[str, Any] = {
+    "arm": part_arm,
+    "learners": part_learners,
+    "mujoco": part_mujoco,
+    "quadrotor": part_quadrotor,
+    "cost": part_cost,
+}
 
 
 def main() -> None:
@@ -330,10 +429,12 @@ def main() -> None:
     parser.add_argument("--part", choices=PARTS, action="append")
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--motion", choices=("three", "sines"), default="three")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     for name in options.part or PARTS:
-        PARTS[name](options.draws, options.seed)
+        more = (options.motion,) if name == "learners" else ()
+        PARTS[name](options.draws, options.seed, *more)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ static void play(robot_state *state, int action, const result *now, real u[M])
     if (action == HELD || action == RELEASED)
         robot_set_held(state, 0, action == HELD);
     if (action == TRACK)
-        robot_track(state, now->r, now->y MORE(halves), now->given);
+        robot_track(state, now->r, now->y, now->given MORE(halves));
     else
         robot_step(state, now->r, now->y MORE(halves), u);
 }

@@ -30,10 +30,8 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.export import TranslationError
-from quell.export.axes_source import parts_of_axes, source_of_axes
-from quell.export.library.axes_vectors import AxesPlayer
-from quell.export.library.vectors import Action
+from quell.export import TranslationError, c_source
+from quell.export.library.vectors import Action, Player
 
 HERE = Path(__file__).resolve().parent
 SQUARE = np.array([[1.0, 0.3, 0.1], [0.2, 2.0, 0.1], [0.0, 0.3, 0.5]])
@@ -93,6 +91,26 @@ def cases() -> dict[str, Any]:
         joint(safe_set=ql.SafeSet(-1.5, 1.5, alpha=8.0, f_rate=1.0)),
     ]
     found["held, safe set"] = ql.Axes(held, np.eye(2) + 0.2, **LIMITS)
+    return found
+
+
+def feedback() -> dict[str, Any]:
+    """Return state feedback with each kind of gain of its observer."""
+    A = [[0, 1, 0, 0], [-5, -0.1, 5, 0.1], [0, 0, 0, 1], [5, 0.1, -5, -0.1]]
+    B, C, E = [0, 1.5, 0, 0], [[1, 0, 0, 0], [0, 0, 1, 0]], [0, 0, 0, 1.0]
+    noise = {"noise_variance": [1e-6, 1e-6], "drift": [1.0]}
+    gain = ql.controllers.state_feedback(A, B, 3.0, 0.01)
+    found = {}
+    for name, options in {
+        "poles": {"omega_o": 30.0},
+        "fixed gains, two rates": {**noise, "time_varying": False, "every": (1, 4)},
+        "covariance": {**noise, "disturbance_order": 2},
+    }.items():
+        observer = ql.ESO.state_space(A, B, C, E, 0.01, **options)
+        law = ql.controllers.StateFeedback(
+            observer, gain, controlled=C[1:], rate_limit=200.0, **LIMITS
+        )
+        found[f"state feedback, {name}"] = law
     return found
 
 
@@ -162,8 +180,8 @@ def replayed(
     axes: ql.Axes, rows: np.ndarray, given: np.ndarray, single: bool
 ) -> tuple[int, int, ql.Status, float]:
     """Return the samples that were replayed, those that differ, all flags, largest authority."""
-    player = AxesPlayer(axes, parts_of_axes(axes, single))
-    player.limit_at(np.full(axes.inputs, 0.5))
+    player = Player(axes, "single" if single else "double")
+    player.limit_at("limits", 0.5)
     authority = 0.0
     for k, row in enumerate(given):
         authority = max(authority, *authorities(player.state.axes))
@@ -179,7 +197,7 @@ def judged(name: str, axes: ql.Axes, precision: str, samples: int) -> list[str]:
     """Return a row of the table."""
     single = precision == "single"
     try:
-        source = source_of_axes(axes, "robot", single)
+        source = c_source(axes, "robot", precision=precision)
     except TranslationError as error:
         return [name, precision, "refused", "0", "0", "", "", str(error)[24:80]]
     rows = script(samples, axes.outputs, single)

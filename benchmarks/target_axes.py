@@ -23,7 +23,7 @@ from rich.table import Table
 from target import HERE, OPTIMISE, TYPES, emulator, export, write
 
 import quell as ql
-from quell.export.axes_source import source_of_axes
+from quell.export import c_source
 
 B0 = np.array([[1.0, 0.3, 0.1], [0.2, 2.0, 0.1], [0.0, 0.3, 0.5]])
 LIMITS = {"u_min": -20.0, "u_max": 20.0}
@@ -71,7 +71,7 @@ def measured(
     real, dtype = TYPES[precision]
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        write(source_of_axes(axes, "axes", precision == "single"), folder)
+        write(c_source(axes, "axes", precision=precision), folder)
         for name, learner in zip(("one", "two", "three"), learners, strict=True):
             export(joint(learner, **LIMITS), precision, name, folder)
         numbers = run["r"].astype(dtype).tobytes() + run["y_measured"].astype(dtype).tobytes()

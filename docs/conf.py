@@ -1,13 +1,18 @@
 """Sphinx configuration."""
 
+import importlib
 import os
 import runpy
 import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from sphinx.application import Sphinx
 
 import quell
+
+sys.path.insert(0, str(Path(__file__).parent))
+import machine_texts
 
 # Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
@@ -26,7 +31,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
-    "sphinx-mathjax-offline",
 ]
 html_theme = "pydata_sphinx_theme"
 html_title = "quell"
@@ -74,3 +78,15 @@ def draw_gallery() -> None:
 
 
 draw_gallery()
+
+
+def setup(app: Sphinx) -> None:
+    """Write the texts for machines beside the pages, which are read in parallel."""
+    # MathJax comes from its package, which does not say that pages may be read in parallel.
+    importlib.import_module("sphinx-mathjax-offline").setup(app)
+
+    def finish(app: Sphinx, exception: Exception | None) -> None:
+        if exception is None and app.builder.format == "html":
+            machine_texts.write(Path(app.outdir))
+
+    app.connect("build-finished", finish)

@@ -30,6 +30,28 @@ TABLES = {
 }
 """A setup whose loop compiles quickly."""
 
+_AXIS = {
+    "observer": {"kind": "model-free", "order": 1, "omega_o": 40.0},
+    "controller": {"omega_c": 8.0},
+}
+AXES = {
+    "title": "Two tanks",
+    "dt": 0.005,
+    "plant": {
+        "kind": "multivariable-linear",
+        "A": [[-1.0, 0.2], [0.1, -2.0]],
+        "B": [[4.0, 1.0], [0.5, 3.0]],
+        "C": [[1.0, 0.0], [0.0, 1.0]],
+    },
+    "axes": {"B0": "plant", "u_min": -5.0, "u_max": [5.0, 4.0]},
+    "axis": [
+        {"name": "left", "reference": {"kind": "step", "at": 0.1}, **_AXIS},
+        {"name": "right", **_AXIS},
+    ],
+    "scenario": {"duration": 1.0},
+}
+"""A setup of two axes whose loop compiles quickly."""
+
 
 @contextmanager
 def running(tables: Any = None, port: int = 0, token: str | None = None) -> Iterator[str]:

@@ -16,6 +16,7 @@ from quell import analysis
 from quell.export.c_files import plant_source
 from quell.plants import NonlinearPlant, labelled, signals_of
 from quell.plants.nonlinear import CompiledParametric
+from quell.plants.registry import IDENTIFIED_NUMBERS
 from quell.realtime import open_device
 from quell.setup import SetupError, made, plant_given, plant_of, varied
 from quell.setup.loading import sweep_of, tuning_task
@@ -115,6 +116,31 @@ def _table(text: str) -> Any:
 
         return tomllib.loads(f"plant = {text}")["plant"]
     return text
+
+
+def test_an_identified_plant_takes_its_numbers_in_place_of_a_file(files: Path) -> None:
+    """They give the same plant; both together, half a friction, and none are refused."""
+    numbers = json.loads((files / "model.json").read_text())
+    table = {"kind": "identified"} | {
+        key: numbers[key] for key in IDENTIFIED_NUMBERS if numbers.get(key) is not None
+    }
+    states = []
+    for each in (table, {"kind": "identified", "path": "model.json"}):
+        plant = plant_of(each, DT)
+        model = plant.sampled(DT, interpret=True)
+        x, scratch = np.zeros(plant.order), np.zeros(6 * plant.order)
+        for k in range(20):
+            ql.plants.base.advance(model, x, scratch, k * DT, 0.3, np.zeros(1))
+        states.append(x.tolist())
+    assert states[0] == states[1]
+    assert states[0][2] != 0.0
+    for wrong, words in (
+        ({"path": "model.json", "num": [1.0]}, "num: go without path"),
+        ({"num": [1.0]}, "path: missing; give the file of results, or num and den"),
+        ({"num": [1.0], "den": [1.0, 1.0], "friction": 0.1}, "give both or none"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            plant_of({"kind": "identified"} | wrong, DT)
 
 
 def test_an_identified_model_has_its_delay_and_friction(files: Path) -> None:

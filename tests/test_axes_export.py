@@ -13,9 +13,10 @@ import pytest
 
 import quell as ql
 from quell.controllers.axes import control_all
-from quell.export import TranslationError
-from quell.export.axes_source import names_in_c, parts_of_axes, source_of_axes
-from quell.export.library.axes_vectors import golden_vectors_of_axes
+from quell.export import TranslationError, c_source
+from quell.export.axes_source import names_in_c
+from quell.export.controller_source import parts_of
+from quell.export.library.vectors import golden_vectors
 from quell.kernels.dispatch import as_python
 
 from . import gain_functions
@@ -48,6 +49,12 @@ def plain() -> dict[str, ql.ADRC]:
     return {"shoulder": joint(feedforward=True), "elbow": joint(), "wrist": joint()}
 
 
+def guarded() -> list[ql.ADRC]:
+    """Return axes with bands, so that y leaves those of the first two, and one without."""
+    wide, narrow = (ql.SafeSet(-y, y, -3.0 * y, 3.0 * y, alpha=8.0, f_rate=1.0) for y in (1.0, 0.3))
+    return [joint(safe_set=wide), joint(1, safe_set=narrow), joint()]
+
+
 def two() -> list[ql.ADRC]:
     """Return two axes with learners and guards."""
     learners = (ql.learners.Kalman(), ql.learners.Harmonic())
@@ -67,6 +74,10 @@ ROWS: dict[str, Any] = {
         plain(), WIDE, saturation="direction", rate_limit=5000.0, **LIMITS
     ),
     "more actuators, priority": lambda: ql.Axes(plain(), WIDE, saturation=RANKED, **LIMITS),
+    "safe sets, rates": lambda: ql.Axes(guarded(), SQUARE, rate_limit=8000.0, **LIMITS),
+    "safe sets, more actuators, direction": lambda: ql.Axes(
+        guarded(), WIDE, saturation="direction", weights=[1, 2, 3, 4], **LIMITS
+    ),
     "orders 1, 3 and 2": lambda: ql.Axes([joint(1), joint(3), joint(2)], SQUARE, u_max=5.0),
     "one axis": lambda: ql.Axes([joint()]),
     "nested tuples": lambda: ql.Axes([joint(), joint()], gain_functions.nested_tuples, **LIMITS),
@@ -79,7 +90,13 @@ ROWS: dict[str, Any] = {
     ),
     "mass matrix of the arm": lambda: ql.Axes([joint(), joint()], M=ARM.inertia, **LIMITS),
 }
-SINGLE = ("each, with rates", "more actuators, direction", "priority", "orders 1, 3 and 2")
+SINGLE = (
+    "each, with rates",
+    "safe sets, rates",
+    "more actuators, direction",
+    "priority",
+    "orders 1, 3 and 2",
+)
 
 
 def outcome(folder: Path, *arguments: str) -> tuple[int, str]:
@@ -108,7 +125,7 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
 def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
     """Held values, limits of magnitude and rate, a brake, and learners that learn."""
     axes = ROWS["each, with rates"]()
-    found = golden_vectors_of_axes(axes, parts_of_axes(axes, False), ("set_held",))
+    found = golden_vectors(axes, c_source(axes))
     flags = ql.Status(int(np.bitwise_or.reduce([row.status for row in found.rows])))
     held = ql.Status.MEASUREMENT_HELD | ql.Status.REFERENCE_HELD | ql.Status.CONTROL_HELD
     assert held | ql.Status.SATURATED | ql.Status.RATE_LIMITED | ql.Status.HELD in flags
@@ -118,6 +135,16 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
         theta = found.estimate[at : at + width][-len(axis.features) :]
         assert np.any(theta != 0.0)
         at += width
+
+
+def test_the_run_of_the_golden_vectors_has_bands_that_are_kept_and_left() -> None:
+    """Samples in which the safe sets act and all is well, and some where the limits are too narrow."""
+    axes = ROWS["safe sets, more actuators, direction"]()
+    rows = golden_vectors(axes, c_source(axes)).rows
+    flags = [ql.Status(row.status) for row in rows]
+    acted = [each for each in flags if ql.Status.SAFE_SET_ACTED in each]
+    assert any(ql.Status.UNSAFE in each for each in acted)
+    assert any(ql.Status.UNSAFE not in each for each in acted)
 
 
 @needs_gcc
@@ -184,7 +211,7 @@ class TestMemory:
     def test_images_of_python_and_c_are_the_same_bytes(self, tmp_path: Path) -> None:
         """And each continues the loop of the other, bit by bit."""
         axes = learning()
-        robot = RobotInC(source_of_axes(axes, "robot"), tmp_path)
+        robot = RobotInC(c_source(axes, "robot"), tmp_path)
         for k in range(100):
             r, y = np.array([0.3, 0.1 * np.sin(0.1 * k)]), np.array([1e-3 * k, 0.05])
             u = np.zeros(2)
@@ -193,7 +220,7 @@ class TestMemory:
             assert np.array_equal(robot.step(r, y, 2), u)
         image = axes.memory()
         assert robot.image(len(image)) == image
-        other, twin = RobotInC(source_of_axes(learning(), "robot"), tmp_path), learning()
+        other, twin = RobotInC(c_source(learning(), "robot"), tmp_path), learning()
         length = ctypes.c_size_t(len(image))
         assert other.call("load", ctypes.c_bool, image, length, ctypes.c_bool(True))
         twin.restore(image, running=True)
@@ -218,7 +245,7 @@ class TestMemory:
     def test_exports_begin_with_what_was_learned(self) -> None:
         """The coefficients are in the state before the first sample."""
         axes = taught(learning())
-        state = parts_of_axes(axes, False).state
+        state = parts_of(axes).state
         assert np.array_equal(state.axes.axis.learner.theta, axes.axes[0]._state.learner.theta)
         assert np.any(state.axes.axis.learner.theta != 0.0)
 
@@ -267,7 +294,7 @@ class TestMemory:
         with pytest.raises(ValueError, match="axis tool: .*learner is a Python object"):
             axes.memory()
         with pytest.raises(TranslationError, match="calls Python at each sample"):
-            source_of_axes(axes)
+            c_source(axes)
 
 
 class TestOperationsInC:
@@ -276,9 +303,7 @@ class TestOperationsInC:
     @needs_gcc
     def test_a_start_holds_the_machine(self, tmp_path: Path) -> None:
         """The next u is that of the start, as in Python; what is no number changes nothing."""
-        robot = RobotInC(
-            source_of_axes(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path
-        )
+        robot = RobotInC(c_source(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path)
         y, u = np.array([0.3, -0.2]), np.array([1.5, 0.7])
         robot.call("start", None, y, u, y)
         np.testing.assert_allclose(robot.step(y, y, 2), u, rtol=1e-9)
@@ -289,9 +314,7 @@ class TestOperationsInC:
     @needs_gcc
     def test_manual_operation_ends_without_a_bump(self, tmp_path: Path) -> None:
         """``hand_over`` needs a sample, and then u continues."""
-        robot = RobotInC(
-            source_of_axes(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path
-        )
+        robot = RobotInC(c_source(ql.Axes([joint(), joint()], [[1, 0.3], [0.2, 1]])), tmp_path)
         assert not robot.call("hand_over", ctypes.c_bool)
         r, y, u = np.zeros(2), np.array([0.2, 0.1]), np.array([0.7, -0.3])
         for _ in range(50):
@@ -302,7 +325,7 @@ class TestOperationsInC:
     @needs_gcc
     def test_one_axis_is_held_by_its_place(self, tmp_path: Path) -> None:
         """A place that no axis has changes nothing."""
-        robot = RobotInC(source_of_axes(ql.Axes([joint(), joint()])), tmp_path)
+        robot = RobotInC(c_source(ql.Axes([joint(), joint()])), tmp_path)
         for place, flag in ((5, 0), (1, int(ql.Status.HELD))):
             robot.call("set_held", None, ctypes.c_int(place), ctypes.c_bool(True))
             robot.step([0.1, 0.1], [0.0, 0.0], 2)
@@ -312,7 +335,7 @@ class TestOperationsInC:
     def test_the_estimate_has_each_axis_by_name(self, tmp_path: Path) -> None:
         """Members of the struct are those of the estimates in Python."""
         axes = ql.Axes({"x": joint(), "y-2": joint()}, [[1, 0.3], [0.2, 1]])
-        source = source_of_axes(axes, "robot")
+        source = c_source(axes, "robot")
         more = (
             "double shown(robot_state *state, int i);\n"
             "double shown(robot_state *state, int i)\n{\n"
@@ -340,7 +363,6 @@ def test_names_of_axes_become_names_in_c() -> None:
 
 
 REFUSED: tuple[tuple[dict[str, Any], str], ...] = (
-    ({"proof": True}, "the proof is of controllers with one u and one y, these are 2 axes"),
     ({"resolution": 1e-4}, "several axes take y in its unit"),
     ({"precision": "single"}, "NOT compared with double precision"),
     ({"plant": ql.plants.two_mass_spring()}, "plant, scenario: the comparison"),

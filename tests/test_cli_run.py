@@ -200,11 +200,11 @@ def test_all_exit_codes_are_in_one_table_that_help_shows(quell: Callable[..., Sh
     codes = {code.name: code.value for code in ExitCode}
     assert codes == {
         "DONE": 0, "INTERNAL": 1, "ERROR": 2, "ENDED_BY_SAFETY": 3, "DIVERGED": 4, "NOT_PROVED": 5,
-        "ALARM": 6, "INTERRUPTED": 130, "TERMINATED": 143,
+        "ALARM": 6, "BROKEN": 7, "INTERRUPTED": 130, "TERMINATED": 143,
     }  # fmt: skip
     told = " ".join(quell("--help").out.split())
     assert all(f"{code.value} {code.about}" in told for code in ExitCode)
-    for command in ("run", "compare", "run-rig", "watch"):
+    for command in ("run", "compare", "run-rig", "watch", "doctor"):
         assert "exit code" in quell(command, "--help").out
 
 
@@ -440,4 +440,4 @@ def test_an_extra_that_is_not_installed_is_named_in_a_line(
     assert tried.code == 2
     assert tried.err.startswith("quell: a serial line needs serial, which")
     assert tried.err.count("\n") == 1
-    assert "quell[serial]" in tried.err
+    assert "quell-control[serial]" in tried.err

@@ -114,7 +114,7 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
 
 def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
     """Held values, both limits, u beside manual operation, and a continuation without a jump."""
-    vectors = golden_vectors(ADRC, ("track", "start", "set_held"))
+    vectors = golden_vectors(ADRC, ql.export.c_source(ADRC))
     flags = Status(int(np.bitwise_or.reduce([row.status for row in vectors.rows])))
     held = Status.MEASUREMENT_HELD | Status.REFERENCE_HELD
     u = Status.SATURATED | Status.RATE_LIMITED | Status.CONTROL_HELD
@@ -246,7 +246,8 @@ def test_the_folder_has_all_files_and_no_placeholder(tmp_path: Path) -> None:
     found = {str(p.relative_to(result.folder)) for p in result.folder.rglob("*") if p.is_file()}
     assert names == found == {
         "src/servo.h", "src/servo.c", "test_servo.c", "CMakeLists.txt", "README.md",
-        "library.properties", "library.json", "examples/servo/servo.ino",
+        "library.properties", "library.json", "idf_component.yml", "keywords.txt", "LICENSE",
+        "examples/servo/servo.ino",
     }  # fmt: skip
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     for path in result.files:

@@ -341,7 +341,7 @@ def test_exported_detection_is_the_same_bit_for_bit(
             action = Action.HELD if k == 1800 else Action.RELEASED
             set_held(code.state, ctypes.c_bool(k == 1800))
         r = float(1 + k // 600)
-        u = player.play(action, r, y)
+        u = float(player.play(action, r, y)[0])
         assert code.run("step", r, y) == u
         before, v = v, 0.0 if held else v + 2e-3 * 50.0 * u
         x += 0.0 if held else 1e-3 * (before + v)

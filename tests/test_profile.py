@@ -249,7 +249,7 @@ def test_exported_moves_are_the_same_bit_for_bit(tmp_path: Path, precision: str)
             assert code.run("stopping_point") == r
         wanted = np.nan if k % 97 == 5 else r
         y = float(np.float32(0.01 * random.standard_normal()))
-        assert code.run("step", wanted, y) == player.play(Action.STEP, wanted, y)
+        assert code.run("step", wanted, y) == player.play(Action.STEP, wanted, y)[0]
 
 
 def test_only_a_generator_plans_a_stop() -> None:

@@ -66,6 +66,21 @@ def test_a_setup_is_made_again_of_its_tables() -> None:
         assert repr(written.controller) == repr(setup.controller)
 
 
+def test_an_axis_has_a_safe_set() -> None:
+    """A table in its controller, with weights of the actuators beside it."""
+    data = gantry()
+    bands = {"y_min": -0.5, "y_max": 0.5, "alpha": 6.0, "gain_error": 0.01, "largest_u": 150.0}
+    data["axis"][0]["controller"]["safe_set"] = bands
+    data["axes"]["weights"] = [1.0, 2.0]
+    found = made_axes("a.toml", data).controller
+    assert found.axes[0].safe_set == ql.SafeSet(**bands)
+    assert found.axes[1].safe_set is None
+    assert found.parameters.safe.weights.tolist() == [1.0, 2.0]
+    del data["axis"][0]["controller"]["safe_set"]
+    with pytest.raises(SetupError, match="weights = .*leave them out"):
+        made_axes("a.toml", data)
+
+
 def test_b0_of_the_plant_is_that_of_each_kind() -> None:
     """Of an arm M(q) in place of it, also behind encoders; of a craft that near the horizontal; of a linear plant C A B."""
     linear = made_axes("a.toml", gantry()).controller
@@ -212,3 +227,58 @@ def test_the_command_simulates_several_axes(quell: Callable[..., Shown], tmp_pat
     late = quell("run", "late.toml")
     assert late.code == 2
     assert "metrics[0].start = 0.7: must be less than the scenario's duration" in late.err
+
+
+ALL_AXES = {"kind": "all-axes", "features": ["state", {"kind": "polynomial", "degree": 2}]}
+LEARNS = {"kind": "rls", "features": [ALL_AXES, "bias"]}
+
+
+def test_learners_of_all_axes_are_those_in_python() -> None:
+    """One in ``[axes]`` for all, or one in each ``[[axis]]``; with guards."""
+    features = ql.features.AllAxes(ql.features.State() + ql.features.Polynomial(2))
+    learner = ql.learners.RLS(features + ql.features.Bias())
+    tables = gantry()
+    parts = {"learner": learner, "guard": ql.Guard(bound=5.0)}
+    shared = gantry(axes=tables["axes"] | {"learner": LEARNS, "guard": {"bound": 5.0}})
+    axis = [each | {"learner": LEARNS, "guard": {"bound": 5.0}} for each in tables["axis"]]
+    for data, given in (
+        (shared, parts),
+        (gantry(axis=axis), {k: [v, v] for k, v in parts.items()}),
+    ):
+        setup = made_axes("gantry.toml", data)
+        plain = made_axes("gantry.toml", gantry()).controller
+        expected = ql.Axes(
+            dict(zip(plain.names, plain.axes, strict=True)),
+            plain.B0, u_min=plain.limits.low, u_max=plain.limits.high, **given,
+        )  # fmt: skip
+        found = setup.controller
+        assert [repr(each) for each in found.axes] == [repr(each) for each in expected.axes]
+        assert found.memory() == expected.memory()
+        again = made_axes("gantry.toml", tomllib.loads(toml_text(setup.tables(), "again")))
+        assert repr(again.controller) == repr(found)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"learner": "rls"}, r"axes.learner.*has no features of all axes"),
+        ({"guard": {}}, "axes.guard.*has no effect"),
+        ({"learner": LEARNS | {"strongest": 3}}, "axes.*decide by the error of one"),
+    ],
+)
+def test_a_learner_of_axes_that_does_not_fit_is_named(change: Any, message: str) -> None:
+    """With the table that has it."""
+    with pytest.raises(SetupError, match=message):
+        made_axes("a.toml", gantry(axes=gantry()["axes"] | change))
+
+
+def test_features_of_all_axes_need_axes() -> None:
+    """In a setup of one axis they are refused."""
+    data = {
+        "dt": 1e-3,
+        "observer": {"kind": "model-free", "order": 2, "omega_o": 60.0, "b0": 1.0},
+        "controller": {"omega_c": 8.0},
+        "learner": LEARNS,
+    }
+    with pytest.raises(SetupError, match="give the learner to quell.Axes"):
+        made("one.toml", data)

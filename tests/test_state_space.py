@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import quell as ql
 from quell.controllers import StateFeedback, quadratic_feedback, state_feedback
+from quell.controllers.axes import control_all
+from quell.kernels.dispatch import as_python
+
+from .in_c import InC, built, needs_gcc
 
 JM, JL, K, C, DT = 1.2e-4, 0.8e-4, 60.0, 0.005, 0.25e-3
 A = np.array(
@@ -130,6 +137,58 @@ class TestOperation:
             assert law.step([0.05], [y])[0] == pytest.approx(adrc.step(0.05, y), rel=2e-3, abs=2e-3)
 
 
+class TestC:
+    """The same law in C; ``tests/contracts`` has each option of law and observer."""
+
+    @needs_gcc
+    @pytest.mark.parametrize("precision", ["double", "single"])
+    def test_the_c_code_repeats_the_kernels_bit_for_bit(
+        self, tmp_path: Path, precision: str
+    ) -> None:
+        """With a covariance in each sample, sensors that are missing, limits, and a restart."""
+        given = controller(u_min=-0.5, u_max=0.5, rate_limit=2000.0)
+        ql.export.c(given, tmp_path / "out", name="servo", precision=precision, accept=True)
+        sources = (tmp_path / "out/test_servo.c", tmp_path / "out/src/servo.c")
+        program = built(tmp_path / "test", sources, "-O2", "-I", tmp_path / "out/src")
+        done = subprocess.run([program, "0"], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout
+        assert "largest difference 0 ulp" in done.stdout
+
+    @needs_gcc
+    def test_a_run_with_missing_encoders_is_that_of_python(self, tmp_path: Path) -> None:
+        """In a loop in which each encoder is away for a while, and an image is handed over."""
+        law, names = controller(u_max=0.5), ("r", "y", "u")
+        code = InC(ql.export.c_source(law, "servo"), tmp_path)
+        plant, x, random = (
+            drive().sampled(DT, interpret=True),
+            np.zeros(4),
+            np.random.default_rng(1),
+        )
+        with np.errstate(all="ignore"), as_python():
+            for k in range(1200):
+                y = ENCODERS @ x + 1e-6 * random.standard_normal(2)
+                y[0] = np.nan if 300 < k < 330 or k < 2 else y[0]
+                y[1] = np.nan if 600 < k < 900 else y[1]
+                u, in_c = (
+                    np.zeros(1),
+                    dict(zip(names, (np.array([0.3]), y, np.zeros(1)), strict=True)),
+                )
+                control_all(law.parameters, law._state, in_c["r"], y, u)
+                code.run("step", *in_c.values())
+                assert in_c["u"][0] == u[0]
+                x = plant.transition @ x + plant.input @ u
+        assert x[2] == pytest.approx(0.3, abs=1e-4)
+        image, other = law.memory(), controller(u_max=0.5)
+        other.restore(image, running=True)
+        assert np.array_equal(other._state.estimates, law._state.estimates)
+
+    def test_a_start_keeps_references_for_steps_without_them(self) -> None:
+        """As the r of ``NAME_start`` in C."""
+        law = controller()
+        law.start([0.2, 0.2], [0.0], [0.2])
+        assert law.step([np.nan], [0.2, 0.2])[0] == pytest.approx(0.0, abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -143,10 +202,8 @@ class TestOperation:
         (lambda: controller(u_min=1.0, u_max=-1.0), "actuator 1: u_min"),
         (lambda: ql.simulate(drive(), controller(), ql.Scenario((1.0, 2.0))),
          "reference has 2 signals"),
-        (lambda: controller().memory(), "learns nothing"),
-        (lambda: ql.export.c_source(controller()), "NOT written as C yet"),
-        (lambda: ql.export.c(controller(), "firmware"), "NOT written as C yet"),
-        (lambda: ql.export.fmu(controller(), "law.fmu"), "NOT written as C yet"),
+        (lambda: ql.export.c_source(controller(), resolution=1e-6), "StateFeedback takes y in its"),
+        (lambda: ql.export.c(controller(), "firmware", precision="single"), "NOT compared"),
         (lambda: ql.controllers.in_single_precision(controller()), "double precision only"),
         (lambda: ql.analysis.analyse(drive(), controller()), "1 inputs and 2 outputs, here there is one of each; several: quell.plants"),
     ],

@@ -228,7 +228,7 @@ def test_friction_in_a_record_of_speed_acts_against_motion(b: float, tmp_path: P
     model = ql.identification.simulated_plant(found).sampled(0.02)
     assert model.force == pytest.approx(np.copysign(found.friction, b))
     write_json(tmp_path / "model.json", found.to_json())
-    plant: Any = identified(tmp_path / "model.json", 0.02)
+    plant: Any = identified(tmp_path / "model.json", dt=0.02)
     still, moving = (speed_under(plant, force) for force in (0.2, 1.3))
     assert abs(still) < 0.05 * abs(moving)
     assert moving == pytest.approx(0.5 * b * (1.3 - 0.3), rel=0.05)

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.analysis import analyse
+from quell.analysis import analyse, analyse_axes
 from quell.kernels.cache import compile_time
-from quell.setup import load, made
+from quell.setup import load, made, made_axes
 from quell.setup.loading import changed
 from quell.studio import messages, separate
 from quell.studio.messages import Columns, frame, parsed_frame
@@ -29,7 +29,7 @@ from quell.studio.runs import Maker, StoppedError, loop_of, python_of, toml_of
 from quell.studio.server import FIRST_REQUEST, MOST_CONNECTIONS
 from quell.studio.tasks import frames_for, varied
 
-from .studio_server import TABLES, Client, running
+from .studio_server import AXES, TABLES, Client, running
 
 PAGE = Path(ql.__file__).parent / "studio" / "page"
 
@@ -379,7 +379,7 @@ def test_presets_and_tours_are_setups_that_can_be_built() -> None:
     tours = json.loads((PAGE / "tours.json").read_text(encoding="utf-8"))
     assert len(tours) == 6
     for preset in presets:
-        made(preset["name"], messages.checked(preset["setup"]))
+        Maker(preset["name"])(messages.checked(preset["setup"]))
     for tour in tours:
         tables = presets[tour["preset"]]["setup"]
         for step in tour["steps"]:
@@ -426,3 +426,90 @@ def test_tuning_uses_the_noise_of_y_and_keeps_the_feedforward(client: Client) ->
     assert found["coefficients"] == pytest.approx([0.0, 4.0 / 50.0, 1.0 / 50.0])
     without = client.ask("tuned", **task | {"structure": "pid"})["tuned"][0]
     assert "feedforward" not in without["setup"]["controller"]
+
+
+def test_tuning_sends_the_runs_of_before_and_after(client: Client) -> None:
+    """Run and loop of the setup as it was, and of the tuned one; the tuned one is not applied."""
+    number = client.send(do="tune", structure="pi", setup=TABLES)
+    frames: list[dict[str, Any]] = []
+    while not frames or frames[-1]["kind"] not in ("done", "error"):
+        frames += [header for header in (client.next()[0],) if header.get("id") == number]
+    parts = [(each["pin"], each["kind"]) for each in frames if "pin" in each]
+    assert parts == [
+        ("before tuning", "run"),
+        ("before tuning", "loop"),
+        ("tuned", "run"),
+        ("tuned", "loop"),
+    ]
+    tuned = next(each for each in frames if each["kind"] == "tuned")
+    assert "--" not in tuned["noise_bound"]
+    loops = [each["loop"]["m_s"] for each in frames if each["kind"] == "loop"]
+    assert loops[1] == pytest.approx(1.6, rel=2e-3)  # the default bound, which is active
+
+
+def test_an_identified_model_is_opened_with_its_file(client: Client, tmp_path: Path) -> None:
+    """Its numbers stand in place of the path, also inside of a delay; friction keeps its width."""
+    model = {"num": [50.0], "den": [1.0, 3.0, 0.0], "delay": 0.01, "friction": 0.1}
+    table = {"kind": "identified", "path": "results\\model.json"}
+    text = toml_of(TABLES | {"plant": {"kind": "encoded", "counts": 4096, "plant": table}})
+    (reason,) = client.ask("opened", do="open", text=text)["error"][0]["text"]
+    assert "open the setup and model.json together" in reason
+    full = model | {"friction_width": 0.05}
+    for content in (model, full):
+        files = {"model.json": json.dumps({"model": content})}
+        opened = client.ask("opened", do="open", text=text, models=files)["opened"][0]["setup"]
+        width = {"friction_width"} <= content.keys()
+        wanted = full if width else {key: model[key] for key in ("num", "den", "delay")}
+        assert opened["plant"]["plant"] == {"kind": "identified"} | wanted
+        assert "run" in client.ask("loop", do="run", setup=opened)
+    for wrong, words in (
+        ({"model.json": "{}"}, "has no model"),
+        ({"model.json": "[1"}, "must be a file of results in JSON"),
+        ({"model.json": 3}, "models: must be texts"),
+        (["model.json"], "models: must be texts"),
+    ):
+        (reason,) = client.ask("opened", do="open", text=text, models=wrong)["error"][0]["text"]
+        assert words in reason
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(full))
+    read = messages.with_models({"plant": {"kind": "identified", "path": str(path)}})
+    assert read["plant"] == {"kind": "identified"} | full
+    with pytest.raises(ValueError, match="can't be read"):
+        messages.with_models({"plant": {"kind": "identified", "path": str(path) + "x"}})
+
+
+def test_of_several_axes_one_is_shown_with_all_actuators(client: Client) -> None:
+    """Its curves are those of ``simulate``, its margins those of its channel; tuning says NOT."""
+    setup = made_axes("two", AXES)
+    run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    loop = analyse_axes(setup.plant, setup.controller)
+    for i, name in enumerate(setup.controller.names):
+        found = client.ask("loop", do="run", setup=AXES, axis=i)
+        header, arrays, _ = found["run"]
+        assert header["axes"] == ["left", "right"]
+        assert "u" not in arrays
+        cut = Columns(len(run), 600)
+        np.testing.assert_allclose(arrays["y"], cut.points(run["y"][:, i]), rtol=1e-6)
+        np.testing.assert_allclose(arrays["u_2"], cut.points(run["u"][:, 1]), rtol=1e-6)
+        numbers = found["loop"][0]["loop"]
+        assert numbers["m_s"] == pytest.approx(1.0 / loop.channel_margins(name).modulus)
+        assert numbers["gains_at_once"] == pytest.approx(list(loop.disk_margin("inputs").gain))
+        S = found["loop"][1]["S"]
+        assert 20.0 * np.log10(numbers["m_s"]) == pytest.approx(S.max(), abs=0.05)
+    for task, last in (("tune", "done"), ("compare", "done"), ("band", "band")):
+        (reason,) = client.ask(last, do=task, setup=AXES)["error"][0]["text"]
+        assert reason.startswith("NOT for several axes: ")
+    (reason,) = client.ask("loop", do="run", setup=AXES, axis=2)["error"][0]["text"]
+    assert reason == "axis = 2: must be a whole number from 0 to 1"
+
+
+def test_texts_and_c_of_several_axes_are_those_of_the_setup(client: Client) -> None:
+    """The TOML opens again as it was, the script runs, and the archive has the C files."""
+    texts = client.ask("texts", do="toml", setup=AXES)["texts"][0]
+    assert client.ask("opened", do="open", text=texts["toml"])["opened"][0]["setup"] == AXES
+    names: dict[str, Any] = {}
+    exec(compile(texts["python"].replace("plt.show()", ""), "script", "exec"), names)
+    assert names["run"].axis_names == ("left", "right")
+    content = client.ask("file", do="export", to="c", setup=AXES)["file"][2]
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        assert "controller/src/controller.c" in archive.namelist()

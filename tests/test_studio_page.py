@@ -16,7 +16,7 @@ from quell.realtime import LiveSink
 from quell.realtime.recordings import LOOP_WIDTH, Header, K, R, U, Y, row_channels
 from quell.studio.runs import toml_of
 
-from .studio_server import TABLES, Client, running, step_test
+from .studio_server import AXES, TABLES, Client, running, step_test
 
 CHROMIUM = Path("/usr/bin/chromium")
 OPTIONS = [
@@ -146,7 +146,7 @@ def test_exported_files_are_those_of_the_server(page: Any, url: str) -> None:
 
 def test_a_wrong_value_is_explained_and_the_next_one_works(page: Any) -> None:
     """The message names the key."""
-    box = page.locator('input[type=number][data-path="observer.omega_o"]')
+    box = page.locator('input[type=text][data-path="observer.omega_o"]')
     box.fill("-5")
     wait_for(lambda: "omega_o" in page.inner_text("#message"))
     frames = page.evaluate("window.studio.picture.frames")
@@ -197,14 +197,152 @@ def test_the_watch_tab_shows_a_running_loop(page: Any) -> None:
         sink.close()
 
 
+def finished(page: Any) -> bool:
+    """Return whether the page has drawn what it was asked for."""
+    return not page.evaluate("window.studio.busy()") and page.is_hidden("#message")
+
+
 def test_tours_set_the_sliders(page: Any) -> None:
     """Each next step changes the design, and says what to look at."""
     page.click("#tab-learn")
     page.locator("#tours button").nth(1).click()
     page.click("#tour-next")
-    wait_for(lambda: page.input_value('input[type=number][data-path="observer.omega_o"]') == "15")
+    wait_for(lambda: page.input_value('input[type=text][data-path="observer.omega_o"]') == "15")
     assert "pinned" in page.inner_text("#tour-text")
     assert page.locator(".pin").count() == 1
+
+
+@pytest.mark.slow
+def test_all_tours_run_through_all_their_steps(page: Any) -> None:
+    """Without an error, which would leave the curves pale, and with the curves of the pins."""
+    page.click("#tab-learn")
+    for tour in range(page.locator("#tours button").count()):
+        page.locator("#tours button").nth(tour).click()
+        steps = int(page.inner_text("#tour-step").split(" of ")[1])
+        for step in range(steps):
+            assert page.inner_text("#tour-step") == f"{step + 1} of {steps}"
+            wait_for(lambda: not page.evaluate("window.studio.busy()"), 120.0)
+            wait_for(lambda: page.evaluate("window.studio.pins().every((pin) => pin.arrays?.t)"))
+            assert page.get_attribute("#plots", "class") != "old"
+            assert len(page.inner_text("#tour-text")) > 40
+            page.click("#tour-next")
+        assert page.is_hidden("#tour")
+
+
+def test_pins_are_at_most_five_and_go_back_to_their_designs(page: Any) -> None:
+    """Each has a colour of its own; a click goes back; one that is removed is undone."""
+    before = page.locator(OMEGA_O).get_attribute("aria-valuetext")
+    page.click("#pin")
+    for _ in range(6):
+        slide(page, "ArrowRight", 1)
+        page.click("#pin")
+    assert page.locator(".pin").count() == 5
+    colours = page.evaluate(
+        "[...document.querySelectorAll('.pin .swatch')].map((e) => getComputedStyle(e).borderTopColor)"
+    )
+    assert len(set(colours)) == 5
+    first = page.evaluate("window.studio.pins()[0].setup.observer.omega_o")
+    page.locator(".pin button").first.click()
+    wait_for(lambda: page.locator(OMEGA_O).get_attribute("aria-valuetext") == f"{first:g}")
+    assert before != f"{first:g}"
+    page.locator(".pin button").nth(1).click()
+    assert page.locator(".pin").count() == 4
+    wait_for(lambda: page.evaluate("window.studio.saved()"))
+    page.click("#undo")
+    wait_for(lambda: page.locator(".pin").count() == 5)
+
+
+def test_a_text_that_is_no_number_says_why(page: Any) -> None:
+    """By the field, for screen readers too; the loop keeps what it had; the next text works."""
+    omega_o = page.locator('input[type=text][data-path="observer.omega_o"]')
+    den = page.locator('input[type=text][data-path="plant.den"]')
+    order = page.locator('input[type=text][data-path="observer.order"]')
+    for box, text, reason in (
+        (omega_o, "50,0", "50,0: write a decimal point, 50.0"),
+        (omega_o, "fast", "fast is no number"),
+        (order, "1.5", "1.5: must be a whole number"),
+        (den, "[50, foo]", "foo is no number"),
+        (den, "50,0", "a list has brackets, [50, 0]"),
+        (den, "[1, 4, 0", "a bracket ] is missing"),
+        (den, "1, 4, 0", "a list has brackets, [1, 4, 0]"),
+    ):
+        was = box.input_value()
+        box.fill(text)
+        assert reason in page.inner_text(".reason")
+        assert box.get_attribute("aria-invalid") == "true"
+        assert box.get_attribute("aria-describedby") == page.locator(".reason").get_attribute("id")
+        box.fill(was)
+        assert page.locator(".reason").count() == 0
+    assert page.is_hidden("#message")
+    page.click("#tune-box summary")
+    page.fill("#tune-ms", "9")
+    page.click("#tune")
+    assert "9: must be from 1.05 to 5" in page.inner_text(".reason")
+    assert not page.is_disabled("#tune")
+
+
+def test_sliders_are_reached_in_few_tabs_and_by_arrow_keys(page: Any) -> None:
+    """A group has one slider for Tab, Up and Down go on; titles and buttons likewise."""
+    focused = "(e => e.dataset.path ? e.type + ' ' + e.dataset.path : e.id)(document.activeElement)"
+    page.locator("#tab-design").focus()
+    page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "open"
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(focused) == "save"
+    page.locator("#forms .group > summary").first.focus()
+    for _ in range(2):
+        page.keyboard.press("ArrowDown")
+    for _ in range(2):
+        page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "range controller.omega_c"
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate(focused) == "range controller.u_min"
+    before = page.locator(":focus").get_attribute("aria-valuetext")
+    page.keyboard.press("ArrowRight")
+    assert page.locator(":focus").get_attribute("aria-valuetext") != before
+    page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "text controller.u_min"
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate(focused) == "text controller.u_max"
+
+
+def test_the_numbers_are_said_when_they_are_at_rest(page: Any) -> None:
+    """In a labelled live region; those outside of their bounds come first."""
+    region = page.locator("#said")
+    assert region.get_attribute("aria-live") == "polite"
+    assert region.get_attribute("aria-label") == "Margins and metrics in words"
+    wait_for(lambda: page.text_content("#said").startswith("All within bounds. M_s "))
+    page.locator("details:has(#bounds) > summary").click()
+    page.fill("#bound-m_s", "1.01")
+    wait_for(lambda: page.text_content("#said").startswith("Outside of bounds: M_s "))
+
+
+@pytest.mark.slow
+def test_a_tuned_controller_that_is_worse_is_shown_and_not_applied(page: Any) -> None:
+    """Before and after stand side by side; a better one is applied; another plant's result goes."""
+    omega_c = 'input[type=text][data-path="controller.omega_c"]'
+    page.click("#tune-box summary")
+    page.select_option("#tune-structure", "pi")
+    page.click("#tune")
+    wait_for(lambda: page.inner_text("#tune-verdict").startswith("NOT applied: worse in "))
+    assert page.input_value(omega_c) == "8"
+    assert page.locator("#tune-rows .worse").count() >= 2
+    assert page.locator(".pin", has_text="tuned").count() == 1
+    wait_for(lambda: page.is_enabled("#tune"))
+    light = pixels(page, "#tradeoff canvas")
+    page.click("#theme")
+    assert pixels(page, "#tradeoff canvas") != light
+    page.click("#tune-use")
+    wait_for(lambda: page.input_value('select[data-path="controller.kind"]') == "pid")
+    page.select_option("#tune-structure", "bandwidths")
+    page.click("#tune")
+    wait_for(lambda: page.inner_text("#tune-verdict").startswith("Applied"), 120.0)
+    assert page.locator("#tune-rows .worse").count() == 0
+    wait_for(lambda: page.is_enabled("#tune"), 120.0)
+    page.fill('input[type=text][data-path="plant.den"]', "[1, 5, 0]")
+    assert page.inner_text("#tune-result") == ""
+    assert page.is_hidden("#tune-compare")
+    assert page.is_hidden("#tradeoff")
 
 
 def test_all_controls_have_names_and_the_page_fits_a_phone(page: Any) -> None:
@@ -243,7 +381,7 @@ def test_a_record_that_is_opened_is_shown_and_tuned_for(page: Any) -> None:
     count = page.locator("#record-plants tr").count()
     assert page.text_content("#record-count") == f"Set of plants: {count}"
     assert page.locator("#plot-record-y canvas").count() == 1
-    wait_for(lambda: page.input_value('input[type=number][data-path="dt"]') == "0.1")
+    wait_for(lambda: page.input_value('input[type=text][data-path="dt"]') == "0.1")
     wait_for(lambda: not page.is_disabled("#record-go"))
     page.click("#tune-box summary")
     page.select_option("#tune-structure", "pi")
@@ -265,4 +403,37 @@ def test_a_file_that_is_dropped_is_read_or_refused(page: Any) -> None:
     wait_for(lambda: "the field Columns" in page.inner_text("#record-state"))
     assert page.is_hidden("#record")
     drop(page, ("setup.toml", toml_of(TABLES | {"dt": 0.004}).encode()))
-    wait_for(lambda: page.input_value('input[type=number][data-path="dt"]') == "0.004")
+    wait_for(lambda: page.input_value('input[type=text][data-path="dt"]') == "0.004")
+
+
+def test_a_setup_with_an_identified_model_is_opened_with_its_file(page: Any) -> None:
+    """Alone it names the file; together the form has the numbers of the model."""
+    plant = {"kind": "identified", "path": "results/model.json"}
+    setup = ("setup.toml", toml_of(TABLES | {"plant": plant}).encode())
+    drop(page, setup)
+    wait_for(lambda: "open the setup and model.json together" in page.inner_text("#message"))
+    drop(page, setup, ("model.json", b'{"num": [50.0], "den": [1.0, 3.0, 0.0], "delay": 0.01}'))
+    den = 'input[type=text][data-path="plant.den"]'
+    wait_for(lambda: page.locator(den).count() and page.input_value(den) == "[1,3,0]")
+    assert page.input_value('select[data-path="plant.kind"]') == "identified"
+    wait_for(lambda: finished(page))
+
+
+def test_of_several_axes_one_is_chosen_and_each_has_its_sliders(page: Any) -> None:
+    """A pin's curves are those of the axis that is shown."""
+    drop(page, ("axes.toml", toml_of(AXES).encode()))
+    wait_for(lambda: page.is_visible("#axes"))
+    wait_for(lambda: finished(page))
+    assert page.locator("#axis option").all_inner_texts() == ["left", "right"]
+    left = curve(page, "y")
+    assert left.max() > 0.5
+    page.click("#pin")
+    page.select_option("#axis", index=1)
+    wait_for(lambda: finished(page) and np.abs(curve(page, "y")).max() < 0.3)
+    wait_for(lambda: page.evaluate("window.studio.pins()[0].arrays?.y?.length > 0"))
+    pinned = np.array(page.evaluate("Array.from(window.studio.pins()[0].arrays.y)"))
+    assert np.array_equal(pinned, curve(page, "y"))
+    page.locator('input[type=range][data-path="axis[1].observer.omega_o"]').press("PageDown")
+    wait_for(lambda: finished(page) and not np.array_equal(curve(page, "y"), pinned))
+    drop(page, ("setup.toml", toml_of(TABLES).encode()))
+    wait_for(lambda: page.is_hidden("#axes"))

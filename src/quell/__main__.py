@@ -26,9 +26,12 @@ def run() -> None:
 
     # Handlers run in the reverse order: this one after those of all modules that are imported now.
     atexit.register(end)
-    from quell.cli import main
-
     try:
+        try:
+            from quell.cli import main
+        except ImportError as error:  # of what quell needs for any command
+            print(f"quell: {error}; pip check says what is missing", file=sys.stderr)
+            sys.exit(2)
         main()
         code = 0
     except SystemExit as ending:

@@ -22,6 +22,21 @@ from quell.types import Matrix, Vector
 
 T = TypeVar("T")
 
+LARGEST = float(np.finfo(np.float64).max)
+FINITE = {"minimum": -LARGEST, "maximum": LARGEST}
+"""The rule of a finite number."""
+
+
+def broken(message: str, name: str, **rule: Any) -> ValueError:
+    """Return an error whose ``rule`` is a pair: the argument's name, and its rule in JSON Schema.
+
+    So the schema of setup files (``quell.setup.json_schema``) has the rules that arguments are
+    checked by.
+    """
+    error = ValueError(message)
+    error.__dict__["rule"] = name, rule
+    return error
+
 
 def optional(check: Callable[..., T], name: str, value: Any, *rule: Any) -> T | None:
     """Return ``check(name, value, *rule)``, or None if ``value`` is None."""
@@ -32,7 +47,7 @@ def finite(name: str, value: Any) -> float:
     """Return ``value`` as a finite float."""
     number = _number(name, value)
     if not math.isfinite(number):
-        raise ValueError(f"{name} = {value!r}: must be a finite number")
+        raise broken(f"{name} = {value!r}: must be a finite number", name, **FINITE)
     return number
 
 
@@ -44,7 +59,8 @@ def signal(name: str, value: Any) -> float:
     """Return ``value`` as a float that can be a reference, a measurement or a control signal."""
     number = finite(name, value)
     if abs(number) > LARGEST_SIGNAL:
-        raise ValueError(f"{name} = {value!r}: must be within ±{LARGEST_SIGNAL:g}")
+        limits = {"minimum": -LARGEST_SIGNAL, "maximum": LARGEST_SIGNAL}
+        raise broken(f"{name} = {value!r}: must be within ±{LARGEST_SIGNAL:g}", name, **limits)
     return number
 
 
@@ -52,7 +68,8 @@ def positive(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float above zero."""
     number, unit = _number(name, value), unit and f" [{unit}]"
     if not (math.isfinite(number) and number > 0.0):
-        raise ValueError(f"{name} = {value!r}: must be finite and greater than zero{unit}")
+        message = f"{name} = {value!r}: must be finite and greater than zero{unit}"
+        raise broken(message, name, exclusiveMinimum=0, maximum=LARGEST)
     return number
 
 
@@ -60,7 +77,8 @@ def time_constant(name: str, value: Any) -> float:
     """Return ``value`` [s] as a float above zero; it may be infinite."""
     number = _number(name, value)
     if not number > 0.0:
-        raise ValueError(f"{name} = {value!r}: must be greater than zero [s]")
+        message = f"{name} = {value!r}: must be greater than zero [s]"
+        raise broken(message, name, exclusiveMinimum=0)
     return number
 
 
@@ -68,7 +86,8 @@ def non_negative(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float of at least zero."""
     number, unit = _number(name, value), unit and f" [{unit}]"
     if not (math.isfinite(number) and number >= 0.0):
-        raise ValueError(f"{name} = {value!r}: must be finite and not negative{unit}")
+        message = f"{name} = {value!r}: must be finite and not negative{unit}"
+        raise broken(message, name, minimum=0, maximum=LARGEST)
     return number
 
 
@@ -76,7 +95,8 @@ def nonzero(name: str, value: Any, why: str) -> float:
     """Return ``value`` as a finite float other than zero; ``why`` completes the message."""
     number = finite(name, value)
     if number == 0.0:
-        raise ValueError(f"{name} = {value!r}: must not be zero, {why}")
+        rule = {**FINITE, "not": {"const": 0}}
+        raise broken(f"{name} = {value!r}: must not be zero, {why}", name, **rule)
     return number
 
 
@@ -85,14 +105,16 @@ def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
     is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_whole or value < least or (most is not None and value > most):
         range_ = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name} = {value!r}: must be a whole number {range_}")
+        rule = {"minimum": least} | ({} if most is None else {"maximum": most})
+        message = f"{name} = {value!r}: must be a whole number {range_}"
+        raise broken(message, name, type="integer", **rule)
     return int(value)
 
 
 def flag(name: str, value: Any) -> bool:
     """Return ``value`` if it is True or False."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} = {value!r}: must be True or False")
+        raise broken(f"{name} = {value!r}: must be True or False", name, type="boolean")
     return bool(value)
 
 
@@ -134,7 +156,7 @@ def is_sequence(value: Any) -> bool:
 
 def vector(name: str, value: Any, size: int | None = None) -> Vector:
     """Return ``value`` as a finite, contiguous float vector, of ``size`` entries if given."""
-    array = _array(name, value)
+    array = numbers(name, value)
     if array.ndim == 0:
         array = array.reshape(1)
     if array.ndim != 1 or (size is not None and array.size != size):
@@ -147,7 +169,8 @@ def positive_vector(name: str, value: Any) -> Vector:
     """Return ``value`` as a vector whose entries are greater than zero."""
     array = vector(name, value)
     if not np.all(array > 0.0):
-        raise ValueError(f"{name} = {value!r}: must be positive")
+        rule = {"items": {"exclusiveMinimum": 0, "maximum": LARGEST}}
+        raise broken(f"{name} = {value!r}: must be positive", name, **rule)
     return array
 
 
@@ -155,13 +178,15 @@ def around_one(name: str, value: Any) -> tuple[float, float]:
     """Return ``value = (low, high)``, an interval of positive numbers around 1."""
     low, high = vector(name, value, 2).tolist()
     if not 0.0 < low <= 1.0 <= high:
-        raise ValueError(f"{name} = {value!r}: must be (low, high) with 0 < low <= 1 <= high")
+        message = f"{name} = {value!r}: must be (low, high) with 0 < low <= 1 <= high"
+        low_rule, high_rule = {"exclusiveMinimum": 0, "maximum": 1}, {**FINITE, "minimum": 1}
+        raise broken(message, name, items=[low_rule, high_rule])
     return low, high
 
 
 def matrix(name: str, value: Any, rows: int | None = None, columns: int | None = None) -> Matrix:
     """Return ``value`` as a finite, contiguous float matrix, with so many rows and columns."""
-    array = _array(name, value)
+    array = numbers(name, value)
     wanted = (rows, columns)
     if array.ndim != 2 or any(w not in (None, n) for n, w in zip(array.shape, wanted, strict=True)):
         shape = ", ".join("any" if w is None else str(w) for w in wanted)
@@ -196,7 +221,8 @@ def printable(name: str, value: str) -> str:
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     """Return ``value`` if it is one of ``choices``."""
     if value not in choices:
-        raise ValueError(f"{name} = {value!r}: must be one of {', '.join(choices)}")
+        message = f"{name} = {value!r}: must be one of {', '.join(choices)}"
+        raise broken(message, name, enum=list(choices))
     return str(value)
 
 
@@ -211,12 +237,21 @@ def _number(name: str, value: Any) -> float:
         raise ValueError(f"{name} = {value!r:.20}…: must be a number up to 1.8e308") from None
 
 
-def _array(name: str, value: Any) -> Vector:
+NUMBERS: dict[str, Any] = {"type": ["number", "array"]}
+for _ in "vector", "matrix":
+    NUMBERS = {"type": ["number", "array"], "items": NUMBERS}
+"""The rule of a number, or of numbers in lists."""
+
+
+def numbers(name: str, value: Any) -> Vector:
+    """Return ``value`` as a finite, contiguous float array."""
     try:
+        if _has_other(value):
+            raise TypeError
         array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError):
         got = type(value).__name__
-        raise ValueError(f"{name}: must be an array of numbers, got {got}") from None
+        raise broken(f"{name}: must be an array of numbers, got {got}", name, **NUMBERS) from None
     if not np.all(np.isfinite(array)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         entry = float(array[where])
@@ -224,7 +259,23 @@ def _array(name: str, value: Any) -> Vector:
     return array
 
 
+def _has_other(value: Any) -> bool:
+    """Return whether there are flags or texts among numbers, which NumPy would convert."""
+    if isinstance(value, list | tuple):
+        return any(map(_has_other, value))
+    return isinstance(value, bool | str | bytes)
+
+
 # ---- Import of packages that only extras of quell install ----
+
+
+DISTRIBUTION = "quell-control"
+"""Name of the distribution on the package index."""
+
+
+def install(extra: str = "") -> str:
+    """Return the command that installs quell, with an extra."""
+    return f"pip install '{DISTRIBUTION}[{extra}]'" if extra else f"pip install {DISTRIBUTION}"
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
@@ -233,8 +284,7 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            f"{purpose} needs {module}, which can't be imported ({error}): "
-            f"pip install 'quell[{extra}]'"
+            f"{purpose} needs {module}, which can't be imported ({error}): {install(extra)}"
         ) from error
 
 

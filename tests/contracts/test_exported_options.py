@@ -104,6 +104,21 @@ def _axis(order: int = 2, **parts: Any) -> Any:
     return ql.ADRC(ql.ESO.model_free(order=order, b0=1.0, omega_o=12.0, dt=DT), 1.5, **parts)
 
 
+_OF_ALL = ql.learners.RLS(feature_room.AllAxes(State()) + feature_room.Bias())
+
+
+def _fed_back(observer: Any) -> Any:
+    gain = room.state_feedback(observer.A, observer.B, 1.5, observer.dt)
+    return room.StateFeedback(observer, gain, controlled=_LOAD, **LIMITS)
+
+
+_LOAD = [[0.0, 0.0, 1.0, 0.0]]
+_COUPLED: dict[str, Any] = {
+    "A": [[0, 1, 0, 0], [-5, -0.1, 5, 0.1], [0, 0, 0, 1], [5, 0.1, -5, -0.1]], "B": [0, 1.5, 0, 0],
+    "C": [[1, 0, 0, 0], [0, 0, 1, 0]], "E": [0, 0, 0, 1.0], "dt": DT, "noise_variance": [1e-6, 1e-6],
+    "drift": [1.0],
+}  # fmt: skip
+_BY_POLES = {**_COUPLED, "noise_variance": None, "drift": None, "omega_o": 12.0}
 _WIDE = [[1.0, 0.3, 0.2], [0.2, 1.0, -0.3]]
 _RANGE: dict[str, Any] = {"u_min": -1.0, "u_max": 1.0, "rate_limit": Several((60.0, (-40.0, 60.0)))}
 _SCALED = {"frequency": 2.0, "scale": (1.0, 2.0, 5.0, 3.0), "bias_bandwidth": 0.2}
@@ -169,6 +184,9 @@ PARTS: dict[str, Part] = {
     "Custom": Part(feature_room.Custom, _with_features, {"function": _products, "names": ("a", "b")}, {
         "function": _squares, "names": ("c", "d"),
     }),
+    "AllAxes": Part(feature_room.AllAxes, lambda block: ql.Axes([_axis(), _axis()], learner=ql.learners.RLS(block + feature_room.Bias()), **LIMITS), {"features": State()}, {
+        "features": feature_room.Polynomial(2), "inputs": True,
+    }),
     # Observers.
     "ESO.model_free": Part(ql.ESO.model_free, _observing, _ESO, {
         **_ORDERS, "form": Several(FORMS), "half_gain": True, "poles": Several(([-1.0, -1.2, -1.5], [-1.0, (-1.5, 0.8)])),
@@ -207,13 +225,14 @@ PARTS: dict[str, Part] = {
         "compensator": ql.Compensator(OBSERVER, omega_c=1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), **LIMITS),
     }),
     "Axes": Part(ql.Axes, _itself, {"axes": [_axis(), _axis()], "u_min": -2.0, "u_max": 3.0}, {
-        "axes": Several(({"x": _axis(), "tool": _axis(3)}, [_axis(), _axis(learner=ql.learners.RLS(), guard=ql.Guard())])),
+        "axes": Several(({"x": _axis(), "tool": _axis(3)}, [_axis(), _axis(learner=ql.learners.RLS(), guard=ql.Guard())], [_axis(safe_set=ql.SafeSet(-0.9, 0.9, alpha=4.0)), _axis()])),
         "B0": Several(([[1.0, 0.3], [0.2, 1.0]], gain_functions.nested_tuples)), "M": Several(([[1.0, 0.3], [0.3, 1.0]], gain_functions.array)),
         "u_min": (-1.0, -2.0), "u_max": (1.0, 2.0), "rate_limit": Several((60.0, [60.0, (-40.0, 60.0)])), "saturation": Several(("direction", [1, 0])),
         "weights": With([1.0, 2.0, 1.0], {"B0": _WIDE}), "wished": With([0.1, 0.0, -0.1], {"B0": _WIDE}),
+        "learner": Several((_OF_ALL, [_OF_ALL, None], ql.learners.NLMS(_OF_ALL.features))), "guard": With(ql.Guard(), {"learner": _OF_ALL}),
     }),
-    "SafeSet": Part(ql.SafeSet, lambda safe: ql.ADRC(OBSERVER, 1.5, safe_set=safe, **LIMITS), {"y_max": 0.9}, {
-        "y_min": -0.9, "y_max": 0.5, "rate_min": -2.0, "rate_max": 2.0, "alpha": 5.0, "f_rate": 0.1, "noise": 1e-5, "gain_error": 0.1,
+    "SafeSet": Part(ql.SafeSet, lambda safe: ql.ADRC(OBSERVER, 1.5, safe_set=safe, **(LIMITS if safe.largest_u == np.inf else {})), {"y_max": 0.9}, {
+        "y_min": -0.9, "y_max": 0.5, "rate_min": -2.0, "rate_max": 2.0, "alpha": 5.0, "f_rate": 0.1, "noise": 1e-5, "gain_error": 0.1, "largest_u": With(2.0, {"gain_error": 0.1}),
     }),
     "HeldPlant": Part(ql.HeldPlant, lambda held: ql.ADRC(OBSERVER, 1.5, held=held, **LIMITS), {}, {"noise": 1e-5}),
     "Schedule": Part(ql.Schedule, lambda schedule: ql.ADRC(OBSERVER, 1.5, schedule=schedule, **LIMITS), {"points": (-0.5, 0.5), "signal": "reference", "b0": (0.8, 2.0)}, {
@@ -262,6 +281,19 @@ PARTS: dict[str, Part] = {
     "ResonanceRatio": Part(baseline_room.ResonanceRatio, _itself, {"omega_o": 5.0, "dt": DT, **LIMITS}, {
         "m1": 2.0, "m2": 2.0, "k": 2.0, "omega_o": 6.0, "dt": 0.02, "omega_d": 8.0, "ratio": 2.0, "measured": "motor",
     }),
+    "StateFeedback": Part(room.StateFeedback, _itself, {
+        "observer": ql.ESO.state_space(**_COUPLED), "gain": [2.0, 1.5, 1.0, 0.5], "controlled": _LOAD, **LIMITS,
+    }, {
+        "observer": ql.ESO.state_space(**_BY_POLES), "gain": Several(([1.0, 1.0, 0.5, 0.5],)), "controlled": Several(([[1.0, 0.0, 0.0, 0.0]],)),
+        "u_min": -1.0, "u_max": 1.0, "rate_limit": Several((60.0, ((-40.0, 60.0),))),
+    }),
+    "ESO.state_space": Part(ql.ESO.state_space, _fed_back, _COUPLED, {
+        "A": Several(([[0, 1, 0, 0], [-3, 0, 3, 0], [0, 0, 0, 1], [3, 0, -3, 0]],)), "B": Several(([[0, 0], [1.5, 0], [0, 0], [0, 1.0]],)),
+        "C": Several(([[1, 0, 0, 0], [0, 0, 0, 1]],)), "E": Several(([0, 1.0, 0, 0],)),
+        "dt": 0.02, "omega_o": With(10.0, {"noise_variance": None, "drift": None}), "noise_variance": Several(([1e-6, 1e-4],)), "drift": Several(([2.0],)),
+        "jitter": Several(([1e-3],)), "D": Several(([[0.0], [0.0]],)), "disturbance_order": Several((2, 3)), "form": "current", "every": Several(((1, 3),)),
+        "time_varying": False, "accept_zeros": True,
+    }),
     # Prefilters.
     "Prefiltered": Part(room.Prefiltered, _itself, {"controller": PID, "prefilter": room.ReferenceModel(3.0)}, {
         "controller": ql.ADRC(OBSERVER, 1.5, feedforward=True, **LIMITS), "prefilter": Several((baseline_room.ZV(3.0), baseline_room.ZVD(3.0, 0.1))),
@@ -274,8 +306,7 @@ PARTS: dict[str, Part] = {
     "ProfileGenerator": Part(room.ProfileGenerator, _shaped, {"v_max": 0.5, "a_max": 2.0, "j_max": 5.0}, {"v_max": 0.4, "a_max": 1.0, "j_max": 4.0}),
 }  # fmt: skip
 # Public classes that are no part of a controller: protocols and base classes, values that parts
-# return, sums of features (the rows of learners), learners that call Python and state feedback, which
-# are refused.
+# return, sums of features (the rows of learners), and learners that call Python, which are refused.
 NO_PARTS = {
     "Controller",
     "DeadTimeTuning",
@@ -290,7 +321,6 @@ NO_PARTS = {
     "PidEqual",
     "Prefilter",
     "Regulator",
-    "StateFeedback",
 }
 IN_PYTHON = {"JaxModel", "PythonModel", "RiverModel", "SklearnModel", "TorchModel"}
 # A function in C, with which Custom code is linked: ``test_export`` and ``test_plants_in_c`` have one.

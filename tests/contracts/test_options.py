@@ -78,12 +78,15 @@ BASES: dict[str, tuple[str, ...]] = {
     "watch": ("record.csv", "--window", "10", "--order", "1"),
     "rig": ("--device", "udp://127.0.0.1:0"),
     "proxy": ("proxy.toml", "--host", "udp://127.0.0.1:0"),
+    "setup": _SETUP,
     "run": (*_SETUP, *_FIGURES),
     "run-rig": (*_SETUP, *_FIGURES),
     "replay": ("recording.csv", *_SETUP, *_FIGURES),
     "sweep": (*_SETUP, *_FIGURES),
     "export": (*_SETUP, "--out", "c"),
     "studio": (*_SETUP, "--no-browser"),
+    "doctor": (),
+    "completion": ("bash",),
 }
 _RECORD = ("record.csv", *_FIGURES)
 _TWIN = (
@@ -154,6 +157,7 @@ CASES: dict[str, dict[str, Case]] = {
         "SETUP": ("slow.toml", "--host", "udp://127.0.0.1:0"), "--host": (("proxy.toml", "--host", "udp://127.0.0.1:0"), ("proxy.toml", "--host", "udp://127.0.0.2:0")), "--device": ("--device", "twin:two-mass"),
         "--watchdog": ("--watchdog", "9"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
     },
+    "setup": {"FILES": ("other.toml",), "--schema": (_SETUP, ("--schema",))},
     "run": {"SETUP": ("--no-figures",), "--example": (("--example",), _SETUP), "--save": ("--save", "run.nc")},
     "run-rig": {
         "SETUP": (_OF_SETUP, ("other.toml", *_FIGURES)), "--example": ("--example",), "--device": ("--device", "twin:torsional"), "--seconds": ("--seconds", "2"), "--omega-c": ("--omega-c", "3"),
@@ -171,6 +175,7 @@ CASES: dict[str, dict[str, Case]] = {
         "--prove": ("--prove",),
     },
     "studio": {"SETUP": (("--no-browser",), ("setup.toml", "--no-browser")), "--port": ("--port", "0"), "--browser": (_SETUP, (*_SETUP, "--no-browser"))},
+    "doctor": {}, "completion": {"SHELL": (("bash",), ("fish",))},
 }  # fmt: skip
 
 
@@ -332,7 +337,7 @@ def test_no_output_replaces_a_file(
 ) -> None:
     """Named files are looked at before the work; so the option has an effect."""
     base = [each for each in BASES[command] if each != "--no-figures"]
-    more = () if option == "--figures" or command in ("b0", "rank", "watch") else _FIGURES
+    more = () if option == "--figures" or command in ("b0", "rank", "watch", "doctor") else _FIGURES
     code, told = outcome(command, *base, *more, option, "taken.json")
     assert code != 0
     assert "taken.json" in told

@@ -89,7 +89,7 @@ def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_band
 def test_the_reference_figures_are_met(
     name: str, overshoot: float, settling: float, peak: float, variation: float
 ) -> None:
-    """docs/theory, to the digits it gives; the control variation to 2 %, as it depends on the noise's seed."""
+    """docs/claims, to the digits it gives; the control variation to 2 %, as it depends on the noise's seed."""
     found = scores(name, 1e-3, 0)
     assert found["overshoot"] == pytest.approx(overshoot, abs=0.0001)
     assert found["settling_time"] == pytest.approx(settling, abs=0.1)
@@ -98,7 +98,7 @@ def test_the_reference_figures_are_met(
 
 
 def test_without_the_reset_mf_eso_has_the_rms_error_of_the_reference() -> None:
-    """docs/theory: 0.178 m over [110, 250] s."""
+    """docs/paper: 0.178 m over [110, 250] s."""
     assert scores(study.MF, 1e-3, 0, reset=False)["rms_from_step"] == pytest.approx(
         0.178, abs=0.001
     )

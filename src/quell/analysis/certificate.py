@@ -6,8 +6,8 @@ small-gain theorem::
 
     sup |q| ≤ sup |q_0| / (1 − κΓ)  if κΓ < 1,        sup |y − y_0| ≤ Γ_y κ sup |q_0| / (1 − κΓ)
 
-q_0 and y_0 are those of the same loop, loads and noise without learner. docs/theory has the proof
-and its assumptions.
+q_0 and y_0 are those of the same loop, loads and noise without learner. docs/certificate has the
+proof and its assumptions.
 
 The error q of the plain observer in a record: what certificates are about.
 """

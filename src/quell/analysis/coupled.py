@@ -14,7 +14,7 @@ inverse ``(I − Γ K)⁻¹`` is the sum of the powers of Γ K, which is not neg
 
 For one axis this is ``analysis/certificate``. ρ < 1 is the condition of Khammash & Pearson (*IEEE
 Trans. Automatic Control* 36, 1991), which is also necessary if nothing else is known of the
-uncertain parts. docs/theory has the proof.
+uncertain parts. docs/certificate has the proof.
 """
 
 from __future__ import annotations

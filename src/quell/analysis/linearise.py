@@ -40,7 +40,7 @@ the learner is linear, and a part of the loop. ^F is the observer's own lag (``l
 H_j its response at ω_j to the sinusoid of the last sample, and c_j turns with the oscillator, which
 makes the law the same in each sample. So the bias is an integrator, and each oscillator is a
 resonance: a loop with a bias has two integrators, and its margins are those of such a loop
-(docs/theory, "Effect of the bias").
+(docs/theory_learners, "Effect of the bias").
 
 The gains γ and Γ are steady ones. Those of a Kalman filter follow from its Riccati equation for the
 features that move at rest, the constant 1 and the sinusoids, in units of the density of the noise,

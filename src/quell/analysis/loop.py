@@ -218,7 +218,7 @@ def analyse(
         design = part.parameters.learner
         if not is_known(design):
             name = type(part.learner).__name__
-            note = f"NOT in these margins: how {name} adapts; measure it (docs/analysis)"
+            note = f"NOT in these margins: how {name} adapts; measure it (docs/analysis_learners)"
     return LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note)
 
 

@@ -35,7 +35,7 @@ def loops_over_time(
 
     Each is the loop that would follow if the plant came to rest there (``analyse``). That all of
     them are stable does not prove that the loop with a learner that learns is stable
-    (docs/analysis). Raises
+    (docs/analysis_learners). Raises
     ``ValueError`` as ``frozen`` and ``analyse`` do, for a time outside of the run, and for a
     scenario in which the loop diverges before it.
 

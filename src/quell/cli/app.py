@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import sys
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 from cyclopts import App, CycloptsError
 
 from quell import __version__
 from quell.cli.compare import compare
+from quell.cli.doctor import doctor
 from quell.cli.exit_codes import HELP, ExitCode
 from quell.cli.identify import b0, excite, identify
 from quell.cli.monitor import rank, watch
 from quell.cli.reproduce import acc, torsional, two_mass
 from quell.cli.rig import proxy, replay, rig, run_rig
 from quell.cli.run import export, run, studio, sweep
+from quell.cli.setup import setup
 from quell.cli.stress import stress
 from quell.cli.tune import tune
 
@@ -39,6 +41,25 @@ reproduce = App(
 app.command(reproduce)
 for _command in (two_mass, torsional, acc):
     reproduce.command(_command)
+
+
+_completion_of = app.generate_completion
+
+
+def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
+    """Print the program with which a shell completes commands, options and files.
+
+    `quell completion bash >> ~/.bashrc`, or source it; of zsh a file `_quell` in a folder of
+    `fpath`, of fish `~/.config/fish/completions/quell.fish`.
+
+    Parameters
+    ----------
+    shell
+        The shell.
+    """
+    print(_completion_of(prog_name="quell", shell=shell), end="")
+
+
 for _each in (
     stress,
     compare,
@@ -50,12 +71,15 @@ for _each in (
     watch,
     rig,
     proxy,
+    setup,
     run,
     run_rig,
     replay,
     sweep,
     export,
     studio,
+    doctor,
+    completion,
 ):
     app.command(_each, help_format="markdown")
 

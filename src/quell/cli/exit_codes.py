@@ -27,6 +27,7 @@ class ExitCode(IntEnum):
     DIVERGED = 4
     NOT_PROVED = 5
     ALARM = 6
+    BROKEN = 7
     INTERRUPTED = 130
     TERMINATED = 143
 
@@ -57,6 +58,9 @@ _MEANINGS = {
     ),
     ExitCode.ALARM: (
         "quell watch: a number of the machine has changed, now or before; the state was written"
+    ),
+    ExitCode.BROKEN: (
+        "quell doctor: something that quell needs does not work here; a line with NOT says what"
     ),
     ExitCode.INTERRUPTED: "stopped by Ctrl-C; quell run-rig ramps u to zero before",
     ExitCode.TERMINATED: "stopped by SIGTERM",

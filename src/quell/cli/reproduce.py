@@ -121,7 +121,7 @@ def _print_claims(console: Console, result: Result) -> None:
         name = f"{claim.claim} \\[{claim.unit}]" if claim.unit else claim.claim
         claims.add_row(name, paper, claim.rule, measured, yes_or_no(claim.holds))
     console.print(claims)
-    console.print("docs/theory explains each no.\n")
+    console.print("docs/claims explains each no.\n")
 
 
 def _print_scores(console: Console, result: Result) -> None:
@@ -249,7 +249,7 @@ def _print_claims_torsional(console: Console, result: TorsionalResult) -> None:
     console.print(rows)
     console.print(
         "Overshoots that differ by a count, and settling times that differ by a sample, are "
-        "different. docs/theory explains each no.\n"
+        "different. docs/claims explains each no.\n"
     )
 
 

@@ -282,7 +282,7 @@ def _repeat(
 def export(
     setup: Path,
     *,
-    to: Literal["c", "fmu"] = "c",
+    to: Literal["c", "fmu", "ros2", "st"] = "c",
     out: Path,
     name: str | None = None,
     precision: Literal["double", "single"] = "double",
@@ -294,24 +294,25 @@ def export(
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write the controller of a setup for another machine: as C files, or as an FMU.
+    """Write the controller of a setup for another machine: C, an FMU, ROS 2, Structured Text.
 
-    The C files (C99) are a library for CMake, Arduino and PlatformIO with golden vectors and a
-    README. In single precision the scenario of the setup is simulated in both precisions before,
-    and nothing is written if they differ too much.
+    The C files (C99) are a library for CMake, Arduino, PlatformIO and ESP-IDF with golden vectors
+    and a README. In single precision the scenario of the setup is simulated in both precisions
+    before, and nothing is written if they differ too much.
 
     Parameters
     ----------
     setup
         The file, in TOML; docs/setup has all keys.
     to
-        c or fmu, which is an FMU of FMI 3.0 for co-simulation.
+        c; fmu, which is an FMU of FMI 3.0 for co-simulation; ros2, a package with a chainable
+        controller of ros2_control; or st, a function block in Structured Text for a PLC.
     out
-        The folder for the C files, or the file .fmu.
+        The folder, or the file .fmu.
     name
-        Begins all names in C; controller by default, and for an FMU the name of the file.
+        Begins all names; controller by default, and for an FMU the name of the file.
     precision
-        Of the C code: double, or single for a processor that has no double precision.
+        Of the code: double, or single for a processor that has no double precision.
     what
         Of an FMU: controller, plant or loop.
     resolution
@@ -342,7 +343,18 @@ def export(
         _to_fmu(given, what, out, name or "", overwrite)
         return
     if what != "controller":
-        raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
+        raise ValueError(f"--what = {what}: is for --to fmu; {to} is of the controller")
+    if to in ("ros2", "st"):
+        if accept or prove or resolution is not None:
+            raise ValueError(
+                f"--resolution, --accept and --prove: are for --to c, not for --to {to}"
+            )
+        controller, title = _any_controller(setup, memory, precision, trust)
+        if to == "ros2":
+            _to_ros2(controller, title, precision, out, name or "controller", overwrite)
+        else:
+            _to_st(controller, title, precision, out, name or "controller", overwrite)
+        return
     if precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
     file, data = read(setup)
@@ -401,6 +413,40 @@ def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> N
     x0 = None if what == "controller" or scenario is None else scenario.x0
     fmu(part, out, name=name, dt=dt, x0=x0, overwrite=overwrite)
     print_line(Console(), f"FMU of the {what}: {out}")
+
+
+def _any_controller(
+    setup: Path, memory: Path | None, precision: str, trust: bool
+) -> tuple[Any, str]:
+    """Return the controller of a setup, of one axis or of several, and the title of the setup."""
+    from quell.setup import made, made_axes, read
+    from quell.setup.description import is_of_axes
+
+    file, data = read(setup)
+    given = (made_axes if is_of_axes(data) else made)(file, data, trust)
+    return _learned(given.controller, memory, precision), given.title
+
+
+def _to_ros2(
+    controller: Any, title: str, precision: str, out: Path, name: str, overwrite: bool
+) -> None:
+    from quell.export import ros2
+
+    if precision != "double":
+        raise ValueError("--precision single: the interfaces of ros2_control are in double")
+    ros2(controller, out, name=name, overwrite=overwrite)
+    print_line(Console(), f"{title}: package {name} of ROS 2 Jazzy in {out}")
+    print_line(Console(), "NOT built with ROS here: run colcon build and colcon test")
+
+
+def _to_st(
+    controller: Any, title: str, precision: str, out: Path, name: str, overwrite: bool
+) -> None:
+    from quell.export import st
+
+    st(controller, out, name=name, precision=precision, overwrite=overwrite)
+    print_line(Console(), f"{title}: function block {name} in {out}/{name}.st")
+    print_line(Console(), "NOT tried on a PLC: compare a record of it with a simulated one")
 
 
 def _print(title: str, exported: Exported) -> None:
@@ -472,13 +518,14 @@ def studio(
         Open the page in the browser; otherwise only print its address.
     """
     from quell.setup import read
-    from quell.studio.messages import Granted, checked, files_of
+    from quell.studio.messages import Granted, checked, files_of, with_models
     from quell.studio.runs import Maker
     from quell.studio.server import serve
 
     tables = None
     if setup is not None:
         name, data = read(setup)
+        data = with_models(data)
         tables = checked(data, Granted(files_of(data), trust))
         tables.setdefault("title", name.removesuffix(".toml").replace("_", " "))
         Maker(name, trust)(tables)

@@ -44,6 +44,7 @@ from quell import checks
 from quell.controllers.base import Limits, RateLimit, checked_limits
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.functions import is_single, sqrt
 from quell.kernels.sized import Flag, Work
 from quell.kernels.user_functions import POINTER, call
 from quell.learners.base import meaning
@@ -62,6 +63,8 @@ _POOR, _SINGULAR = 30.0, 1e8
 # ends by itself after about as many as there are actuators. An actuator is freed if its slope is
 # above this share of what moving it through its whole range changes. Chosen by hand.
 _GAMMA, _ROUNDS, _RELEASE = 1e8, 4, 1e-12
+# The least square of a pivot of the factor, so that it is never divided by zero.
+_TINY, _TINY_SINGLE = 1e-300, 1e-30
 # A pivot below this share of the largest entry of a matrix that a function returned counts as zero.
 _LEAST_PIVOT = 1e-12
 
@@ -263,16 +266,31 @@ def set_range(limits: ActuatorLimits, before: Vector, memory: RangeMemory) -> No
 
 @kernel
 def _cut(memory: RangeMemory, limits: ActuatorLimits, i: int, wish: float) -> tuple[float, int]:
-    """Return a value of actuator i within its range, and the flag of what cut it."""
-    if wish > memory.high[i]:
+    """Return a value of actuator i within its range, and the flag of what cut it.
+
+    It is always a number: without one it is that of rest, as for one actuator.
+    """
+    value, flag = wish, 0
+    if value > memory.high[i]:
         value = memory.high[i]
-        return value, _SATURATED if value == limits.high[i] else _RATE_LIMITED
-    if wish < memory.low[i]:
+        flag = _SATURATED if value == limits.high[i] else _RATE_LIMITED
+    elif value < memory.low[i]:
         value = memory.low[i]
-        return value, _SATURATED if value == limits.low[i] else _RATE_LIMITED
-    if not is_finite(wish):
-        return min(max(0.0, memory.low[i]), memory.high[i]), _OVERFLOWED
-    return wish, 0
+        flag = _SATURATED if value == limits.low[i] else _RATE_LIMITED
+    if not is_finite(value):
+        value, flag = min(max(0.0, limits.low[i]), limits.high[i]), _OVERFLOWED
+    return value, flag
+
+
+@kernel
+def cut_to_range(limits: ActuatorLimits, before: Vector, memory: RangeMemory, u: Vector) -> int:
+    """Cut each control signal in ``u`` to its range after ``before``; return the flags."""
+    set_range(limits, before, memory)
+    flags = 0
+    for k in range(u.size):
+        u[k], cut = _cut(memory, limits, k, u[k])
+        flags |= cut
+    return flags
 
 
 @kernel
@@ -314,12 +332,8 @@ def _cut_each(
     u: Vector,
 ) -> int:
     n, m = gain.B.shape
-    set_range(limits, before, memory)
     _wish(gain, rule.wished, v, memory.rest, u)
-    flags = 0
-    for k in range(m):
-        u[k], cut = _cut(memory, limits, k, u[k])
-        flags |= cut
+    flags = cut_to_range(limits, before, memory, u)
     usable = flags & _OVERFLOWED == 0
     for i in range(n):
         usable = usable and is_finite(v[i])
@@ -360,7 +374,7 @@ def _least_squares(
         H[k, k] += rule.weights[k] / largest
     for _ in range(_ROUNDS * m):
         _slope(rule, gain, v, u, largest, slope)
-        _solve_free(H, L, slope, free, memory.step)
+        solve_free(H, L, slope, free, memory.step)
         share, end = 1.0, -1
         for k in range(m):
             step = memory.step[k]
@@ -404,7 +418,7 @@ def _slope(
 
 
 @kernel
-def _solve_free(H: Matrix, L: Matrix, slope: Vector, free: Vector, step: Vector) -> None:
+def solve_free(H: Matrix, L: Matrix, slope: Vector, free: Vector, step: Vector) -> None:
     """Write the solution of ``H step = −slope`` for the free actuators, by Cholesky; else 0."""
     m = slope.size
     for i in range(m):
@@ -423,7 +437,7 @@ def _solve_free(H: Matrix, L: Matrix, slope: Vector, free: Vector, step: Vector)
                 L[i, j] = entry / L[j, j]
                 total -= L[i, j] * step[j]
             else:
-                L[i, i] = math.sqrt(max(entry, 1.0e-300))
+                L[i, i] = sqrt(max(entry, _TINY_SINGLE if is_single(entry) else _TINY))
         step[i] = total / L[i, i]
     for i in range(m - 1, -1, -1):
         if free[i] == 0.0:
@@ -586,7 +600,14 @@ class Gain(NamedTuple):
         return GainMemory(self.first.copy(), inverse, fresh, work)
 
 
-def checked_gain(B0: Any, M: Any, weights: Any, names: Sequence[str], most: int) -> Gain:
+def checked_gain(
+    B0: Any,
+    M: Any,
+    weights: Any,
+    names: Sequence[str],
+    most: int,
+    weighs_change: bool = False,
+) -> Gain:
     """Return B0 of axes with these names, given as B0 or as its inverse M.
 
     Parameters
@@ -599,6 +620,8 @@ def checked_gain(B0: Any, M: Any, weights: Any, names: Sequence[str], most: int)
         of the n axes.
     most
         largest order of an axis.
+    weighs_change
+        whether weights have a use with as many actuators as axes, too.
 
     Raises
     ------
@@ -630,7 +653,7 @@ def checked_gain(B0: Any, M: Any, weights: Any, names: Sequence[str], most: int)
     of_actuators = np.ones(count) if weights is None else checks.vector("weights", weights, count)
     if np.any(of_actuators <= 0.0):
         raise ValueError(f"weights = {weights!r}: must be positive")
-    if weights is not None and count == n:
+    if weights is not None and count == n and not weighs_change:
         raise ValueError(
             f"weights = {weights!r}: there are as many actuators as axes, so u has no freedom for "
             "them; leave them out"

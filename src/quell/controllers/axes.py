@@ -32,6 +32,7 @@ from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.allocation import (
     ActuatorLimits,
+    Gain,
     GainMemory,
     RangeMemory,
     allocate,
@@ -42,18 +43,42 @@ from quell.controllers.allocation import (
     range_memory,
     update_gain,
 )
+from quell.controllers.axes_chain import (
+    AxisDesigns,
+    AxisStates,
+    NoAxis,
+    NoAxisMemory,
+    ask_axes,
+    continue_axes,
+    have_started,
+    reset_axes,
+    set_axes_derivatives,
+    set_axes_manual,
+    start_axes,
+    tell_axes,
+    write_axes,
+)
+from quell.controllers.axes_learning import (
+    LearningOfAxes,
+    learn_of_all,
+    look_at_all,
+    restart_of_all,
+)
 from quell.controllers.base import (
     RateLimit,
-    control,
-    is_usable,
     reset_loop,
-    set_applied_control,
     set_reference_derivatives,
     status_flags,
     write_row,
 )
-from quell.controllers.compensator import Estimate, samples_to_settle, start_at_rest
+from quell.controllers.compensator import Estimate, samples_to_settle
 from quell.controllers.memory import Layout
+from quell.controllers.safe_axes import (
+    check_safe_sets,
+    keep_in_bands,
+    safe_axes_design,
+    safe_axes_memory,
+)
 from quell.controllers.stateful import PackedController, StatefulController, unpacked
 from quell.kernels import dispatch
 from quell.kernels.dispatch import (
@@ -75,201 +100,20 @@ def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) ->
     raise TypeError
 
 
-# ---- The axes, one inside of the other, so that each may be of another kind ----
-
-
-class NoAxis(NamedTuple):
-    """The end of the axes."""
-
-
-class NoAxisMemory(NamedTuple):
-    """The end of the axes' states."""
-
-    nothing: Vector  # (0,)
-
-
-class AxisDesigns(NamedTuple):
-    """Parameters of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
-
-class AxisStates(NamedTuple):
-    """State of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
-
 @generic
-def ask_axes(axes: Any, states: Any, i: int, r: Vector, y: Vector, v: Vector, x: Matrix) -> int:
-    """Run the axes from the i-th on: write v and the estimates x; return the flags."""
-    raise TypeError
+def start_all(controller: Any, state: Any, samples: Any, y: Vector, u: Vector, r: Vector) -> None:
+    """Start at a machine that rests at y under u: the next sample continues from there.
 
-
-@generic
-def tell_axes(axes: Any, states: Any, i: int, v: Vector) -> None:
-    """Tell the axes from the i-th on what was applied."""
-    raise TypeError
-
-
-@generic
-def reset_axes(axes: Any, states: Any) -> None:
-    """Start the axes from rest at the next sample."""
-    raise TypeError
-
-
-@generic
-def write_axes(axes: Any, states: Any, widths: Any, i: int, row: Vector) -> None:
-    """Write the channels of the axes from the i-th on into ``row``; ``widths`` has their number."""
-    raise TypeError
-
-
-@generic
-def set_axes_derivatives(axes: Any, states: Any, counts: Any, i: int, values: Vector) -> None:
-    """Set the derivatives of the references of the axes from the i-th on."""
-    raise TypeError
-
-
-@generic
-def start_axes(
-    axes: Any, states: Any, samples: Any, i: int, y: Vector, v: Vector, r: Vector
-) -> None:
-    """Start the axes from the i-th on at rest; see ``start_at_rest``.
-
-    A reference that is no number is y.
+    r are the references of the next sample. What was learned is kept. The observer of each axis
+    takes as many ``samples`` (n,) as it needs to settle.
     """
     raise TypeError
 
 
 @generic
-def have_started(axes: Any, states: Any) -> bool:
-    """Return whether all axes had a measurement or a start."""
+def tell_applied(controller: Any, state: Any) -> None:
+    """Tell observers that the control signals in the state were applied."""
     raise TypeError
-
-
-@generic
-def continue_axes(axes: Any, states: Any) -> None:
-    """Let the next sample of each axis continue from what was applied."""
-    raise TypeError
-
-
-@generic
-def set_axes_manual(axes: Any, states: Any, manual: float, i: int, v: Vector) -> None:
-    """Begin or end manual operation under v of the axes from the i-th on."""
-    raise TypeError
-
-
-@ask_axes.register(NoAxis)
-def _ask_none(axes: NoAxis, states: Any, i: int, r: Any, y: Any, v: Any, x: Any) -> int:
-    return 0
-
-
-@ask_axes.register(AxisDesigns)
-def _ask(
-    axes: AxisDesigns, states: AxisStates, i: int, r: Vector, y: Vector, v: Vector, x: Matrix
-) -> int:
-    v[i] = control(axes.axis, states.axis, r[i], y[i])
-    for j in range(axes.axis.law.size):
-        x[i, j] = states.axis.estimates[j]
-    flags = status_flags(axes.axis, states.axis)
-    return flags | ask_axes(axes.others, states.others, i + 1, r, y, v, x)
-
-
-@tell_axes.register(NoAxis)
-def _tell_none(axes: NoAxis, states: Any, i: int, v: Any) -> None:
-    pass
-
-
-@tell_axes.register(AxisDesigns)
-def _tell(axes: AxisDesigns, states: AxisStates, i: int, v: Vector) -> None:
-    set_applied_control(axes.axis, states.axis, v[i])
-    tell_axes(axes.others, states.others, i + 1, v)
-
-
-@reset_axes.register(NoAxis)
-def _reset_none(axes: NoAxis, states: Any) -> None:
-    pass
-
-
-@reset_axes.register(AxisDesigns)
-def _reset(axes: AxisDesigns, states: AxisStates) -> None:
-    reset_loop(axes.axis, states.axis)
-    reset_axes(axes.others, states.others)
-
-
-@write_axes.register(NoAxis)
-def _write_none(axes: NoAxis, states: Any, widths: Any, i: int, row: Any) -> None:
-    pass
-
-
-@write_axes.register(AxisDesigns)
-def _write(axes: AxisDesigns, states: AxisStates, widths: Any, i: int, row: Vector) -> None:
-    write_row(axes.axis, states.axis, row[: widths[i]])
-    write_axes(axes.others, states.others, widths, i + 1, row[widths[i] :])
-
-
-@set_axes_derivatives.register(NoAxis)
-def _no_derivatives(axes: NoAxis, states: Any, counts: Any, i: int, values: Any) -> None:
-    pass
-
-
-@set_axes_derivatives.register(AxisDesigns)
-def _derivatives(
-    axes: AxisDesigns, states: AxisStates, counts: Any, i: int, values: Vector
-) -> None:
-    if counts[i] > 0:
-        set_reference_derivatives(axes.axis, states.axis, values[: counts[i]])
-    set_axes_derivatives(axes.others, states.others, counts, i + 1, values[counts[i] :])
-
-
-@start_axes.register(NoAxis)
-def _start_none(axes: NoAxis, states: Any, samples: Any, i: int, y: Any, v: Any, r: Any) -> None:
-    pass
-
-
-@start_axes.register(AxisDesigns)
-def _start(
-    axes: AxisDesigns, states: AxisStates, samples: Any, i: int, y: Vector, v: Vector, r: Vector
-) -> None:
-    goal = r[i] if is_usable(r[i]) else y[i]
-    start_at_rest(axes.axis, states.axis, samples[i], y[i], v[i], goal)
-    start_axes(axes.others, states.others, samples, i + 1, y, v, r)
-
-
-@have_started.register(NoAxis)
-def _none_has_started(axes: NoAxis, states: Any) -> bool:
-    return True
-
-
-@have_started.register(AxisDesigns)
-def _have_started(axes: AxisDesigns, states: AxisStates) -> bool:
-    if states.axis.loop[0].started == 0.0:
-        return False
-    return have_started(axes.others, states.others)
-
-
-@continue_axes.register(NoAxis)
-def _continue_none(axes: NoAxis, states: Any) -> None:
-    pass
-
-
-@continue_axes.register(AxisDesigns)
-def _continue(axes: AxisDesigns, states: AxisStates) -> None:
-    states.axis.loop[0].bumpless = 1.0
-    continue_axes(axes.others, states.others)
-
-
-@set_axes_manual.register(NoAxis)
-def _set_none_manual(axes: NoAxis, states: Any, manual: float, i: int, v: Any) -> None:
-    pass
-
-
-@set_axes_manual.register(AxisDesigns)
-def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v: Vector) -> None:
-    states.axis.loop[0].manual, states.axis.loop[0].u_manual = manual, v[i]
-    set_axes_manual(axes.others, states.others, manual, i + 1, v)
 
 
 # ---- A sample of all axes ----
@@ -290,16 +134,20 @@ class AxesDesign(NamedTuple):
     gain: Any  # B0
     rule: Any  # what is done at the limits
     limits: ActuatorLimits
+    learning: Any  # of learners that see all axes, see ``axes_learning``
     widths: Any  # channels of each axis (n,), integers
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
+    safe: Any  # the safe sets of axes together, or none
 
 
 class AxesState(NamedTuple):
     """State of several axes."""
 
     axes: Any  # each axis with those behind it
+    learning: Any
     gain: GainMemory
     range: RangeMemory
+    safe: Any
     loop: NDArray[AxesLoop]  # (1,)
     x: Work  # estimates x[axis, derivative] (n, largest order)
     v: Vector  # what the axes asked for, then what was applied (n,)
@@ -321,7 +169,9 @@ def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
 @control_all.register(AxesDesign)
 def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
     loop = state.loop[0]
+    look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags = ask_axes(design.axes, state.axes, 0, r, y, state.v, state.x)
+    learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
@@ -329,6 +179,10 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     flags |= allocate(
         design.rule, design.limits, state.gain, state.range, state.v, state.u, state.u_limited
     )
+    flags |= keep_in_bands(
+        design.safe, state.safe, design.axes, state.axes, design.limits, state.gain, state.range,
+        state.u_limited,
+    )  # fmt: skip
     for k in range(u.size):
         state.u[k] = state.u_limited[k]
         u[k] = state.u[k]
@@ -337,20 +191,16 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     loop.status, loop.started = flags, 1.0
 
 
-def tell_applied(design: AxesDesign, state: AxesState) -> None:
-    """Tell all axes what the control signals in the state do."""
+@tell_applied.register(AxesDesign)
+def _tell_applied(design: AxesDesign, state: AxesState) -> None:
     apply_to_axes(state.gain, state.u, state.v)
     tell_axes(design.axes, state.axes, 0, state.v)
 
 
-def start_all(
+@start_all.register(AxesDesign)
+def _start_all(
     design: AxesDesign, state: AxesState, samples: Any, y: Vector, u: Vector, r: Vector
 ) -> None:
-    """Start at a machine that rests at y under u: the next sample continues from there.
-
-    r are the references of the next sample; one that is no number is y. What was learned is kept.
-    Each observer takes as many ``samples`` (n,) as it needs to settle.
-    """
     reset_loop(design, state)
     for i in range(state.v.size):
         for j in range(state.x.shape[1]):
@@ -394,6 +244,7 @@ def _status_flags(design: AxesDesign, state: AxesState) -> int:
 @reset_loop.register(AxesDesign)
 def _reset_loop(design: AxesDesign, state: AxesState) -> None:
     reset_axes(design.axes, state.axes)
+    restart_of_all(design.learning, state.learning)
     clear(state.loop)
     for k in range(state.u.size):
         state.u[k] = 0.0
@@ -476,10 +327,17 @@ class Axes(StatefulController):
         order.
     weights
         of the actuators, where there are more than axes: u is the smallest ``Σ W (u − wished)²``
-        that does what the axes ask for (m,).
+        that does what the axes ask for (m,). If an axis has a safe set, also of the change of u
+        that keeps v within the bounds of all axes (``controllers/safe_axes.py``).
     wished
         the u from which that is measured (m,) [u-unit], as the thrusts that carry a craft; zero by
         default.
+    learner
+        one that sees the states of all axes, with features ``AllAxes(...)``: one for all axes,
+        which have one gain and θ of their own (``RLS``, ``NLMS``), or a list or dictionary with one
+        for each, None for an axis without. A learner that sees its own axis belongs into its ADRC.
+    guard
+        of these learners: a description, of which each axis has its own guard, or one for each.
 
     Raises
     ------
@@ -519,6 +377,8 @@ class Axes(StatefulController):
         saturation: str | Sequence[int | str] = "each",
         weights: Sequence[float] | None = None,
         wished: Sequence[float] | None = None,
+        learner: Any = None,
+        guard: Any = None,
     ) -> None:
         if not isinstance(axes, dict) and not checks.is_sequence(axes):
             raise ValueError(f"axes = {axes!r:.60}: must be an ADRC for each axis, in a list")
@@ -527,10 +387,12 @@ class Axes(StatefulController):
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
         check_axes(parts, self.names)
         self.axes: tuple[ADRC, ...] = tuple(copy.copy(axis) for axis in parts)
-        self._gain = checked_gain(B0, M, weights, self.names, self._most)
         self.B0, self.M, self.weights = B0, M, weights
+        self._gain = self._checked_gain()
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
+        self.learning.attach(self.axes)
         self._initialise()
 
     # ---- What simulation and real-time loop use ----
@@ -560,6 +422,14 @@ class Axes(StatefulController):
         return max(axis.observer.order for axis in self.axes)
 
     @property
+    def _has_bands(self) -> bool:
+        return any(axis.safe_set is not None for axis in self.axes)
+
+    def _checked_gain(self) -> Gain:
+        given = (self.B0, self.M, self.weights)
+        return checked_gain(*given, self.names, self._most, weighs_change=self._has_bands)
+
+    @property
     def derivatives(self) -> tuple[int, ...]:
         """Number of derivatives of the reference that each axis feeds forward."""
         return tuple(axis.derivatives for axis in self.axes)
@@ -585,6 +455,8 @@ class Axes(StatefulController):
         return self._actuators
 
     def _update_parameters(self) -> None:
+        safe_sets = [axis.safe_set for axis in self.axes]
+        check_safe_sets(safe_sets, self.names, self._gain.first, self._actuators)
         designs: Any = NoAxis()
         for axis in reversed(self.axes):
             designs = AxisDesigns(axis.parameters, designs)
@@ -594,8 +466,10 @@ class Axes(StatefulController):
             self._gain.design,
             self._rule,
             self._actuators,
+            self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
             np.array(self.derivatives, dtype=np.int64),
+            safe_axes_design(self._has_bands, self._gain.weights),
         )
 
     def initial_state(self) -> AxesState:
@@ -606,8 +480,10 @@ class Axes(StatefulController):
             states = AxisStates(axis.initial_state(), states)
         return AxesState(
             axes=states,
+            learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
             range=range_memory(n, m),
+            safe=safe_axes_memory(self.parameters.safe, n, m),
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
             v=np.zeros(n),
@@ -753,7 +629,9 @@ class Axes(StatefulController):
         **changes
             ``omega_c`` and ``observer``, as for ``ADRC.retune``, with the same errors.
         """
+        self.learning.check_retuning(changes)
         self.axes[self.index(axis)].retune(**changes)
+        self.learning.update(self.axes)
         self._update_parameters()
         self._pack_again()
 
@@ -791,6 +669,9 @@ class Axes(StatefulController):
         for name in ("B0", "M"):
             if getattr(self, name) is not None:
                 found[name] = getattr(self, name)
+        for name in ("learner", "guard"):
+            if getattr(self.learning, name) is not None:
+                found[name] = getattr(self.learning, name)
         for name, values in (("u_min", self._actuators.low), ("u_max", self._actuators.high)):
             if np.all(np.isfinite(values)):
                 found[name] = values.tolist()
@@ -812,7 +693,7 @@ class Axes(StatefulController):
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
         self.axes = tuple(copy.copy(axis) for axis in self.axes)
-        self._gain = checked_gain(self.B0, self.M, self.weights, self.names, self._most)
+        self._gain = self._checked_gain()
         self._initialise()
         self.state = kept["state"]
 

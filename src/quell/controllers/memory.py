@@ -160,7 +160,8 @@ def _what(design: Any) -> Any:
         kinds = (type(design.learner).__name__, type(design.guard).__name__)
         return kinds, meaning(design.learner), design.b0, design.cancel, design.cancel_f
     if hasattr(design, "axes"):  # several axes: what they learn is relative to B0
-        return type(design).__name__, meaning(design.gain), _what(design.axes)
+        together = (meaning(design.learning),) if design.learning else ()
+        return type(design).__name__, meaning(design.gain), *together, _what(design.axes)
     inner = tuple(_what(each) for each in _inside(design))
     return type(design).__name__, type(getattr(design, "prefilter", None)).__name__, inner
 
@@ -350,11 +351,12 @@ def learned_state(controller: Any) -> Any:
 
 
 def _learned_arrays(state: Any) -> list[NDArray[Any]]:
-    """Return what the ADRCs and compensators in a state have learned, in order."""
+    """Return what ADRCs, compensators, and axes together, have learned in a state, in order."""
+    parts = [getattr(each, part) for each in _adrc_states(state) for part in _LEARNED]
+    parts += [state.learning] if hasattr(state, "learning") else []
     return [
         array
-        for each in _adrc_states(state)
-        for part in _LEARNED
-        for array in named_arrays(_Part(getattr(each, part))).values()
+        for part in parts
+        for array in named_arrays(_Part(part)).values()
         if array.dtype.kind == "f"
     ]

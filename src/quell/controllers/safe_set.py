@@ -140,6 +140,19 @@ def nearest_safe(design: Any, memory: Any, u: float) -> tuple[float, int]:
     return u, 0
 
 
+BOUNDS = 4
+"""Numbers that ``write_bounds`` writes."""
+
+
+@generic_with_default
+def write_bounds(design: Any, memory: Any, row: Vector) -> None:
+    """Write the bounds of u by the band of y, and those by both bands, after ``nearest_safe``.
+
+    Without a safe set they are infinite.
+    """
+    row[0], row[1], row[2], row[3] = -math.inf, math.inf, -math.inf, math.inf
+
+
 @generic_with_default
 def flags_of_applied(design: Any, memory: Any, u: float) -> int:
     """Return the flag for a u, after limits, that does not keep the loop in the set."""
@@ -197,6 +210,15 @@ def _nearest_safe(design: SafeSetDesign, memory: SafeSetMemory, u: float) -> tup
     low, high = _bounds(design.rate, memory.estimates, loop.low, loop.high)
     safe = min(max(u, low), high)
     return safe, _SAFE_SET_ACTED if safe != u else 0
+
+
+@write_bounds.register(SafeSetDesign)
+def _write_bounds(design: SafeSetDesign, memory: SafeSetMemory, row: Vector) -> None:
+    loop = memory.loop[0]
+    row[0], row[1], row[2], row[3] = -math.inf, math.inf, -math.inf, math.inf
+    if loop.started != 0.0:
+        row[0], row[1] = loop.low, loop.high
+        row[2], row[3] = _bounds(design.rate, memory.estimates, loop.low, loop.high)
 
 
 @flags_of_applied.register(SafeSetDesign)
@@ -310,6 +332,10 @@ class SafeSet:
         largest error of the measurement [y-unit], half a step of an encoder for instance.
     gain_error
         largest ``|b/b0 − 1|``; above zero the limits of u must be finite.
+    largest_u
+        largest ``|u|`` that gain_error is of [u-unit], for a controller without limits of u. Of an
+        axis of ``Axes`` it is the largest ``Σ_k |B0_ik u_k|``, and gain_error the largest relative
+        error of an entry of B0.
 
     Raises
     ------
@@ -336,6 +362,7 @@ class SafeSet:
     f_rate: float = 0.0
     noise: float = 0.0
     gain_error: float = 0.0
+    largest_u: float = math.inf
 
     def __post_init__(self) -> None:
         borders = (self.y_min, self.y_max, self.rate_min, self.rate_max)
@@ -349,6 +376,11 @@ class SafeSet:
         if self.gain_error >= 1.0:
             rule = "must be below 1, or the sign of b is not known"
             raise ValueError(f"gain_error = {self.gain_error!r}: {rule}")
+        if self.largest_u != math.inf:
+            checks.positive("largest_u", self.largest_u, "u-unit")
+            if self.gain_error == 0.0:
+                rule = "says what gain_error is of, which is 0; leave it out or give gain_error"
+                raise ValueError(f"largest_u = {self.largest_u!r}: {rule}")
 
     def design(self, observer: ESO, limits: Limits, ratio: float = 1.0) -> SafeSetDesign:
         """Return the parameters for an observer and limits of u.
@@ -361,10 +393,15 @@ class SafeSet:
             rule = "alpha * dt must be at most 0.5, or u holds for too long before a border"
             raise ValueError(f"alpha = {self.alpha!r} rad/s with dt = {observer.dt!r} s: {rule}")
         largest = float(largest_magnitude(limits))
+        if math.isfinite(largest) and math.isfinite(self.largest_u):
+            raise ValueError(
+                f"largest_u = {self.largest_u!r}: limits of u say it, {largest:.4g}; leave it out"
+            )
+        largest = min(largest, self.largest_u)
         if self.gain_error > 0.0 and not math.isfinite(largest):
             raise ValueError(
                 f"gain_error = {self.gain_error!r}: the largest |u| bounds what it does; give "
-                "u_min and u_max"
+                "u_min and u_max, or largest_u for an axis of quell.Axes"
             )
         how = (largest, ratio)
         position = self._band(observer, model, n, (self.y_min, self.y_max), *how)

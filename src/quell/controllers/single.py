@@ -18,7 +18,8 @@ import numba
 import numpy as np
 
 from quell import checks
-from quell.controllers.axes import Axes, AxesDesign, AxisDesigns
+from quell.controllers.axes import Axes, AxesDesign
+from quell.controllers.axes_chain import AxisDesigns
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
@@ -49,6 +50,7 @@ from quell.kernels.functions import single
 from quell.kernels.linking import KERNEL_OPTIONS, in_both_precisions
 from quell.kernels.numba_internals import REMEDY
 from quell.kernels.single import in_single
+from quell.learners.all_axes import NoiseGateOfAxes
 from quell.learners.base import Lag, NoiseGate, NoiseGateMemory
 from quell.learners.kalman import KalmanDesign, KalmanMemory, needs_carries
 from quell.learners.python_model import PythonDesign
@@ -64,6 +66,7 @@ _RATES: dict[type, tuple[str, ...]] = {
     GuardDesign: ("forget", "earn", "forget_account", "rise", "decay", "growth", "smooth"),
     KalmanDesign: ("forget",),
     NoiseGate: ("forget",),
+    NoiseGateOfAxes: ("forget",),
 }
 _LEAST_RATE = 2.0**-21
 # What decays to zero needs a unit of the last digit in a sample.
@@ -131,7 +134,8 @@ def _with_carries(design: Any, state: Any) -> Any:
         given = _with_carries(design.controller, state.controller)
         return state._replace(controller=given, compensator=inner)
     if isinstance(design, AxesDesign):
-        return state._replace(axes=_with_carries(design.axes, state.axes))
+        axes = _with_carries(design.axes, state.axes)
+        return state._replace(axes=axes, learning=_with_longer(state.learning))
     if isinstance(design, AxisDesigns):
         own, others = design.axis, design.others
         behind = _with_carries(others, state.others)
@@ -261,13 +265,12 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
     """
     if isinstance(controller, SinglePrecision):
         return controller
-    if isinstance(controller, Axes):
+    if isinstance(controller, Axes | StateFeedback):
+        what = "several axes run" if isinstance(controller, Axes) else "state feedback runs"
         raise ValueError(
-            "controller = Axes(…): several axes run in Python in double precision only; "
-            "quell.export.c(…, precision='single', accept=True) writes their C code in single"
+            f"controller = {type(controller).__name__}(…): {what} in Python in double precision "
+            "only; quell.export.c(…, precision='single', accept=True) writes the C code in single"
         )
-    if isinstance(controller, StateFeedback):
-        raise ValueError("controller = StateFeedback(…): runs in double precision only")
     return SinglePrecision(controller)
 
 

@@ -22,15 +22,21 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.allocation import (
     ActuatorLimits,
+    RangeMemory,
     changed_actuator_limits,
     checked_actuator_limits,
+    cut_to_range,
+    range_memory,
 )
-from quell.controllers.axes import control_all, prepared_step, take_signals
+from quell.controllers.axes import (
+    control_all,
+    prepared_step,
+    start_all,
+    take_signals,
+    tell_applied,
+)
 from quell.controllers.base import (
-    Limits,
     RateLimit,
-    apply_limits,
-    control_at_rest,
     is_usable,
     reset_loop,
     status_flags,
@@ -39,7 +45,7 @@ from quell.controllers.base import (
 from quell.controllers.feedback_gains import regulator
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import kernel
-from quell.kernels.sized import Scalars, clear
+from quell.kernels.sized import Scalars, Work, clear
 from quell.observers.multivariable import MultivariableESO
 from quell.observers.multivariable_forms import begin_signals, observe_signals
 from quell.types import Channels, Matrix, Status, Vector
@@ -76,8 +82,10 @@ class FeedbackState(NamedTuple):
     reference: Vector  # last finite references
     nothing: Vector  # known disturbances: zero (q,)
     u: Vector  # applied control signals (m,)
-    r_given: Vector  # references and measurements of a call from Python
-    y_given: Vector
+    range: RangeMemory
+    wished: Work  # control signals of the law before the limits, then behind them (m,)
+    r_given: Work  # references and measurements of a call from Python
+    y_given: Work
 
 
 @kernel
@@ -112,16 +120,6 @@ def _control(design: FeedbackDesign, state: FeedbackState, r: Vector, y: Vector,
         loop.started = 1.0
     n = design.gain.shape[1]
     for i in range(u.size):
-        before = state.u[i]
-        limits = Limits(
-            design.limits.low[i],
-            design.limits.high[i],
-            design.limits.most_change[i],
-            design.limits.least_change[i],
-        )
-        if loop.started == 0.0:
-            u[i] = control_at_rest(limits)
-            continue
         wished = 0.0
         for j in range(r.size):
             wished += design.of_reference[i, j] * state.reference[j]
@@ -129,11 +127,36 @@ def _control(design: FeedbackDesign, state: FeedbackState, r: Vector, y: Vector,
             wished += design.of_disturbance[i, j] * state.estimates[n + j]
         for j in range(n):
             wished -= design.gain[i, j] * state.estimates[j]
-        u[i], cut = apply_limits(limits, wished, before)
-        status |= cut
+        state.wished[i] = wished
+    if loop.started == 0.0:
+        for i in range(u.size):
+            u[i] = min(max(0.0, design.limits.low[i]), design.limits.high[i])
+    else:
+        status |= cut_to_range(design.limits, state.u, state.range, state.wished)
+        for i in range(u.size):
+            u[i] = state.wished[i]
     for i in range(u.size):
         state.u[i] = u[i]
     loop.status = status
+
+
+@start_all.register(FeedbackDesign)
+def _start_all(
+    design: FeedbackDesign, state: FeedbackState, samples: Any, y: Vector, u: Vector, r: Vector
+) -> None:
+    reset_loop(design, state)
+    for i in range(u.size):
+        state.u[i] = u[i]
+    for i in range(r.size):
+        if is_usable(r[i]):
+            state.reference[i] = r[i]
+    _begin_at_rest(design, state, y)
+    state.loop[0].started = 1.0
+
+
+@tell_applied.register(FeedbackDesign)
+def _tell_applied(design: FeedbackDesign, state: FeedbackState) -> None:
+    pass  # the observer reads them in the next sample
 
 
 @status_flags.register(FeedbackDesign)
@@ -303,6 +326,8 @@ class StateFeedback(StatefulController):
             reference=np.zeros(self.references),
             nothing=np.zeros(observer.E.shape[1]),
             u=np.zeros(self.inputs),
+            range=range_memory(self.inputs, self.inputs),
+            wished=np.zeros(self.inputs),
             r_given=np.zeros(self.references),
             y_given=np.zeros(self.outputs),
         )
@@ -341,14 +366,20 @@ class StateFeedback(StatefulController):
         """Set the control signals that were really applied since the last ``step`` (m,)."""
         self._state.u[:] = checks.vector("u", u, self.inputs)
 
-    def start(self, y: Sequence[float] | Vector, u: Sequence[float] | Vector) -> None:
-        """Start at a plant that rests at measurements ``y`` under control signals ``u``."""
+    def start(
+        self,
+        y: Sequence[float] | Vector,
+        u: Sequence[float] | Vector,
+        r: Sequence[float] | Vector | None = None,
+    ) -> None:
+        """Start at a plant that rests at measurements ``y`` under control signals ``u``.
+
+        ``r`` are the references until a step has others; by default the last ones.
+        """
         rest, given = checks.vector("y", y, self.outputs), checks.vector("u", u, self.inputs)
         state = self._state
-        reset_loop(self.parameters, state)
-        state.u[:] = given
-        _begin_at_rest(self.parameters, state, rest)
-        state.loop[0].started = 1.0
+        goals = state.reference if r is None else checks.vector("r", r, self.references)
+        start_all(self.parameters, state, 0, rest, given, goals)
 
     def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
         """Change limits of the actuators while running; what is not given stays."""
@@ -367,10 +398,6 @@ class StateFeedback(StatefulController):
         """The states x̂ (n,) and disturbances d̂ (N − n,) as estimated in the last step."""
         n, found = self.observer.order, self._state.estimates.copy()
         return found[:n], found[n:]
-
-    def memory(self) -> bytes:
-        """Raise a ``ValueError``: a state of estimates alone has nothing that should last."""
-        raise ValueError("StateFeedback learns nothing: start it from rest")
 
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints."""

@@ -4,7 +4,7 @@ From rest the output follows sin t for 110 s, while a learner learns; then the l
 again, with what was learned, and follows a unit step. From 150 s a force sin(π(t − 150)/10) N acts
 on m2. The paper leaves open the start from rest, the settling band of 0.2 %, the force's amplitude
 and the observer's discretisation. They are chosen here to reproduce the paper's figures;
-docs/theory describes how.
+docs/paper describes how.
 
 Means and 95 % intervals over seeds of the noise, under forces of three frequencies.
 
@@ -90,7 +90,7 @@ LOADS = (0.1, PAPERS_LOAD, 0.8)
 # About 5 GB of records.
 _MOST_SAMPLES = 5e6
 GRADIENT_RATE = 0.01
-"""Algorithm 1's rate · batch / dt [1/s]: it is stable below about 0.015/s (docs/theory)."""
+"""Algorithm 1's rate · batch / dt [1/s]: it is stable below about 0.015/s (docs/paper)."""
 GRADIENT_BATCH = 10
 """Samples in a batch of Algorithm 1: chosen by hand; the stable range does not depend on it."""
 RATE_WITHOUT_U = 1.0

@@ -25,7 +25,6 @@ from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
 from quell.controllers.linear import LinearDesign, LinearState
 from quell.controllers.memory import Layout
 from quell.controllers.prefilters import PrefilteredDesign, PrefilteredState, settle, stopping_point
-from quell.controllers.state_space import StateFeedback
 from quell.export.image_code import ImageCode
 from quell.export.translate.expressions import implementation_of
 from quell.export.translate.program import Program
@@ -103,9 +102,10 @@ class CSource:
         names of functions in C that the user has to link.
     signals
         number of signals of a schedule, which ``step`` takes behind the derivatives.
-    axes, actuators
-        names of several axes in C, and the number of control signals; none for one u and y. Then
-        ``derivatives`` are arrays.
+    axes
+        names of several axes in C.
+    sizes
+        numbers of r, y and u where they are arrays, and ``derivatives``, too; None for one of each.
     """
 
     name: str
@@ -118,7 +118,7 @@ class CSource:
     externals: tuple[str, ...] = ()
     signals: int = 0
     axes: tuple[str, ...] = ()
-    actuators: int = 0
+    sizes: tuple[int, int, int] | None = None
 
     @property
     def further(self) -> tuple[str, ...]:
@@ -340,14 +340,6 @@ def _struct(kind: Any) -> Struct:
     if not isinstance(kind, Struct):
         raise TypeError
     return kind
-
-
-def refuse_state_feedback(controller: Any) -> None:
-    """Raise a ``TranslationError`` for a controller that is not written as C."""
-    if isinstance(controller, StateFeedback):
-        raise TranslationError(
-            "controller = StateFeedback(…): NOT written as C yet; quell.ADRC and quell.Axes are"
-        )
 
 
 def check_parts(controller: Any) -> None:

@@ -4,11 +4,13 @@ May import ``observers``, ``kernels`` and what stands before them. A new block n
 and its name here; users can also write one, see ``base.py``.
 """
 
+from quell.features.all_axes import AllAxes
 from quell.features.base import Bias, Custom, Features, Input, Joined, Polynomial, State
 from quell.features.basis import RBF, Friction, Periodic, RandomFourier
 
 __all__ = [
     "RBF",
+    "AllAxes",
     "Bias",
     "Custom",
     "Features",

@@ -30,7 +30,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, singledispatch
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
@@ -52,7 +52,6 @@ from quell.kernels.user_functions import (
     jit_user_function,
     set_origin,
 )
-from quell.observers.eso import ESO
 from quell.types import Vector
 
 # ---- The interface of a block of features ----
@@ -279,7 +278,8 @@ class Scaling(NamedTuple):
     fixed: Flag  # whether the scales are given and do not change
 
 
-def scaling(observer: ESO, frequency: float, fixed: bool) -> Scaling:
+@singledispatch
+def scaling(observer: Any, frequency: float, fixed: bool) -> Any:
     """Return the scaling for an observer and a ``frequency`` of the plant [rad/s]."""
     floors = frequency ** np.arange(observer.order) * _FLOOR
     floors[0] = 0.0
@@ -306,8 +306,8 @@ def reset_scale(scaling: Scaling, scale: Vector) -> None:
         scale[i] = least_scale(scale[i])
 
 
-@kernel
-def update_scale(scaling: Scaling, scale: Vector, estimate: Vector, u: float, f: float) -> None:
+@generic_with_default
+def update_scale(scaling: Any, scale: Vector, estimate: Vector, u: float, f: float) -> None:
     """Increase ``scale`` (n + 2,) to cover the state in ``estimate`` (n + 1,), ``u`` and ``f``."""
     if scaling.fixed:
         return

@@ -192,7 +192,7 @@ def _without_constant(system: System, constant: Vector) -> System:
 # ---- The bound of a guard that is certified for a set of plants ----
 
 # Largest κΓ of a certified guard: no learner can then make q larger than ten times the largest q
-# without learner. In random two-mass loops an honest learner loses more with 0.7 (docs/theory).
+# without learner. In random two-mass loops an honest learner loses more with 0.7.
 _LARGEST_PRODUCT = 0.9
 
 

@@ -107,7 +107,7 @@ filter of a chain of integrators with the same omega_o; for them nothing is cert
 
 An output that is not finite, or a hundred times larger than f, is cut off within the sample.
 
-docs/theory, "Guard", gives theorem, proof and measurements.
+docs/theory_guard, docs/certificate and docs/guard_measured give theorem, proof and measurements.
 
 Functions of a guard, registered for the type of its parameters; their defaults limit nothing.
 

@@ -115,7 +115,7 @@ def excitation(
     u_min, u_max
         limits of u, which are reached. With both of the same sign a motor does not turn back: then
         Coulomb friction is a constant force, and does not disturb the identification
-        (docs/identification).
+        (docs/identification_friction).
     seed
         start of a PRBS, and phase of the first line of a multisine.
 

@@ -91,7 +91,6 @@ from quell.checks import Described
 from quell.features import Bias, Features, State
 from quell.features.base import (
     Indices,
-    Scaling,
     checked_design,
     initial_scale,
     initial_sizes,
@@ -303,7 +302,7 @@ coefficients.register(NoLearnerDesign)(no_coefficients)
 # noise that is constant for ten samples 3; with a margin of two above that, not tuned further.
 SIGNAL_TO_NOISE = 6.0
 # Standard deviations of noise in f that ``confidence`` counts: a three-sigma bound.
-_NOISE_DEVIATIONS = 3.0
+NOISE_DEVIATIONS = 3.0
 # Rounding in y counts as noise of this share of y: no sensor resolves better. In single precision
 # y itself is rounded, by 2⁻²⁶ to 2⁻²⁵ of it in the root mean square.
 _RESOLUTION, _RESOLUTION_SINGLE = 1e-8, 2.0**-25
@@ -326,7 +325,9 @@ class NoiseGateMemory(NamedTuple):
 
     mean: Vector  # of x_1 … x_n and u (n + 1,); in single precision with carries (2n + 2,)
     variance: Vector  # (n + 1,)
-    noise: Vector  # (2,): mean square of y − x̂_1; sum of its weights, which grows from 0 to 1
+    # Mean square of y − x̂_1; sum of its weights, which grows from 0 to 1 (2,). With the states of
+    # other axes also theirs.
+    noise: Vector
 
 
 def relative_noise(observer: ESO) -> Vector:
@@ -343,7 +344,8 @@ def relative_noise(observer: ESO) -> Vector:
     return noise_gains(observer)
 
 
-def noise_gate(observer: ESO, frequency: float) -> NoiseGate:
+@functools.singledispatch
+def noise_gate(observer: Any, frequency: float) -> Any:
     """Return the gate for an observer and a frequency of the plant [rad/s]."""
     noise = relative_noise(observer)
     f_noise = float(noise[-1])
@@ -356,9 +358,10 @@ def noise_gate(observer: ESO, frequency: float) -> NoiseGate:
     )
 
 
-def noise_gate_memory(order: int) -> NoiseGateMemory:
-    """Return the state before the first sample."""
-    return NoiseGateMemory(np.zeros(order + 1), np.zeros(order + 1), np.zeros(2))
+def noise_gate_memory(gate: Any) -> NoiseGateMemory:
+    """Return the state of a gate before the first sample."""
+    signals, sources = gate.threshold.size, getattr(gate, "sources", 1)
+    return NoiseGateMemory(np.zeros(signals), np.zeros(signals), np.zeros(2 * sources))
 
 
 @kernel
@@ -390,10 +393,8 @@ def follow_moments(mean: Vector, variance: Vector, i: int, value: float, forget:
     variance[i] += forget * (away * away - variance[i])
 
 
-@kernel
-def update_gate(
-    gate: NoiseGate, memory: NoiseGateMemory, estimates: Vector, y: float, u: float
-) -> bool:
+@generic_with_default
+def update_gate(gate: Any, memory: NoiseGateMemory, estimates: Vector, y: float, u: float) -> bool:
     """Update the means with a sample; return whether any state moves."""
     memory.noise[0] = follow_noise(memory.noise[0], gate.forget, y, y - estimates[0])
     memory.noise[1] = grown(memory.noise[1], gate.forget)
@@ -407,23 +408,23 @@ def update_gate(
     return moves
 
 
-@kernel
-def is_moving(gate: NoiseGate, memory: NoiseGateMemory, i: int) -> bool:
+@generic_with_default
+def is_moving(gate: Any, memory: NoiseGateMemory, i: int) -> bool:
     """Return whether signal ``i`` moves."""
     return memory.variance[i] * memory.noise[1] > gate.threshold[i] * memory.noise[0]
 
 
 @kernel
-def gated(gate: NoiseGate, memory: NoiseGateMemory, i: int, value: float) -> float:
+def gated(gate: Any, memory: NoiseGateMemory, i: int, value: float) -> float:
     """Return ``value`` of signal ``i`` if it moves, else its mean."""
     return value if is_moving(gate, memory, i) else memory.mean[i]
 
 
 @kernel
-def confidence(gate: NoiseGate, memory: NoiseGateMemory, size: float) -> float:
+def confidence(gate: Any, memory: NoiseGateMemory, size: float) -> float:
     """Return ``F²/(F² + (3σ)²)`` with the noise σ in f; ``size`` is that of x_1."""
     motion = gate.power * size
-    noise = _NOISE_DEVIATIONS * _NOISE_DEVIATIONS * gate.f_noise * memory.noise[0]
+    noise = NOISE_DEVIATIONS * NOISE_DEVIATIONS * gate.f_noise * memory.noise[0]
     return motion * motion * memory.noise[1] / (motion * motion * memory.noise[1] + noise)
 
 
@@ -434,7 +435,8 @@ def reset_gate(memory: NoiseGateMemory) -> None:
         memory.mean[i] = 0.0
     for i in range(memory.variance.size):
         memory.variance[i] = 0.0
-    memory.noise[0] = memory.noise[1] = 0.0
+    for i in range(memory.noise.size):
+        memory.noise[i] = 0.0
 
 
 # ---- Detection of a learner that has lost its numbers, for all learners alike ----
@@ -623,7 +625,8 @@ def reset_lag(memory: Matrix) -> None:
             memory[i, j] = 0.0
 
 
-def lag_of(observer: ESO) -> Lag | DenseLag:
+@functools.singledispatch
+def lag_of(observer: Any) -> Lag | DenseLag:
     """Return the lag filter of an observer.
 
     It is a ``Lag`` if all poles are in one place, else a ``DenseLag``. A delay of u has no effect:
@@ -640,7 +643,8 @@ def _response(observer: ESO) -> Response:
     return response(without_delay(observer.model), observer.estimates, observer.order)
 
 
-def group_delay(observer: ESO) -> float:
+@functools.singledispatch
+def group_delay(observer: Any) -> float:
     """Return the lag in samples of f^F, as the next estimate shows it, behind slow changes of f.
 
     The j-th lag of the chain delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
@@ -729,8 +733,8 @@ class Inputs(NamedTuple):
 
     features: Any
     unscaled: Indices  # of the features whose size is unknown (k,)
-    scaling: Scaling
-    gate: NoiseGate
+    scaling: Any
+    gate: Any
     bias_gain: float  # λ dt, at most 1
     startup: int  # samples after a start from rest in which nothing is learned
 

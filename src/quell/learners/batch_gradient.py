@@ -358,7 +358,7 @@ class BatchGradient:
     """Algorithm 1 of the paper, with the features ``(x̂_1 … x̂_n, u, 1)`` and θ from zero.
 
     It is included for comparison. As printed it is fragile: it is stable in a small range of rates,
-    which shrinks when a disturbance comes (docs/theory). Use ``Kalman`` instead.
+    which shrinks when a disturbance comes (docs/paper). Use ``Kalman`` instead.
 
     Parameters
     ----------
@@ -372,7 +372,7 @@ class BatchGradient:
         size n of the three buffers, in samples.
     u
         whether u is one of the paper's features. Without it the algorithm does not learn the
-        control law in place of the plant, and far larger rates are stable (docs/theory).
+        control law in place of the plant, and far larger rates are stable (docs/paper).
 
     Raises
     ------

@@ -33,7 +33,7 @@ bias at that mean.
 **Start.** After a start from rest Δf̂ contains the observer's initial error, which is no
 disturbance: the learner does not learn for 2 τ.
 
-docs/theory, "Lag compensation", has the derivation and measurements.
+docs/theory, "Lag compensation", and docs/theory_learners have derivation and measurements.
 
 The learner ``Kalman``: features, bandwidths and prior of a Kalman filter.
 
@@ -437,7 +437,7 @@ class Kalman:
 
     References
     ----------
-    docs/theory: Algorithm 1 of the paper, its weaknesses and their remedies.
+    docs/paper, docs/theory_learners: Algorithm 1 of the paper, its weaknesses and their remedies.
     """
 
     state: bool = True

@@ -330,7 +330,7 @@ class Online(FeatureLearner):
             features=np.zeros(p),
             ring=np.zeros((parameters.delay + 1, p)),
             loop=OnlineLoop.zeros(),
-            gate=noise_gate_memory(n),
+            gate=noise_gate_memory(parameters.inputs.gate),
             model=model,
             flat=flat,
             initial=flat.copy(),

@@ -79,12 +79,12 @@ from quell.types import Matrix, Vector
 
 # Below this confidence nothing is learned: noise that stays constant for several samples has more
 # effect than the white noise that the gate assumes. Chosen by hand; not tuned further.
-_LEAST_CONFIDENCE = 0.1
+LEAST_CONFIDENCE = 0.1
 
 
 # Samples are counted up to this; in single precision a count ends at 2²⁴. It is longer than any
 # start of a loop that is fast enough for its observer.
-_MOST_SAMPLES = 2.0**23
+MOST_SAMPLES = 2.0**23
 
 
 @generic
@@ -192,7 +192,7 @@ def _adapt(
     moves = update_gate(inputs.gate, memory.gate, estimates, y, u_before)
     if loop.samples <= inputs.startup:
         return
-    _rescale(learner, memory, estimates, u_before, f_plain)
+    rescale(learner, memory, estimates, u_before, f_plain)
     if loop.samples <= inputs.startup:
         return
     scale = memory.scale
@@ -203,7 +203,7 @@ def _adapt(
         return
     loop.bias += inputs.bias_gain * (error * scale[scale.size - 1] - loop.bias)
     share = confidence(inputs.gate, memory.gate, scale[0])
-    if not moves or share < _LEAST_CONFIDENCE or loop.samples <= loop.learn_after:
+    if not moves or share < LEAST_CONFIDENCE or loop.samples <= loop.learn_after:
         return
     update_theta(learner.rule, memory.rule, theta, memory.filtered, error, share)
     if learner.with_u:
@@ -214,7 +214,7 @@ def _adapt(
 
 
 @kernel
-def _rescale(
+def rescale(
     learner: LinearDesign, memory: LinearMemory, estimates: Vector, u: float, f: float
 ) -> None:
     """Let the scales grow, and convert what is in their units."""
@@ -285,7 +285,7 @@ def _commit(
     learner: LinearDesign, memory: LinearMemory, estimates: Vector, u: float, f_learned: float
 ) -> None:
     loop = memory.loop[0]
-    if loop.samples < _MOST_SAMPLES:
+    if loop.samples < MOST_SAMPLES:
         loop.samples += 1.0
     elif loop.learn_after > 0.0:
         loop.learn_after -= 1.0
@@ -410,7 +410,7 @@ class Linear(FeatureLearner):
             chain=lag_memory(parameters.lag, p),
             filtered=np.zeros(p),
             loop=LinearLoop.zeros(),
-            gate=noise_gate_memory(n),
+            gate=noise_gate_memory(parameters.inputs.gate),
             rule=self.rule_memory(parameters.rule, p),
         )
 

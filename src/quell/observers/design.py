@@ -265,7 +265,7 @@ def continuous_gain(a: Vector, omega_o: float, disturbance_order: int = 1) -> Ve
 
     With m extended states N = n + m, and ``l_N = omega_o^N`` for any m.
 
-    The paper's Table I has another ``l_5`` (docs/theory, errata). Sampled designs do not use this
+    The paper's Table I has another ``l_5`` (docs/paper). Sampled designs do not use this
     gain; it is the limit of their ``L/dt``.
     """
     n, size = a.size, a.size + disturbance_order

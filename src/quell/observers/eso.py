@@ -124,7 +124,7 @@ class ESO:
             number m of extended states f, f', …, 1 to 3: the observer's model of f is a polynomial
             of degree m − 1 in time. With 2 a ramp of f is rejected without error, with 3 a
             parabola, and slow loads better; the loop comes closer to −1 at the same omega_o
-            (docs/forms). A ``Guard`` needs 1.
+            (docs/forms_extended). A ``Guard`` needs 1.
 
         Raises
         ------
@@ -171,7 +171,7 @@ class ESO:
             Then f̂ follows f as if there were none, ``(omega_o/(s + omega_o))^(N − zeros)``, which
             is what a learner needs; the state is found no faster than the zeros are. By default all
             N poles lie at ``exp(−omega_o dt)``: state and constant f are found fast, but f̂
-            exaggerates changes (docs/design).
+            exaggerates changes (docs/zeros).
         far
             zeros from u that are beyond 3 times the fastest pole and beyond ``far`` times omega_o
             are not in the observer's model, and a warning names them: the gain to the derivative

@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,21 @@ from quell.types import warn
 # ---- Plants from the results of an identification ----
 
 
-def identified(path: str | os.PathLike[str], dt: float) -> Plant:
+def identified(
+    path: str | os.PathLike[str] | None = None,
+    *,
+    dt: float,
+    num: Sequence[float] | None = None,
+    den: Sequence[float] | None = None,
+    delay: float | None = None,
+    friction: float | None = None,
+    friction_width: float | None = None,
+) -> Plant:
     """Return the plant that `quell identify --json` or `quell tune --json` found in a record.
 
     It is the transfer function with its delay and its dry friction, as
     ``quell.identification.simulated_plant`` has it; designs use its part without friction. The
-    constant force is left out.
+    constant force is left out. The model is in a file, or its numbers are given in place of one.
 
     Parameters
     ----------
@@ -44,36 +53,76 @@ def identified(path: str | os.PathLike[str], dt: float) -> Plant:
         the file of results, in JSON; relative to the folder where the command is run.
     dt
         sample time of the loop [s]; with friction the delay is rounded to whole samples.
+    num, den
+        the transfer function, highest power of s first, in place of ``path``.
+    delay
+        delay of u [s], beside ``num`` and ``den``.
+    friction
+        Coulomb friction [u-unit], beside ``num`` and ``den``.
+    friction_width
+        speed at which three quarters of the friction act [y-unit/s]; goes with ``friction``.
 
     Raises
     ------
     ValueError
-        for a file that can't be read or has no model, and for a model with direct feedthrough.
+        for a file that can't be read or has no model, for a model with direct feedthrough, and for
+        numbers beside a path.
     """
-    found = _model(path)
-    numbers: dict[str, Any] = {}
-    for name in ("num", "den"):
-        numbers[name] = checks.vector(f"{path}: {name}", found[name])
-    delay = checks.non_negative(f"{path}: delay", found.get("delay", 0.0), "s")
-    name = f"identified plant ({Path(path).name})"
-    linear = LinearPlant.of((numbers["num"], numbers["den"]), name=name)
-    force, width = found.get("friction"), found.get("friction_width")
+    numbers = {
+        "num": num, "den": den, "delay": delay, "friction": friction,
+        "friction_width": friction_width,
+    }  # fmt: skip
+    given = {key: value for key, value in numbers.items() if value is not None}
+    if path is None:
+        if num is None or den is None:
+            raise ValueError("path: missing; give the file of results, or num and den")
+        if (friction is None) != (friction_width is None):
+            raise ValueError("friction and friction_width go together: give both or none")
+        name, before = "identified plant", ""
+        model: Mapping[str, Any] = dict(given)
+    elif given:
+        raise ValueError(f"{', '.join(given)}: go without path = {os.fspath(path)!r}; give one")
+    else:
+        name, before, model = f"identified plant ({Path(path).name})", f"{path}: ", _model(path)
+    num_s, den_s = (checks.vector(f"{before}{key}", model[key]) for key in ("num", "den"))
+    lag = checks.non_negative(f"{before}delay", model.get("delay", 0.0), "s")
+    linear = LinearPlant.of((num_s, den_s), name=name)
+    force, width = model.get("friction"), model.get("friction_width")
     if force and width:
-        force = checks.positive(f"{path}: friction", force, "u-unit")
-        width = checks.positive(f"{path}: friction_width", width, "y-unit/s")
-    elif force and "friction_width" not in found:
-        text = f"{path}: its friction is left out: the file is of an older quell; identify again"
+        force = checks.positive(f"{before}friction", force, "u-unit")
+        width = checks.positive(f"{before}friction_width", width, "y-unit/s")
+    elif force and "friction_width" not in model:
+        text = f"{before}its friction is left out: the file is of an older quell; identify again"
         warn(text)
     dt = checks.positive("dt", dt, "s")
-    return with_friction_and_delay(linear, **numbers, force=force, width=width, delay=delay, dt=dt)
+    return with_friction_and_delay(linear, num_s, den_s, force, width, lag, dt)
 
 
 def _model(path: str | os.PathLike[str]) -> Mapping[str, Any]:
     where = f"path = {os.fspath(path)!r}"
     try:
-        content = json.loads(whole_text(path))
+        text = whole_text(path)
     except OSError as error:
         raise ValueError(f"{where}: can't be read ({error.strerror})") from None
+    except ValueError as error:
+        raise ValueError(f"{where}: must be a file of results in JSON ({error})") from None
+    return identified_numbers(text, where)
+
+
+IDENTIFIED_NUMBERS = ("num", "den", "delay", "friction", "friction_width")
+"""Keys of a file of results that the plant of ``identified`` has."""
+
+
+def identified_numbers(text: str, where: str) -> Mapping[str, Any]:
+    """Return the numbers of the model in the text of a file of results; ``where`` names it.
+
+    Raises
+    ------
+    ValueError
+        for a text that is not JSON, and for one that has no model.
+    """
+    try:
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{where}: must be a file of results in JSON ({reason})") from None
@@ -248,8 +297,10 @@ def linear(
     E
         how disturbances enter, with a column for each; as u does by default.
     """
-    values = {"num": num, "den": den, "A": A, "B": B, "C": C}
-    given = [name for name, value in values.items() if value is not None]
+    values = {"num": num, "den": den, "A": A, "B": B, "C": C, "E": E}
+    for name, value in values.items():
+        checks.optional(checks.vector if name in ("num", "den") else checks.numbers, name, value)
+    given = [name for name, value in values.items() if value is not None and name != "E"]
     if given == ["num", "den"]:
         return LinearPlant.of((num, den), E)
     if given == ["A", "B", "C"]:

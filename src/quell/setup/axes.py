@@ -21,6 +21,7 @@ from pydantic import Field, ValidationError
 from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
+from quell.features.all_axes import sees_all_axes
 from quell.plants.base import PlantWrapper
 from quell.plants.multibody import Arm, Craft
 from quell.plants.multivariable import (
@@ -31,7 +32,16 @@ from quell.plants.multivariable import (
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import Setup, Variation, changed, sweep_of, title_of, windows_of
+from quell.setup.loading import (
+    Known,
+    Setup,
+    Variation,
+    changed,
+    made_once,
+    sweep_of,
+    title_of,
+    windows_of,
+)
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -75,6 +85,9 @@ def coupled(
     saturation: str | Sequence[str] = "each",
     weights: Sequence[float] | None = None,
     wished: Sequence[float] | None = None,
+    learner: Any = None,
+    guard: Any = None,
+    of_axes: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> Axes:
     """Return the controller of several axes: B0, or its inverse M, and limits of the actuators.
 
@@ -82,6 +95,8 @@ def coupled(
     ----------
     axes, plant
         the controllers of the axes by name, and the plant.
+    of_axes
+        learners with features of all axes, each with its guard, by the name of the axis.
     B0
         from the control signals to the axes, a list of rows, with a row for each axis; ``"plant"``
         takes that of the plant: of an arm the inverse of M(q), of a craft that near the horizontal,
@@ -97,10 +112,21 @@ def coupled(
         what happens at the limits: `each` cuts each actuator, `direction` scales all, and a list of
         all axes gives them what they ask for in this order.
     weights
-        of the actuators, where there are more than axes.
+        of the actuators, where there are more than axes or an axis has a safe set.
     wished
         the control signals from which that is measured [u-unit]; zero by default.
+    learner, guard
+        one learner for all axes, and its guard, of which each axis has its own.
     """
+    of_axes = of_axes or {}
+    if of_axes and learner is not None:
+        raise ValueError(
+            f"learner: {', '.join(of_axes)} have learners with features of all axes, too; give "
+            "one for all, or one for each"
+        )
+    if of_axes:
+        learner = {name: parts[0] for name, parts in of_axes.items()}
+        guard = {name: parts[1] for name, parts in of_axes.items() if parts[1] is not None}
     inverse: Any = M
     gain: Any = B0
     if isinstance(B0, str):
@@ -110,7 +136,7 @@ def coupled(
         gain, inverse = _of_plant(plant, [axis.observer.order for axis in axes.values()], M)
     limits: dict[str, Any] = {"u_min": u_min, "u_max": u_max, "rate_limit": rate_limit}
     rest: dict[str, Any] = {"saturation": saturation, "weights": weights, "wished": wished}
-    return Axes(dict(axes), gain, M=inverse, **limits, **rest)
+    return Axes(dict(axes), gain, M=inverse, learner=learner, guard=guard, **limits, **rest)
 
 
 def _of_plant(plant: Any, orders: Sequence[int], M: Any) -> tuple[Any, Any]:
@@ -252,9 +278,27 @@ OBSERVERS = {
     )
     for kind, table in registry.OBSERVERS.items()
 }
-_OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule", "safe_set")
+_OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule")
 CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
-AXES = call_table("axes", coupled, only=True, without=("axes", "plant"))
+AXES = call_table(
+    "axes",
+    coupled,
+    only=True,
+    without=("axes", "plant", "of_axes"),
+    beside={
+        "learner": (
+            registry.Learner | None,
+            optional(
+                "one learner for all axes, `rls` or `nlms`, with features of kind `all-axes`; one "
+                "that learns from its own axis belongs into its `[[axis]]`."
+            ),
+        ),
+        "guard": (
+            registry.Guard | None,
+            optional("the guard of this learner, of which each axis has its own."),
+        ),
+    },
+)
 SCENARIO = call_table(
     "scenario",
     Scenario,
@@ -290,7 +334,10 @@ class AxesDescription(Table):
     dt: float = DT
     plant: AxesPlant | None = optional("the plant with several signals, for `quell run`.")
     axes: AxesTable | None = optional("B0 and the actuators; the unit matrix by default.")
-    axis: tuple[Axis, ...] = Field(description="[[axis]]: an axis, in the order of the outputs.")
+    axis: tuple[Axis, ...] = Field(
+        description="[[axis]]: an axis, in the order of the outputs.",
+        json_schema_extra={"minItems": 1},
+    )
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
     tune: Tune | None = optional("what `quell tune` bounds.")
     sweep: Sweep | None = optional("many runs with other values, for `quell sweep`.")
@@ -323,8 +370,12 @@ def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     return made_axes(*read(path), trust)
 
 
-def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
+def made_axes(
+    name: str, data: Mapping[str, Any], trust: bool = False, known: Known | None = None
+) -> Setup:
     """Build the objects that ``data`` describes: the content of a file of several axes.
+
+    ``known`` has the plant of an earlier call, which is not built again if its table is the same.
 
     Raises
     ------
@@ -345,17 +396,24 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
     plant = None
     if tables.plant is not None:
-        plant = builder.build(tables.plant, "plant", dt=dt)
+        make = partial(builder.build, tables.plant, "plant", dt=dt)
+        plant = made_once({} if known is None else known, "plant", (tables.plant, dt), make)
         builder.attempt("", (), check_several, plant)
     names = [axis.name or f"axis{i + 1}" for i, axis in enumerate(tables.axis)]
     if len(set(names)) < len(names):
         raise SetupError([f"{name}: axis: names {', '.join(names)} must be different"])
-    axes = {
+    made = {
         key: _axis(builder, axis, f"axis[{i}]", dt)
         for i, (key, axis) in enumerate(zip(names, tables.axis, strict=True))
     }
-    table = AXES() if tables.axes is None else tables.axes
-    controller = builder.build(table, "axes", axes=axes, plant=plant)
+    table: Any = AXES() if tables.axes is None else tables.axes
+    of_axes = {key: parts for key, (_, *parts) in made.items() if parts}
+    axes = {key: parts[0] for key, parts in made.items()}
+    shared = {
+        key: None if part is None else builder.build(part, f"axes.{key}", dt=dt)
+        for key, part in (("learner", table.learner), ("guard", table.guard))
+    }
+    controller = builder.build(table, "axes", axes=axes, plant=plant, of_axes=of_axes, **shared)
     scenario = _scenario(builder, tables, dt)
     if plant is not None:
         builder.attempt("plant", (), _check_fit, plant, controller, scenario)
@@ -367,8 +425,8 @@ def made_axes(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     return Setup(name, title, *parts, tables, tune, trust)
 
 
-def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> ADRC:
-    """Return the controller of an axis."""
+def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:
+    """Return the controller of an axis; with its learner and guard if they are of all axes."""
     parts = {
         key: None if table is None else builder.build(table, f"{path}.{key}", dt=dt)
         for key, table in (("observer", axis.observer), ("guard", axis.guard))
@@ -376,8 +434,11 @@ def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> ADRC:
     learner = None
     if axis.learner is not None:
         learner = builder.build(axis.learner, f"{path}.learner", dt=dt, **parts)
+    outside: tuple[Any, ...] = ()
+    if sees_all_axes(learner):
+        outside, learner = (learner, parts.pop("guard")), None
     made: ADRC = builder.build(axis.controller, f"{path}.controller", learner=learner, **parts)
-    return made
+    return made, *outside
 
 
 def _scenario(builder: Builder, tables: AxesDescription, dt: float) -> Scenario | None:

@@ -76,9 +76,13 @@ class Description(Table):
     )
 
 
+OF_AXES = ("axis", "axes")
+"""Keys of a setup of several axes only."""
+
+
 def is_of_axes(data: Mapping[str, Any]) -> bool:
     """Return whether the content of a file is a setup of several axes."""
-    return "axis" in data or "axes" in data
+    return any(key in data for key in OF_AXES)
 
 
 def describe(name: str, data: Mapping[str, Any]) -> Description:

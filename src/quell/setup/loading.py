@@ -152,7 +152,7 @@ def assembled(
     ``known`` has inputs and objects of an earlier call: what is the same is not built again.
     """
     builder = Builder(name, trust)
-    made_once = partial(_made_once, {} if known is None else known)
+    build_once = partial(made_once, {} if known is None else known)
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
 
     def build(key: str, **context: Any) -> Any:
@@ -164,13 +164,13 @@ def assembled(
             takes.add("plant")  # the feedforward of a model
         context = {each: context[each] for each in takes & context.keys()}
         inputs = table, dt, *context, *context.values()
-        return made_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
+        return build_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
 
     _check_ranges(name, tables.plant)
     plant = build("plant")
     if plant is not None:
         check_single(name, plant)
-    model = None if plant is None else made_once("model", (plant,), partial(linear_model, plant))
+    model = None if plant is None else build_once("model", (plant,), partial(linear_model, plant))
     parts = {key: build(key, plant=model) for key in ("observer", "learner", "guard")}
     kind, used = tables.controller.kind_name, tables.controller.context
     if tables.compensator is not None:
@@ -186,19 +186,19 @@ def assembled(
     if tables.compensator is not None:
         compensator = build("compensator", **parts)
         combine = partial(builder.attempt, "compensator", (), Compensated, controller, compensator)
-        controller = made_once("compensated", (controller, compensator), combine)
+        controller = build_once("compensated", (controller, compensator), combine)
     prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
     if rig is not None and plant is not None and signals_of(plant).known:
         rig = {"signals": signals_of(plant), **rig}
     sweep = build("sweep")
     if prefilter is not None:
         join = partial(builder.attempt, "prefilter", (), Prefiltered, controller, prefilter)
-        controller = made_once("joined", (controller, prefilter), join)
+        controller = build_once("joined", (controller, prefilter), join)
     if scenario is not None and plant is not None:
         count = plant.disturbances
         check = partial(scenario.seeded_signals, count)
         attempt = partial(builder.attempt, "scenario", ("disturbances",), check)
-        made_once("signals", (scenario, count), attempt)
+        build_once("signals", (scenario, count), attempt)
     windows = windows_of(builder, tables.metrics)
     title = tables.title or title_of(name)
     tune = build("tune")
@@ -210,7 +210,7 @@ def windows_of(builder: Builder, tables: Sequence[Table]) -> tuple[dict[str, Any
     """Return the windows of [[metrics]], checked."""
     windows = tuple(window.written() for window in tables)
     for i, window in enumerate(windows):
-        builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
+        builder.attempt(f"metrics[{i}]", [*window], partial(check_window, **window))
     return windows
 
 
@@ -238,7 +238,7 @@ def _check_ranges(name: str, plant: CallTable | None) -> None:
             table = getattr(table, key)
 
 
-def _made_once(known: Known, key: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+def made_once(known: Known, key: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
     """Return the object that was made of the same inputs before, or make it.
 
     Tables and numbers are the same if they are equal, objects if they are one.
@@ -257,7 +257,7 @@ def _same(before: tuple[Any, ...], now: tuple[Any, ...]) -> bool:
     )
 
 
-def _check_window(
+def check_window(
     start: float = 0.0,
     stop: float | None = None,
     target: float | None = None,

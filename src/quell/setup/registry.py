@@ -315,7 +315,9 @@ OBSERVERS = _call_tables(
     {"plant": Plant | None},
     _MODEL,
 )
-FEATURES = _call_tables(_public_classes(features, "design", "names", but=features.Features))
+_OF_ONE_AXIS = _call_tables(_public_classes(features, "design", "names", but=features.Features))
+_ALL_AXES = {"features": list_of(one_of(_OF_ONE_AXIS))}
+FEATURES = _OF_ONE_AXIS | _call_tables({"all-axes": features.AllAxes}, _ALL_AXES)
 LEARNERS = _call_tables(
     _public_classes(learners, "design", "memory"), {"features": list_of(one_of(FEATURES)) | None}
 )

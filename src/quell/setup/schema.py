@@ -214,6 +214,7 @@ def one_of(
             return "list"
         return plain
 
+    tag.__dict__.update(tables=tables, default=default)  # for the JSON Schema
     choices: list[Any] = [Annotated[model, Tag(kind)] for kind, model in tables.items()]
     choices += [Annotated[float, Tag("number")]] if number else []
     choices += [Annotated[bool, Tag("flag")]] if flag else []

@@ -13,7 +13,8 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
+from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +22,9 @@ from numpy.typing import NDArray
 from pydantic_core import PydanticUndefined
 
 from quell import checks
-from quell.files import nonfinite_to_none
-from quell.setup import loading, registry
+from quell.files import nonfinite_to_none, whole_text
+from quell.plants.registry import IDENTIFIED_NUMBERS, identified_numbers
+from quell.setup import axes, loading, registry
 from quell.setup.schema import CallTable
 from quell.types import Vector
 
@@ -66,11 +68,59 @@ def files_of(tables: Any) -> frozenset[tuple[Any, ...]]:
     """Return kind and file of each plant in the tables of a setup that is from a file."""
     parts = tables.values() if isinstance(tables, dict) else tables
     found: set[tuple[Any, ...]] = set()
-    if isinstance(tables, dict) and tables.get("kind") in FILE_KINDS:
+    if isinstance(tables, dict) and tables.get("kind") in FILE_KINDS and not _has_numbers(tables):
         found.add(_file_of(tables))
     if isinstance(tables, dict | list | tuple):
         found = found.union(*map(files_of, parts))
     return frozenset(found)
+
+
+def _has_numbers(table: Mapping[str, Any]) -> bool:
+    """Return whether a table has the numbers of an identified model, and names no file."""
+    return table.get("kind") == "identified" and "path" not in table
+
+
+def with_models(tables: Any, models: Mapping[str, str] | None = None) -> Any:
+    """Return tables of a setup with the numbers of identified models in place of their files.
+
+    Parameters
+    ----------
+    models
+        texts of files of results by name, without folder; None reads the files that are named.
+
+    Raises
+    ------
+    ValueError
+        for a file that is no file of results, and for one that is not in ``models``.
+    """
+    if isinstance(tables, list | tuple):
+        return [with_models(part, models) for part in tables]
+    if not isinstance(tables, Mapping):
+        return tables
+    path = tables.get("path")
+    if tables.get("kind") != "identified" or not isinstance(path, str):
+        return {key: with_models(part, models) for key, part in tables.items()}
+    found = identified_numbers(_model_text(path, models), f"path = {path!r}")
+    rest = {key: part for key, part in tables.items() if key != "path"}
+    numbers = {key: found[key] for key in IDENTIFIED_NUMBERS if found.get(key) is not None}
+    if not {"friction", "friction_width"} <= numbers.keys() or not numbers["friction"]:
+        for key in ("friction", "friction_width"):
+            numbers.pop(key, None)
+    return rest | numbers
+
+
+def _model_text(path: str, models: Mapping[str, str] | None) -> str:
+    name = PurePosixPath(path.replace("\\", "/")).name
+    if models is None:
+        try:
+            return whole_text(path)
+        except OSError as error:
+            raise ValueError(f"path = {path!r}: can't be read ({error.strerror})") from None
+    if name not in models:
+        raise ValueError(
+            f"plant: its model is in the file {name}: open the setup and {name} together"
+        )
+    return models[name]
 
 
 def _file_of(table: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -170,7 +220,8 @@ def _check_sizes(value: Any, path: str, dt: float) -> None:
     """Check all numbers and lists of a setup that decide how much memory and time it takes."""
     key = path.rpartition(".")[2].partition("[")[0]
     if isinstance(value, dict):
-        from_file = value.get("kind") in FILE_KINDS  # granted, or refused before
+        # A file is granted, or was refused before.
+        from_file = value.get("kind") in FILE_KINDS
         for each, part in value.items():
             if each in _FILES and not from_file:
                 raise ValueError(f"{path}.{each}: the studio opens no files")
@@ -308,21 +359,20 @@ _NESTED = {
 _LISTS = {"disturbances": "signal", "features": "feature"}
 # Keys for later: a page has no place for them.
 _HIDDEN = ("uncertain", "certified_for", "name")
+_HIDDEN_OF = {"identified": ("path",)}
 
 
 def forms(granted: Granted) -> dict[str, Any]:
     """Return for each group of tables its kinds, and for each kind its keys.
 
-    Plants that are files are left out if they are not granted.
+    ``"one"`` has the groups of a setup of one axis, ``"several"`` those of one of several axes.
+
+    Plants that are files are left out if they are not granted; an identified one has its numbers.
     """
     files = {each[0] for each in granted.files}
-    without = {*FILE_KINDS, "no-learner"} - files
-    groups: Mapping[str, Mapping[str, type[CallTable]]] = {
-        "plant": registry.PLANTS,
-        "observer": registry.OBSERVERS,
-        "controller": registry.CONTROLLERS,
+    without = {*FILE_KINDS, "no-learner"} - files - {"identified"}
+    shared: dict[str, Mapping[str, type[CallTable]]] = {
         "learner": registry.LEARNERS,
-        "prefilter": registry.PREFILTERS,
         "signal": registry.SIGNALS,
         "feature": registry.FEATURES,
         "notch": {"": registry.Notch},
@@ -330,9 +380,29 @@ def forms(granted: Granted) -> dict[str, Any]:
         "feedforward": registry.FEEDFORWARDS,
         "labels": {"": registry.Labels},
         "guard": {"": registry.Guard},
+    }
+    one = shared | {
+        "plant": registry.PLANTS,
+        "observer": registry.OBSERVERS,
+        "controller": registry.CONTROLLERS,
+        "prefilter": registry.PREFILTERS,
         "scenario": {"": registry.Scenario},
         "metrics": {"": registry.Metrics},
     }
+    several = shared | {
+        "plant": registry.AXES_PLANTS,
+        "observer": axes.OBSERVERS,
+        "controller": {"adrc": axes.CONTROLLER},
+        "axes": {"": axes.AXES},
+        "scenario": {"": axes.SCENARIO},
+        "metrics": {"": axes.METRICS},
+    }
+    return {"one": _described(one, without), "several": _described(several, without)}
+
+
+def _described(
+    groups: Mapping[str, Mapping[str, type[CallTable]]], without: Set[str]
+) -> dict[str, Any]:
     return {
         group: {
             kind: {"about": _plain(table.__doc__ or ""), "keys": _keys(table)}
@@ -346,7 +416,7 @@ def forms(granted: Granted) -> dict[str, Any]:
 def _keys(table: type[CallTable]) -> list[dict[str, Any]]:
     found = []
     for key, kind, _, about in loading.keys(table):
-        if key in _HIDDEN:
+        if key in _HIDDEN or key in _HIDDEN_OF.get(table.kind_name, ()):
             continue
         default = table.model_fields[key].default
         needed = default is PydanticUndefined

@@ -13,16 +13,29 @@ from typing import Any
 
 import numpy as np
 
-from quell.analysis import LoopAnalysis, analyse
+from quell import checks
+from quell.analysis import LoopAnalysis, analyse, analyse_axes
+from quell.analysis.margins import Margins
+from quell.controllers.axes import Axes
 from quell.kernels.cache import compile_time
 from quell.plants.linearise import linear_model, linear_part
+from quell.records.axes import AxesTrajectory
 from quell.records.record import describe
 from quell.records.trajectory import Trajectory
+from quell.setup.axes import made_axes
 from quell.setup.description import describe as tables_of
-from quell.setup.description import parsed
+from quell.setup.description import is_of_axes, parsed
 from quell.setup.loading import Known, Setup, assembled
 from quell.simulation import simulate
-from quell.studio.messages import MOST_BYTES, Columns, Granted, checked, frame
+from quell.studio.messages import (
+    MOST_BYTES,
+    Columns,
+    Granted,
+    checked,
+    files_of,
+    frame,
+    with_models,
+)
 from quell.tuning.report import toml_text
 from quell.types import Vector
 
@@ -82,9 +95,12 @@ class Maker:
 
     def __call__(self, tables: Mapping[str, Any]) -> Setup:
         """Return the setup; raise a ``SetupError`` for tables that do not fit."""
-        described = tables_of(self.name, tables)
         with caught_warnings() as self.warnings:
-            setup = assembled(self.name, described, self._known, self.trust)
+            if is_of_axes(tables):
+                setup = made_axes(self.name, tables, self.trust, self._known)
+            else:
+                described = tables_of(self.name, tables)
+                setup = assembled(self.name, described, self._known, self.trust)
         if self.warnings:
             self._known = {}  # what is not built again would not warn again
         for table in ("plant", "scenario"):
@@ -98,8 +114,12 @@ def run_frames(
     about: Mapping[str, Any],
     stale: Callable[[], bool],
     design_warnings: Sequence[str] = (),
+    axis: int = 0,
 ) -> Iterator[bytes]:
     """Yield two frames for a setup: the run, and the analysis of its loop.
+
+    Of several axes they have one, with the control signals of all actuators, and its loop with all
+    other loops closed.
 
     Parameters
     ----------
@@ -113,15 +133,22 @@ def run_frames(
         returns whether nobody waits for the result any more; ``StoppedError`` is raised then.
     design_warnings
         warnings of the setup, which stand before those of the run.
+    axis
+        number of the axis, from 0, of a setup of several.
     """
     began, compiled = time.perf_counter(), compile_time.seconds
     plant, scenario = setup.needed("plant"), setup.needed("scenario")
     with caught_warnings() as caught:
-        run = simulate(plant, setup.controller, scenario, progress=watched(stale))
+        whole = simulate(plant, setup.controller, scenario, progress=watched(stale))
+    run, actuators = whole, {}
+    if isinstance(whole, AxesTrajectory):
+        run = whole.axis(checks.whole("axis", axis, 0, len(whole.axis_names) - 1))
+        actuators = {f"u_{k + 1}": u for k, u in enumerate(whole["u"].T)}
     header: dict[str, Any] = {
         "kind": "run",
         "plant": run.plant,
         "status": int(run.status),
+        "diverged": bool(run.diverged),
         "message": run.message if run.diverged or run.status else "",
         "warnings": [*design_warnings, *caught],
         "metrics": _metrics(run, setup),
@@ -129,14 +156,17 @@ def run_frames(
         "units": {name: describe(name, run.signals)[1] for name in _CHANNELS},
         "seconds": time.perf_counter() - began,
         "compiled": compile_time.seconds - compiled,
+        "axes": list(getattr(whole, "axis_names", ())),
     }
-    yield frame(header | dict(about), _curves(run, columns))
+    yield frame(header | dict(about), _curves(run, columns, actuators))
     if stale():
         raise StoppedError
     began = time.perf_counter()
     try:
-        loop = loop_of(setup)
-        numbers, curves = _analysis(loop)
+        if isinstance(setup.controller, Axes):
+            numbers, curves = _analysis_of_axis(setup, axis)
+        else:
+            numbers, curves = _analysis(loop_of(setup))
     except (ValueError, ArithmeticError) as error:
         numbers, curves = {"reason": " ".join(str(error).split())}, {}
     more = {"kind": "loop", "loop": numbers, "seconds": time.perf_counter() - began}
@@ -179,12 +209,16 @@ def watched(stale: Callable[[], bool]) -> Callable[[float], None]:
     return progress
 
 
-def _curves(run: Trajectory, columns: int) -> dict[str, Vector]:
-    """Return the curves of a run for a plot of some columns of pixels."""
-    names = [name for name in _CHANNELS if name in run.names]
+def _curves(run: Trajectory, columns: int, actuators: Mapping[str, Vector]) -> dict[str, Vector]:
+    """Return the curves of a run for a plot of some columns of pixels.
+
+    The control signals of ``actuators`` stand in place of u, if there are any.
+    """
+    names = [name for name in _CHANNELS if name in run.names and not (actuators and name == "u")]
     t = np.asarray(run.t, dtype=np.float64)
     cut = Columns(len(run), columns)
-    return {"t": cut.times(t)} | {name: cut.points(run[name]) for name in names}
+    curves = {name: run[name] for name in names} | dict(actuators)
+    return {"t": cut.times(t)} | {name: cut.points(each) for name, each in curves.items()}
 
 
 def _metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
@@ -200,43 +234,83 @@ def _metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
     return found
 
 
-def _analysis(loop: LoopAnalysis) -> tuple[dict[str, Any], dict[str, Vector]]:
-    """Return the numbers and the curves of a loop."""
-    # At half the sampling rate L is real, and its phase jumps: the curves end just below.
-    omega = loop.omega[loop.omega < 0.97 * math.pi / loop.dt]
-    if omega.size > _MARGIN_FREQUENCIES:
-        omega = omega[:: math.ceil(omega.size / _MARGIN_FREQUENCIES)]
-    L = loop.response("L", omega)
-    S = 1.0 / (1.0 + L)
+def _analysis_of_axis(setup: Setup, axis: int) -> tuple[dict[str, Any], dict[str, Vector]]:
+    """Return the numbers and the curves of the loop of an axis, the others closed.
+
+    A nonlinear plant is linearised at the start of the scenario, without control signals.
+    """
+    plant: Any = setup.needed("plant")
+    controller: Any = setup.controller
+    scenario = setup.needed("scenario")
+    x0 = np.zeros(plant.order) if scenario.x0 is None else np.asarray(scenario.x0, dtype=float)
+    is_linear = hasattr(plant, "A") or hasattr(getattr(plant, "plant", None), "A")
+    point = None if is_linear else (x0, np.zeros(plant.inputs))
+    loop = analyse_axes(plant, controller, point)
+    name = controller.names[axis]
+    omega = _shown(loop.omega[1:], loop.dt)
+    S = loop.response("S_o", omega)[:, axis, axis]
+    curves = _diagrams(omega, 1.0 / S - 1.0, S)
+    numbers: dict[str, Any] = {"stable": loop.stable}
+    numbers["largest_pole"] = max(abs(each.z) for each in loop.poles)
+    if loop.stable:
+        numbers |= _margins(loop.channel_margins(name))
+        numbers["gains_at_once"] = list(loop.disk_margin("inputs").gain)
+    return numbers, curves
+
+
+def _shown(omega: Vector, dt: float) -> Vector:
+    """Return the frequencies [rad/s] of a plot.
+
+    At half the sampling rate L is real, and its phase jumps: the curves end just below.
+    """
+    omega = omega[omega < 0.97 * math.pi / dt]
+    return omega[:: max(1, math.ceil(omega.size / _MARGIN_FREQUENCIES))]
+
+
+def _diagrams(omega: Vector, L: Any, S: Any) -> dict[str, Vector]:
+    """Return the curves of an open loop and its sensitivity.
+
+    The phase starts within one turn, so that the curve of one design lies on that of another.
+    """
+    phase = np.degrees(np.unwrap(np.angle(L)))
     with np.errstate(divide="ignore"):
-        curves: dict[str, Any] = {
+        return {
             "omega": omega,
             "gain": 20.0 * np.log10(np.abs(L)),
-            "phase": np.degrees(np.unwrap(np.angle(L))),
+            "phase": phase - math.floor((float(phase[0]) + 360.0) / 360.0) * 360.0,
             "S": 20.0 * np.log10(np.abs(S)),
             "T": 20.0 * np.log10(np.abs(L * S)),
             "re": np.real(L),
             "im": np.imag(L),
         }
+
+
+def _margins(m: Margins) -> dict[str, Any]:
+    """Return the margins of a loop for the header of a frame."""
+    return {
+        "m_s": 1.0 / m.modulus,
+        "m_s_omega": m.modulus_omega,
+        "gain_margin": list(m.gain),
+        "phase_margin": m.phase,
+        "phase_omega": m.phase_omega,
+        "delay_margin": m.delay,
+        "disk_margin": m.disk,
+    }
+
+
+def _analysis(loop: LoopAnalysis) -> tuple[dict[str, Any], dict[str, Vector]]:
+    """Return the numbers and the curves of a loop."""
+    omega = _shown(loop.omega, loop.dt)
+    L = loop.response("L", omega)
+    curves = _diagrams(omega, L, 1.0 / (1.0 + L))
     largest = float(np.abs(loop.poles).max())
     numbers: dict[str, Any] = {"stable": loop.stable, "largest_pole": largest}
     if loop.stable:
-        m = loop.margins
-        numbers |= {
-            "m_s": 1.0 / m.modulus,
-            "m_s_omega": m.modulus_omega,
-            "gain_margin": list(m.gain),
-            "phase_margin": m.phase,
-            "phase_omega": m.phase_omega,
-            "delay_margin": m.delay,
-            "disk_margin": m.disk,
+        numbers |= _margins(loop.margins) | {
             "b_range": list(loop.b_range),
             "b_over_b0": loop.b_over_b0,
             "noise_to_control": loop.noise_to_control,
         }
-    # The phase starts within one turn, so that the curve of one design lies on that of another.
-    turns = math.floor((float(curves["phase"][0]) + 360.0) / 360.0) * 360.0
-    curves["phase"] = curves["phase"] - turns
     return numbers, curves
 
 
@@ -255,6 +329,21 @@ plt.show()
 '''
 
 
+_SCRIPT_OF_AXES = '''"""{title}: simulated and drawn."""
+
+import matplotlib.pyplot as plt
+
+import quell as ql
+
+setup = ql.setup.made_axes("{name}", {tables})
+run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+for axis, metrics in run.metrics().items():
+    print(axis, metrics)
+run.plot()
+plt.show()
+'''
+
+
 def toml_of(tables: Mapping[str, Any]) -> str:
     """Return the tables as a setup file."""
     return toml_text(_without_none(tables))
@@ -267,6 +356,9 @@ def python_of(tables: Mapping[str, Any], title: str, is_whole: bool, delay: floa
     [s].
     """
     literal = pprint.pformat(_without_none(tables), indent=1, width=92, sort_dicts=False)
+    if is_of_axes(tables):
+        about = _in_docstring(title) or "A setup"
+        return _SCRIPT_OF_AXES.format(title=about, name=NAME, tables=literal)
     return _SCRIPT.format(
         title=_in_docstring(title) or "A setup",
         name=NAME,
@@ -282,11 +374,20 @@ def _in_docstring(title: str) -> str:
     return " ".join(plain.replace('"', "'").replace("\\", "/").split())
 
 
-def tables_of_text(text: Any, granted: Granted) -> dict[str, Any]:
-    """Return the tables of the text of a setup file; raise a ``SetupError`` or ``ValueError``."""
+def tables_of_text(text: Any, granted: Granted, models: Any = None) -> dict[str, Any]:
+    """Return the tables of the text of a setup file; raise a ``SetupError`` or ``ValueError``.
+
+    ``models`` has the texts of files of identified models by name.
+    """
     if not isinstance(text, str) or len(text) > MOST_BYTES:
         raise ValueError(f"text: must be the content of a TOML file, at most {MOST_BYTES} bytes")
-    return checked(parsed(NAME, text), granted)
+    texts = models or {}
+    if not isinstance(texts, Mapping) or not all(isinstance(each, str) for each in texts.values()):
+        raise ValueError("models: must be texts of files by name")
+    tables = parsed(NAME, text)
+    if not files_of(tables) <= granted.files:
+        tables = with_models(tables, texts)
+    return checked(tables, granted)
 
 
 def _without_none(value: Any) -> Any:

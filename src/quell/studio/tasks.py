@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.controllers.axes import Axes
 from quell.controllers.prefilters import without_prefilters
 from quell.experiments.compare import tuned as tuned_references
 from quell.setup.loading import Setup
@@ -53,6 +55,7 @@ STRUCTURES = (
 _TRADEOFF = (1.2, 1.3, 1.4, 1.6, 1.8, 2.0)
 _COMPARED = {"tuned-pid": "PID", "tuned-lqg": "LQG"}
 _LIMITS = ("u_min", "u_max", "rate_limit")
+_WITH_OPTIONS = re.compile(r" \(--[^)]*\)")  # in a text for the command line
 # Plants of a band, and the most that their parameters change [%]. Chosen by hand: 24 runs take a
 # quarter of a second.
 _PLANTS, _MOST_PERCENT = 24, 50.0
@@ -70,8 +73,11 @@ def tuned_frames(
     message: Mapping[str, Any],
     stale: Stale,
     report: Report,
+    make: Maker,
 ) -> Iterator[bytes]:
     """Yield the tuned controller's tables, and then the trade-off between M_s and load rejection.
+
+    In between are run and loop of the setup as it was and of the tuned one, to compare them.
 
     The message has ``structure``, ``m_s``, ``m_t`` and, if noise is bounded, ``m_ks``, or the noise
     of y: ``noise_std`` and ``resolution``. A controller that feeds forward is tuned with the
@@ -109,11 +115,14 @@ def tuned_frames(
             "k_i": design.k_i,
             "active": list(best.active),
             "constraints": str(best.constraints),
-            "noise_bound": best.noise_bound,
+            "noise_bound": _WITH_OPTIONS.sub("", best.noise_bound),
             "step": _sentence(str(best.reference_step)),
             "plants": len(best.plants.plants),
         }
     )
+    wide = columns(message)
+    for pin, each in (("before tuning", setup), ("tuned", make(tables))):
+        yield from run_frames(each, wide, {"id": message["id"], "pin": pin}, stale)
     for at in sorted({*_TRADEOFF, bounds.m_s or _TRADEOFF[0]}):
         other = dataclasses.replace(best.constraints, m_s=at)
         try:
@@ -275,14 +284,11 @@ def _fmu(setup: Setup, folder: Path) -> tuple[str, bytes]:
 def _c(setup: Setup, folder: Path, precision: str) -> tuple[str, bytes]:
     from quell.export import c
 
-    found = c(
-        setup.controller,
-        folder,
-        name=C_NAME,
-        precision=precision,
-        plant=setup.plant,
-        scenario=setup.scenario,
-    )
+    # The run in which single precision is compared with double is one of one axis.
+    run: dict[str, Any] = {"plant": setup.plant, "scenario": setup.scenario}
+    if isinstance(setup.controller, Axes):
+        run = {}
+    found = c(setup.controller, folder, name=C_NAME, precision=precision, **run)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
         for path in sorted(found.files):
@@ -294,6 +300,12 @@ def _c(setup: Setup, folder: Path, precision: str) -> tuple[str, bytes]:
 
 
 # ---- Tasks that messages of the page ask for ----
+
+_OF_ONE_AXIS = {
+    "band": "the band of uncertain plants is drawn for one axis",
+    "compare": "the comparison with PID and LQG is of one axis",
+    "tune": "the page tunes one axis; choose omega_c and omega_o by the margins of each axis",
+}
 
 LONG = ("compare", "tune", "export", "record")
 """Tasks that take seconds: they have a thread of their own, so that sliders go on moving."""
@@ -318,7 +330,7 @@ def frames_for(
     """
     task, about = message["do"], {"id": message["id"]}
     if task == "open":
-        tables = tables_of_text(message.get("text"), granted)
+        tables = tables_of_text(message.get("text"), granted, message.get("models"))
         make(tables)
         yield frame({"kind": "opened", "setup": tables, **about})
         return
@@ -327,18 +339,24 @@ def frames_for(
         return
     tables = setup_tables(message, granted)
     setup = make(tables)
+    if isinstance(setup.controller, Axes) and task in _OF_ONE_AXIS:
+        raise ValueError(f"NOT for several axes: {_OF_ONE_AXIS[task]}")
     if task == "run":
-        yield from run_frames(setup, columns(message), about, stale, make.warnings)
+        axis = checks.whole("axis", message.get("axis", 0), 0)
+        yield from run_frames(setup, columns(message), about, stale, make.warnings, axis)
     elif task == "band":
         yield from band_frames(setup, tables, message, stale)
     elif task in ("compare", "tune"):
-        work = compared_frames if task == "compare" else tuned_frames
-        yield from work(setup, record, message, stale, report)
+        if task == "compare":
+            yield from compared_frames(setup, record, message, stale, report)
+        else:
+            yield from tuned_frames(setup, record, message, stale, report, make)
         yield frame({"kind": "done", **about})
     elif task == "export":
         name, content = exported(setup, message)
         yield file_frame({"kind": "file", "name": name, **about}, content)
     else:
         is_whole = not hasattr(setup.plant, "linear")
-        script = python_of(tables, setup.title, is_whole, delay_beside(setup))
+        delay = 0.0 if isinstance(setup.controller, Axes) else delay_beside(setup)
+        script = python_of(tables, setup.title, is_whole, delay)
         yield frame({"kind": "texts", "toml": toml_of(tables), "python": script, **about})

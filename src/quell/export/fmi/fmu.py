@@ -32,7 +32,8 @@ from numpy.typing import ArrayLike
 from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
-from quell.export.c_files import plant_source, refuse_state_feedback
+from quell.controllers.state_space import StateFeedback
+from quell.export.c_files import plant_source
 from quell.export.controller_source import c_source
 from quell.export.fmi.parts import (
     FIXED,
@@ -576,10 +577,10 @@ def _parts(part: Any) -> tuple[Any, Any]:
         plant, controller = part, None
     if controller is not None:
         check_controller(controller, several=True)
-        refuse_state_feedback(controller)
-    if isinstance(controller, Axes):
+    if isinstance(controller, Axes | StateFeedback):
+        what = f"{controller.outputs} axes" if controller.axes else "StateFeedback"
         raise TranslationError(
-            f"{controller.outputs} axes: an FMU is of one u and one y; write the axes as C by "
+            f"{what}: an FMU is of one u and one y; write the controller as C by "
             "quell.export.c, whose files can be linked into a block of your simulator"
         )
     if plant is not None or controller is None:

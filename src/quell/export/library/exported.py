@@ -14,7 +14,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,15 +25,11 @@ from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
 from quell.controllers.prefilters import without_prefilters
-from quell.controllers.single import SinglePrecision, in_single_precision
-from quell.export.axes_source import parts_of_axes, source_of_axes
-from quell.export.c_files import CSource, refuse_state_feedback
+from quell.controllers.single import SinglePrecision
+from quell.controllers.state_space import StateFeedback
+from quell.export.c_files import CSource
 from quell.export.controller_source import c_source, in_double_precision, limits_path
-from quell.export.library.axes_vectors import (
-    AxesVectors,
-    golden_vectors_of_axes,
-    test_program_of_axes,
-)
+from quell.export.library.packages import package_files, package_note
 from quell.export.library.vectors import (
     TOLERANCE_REASON,
     Vectors,
@@ -84,7 +80,7 @@ _OPERATIONS = {
     "status": ("status(s)", "after the step: flags, see the enum in the header"),
     "get_estimate": ("get_estimate(s)", "after the step: what the controller knows, for telemetry"),
 }
-_TEXTS = ("CMakeLists.txt", "library.json", "library.properties", "README.md")
+_TEXTS = ("CMakeLists.txt", "README.md")
 _RETUNING = """## Other limits
 
 Parameters are constants. To change a limit while running, change a copy:
@@ -139,15 +135,30 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
     vectors
         a run of it.
     """
-    path = limits_path(controller)
-    values = {
-        **_values(source, controller.dt, f"{path}.high" if path else ""),
+    path, several = limits_path(controller), source.sizes is not None
+    limit = f"{path}.high{'[0]' if several else ''}" if path else ""
+    values = _values(source, controller.dt, limit)
+    values |= (_texts_of_several if several else _texts_of_one)(controller, source)
+    kind = "_axes" if several else ""
+    values["loop"] = filled(f"loop{kind}.md", values).rstrip("\n")
+    name = source.name
+    return {
+        f"src/{name}.h": source.header,
+        f"src/{name}.c": source.source,
+        f"test_{name}.c": test_program(source, vectors),
+        f"examples/{name}/{name}.ino": filled(f"example{kind}.ino", values),
+        **{each: filled(each, values) for each in _TEXTS},
+        **package_files(source, values),
+    }
+
+
+def _texts_of_one(controller: Any, source: CSource) -> dict[str, str]:
+    """Return the texts of a controller of one u and y."""
+    return {
         "title": f"Controller {type(in_double_precision(controller)).__name__}",
         **_with_signals(_reference_texts(source), source),
         "operations": _operation_rows(source, _OPERATIONS),
     }
-    values["loop"] = filled("loop.md", values).rstrip("\n")
-    return _library(source, test_program(source, vectors), filled("example.ino", values), values)
 
 
 def _operation_rows(source: CSource, operations: dict[str, tuple[str, str]]) -> str:
@@ -182,20 +193,7 @@ def _values(source: CSource, dt: float, limit: str) -> dict[str, object]:
         "external_note": " # and your functions" if functions else "",
         "link": " YOUR_FILES" if functions else "",
         "tolerance_reason": TOLERANCE_REASON,
-    }
-
-
-def _library(
-    source: CSource, test: str, example: str, values: Mapping[str, object]
-) -> dict[str, str]:
-    """Return the text of all files of a library by path."""
-    name = source.name
-    return {
-        f"src/{name}.h": source.header,
-        f"src/{name}.c": source.source,
-        f"test_{name}.c": test,
-        f"examples/{name}/{name}.ino": example,
-        **{each: filled(each, values) for each in _TEXTS},
+        "package_note": package_note(source),
     }
 
 
@@ -213,27 +211,41 @@ _OPERATIONS_OF_AXES = _OPERATIONS | {
 }
 
 
-def library_files_of_axes(
-    controller: Axes, source: CSource, vectors: AxesVectors
-) -> dict[str, str]:
-    """Return the text of all files of the library of several axes by path."""
-    upper = source.name.upper()
+_OPERATIONS_OF_FEEDBACK = _OPERATIONS_OF_AXES | {
+    "start": ("start(s, y, u, r)", "the plant rests at y under u"),
+    "retune": ("retune(s, &parameters)", "between two samples: other limits"),
+    "reset": ("reset(s)", "from rest at the next sample"),
+}
+
+
+def _texts_of_several(controller: Any, source: CSource) -> dict[str, str]:
+    """Return the texts of several axes, and of state feedback."""
+    upper, (n, p, m) = source.name.upper(), source.sizes or (1, 1, 1)
     arrays = "".join(f", {each}[{upper}_AXES]" for each in source.further)
     primes = ", ".join("r" + "'" * (i + 1) for i in range(source.derivatives))
-    places = (f"{i} `{name}`" for i, name in enumerate(controller.names))
-    values = {
-        **_values(source, controller.dt, "limits.high[0]"),
-        "title": f"Controller of {controller.outputs} axes with {controller.inputs} actuators",
-        "operations": _operation_rows(source, _OPERATIONS_OF_AXES),
-        "axes": ", ".join(places),
+    if source.axes:
+        names = ", ".join(f"{i} `{name}`" for i, name in enumerate(controller.names))
+        title, sizes = f"Controller of {n} axes with {m} actuators", ("AXES", "AXES")
+        about = f"The places of the axes in `r`, `y` and `v`: {names}."
+    else:
+        title, sizes = (
+            f"State feedback of {p} outputs with {m} actuators",
+            ("REFERENCES", "MEASUREMENTS"),
+        )
+        about = f"`r` has a number for each of the {n} controlled outputs, in their order."
+    return {
+        "title": title,
+        "operations": _operation_rows(
+            source, _OPERATIONS_OF_AXES if source.axes else _OPERATIONS_OF_FEEDBACK
+        ),
+        "places": f"{about} `r`, `y` and `u` must be different arrays.",
+        "r_size": f"{upper}_{sizes[0]}",
+        "y_size": f"{upper}_{sizes[1]}",
         "further": "".join(f", {each}" for each in source.further),
         "local_further": arrays,
         "declared_further": arrays.replace(", ", f", {source.real} "),
         "about_further": f" /* with {primes} of the same move */" if primes else "",
     }
-    values["loop"] = filled("loop_axes.md", values).rstrip("\n")
-    test = test_program_of_axes(source, vectors)
-    return _library(source, test, filled("example_axes.ino", values), values)
 
 
 def _reference_texts(source: CSource) -> dict[str, str]:
@@ -607,17 +619,18 @@ def c(
 ) -> Exported:
     """Write a controller as a library in C99, translated from the kernels that simulate it.
 
-    The folder is a project for CMake, and a library for Arduino and PlatformIO: ``src/NAME.h`` and
-    ``src/NAME.c``, a test with golden vectors ``test_NAME.c``, and ``README.md``. Without
-    contraction to FMA the code gives, in double precision, the bits of the interpreted kernels, and
-    in single precision those of ``simulate(..., precision="single", interpret=True)``.
+    The folder is a project for CMake, a library for Arduino and PlatformIO, and a component for
+    ESP-IDF (docs/ecosystems): ``src/NAME.h`` and ``src/NAME.c``, a test with golden vectors
+    ``test_NAME.c``, and ``README.md``. Without contraction to FMA the code gives, in double
+    precision, the bits of the interpreted kernels, and in single precision those of
+    ``simulate(..., precision="single", interpret=True)``.
 
     Parameters
     ----------
     controller
         any controller that does not call Python; its parameters and its state before the first
-        sample are written. Of several axes, ``quell.Axes``, the functions take arrays
-        (docs/axes).
+        sample are written. Of several axes, ``quell.Axes`` (docs/axes), and of
+        ``controllers.StateFeedback`` the functions take arrays.
     folder
         where to write; must be new or empty.
     name
@@ -659,7 +672,6 @@ def c(
     ['servo.h', 'servo.c', 'test_servo.c']
     """
     check_controller(controller, several=True)
-    refuse_state_feedback(controller)
     if checked_name(name).lower() in _CMAKE_TARGETS.split():
         rule = "is a target of CMake itself, so CMakeLists.txt can't have it; choose another name"
         raise ValueError(f"name = {name!r}: {rule}")
@@ -667,45 +679,31 @@ def c(
     check_folder(folder, checks.flag("overwrite", overwrite))
     checks.flag("accept", accept)
     checks.flag("proof", proof)
-    if isinstance(controller, Axes):
-        _check_options_of_axes(controller, single, accept, proof, plant, scenario, resolution)
-        parts, source = parts_of_axes(controller, single), source_of_axes(controller, name, single)
-        run = golden_vectors_of_axes(controller, parts, source.operations)
-        files = write_folder(folder, library_files_of_axes(controller, source, run), overwrite)
-        return Exported(Path(folder), files, source, None)
     single = single or isinstance(controller, SinglePrecision)
-    shown = in_single_precision(controller) if single else controller
-    source = c_source(shown, name, resolution=resolution)
+    if isinstance(controller, Axes | StateFeedback):
+        _check_options_of_several(controller, single, accept, plant, scenario)
+    source = c_source(controller, name, precision=precision, resolution=resolution)
     comparison = None
     if single and plant is not None and scenario is not None:
         comparison = compared(plant, controller, scenario)
     if single and not accept:
         _check_comparison(comparison, controller)
-    proving = proof_files(shown, source) if proof else {}
-    vectors = golden_vectors(shown, source.operations)
-    files = write_folder(folder, library_files(shown, source, vectors) | proving, overwrite)
+    proving = proof_files(controller, source) if proof else {}
+    vectors = golden_vectors(controller, source)
+    files = write_folder(folder, library_files(controller, source, vectors) | proving, overwrite)
     done = prove(Path(folder), source, sizes=_function_table(source)) if proof else None
     return Exported(Path(folder), files, source, comparison, done)
 
 
-def _check_options_of_axes(
-    controller: Axes,
+def _check_options_of_several(
+    controller: Any,
     single: bool,
     accept: bool,
-    proof: bool,
     plant: Any,
     scenario: Any,
-    resolution: float | None,
 ) -> None:
     """Refuse what ``c`` does for one u and y only."""
-    what = f"{controller.outputs} axes"
-    if proof:
-        raise ValueError(
-            f"proof = True: the proof is of controllers with one u and one y, these are {what}; "
-            "leave it out, and prove each axis by itself as an ADRC"
-        )
-    if resolution is not None:
-        c_source(controller, resolution=resolution)  # says why it is refused
+    what = f"{controller.outputs} axes" if controller.axes else "several signals"
     if plant is not None or scenario is not None:
         raise ValueError(
             f"plant, scenario: the comparison of single with double precision is of controllers "

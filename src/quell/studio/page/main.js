@@ -9,8 +9,10 @@ import { Forms } from "./panels/forms.js";
 import { boundFields, usual } from "./panels/numbers.js";
 import { MachineRecord } from "./panels/record.js";
 import { Pins } from "./panels/pins.js";
+import { rovingButtons, rovingTitles } from "./panels/roving.js";
 import { tabs } from "./panels/tabs.js";
 import { Tours } from "./panels/tours.js";
+import { takesNumber } from "./panels/typed.js";
 import { Watch } from "./panels/watch.js";
 import { Picture } from "./picture.js";
 import { short } from "./plots/plots.js";
@@ -51,6 +53,7 @@ function set(values, ...how) {
 }
 
 function onState(state, structure, source) {
+  designs.changed(state.setup);
   if (source === "history") {
     home("undo").disabled = !store.past.length;
     home("redo").disabled = !store.future.length;
@@ -80,7 +83,8 @@ function send(task) {
 }
 
 function askRun(setup, local) {
-  server.run({ do: "run", setup, columns: picture.columns, local });
+  const axis = Math.min(picture.axis, (setup.axis?.length ?? 1) - 1);
+  server.run({ do: "run", setup, axis, columns: picture.columns, local });
 }
 
 function ask() {
@@ -145,17 +149,19 @@ function keepPins() {
 const designs = new Designs(
   (task) => send({ ...task, record: record.shown }),
   () => server.send({ do: "cancel" }),
+  () => store.state,
+  () => record.shown,
   (setup) => {
     pinNow("before tuning");
     set({ setup });
   },
-  (header, arrays) => {
-    pins.compare(header.pin, header.kind === "run", arrays);
+  (label, isRun, arrays) => {
+    pins.compare(label, isRun, arrays);
     picture.draw();
   },
 );
 
-const openText = (text) => server.send({ do: "open", text });
+const openText = (text, models) => server.send({ do: "open", text, models });
 const files = new Files(send, openText);
 const record = new MachineRecord(
   (message) => (server.connected ? server.send({ ...message, columns: picture.columns }) : null),
@@ -206,7 +212,7 @@ function chooseTab(name) {
 // ---- beginning
 
 async function begin(hello) {
-  forms.groups = hello.forms;
+  forms.kinds = hello.forms;
   if (store) {
     server.flying = null;
     ask(); // the connection was lost
@@ -243,13 +249,19 @@ home("preset").onchange = () => home("preset").value !== "" && choosePreset(Numb
 home("undo").onclick = () => store.undo();
 home("redo").onclick = () => store.redo();
 home("pin").onclick = () => pinNow();
-home("watch-go").onclick = () => watch.start(Number(home("watch-port").value));
+const portIsRight = takesNumber(home("watch-port"));
+home("watch-go").onclick = () => portIsRight().value !== undefined && watch.start(portIsRight().value);
 home("frequency").onchange = () => {
   picture.views.setFrequency(home("frequency").value);
   set({ frequency: home("frequency").value }, false, "choice");
 };
+home("axis").onchange = () => {
+  picture.axis = Number(home("axis").value);
+  pins.forget();
+  ask();
+};
 home("band").onchange = () => set({ band: home("band").checked }, false, "choice");
-home("percent").oninput = () => set({ percent: Number(home("percent").value) }, false, "choice");
+takesNumber(home("percent"), (percent) => percent !== undefined && set({ percent }, false, "choice"));
 tabs(["design", "learn", "watch"], chooseTab);
 keys({ undo: () => store.undo(), redo: () => store.redo(), pin: () => pinNow() });
 theme(() => {
@@ -258,4 +270,7 @@ theme(() => {
   picture.views.redraw();
   pins.show();
   record.redraw();
+  designs.redraw();
 });
+rovingButtons(document.querySelector(".tools"));
+rovingTitles(home("left"));

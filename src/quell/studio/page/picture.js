@@ -1,18 +1,19 @@
 // What the server last sent, drawn with the pins: a run, its loop, a band of runs, and their numbers.
 
 import { home, write } from "./dom.js";
-import { showNumbers, unit } from "./panels/numbers.js";
+import { inWords, numbersOf, showNumbers, unit } from "./panels/numbers.js";
 import { short } from "./plots/plots.js";
 import { Views } from "./plots/views.js";
 
 const MOST_TIMES = 10_000;
 const REST = 150; // the page is at rest when nothing has moved for this time [ms]
+const PAUSE = 700; // the numbers are said when they have not changed for this time [ms]
 
 export class Picture {
   // `state()` returns the state of the page, and `pins` has the designs to compare with.
   constructor(state, pins) {
     Object.assign(this, { state, pins, views: new Views(), watching: false });
-    Object.assign(this, { arrays: {}, loopArrays: {}, run: null, loop: null, band: null });
+    Object.assign(this, { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, axis: 0 });
     // For measurements from outside: times from an input to its pictures [ms], pictures, compilation [s].
     Object.assign(this, { firstTimes: [], times: [], frames: 0, compiled: 0 });
   }
@@ -40,16 +41,28 @@ export class Picture {
     if (!this.watching) this.age(false);
     this.arrays = arrays;
     this.run = header;
+    this.nameAxes(header.axes);
     this.compiled += header.compiled;
     this.message([header.message, ...header.warnings].filter(Boolean).join("\n"));
     if (!this.watching) this.drawRun();
     timed(this.firstTimes, asked);
   }
 
+  // Offer the axes of the setup, of which one is shown; there is no choice of one.
+  nameAxes(names) {
+    const choice = home("axis");
+    if (names.join("\n") !== [...choice.options].map((each) => each.text).join("\n")) {
+      this.axis = Math.max(0, Math.min(this.axis, names.length - 1));
+      choice.replaceChildren(...names.map((name, i) => new Option(name, i, false, i === this.axis)));
+    }
+    write(home("axes"), { hidden: names.length < 2 });
+  }
+
   takeLoop(header, arrays, asked) {
     const pin = asked.local?.pin;
     if (pin) {
       Object.assign(pin.arrays, arrays);
+      if (!this.watching) this.age(false); // a pin is asked for when the present curves are there
       this.draw();
       return;
     }
@@ -105,7 +118,10 @@ export class Picture {
     this.numbering ??= requestAnimationFrame(() => {
       this.numbering = null;
       const { bounds, setup } = this.state();
-      showNumbers(home("numbers"), this.run, this.loop, bounds, setup.dt);
+      const entries = numbersOf(this.run, this.loop, bounds, setup.dt);
+      showNumbers(home("numbers"), entries);
+      clearTimeout(this.sayTimer);
+      this.sayTimer = setTimeout(() => write(home("said"), { textContent: inWords(entries) }), PAUSE);
     });
   }
 }

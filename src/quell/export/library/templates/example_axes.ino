@@ -1,4 +1,4 @@
-/* The controller @name@ of several axes in the loop of an Arduino.
+/* The controller @name@ of several signals in the loop of an Arduino.
  *
  * A timer interrupt is more exact; README.md has it. Replace pins and scales by those of your
  * sensors and drives.
@@ -11,7 +11,7 @@ static const unsigned long sample_time = (unsigned long)(1e6 * @NAME@_SAMPLE_TIM
 
 static const @real@ y_per_count = @one@; /* sensors: units of y */
 static const @real@ counts_per_u = @one@; /* drives */
-static @real@ r[@NAME@_AXES]@local_further@; /* references: replace them by your move */
+static @real@ r[@r_size@]@local_further@; /* references: replace them by your move */
 
 void setup()
 {
@@ -21,13 +21,13 @@ void setup()
 
 void loop()
 {
-    @real@ y[@NAME@_AXES], u[@NAME@_ACTUATORS];
+    @real@ y[@y_size@], u[@NAME@_ACTUATORS];
 
     if ((long)(micros() - next_sample) < 0)
         return;
     next_sample += sample_time;
 
-    for (int i = 0; i < @NAME@_AXES; i++)
+    for (int i = 0; i < @y_size@; i++)
         y[i] = y_per_count * (@real@)analogRead(A0 + i);
     @name@_step(&controller, r, y@further@, u);
     for (int k = 0; k < @NAME@_ACTUATORS; k++) {

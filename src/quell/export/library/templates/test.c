@@ -8,8 +8,8 @@
  *     ./test_@name@
  *
  * It ends with 0 if all u are within TOLERANCE of quell's and the status flags are the same, and
- * with 1 if not. Differences are in ulps: the spacing of numbers at |u|, or at the RMS of u where
- * that is larger. @tolerance_reason@
+ * with 1 if not. Differences are in ulps: the spacing of numbers at |u|, or at the RMS of this u
+ * where that is larger. @tolerance_reason@
  */
 #include "@name@.h"
 
@@ -22,7 +22,9 @@
 #define TOLERANCE @tolerance@ /* [ulp]; the first argument of the program takes its place */
 #endif
 #define EPSILON @epsilon@
-#define SCALE @scale@ /* RMS of u */
+#define REFERENCES @references@
+#define MEASUREMENTS @measurements@
+#define ACTUATORS @actuators@
 
 typedef @real@ real;
 
@@ -30,16 +32,18 @@ enum action { @actions@ };
 
 typedef struct {
     int action;
-    real r;
-    real y;
-    real given; /* u that was applied */
-    real u; /* u of the controller */
+    real r[REFERENCES];
+    real y[MEASUREMENTS];
+    real given[ACTUATORS]; /* u that was applied */
+    real u[ACTUATORS]; /* u of the controller */
     int status;
 } sample;
 
 static const sample samples[] = {
 @rows@
 };
+
+static const double scale[ACTUATORS] = {@scale@}; /* RMS of each u */
 
 /* What the controller knows after the last sample. */
 typedef struct {
@@ -59,14 +63,14 @@ static double in_ulps(real found, real right, double size)
 }
 
 @loop@
-static real play(@name@_state *state@limited_parameter@, const sample *now)
+static void play(@name@_state *state@limited_parameter@, const sample *now, real u[ACTUATORS])
 {
-    switch (now->action) {
+@halves@    switch (now->action) {
 @cases@
     default:
         break;
     }
-    return @name@_step(state, now->r, now->y@derivatives@);
+    @step@;
 }
 
 /* Save, forget everything, load: nothing may change; a damaged image must be refused. */
@@ -97,19 +101,24 @@ int main(int argc, char **argv)
     @name@_init(&state);
     for (int k = 0; k < count; k++) {
         const sample *now = &samples[k];
+        real u[ACTUATORS] = {@zero@};
+
         if (k == 30 || k == count - 1)
             wrong += power_cycle(&state);
-        const real u = play(&state@limited_argument@, now);
-        const double difference = in_ulps(u, now->u, SCALE);
+        play(&state@limited_argument@, now, u);
         const int status = @name@_status(&state);
 
-        if (difference > largest || !(difference >= 0.0))
-            largest = difference;
-        if (difference <= tolerance && status == now->status)
-            continue;
-        if (wrong++ == 0)
-            printf("sample %d: u = %.@digits@g, status %d; must be %.@digits@g, status %d\n", k,
-                (double)u, status, (double)now->u, now->status);
+        for (int i = 0; i < ACTUATORS; i++) {
+            const double difference = in_ulps(u[i], now->u[i], scale[i]);
+
+            if (difference > largest || !(difference >= 0.0))
+                largest = difference;
+            if (difference <= tolerance && status == now->status)
+                continue;
+            if (wrong++ == 0)
+                printf("sample %d: u[%d] = %.@digits@g, status %d; must be %.@digits@g, status %d\n", k,
+                    i, (double)u[i], status, (double)now->u[i], now->status);
+        }
     }
     const @name@_estimate estimate = @name@_get_estimate(&state);
     const real found[] = {

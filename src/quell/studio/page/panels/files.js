@@ -3,7 +3,7 @@
 import { home } from "../dom.js";
 
 export class Files {
-  // `ask(message)` sends with the present setup; `open(text)` opens the text of a file.
+  // `ask(message)` sends with the present setup; `open(text, models)` opens the texts of files.
   constructor(ask, open) {
     Object.assign(this, { ask, texts: null, saving: false });
     home("save").onclick = () => this.askText(true);
@@ -12,9 +12,10 @@ export class Files {
     home("export-fmu").onclick = () => this.askExport("fmu");
     home("open").onclick = () => home("file").click();
     home("file").onchange = async () => {
-      const [file] = home("file").files;
-      if (file) open(await file.text());
+      const found = await setupOf([...home("file").files]);
       home("file").value = "";
+      if (found) open(...found);
+      else home("state").textContent = "Choose one setup (.toml), and the file of its identified model (.json) if it has one.";
     };
     home("as-toml").onclick = () => this.choose("toml");
     home("as-python").onclick = () => this.choose("python");
@@ -62,4 +63,13 @@ export function download(name, content) {
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+// Return the text of a setup file and those of models beside it by name; null for other files.
+export async function setupOf(files) {
+  const setups = files.filter((file) => !/\.json$/i.test(file.name));
+  if (setups.length !== 1) return null;
+  const models = files.filter((file) => file !== setups[0]);
+  const texts = await Promise.all(models.map(async (file) => [file.name, await file.text()]));
+  return [await setups[0].text(), Object.fromEntries(texts)];
 }

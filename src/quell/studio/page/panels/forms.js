@@ -2,6 +2,8 @@
 
 import { element, field, input, select } from "../dom.js";
 import { at } from "../store.js";
+import { rovingSliders } from "./roving.js";
+import { takes, typedList, typedNumber } from "./typed.js";
 
 const TITLES = {
   plant: "Plant", observer: "Observer", controller: "Controller", learner: "Learner",
@@ -17,6 +19,7 @@ const SHOWN = ["disturbance_order"];
 const RANGES = { disturbance_order: [1, 3] };
 const OPTIONAL = ["observer", "learner", "guard", "prefilter"];
 const OPEN = ["plant", "observer", "controller"];
+const PARTS = ["observer", "controller", "learner", "guard"]; // of one of several axes
 const POLYNOMIALS = ["num", "den"];
 const WHOLE = "whole number";
 
@@ -25,22 +28,24 @@ export class Forms {
   constructor(home, change) {
     this.home = home;
     this.change = change;
-    this.groups = null;
+    this.kinds = null; // what the server says of the groups: of one axis, and of several
     this.anchors = new Map();
     this.unfolded = new Map();
+    this.rove = rovingSliders(home);
   }
 
   build(setup) {
     this.setup = setup;
     const focus = document.activeElement?.dataset?.path;
     const kind = document.activeElement?.type;
-    const parts = [this.sampling()];
-    for (const [group, title] of Object.entries(TITLES)) parts.push(this.section(group, title));
+    this.groups = setup.axis ? this.kinds.several : this.kinds.one;
+    const parts = [this.sampling(), ...(setup.axis ? this.axes() : this.sections(Object.keys(TITLES)))];
     this.home.replaceChildren(...parts);
     if (focus) {
       const same = [...this.home.querySelectorAll("[data-path]")].filter((e) => e.dataset.path === focus);
       (same.find((e) => e.type === kind) ?? same[0])?.focus();
     }
+    this.rove();
   }
 
   // Show another value of a path in the same form, in all its controls but the one that set it.
@@ -49,28 +54,52 @@ export class Forms {
     for (const input of this.home.querySelectorAll("[data-path]")) {
       const own = input.dataset.path;
       const related = own.startsWith(path) || path.startsWith(own);
-      if (related && input !== except && input.showValue) input.showValue(at(setup, own));
+      if (!related || input === except || !input.showValue) continue;
+      input.showValue(at(setup, own));
+      input.recheck?.();
     }
   }
 
   sampling() {
     const entry = { key: "dt", type: "number", about: "sample time of the loop [s].", needed: true };
-    const box = element("div");
+    const box = element("div", "plain");
     box.append(this.number(entry, "dt", "sample time [s]", false));
     return box;
   }
 
-  section(group, title) {
-    const table = at(this.setup, group);
-    const box = this.details(group, title, OPEN.includes(group) || (table != null && group !== "scenario"));
-    if (OPTIONAL.includes(group)) {
-      const on = input("checkbox", group + "!", `Use: ${title}`);
+  sections(groups) {
+    return groups.map((group) => this.section(group, TITLES[group], group, OPTIONAL.includes(group)));
+  }
+
+  section(group, title, path, optional) {
+    const table = at(this.setup, path);
+    const box = this.details(path, title, OPEN.includes(group) || (table != null && group !== "scenario"));
+    if (optional) {
+      const on = input("checkbox", path + "!", `Use: ${title}`);
       on.checked = table != null;
-      on.onchange = () => this.change(group, on.checked ? this.fresh(group) : undefined, true);
+      on.onchange = () => this.change(path, on.checked ? this.fresh(group) : undefined, true);
       box.append(field(`Use`, on));
     }
-    if (table != null) box.append(...this.table(group, table, group));
+    if (table != null) box.append(...this.table(group, table, path));
     return box;
+  }
+
+  // Return the sections of a setup of several axes: those of an axis are named after it.
+  axes() {
+    const ofAxis = (axis, i) => {
+      const name = axis.name || `axis${i + 1}`;
+      const parts = PARTS.map((group) => this.section(group, `${name}: ${TITLES[group].toLowerCase()}`, `axis[${i}].${group}`, ["learner", "guard"].includes(group)));
+      const box = this.details(`axis[${i}] signals`, `${name}: reference and noise`, false);
+      for (const key of ["reference", "noise"]) {
+        const about = key === "noise" ? "signal added to y before the controller." : "signal that y has to follow.";
+        box.append(this.signal({ key, about }, `axis[${i}].${key}`, key, axis[key]));
+      }
+      return [...parts, box];
+    };
+    return [
+      ...this.sections(["plant"]), this.section("axes", "B0 and actuators", "axes", true),
+      ...this.setup.axis.flatMap(ofAxis), ...this.sections(["scenario"]),
+    ];
   }
 
   details(path, title, open) {
@@ -217,16 +246,8 @@ export class Forms {
     box.placeholder = "[1, 2, 3]";
     box.showValue = (now) => (box.value = now === undefined ? "" : JSON.stringify(now));
     box.showValue(at(this.setup, path));
-    box.oninput = () => {
-      try {
-        const value = box.value.trim() ? JSON.parse(box.value) : undefined;
-        box.setCustomValidity("");
-        this.change(path, value, false, box);
-      } catch {
-        box.setCustomValidity("A number, or a list as [1, 2, 3]");
-      }
-    };
     const row = field(name, box, entry.about);
+    takes(box, typedList, (value) => this.change(path, value, false, box));
     if (!POLYNOMIALS.includes(entry.key)) return row;
     const shape = () => JSON.stringify([at(this.setup, path)].flat().map(Boolean));
     const before = shape();
@@ -250,9 +271,10 @@ export class Forms {
 
   // Return a number with, where it can slide, a slider: logarithmic for a positive one.
   number(entry, path, name, slides = entry.type === "number") {
-    const box = input("number", path, name);
-    box.step = entry.type === WHOLE ? "1" : "any";
-    if (RANGES[entry.key]) [box.min, box.max] = RANGES[entry.key];
+    const box = input("text", path, name);
+    box.inputMode = "decimal";
+    const [low, high] = RANGES[entry.key] ?? [];
+    const read = (text) => typedNumber(text, { whole: entry.type === WHOLE, low, high });
     box.showValue = (now) => {
       box.value = now ?? (Number.isFinite(entry.default) ? entry.default : "");
       if (now == null && entry.default === undefined) box.placeholder = "auto";
@@ -262,7 +284,7 @@ export class Forms {
     const isEntry = path.endsWith("]"); // of a list, which keeps its length
     const set = (number, source) => (number !== undefined || !isEntry) && this.change(path, number, false, source);
     if (!slides || value === null || typeof value !== "number") {
-      box.oninput = () => box.validity.valid && set(box.value === "" ? undefined : Number(box.value), box);
+      takes(box, read, (number) => set(number, box));
       return field(name, box, entry.about);
     }
     const slider = input("range", path, `${name}, slider`);
@@ -277,14 +299,14 @@ export class Forms {
     slider.oninput = () => {
       const number = scale.value(Number(slider.value));
       box.value = number;
+      box.recheck();
       slider.setAttribute("aria-valuetext", String(number));
       set(number, slider);
     };
-    box.oninput = () => {
-      if (!box.validity.valid) return;
-      set(box.value === "" ? undefined : Number(box.value), box);
-      if (box.value !== "") slider.showValue(Number(box.value));
-    };
+    takes(box, read, (number) => {
+      set(number, box);
+      if (number !== undefined) slider.showValue(number);
+    });
     const row = field(name, slider, entry.about);
     row.classList.add("slides");
     row.append(box);

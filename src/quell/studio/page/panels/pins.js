@@ -50,6 +50,13 @@ export class Pins {
     this.show();
   }
 
+  // Another axis is shown: the curves of the pins are asked for again.
+  forget() {
+    this.list = this.list.filter((pin) => pin.setup);
+    for (const pin of this.list) pin.arrays = undefined;
+    this.show();
+  }
+
   // Return the next pin whose curves are not here yet.
   get missing() {
     return this.list.find((pin) => !pin.arrays && !pin.failed && pin.setup);

@@ -2,6 +2,8 @@
 
 import { element, field, home, write } from "../dom.js";
 import { Plot, short } from "../plots/plots.js";
+import { setupOf } from "./files.js";
+import { takesNumber } from "./typed.js";
 
 const MOST = 8 * 2 ** 20; // largest file [bytes], as in records.py
 const PART = 150_000; // bytes of a file in one message
@@ -24,10 +26,12 @@ const FIELDS = [
 
 export class MachineRecord {
   // `send(message)` returns the id of a message, null without a connection; `use(setup)` takes the
-  // setup of an identified plant; `open(text)` takes the text of a setup file.
+  // setup of an identified plant; `open(text, models)` takes the texts of a setup file and of
+  // identified models.
   constructor(send, use, open) {
     Object.assign(this, { send, use, open, file: null, first: 0, id: null, shown: false });
     home("record-fields").append(...FIELDS.map((each) => field(each[1], control(...each), each[4])));
+    this.checks = new Map(FIELDS.filter((each) => each[2] === "number").map(([key]) => [key, takesNumber(home(`record-${key}`))]));
     const time = { name: "t", label: "t [s]", sync: "record" };
     this.plots = [
       new Plot(home("plot-record-y"), time, [
@@ -63,10 +67,11 @@ export class MachineRecord {
       if (!has(event)) return;
       event.preventDefault();
       mark(false);
-      const { files } = event.dataTransfer;
-      if (files.length !== 1) this.tell("Drop one file: a record, or a setup (.toml).", true);
-      else if (/\.toml$/i.test(files[0].name)) this.open(await files[0].text());
-      else this.take(files[0]);
+      const files = [...event.dataTransfer.files];
+      const found = files.some((file) => /\.toml$/i.test(file.name)) ? await setupOf(files) : null;
+      if (found) this.open(...found);
+      else if (files.length === 1) this.take(files[0]);
+      else this.tell("Drop one file: a record, or a setup (.toml), with the file of its identified model (.json) if it has one.", true);
     });
   }
 
@@ -91,8 +96,9 @@ export class MachineRecord {
     const message = { name: this.file.name, size: this.file.bytes.length };
     for (const [key, name, kind] of FIELDS) {
       const box = home(`record-${key}`);
-      if (!box.checkValidity()) {
-        this.tell(`The field ${name} must be a number.`, true);
+      const reason = this.checks.get(key)?.().reason;
+      if (reason) {
+        this.tell(`The field ${name}: ${reason}`, true);
         box.focus();
         return;
       }
@@ -209,7 +215,7 @@ function percent(value) {
 function control(key, name, kind, hint) {
   const box = element(Array.isArray(kind) ? "select" : "input");
   if (Array.isArray(kind)) for (const each of kind) box.append(new Option(each || "automatic", each));
-  else Object.assign(box, { type: kind, placeholder: hint, step: "any" });
+  else Object.assign(box, { placeholder: hint });
   box.id = `record-${key}`;
   box.setAttribute("aria-label", name);
   return box;

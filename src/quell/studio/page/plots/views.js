@@ -4,6 +4,12 @@ import { home, write } from "../dom.js";
 import { Nyquist } from "./nyquist.js";
 import { Plot } from "./plots.js";
 
+// Control signals of several axes: colours and dashes repeat after six.
+const COLORS = ["main", "other", "quiet"];
+const ACTUATORS = Array.from({ length: 24 }, (_, k) => ({
+  name: `u_${k + 1}`, label: `u ${k + 1}`, color: COLORS[k % 3], dash: k % 6 < 3 ? undefined : [6, 3], pinned: true,
+}));
+
 export class Views {
   constructor() {
     const time = { name: "t", label: "t [s]", sync: "time" };
@@ -12,7 +18,7 @@ export class Views {
         { name: "y", label: "y", color: "main", pinned: true },
         { name: "r", label: "r", color: "quiet", dash: [6, 4] },
       ]),
-      u: new Plot(home("plot-u"), time, [{ name: "u", label: "u", color: "main", pinned: true }]),
+      u: new Plot(home("plot-u"), time, [{ name: "u", label: "u", color: "main", pinned: true }, ...ACTUATORS]),
       f: new Plot(home("plot-f"), time, [
         { name: "f_hat", label: "f estimated", color: "main", pinned: true },
         { name: "f_learned", label: "learned share", color: "other", dash: [8, 3] },
@@ -36,11 +42,11 @@ export class Views {
   showRun(arrays, pins, band, setup) {
     const kept = pins.filter((pin) => pin.arrays?.t);
     const data = { ...arrays };
-    const learns = setup?.learner != null || arrays.watched;
+    const learns = setup?.learner != null || setup?.axis?.some((axis) => axis.learner != null) || arrays.watched;
     if (!learns) delete data.f_learned;
     write(home("fig-authority"), { hidden: !data.authority });
     write(home("fig-f"), { hidden: !data.f_hat, className: data.authority ? "" : "wide" });
-    const limits = ["u_min", "u_max"].map((key) => setup?.controller?.[key]).filter(Number.isFinite);
+    const limits = ["u_min", "u_max"].flatMap((key) => setup?.controller?.[key] ?? setup?.axes?.[key] ?? []).filter(Number.isFinite);
     this.time.y.show(data, kept, band?.y_low ? { t: band.t, low: band.y_low, high: band.y_high } : null);
     this.time.u.show(data, kept, band?.u_low ? { t: band.t, low: band.u_low, high: band.u_high } : null, limits);
     if (data.f_hat) this.time.f.show(data, kept.filter((pin) => pin.arrays.f_hat));

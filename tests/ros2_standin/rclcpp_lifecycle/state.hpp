@@ -1,0 +1,6 @@
+// Stand-in for tests.
+#pragma once
+namespace rclcpp_lifecycle
+{
+class State {};
+}  // namespace rclcpp_lifecycle
