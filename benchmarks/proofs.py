@@ -3,10 +3,10 @@
     python benchmarks/proofs.py [--only TEXT] [--precision double] [--results FILE]
 
 Every row of ``exported.py`` and ``exported_axes.py``, and state feedback, is exported in double and
-in single precision with ``proof=True`` and proved by Frama-C (docs/target_proof). One that is not proved,
-nor in ``OPEN``, ends the script with 1. All rows take hours of a core: ``--results`` names a file
-to which each row is added when it is ready, and whose rows are not run again. ``--part I/N`` takes
-each N-th row from the I-th on.
+in single precision with ``proof=True`` and proved by Frama-C (docs/target_proof). One that is not
+proved, nor in ``OPEN``, ends the script with 1. All rows take hours of a core: ``--results`` names
+a file to which each row is added when it is ready, and whose rows are not run again. ``--part I/N``
+takes each N-th row from the I-th on.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.axes import control_all
+from quell.controllers.several import control_all
 from quell.export import c_source
 from quell.export.controller_source import parts_of
 from quell.features import AllAxes, Bias, Custom, Friction, Input, Polynomial, RandomFourier, State

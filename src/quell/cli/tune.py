@@ -547,7 +547,8 @@ def _tune_axes(
     rule = "is for one axis; of several m_s, m_t, m_ks, damping and objective count, and [tune]"
     refuse({name: (value, None) for name, value in options.items() if name not in usable}, rule)
     setup, how = axes_task(path, options, trust)
-    plant, axes = setup.needed("plant"), setup.controller
+    plant = setup.needed("plant")
+    axes: Any = setup.controller
     with progress_bar(console, "tuning") as bar:
         tuned = tune_axes(plant, axes, progress=partial(_progress, bar), **how)
     count = len(axes.names)

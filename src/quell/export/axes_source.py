@@ -18,10 +18,7 @@ from quell.controllers.axes import (
     AxesState,
     apply_to_axes,
     begin_manual,
-    control_all,
     end_manual,
-    start_all,
-    tell_applied,
 )
 from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.controllers.base import (
@@ -30,6 +27,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.compensator import change_design
+from quell.controllers.several import control_all, start_all, tell_applied
 from quell.export.c_files import CFiles
 from quell.export.estimates import estimate_lines, estimate_struct
 from quell.export.translate.structs import ascii_text

@@ -21,6 +21,7 @@ from pydantic import Field, ValidationError
 from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
+from quell.controllers.compensator import Compensator
 from quell.features.all_axes import sees_all_axes
 from quell.plants.base import PlantWrapper
 from quell.plants.multibody import Arm, Craft
@@ -42,6 +43,7 @@ from quell.setup.loading import (
     title_of,
     windows_of,
 )
+from quell.setup.registry import CASE
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -62,11 +64,13 @@ from quell.types import Matrix
 if TYPE_CHECKING:  # these types are made at run time, which a type checker cannot follow
     from quell.setup.schema import CallTable as AxesPlant
     from quell.setup.schema import CallTable as AxesTable
+    from quell.setup.schema import CallTable as AxisDrive
     from quell.setup.schema import CallTable as Controller
     from quell.setup.schema import CallTable as Guard
     from quell.setup.schema import CallTable as Learner
     from quell.setup.schema import CallTable as Metrics
     from quell.setup.schema import CallTable as Observer
+    from quell.setup.schema import CallTable as OnTop
     from quell.setup.schema import CallTable as ScenarioTable
     from quell.setup.schema import CallTable as Sweep
     from quell.setup.schema import CallTable as Tune
@@ -75,8 +79,9 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
 
 
 def coupled(
-    axes: Mapping[str, ADRC],
+    axes: Mapping[str, Compensator],
     plant: Any = None,
+    drives: Sequence[Any] | None = None,
     B0: Sequence[Sequence[float]] | str | None = None,
     M: Sequence[Sequence[float]] | None = None,
     u_min: float | Sequence[float] = -math.inf,
@@ -93,8 +98,8 @@ def coupled(
 
     Parameters
     ----------
-    axes, plant
-        the controllers of the axes by name, and the plant.
+    axes, plant, drives
+        the controllers of the axes by name, the plant, and the controllers below compensators.
     of_axes
         learners with features of all axes, each with its guard, by the name of the axis.
     B0
@@ -136,7 +141,8 @@ def coupled(
         gain, inverse = _of_plant(plant, [axis.observer.order for axis in axes.values()], M)
     limits: dict[str, Any] = {"u_min": u_min, "u_max": u_max, "rate_limit": rate_limit}
     rest: dict[str, Any] = {"saturation": saturation, "weights": weights, "wished": wished}
-    return Axes(dict(axes), gain, M=inverse, learner=learner, guard=guard, **limits, **rest)
+    rest |= {"learner": learner, "guard": guard, "drives": drives}
+    return Axes(dict(axes), gain, M=inverse, **limits, **rest)
 
 
 def _of_plant(plant: Any, orders: Sequence[int], M: Any) -> tuple[Any, Any]:
@@ -280,11 +286,17 @@ OBSERVERS = {
 }
 _OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule")
 CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
+ON_TOP = call_table(
+    "compensator", Compensator, only=True, types=registry.PARTS, without=_OF_ACTUATORS
+)
+# Controllers without observer, that are not designed for the linear part of a plant.
+_DRIVES = ("pid", "pid-simc", "notch-pid", "p-pi", "resonance-ratio")
+DRIVES = {kind: registry.CONTROLLERS[kind] for kind in _DRIVES}
 AXES = call_table(
     "axes",
     coupled,
     only=True,
-    without=("axes", "plant", "of_axes"),
+    without=("axes", "plant", "drives", "of_axes"),
     beside={
         "learner": (
             registry.Learner | None,
@@ -311,6 +323,7 @@ METRICS = call_table("metrics", AxesTrajectory.metrics, only=True)
 if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
     Observer, Learner = one_of(OBSERVERS), registry.Learner
+    AxisDrive, OnTop = one_of(DRIVES, default="pid"), ON_TOP
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
     Sweep, Tune = registry.Sweep, TUNE
 
@@ -320,7 +333,9 @@ class Axis(Table):
 
     name: str = Field("", description="its name; axis1 and so on by default.")
     observer: Observer = Field(description="the observer; its b0 is 1.")
-    controller: Controller = Field(description="the ADRC, without limits of u.")
+    controller: Controller | None = optional("the ADRC, without limits of u.")
+    compensator: OnTop | None = optional("a compensator in place of the ADRC; then of all axes.")
+    drive: AxisDrive | None = optional("the controller that gives u_0 below a compensator.")
     learner: Learner | None = optional("the learner; none by default.")
     guard: Guard | None = optional("the guard of the learner; none by default.")
     reference: registry.Signal = Field(0.0, description="signal that y has to follow [y-unit].")
@@ -350,8 +365,10 @@ class AxesDescription(Table):
 
 # Tables of a setup of one axis, and where they are here; what belongs to one axis only.
 _ELSEWHERE = {
-    **dict.fromkeys(("observer", "controller", "learner", "guard"), "belongs into each [[axis]]"),
-    **dict.fromkeys(("compensator", "prefilter", "rig"), "NOT for several axes yet"),
+    **dict.fromkeys(
+        ("observer", "controller", "compensator", "learner", "guard"), "belongs into each [[axis]]"
+    ),
+    **dict.fromkeys(("prefilter", "rig"), "NOT for several axes yet"),
 }
 
 
@@ -406,6 +423,11 @@ def made_axes(
         key: _axis(builder, axis, f"axis[{i}]", dt)
         for i, (key, axis) in enumerate(zip(names, tables.axis, strict=True))
     }
+    drives = [
+        builder.build(axis.drive, f"axis[{i}].drive", dt=dt)
+        for i, axis in enumerate(tables.axis)
+        if axis.drive is not None
+    ]
     table: Any = AXES() if tables.axes is None else tables.axes
     of_axes = {key: parts for key, (_, *parts) in made.items() if parts}
     axes = {key: parts[0] for key, parts in made.items()}
@@ -413,7 +435,8 @@ def made_axes(
         key: None if part is None else builder.build(part, f"axes.{key}", dt=dt)
         for key, part in (("learner", table.learner), ("guard", table.guard))
     }
-    controller = builder.build(table, "axes", axes=axes, plant=plant, of_axes=of_axes, **shared)
+    context = {"axes": axes, "plant": plant, "drives": drives or None, "of_axes": of_axes}
+    controller = builder.build(table, "axes", **context, **shared)
     scenario = _scenario(builder, tables, dt)
     if plant is not None:
         builder.attempt("plant", (), _check_fit, plant, controller, scenario)
@@ -427,6 +450,10 @@ def made_axes(
 
 def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:
     """Return the controller of an axis; with its learner and guard if they are of all axes."""
+    if (axis.controller is None) == (axis.compensator is None):
+        has = "neither" if axis.controller is None else "both"
+        rule = f"has {has}; give a controller, which is an ADRC, or a compensator"
+        raise SetupError([f"{builder.name}: {path}: {rule}"])
     parts = {
         key: None if table is None else builder.build(table, f"{path}.{key}", dt=dt)
         for key, table in (("observer", axis.observer), ("guard", axis.guard))
@@ -437,7 +464,9 @@ def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]
     outside: tuple[Any, ...] = ()
     if sees_all_axes(learner):
         outside, learner = (learner, parts.pop("guard")), None
-    made: ADRC = builder.build(axis.controller, f"{path}.controller", learner=learner, **parts)
+    key = "controller" if axis.compensator is None else "compensator"
+    table: Any = getattr(axis, key)
+    made: Compensator = builder.build(table, f"{path}.{key}", learner=learner, **parts)
     return made, *outside
 
 
@@ -473,7 +502,8 @@ def _explained(error: SetupError) -> SetupError:
         "scenario.noise: unknown": "belongs into each [[axis]]",
     }
     for key in ("u_min", "u_max", "rate_limit"):
-        rules[f".controller.{key}: unknown"] = "belongs into [axes]: an actuator moves all axes"
+        for table in ("controller", "compensator"):
+            rules[f".{table}.{key}: unknown"] = "belongs into [axes]: an actuator moves all axes"
     lines = []
     for line in error.mistakes:
         for begin, rule in rules.items():
@@ -492,7 +522,7 @@ class AxesVariation(Variation):
 
     def __call__(self, **values: Any) -> Setup:
         """Return the setup; values are by path, and ``case`` is the name of a case."""
-        case = values.pop(registry.CASE, None)
+        case = values.pop(CASE, None)
         changes = {**({} if case is None else self.cases[case]), **values}
         return made_axes(self.name, changed(self.name, self.data, changes), self.trust)
 

@@ -614,9 +614,8 @@ def built(job: Job, part: Part, run: int) -> Parts:
 def is_random(scenario: Scenario) -> bool:
     """Return whether the signals of a scenario depend on its seed."""
     given: list[Any] = [*scenario.disturbances]
-    for one in (scenario.reference, scenario.noise):  # of several axes one for each
-        several: Any = one if checks.is_sequence(one) else [one]
-        given += several
+    for each in (scenario.reference, scenario.noise):  # of several axes one for each
+        given += each if isinstance(each, Sequence) else [each]
     return any(each.seeded(0) != each.seeded(1) for each in given if isinstance(each, Signal))
 
 
@@ -788,8 +787,8 @@ def describe_measures(measures: Measures) -> dict[str, Any]:
     for name, each in measures.items():
         if isinstance(each, Measure):
             about, unit = UNITS[each.name]
-            window: dict[str, Any] = {"start": each.start, "stop": each.stop, "target": each.target}
-            window |= {"axis": each.axis or None}
+            window: dict[str, Any] = {"start": each.start, "stop": each.stop}
+            window |= {"target": each.target, "axis": each.axis or None}
             given = {key: value for key, value in window.items() if value is not None}
             found[name] = {"long_name": about, "units": unit, **given, "band": each.band}
         else:

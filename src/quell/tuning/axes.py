@@ -582,17 +582,17 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
     """Return the plants whose B0 differs from the controller's by a share."""
     if off == 0.0:
         return []
-    B0 = np.asarray(np.linalg.pinv(nominal.R), dtype=np.float64)
+    B0 = np.linalg.pinv(nominal.R)
     entries = int(np.count_nonzero(B0))
     if 2**entries <= _MOST_PATTERNS:
         patterns = np.array(list(itertools.product((-1.0, 1.0), repeat=entries)))
     else:
         rng = np.random.default_rng([seed, 2])
-        patterns = rng.choice((-1.0, 1.0), size=(_MOST_PATTERNS, entries))
+        patterns = rng.choice(np.array([-1.0, 1.0]), size=(_MOST_PATTERNS, entries))
     return [_off_by(nominal, B0, off * signs) for signs in patterns]
 
 
-def _off_by(nominal: Plant, B0: Matrix, shares: Vector) -> Plant:
+def _off_by(nominal: Plant, B0: Matrix, shares: Any) -> Plant:
     """Return the plant with the entries of B0 that are not zero off by shares."""
     error = np.zeros(B0.shape)
     error[B0 != 0.0] = shares * B0[B0 != 0.0]
@@ -701,7 +701,7 @@ def _each_alone(
         best = min(ends, key=lambda each: each.rank)
         rows.append(best.values[0])
         costs.append(best.measured.costs[0])
-    of_noise = None if None in known else tuple(float(each) for each in known if each)
+    of_noise = None if None in known else tuple(each for each in known if each is not None)
     limits = Limits(bounds.m_s, bounds.m_t, of_noise, least, bounds.damping)
     return limits, np.array(rows), np.array(costs)
 
@@ -868,8 +868,8 @@ def _check(
     drawn = []
     for k in range(samples):
         one = nominal[k % len(nominal)]
-        B0 = np.asarray(np.linalg.pinv(one.R), dtype=np.float64)
-        drawn.append(_off_by(one, B0, rng.uniform(-off, off, np.count_nonzero(B0))))
+        B0 = np.linalg.pinv(one.R)
+        drawn.append(_off_by(one, B0, rng.uniform(-off, off, int(np.count_nonzero(B0)))))
     measured = loops(drawn).measured(found.values)
     ratios = np.exp(-np.min(measured.slacks, axis=1))
     stable = measured.slacks[:, -1] > UNSTABLE

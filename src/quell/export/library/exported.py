@@ -225,8 +225,11 @@ def _texts_of_several(controller: Any, source: CSource) -> dict[str, str]:
     primes = ", ".join("r" + "'" * (i + 1) for i in range(source.derivatives))
     if source.axes:
         names = ", ".join(f"{i} `{name}`" for i, name in enumerate(controller.names))
-        title, sizes = f"Controller of {n} axes with {m} actuators", ("AXES", "AXES")
+        title, sizes = f"Controller of {p} axes with {m} actuators", ("AXES", "AXES")
         about = f"The places of the axes in `r`, `y` and `v`: {names}."
+        if controller.takes_u_0:
+            sizes = ("ACTUATORS", "AXES")
+            about = f"`r` are the u_0 of other controllers, with the places of `u`. {about}"
     else:
         title, sizes = (
             f"State feedback of {p} outputs with {m} actuators",

@@ -689,7 +689,8 @@ class Translator:
                 if isinstance(array, Array):
                     return self._moved(array, self._node(value.operand.at))
             return self.evaluate(value.operand)
-        if value.operator == "-" and value.operand in map(Name, ("INFINITY", "DBL_MAX", "FLT_MAX")):
+        extremes = [Name(each) for each in ("INFINITY", "DBL_MAX", "FLT_MAX")]
+        if value.operator == "-" and value.operand in extremes:
             return self.extreme(-math.inf)
         operand = self._node(value.operand)
         if value.operator == "!":

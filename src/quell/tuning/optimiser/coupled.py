@@ -185,7 +185,7 @@ class CoupledLoops:
         laws = [law.at(*map(float, row)) for law, row in zip(self.laws, values, strict=True)]
         C = np.stack([Response(_feedback(law))(self.omega, self.dt) for law in laws], axis=1)
         matrices = np.stack([closed(plant, laws) for plant in self.plants])
-        shifted = np.linalg.eigvals(matrices).astype(complex)
+        shifted: Complex = np.linalg.eigvals(matrices).astype(np.complex128)
         damped, stable, first = [], True, np.zeros(0, dtype=complex)
         for j, each in enumerate(shifted):
             s = in_s_plane(each, self.dt)
@@ -204,9 +204,9 @@ class CoupledLoops:
     def _peaks(self, C: Complex) -> Matrix:
         """Return the slacks of the bounds over frequency (j, q), for feedbacks C (k, p)."""
         p, m = C.shape[1], self._G.shape[3]
-        S: Complex = np.linalg.inv(np.eye(p) + self._G_v * C[:, None, :]).astype(complex)
+        S = np.linalg.inv(np.eye(p) + self._G_v * C[:, None, :]).astype(np.complex128)
         # R C S_o G_u, the complementary sensitivity of the actuators.
-        T_u = self._R @ (C[:, :, None] * (S @ self._G))
+        T_u: Complex = self._R @ (C[:, :, None] * (S @ self._G))
         outputs = np.einsum("jkii->jki", S)
         found = []
         for S_own in (outputs, 1.0 - np.einsum("jkii->jki", T_u)):
