@@ -245,6 +245,8 @@ class TunedAxes:
             lines.append(
                 "NOT proved for fast motion: margins are those of B0 held at each operating point"
             )
+        if getattr(self.controller, "learner", None) is not None:
+            lines.append("NOT in any margin: the learner that sees all axes; simulate with it")
         loop = self.with_learners
         if loop is not None:
             if not loop.stable:
