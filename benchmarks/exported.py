@@ -298,10 +298,13 @@ def ready_row(
     return cells
 
 
-def chosen_rows(text: str, part: str, precision: str | None = None) -> list[tuple[str, Any, str]]:
+def chosen_rows(
+    text: str, part: str, precision: str | None = None, more: Iterable[tuple[str, Any]] = ()
+) -> list[tuple[str, Any, str]]:
     """Return controllers whose name has a text, in one precision or both; ``part`` is I/N."""
     precisions = [precision] if precision else ["double", "single"]
-    rows = [(name, each, kind) for name, each in cases() for kind in precisions if text in name]
+    known = [*cases(), *more]
+    rows = [(name, each, kind) for name, each in known for kind in precisions if text in name]
     first, step = map(int, part.split("/"))
     return rows[first - 1 :: step]
 

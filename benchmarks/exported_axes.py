@@ -94,6 +94,26 @@ def cases() -> dict[str, Any]:
     return found
 
 
+def feedback() -> dict[str, Any]:
+    """Return state feedback with each kind of gain of its observer."""
+    A = [[0, 1, 0, 0], [-5, -0.1, 5, 0.1], [0, 0, 0, 1], [5, 0.1, -5, -0.1]]
+    B, C, E = [0, 1.5, 0, 0], [[1, 0, 0, 0], [0, 0, 1, 0]], [0, 0, 0, 1.0]
+    noise = {"noise_variance": [1e-6, 1e-6], "drift": [1.0]}
+    gain = ql.controllers.state_feedback(A, B, 3.0, 0.01)
+    found = {}
+    for name, options in {
+        "poles": {"omega_o": 30.0},
+        "fixed gains, two rates": {**noise, "time_varying": False, "every": (1, 4)},
+        "covariance": {**noise, "disturbance_order": 2},
+    }.items():
+        observer = ql.ESO.state_space(A, B, C, E, 0.01, **options)
+        law = ql.controllers.StateFeedback(
+            observer, gain, controlled=C[1:], rate_limit=200.0, **LIMITS
+        )
+        found[f"state feedback, {name}"] = law
+    return found
+
+
 def script(samples: int, axes: int, single: bool) -> np.ndarray:
     """Return the rows (action, references, noise, share of u) of a run."""
     random, k = np.random.default_rng(7), np.arange(samples)

@@ -2,9 +2,10 @@
 
     python benchmarks/hostile_axes.py [--calls 1e6] [--rows TEXT] [--precision P] [--results FILE]
 
-As ``hostile_exports.py`` does for one u and one y, for the rows of ``exported_axes.py``: a program
-calls all functions of the axes in an order drawn by chance, with random bits, absurd and good
-values in any of the arrays, compiled with the sanitizers of addresses and of undefined behaviour.
+As ``hostile_exports.py`` does for one u and one y, for the rows of ``exported_axes.py`` and for
+state feedback: a program calls all functions of the controller in an order drawn by chance, with
+random bits, absurd and good values in any of the arrays, compiled with the sanitizers of addresses
+and of undefined behaviour.
 After each call all u are looked at: they must be numbers within the limits in use. A memory image
 that is refused must change nothing.
 """
@@ -30,14 +31,15 @@ from quell.export import CSource, TranslationError, c_source
 HEADS = ("axes", "precision", "functions", "calls", "reports", "u not finite", "u beyond limits",
          "time [s]")  # fmt: skip
 _CHECKS = r"""
-enum { N = UPPER_AXES, M = UPPER_ACTUATORS };
-static REAL r[N], y[N], r1[N], r2[N], r3[N], given[M], u[M];
+enum { N = REFERENCES, P = MEASUREMENTS, M = UPPER_ACTUATORS };
+static REAL r[N], y[P], r1[N], r2[N], r3[N], given[M], u[M];
 
 static void draw_all(void)
 {
+    for (int i = 0; i < P; i++)
+        y[i] = measurement();
     for (int i = 0; i < N; i++) {
         r[i] = reference();
-        y[i] = measurement();
         r1[i] = hostile();
         r2[i] = hostile();
         r3[i] = hostile();
@@ -135,6 +137,7 @@ def hostile_program(source: CSource, seed: int) -> str:
     text = helpers + _CHECKS + hostile_exports._IMAGES + _MAIN.replace("CASES", "".join(known))
     words = words_of_type(source, seed)
     words["FURTHER"] = "".join(f", {each}" for each in source.further)
+    words["REFERENCES"], words["MEASUREMENTS"] = map(str, (source.sizes or (1, 1))[:2])
     for word, value in {"UPPER": source.name.upper(), **words}.items():
         text = text.replace(word, value)
     headers = ("float.h", "math.h", "stdint.h", "stdio.h", "stdlib.h", "string.h")
@@ -160,7 +163,7 @@ def row_of(name: str, axes: Any, precision: str, options: argparse.Namespace) ->
 def main() -> None:
     """Run the rows and print a table."""
     from exported import earlier_rows, ready_row
-    from exported_axes import cases
+    from exported_axes import cases, feedback
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--calls", type=float, default=1e6, help="calls of each row")
@@ -173,7 +176,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     console, known, bad = Console(width=160), earlier_rows(options.results), 0
     table = Table(*HEADS)
-    for name, axes in cases().items():
+    for name, axes in (cases() | feedback()).items():
         for precision in [options.precision] if options.precision else ["double", "single"]:
             if options.rows in name:
                 make = partial(row_of, name, axes, precision, options)

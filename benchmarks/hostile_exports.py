@@ -35,7 +35,7 @@ import quell as ql
 from quell.controllers import in_single_precision
 from quell.export import CSource
 from quell.export.controller_source import limits_path
-from quell.export.proof import CALLS, RETURN_U, narrower_limit
+from quell.export.proof import CALLS, RETURN_U, narrower_limits
 
 FLAGS = ("-std=c99", "-O2", "-g1", "-ffp-contract=off")
 SANITIZERS = {
@@ -278,7 +278,6 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
     was beyond its limits, and a hash of all u and flags. It ends with 0 if both numbers are 0.
     """
     name, path = source.name, limits_path(controller)
-    single = source.precision == "single"
     drawn = ", hostile()" * source.derivatives
     unknown = set(source.operations) - {*CALLS, "init", "retune"}
     if unknown:
@@ -329,7 +328,7 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
     missing = set(source.operations) - {*SHARES, "init", "step"}
     if missing:
         raise ValueError(f"the program does not call {sorted(missing)}")
-    narrower = narrower_limit(controller, path, single)
+    narrower = narrower_limits(controller, path, source.precision)
     inside = path.removesuffix("limits")
     others = [
         f"other.{inside}{member} {change};"
@@ -345,7 +344,7 @@ def hostile_program(controller: Any, source: CSource, seed: int = 1) -> str:
         **words_of_type(source, seed),
         "LIMITS_CHECK": f"beyond += u < state->parameters->{path}.low || "
         f"u > state->parameters->{path}.high;" if path else "(void)beyond;",
-        "NARROWER": f"narrower.{path}.high = {narrower};" if narrower else "",
+        "NARROWER": "".join(f"narrower.{path}.high = {limit};" for _, limit in narrower),
         "HOSTILE_DERIVATIVES": drawn,
         "DERIVATIVES": drawn,
     }  # fmt: skip

@@ -2,11 +2,11 @@
 
     python benchmarks/proofs.py [--only TEXT] [--precision double] [--results FILE]
 
-Every row of ``exported.py`` is exported in double and in single precision with ``proof=True`` and
-proved by Frama-C (docs/target_proof). One that is not proved, nor in ``OPEN``, ends it with 1.
-All rows take hours of a core: ``--results`` names a file to which
-each row is added when it is ready, and whose rows are not run again. ``--part I/N`` takes each N-th
-row from the I-th on.
+Every row of ``exported.py`` and ``exported_axes.py``, and state feedback, is exported in double and
+in single precision with ``proof=True`` and proved by Frama-C (docs/target_proof). One that is not
+proved, nor in ``OPEN``, ends the script with 1. All rows take hours of a core: ``--results`` names
+a file to which each row is added when it is ready, and whose rows are not run again. ``--part I/N``
+takes each N-th row from the I-th on.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from exported import chosen_rows, shown_rows
+from exported_axes import cases, feedback
 
 import quell as ql
 from quell.export import TranslationError
@@ -57,7 +58,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    rows = chosen_rows(options.only, options.part, options.precision)
+    several = [*(cases() | feedback()).items()]
+    rows = chosen_rows(options.only, options.part, options.precision, several)
     done = shown_rows(rows, HEADS, row_of, options.results)
     bad = any(cells[2] not in ("yes", "refused") and cells[0] not in OPEN for cells in done)
     sys.exit(1 if bad else 0)

@@ -29,9 +29,9 @@ from rich.table import Table
 from scipy.linalg import expm
 
 import quell as ql
-from quell.controllers.axes import control_all
 from quell.controllers.base import status_flags
 from quell.controllers.safe_axes import NoSafeAxes, NoSafeAxesMemory
+from quell.controllers.several import control_all
 from quell.kernels.dispatch import compiled
 
 DT, SUBSTEPS, SAMPLES = 1e-3, 4, 2500

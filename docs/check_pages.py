@@ -10,7 +10,7 @@ Prints each overflow and returns 1 if there is one:
 - *contrast*: text has less contrast than WCAG 2.1 asks for at level AA;
 - *small*: a picture that is shown smaller than 200 pixels on the wide screen.
 
-At the end stand the longest pages but those of the API, in screens of 800 pixels at a width of 1280.
+At the end stand the longest pages but those of the API, in screens of 800 pixels, 1280 wide.
 Without Chromium or Playwright nothing is looked at, and the program says so.
 """
 
@@ -96,7 +96,9 @@ _CONTRAST = """() => {
     if (!text || element.closest("script, style, mjx-assistive-mml, .headerlink, button")) continue;
     if (!element.getClientRects().length) continue;
     const style = getComputedStyle(element), under = back(element);
-    const [a, b] = [light(over(parse(style.color), under)), light(under)];
+    const ink = [...parse(style.color), 1].slice(0, 4);
+    for (let e = element; e; e = e.parentElement) ink[3] *= getComputedStyle(e).opacity;
+    const [a, b] = [light(over(ink, under)), light(under)];
     const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
     const size = parseFloat(style.fontSize), bold = parseInt(style.fontWeight) >= 700;
     const least = size >= 24 || (bold && size >= 18.66) ? 3 : 4.5;

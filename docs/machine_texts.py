@@ -121,7 +121,9 @@ def signature(thing: Any) -> str:
     if bare and bare[0].name in ("self", "cls"):
         bare = bare[1:]
     text = str(given.replace(parameters=bare, return_annotation=given.empty))
-    text = re.sub(r"<[^<>]*(?:<lambda>)?[^<>]* at 0x[0-9a-f]+>", "…", text)  # a mark of a missing argument
+    text = re.sub(
+        r"<[^<>]*(?:<lambda>)?[^<>]* at 0x[0-9a-f]+>", "…", text
+    )  # a mark of a missing argument
     return re.sub(r"<(?:function|class) ?'?([\w.]+)[^>]*>", r"\1", text)
 
 

@@ -9,7 +9,7 @@ import quell as ql
 try:
     from sklearn.neural_network import MLPRegressor
 except ImportError:
-    print("This example needs scikit-learn: pip install 'quell[sklearn]'")
+    print("This example needs scikit-learn: pip install 'quell-control[sklearn]'")
     sys.exit(0)
 
 

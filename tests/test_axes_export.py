@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.axes import control_all
+from quell.controllers.several import control_all
 from quell.export import TranslationError, c_source
 from quell.export.axes_source import names_in_c
 from quell.export.controller_source import parts_of
@@ -55,6 +55,22 @@ def guarded() -> list[ql.ADRC]:
     return [joint(safe_set=wide), joint(1, safe_set=narrow), joint()]
 
 
+def adding() -> list[ql.Compensator]:
+    """Return compensators of axes, with a learner and with a safe set."""
+    first, second = (ql.ESO.model_free(order, 1.0, 60.0, DT) for order in (2, 1))
+    return [
+        ql.Compensator(first, omega_c=8.0, learner=ql.learners.Kalman(), guard=ql.Guard()),
+        ql.Compensator(second),
+        ql.Compensator(first, safe_set=ql.SafeSet(-1.0, 1.0, -3.0, 3.0, alpha=8.0, f_rate=1.0)),
+    ]
+
+
+def drives() -> list[Any]:
+    """Return controllers of u_0."""
+    pid = ql.baselines.PID(kp=100.0, ki=50.0, kd=20.0, tf=0.005, dt=DT)
+    return [pid, ql.baselines.PPI(kv=5.0, kp=1.0, tn=0.1, dt=DT), pid]
+
+
 def two() -> list[ql.ADRC]:
     """Return two axes with learners and guards."""
     learners = (ql.learners.Kalman(), ql.learners.Harmonic())
@@ -78,6 +94,11 @@ ROWS: dict[str, Any] = {
     "safe sets, more actuators, direction": lambda: ql.Axes(
         guarded(), WIDE, saturation="direction", weights=[1, 2, 3, 4], **LIMITS
     ),
+    "compensators": lambda: ql.Axes(adding(), SQUARE, rate_limit=8000.0, **LIMITS),
+    "compensators, more actuators": lambda: ql.Axes(adding(), WIDE, weights=[1, 2, 3, 4], **LIMITS),
+    "drives, direction": lambda: ql.Axes(
+        adding(), SQUARE, saturation="direction", drives=drives(), **LIMITS
+    ),
     "orders 1, 3 and 2": lambda: ql.Axes([joint(1), joint(3), joint(2)], SQUARE, u_max=5.0),
     "one axis": lambda: ql.Axes([joint()]),
     "nested tuples": lambda: ql.Axes([joint(), joint()], gain_functions.nested_tuples, **LIMITS),
@@ -93,6 +114,7 @@ ROWS: dict[str, Any] = {
 SINGLE = (
     "each, with rates",
     "safe sets, rates",
+    "drives, direction",
     "more actuators, direction",
     "priority",
     "orders 1, 3 and 2",
@@ -363,7 +385,6 @@ def test_names_of_axes_become_names_in_c() -> None:
 
 
 REFUSED: tuple[tuple[dict[str, Any], str], ...] = (
-    ({"proof": True}, "the proof is of controllers with one u and one y, these are 2 axes"),
     ({"resolution": 1e-4}, "several axes take y in its unit"),
     ({"precision": "single"}, "NOT compared with double precision"),
     ({"plant": ql.plants.two_mass_spring()}, "plant, scenario: the comparison"),

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.axes import control_all
-from quell.export.axes_source import parts_of_axes, source_of_axes
+from quell.controllers.several import control_all
+from quell.export import c_source
+from quell.export.controller_source import parts_of
 from quell.features import AllAxes, Bias, Custom, Friction, Input, Polynomial, RandomFourier, State
 from quell.kernels.dispatch import as_python
 from quell.learners import MLP, NLMS, RLS, GaussianProcess, Kalman
@@ -290,10 +291,10 @@ class TestC:
         """An export begins with it, and both images are the same bytes."""
         axes = axes_with(RLS(coupled()))
         run(axes, 1200)
-        state = parts_of_axes(axes, False).state
+        state = parts_of(axes).state
         learned = axes._state.learning.shared.linear.rule.covariance
         assert np.array_equal(state.learning.shared.linear.rule.covariance, learned)
-        robot = RobotInC(source_of_axes(axes, "robot"), tmp_path)
+        robot = RobotInC(c_source(axes, "robot"), tmp_path)
         image = axes.memory()
         length = ctypes.c_size_t(len(image))
         assert robot.call("load", ctypes.c_bool, image, length, ctypes.c_bool(True))

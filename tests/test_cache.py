@@ -212,11 +212,13 @@ def test_a_long_compilation_is_announced_with_what_and_how_long(
     def run_block() -> None:
         pass
 
-    data = {"dispatcher": SimpleNamespace(py_func=run_block), "args": (typeof(RlsModel(1.0)),)}
-    told = SimpleNamespace(data=data)
+    kept = object.__new__(module.FunctionCache)
     listener = module.CompileTime()
     monkeypatch.setattr(module, "_LONG", 0.02)
-    for on in (True, False):
+    for on, place in ((True, kept), (True, None), (False, kept)):
+        dispatcher = SimpleNamespace(py_func=run_block, _cache=place)
+        data = {"dispatcher": dispatcher, "args": (typeof(RlsModel(1.0)),)}
+        told = SimpleNamespace(data=data)
         listener.announced = on
         listener.on_start(told)
         time.sleep(0.1)
@@ -224,6 +226,8 @@ def test_a_long_compilation_is_announced_with_what_and_how_long(
         lines = capsys.readouterr().err.splitlines()
         assert len(lines) == (2 if on else 0)
         if on:
-            assert lines[0] == "quell: compiling run block for Rls: takes up to a minute, once"
+            once = ", once" if place else ""
+            assert lines[0] == f"quell: compiling run block for Rls: takes up to a minute{once}"
             assert lines[1].startswith("quell: compiled in 0.")
+            assert ("later runs load it" in lines[1]) == (place is not None)
     assert listener.seconds > listener.told > 0.0

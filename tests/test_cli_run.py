@@ -440,4 +440,4 @@ def test_an_extra_that_is_not_installed_is_named_in_a_line(
     assert tried.code == 2
     assert tried.err.startswith("quell: a serial line needs serial, which")
     assert tried.err.count("\n") == 1
-    assert "quell[serial]" in tried.err
+    assert "quell-control[serial]" in tried.err

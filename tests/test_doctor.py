@@ -74,6 +74,7 @@ def test_a_library_that_cannot_be_imported_is_named(
             raise RuntimeError("libhdf5.so.310: wrong ELF class")
         return real(name, *more)
 
+    monkeypatch.setattr("importlib.metadata.requires", lambda _: ["h5py>=3.11"])
     monkeypatch.setattr(importlib, "import_module", broken)
     shown, found = told()
     assert shown.code == ExitCode.BROKEN

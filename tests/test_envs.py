@@ -363,7 +363,7 @@ def test_without_gymnasium_the_error_names_the_extra() -> None:
         "except ImportError as error: print(error)\n"
     )
     shown = run_python(code)
-    assert "pip install 'quell[envs]'" in shown.stdout
+    assert "pip install 'quell-control[envs]'" in shown.stdout
 
 
 def test_gymnasium_finds_the_environments_by_their_module() -> None:

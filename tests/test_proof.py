@@ -13,10 +13,11 @@ import pytest
 
 import quell as ql
 from quell.export.library.exported import Exported
-from quell.export.proof import prove, read_findings, structure
+from quell.export.proof import proof_files, prove, read_findings, structure
 from quell.features import Custom
 
 from .commands import in_this_process
+from .contracts.test_controllers import SEVERAL
 from .in_c import needs_gcc
 from .setups import TWO_MASS
 
@@ -27,6 +28,8 @@ needs_frama_c = pytest.mark.skipif(
 LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
 ADRC = ql.ADRC(OBSERVER, 1.5, **LIMITS)
+JOINT = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=0.01), 1.5)
+AXES = ql.Axes([JOINT, JOINT], [[1, 0.3], [0.2, 1]], u_min=-2.0, u_max=3.0, saturation="direction")
 PID = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=0.01, **LIMITS)
 
 
@@ -46,6 +49,9 @@ def exported(folder: Path, controller: Any = ADRC, **options: Any) -> Exported:
         pytest.param(ql.ADRC(OBSERVER, 1.5), {}, id="without limits"),
         pytest.param(PID, {}, id="PID"),
         pytest.param(ql.controllers.Prefiltered(PID, ql.baselines.ZV(3.0)), {}, id="shaper, with a ring"),
+        pytest.param(AXES, {}, id="axes"),
+        pytest.param(AXES, {"precision": "single"}, id="axes, single"),
+        pytest.param(SEVERAL["StateFeedback"], {}, id="state feedback"),
     ],
 )  # fmt: skip
 def test_a_controller_is_proved(tmp_path: Path, controller: Any, options: dict[str, Any]) -> None:
@@ -154,6 +160,16 @@ def test_without_frama_c_nothing_is_proved(
     assert names == {"servo_contract.h", "servo_proof.c", "prove.sh", "REPORT.md"}
     fmu = in_this_process((*arguments, "--to", "fmu", "--prove"), monkeypatch, capsys)
     assert (fmu.code, "--prove: are for --to c" in fmu.err) == (2, True)
+
+
+def test_the_contract_of_several_signals_has_each_actuator() -> None:
+    """Each u is a number within its own limits, for arrays of the right lengths."""
+    text = proof_files(AXES, ql.export.c_source(AXES, "servo"))["proof/servo_contract.h"]
+    for k in (0, 1):
+        assert f"\\is_finite(u[{k}]);" in text
+        assert f"limits.low[{k}] <= u[{k}] <= state->parameters->limits.high[{k}];" in text
+    assert "\\valid_read(y + (0 .. 1)) && \\valid(u + (0 .. 1));" in text
+    assert text.count("ensures") == 4
 
 
 def test_the_program_of_the_proof_calls_everything(tmp_path: Path) -> None:

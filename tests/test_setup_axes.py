@@ -81,6 +81,34 @@ def test_an_axis_has_a_safe_set() -> None:
         made_axes("a.toml", data)
 
 
+def test_axes_are_compensators_above_drives() -> None:
+    """The same as the objects in Python; a table of an axis that does not fit is named."""
+    data = gantry()
+    for axis in data["axis"]:
+        del axis["controller"]
+        axis["compensator"] = {"omega_c": 8.0}
+        axis["drive"] = {"kp": 100.0, "ki": 50.0, "kd": 20.0, "tf": 0.005}
+    setup = made_axes("a.toml", data)
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3)
+    each = {name: ql.Compensator(observer, omega_c=8.0) for name in "xy"}
+    pid = ql.baselines.PID(kp=100.0, ki=50.0, kd=20.0, tf=0.005, dt=1e-3)
+    limits: dict[str, Any] = {"u_max": [20.0, 30.0], "u_min": -25.0}
+    axes = ql.Axes(each, [[5, 0.5], [0.4, 6]], drives=[pid, pid], **limits)
+    r, y = [0.1, 0.0], [0.02, 0.01]
+    assert setup.controller.step(r, y).tolist() == axes.step(r, y).tolist()
+    again = made_axes("a.toml", tomllib.loads(toml_text(setup.tables(), "again")))
+    assert again.description == setup.description
+    data["axis"][1]["controller"] = {"omega_c": 8.0}
+    with pytest.raises(SetupError, match=r"axis\[1\]: has both; give a controller"):
+        made_axes("a.toml", data)
+    del data["axis"][1]["controller"], data["axis"][1]["drive"]
+    with pytest.raises(SetupError, match="drives = .*must be a controller for each axis"):
+        made_axes("a.toml", data)
+    data["axis"][0]["compensator"] = {"u_max": 3.0}
+    with pytest.raises(SetupError, match=r"axis\[0\].compensator.u_max: belongs into \[axes\]"):
+        made_axes("a.toml", data)
+
+
 def test_b0_of_the_plant_is_that_of_each_kind() -> None:
     """Of an arm M(q) in place of it, also behind encoders; of a craft that near the horizontal; of a linear plant C A B."""
     linear = made_axes("a.toml", gantry()).controller
@@ -112,7 +140,8 @@ def test_b0_of_the_plant_is_that_of_each_kind() -> None:
             {"axes": {"actuators": ["force [N]"]}},
             "axes.actuators = .*there are 2; give one for each",
         ),
-        ({"tune": {}}, "tune: NOT for several axes yet"),
+        ({"tune": {"m_s": 0.5}}, "tune.m_s = 0.5: must be above 1"),
+        ({"tune": {"B0_of": 0.1}}, "tune.B0_of: unknown; did you mean B0_off"),
         ({"axes": {"B1": 1}}, "axes.B1: unknown; "),
         ({"axes": {"B0": "model"}}, "axes.B0 = 'model'"),
         ({"axes": {"B0": [[1, 2], [2, 4]]}}, "axes.*singular"),
@@ -172,8 +201,6 @@ def test_one_axis_is_not_several() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("tune", "gantry.toml", "--no-figures"),
-        ("sweep", "gantry.toml"),
         ("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu"),
         ("compare", "gantry.toml"),
         ("studio", "gantry.toml", "--no-browser"),

@@ -10,7 +10,7 @@ import pytest
 
 import quell as ql
 from quell.controllers import StateFeedback, quadratic_feedback, state_feedback
-from quell.controllers.axes import control_all
+from quell.controllers.several import control_all
 from quell.kernels.dispatch import as_python
 
 from .in_c import InC, built, needs_gcc

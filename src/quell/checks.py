@@ -269,7 +269,7 @@ def _has_other(value: Any) -> bool:
 # ---- Import of packages that only extras of quell install ----
 
 
-DISTRIBUTION = "quell"
+DISTRIBUTION = "quell-control"
 """Name of the distribution on the package index."""
 
 

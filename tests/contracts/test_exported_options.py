@@ -104,6 +104,9 @@ def _axis(order: int = 2, **parts: Any) -> Any:
     return ql.ADRC(ql.ESO.model_free(order=order, b0=1.0, omega_o=12.0, dt=DT), 1.5, **parts)
 
 
+_OF_ALL = ql.learners.RLS(feature_room.AllAxes(State()) + feature_room.Bias())
+
+
 def _fed_back(observer: Any) -> Any:
     gain = room.state_feedback(observer.A, observer.B, 1.5, observer.dt)
     return room.StateFeedback(observer, gain, controlled=_LOAD, **LIMITS)
@@ -181,6 +184,9 @@ PARTS: dict[str, Part] = {
     "Custom": Part(feature_room.Custom, _with_features, {"function": _products, "names": ("a", "b")}, {
         "function": _squares, "names": ("c", "d"),
     }),
+    "AllAxes": Part(feature_room.AllAxes, lambda block: ql.Axes([_axis(), _axis()], learner=ql.learners.RLS(block + feature_room.Bias()), **LIMITS), {"features": State()}, {
+        "features": feature_room.Polynomial(2), "inputs": True,
+    }),
     # Observers.
     "ESO.model_free": Part(ql.ESO.model_free, _observing, _ESO, {
         **_ORDERS, "form": Several(FORMS), "half_gain": True, "poles": Several(([-1.0, -1.2, -1.5], [-1.0, (-1.5, 0.8)])),
@@ -223,6 +229,7 @@ PARTS: dict[str, Part] = {
         "B0": Several(([[1.0, 0.3], [0.2, 1.0]], gain_functions.nested_tuples)), "M": Several(([[1.0, 0.3], [0.3, 1.0]], gain_functions.array)),
         "u_min": (-1.0, -2.0), "u_max": (1.0, 2.0), "rate_limit": Several((60.0, [60.0, (-40.0, 60.0)])), "saturation": Several(("direction", [1, 0])),
         "weights": With([1.0, 2.0, 1.0], {"B0": _WIDE}), "wished": With([0.1, 0.0, -0.1], {"B0": _WIDE}),
+        "learner": Several((_OF_ALL, [_OF_ALL, None], ql.learners.NLMS(_OF_ALL.features))), "guard": With(ql.Guard(), {"learner": _OF_ALL}),
     }),
     "SafeSet": Part(ql.SafeSet, lambda safe: ql.ADRC(OBSERVER, 1.5, safe_set=safe, **(LIMITS if safe.largest_u == np.inf else {})), {"y_max": 0.9}, {
         "y_min": -0.9, "y_max": 0.5, "rate_min": -2.0, "rate_max": 2.0, "alpha": 5.0, "f_rate": 0.1, "noise": 1e-5, "gain_error": 0.1, "largest_u": With(2.0, {"gain_error": 0.1}),

@@ -8,6 +8,12 @@ from quell.analysis.certificate import Certificate, certify, observer_error
 from quell.analysis.coupled import CoupledCertificate, certify_axes, certify_coupled
 from quell.analysis.coupling import Coupling, coupling, relative_gains
 from quell.analysis.disk import DiskMargin
+from quell.analysis.feedback import (
+    BoundedObserver,
+    analyse_feedback,
+    law_of_feedback,
+    observer_within,
+)
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
@@ -24,6 +30,7 @@ from quell.analysis.plots import (
     plot_nyquist,
     plot_root_locus,
 )
+from quell.analysis.points import LoopsAtPoints, analyse_points
 from quell.controllers.adrc import Finding
 from quell.lti.zeros import (
     Existence,
@@ -35,6 +42,7 @@ from quell.lti.zeros import (
 
 __all__ = [
     "Adapting",
+    "BoundedObserver",
     "Certificate",
     "CoupledCertificate",
     "Coupling",
@@ -44,6 +52,7 @@ __all__ = [
     "Frozen",
     "InvariantZeros",
     "LoopAnalysis",
+    "LoopsAtPoints",
     "Margins",
     "MatrixLaw",
     "MultivariableLoop",
@@ -54,6 +63,8 @@ __all__ = [
     "advise",
     "analyse",
     "analyse_axes",
+    "analyse_feedback",
+    "analyse_points",
     "axes_law",
     "certify",
     "certify_axes",
@@ -62,11 +73,13 @@ __all__ = [
     "coupling",
     "frozen",
     "invariant_zeros",
+    "law_of_feedback",
     "linear_law",
     "loops_over_omega_o",
     "loops_over_time",
     "observer_error",
     "observer_exists",
+    "observer_within",
     "plot_bode",
     "plot_gang_of_four",
     "plot_margins_against_omega_o",

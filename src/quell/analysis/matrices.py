@@ -133,6 +133,26 @@ def sampled_matrices(
                 "the same"
             )
         return plant_matrices(plant)
+    linear, waiting = linear_part_of(plant, dt, operating_point)
+    sampled = linear.sampled(dt)
+    A, B, C = sampled.transition, sampled.input, sampled.output
+    for j, samples in enumerate(waiting):
+        for _ in range(samples):
+            n, m = B.shape
+            A = np.block([[A, B[:, j : j + 1]], [np.zeros((1, n + 1))]])
+            B, C = np.vstack([B, np.zeros((1, m))]), np.hstack([C, np.zeros((C.shape[0], 1))])
+            B[:, j] = np.eye(n + 1)[n]
+    return plant_matrices((A, B, C))
+
+
+def linear_part_of(
+    plant: Any, dt: float, operating_point: Any = None
+) -> tuple[MultivariableLinearPlant, tuple[int, ...]]:
+    """Return a plant without delays and encoders, in continuous time, and the delays [samples].
+
+    There is a delay for each input. Plants and errors are those of ``sampled_matrices``, but for
+    sampled plants, which have no model in continuous time.
+    """
     waiting: Any = 0
     while isinstance(plant, DelayedInputs | EncodedOutputs):
         if isinstance(plant, DelayedInputs):
@@ -146,15 +166,8 @@ def sampled_matrices(
                 "operating_point=(x, u)"
             )
         plant = linearised(plant, *checked_point(operating_point))
-    sampled = MultivariableLinearPlant.of(plant).sampled(dt)
-    A, B, C = sampled.transition, sampled.input, sampled.output
-    for j, samples in enumerate(np.broadcast_to(waiting, B.shape[1])):
-        for _ in range(samples):
-            n, m = B.shape
-            A = np.block([[A, B[:, j : j + 1]], [np.zeros((1, n + 1))]])
-            B, C = np.vstack([B, np.zeros((1, m))]), np.hstack([C, np.zeros((C.shape[0], 1))])
-            B[:, j] = np.eye(n + 1)[n]
-    return plant_matrices((A, B, C))
+    linear = MultivariableLinearPlant.of(plant)
+    return linear, tuple(np.broadcast_to(waiting, linear.inputs).tolist())
 
 
 def gain_at(axes: Axes, x: Any = None) -> tuple[Matrix, Matrix]:
@@ -187,7 +200,7 @@ def estimates_at(axes: Axes, plant: Any, operating_point: Any) -> Matrix | None:
 
 def law_of_axes(axes: Axes, x: Any = None) -> MatrixLaw:
     """Return the linear law of axes without limits, learners at rest, B0 as in ``gain_at``."""
-    return _joined([linear_law(axis) for axis in axes.axes], gain_at(axes, x)[1])
+    return joined([linear_law(axis) for axis in axes.axes], gain_at(axes, x)[1])
 
 
 def axes_law(laws: Sequence[LinearLaw], B0: Any) -> MatrixLaw:
@@ -214,10 +227,10 @@ def axes_law(laws: Sequence[LinearLaw], B0: Any) -> MatrixLaw:
         )
     if np.linalg.matrix_rank(B0) < axes:
         raise ValueError(f"B0 = {B0.tolist()!r}: must have an inverse, u = B0⁻¹ v")
-    return _joined(laws, np.linalg.inv(B0))
+    return joined(laws, np.linalg.inv(B0))
 
 
-def _joined(laws: Sequence[LinearLaw], inverse: Matrix) -> MatrixLaw:
+def joined(laws: Sequence[LinearLaw], inverse: Matrix) -> MatrixLaw:
     """Return the law of axes with ``u = inverse v``."""
     from scipy.linalg import block_diag
 

@@ -169,6 +169,8 @@ class MultivariableLoop:
                 raise ValueError(f"{name} has {size.size} entries: must have {count}")
         self._size = np.concatenate(sizes)
         self._response = MatrixResponse(self._broken())
+        self.remark = ""
+        """A line on what the loop stands for, at the end of the summary."""
 
     def __repr__(self) -> str:
         m, p = len(self.inputs), len(self.outputs)
@@ -456,7 +458,7 @@ class MultivariableLoop:
             return "\n".join(
                 [
                     f"unstable: a pole at |z| = {abs(worst.z):.6g}{repeated}",
-                    *filter(None, [self.note]),
+                    *filter(None, [self.note, self.remark]),
                 ]
             )
         lines = [
@@ -477,14 +479,15 @@ class MultivariableLoop:
                 f"all {where} at once: disk margin {d.alpha:.3f}, gains {d.gain[0]:.3g} … "
                 f"{d.gain[1]:.3g} or phases ±{d.phase:.1f}°, at {d.omega:.3g} rad/s"
             )
-        return "\n".join([*lines, *filter(None, [self.note])])
+        return "\n".join([*lines, *filter(None, [self.note, self.remark])])
 
 
 def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> MultivariableLoop:
     """Analyse the loop of a plant and several axes, unlimited, with learners at rest.
 
     Learners are taken as ``analyse`` takes them. A B0 that is a function of the estimates is a
-    constant here, the one at the operating point: what its changes do is not in these margins.
+    constant here, the one at the operating point: what its changes do is not in these margins, and
+    the summary says so (``analyse_points`` judges several points).
 
     Parameters
     ----------
@@ -525,7 +528,13 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
             f"{axes.inputs} actuators"
         )
     law = law_of_axes(axes, estimates_at(axes, plant, operating_point))
-    return MultivariableLoop(matrices, law, axes.dt, outputs=axes.names)
+    loop = MultivariableLoop(matrices, law, axes.dt, outputs=axes.names)
+    if callable(axes.B0) or callable(axes.M):
+        loop.remark = (
+            "NOT judged at other operating points than this one, where B0 is another: "
+            "analyse_points takes several"
+        )
+    return loop
 
 
 def _channel_names(

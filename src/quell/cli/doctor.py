@@ -161,7 +161,7 @@ def _extras(_: list[Finding]) -> Iterator[Finding]:
 
 def _compiled(_: list[Finding]) -> Iterator[Finding]:
     part = "Compiled code"
-    from quell.kernels.cache import announcements, cache_path, compile_time
+    from quell.kernels.cache import cache_path, compile_time
 
     place = cache_path()
     if place is None:
@@ -176,13 +176,12 @@ def _compiled(_: list[Finding]) -> Iterator[Finding]:
     import quell as ql
 
     before, began = compile_time.seconds, time.perf_counter()
-    with announcements(False):
-        plant = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
-        observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=0.01)
-        scenario = ql.Scenario(reference=ql.signals.Step(), duration=1.0)
-        run = ql.simulate(plant, ql.ADRC(observer, omega_c=2.0), scenario)
+    plant = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
+    observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=0.01)
+    scenario = ql.Scenario(reference=ql.signals.Step(), duration=1.0)
+    run = ql.simulate(plant, ql.ADRC(observer, omega_c=2.0), scenario)
     took, compiling = time.perf_counter() - began, compile_time.seconds - before
-    compile_time.told += compiling
+    compile_time.told = compile_time.seconds  # a line below says it
     reached = float(run["y"][-1])
     if not abs(reached - 0.86) < 0.1:
         text = f"y = {reached:.3g} after 1 s, must be 0.86: results are wrong here"

@@ -167,11 +167,15 @@ def sweep(
     worst
         Number of worst runs to print.
     """
-    from quell.setup import load
+    from quell.setup import made, made_axes, read
+    from quell.setup.axes import sweep_of_axes
+    from quell.setup.description import is_of_axes
     from quell.setup.loading import sweep_of
 
-    given = load(setup, trust)
-    plan = sweep_of(given)
+    name, data = read(setup)
+    several = is_of_axes(data)
+    given = (made_axes if several else made)(name, data, trust)
+    plan = (sweep_of_axes if several else sweep_of)(given)
     where = Path(f"{setup.stem}-sweep") if folder is None else folder
     console = Console()
     if repeat is not None:
@@ -256,9 +260,15 @@ def _repeat(
     outputs = check_outputs(outputs, [name])
     with progress_bar(console, COMPILING) as report:
         run = simulate(*parts, progress=partial(report, COMPILING))
-    scores = windowed_metrics(run, replace(given, scenario=parts.scenario, plant=parts.plant))
-    print_metrics(console, f"{given.title}, {text}", scores)
-    learned = print_outcome(console, run)
+    of_run = replace(given, scenario=parts.scenario, plant=parts.plant)
+    scores: Any
+    learned: Any
+    if hasattr(parts.controller, "inputs"):
+        scores, learned = print_axes(console, run, replace(of_run, title=f"{given.title}, {text}"))
+    else:
+        scores = windowed_metrics(run, of_run)
+        print_metrics(console, f"{given.title}, {text}", scores)
+        learned = print_outcome(console, run)
     same = stored_alike(folder, number, text, run, arguments["metrics"])
     if same is not None:
         print_line(console, f"In {folder}/: {'the same, bit for bit' if same else 'other values'}.")
@@ -275,7 +285,7 @@ def _repeat(
 def export(
     setup: Path,
     *,
-    to: Literal["c", "fmu", "ros2"] = "c",
+    to: Literal["c", "fmu", "ros2", "st"] = "c",
     out: Path,
     name: str | None = None,
     precision: Literal["double", "single"] = "double",
@@ -287,7 +297,7 @@ def export(
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write the controller of a setup for another machine: in C, as an FMU, or for ROS 2.
+    """Write the controller of a setup for another machine: C, an FMU, ROS 2, Structured Text.
 
     The C files (C99) are a library for CMake, Arduino, PlatformIO and ESP-IDF with golden vectors
     and a README. In single precision the scenario of the setup is simulated in both precisions
@@ -298,14 +308,14 @@ def export(
     setup
         The file, in TOML; docs/setup has all keys.
     to
-        c; fmu, which is an FMU of FMI 3.0 for co-simulation; or ros2, a package with a chainable
-        controller of ros2_control.
+        c; fmu, which is an FMU of FMI 3.0 for co-simulation; ros2, a package with a chainable
+        controller of ros2_control; or st, a function block in Structured Text for a PLC.
     out
         The folder, or the file .fmu.
     name
-        Begins all names in C; controller by default, and for an FMU the name of the file.
+        Begins all names; controller by default, and for an FMU the name of the file.
     precision
-        Of the C code: double, or single for a processor that has no double precision.
+        Of the code: double, or single for a processor that has no double precision.
     what
         Of an FMU: controller, plant or loop.
     resolution
@@ -337,11 +347,16 @@ def export(
         return
     if what != "controller":
         raise ValueError(f"--what = {what}: is for --to fmu; {to} is of the controller")
-    if to == "ros2":
-        if precision != "double" or accept or prove or resolution is not None:
-            rule = "are for --to c; a package of ROS 2 is in double"
-            raise ValueError(f"--precision, --resolution, --accept and --prove: {rule}")
-        _to_ros2(setup, memory, out, name or "controller", trust, overwrite)
+    if to in ("ros2", "st"):
+        if accept or prove or resolution is not None:
+            raise ValueError(
+                f"--resolution, --accept and --prove: are for --to c, not for --to {to}"
+            )
+        controller, title = _any_controller(setup, memory, precision, trust)
+        if to == "ros2":
+            _to_ros2(controller, title, precision, out, name or "controller", overwrite)
+        else:
+            _to_st(controller, title, precision, out, name or "controller", overwrite)
         return
     if precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
@@ -403,18 +418,38 @@ def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> N
     print_line(Console(), f"FMU of the {what}: {out}")
 
 
-def _to_ros2(
-    setup: Path, memory: Path | None, out: Path, name: str, trust: bool, overwrite: bool
-) -> None:
-    from quell.export import ros2
+def _any_controller(
+    setup: Path, memory: Path | None, precision: str, trust: bool
+) -> tuple[Any, str]:
+    """Return the controller of a setup, of one axis or of several, and the title of the setup."""
     from quell.setup import made, made_axes, read
     from quell.setup.description import is_of_axes
 
     file, data = read(setup)
     given = (made_axes if is_of_axes(data) else made)(file, data, trust)
-    ros2(_learned(given.controller, memory, "double"), out, name=name, overwrite=overwrite)
-    print_line(Console(), f"{given.title}: package {name} of ROS 2 Jazzy in {out}")
+    return _learned(given.controller, memory, precision), given.title
+
+
+def _to_ros2(
+    controller: Any, title: str, precision: str, out: Path, name: str, overwrite: bool
+) -> None:
+    from quell.export import ros2
+
+    if precision != "double":
+        raise ValueError("--precision single: the interfaces of ros2_control are in double")
+    ros2(controller, out, name=name, overwrite=overwrite)
+    print_line(Console(), f"{title}: package {name} of ROS 2 Jazzy in {out}")
     print_line(Console(), "NOT built with ROS here: run colcon build and colcon test")
+
+
+def _to_st(
+    controller: Any, title: str, precision: str, out: Path, name: str, overwrite: bool
+) -> None:
+    from quell.export import st
+
+    st(controller, out, name=name, precision=precision, overwrite=overwrite)
+    print_line(Console(), f"{title}: function block {name} in {out}/{name}.st")
+    print_line(Console(), "NOT tried on a PLC: compare a record of it with a simulated one")
 
 
 def _print(title: str, exported: Exported) -> None:

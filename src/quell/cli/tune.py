@@ -305,7 +305,8 @@ def tune(
     """Tune a controller for a linear plant: the best load rejection under constraints.
 
     Of a setup with a [compensator] that is tuned, and its controller stays as it is. With
-    [tune.schedule], a list of operating points, the gains of the controller follow a signal.
+    [tune.schedule], a list of operating points, the gains of the controller follow a signal. Of
+    several axes, a table [[axis]] each, all bandwidths are tuned for the coupled loop.
 
     The plant is that of a setup file, a transfer function, one that a record shows, or that an
     experiment at a rig shows (--device). A record is identified first, and the deviations of gain,
@@ -364,6 +365,7 @@ def tune(
     """
     from quell.commissioning import is_record
     from quell.files import check_writable
+    from quell.setup.description import is_of_axes
     from quell.setup.points import has_schedule
     from quell.setup.schema import read as tables_of
     from quell.tuning.designs import range_of_u
@@ -396,6 +398,9 @@ def tune(
         refuse(of_rig, "goes with --device, an experiment at a rig")
         if setup is not None and not (num or den or dt):
             tables = tables_of(setup)[1]
+            if is_of_axes(tables):
+                refuse(options_of(works, WORKS), "is for one axis, not for several")
+                return _tune_axes(console, setup, options, trust, out, outputs)
             if has_schedule(tables):
                 limits = works.limits()
                 refuse(of_rest(works), "is the operating_point of a plant, in a setup")
@@ -513,6 +518,49 @@ def _tune_schedule(
     controller = tuned.controller
     observer = f"omega_o = {controller.observer.omega_o:.5g}"
     print_line(console, f"omega_c = {controller.omega_c:.5g}, {observer}, {tuned.schedule}")
+    if out is not None:
+        tuned.save(out, outputs.overwrite)
+        print_line(console, f"Setup: {out}")
+    paths = []
+    if outputs.figures:
+        from quell.experiments.common import save_figure
+
+        figure = tuned.plot()[0].figure
+        paths += save_figure(figure, outputs.figures, "tuned", outputs.overwrite)
+    write_results(console, tuned.to_json(), outputs, paths)
+    return ExitCode.DONE
+
+
+def _tune_axes(
+    console: Console,
+    path: Path,
+    options: dict[str, Any],
+    trust: bool,
+    out: Path | None,
+    outputs: Outputs,
+) -> int:
+    """Tune the bandwidths of all axes of a setup, for the coupled loop."""
+    from quell.setup.axes import axes_task
+    from quell.tuning.axes import quantity, tune_axes
+
+    usable = {"m_s", "m_t", "m_ks", "damping", "objective"}
+    rule = "is for one axis; of several m_s, m_t, m_ks, damping and objective count, and [tune]"
+    refuse({name: (value, None) for name, value in options.items() if name not in usable}, rule)
+    setup, how = axes_task(path, options, trust)
+    plant = setup.needed("plant")
+    axes: Any = setup.controller
+    with progress_bar(console, "tuning") as bar:
+        tuned = tune_axes(plant, axes, progress=partial(_progress, bar), **how)
+    count = len(axes.names)
+    print_line(console, f"{setup.title}, dt = {axes.dt:g} s, {count} axes, {tuned.plants} plants")
+    print_line(console, f"constraints: {tuned.constraints} of each channel, all others closed")
+    cost = (quantity(tuned.objective), "over that\nof alone")
+    rows = table("The coupled loop", "axis", "omega_c", "omega_o", *cost, "M_s", "M_t", "M_ks")
+    for row in tuned.rows():
+        rows.add_row(*row)
+    console.print(rows)
+    for line in tuned.verdicts():
+        print_line(console, line)
     if out is not None:
         tuned.save(out, outputs.overwrite)
         print_line(console, f"Setup: {out}")

@@ -266,16 +266,20 @@ def set_range(limits: ActuatorLimits, before: Vector, memory: RangeMemory) -> No
 
 @kernel
 def _cut(memory: RangeMemory, limits: ActuatorLimits, i: int, wish: float) -> tuple[float, int]:
-    """Return a value of actuator i within its range, and the flag of what cut it."""
-    if wish > memory.high[i]:
+    """Return a value of actuator i within its range, and the flag of what cut it.
+
+    It is always a number: without one it is that of rest, as for one actuator.
+    """
+    value, flag = wish, 0
+    if value > memory.high[i]:
         value = memory.high[i]
-        return value, _SATURATED if value == limits.high[i] else _RATE_LIMITED
-    if wish < memory.low[i]:
+        flag = _SATURATED if value == limits.high[i] else _RATE_LIMITED
+    elif value < memory.low[i]:
         value = memory.low[i]
-        return value, _SATURATED if value == limits.low[i] else _RATE_LIMITED
-    if not is_finite(wish):
-        return min(max(0.0, memory.low[i]), memory.high[i]), _OVERFLOWED
-    return wish, 0
+        flag = _SATURATED if value == limits.low[i] else _RATE_LIMITED
+    if not is_finite(value):
+        value, flag = min(max(0.0, limits.low[i]), limits.high[i]), _OVERFLOWED
+    return value, flag
 
 
 @kernel

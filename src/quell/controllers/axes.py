@@ -29,13 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.adrc import ADRC
 from quell.controllers.allocation import (
     ActuatorLimits,
     Gain,
     GainMemory,
     RangeMemory,
-    allocate,
     changed_actuator_limits,
     checked_actuator_limits,
     checked_gain,
@@ -43,259 +41,74 @@ from quell.controllers.allocation import (
     range_memory,
     update_gain,
 )
-from quell.controllers.axes_learning import (
+from quell.controllers.axes_chain import (
     AxisDesigns,
     AxisStates,
-    LearningOfAxes,
     NoAxis,
     NoAxisMemory,
+    ask_axes,
+    continue_axes,
+    have_started,
+    reset_axes,
+    set_axes_derivatives,
+    set_axes_manual,
+    start_axes,
+    tell_axes,
+    write_axes,
+)
+from quell.controllers.axes_learning import (
+    LearningOfAxes,
     learn_of_all,
     look_at_all,
     restart_of_all,
 )
 from quell.controllers.base import (
+    Controller,
     RateLimit,
-    control,
-    is_usable,
     reset_loop,
-    set_applied_control,
     set_reference_derivatives,
     status_flags,
     write_row,
 )
-from quell.controllers.compensator import Estimate, samples_to_settle, start_at_rest
+from quell.controllers.compensated import takes_control
+from quell.controllers.compensator import (
+    Compensator,
+    Estimate,
+    samples_to_settle,
+)
+from quell.controllers.given_controls import (
+    ANY_CUT,
+    allocate_given,
+    check_axes,
+    check_compensates,
+    checked_drives,
+    given_design,
+    given_memory,
+    reset_given,
+    start_given,
+    take_references,
+    tell_given,
+)
 from quell.controllers.memory import Layout
 from quell.controllers.safe_axes import (
-    add_axes_flags,
     check_safe_sets,
     keep_in_bands,
     safe_axes_design,
     safe_axes_memory,
-    write_axes_bounds,
 )
-from quell.controllers.safe_set import write_bounds
-from quell.controllers.stateful import PackedController, StatefulController, unpacked
-from quell.kernels import dispatch
+from quell.controllers.several import (
+    control_all,
+    prepared_step,
+    start_all,
+    take_signals,
+    tell_applied,
+)
+from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import (
-    compiled_call,
-    dispatcher_for,
-    explain_compile_errors,
-    generic,
     kernel,
 )
 from quell.kernels.sized import Scalars, Work, clear
 from quell.types import Channels, Matrix, Status, Vector
-
-# ---- Functions of a controller of several signals, as ``controllers.base`` has them for one ----
-
-
-@generic
-def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) -> None:
-    """Take one sample: write the control signals ``u`` (m,) for references and measurements."""
-    raise TypeError
-
-
-@generic
-def start_all(controller: Any, state: Any, samples: Any, y: Vector, u: Vector, r: Vector) -> None:
-    """Start at a machine that rests at y under u: the next sample continues from there.
-
-    r are the references of the next sample. What was learned is kept. The observer of each axis
-    takes as many ``samples`` (n,) as it needs to settle.
-    """
-    raise TypeError
-
-
-@generic
-def tell_applied(controller: Any, state: Any) -> None:
-    """Tell observers that the control signals in the state were applied."""
-    raise TypeError
-
-
-# ---- The axes, one inside of the other, so that each may be of another kind ----
-
-
-@generic
-def ask_axes(axes: Any, states: Any, i: int, r: Vector, y: Vector, v: Vector, x: Matrix) -> int:
-    """Run the axes from the i-th on: write v and the estimates x; return the flags."""
-    raise TypeError
-
-
-@generic
-def tell_axes(axes: Any, states: Any, i: int, v: Vector) -> None:
-    """Tell the axes from the i-th on what was applied."""
-    raise TypeError
-
-
-@generic
-def reset_axes(axes: Any, states: Any) -> None:
-    """Start the axes from rest at the next sample."""
-    raise TypeError
-
-
-@generic
-def write_axes(axes: Any, states: Any, widths: Any, i: int, row: Vector) -> None:
-    """Write the channels of the axes from the i-th on into ``row``; ``widths`` has their number."""
-    raise TypeError
-
-
-@generic
-def set_axes_derivatives(axes: Any, states: Any, counts: Any, i: int, values: Vector) -> None:
-    """Set the derivatives of the references of the axes from the i-th on."""
-    raise TypeError
-
-
-@generic
-def start_axes(
-    axes: Any, states: Any, samples: Any, i: int, y: Vector, v: Vector, r: Vector
-) -> None:
-    """Start the axes from the i-th on at rest; see ``start_at_rest``.
-
-    A reference that is no number is y.
-    """
-    raise TypeError
-
-
-@generic
-def have_started(axes: Any, states: Any) -> bool:
-    """Return whether all axes had a measurement or a start."""
-    raise TypeError
-
-
-@generic
-def continue_axes(axes: Any, states: Any) -> None:
-    """Let the next sample of each axis continue from what was applied."""
-    raise TypeError
-
-
-@generic
-def set_axes_manual(axes: Any, states: Any, manual: float, i: int, v: Vector) -> None:
-    """Begin or end manual operation under v of the axes from the i-th on."""
-    raise TypeError
-
-
-@ask_axes.register(NoAxis)
-def _ask_none(axes: NoAxis, states: Any, i: int, r: Any, y: Any, v: Any, x: Any) -> int:
-    return 0
-
-
-@ask_axes.register(AxisDesigns)
-def _ask(
-    axes: AxisDesigns, states: AxisStates, i: int, r: Vector, y: Vector, v: Vector, x: Matrix
-) -> int:
-    v[i] = control(axes.axis, states.axis, r[i], y[i])
-    for j in range(axes.axis.law.size):
-        x[i, j] = states.axis.estimates[j]
-    flags = status_flags(axes.axis, states.axis)
-    return flags | ask_axes(axes.others, states.others, i + 1, r, y, v, x)
-
-
-@tell_axes.register(NoAxis)
-def _tell_none(axes: NoAxis, states: Any, i: int, v: Any) -> None:
-    pass
-
-
-@tell_axes.register(AxisDesigns)
-def _tell(axes: AxisDesigns, states: AxisStates, i: int, v: Vector) -> None:
-    set_applied_control(axes.axis, states.axis, v[i])
-    tell_axes(axes.others, states.others, i + 1, v)
-
-
-@reset_axes.register(NoAxis)
-def _reset_none(axes: NoAxis, states: Any) -> None:
-    pass
-
-
-@reset_axes.register(AxisDesigns)
-def _reset(axes: AxisDesigns, states: AxisStates) -> None:
-    reset_loop(axes.axis, states.axis)
-    reset_axes(axes.others, states.others)
-
-
-@write_axes.register(NoAxis)
-def _write_none(axes: NoAxis, states: Any, widths: Any, i: int, row: Any) -> None:
-    pass
-
-
-@write_axes.register(AxisDesigns)
-def _write(axes: AxisDesigns, states: AxisStates, widths: Any, i: int, row: Vector) -> None:
-    write_row(axes.axis, states.axis, row[: widths[i]])
-    write_axes(axes.others, states.others, widths, i + 1, row[widths[i] :])
-
-
-@set_axes_derivatives.register(NoAxis)
-def _no_derivatives(axes: NoAxis, states: Any, counts: Any, i: int, values: Any) -> None:
-    pass
-
-
-@set_axes_derivatives.register(AxisDesigns)
-def _derivatives(
-    axes: AxisDesigns, states: AxisStates, counts: Any, i: int, values: Vector
-) -> None:
-    if counts[i] > 0:
-        set_reference_derivatives(axes.axis, states.axis, values[: counts[i]])
-    set_axes_derivatives(axes.others, states.others, counts, i + 1, values[counts[i] :])
-
-
-@start_axes.register(NoAxis)
-def _start_none(axes: NoAxis, states: Any, samples: Any, i: int, y: Any, v: Any, r: Any) -> None:
-    pass
-
-
-@start_axes.register(AxisDesigns)
-def _start(
-    axes: AxisDesigns, states: AxisStates, samples: Any, i: int, y: Vector, v: Vector, r: Vector
-) -> None:
-    goal = r[i] if is_usable(r[i]) else y[i]
-    start_at_rest(axes.axis, states.axis, samples[i], y[i], v[i], goal)
-    start_axes(axes.others, states.others, samples, i + 1, y, v, r)
-
-
-@have_started.register(NoAxis)
-def _none_has_started(axes: NoAxis, states: Any) -> bool:
-    return True
-
-
-@have_started.register(AxisDesigns)
-def _have_started(axes: AxisDesigns, states: AxisStates) -> bool:
-    if states.axis.loop[0].started == 0.0:
-        return False
-    return have_started(axes.others, states.others)
-
-
-@continue_axes.register(NoAxis)
-def _continue_none(axes: NoAxis, states: Any) -> None:
-    pass
-
-
-@continue_axes.register(AxisDesigns)
-def _continue(axes: AxisDesigns, states: AxisStates) -> None:
-    states.axis.loop[0].bumpless = 1.0
-    continue_axes(axes.others, states.others)
-
-
-@set_axes_manual.register(NoAxis)
-def _set_none_manual(axes: NoAxis, states: Any, manual: float, i: int, v: Any) -> None:
-    pass
-
-
-@set_axes_manual.register(AxisDesigns)
-def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v: Vector) -> None:
-    states.axis.loop[0].manual, states.axis.loop[0].u_manual = manual, v[i]
-    set_axes_manual(axes.others, states.others, manual, i + 1, v)
-
-
-@write_axes_bounds.register(AxisDesigns)
-def _write_bounds(axes: AxisDesigns, states: AxisStates, i: int, bounds: Matrix) -> None:
-    write_bounds(axes.axis.safe_set, states.axis.safe_set, bounds[i])
-    write_axes_bounds(axes.others, states.others, i + 1, bounds)
-
-
-@add_axes_flags.register(AxisDesigns)
-def _add_flags(axes: AxisDesigns, states: AxisStates, i: int, flags: Vector) -> None:
-    own = states.axis.loop[0]
-    own.status = int(own.status) | int(flags[i])
-    add_axes_flags(axes.others, states.others, i + 1, flags)
-
 
 # ---- A sample of all axes ----
 
@@ -319,6 +132,7 @@ class AxesDesign(NamedTuple):
     widths: Any  # channels of each axis (n,), integers
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
     safe: Any  # the safe sets of axes together, or none
+    given: Any  # references, or control signals in their place
 
 
 class AxesState(NamedTuple):
@@ -329,11 +143,13 @@ class AxesState(NamedTuple):
     gain: GainMemory
     range: RangeMemory
     safe: Any
+    given: Any
     loop: NDArray[AxesLoop]  # (1,)
     x: Work  # estimates x[axis, derivative] (n, largest order)
     v: Vector  # what the axes asked for, then what was applied (n,)
     u: Vector  # applied control signals (m,)
     u_limited: Work  # those of the law; they differ from u in manual operation (m,)
+    wish: Work  # what each axis is asked for: its reference, or v of given control signals (n,)
     r_given: Work  # references and measurements of a call from Python (n,)
     y_given: Work
 
@@ -350,16 +166,18 @@ def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
 @control_all.register(AxesDesign)
 def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
     loop = state.loop[0]
+    flags = take_references(design.given, state.given, state.gain, r, y, state.wish)
     look_at_all(design.learning, state.learning, design.axes, state.axes)
-    flags = ask_axes(design.axes, state.axes, 0, r, y, state.v, state.x)
+    flags |= ask_axes(design.axes, state.axes, 0, state.wish, y, state.v, state.x)
     learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
         return
-    flags |= allocate(
-        design.rule, design.limits, state.gain, state.range, state.v, state.u, state.u_limited
-    )
+    flags |= allocate_given(
+        design.given, state.given, design.rule, design.limits, state.gain, state.range, state.v,
+        state.u, state.u_limited,
+    )  # fmt: skip
     flags |= keep_in_bands(
         design.safe, state.safe, design.axes, state.axes, design.limits, state.gain, state.range,
         state.u_limited,
@@ -368,6 +186,7 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
         state.u[k] = state.u_limited[k]
         u[k] = state.u[k]
     apply_to_axes(state.gain, state.u, state.v)
+    tell_given(design.given, state.given, design.axes, state.axes, state.gain, state.u, flags)
     tell_axes(design.axes, state.axes, 0, state.v)
     loop.status, loop.started = flags, 1.0
 
@@ -375,6 +194,7 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
 @tell_applied.register(AxesDesign)
 def _tell_applied(design: AxesDesign, state: AxesState) -> None:
     apply_to_axes(state.gain, state.u, state.v)
+    tell_given(design.given, state.given, design.axes, state.axes, state.gain, state.u, ANY_CUT)
     tell_axes(design.axes, state.axes, 0, state.v)
 
 
@@ -390,7 +210,8 @@ def _start_all(
     for k in range(state.u.size):
         state.u[k] = u[k]
     apply_to_axes(state.gain, state.u, state.v)
-    start_axes(design.axes, state.axes, samples, 0, y, state.v, r)
+    start_given(design.given, state.given, state.gain, u, r, state.wish)
+    start_axes(design.axes, state.axes, samples, 0, y, state.v, state.wish)
     state.loop[0].started = 1.0
 
 
@@ -425,6 +246,7 @@ def _status_flags(design: AxesDesign, state: AxesState) -> int:
 @reset_loop.register(AxesDesign)
 def _reset_loop(design: AxesDesign, state: AxesState) -> None:
     reset_axes(design.axes, state.axes)
+    reset_given(design.given, state.given)
     restart_of_all(design.learning, state.learning)
     clear(state.loop)
     for k in range(state.u.size):
@@ -445,39 +267,6 @@ def _set_derivatives(design: AxesDesign, state: AxesState, derivatives: Vector) 
     set_axes_derivatives(design.axes, state.axes, design.derivatives, 0, derivatives)
 
 
-@compiled_call
-def step_axes(packed: Any) -> None:
-    """Take one sample with the references and measurements that are in the state."""
-    design, state = unpacked(packed)
-    control_all(design, state, state.r_given, state.y_given, state.u)
-
-
-def _step_as_python(packed: Any) -> None:
-    design, state = packed.arrays
-    with np.errstate(all="ignore"):  # compiled code does not warn
-        control_all(design, state, state.r_given, state.y_given, state.u)
-
-
-def prepared_step(design: Any, state: Any) -> tuple[PackedController, Any]:
-    """Return a packed controller of several signals, and the compiled function that steps it."""
-    packed = PackedController(design, state)
-    if dispatch.interpret_all:
-        return packed, _step_as_python
-    with explain_compile_errors(design):
-        return packed, dispatcher_for(step_axes, design).compile((packed.type,))
-
-
-def take_signals(state: Any, r: Any, y: Any) -> None:
-    """Write references and measurements of a call from Python into the state.
-
-    Raises ``TypeError`` or ``ValueError`` unless there is a number for each: NumPy would give one
-    number to all.
-    """
-    if len(r) != state.r_given.size or len(y) != state.y_given.size:
-        raise ValueError
-    state.r_given[:], state.y_given[:] = r, y
-
-
 # ---- The controller ----
 
 
@@ -489,7 +278,9 @@ class Axes(StatefulController):
     axes
         an ``ADRC`` for each axis, all with one ``dt``, with an observer of ``b0 = 1`` and without
         limits of u: what it calls u is v_i, the acceleration (for order 2) that it asks for. In a
-        dictionary each has a name. They are copied.
+        dictionary each has a name. They are copied. Or a ``Compensator`` for each: then control
+        signals u_0 of the actuators (m,) take the place of the references r, and
+        ``u = u_0 − B0⁺ f̂`` (``controllers/given_controls.py``).
     B0
         from the control signals to the axes (n, m) [y-unit/s^n per u-unit]: a matrix, or a function
         of the estimates that returns it. The function takes ``x[axis, derivative]``, so ``x[0, 0]``
@@ -513,6 +304,9 @@ class Axes(StatefulController):
     wished
         the u from which that is measured (m,) [u-unit], as the thrusts that carry a craft; zero by
         default.
+    drives
+        controllers that give u_0 where the axes are compensators, one for each axis and for the
+        actuator of its place, as ``PID``; r are then their references. They are copied.
     learner
         one that sees the states of all axes, with features ``AllAxes(...)``: one for all axes,
         which have one gain and θ of their own (``RLS``, ``NLMS``), or a list or dictionary with one
@@ -548,7 +342,7 @@ class Axes(StatefulController):
 
     def __init__(
         self,
-        axes: Sequence[ADRC] | dict[str, ADRC],
+        axes: Sequence[Compensator] | dict[str, Compensator],
         B0: Any = None,
         *,
         M: Any = None,
@@ -558,6 +352,7 @@ class Axes(StatefulController):
         saturation: str | Sequence[int | str] = "each",
         weights: Sequence[float] | None = None,
         wished: Sequence[float] | None = None,
+        drives: Sequence[Controller] | None = None,
         learner: Any = None,
         guard: Any = None,
     ) -> None:
@@ -567,10 +362,12 @@ class Axes(StatefulController):
         parts: list[Any] = list(given.values()) if given else list(axes)
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
         check_axes(parts, self.names)
-        self.axes: tuple[ADRC, ...] = tuple(copy.copy(axis) for axis in parts)
+        self.axes: tuple[Any, ...] = tuple(copy.copy(axis) for axis in parts)
         self.B0, self.M, self.weights = B0, M, weights
         self._gain = self._checked_gain()
+        check_compensates(self.compensates, drives, wished)
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
+        self.drives = checked_drives(drives, self.names, self.inputs, self.dt)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
         self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
         self.learning.attach(self.axes)
@@ -592,6 +389,21 @@ class Axes(StatefulController):
     def outputs(self) -> int:
         """Number of axes n, and so of references and measurements."""
         return len(self.axes)
+
+    @property
+    def references(self) -> int:
+        """Number of references, or of control signals u_0 in their place."""
+        return self.inputs if self.takes_u_0 else self.outputs
+
+    @property
+    def takes_u_0(self) -> bool:
+        """Whether control signals take the place of references: of compensators without drives."""
+        return self.compensates and not self.drives
+
+    @property
+    def compensates(self) -> bool:
+        """Whether the axes are compensators."""
+        return takes_control(self.axes[0])
 
     @property
     def first_gain(self) -> Matrix:
@@ -651,6 +463,7 @@ class Axes(StatefulController):
             np.array(widths, dtype=np.int64),
             np.array(self.derivatives, dtype=np.int64),
             safe_axes_design(self._has_bands, self._gain.weights),
+            given_design(self.compensates, self.drives),
         )
 
     def initial_state(self) -> AxesState:
@@ -665,12 +478,14 @@ class Axes(StatefulController):
             gain=self._gain.memory(),
             range=range_memory(n, m),
             safe=safe_axes_memory(self.parameters.safe, n, m),
+            given=given_memory(self.parameters.given, self.drives, n, m),
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
             v=np.zeros(n),
             u=np.zeros(m),
             u_limited=np.zeros(m),
-            r_given=np.zeros(n),
+            wish=np.zeros(n),
+            r_given=np.zeros(self.references),
             y_given=np.zeros(n),
         )
 
@@ -702,7 +517,8 @@ class Axes(StatefulController):
         ----------
         r, y
             references and measurements of the axes (n,) [y-unit]. One that is not finite is
-            replaced as ``ADRC.step`` does; ``status`` reports it.
+            replaced as ``ADRC.step`` does; ``status`` reports it. Of compensators without drives r
+            is u_0 (m,) [u-unit].
         derivatives
             r' (n,), r'' (n,) …, for axes with feedforward; zero by default.
         """
@@ -712,10 +528,11 @@ class Axes(StatefulController):
         try:
             take_signals(state, r, y)
         except (TypeError, ValueError):
-            raise ValueError(
-                f"r = {r!r}, y = {y!r}: each must have {self.outputs} numbers, one for each axis "
-                f"({', '.join(self.names)})"
-            ) from None
+            n, m, names = self.outputs, self.references, ", ".join(self.names)
+            rule = f"each must have {n} numbers, one for each axis ({names})"
+            if self.takes_u_0:
+                rule = f"u_0 must have {m} numbers, one for each actuator, y {n} ({names})"
+            raise ValueError(f"r = {r!r}, y = {y!r}: {rule}") from None
         if derivatives:
             self._set_derivatives(derivatives)
         self._step(self._packed)
@@ -756,11 +573,12 @@ class Axes(StatefulController):
             control signals that hold the machine there (m,) [u-unit]; zero by default. One that
             holds an arm against gravity, for instance.
         r
-            references of the next step (n,); ``y`` by default.
+            references of the next step (n,); ``y`` by default. Of compensators it is checked only.
         """
         rest = checks.vector("y", y, self.outputs)
         given = np.zeros(self.inputs) if u is None else checks.vector("u", u, self.inputs)
-        goals = rest if r is None else checks.vector("r", r, self.outputs)
+        usual = given if self.takes_u_0 else rest
+        goals = usual if r is None else checks.vector("r", r, self.references)
         samples = [samples_to_settle(axis.observer) for axis in self.axes]
         start_all(self.parameters, self._state, samples, rest, given, goals)
 
@@ -810,6 +628,9 @@ class Axes(StatefulController):
         **changes
             ``omega_c`` and ``observer``, as for ``ADRC.retune``, with the same errors.
         """
+        if self.compensates and "omega_c" in changes:
+            omega_c = changes["omega_c"]
+            raise ValueError(f"omega_c = {omega_c!r}: a compensator has no law; give an observer")
         self.learning.check_retuning(changes)
         self.axes[self.index(axis)].retune(**changes)
         self.learning.update(self.axes)
@@ -877,34 +698,3 @@ class Axes(StatefulController):
         self._gain = self._checked_gain()
         self._initialise()
         self.state = kept["state"]
-
-
-def check_axes(axes: Sequence[Any], names: Sequence[str]) -> None:
-    """Check that these can be the axes of a controller."""
-    if len(axes) < 1:
-        raise ValueError("axes has no entries: give an ADRC for each axis")
-    for name, axis in zip(names, axes, strict=True):
-        if not isinstance(name, str) or not name or "." in name:
-            raise ValueError(f"axes: name {name!r} must be a text without a dot")
-        checks.printable("axes", name)
-        if not isinstance(axis, ADRC):
-            raise ValueError(f"axes: {name} = {axis!r:.60}: must be an ADRC")
-        if axis.dt != axes[0].dt:
-            raise ValueError(
-                f"axes: {name} has dt = {axis.dt!r} s, {names[0]} {axes[0].dt!r} s: must be one dt"
-            )
-        if axis.observer.b0 != 1.0:
-            raise ValueError(
-                f"axes: {name} has an observer with b0 = {axis.observer.b0!r}: must be 1, its "
-                "input is v = B0 u; the gain of the actuator belongs in B0"
-            )
-        limits = axis.limits
-        if any(map(np.isfinite, limits)):
-            raise ValueError(
-                f"axes: {name} has limits of u: must have none, give u_min, u_max and rate_limit "
-                "of the actuators to Axes"
-            )
-        if axis.schedule is not None:
-            raise ValueError(
-                f"axes: {name} has a schedule: must have none; make B0 a function of the estimates"
-            )

@@ -1,4 +1,4 @@
-"""Axes one inside of the other, and what their learners know of each other.
+"""What the learners of several axes know of each other.
 
 A learner that is given to ``Axes`` sees the states of all axes (``learners/all_axes.py``). At the
 beginning of a sample, before the axes run, all signals are gathered; a learner that all axes share
@@ -14,6 +14,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.adrc import ADRC
+from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.guard import Guard
 from quell.kernels.dispatch import generic, generic_with_default
 from quell.kernels.sized import Size, Work
@@ -29,40 +30,18 @@ from quell.learners.all_axes import (
     find_gain,
     forget_uncertainty,
     look,
-    restart_shared,
     share,
     show,
     take_gain,
 )
-from quell.learners.base import NoLearner, meaning
+from quell.learners.base import (
+    NoLearner,
+    NoLearnerDesign,
+    NoLearnerMemory,
+    meaning,
+    restart,
+)
 from quell.types import Vector
-
-# ---- The axes, one inside of the other, so that each may be of another kind ----
-
-
-class NoAxis(NamedTuple):
-    """The end of the axes."""
-
-
-class NoAxisMemory(NamedTuple):
-    """The end of the axes' states."""
-
-    nothing: Vector  # (0,)
-
-
-class AxisDesigns(NamedTuple):
-    """Parameters of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
-
-class AxisStates(NamedTuple):
-    """State of an axis, and of those behind it."""
-
-    axis: Any
-    others: Any
-
 
 # ---- What the learners of all axes know together ----
 
@@ -83,7 +62,7 @@ class LearningDesign(NamedTuple):
     dt: float
     states: Size  # of all axes
     axes: Size
-    shared: Any  # what the outputs of one learner share, or ``NoLearning``
+    shared: Any  # what the outputs of one learner share, or ``NoLearnerDesign``
 
 
 @meaning.register(LearningDesign)
@@ -115,8 +94,10 @@ def restart_of_all(learning: Any, memory: Any) -> None:
 
 
 @generic
-def gather_axes(axes: Any, states: Any, dt: float, at: int, before: Vector, now: Vector) -> None:  # fmt: skip
-    """Write the signals of the axes, whose states begin at ``at``.
+def gather_axes(
+    axes: Any, states: Any, learning: Any, at: int, i: int, before: Vector, now: Vector
+) -> None:
+    """Write the signals of the axes from the i-th on, whose states begin at ``at``.
 
     Both arrays have the states of all axes, then v, y and y − x̂_1 of each.
     """
@@ -154,16 +135,24 @@ def look_for_forgotten(axes: Any, states: Any, shared: Any, memory: Any) -> None
 
 
 @gather_axes.register(NoAxis)
-def _gather_none(axes: NoAxis, states: Any, dt: float, at: int, before: Any, now: Any) -> None:  # fmt: skip
+def _gather_none(
+    axes: NoAxis, states: Any, learning: Any, at: int, i: int, before: Any, now: Any
+) -> None:
     pass
 
 
 @gather_axes.register(AxisDesigns)
 def _gather(
-    axes: AxisDesigns, states: AxisStates, dt: float, at: int, before: Vector, now: Vector
+    axes: AxisDesigns,
+    states: AxisStates,
+    learning: LearningDesign,
+    at: int,
+    i: int,
+    before: Vector,
+    now: Vector,
 ) -> None:
     own, loop, estimates = axes.axis, states.axis.loop[0], states.axis.estimates
-    order = own.law.size
+    order, dt = own.law.size, learning.dt
     # y^(n) as the observer has it, for f that enters where v does.
     rate = own.cancel_f * (loop.u + estimates[order] + loop.f_learned + loop.f_known)
     for j in range(order):
@@ -172,29 +161,11 @@ def _gather(
     for j in range(order - 1):
         now[at + j] = estimates[j] + dt * estimates[j + 1]
     now[at + order - 1] = estimates[order - 1] + dt * rate
-    gather_axes(axes.others, states.others, dt, at + order, before, now)
-
-
-@generic
-def gather_signals(axes: Any, states: Any, at: int, step: int, before: Vector, now: Vector) -> None:
-    """Write v, y and y − x̂_1 of the axes, those of an axis ``step`` apart, from ``at`` on."""
-    raise TypeError
-
-
-@gather_signals.register(NoAxis)
-def _gather_no_signals(axes: NoAxis, states: Any, at: int, step: int, before: Any, now: Any) -> None:  # fmt: skip
-    pass
-
-
-@gather_signals.register(AxisDesigns)
-def _gather_signals(
-    axes: AxisDesigns, states: AxisStates, at: int, step: int, before: Vector, now: Vector
-) -> None:
-    loop, estimates = states.axis.loop[0], states.axis.estimates
-    before[at] = now[at] = loop.u
-    before[at + step] = now[at + step] = loop.y
-    before[at + 2 * step] = now[at + 2 * step] = loop.y - estimates[0]
-    gather_signals(axes.others, states.others, at + 1, step, before, now)
+    place, step = learning.states + i, learning.axes
+    before[place] = now[place] = loop.u
+    before[place + step] = now[place + step] = loop.y
+    before[place + 2 * step] = now[place + 2 * step] = loop.y - estimates[0]
+    gather_axes(axes.others, states.others, learning, at + order, i + 1, before, now)
 
 
 @show_axes.register(NoAxis)
@@ -288,21 +259,10 @@ def _end_shared(shared: SharedDesign, memory: SharedMemory, axes: Any, states: A
         take_gains(axes, states, shared, memory)
 
 
-@generic_with_default
-def restart_if_shared(shared: Any, memory: Any) -> None:
-    """Restart a shared learner; by default there is none."""
-
-
-@restart_if_shared.register(SharedDesign)
-def _restart_if_shared(shared: SharedDesign, memory: SharedMemory) -> None:
-    restart_shared(shared, memory)
-
-
 @look_at_all.register(LearningDesign)
 def _look_at_all(learning: LearningDesign, memory: LearningMemory, axes: Any, states: Any) -> None:
     before, now = memory.before, memory.now
-    gather_axes(axes, states, learning.dt, 0, before, now)
-    gather_signals(axes, states, learning.states, learning.axes, before, now)
+    gather_axes(axes, states, learning, 0, 0, before, now)
     show_axes(axes, states, before, now)
     begin_shared(learning.shared, memory.shared, axes, states, before, now)
 
@@ -314,7 +274,7 @@ def _learn_of_all(learning: LearningDesign, memory: LearningMemory, axes: Any, s
 
 @restart_of_all.register(LearningDesign)
 def _restart_of_all(learning: LearningDesign, memory: LearningMemory) -> None:
-    restart_if_shared(learning.shared, memory.shared)
+    restart(learning.shared, memory.shared)
 
 
 # ---- Learners and guards that users give to Axes ----
@@ -420,7 +380,7 @@ class LearningOfAxes:
         if not self.learns:
             return NoLearning()
         states = sum(observer.order for observer in self._view.observers)
-        shared = NoLearning() if self._shared is None else self._shared.design()
+        shared = NoLearnerDesign() if self._shared is None else self._shared.design()
         return LearningDesign(dt, states, len(self._names), shared)
 
     def memory(self, parameters: Any) -> NoLearningMemory | LearningMemory:
@@ -428,7 +388,7 @@ class LearningOfAxes:
         if not self.learns:
             return NoLearningMemory(np.zeros(0))
         before, now = np.zeros((2, parameters.states + 3 * parameters.axes))
-        shared: Any = NoLearningMemory(np.zeros(0))
+        shared: Any = NoLearnerMemory(np.zeros(0))
         if self._shared is not None:
             shared = self._shared.memory(parameters.shared)
         return LearningMemory(before, now, shared)

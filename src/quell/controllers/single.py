@@ -19,7 +19,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.axes import Axes, AxesDesign
-from quell.controllers.axes_learning import AxisDesigns
+from quell.controllers.axes_chain import AxisDesigns
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,

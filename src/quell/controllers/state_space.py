@@ -28,13 +28,6 @@ from quell.controllers.allocation import (
     cut_to_range,
     range_memory,
 )
-from quell.controllers.axes import (
-    control_all,
-    prepared_step,
-    start_all,
-    take_signals,
-    tell_applied,
-)
 from quell.controllers.base import (
     RateLimit,
     is_usable,
@@ -43,6 +36,13 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.feedback_gains import regulator
+from quell.controllers.several import (
+    control_all,
+    prepared_step,
+    start_all,
+    take_signals,
+    tell_applied,
+)
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Scalars, Work, clear

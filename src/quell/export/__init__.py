@@ -9,9 +9,10 @@ from quell.export.fmi import fmu
 from quell.export.library import Comparison, Exported, NoCompilerError, Sizes, c
 from quell.export.proof import Alarm, Proof
 from quell.export.ros2 import ros2
+from quell.export.structured_text import st, st_source
 from quell.export.translate.text import TranslationError
 
 __all__ = [
     "Alarm", "CSource", "Comparison", "Exported", "NoCompilerError", "Proof", "Sizes",
-    "TranslationError", "c", "c_source", "fmu", "plant_source", "ros2",
+    "TranslationError", "c", "c_source", "fmu", "plant_source", "ros2", "st", "st_source",
 ]  # fmt: skip

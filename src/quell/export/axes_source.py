@@ -18,18 +18,16 @@ from quell.controllers.axes import (
     AxesState,
     apply_to_axes,
     begin_manual,
-    control_all,
     end_manual,
-    start_all,
-    tell_applied,
 )
-from quell.controllers.axes_learning import AxisDesigns, AxisStates, NoAxis
+from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.controllers.base import (
     change_parameters,
     is_usable,
     write_row,
 )
 from quell.controllers.compensator import change_design
+from quell.controllers.several import control_all, start_all, tell_applied
 from quell.export.c_files import CFiles
 from quell.export.estimates import estimate_lines, estimate_struct
 from quell.export.translate.structs import ascii_text
@@ -42,7 +40,7 @@ from quell.export.translate.text import (
     unique,
     wrapped,
 )
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.types import Channels, Status, Vector
 
 # ---- Operations besides a step ----
@@ -56,11 +54,19 @@ def add_flag_of_axes(design: Any, state: Any, flag: int) -> None:
     state.loop[0].status = int(state.loop[0].status) | flag
 
 
+@kernel
+def as_number(value: float) -> float:
+    """Return a value that has been tested, so that a proof sees that it is a number."""
+    if not is_finite(value):
+        value = 0.0
+    return value
+
+
 def set_applied_controls(design: Any, state: Any, u: Vector) -> None:
     """Set the control signals that were really applied; those that are no numbers are ignored."""
     for k in range(u.size):
         if is_usable(u[k]):
-            state.u[k] = u[k]
+            state.u[k] = as_number(u[k])
         else:
             add_flag_of_axes(design, state, _CONTROL_HELD)
     tell_applied(design, state)
@@ -80,6 +86,8 @@ def start_axes_from(design: Any, state: Any, samples: Any, y: Vector, u: Vector,
         add_flag_of_axes(design, state, _CONTROL_HELD)
         return
     start_all(design, state, samples, y, u, r)
+    for k in range(u.size):
+        state.u[k] = as_number(u[k])
     for i in range(r.size):
         if not is_usable(r[i]):
             add_flag_of_axes(design, state, _REFERENCE_HELD)
@@ -93,7 +101,7 @@ def track_axes(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Ve
     missing = 0
     for k in range(u.size):
         if is_usable(u[k]):
-            state.u[k] = u[k]
+            state.u[k] = as_number(u[k])
         else:
             missing = _CONTROL_HELD
     apply_to_axes(state.gain, state.u, state.v)

@@ -38,6 +38,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from quell.export.c_files import CSource
 from quell.export.controller_source import at_path, limits_path, parts_of
 from quell.export.translate.text import Literals
@@ -352,9 +354,31 @@ CALLS = {
     "load": "image, (size_t)any_int, any_int != 0",
 }
 """Arguments of the functions, each call with other numbers; without ``init`` and ``retune``."""
+_CALLS_OF_SEVERAL = CALLS | {
+    "step": "r, yDERIVATIVES, u",
+    "applied": "given",
+    "track": "r, y, givenDERIVATIVES",
+    "set_held": "any_int, any_int != 0",
+    "start": "y, given, r",
+}
 RETURN_U = {"step": "REAL r, REAL y", "step_counts": "int32_t r, int32_t count",
              "track": "REAL r, REAL y, REAL u"}  # fmt: skip
-"""Functions that return u, and their arguments but for derivatives of the reference."""
+"""Functions that return one u, and their arguments but for derivatives of the reference."""
+
+
+def _returning_u(source: CSource) -> dict[str, str]:
+    """Return the functions that return or write u, and their arguments behind the state."""
+    real = source.real
+    if source.sizes is not None:
+        n, p, m = source.sizes
+        more = "".join(f", const {real} {each}[{n}]" for each in source.further)
+        return {"step": f"const {real} r[{n}], const {real} y[{p}]{more}, {real} u[{m}]"}
+    more = "".join(f", {real} {each}" for each in source.further)
+    return {
+        operation: f"{given}{more}".replace("REAL", real)
+        for operation, given in RETURN_U.items()
+        if operation in source.operations
+    }
 
 
 def frama_c_options(name: str) -> tuple[str, ...]:
@@ -390,11 +414,19 @@ def proof_files(controller: Any, source: CSource) -> dict[str, str]:
 def _contract(source: CSource, path: str) -> str:
     """Return the declarations of the functions that return u, with what they promise."""
     name, upper = source.name, source.name.upper()
-    more = "".join(f", {source.real} {each}" for each in source.further)
-    limits = f"state->parameters->{path}"
-    promises = ["ensures a_number: \\is_finite(\\result);"]
-    if path:
-        promises.append(f"ensures within_limits: {limits}.low <= \\result <= {limits}.high;")
+    limits, places = f"state->parameters->{path}", [("\\result", "")]
+    valid, kind = "\\valid(state) && \\valid_read(state->parameters)", source.real
+    if source.sizes is not None:
+        n, p, m = source.sizes
+        places, kind = [(f"u[{k}]", f"[{k}]") for k in range(m)], "void"
+        given = [("r", n), ("y", p), *((each, n) for each in source.further)]
+        valid += "".join(f" && \\valid_read({each} + (0 .. {size - 1}))" for each, size in given)
+        valid += f" && \\valid(u + (0 .. {m - 1}))"
+    promises = []
+    for u, k in places:
+        promises.append(f"ensures a_number: \\is_finite({u});")
+        if path:
+            promises.append(f"ensures within_limits: {limits}.low{k} <= {u} <= {limits}.high{k};")
     lines = [
         f"/* What {name} promises, in ACSL: u is a number within the limits, for any arguments.",
         " *",
@@ -404,26 +436,24 @@ def _contract(source: CSource, path: str) -> str:
         "",
         f'#include "{name}.h"',
     ]
-    for operation, given in RETURN_U.items():
-        if operation in source.operations:
-            arguments = f"{name}_state *state, {given}{more}".replace("REAL", source.real)
-            lines += [
-                "",
-                "/*@ requires a_state: \\valid(state) && \\valid_read(state->parameters);",
-                *(f"    {each}" for each in promises),
-                "*/",
-                f"{source.real} {name}_{operation}({arguments});",
-            ]
+    for operation, arguments in _returning_u(source).items():
+        lines += [
+            "",
+            f"/*@ requires a_state: {valid};",
+            *(f"    {each}" for each in promises),
+            "*/",
+            f"{kind} {name}_{operation}({name}_state *state, {arguments});",
+        ]
     return "\n".join([*lines, "", "#endif", ""])
 
 
 def _program(controller: Any, source: CSource, path: str) -> str:
     """Return the program that calls all functions in any order, with any numbers."""
-    name, real = source.name, source.real
-    more = ", any_real" * len(source.further)
+    name, real, several = source.name, source.real, source.sizes is not None
+    more = "".join(f", {each if several else 'any_real'}" for each in source.further)
     size = f"{name.upper()}_MEMORY_SIZE"
     cases: list[str] = []
-    for i, (operation, given) in enumerate(CALLS.items()):
+    for i, (operation, given) in enumerate((_CALLS_OF_SEVERAL if several else CALLS).items()):
         if operation in source.operations:
             arguments = "".join(f", {each}" for each in [given] if each)
             call = f"{name}_{operation}(state{arguments.replace('DERIVATIVES', more)});"
@@ -433,10 +463,10 @@ def _program(controller: Any, source: CSource, path: str) -> str:
                           "                image[k] = any_byte;", "            }"]  # fmt: skip
             cases += [f"            {call}", "            break;"]
     counts = "step_counts" in source.operations
-    narrower = narrower_limit(controller, path, source.precision)
+    narrower = narrower_limits(controller, path, source.precision)
     retuning = [
         f"    narrower = {name}_default_parameters;",
-        *([f"    narrower.{path}.high = {narrower};"] if narrower else []),
+        *(f"    narrower.{path}.high{place} = {limit};" for place, limit in narrower),
         "    while (any_int) {",
         f"        {name}_retune(&controller, &narrower);",
         "        operate(&controller);",
@@ -444,6 +474,12 @@ def _program(controller: Any, source: CSource, path: str) -> str:
         "        operate(&controller);",
         "    }",
     ]
+    signals: list[tuple[str, int]] = []
+    if source.sizes is not None:
+        n, p, m = source.sizes
+        signals = [("r", n), ("y", p), ("given", m), *((each, n) for each in source.further)]
+    drawn = [f"        for (int k = 0; k < {size}; k++) {{\n            {each}[k] = any_real;\n"
+             "        }" for each, size in signals]  # fmt: skip
     return "\n".join([
         f"/* All that a program can do with {name}: every function, in any order, for ever, with",
         " * any numbers, also infinities and NaN. Each read of a volatile variable is another. */",
@@ -456,10 +492,13 @@ def _program(controller: Any, source: CSource, path: str) -> str:
         f"static unsigned char image[{size}];",
         f"static {name}_state controller;",
         f"static {name}_parameters narrower;",
+        *(f"static {real} {each}[{size}];" for each, size in signals),
+        *([f"static {real} u[{source.sizes[2]}];"] if source.sizes is not None else []),
         "",
         f"static void operate({name}_state *state)",
         "{",
         "    while (any_int) {",
+        *drawn,
         "        switch (any_int) {",
         *cases,
         "        default:",
@@ -479,18 +518,23 @@ def _program(controller: Any, source: CSource, path: str) -> str:
     ])  # fmt: skip
 
 
-def narrower_limit(controller: Any, path: str, precision: str) -> str:
-    """Return an upper limit below that of the controller, as C code; nothing without limits."""
+def narrower_limits(controller: Any, path: str, precision: str) -> list[tuple[str, str]]:
+    """Return place and value of upper limits below those of the controller, as C code."""
     if not path:
-        return ""
+        return []
     limits = at_path(parts_of(controller, precision).parameters, path)
-    low, high = float(limits.low), float(limits.high)
-    write = Literals(precision == "single").write_real
-    if math.isfinite(low) and math.isfinite(high):
-        return write(0.5 * low + 0.5 * high)
-    if math.isfinite(low):
-        return write(low + 1.0 + abs(low))
-    return write(high - 1.0 - abs(high) if math.isfinite(high) else 1.0)
+    write, several = Literals(precision == "single").write_real, np.ndim(limits.low) > 0
+    found = []
+    lows, highs = np.atleast_1d(limits.low).tolist(), np.atleast_1d(limits.high).tolist()
+    for k, (low, high) in enumerate(zip(lows, highs, strict=True)):
+        if math.isfinite(low) and math.isfinite(high):
+            new = 0.5 * low + 0.5 * high
+        elif math.isfinite(low):
+            new = low + 1.0 + abs(low)
+        else:
+            new = high - 1.0 - abs(high) if math.isfinite(high) else 1.0
+        found.append((f"[{k}]" if several else "", write(new)))
+    return found
 
 
 # ---- Frama-C ----
@@ -679,6 +723,8 @@ class Proof:
         SHA-256 of header and source, one after the other: the proof is for these files alone.
     sizes
         stack and code of each function, in Markdown; empty if nobody has measured them.
+    limited
+        whether u has limits.
     """
 
     folder: Path
@@ -689,6 +735,7 @@ class Proof:
     promising: tuple[str, ...]
     digest: str
     sizes: str = ""
+    limited: bool = False
 
     @property
     def proved(self) -> bool:
@@ -745,7 +792,7 @@ class Proof:
             "name": self.name,
             "head": "What is proved" if self.proved else "What holds but for the open properties",
             "functions": " or ".join(f"`{self.name}_{each}`" for each in promising),
-            "limits": _LIMITS if self.promised > len(promising) else " There are no limits of u.",
+            "limits": _LIMITS if self.limited else " There are no limits of u.",
             "loops": self._loops(),
             "called": ", ".join(f"`{each}`" for each in sorted(self.structure.library)) or "none",
             "version": found.version,
@@ -796,9 +843,10 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: st
         structure(code.decode("utf-8"), f"{source.name}_step"),
         hashlib.sha256(header + code).hexdigest(),
     )
-    promising = tuple(each for each in RETURN_U if each in source.operations)
+    promising = tuple(_returning_u(source))
     promised = contract.count("ensures ")
-    proof = Proof(folder, source.name, found, read, promised, promising, digest, sizes)
+    limited = "within_limits" in contract
+    proof = Proof(folder, source.name, found, read, promised, promising, digest, sizes, limited)
     with written_atomically(folder / FOLDER / REPORT, overwrite=True) as part:
         part.write_text(proof.text, encoding="utf-8")
     return proof

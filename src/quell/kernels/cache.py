@@ -238,7 +238,12 @@ class CompileTime(event.Listener):
                 timer.cancel()
                 if took >= _LONG:
                     self.told += took
-                    _print(f"compiled in {took:.1f} s; later runs load it from the disk")
+                    later = "later runs load it from the disk"
+                    if not _is_kept(event.data):
+                        later = (
+                            "each run compiles it, as it is a user's or depends on one's numbers"
+                        )
+                    _print(f"compiled in {took:.1f} s; {later}")
 
 
 @contextmanager
@@ -257,7 +262,13 @@ def _announce(data: Any) -> None:
     name = getattr(function, "__name__", "code").strip("_").replace("_", " ")
     parts = list(dict.fromkeys(_parts(data.get("args", ()))))
     about = f" for {', '.join(parts[:_MOST_PARTS])}" if parts else ""
-    _print(f"compiling {name}{about}: takes up to a minute, once")
+    once = ", once" if _is_kept(data) else ""
+    _print(f"compiling {name}{about}: takes up to a minute{once}")
+
+
+def _is_kept(data: Any) -> bool:
+    """Return whether what is compiled is kept in the disk cache."""
+    return isinstance(getattr(data.get("dispatcher"), "_cache", None), FunctionCache)
 
 
 def _parts(kinds: Any) -> Iterator[str]:

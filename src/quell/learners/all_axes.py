@@ -632,9 +632,8 @@ def take_gain(memory: SharedMemory, output: OutputMemory) -> None:
             output.theta[i] += memory.gain[i] * output.loop[0].error
 
 
-@kernel
-def restart_shared(shared: SharedDesign, memory: SharedMemory) -> None:
-    """Reset the filters of all outputs; keep scales and P."""
+@restart.register(SharedDesign)
+def _restart_shared(shared: SharedDesign, memory: SharedMemory) -> None:
     restart(shared.linear, memory.linear)
 
 

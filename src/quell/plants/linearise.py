@@ -16,6 +16,7 @@ from quell.plants.base import labelled, signals_of
 from quell.plants.flexible import CubicSpringPlant
 from quell.plants.linear import DelayedPlant, EncodedPlant, LinearPlant
 from quell.plants.multivariable import (
+    DelayedInputs,
     EncodedOutputs,
     MultivariableLinearPlant,
     MultivariableNonlinearPlant,
@@ -29,6 +30,11 @@ _STEP = 1e-6
 # Slopes of four steps in a row that differ from a line by more than this share belong to a function
 # with a jump or a corner. Chosen by hand; those of smooth functions are a line to 1e-5.
 _SMOOTH, _PLACES = 1e-2, np.array([-1.5, -0.5, 0.5, 1.5])
+
+# A slope that varies by less than this share of the largest slope of its value may be rounding.
+_HIDDEN = 1e-7
+# Rates that are left at a state that counts as held at rest, in units of those without u.
+_AT_REST = 1e-6
 
 
 def linearised(plant: Any, x: Any, u: Any = 0.0, *, w: Any = None, t: float = 0.0) -> Any:
@@ -90,6 +96,52 @@ def linearised(plant: Any, x: Any, u: Any = 0.0, *, w: Any = None, t: float = 0.
     raise ValueError(f"plant = {getattr(plant, 'name', plant)!r}: {rule}")
 
 
+def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
+    """Return an operating point (x, u) of a plant with several signals; u holds x at rest.
+
+    Parameters
+    ----------
+    plant
+        a ``MultivariableNonlinearPlant``, also behind delays or encoders.
+    point
+        (x, u), which is returned as it is, or the state x (n,), for which u is found by least
+        squares: the equations of motion are taken as linear in u.
+
+    Raises
+    ------
+    ValueError
+        for another plant, a state of unsuitable length, and one that no u holds at rest.
+    """
+    while isinstance(plant, DelayedInputs | EncodedOutputs):
+        plant = plant.plant
+    if not isinstance(plant, MultivariableNonlinearPlant):
+        name = getattr(plant, "name", plant)
+        raise ValueError(
+            f"plant = {name!r}: must be a nonlinear plant with several signals; a linear one is "
+            "the same at all points"
+        )
+    if len(point) == 2 and np.ndim(point[0]) > 0:
+        x = checks.vector("x", point[0], plant.order)
+        return x, checks.vector("u", point[1], plant.inputs)
+    x = checks.vector("x", point, plant.order)
+    model: Any = plant.sampled(1.0, interpret=True)
+    w = np.zeros(plant.disturbances)
+
+    def rate(u: Vector) -> Vector:
+        return np.array(model.rate(0.0, x, u, w), dtype=np.float64)
+
+    first = rate(np.zeros(plant.inputs))
+    columns = np.column_stack([rate(row) - first for row in np.eye(plant.inputs)])
+    u: Vector = np.asarray(np.linalg.lstsq(columns, -first, rcond=None)[0], dtype=np.float64)
+    left = float(np.max(np.abs(rate(u))))
+    if not left <= _AT_REST * (1.0 + float(np.max(np.abs(first)))):
+        raise ValueError(
+            f"x = {x.tolist()!r}: no u holds it at rest (rates of up to {left:.3g} are left); give "
+            "a state with rates of zero, and of an elastic joint with its deflection, or (x, u)"
+        )
+    return x, u
+
+
 def _with_spring_of(plant: CubicSpringPlant, x: Vector) -> LinearPlant:
     """Return the linear part with ``k + 3 k_cubic (x1 − x2)²`` for k."""
     A = plant.linear.A.copy()
@@ -128,19 +180,22 @@ def _differentiated_all(
 
 def _jacobian(function: Callable[[Vector], Any], point: Vector, name: str) -> Matrix:
     """Return the derivatives (m, n) of m values by the n entries of ``point``."""
-    columns = []
-    for i in range(point.size):
-        step = _STEP * max(1.0, abs(point[i]))
+    steps = _STEP * np.maximum(1.0, np.abs(point))
+    every, sizes = [], []
+    for i, step in enumerate(steps):
         values = []
         for share in (-2.0, -1.0, 0.0, 1.0, 2.0):
             moved = point.copy()
             moved[i] += share * step
             values.append(np.array(function(moved), dtype=np.float64))
-        slopes = np.diff(values, axis=0) / step
-        derivative = 0.5 * (slopes[1] + slopes[2])
+        every.append(np.diff(values, axis=0) / step)
         # Rounding errors of the values, divided by the step.
-        size = np.max(np.abs(values), axis=0) * 1e-9 / step
-        allowed = _SMOOTH * np.max(np.abs(slopes), axis=0) + size
+        sizes.append(np.max(np.abs(values), axis=0) * 1e-9 / step)
+    # At rest large terms cancel, whose rounding errors the values do not show.
+    hidden = _HIDDEN * np.max(np.abs(every), axis=(0, 1)) if every else np.zeros(0)
+    columns = []
+    for i, (slopes, size) in enumerate(zip(every, sizes, strict=True)):
+        allowed = _SMOOTH * np.max(np.abs(slopes), axis=0) + size + hidden
         # What is left of the slopes without their own trend, which a second derivative makes.
         bend = np.tensordot(_PLACES, slopes, 1) / (_PLACES @ _PLACES)
         if not np.all(np.ptp(slopes - np.multiply.outer(_PLACES, bend), axis=0) <= allowed):
@@ -149,7 +204,7 @@ def _jacobian(function: Callable[[Vector], Any], point: Vector, name: str) -> Ma
                 "it jumps or has a corner (dry friction, a stop, the end of a range); take a point "
                 "beside it, or a smooth model"
             )
-        columns.append(derivative)
+        columns.append(0.5 * (slopes[1] + slopes[2]))
     return np.array(columns).T
 
 

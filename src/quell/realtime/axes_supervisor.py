@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.axes import AxesDesign, AxesState, tell_applied
-from quell.controllers.axes_learning import AxisDesigns, AxisStates, NoAxis
+from quell.controllers.axes import AxesDesign, AxesState
+from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.controllers.base import bumpless_transfer
+from quell.controllers.several import tell_applied
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.sized import Work
 from quell.realtime.supervisor import (

@@ -40,7 +40,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.axes import Axes, apply_to_axes, control_all
+from quell.controllers.axes import Axes, apply_to_axes
 from quell.controllers.base import (
     bumpless_transfer,
     control,
@@ -48,6 +48,7 @@ from quell.controllers.base import (
     set_reference_derivatives,
     write_row,
 )
+from quell.controllers.several import control_all
 from quell.kernels.dispatch import (
     compiled,
     explain_compile_errors,

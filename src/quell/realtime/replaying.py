@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.axes import Axes, apply_to_axes, control_all
+from quell.controllers.axes import Axes, apply_to_axes
 from quell.controllers.base import (
     bumpless_transfer,
     check_controller,
@@ -25,6 +25,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.several import control_all
 from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors
 from quell.realtime.axes_supervisor import set_applied_controls
 from quell.realtime.channels import ChannelInputs, channel_inputs, checked_channels, pass_channels

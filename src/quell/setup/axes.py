@@ -21,15 +21,30 @@ from pydantic import Field, ValidationError
 from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
+from quell.controllers.compensator import Compensator
 from quell.features.all_axes import sees_all_axes
 from quell.plants.base import PlantWrapper
 from quell.plants.multibody import Arm, Craft
-from quell.plants.multivariable import MultivariableLinearPlant, check_several
+from quell.plants.multivariable import (
+    MultivariableLinearPlant,
+    MultivariableNonlinearPlant,
+    check_several,
+)
 from quell.quantities import AxesSignals
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import Known, Setup, made_once, title_of, windows_of
+from quell.setup.loading import (
+    Known,
+    Setup,
+    Variation,
+    changed,
+    made_once,
+    sweep_of,
+    title_of,
+    windows_of,
+)
+from quell.setup.registry import CASE
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -43,25 +58,32 @@ from quell.setup.schema import (
     read,
 )
 from quell.simulation.driver import Scenario
+from quell.tuning.axes import OBJECTIVES
+from quell.tuning.constraints import Constraints
 from quell.types import Matrix
 
 if TYPE_CHECKING:  # these types are made at run time, which a type checker cannot follow
     from quell.setup.schema import CallTable as AxesPlant
     from quell.setup.schema import CallTable as AxesTable
+    from quell.setup.schema import CallTable as AxisDrive
     from quell.setup.schema import CallTable as Controller
     from quell.setup.schema import CallTable as Guard
     from quell.setup.schema import CallTable as Learner
     from quell.setup.schema import CallTable as Metrics
     from quell.setup.schema import CallTable as Observer
+    from quell.setup.schema import CallTable as OnTop
     from quell.setup.schema import CallTable as Rig
     from quell.setup.schema import CallTable as ScenarioTable
+    from quell.setup.schema import CallTable as Sweep
+    from quell.setup.schema import CallTable as Tune
 
 # ---- B0 and the actuators ----
 
 
 def coupled(
-    axes: Mapping[str, ADRC],
+    axes: Mapping[str, Compensator],
     plant: Any = None,
+    drives: Sequence[Any] | None = None,
     B0: Sequence[Sequence[float]] | str | None = None,
     M: Sequence[Sequence[float]] | None = None,
     u_min: float | Sequence[float] = -math.inf,
@@ -78,8 +100,8 @@ def coupled(
 
     Parameters
     ----------
-    axes, plant
-        the controllers of the axes by name, and the plant.
+    axes, plant, drives
+        the controllers of the axes by name, the plant, and the controllers below compensators.
     of_axes
         learners with features of all axes, each with its guard, by the name of the axis.
     B0
@@ -121,16 +143,15 @@ def coupled(
         gain, inverse = _of_plant(plant, [axis.observer.order for axis in axes.values()], M)
     limits: dict[str, Any] = {"u_min": u_min, "u_max": u_max, "rate_limit": rate_limit}
     rest: dict[str, Any] = {"saturation": saturation, "weights": weights, "wished": wished}
-    return Axes(dict(axes), gain, M=inverse, learner=learner, guard=guard, **limits, **rest)
+    rest |= {"learner": learner, "guard": guard, "drives": drives}
+    return Axes(dict(axes), gain, M=inverse, **limits, **rest)
 
 
 def _of_plant(plant: Any, orders: Sequence[int], M: Any) -> tuple[Any, Any]:
     """Return B0 and M of a plant; one of them is None."""
     if M is not None:
         raise ValueError('B0 = "plant" and M: are two of the same; give one')
-    inner = plant
-    while isinstance(inner, PlantWrapper):
-        inner = inner.plant
+    inner = _inner(plant)
     if isinstance(inner, Arm):
         return None, inner.inertia
     if isinstance(inner, Craft):
@@ -155,6 +176,87 @@ def _markov(plant: MultivariableLinearPlant, orders: Sequence[int]) -> Matrix:
         for i, order in enumerate(orders)
     ]
     return np.array(rows)
+
+
+# ---- Tuning ----
+
+
+def tuning_of_axes(
+    m_s: float | None = 1.6,
+    m_t: float | None = 1.6,
+    m_ks: float | None = None,
+    damping: float | None = 0.4,
+    noise_over_pi: float | None = 10.0,
+    omega_o_dt: float = 0.5,
+    disk: float | None = None,
+    B0_off: float = 0.0,
+    operating_points: Sequence[Sequence[float]] | None = None,
+    objective: str = "load-iae",
+) -> dict[str, Any]:
+    """Return the arguments of ``quell.tuning.tune_axes``.
+
+    Parameters
+    ----------
+    m_s, m_t
+        largest sensitivity and complementary sensitivity of each channel, all others closed.
+    m_ks
+        largest gain from y to v of each axis [1/s^n]; by default from its own tuning.
+    damping
+        least damping of the closed loop's poles.
+    noise_over_pi, omega_o_dt
+        as in `[tune]` of one axis.
+    disk
+        least disk margin of all inputs, and of all outputs, at once; by default what a single loop
+        has with these m_s and m_t.
+    B0_off
+        share by which each entry of B0 may be off.
+    operating_points
+        states of a nonlinear plant at rest, in each of which the bounds hold; by default the start
+        of the scenario alone.
+    objective
+        `load-iae` or `load`.
+    """
+    bounds: dict[str, Any] = {"m_s": m_s, "m_t": m_t, "m_ks": m_ks, "damping": damping}
+    limits: dict[str, Any] = {"noise_over_pi": noise_over_pi, "omega_o_dt": omega_o_dt}
+    return {
+        "constraints": Constraints(**bounds, **limits),
+        "disk": disk,
+        "B0_off": B0_off,
+        "operating_points": operating_points,
+        "objective": checks.one_of("objective", objective, OBJECTIVES),
+    }
+
+
+def axes_task(
+    path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None, trust: bool = False
+) -> tuple[Setup, dict[str, Any]]:
+    """Read a setup file of several axes; return it and the arguments of ``tune_axes``.
+
+    ``changes`` are values of ``[tune]`` by name. Raises ``SetupError`` as ``load_axes``, and for a
+    file without plant.
+    """
+    name, data = read(path)
+    tables = dict(data)
+    if changes:
+        tables["tune"] = {**data.get("tune", {}), **changes}
+    setup = made_axes(name, tables, trust)
+    plant = setup.needed("plant")
+    options = dict(setup.tune or tuning_of_axes())
+    if options["operating_points"] is None and _is_nonlinear(plant):
+        x0 = None if setup.scenario is None else setup.scenario.x0
+        order = getattr(_inner(plant), "order", 0)
+        options["operating_points"] = [np.zeros(order) if x0 is None else np.asarray(x0)[:order]]
+    return setup, options | {"setup": dict(data)}
+
+
+def _inner(plant: Any) -> Any:
+    while isinstance(plant, PlantWrapper):
+        plant = plant.plant
+    return plant
+
+
+def _is_nonlinear(plant: Any) -> bool:
+    return isinstance(_inner(plant), MultivariableNonlinearPlant)
 
 
 # ---- The tables ----
@@ -186,12 +288,18 @@ OBSERVERS = {
 }
 _OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule")
 CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
+ON_TOP = call_table(
+    "compensator", Compensator, only=True, types=registry.PARTS, without=_OF_ACTUATORS
+)
+# Controllers without observer, that are not designed for the linear part of a plant.
+_DRIVES = ("pid", "pid-simc", "notch-pid", "p-pi", "resonance-ratio")
+DRIVES = {kind: registry.CONTROLLERS[kind] for kind in _DRIVES}
 _ACTUATORS = "names and units of the control signals, `torque [N m]`, for files."
 AXES = call_table(
     "axes",
     coupled,
     only=True,
-    without=("axes", "plant", "of_axes"),
+    without=("axes", "plant", "drives", "of_axes"),
     beside={
         "actuators": (list_of(str), Field((), description=_ACTUATORS)),
         "learner": (
@@ -214,11 +322,14 @@ SCENARIO = call_table(
     types={"disturbances": list_of(registry.Signal)},
     without=("reference", "noise", "schedule"),
 )
+TUNE = call_table("tune", tuning_of_axes, only=True)
 METRICS = call_table("metrics", AxesTrajectory.metrics, only=True)
 if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
     Observer, Learner = one_of(OBSERVERS), registry.Learner
+    AxisDrive, OnTop = one_of(DRIVES, default="pid"), ON_TOP
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
+    Sweep, Tune = registry.Sweep, TUNE
     Rig = registry.AxesRig
 
 
@@ -227,7 +338,9 @@ class Axis(Table):
 
     name: str = Field("", description="its name; axis1 and so on by default.")
     observer: Observer = Field(description="the observer; its b0 is 1.")
-    controller: Controller = Field(description="the ADRC, without limits of u.")
+    controller: Controller | None = optional("the ADRC, without limits of u.")
+    compensator: OnTop | None = optional("a compensator in place of the ADRC; then of all axes.")
+    drive: AxisDrive | None = optional("the controller that gives u_0 below a compensator.")
     learner: Learner | None = optional("the learner; none by default.")
     guard: Guard | None = optional("the guard of the learner; none by default.")
     signal: str = Field("", description="name and unit of its y, `angle [rad]`, for files.")
@@ -247,6 +360,8 @@ class AxesDescription(Table):
         json_schema_extra={"minItems": 1},
     )
     scenario: ScenarioTable | None = optional("duration, disturbances and start.")
+    tune: Tune | None = optional("what `quell tune` bounds.")
+    sweep: Sweep | None = optional("many runs with other values, for `quell sweep`.")
     rig: Rig | None = optional("the device and its safety limits, for `quell run-rig`.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which all axes are judged."
@@ -257,16 +372,17 @@ class AxesDescription(Table):
 
 # Tables of a setup of one axis, and where they are here; what belongs to one axis only.
 _ELSEWHERE = {
-    **dict.fromkeys(("observer", "controller", "learner", "guard"), "belongs into each [[axis]]"),
-    **dict.fromkeys(("compensator", "prefilter", "sweep", "tune"), "NOT for several axes yet"),
+    **dict.fromkeys(
+        ("observer", "controller", "compensator", "learner", "guard"), "belongs into each [[axis]]"
+    ),
+    "prefilter": "NOT for several axes yet",
 }
 
 
 def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     """Read a TOML file of several axes and build the objects that it describes.
 
-    The ``controller`` of the setup is a ``quell.Axes``; it has no sweep and tuning. ``trust`` and
-    errors are those of ``load``.
+    The ``controller`` of the setup is a ``quell.Axes``. ``trust`` and errors are those of ``load``.
 
     Examples
     --------
@@ -313,6 +429,11 @@ def made_axes(
         key: _axis(builder, axis, f"axis[{i}]", dt)
         for i, (key, axis) in enumerate(zip(names, tables.axis, strict=True))
     }
+    drives = [
+        builder.build(axis.drive, f"axis[{i}].drive", dt=dt)
+        for i, axis in enumerate(tables.axis)
+        if axis.drive is not None
+    ]
     table: Any = AXES() if tables.axes is None else tables.axes
     of_axes = {key: parts for key, (_, *parts) in made.items() if parts}
     axes = {key: parts[0] for key, parts in made.items()}
@@ -320,17 +441,21 @@ def made_axes(
         key: None if part is None else builder.build(part, f"axes.{key}", dt=dt)
         for key, part in (("learner", table.learner), ("guard", table.guard))
     }
-    controller = builder.build(table, "axes", axes=axes, plant=plant, of_axes=of_axes, **shared)
+    context = {"axes": axes, "plant": plant, "drives": drives or None, "of_axes": of_axes}
+    controller = builder.build(table, "axes", **context, **shared)
     scenario = _scenario(builder, tables, dt)
     if plant is not None:
         builder.attempt("plant", (), _check_fit, plant, controller, scenario)
     windows = windows_of(builder, tables.metrics)
     title = tables.title or title_of(name)
+    tune = None if tables.tune is None else builder.build(tables.tune, "tune")
+    sweep = None if tables.sweep is None else builder.build(tables.sweep, "sweep")
     rig = None if tables.rig is None else builder.build(tables.rig, "rig", dt=dt)
     signals = builder.attempt("", (), signals_in, tables, controller)
     if rig is not None and signals.known:
         rig = {"signals": signals, **rig}
-    return Setup(name, title, controller, plant, scenario, rig, None, windows, tables, trust=trust)
+    parts = (controller, plant, scenario, rig, sweep, windows)
+    return Setup(name, title, *parts, tables, tune, trust)
 
 
 def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:
@@ -351,6 +476,10 @@ def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:
 
 def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:
     """Return the controller of an axis; with its learner and guard if they are of all axes."""
+    if (axis.controller is None) == (axis.compensator is None):
+        has = "neither" if axis.controller is None else "both"
+        rule = f"has {has}; give a controller, which is an ADRC, or a compensator"
+        raise SetupError([f"{builder.name}: {path}: {rule}"])
     parts = {
         key: None if table is None else builder.build(table, f"{path}.{key}", dt=dt)
         for key, table in (("observer", axis.observer), ("guard", axis.guard))
@@ -361,7 +490,9 @@ def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]
     outside: tuple[Any, ...] = ()
     if sees_all_axes(learner):
         outside, learner = (learner, parts.pop("guard")), None
-    made: ADRC = builder.build(axis.controller, f"{path}.controller", learner=learner, **parts)
+    key = "controller" if axis.compensator is None else "compensator"
+    table: Any = getattr(axis, key)
+    made: Compensator = builder.build(table, f"{path}.{key}", learner=learner, **parts)
     return made, *outside
 
 
@@ -397,7 +528,8 @@ def _explained(error: SetupError) -> SetupError:
         "scenario.noise: unknown": "belongs into each [[axis]]",
     }
     for key in ("u_min", "u_max", "rate_limit"):
-        rules[f".controller.{key}: unknown"] = "belongs into [axes]: an actuator moves all axes"
+        for table in ("controller", "compensator"):
+            rules[f".{table}.{key}: unknown"] = "belongs into [axes]: an actuator moves all axes"
     lines = []
     for line in error.mistakes:
         for begin, rule in rules.items():
@@ -406,3 +538,25 @@ def _explained(error: SetupError) -> SetupError:
                 break
         lines.append(line)
     return SetupError(lines)
+
+
+# ---- Sweeps ----
+
+
+class AxesVariation(Variation):
+    """A function of values by path that returns a setup of several axes with these values."""
+
+    def __call__(self, **values: Any) -> Setup:
+        """Return the setup; values are by path, and ``case`` is the name of a case."""
+        case = values.pop(CASE, None)
+        changes = {**({} if case is None else self.cases[case]), **values}
+        return made_axes(self.name, changed(self.name, self.data, changes), self.trust)
+
+
+def sweep_of_axes(setup: Setup) -> dict[str, Any]:
+    """Return the arguments of ``quell.sweep`` for a setup of several axes, except the folder.
+
+    Each measure is taken of each axis, as ``elbow.rms``; a limit of ``rms`` holds for all. Errors
+    are those of ``sweep_of``.
+    """
+    return sweep_of(setup, AxesVariation)

@@ -91,8 +91,8 @@ def describe(name: str, data: Mapping[str, Any]) -> Description:
         raise SetupError(
             [
                 f"{name}: NOT for several axes yet: this works on one axis, and the file has "
-                "[[axis]]; quell run simulates it, quell run-rig runs it at a device, quell export "
-                "writes it as C, and in Python quell.setup.load_axes reads it"
+                "[[axis]]; quell run, run-rig, tune and export take it, and in Python "
+                "quell.setup.load_axes reads it"
             ]
         )
     values = immutable(data)

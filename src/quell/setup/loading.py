@@ -584,8 +584,10 @@ def _ranges(setup: Setup) -> dict[str, tuple[float, float]]:
 _NOT_USED = ("sweep", "rig", "metrics", "title")
 
 
-def sweep_of(setup: Setup) -> dict[str, Any]:
+def sweep_of(setup: Setup, variation: type[Variation] | None = None) -> dict[str, Any]:
     """Return the arguments of ``quell.sweep`` for a setup, except the folder.
+
+    ``variation`` makes the setups with other values, ``Variation`` by default.
 
     Raises
     ------
@@ -596,7 +598,8 @@ def sweep_of(setup: Setup) -> dict[str, Any]:
     for needed in ("plant", "scenario", "sweep"):
         setup.needed(needed)
     table: dict[str, Any] = dict(setup.sweep or {})
-    build = Variation(setup.file, setup.tables(), table.pop("cases"), setup.trust)
+    make = variation or Variation
+    build = make(setup.file, setup.tables(), table.pop("cases"), setup.trust)
     for name in build.cases:
         _attempt(build, f"sweep.cases.{name}", {CASE: name})
     for path, given in table["parameters"].items():
@@ -654,8 +657,11 @@ def _measures(setup: Setup, names: Any) -> dict[str, Measure]:
         raise SetupError([f"{setup.file}: sweep.metrics = {names!r:.60}: must be a list of names"])
     try:
         return {
-            name if len(windows) == 1 else f"{name}_{i}": Measure(name, **window)
+            f"{axis}.{name}"[not axis :] + ("" if len(windows) == 1 else f"_{i}"): Measure(
+                name, **window, axis=axis
+            )
             for i, window in enumerate(windows, 1)
+            for axis in getattr(setup.controller, "names", ("",))
             for name in names
         }
     except ValueError as error:

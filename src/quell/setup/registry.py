@@ -329,13 +329,13 @@ _SERIES: Mapping[str, Callable[..., Any]] = {
     "series": Feedforward,
 }
 FEEDFORWARDS = _call_tables(_SERIES, {"plant": Plant | None}, _MODEL)
-_PARTS = {
+PARTS = {
     "safe_set": call_table("safe-set", SafeSet, only=True) | None,
     "held": call_table("held-plant", HeldPlant, only=True) | None,
 }
 _SCHEDULES = {"table": Schedule, "online-gain": OnlineGain}
-_PARTS["schedule"] = one_of(_call_tables(_SCHEDULES), default="table") | None
-LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **_PARTS}
+PARTS["schedule"] = one_of(_call_tables(_SCHEDULES), default="table") | None
+LAW = {"feedback": Feedback | None, "feedforward": one_of(FEEDFORWARDS, flag=True), **PARTS}
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
 _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)
 _CONTROLLERS = (
@@ -348,7 +348,7 @@ _CONTROLLERS = (
         types=LAW,
         without=("half_gain", "feedback", "law_poles"),
     ),
-    call_table("compensator", Compensator, types=_PARTS),
+    call_table("compensator", Compensator, types=PARTS),
     call_table("pid", PID, forwards_to=_LINEAR),
     call_table("pid-simc", PID.simc, forwards_to=_PID),
     call_table(_DOUBLE_INTEGRATOR, PID.simc_double_integrator, forwards_to=_PID),
@@ -364,7 +364,7 @@ PREFILTERS = _call_tables(
 )
 Observer, Learner, Prefilter = one_of(OBSERVERS), one_of(LEARNERS), one_of(PREFILTERS)
 Controller = one_of(CONTROLLERS, default="adrc")
-OnTop = call_table("compensator", Compensator, only=True, types=_PARTS)
+OnTop = call_table("compensator", Compensator, only=True, types=PARTS)
 _CERTIFIED = {"certified_for": one_of(PLANTS, many=Plant) | None}
 Guard = call_table("guard", guard.Guard, only=True, types=_CERTIFIED)
 _SIGNALS = {"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)}

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.axes import control_all
 from quell.controllers.base import set_reference_derivatives, status_flags, write_row
+from quell.controllers.several import control_all
 from quell.kernels.dispatch import compiled_loop
 from quell.plants.base import advance
 from quell.plants.multivariable import is_several, measure_all

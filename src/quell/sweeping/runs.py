@@ -36,9 +36,10 @@ from quell.lti.models import is_linear_model
 from quell.parallel import one_blas_thread
 from quell.plants.base import Plant, check_plant
 from quell.plants.linear import LinearPlant
+from quell.records.axes import AxesTrajectory
 from quell.records.metrics import MEASURES, SETTLING_BAND
 from quell.records.record import netcdf_of
-from quell.records.trajectory import BatchTrajectory, Trajectory
+from quell.records.trajectory import Trajectory
 from quell.signals import Signal
 from quell.simulation.driver import Scenario, check_scenario
 from quell.simulation.simulate import simulate
@@ -402,6 +403,8 @@ class Measure:
         ``total_variation``, ``overshoot``, ``settling_time`` or ``rise_time``.
     start, stop, target, band
         as those of ``Trajectory.metrics``.
+    axis
+        name of the axis, of a run of several axes.
 
     Raises
     ------
@@ -414,6 +417,7 @@ class Measure:
     stop: float | None = None
     target: float | None = None
     band: float = SETTLING_BAND
+    axis: str = ""
 
     def __post_init__(self) -> None:
         if self.name not in MEASURES:
@@ -431,21 +435,22 @@ class Measure:
         return self.start, self.stop, self.target, self.band
 
 
-Measures: TypeAlias = Mapping[str, Measure | Callable[[Trajectory], float]]
+Measures: TypeAlias = Mapping[str, Measure | Callable[[Any], float]]
 
 
 def as_measures(metrics: Any) -> Measures:
     """Return the measures of a sweep by the name of their variable.
 
-    ``metrics`` has names of measures, or a measure or a function of a run for each name.
+    ``metrics`` has names of measures, or a measure or a function of a run for each name. Of several
+    axes the name of the axis stands before it, as ``"elbow.rms"``.
     """
     if isinstance(metrics, str) or not isinstance(metrics, Mapping | Sequence):
         raise ValueError(f"metrics = {metrics!r:.60}: must be names, or measures by name")
     if not isinstance(metrics, Mapping):
-        metrics = {name: Measure(name) for name in metrics}
+        metrics = {name: name for name in metrics}
     found: dict[str, Any] = {}
     for name, each in metrics.items():
-        found[name] = Measure(each) if isinstance(each, str) else each
+        found[name] = _named(each) if isinstance(each, str) else each
         if not isinstance(found[name], Measure) and not callable(found[name]):
             rule = "must be a quell.sweeping.Measure, or a function of a Trajectory"
             raise ValueError(f"metrics[{name!r}] = {each!r:.60}: {rule}")
@@ -454,34 +459,56 @@ def as_measures(metrics: Any) -> Measures:
     return found
 
 
-def measure_runs(runs: BatchTrajectory, measures: Measures) -> tuple[dict[str, Vector], list[str]]:
+def _named(text: str) -> Measure:
+    """Return the measure of a name, before which the name of an axis may stand."""
+    axis, _, name = text.rpartition(".")
+    return Measure(name, axis=axis)
+
+
+def measure_runs(
+    runs: Sequence[Trajectory | AxesTrajectory], measures: Measures
+) -> tuple[dict[str, Vector], list[str]]:
     """Return each measure (runs,), NaN where there is none, and the error of each run, if any."""
     values = {name: np.full(len(runs), np.nan) for name in measures}
     errors = [""] * len(runs)
     for i in range(len(runs)):
         try:
-            for name, value in measure_run(runs.run(i), measures).items():
+            for name, value in measure_run(runs[i], measures).items():
                 values[name][i] = value
         except Exception as error:  # a function of the user's may raise anything
             errors[i] = f"{type(error).__name__}: {error}"
     return values, errors
 
 
-def measure_run(run: Trajectory, measures: Measures) -> dict[str, float]:
+def measure_run(run: Trajectory | AxesTrajectory, measures: Measures) -> dict[str, float]:
     """Return each measure of a run, NaN where there is none."""
     windows: dict[tuple[Any, ...], dict[str, str]] = {}
     for name, each in measures.items():
         if isinstance(each, Measure):
-            windows.setdefault(each.window, {})[name] = each.name
+            windows.setdefault((each.axis, *each.window), {})[name] = each.name
     values: dict[str, float] = {}
-    for (start, stop, target, band), wanted in windows.items():
-        if run.diverged and run.window(start, np.inf).start >= len(run):  # ended before it
+    for (axis, start, stop, target, band), wanted in windows.items():
+        one = _one_axis(run, axis, wanted)
+        if one.diverged and one.window(start, np.inf).start >= len(one):  # ended before it
             values |= dict.fromkeys(wanted, np.nan)
             continue
-        found = run.metrics_of(tuple(wanted.values()), start, stop, target, band)
+        found = one.metrics_of(tuple(wanted.values()), start, stop, target, band)
         values |= {name: found.get(measure, np.nan) for name, measure in wanted.items()}
     own = {name: each for name, each in measures.items() if not isinstance(each, Measure)}
     return values | {name: float(function(run)) for name, function in own.items()}
+
+
+def _one_axis(run: Trajectory | AxesTrajectory, axis: str, wanted: Mapping[str, str]) -> Trajectory:
+    """Return the record that measures of an axis are taken of."""
+    first = next(iter(wanted.values()))
+    if isinstance(run, Trajectory):
+        if axis:
+            raise ValueError(f"metrics: {axis}.{first}: the run has one axis; give {first}")
+        return run
+    if not axis:
+        example = f"{run.axis_names[0]}.{first}" if run.axis_names else first
+        raise ValueError(f"metrics: {first}: the run has several axes; name one, {example}")
+    return run.axis(axis)
 
 
 # ---- The runs of a part of a sweep ----
@@ -577,7 +604,7 @@ def built(job: Job, part: Part, run: int) -> Parts:
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
     check_plant(plant)
-    check_controller(controller)
+    check_controller(controller, several=True)
     check_scenario(scenario)
     if not job.takes_seed and is_random(scenario):
         scenario = replace(scenario, seed=seed)
@@ -586,7 +613,9 @@ def built(job: Job, part: Part, run: int) -> Parts:
 
 def is_random(scenario: Scenario) -> bool:
     """Return whether the signals of a scenario depend on its seed."""
-    given: list[Any] = [scenario.reference, scenario.noise, *scenario.disturbances]
+    given: list[Any] = [*scenario.disturbances]
+    for each in (scenario.reference, scenario.noise):  # of several axes one for each
+        given += each if isinstance(each, Sequence) else [each]
     return any(each.seeded(0) != each.seeded(1) for each in given if isinstance(each, Signal))
 
 
@@ -641,12 +670,21 @@ def _batch_key(parts: Parts) -> Hashable:
     return *about_plant, *about_controller, type(controller), scenario.duration
 
 
+def _is_of_axes(controller: Any) -> bool:
+    return hasattr(controller, "inputs")
+
+
 def _run_group(job: Job, group: Sequence[tuple[int, Parts]], outcome: Outcome) -> None:
     """Simulate runs as one batch; if one of them makes that impossible, in halves."""
     places = [place for place, _ in group]
     plants, controllers, scenarios = zip(*(parts for _, parts in group), strict=True)
     options: dict[str, Any] = {"record": job.record, "workers": 1}
     try:
+        if _is_of_axes(controllers[0]):  # a batch has one control signal and one output
+            alone: list[Any] = [simulate(*parts) for _, parts in group]
+            statuses = np.array([int(run.status) for run in alone])
+            _take(job, places, alone, statuses, np.array([run.ended for run in alone]), outcome)
+            return
         result = simulate(list(plants), list(controllers), list(scenarios), **options)
     except Exception as error:  # a plant of the user's may raise anything
         if len(group) == 1:
@@ -656,11 +694,19 @@ def _run_group(job: Job, group: Sequence[tuple[int, Parts]], outcome: Outcome) -
         _run_group(job, group[:half], outcome)
         _run_group(job, group[half:], outcome)
         return
-    values, errors = measure_runs(result, job.measures)
+    runs = [result.run(i) for i in range(len(result))]
+    _take(job, places, runs, result.status, result.ended, outcome)
+
+
+def _take(
+    job: Job, places: list[int], runs: Sequence[Any], status: Any, ended: Any, outcome: Outcome
+) -> None:
+    """Write the measures of some runs into an outcome."""
+    values, errors = measure_runs(runs, job.measures)
     for name, column in values.items():
         outcome.measures[name][places] = column
-    outcome.ended[places] = result.ended
-    outcome.status[places] = np.where([bool(text) for text in errors], ERROR, result.status)
+    outcome.ended[places] = ended
+    outcome.status[places] = np.where([bool(text) for text in errors], ERROR, status)
     outcome.messages.update(
         {place: text for place, text in zip(places, errors, strict=True) if text}
     )
@@ -741,7 +787,8 @@ def describe_measures(measures: Measures) -> dict[str, Any]:
     for name, each in measures.items():
         if isinstance(each, Measure):
             about, unit = UNITS[each.name]
-            window = {"start": each.start, "stop": each.stop, "target": each.target}
+            window: dict[str, Any] = {"start": each.start, "stop": each.stop}
+            window |= {"target": each.target, "axis": each.axis or None}
             given = {key: value for key, value in window.items() if value is not None}
             found[name] = {"long_name": about, "units": unit, **given, "band": each.band}
         else:

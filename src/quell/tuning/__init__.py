@@ -6,6 +6,7 @@ the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` p
 and returns a ``Tuned``.
 """
 
+from quell.tuning.axes import AxesCheck, AxisResult, TunedAxes, tune_axes
 from quell.tuning.compensator import TunedCompensator, tune_compensator
 from quell.tuning.constraints import Constraints
 from quell.tuning.plants import identified_plants
@@ -16,12 +17,16 @@ from quell.tuning.tuned import Tuned
 
 __all__ = [
     "STRUCTURES",
+    "AxesCheck",
+    "AxisResult",
     "Constraints",
     "Tuned",
+    "TunedAxes",
     "TunedCompensator",
     "TunedSchedule",
     "identified_plants",
     "tune",
+    "tune_axes",
     "tune_compensator",
     "tune_schedule",
 ]

@@ -225,8 +225,11 @@ def _texts_of_several(controller: Any, source: CSource) -> dict[str, str]:
     primes = ", ".join("r" + "'" * (i + 1) for i in range(source.derivatives))
     if source.axes:
         names = ", ".join(f"{i} `{name}`" for i, name in enumerate(controller.names))
-        title, sizes = f"Controller of {n} axes with {m} actuators", ("AXES", "AXES")
+        title, sizes = f"Controller of {p} axes with {m} actuators", ("AXES", "AXES")
         about = f"The places of the axes in `r`, `y` and `v`: {names}."
+        if controller.takes_u_0:
+            sizes = ("ACTUATORS", "AXES")
+            about = f"`r` are the u_0 of other controllers, with the places of `u`. {about}"
     else:
         title, sizes = (
             f"State feedback of {p} outputs with {m} actuators",
@@ -681,7 +684,7 @@ def c(
     checks.flag("proof", proof)
     single = single or isinstance(controller, SinglePrecision)
     if isinstance(controller, Axes | StateFeedback):
-        _check_options_of_several(controller, single, accept, proof, plant, scenario)
+        _check_options_of_several(controller, single, accept, plant, scenario)
     source = c_source(controller, name, precision=precision, resolution=resolution)
     comparison = None
     if single and plant is not None and scenario is not None:
@@ -699,17 +702,11 @@ def _check_options_of_several(
     controller: Any,
     single: bool,
     accept: bool,
-    proof: bool,
     plant: Any,
     scenario: Any,
 ) -> None:
     """Refuse what ``c`` does for one u and y only."""
     what = f"{controller.outputs} axes" if controller.axes else "several signals"
-    if proof:
-        raise ValueError(
-            f"proof = True: the proof is of controllers with one u and one y, these are {what}; "
-            "leave it out, and prove each axis by itself as an ADRC"
-        )
     if plant is not None or scenario is not None:
         raise ValueError(
             f"plant, scenario: the comparison of single with double precision is of controllers "

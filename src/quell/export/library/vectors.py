@@ -117,12 +117,14 @@ class Loops:
         gain = [[parts.compensating[0].observer.b0]]
         self.B = np.array(gain if parts.sizes is None else parts.controller.first_gain, dtype=dtype)
         self.each = [Loop(plant, dtype, seed=i + 1) for i, plant in enumerate(plants)]
+        self.references = len(plants) if parts.sizes is None else parts.sizes[0]
         self.dtype = dtype
 
     def measure(self) -> tuple[Vector, Vector]:
         """Return r and y of the next sample."""
         r, y = zip(*(loop.measure() for loop in self.each), strict=True)
-        return np.array(r, dtype=self.dtype), np.array(y, dtype=self.dtype)
+        more = (0.0,) * (self.references - len(r))  # u_0 of more actuators than axes
+        return np.array(r + more, dtype=self.dtype), np.array(y, dtype=self.dtype)
 
     def advance(self, u: Vector) -> None:
         """Move all plants by a sample."""
@@ -147,7 +149,7 @@ static void play_loop(@NAME@_state *state, real u[ACTUATORS])
     static int k;
 
     for (int n = 0; n < @BLOCK@; n++) {
-        real r[REFERENCES], y[MEASUREMENTS];
+        real r[REFERENCES] = {@ZERO@}, y[MEASUREMENTS];
         int position = k % (2 * @HALF@);
 
         position = position < @HALF@ ? position : 2 * @HALF@ - position;

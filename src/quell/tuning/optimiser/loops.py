@@ -485,7 +485,7 @@ def response(plant: SampledPlant, law: LinearLaw, inputs: Inputs, target: str = 
         total += inputs.u_ff
     for source, given in inputs.of_loop():
         if np.any(given):
-            pulse = _pulse(closed_loop(plant, law, source, target), size)
+            pulse = pulse_in_blocks(closed_loop(plant, law, source, target), size)
             if not np.max(np.abs(pulse)) < _DIVERGED:
                 return np.full(size, np.inf)
             total += _convolved(pulse, given)
@@ -504,7 +504,7 @@ def _convolved(one: Vector, other: Vector) -> Vector:
     return found
 
 
-def _pulse(system: System, size: int) -> Vector:
+def pulse_in_blocks(system: System, size: int) -> Vector:
     """Return ``D, C B, C A B, …`` (size,)."""
     N, B, C, D = System.balanced(*system)
     n = N.shape[0]

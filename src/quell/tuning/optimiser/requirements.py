@@ -51,7 +51,6 @@ from numpy.typing import NDArray
 
 from quell.analysis.loop import closed_loop_matrix, law_matrix
 from quell.analysis.margins import Complex, eigenvalues, in_s_plane
-from quell.plants.linear import SampledPlant
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import (
     NARROW,
@@ -122,20 +121,32 @@ def counted(plants: PlantSet, poles: list[Complex], damping: float) -> list[Pole
     """Return the poles that count, of those of each plant's loop, with the damping they need."""
     found: list[Pole] = []
     for j, (plant, s) in enumerate(zip(plants.plants, poles, strict=True)):
-        top = math.pi / ((dead_samples(plant) + _SAMPLING) * plants.dt)
-        s = _upper(s)
-        s = s[s.imag < top]
-        least, own = np.full(s.size, damping), np.zeros(s.size, dtype=bool)
-        modes, count = _modes(plant, plants.s_poles(plant), damping, plants.dt)
-        if count:
-            distance = np.abs(np.log(np.abs(s)[:, None] / np.abs(modes)[None, :]))
-            nearest = np.min(distance, axis=1)
-            few = np.flatnonzero((nearest < math.log(_NEAR)) & (_damping(s) < damping))
-            own[few[np.argsort(nearest[few])][: _PAIRS * count]] = True
-            least[own] = _KEPT * max(float(np.min(_damping(modes))), 0.0)
-        rows = zip(s.tolist(), least.tolist(), own.tolist(), strict=True)
-        found += [Pole(pole, j, needs, is_own) for pole, needs, is_own in rows]
+        matrices = (plant.N, plant.B[:, None], plant.C[None, :])
+        own = modes_of(matrices, plants.s_poles(plant), damping, plants.dt)
+        found += counted_of(s, own, dead_samples(plant), damping, plants.dt, j)
     return found
+
+
+def counted_of(
+    s: Complex, of_plant: tuple[Complex, int], dead: int, damping: float, dt: float, j: int = 0
+) -> list[Pole]:
+    """Return the poles that count, of the poles s of the loop with one plant, the j-th.
+
+    ``of_plant`` is what ``modes_of`` returns, ``dead`` the samples that its inputs wait.
+    """
+    top = math.pi / ((dead + _SAMPLING) * dt)
+    s = _upper(s)
+    s = s[s.imag < top]
+    least, own = np.full(s.size, damping), np.zeros(s.size, dtype=bool)
+    modes, count = of_plant
+    if count:
+        distance = np.abs(np.log(np.abs(s)[:, None] / np.abs(modes)[None, :]))
+        nearest = np.min(distance, axis=1)
+        few = np.flatnonzero((nearest < math.log(_NEAR)) & (_damping(s) < damping))
+        own[few[np.argsort(nearest[few])][: _PAIRS * count]] = True
+        least[own] = _KEPT * max(float(np.min(_damping(modes))), 0.0)
+    rows = zip(s.tolist(), least.tolist(), own.tolist(), strict=True)
+    return [Pole(pole, j, needs, is_own) for pole, needs, is_own in rows]
 
 
 def _damping(s: Complex) -> Vector:
@@ -196,11 +207,13 @@ class Followed:
         return np.nan_to_num(slack, nan=-1.0, posinf=-1.0, neginf=-1.0)
 
 
-def _modes(plant: SampledPlant, poles: Complex, damping: float, dt: float) -> tuple[Complex, int]:
-    """Return poles and zeros of a plant with less damping, and the number of these poles.
+def modes_of(
+    plant: tuple[Matrix, Matrix, Matrix], poles: Complex, damping: float, dt: float
+) -> tuple[Complex, int]:
+    """Return poles and zeros of a sampled plant with less damping, and the number of these poles.
 
-    All are in the upper half plane [rad/s]; ``poles`` are all of the plant's. Without such poles
-    there are no modes.
+    All are in the upper half plane [rad/s]; ``plant`` is (A − I, B, C) with as many inputs as
+    outputs, and ``poles`` are all of its poles. Without such poles there are no modes.
     """
     from scipy.linalg import eigvals
 
@@ -208,9 +221,10 @@ def _modes(plant: SampledPlant, poles: Complex, damping: float, dt: float) -> tu
     few = few[_damping(few) < damping]
     if few.size == 0:
         return few, 0
-    n = plant.N.shape[0]
-    pencil = np.block([[plant.N, plant.B[:, None]], [plant.C[None, :], np.zeros((1, 1))]])
-    shifted = eigvals(pencil, np.diag(np.append(np.ones(n), 0.0)))
+    N, B, C = plant
+    n, m = B.shape
+    pencil = np.block([[N, B], [C, np.zeros((m, m))]])
+    shifted = eigvals(pencil, np.diag(np.append(np.ones(n), np.zeros(m))))
     shifted = shifted[np.isfinite(shifted)]
     shifted = shifted[np.abs(1.0 + shifted) > 1e-3]
     zeros = _upper(in_s_plane(shifted, dt))

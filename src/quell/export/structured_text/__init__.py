@@ -1,0 +1,8 @@
+"""Controllers in Structured Text of IEC 61131-3, translated from their C code.
+
+May import: the C code of a controller, and what ``quell.export`` may.
+"""
+
+from quell.export.structured_text.function_block import st, st_source
+
+__all__ = ["st", "st_source"]

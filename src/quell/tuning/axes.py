@@ -1,0 +1,894 @@
+"""``tune_axes``: the bandwidths of coupled axes, so that all bounds hold for the whole.
+
+Each axis is tuned alone first, on its own diagonal entry of the plant behind B0 (``tuning.tune``),
+or on ``b/s^n`` where that entry cannot be stabilised by itself. That is optimal where the axes do
+not notice each other. In the coupled loop it may keep no bound at all, so factors of omega_c and
+omega_o that all axes share are tried on a grid, and from the best of them, in different valleys,
+all bandwidths are searched together for the least mean of the logarithms of::
+
+    ∫ |y_i| dt after a step of the load of axis i, over that of axis i alone
+
+Where none of the grid keeps the bounds there are starts with one axis slower than the others by a
+factor of ten, for each axis: loops that are closed one after the other, the fast ones first, need
+no more than a plant that is diagonally dominant up to the bandwidth of each (Mayne, *Automatica* 9,
+1973; Hovd & Skogestad, *Automatica* 30, 1994). It is the way out where the axes are coupled and B0
+does not know it.
+
+The bounds, for every plant of the set:
+
+* M_s, M_t of each output and of each actuator with the loops of all others closed, and M_ks of each
+  axis from y_i to v_i;
+* the disk margin of all outputs at once, and of all actuators at once. By default it must be what
+  any single loop has with these M_s and M_t, ``1/√((M_s² + M_t²)/2 − 1/4)``, which follows from
+  ``|S − 1/2|² = (|S|² + |T|²)/2 − 1/4``: 0.658 for 1.6;
+* the damping of the closed loop's poles.
+
+The plants are those of the operating points, and those with entries of B0 that are off by a share,
+in both directions: all combinations for two axes, else as many drawn ones.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.analysis.coupling import Coupling, coupling
+from quell.analysis.matrices import (
+    estimates_at,
+    gain_at,
+    joined,
+    linear_part_of,
+    sampled_matrices,
+)
+from quell.analysis.multivariable import MultivariableLoop, analyse_axes
+from quell.controllers.adrc import ADRC
+from quell.controllers.axes import Axes
+from quell.files import nonfinite_to_none, written_atomically
+from quell.learners.base import NoLearner
+from quell.lti.zeros import invariant_zeros
+from quell.observers.eso import with_gains
+from quell.parallel import one_blas_thread
+from quell.plants.linear import LinearPlant
+from quell.plants.linearise import held_at
+from quell.plants.multivariable import MultivariableLinearPlant, delayed_inputs
+from quell.sweeping.sweep import share_interval
+from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser.coupled import (
+    UNSTABLE,
+    CoupledLoops,
+    Found,
+    Law,
+    Limits,
+    Plant,
+    optimum,
+    starts,
+)
+from quell.tuning.report import toml_text
+from quell.tuning.tune import tune
+from quell.tuning.tuned import Tuned
+from quell.types import Matrix, Progress, Vector
+
+# Sign patterns of the errors of B0 that are in the set at most.
+_MOST_PATTERNS = 16
+# How much slower one axis is than the others in further starts.
+_APART = 10.0
+# Starts of a search.
+_STARTS = 3
+# A bound counts as kept up to this share beyond it, on the exact response; limits are lowered by
+# as much as a result exceeds them, so many times.
+_TOLERANCE, _REPAIRS = 1e-3, 4
+# An excess that is not repaired, and the most that bounds are tightened by in a round.
+_HOPELESS, _MOST_TIGHTER = 0.5, 0.1
+# Plants with errors of B0 that join the search in a round, and the lowest bandwidth in units of the
+# lowest of the axes alone.
+_WORST, _SLOWEST = 2, 1e-4
+# A pole and a zero of the diagonal entry cancel within this share of their size, and of the
+# fastest pole; it is far above rounding, and far below what a controller notices.
+_CANCEL, _CANCEL_OF_FASTEST = 1e-6, 1e-10
+# A gain that changes by less with the other loops closed: as in ``analysis.coupling``.
+_INDEPENDENT = 1.25
+# Bounds of ``Constraints`` that are not for axes.
+_NOT_HERE = ("u_std", "noise_std", "resolution", "delay_margin", "u_max", "rate_max")
+OBJECTIVES = ("load-iae", "load")
+
+
+class AxisResult(NamedTuple):
+    """One axis of a result."""
+
+    name: str
+    omega_c: float  #: [rad/s]
+    omega_o: float  #: [rad/s]
+    cost: float  #: integral of ``|y|`` after a unit step of v, the largest over the plants
+    alone: float  #: the same of the axis alone, tuned for itself
+    m_s: float  #: the largest M_s at its output with the other loops closed
+    m_t: float
+    m_ks: float  #: from y to v [1/s^n]
+
+    @property
+    def ratio(self) -> float:
+        """The cost over that of the axis alone: what the coupling takes."""
+        return self.cost / self.alone
+
+
+class AxesCheck(NamedTuple):
+    """A result on drawn errors of B0."""
+
+    samples: int
+    unstable: int
+    violating: int
+    interval: tuple[float, float]  #: 95 % interval of the share that violates
+
+    def __str__(self) -> str:
+        """Return the check as a sentence."""
+        low, high = (100.0 * end for end in self.interval)
+        return (
+            f"{self.samples} drawn errors of B0: {self.violating} exceed a bound, {self.unstable} "
+            f"of them unstable; a share of {low:.2g} to {high:.2g} % (95 % interval)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TunedAxes:
+    """Tuned axes; from ``tune_axes``.
+
+    Attributes
+    ----------
+    controller : Axes
+        the axes with their bandwidths, and learners, guards and limits as they were.
+    axes : tuple of AxisResult
+        bandwidths and figures of each axis.
+    loops : tuple of MultivariableLoop
+        the loop at each operating point, and with the errors of B0 that are the worst; without
+        learners, the nominal one first.
+    alone : Mapping
+        the tuning of each axis by itself, by name.
+    constraints : Constraints
+        the bounds of each channel.
+    disk : float
+        the least disk margin that was asked for.
+    met : bool
+        whether all bounds hold.
+    excess : float
+        the largest ratio to a bound, less one.
+    left : Coupling or None
+        relative gains behind B0: how much the axes notice each other through it.
+    of_plant : Coupling or None
+        those of the plant without B0; None if there are more actuators than axes.
+    check : AxesCheck or None
+        drawn errors of B0, if it may be off.
+    setup : Mapping
+        tables of a setup file that ``toml`` completes; empty without.
+    """
+
+    controller: Axes
+    axes: tuple[AxisResult, ...]
+    loops: tuple[MultivariableLoop, ...]
+    alone: Mapping[str, Tuned]
+    constraints: Constraints
+    disk: float
+    met: bool
+    excess: float
+    B0_off: float
+    points: int
+    plants: int
+    objective: str
+    left: Coupling | None
+    of_plant: Coupling | None
+    check: AxesCheck | None = None
+    with_learners: MultivariableLoop | None = None
+    setup: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def disk_margins(self) -> tuple[float, float]:
+        """Least disk margins of all inputs, and of all outputs, over the plants."""
+        found = [[loop.disk_margin(at).alpha for loop in self.loops] for at in _PLACES]
+        return min(found[0]), min(found[1])
+
+    @cached_property
+    def m_s(self) -> float:
+        """The largest singular value of S at the outputs, over the plants; it has units."""
+        return max(loop.m_s("outputs").value for loop in self.loops)
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return a row for each axis: name, bandwidths, cost, its ratio, M_s, M_t, M_ks."""
+        return [
+            (
+                each.name,
+                f"{each.omega_c:.4g}",
+                f"{each.omega_o:.4g}",
+                f"{each.cost:.4g}",
+                f"{each.ratio:.3f}",
+                f"{each.m_s:.3f}",
+                f"{each.m_t:.3f}",
+                f"{each.m_ks:.4g}",
+            )
+            for each in self.axes
+        ]
+
+    def verdicts(self) -> list[str]:
+        """Return what holds, what does not, and what is not known, as lines."""
+        inputs, outputs = self.disk_margins
+        lines = [
+            f"disk margin {inputs:.3f} of all inputs, {outputs:.3f} of all outputs at once; "
+            f"at least {self.disk:.3f} is asked for; max σ(S) {self.m_s:.3f} at the outputs"
+        ]
+        if not self.met:
+            lines.append(
+                f"NOT met: a bound is exceeded by {100.0 * self.excess:.3g} % with the best "
+                f"bandwidths that were found; {self._remedy()}"
+            )
+        lines += self._advice()
+        if self.check is not None:
+            lines.append(str(self.check))
+        elif self.B0_off == 0.0:
+            lines.append(
+                "NOT known for another B0 than this one: give the share by which it may be off, "
+                "B0_off"
+            )
+        if callable(self.controller.B0) or callable(self.controller.M):
+            if self.points == 1:
+                lines.append(
+                    "NOT judged away from this operating point, where B0 is another: give several, "
+                    "operating_points=[x, …]"
+                )
+            lines.append(
+                "NOT proved for fast motion: margins are those of B0 held at each operating point"
+            )
+        loop = self.with_learners
+        if loop is not None:
+            if not loop.stable:
+                lines.append("NOT stable with the learners at rest: lower their bias or rate")
+            else:
+                d = min(loop.disk_margin(at).alpha for at in _PLACES)
+                lines.append(
+                    f"with the learners at rest the disk margin is {d:.3f}, which no bound is for"
+                )
+        return lines
+
+    def _remedy(self) -> str:
+        left = self.left
+        if left is None or not left.decided or left.factor > _INDEPENDENT:
+            return (
+                "the axes are coupled through this B0: give the B0 of the machine (quell b0 --axes "
+                "finds it in a record), or looser bounds"
+            )
+        if self.B0_off > 0.0:
+            share = f"{100.0 * self.B0_off:.3g} %"
+            return f"B0 has to be known better than to {share}, or the bounds be looser"
+        return "give looser bounds, less delay or faster samples"
+
+    def _advice(self) -> list[str]:
+        lines = []
+        if self.of_plant is not None:
+            lines.append(f"of the plant: {self.of_plant.advice.splitlines()[0]}")
+        left = self.left
+        if left is not None:
+            if not left.decided:
+                lines.append(f"behind B0: {left.advice.splitlines()[0]}")
+            elif left.factor > _INDEPENDENT:
+                lines.append(
+                    f"NOT decoupled by this B0: behind it a gain changes by {left.factor:.3g} with "
+                    "the other loops closed; give the B0 of the machine"
+                )
+            else:
+                lines.append(
+                    f"decoupled by this B0: behind it gains change by {left.factor:.3g} at most"
+                )
+        return lines
+
+    def summary(self) -> str:
+        """Return bandwidths, figures and verdicts as lines."""
+        lines = [f"constraints: {self.constraints} of each channel, all others closed"]
+        for name, omega_c, omega_o, cost, ratio, m_s, m_t, m_ks in self.rows():
+            lines.append(
+                f"{name}: omega_c {omega_c}, omega_o {omega_o}, {quantity(self.objective)} "
+                f"{cost}, {ratio} of alone, M_s {m_s}, M_t {m_t}, M_ks {m_ks}"
+            )
+        return "\n".join([*lines, *self.verdicts()])
+
+    def __repr__(self) -> str:
+        return f"TunedAxes of {len(self.axes)} axes:\n{self.summary()}"
+
+    def toml(self) -> str:
+        """Return the setup file that was given with these bandwidths.
+
+        Raises ``ValueError`` without one.
+        """
+        if "axis" not in self.setup:
+            raise ValueError("toml: there is no setup to complete; give tune_axes its tables")
+        tables = dict(self.setup)
+        entries = []
+        for table, axis in zip(tables["axis"], self.axes, strict=True):
+            observer = {**table["observer"], "omega_o": axis.omega_o}
+            law = table["controller"]
+            law = {"kind": law} if isinstance(law, str) else law
+            entries.append(
+                {**table, "observer": observer, "controller": {**law, "omega_c": axis.omega_c}}
+            )
+        tables["axis"] = entries
+        found = "\n".join(self.verdicts())
+        return toml_text(tables, f"axes tuned by quell\nconstraints: {self.constraints}\n{found}")
+
+    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
+        text = self.toml()
+        with written_atomically(Path(path), overwrite) as part:
+            part.write_text(text, encoding="utf-8")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results for ``quell.files.write_json``; infinite numbers become None."""
+        inputs, outputs = self.disk_margins
+        found: dict[str, Any] = nonfinite_to_none(
+            {
+                "objective": self.objective,
+                "constraints": dict(vars(self.constraints)),
+                "disk": self.disk,
+                "met": self.met,
+                "excess": self.excess,
+                "axes": [each._asdict() | {"ratio": each.ratio} for each in self.axes],
+                "disk_margin": {"inputs": inputs, "outputs": outputs},
+                "max_singular_value": self.m_s,
+                "B0_off": self.B0_off,
+                "operating_points": self.points,
+                "plants": self.plants,
+                "coupled": {
+                    "plant": None if self.of_plant is None else self.of_plant.factor,
+                    "behind_B0": None if self.left is None else self.left.factor,
+                },
+                "check": None
+                if self.check is None
+                else {**self.check._asdict(), "interval": list(self.check.interval)},
+                "verdicts": self.verdicts(),
+            }
+        )
+        return found
+
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
+        """Draw the singular values of S at the outputs and the sensitivities of all channels.
+
+        Lines are of the nominal plant, grey ones of the others. Returns the two matplotlib axes;
+        ``axes`` or ``ax`` are those to draw into, new ones by default.
+        """
+        from quell.records.plotting import given_axes, grid_of_axes, new_figure
+
+        drawn = grid_of_axes(given_axes(axes, ax), lambda: new_figure(6.4, 5.6), 2, sharex=True)
+        first, second = drawn[:, 0]
+        for j, loop in reversed([*enumerate(self.loops)]):
+            omega = loop.omega[1:]
+            grey = {"color": "0.8", "linewidth": 0.8}
+            S = np.abs(np.einsum("kii->ki", loop.response("S_o", omega)))
+            for k, name in enumerate(self.controller.names):
+                how: dict[str, Any] = {"label": f"|S| of {name}"} if j == 0 else grey
+                first.loglog(omega, S[:, k], **how)
+            sigma = loop.singular_values("S_o", omega)[:, 0]
+            second.loglog(omega, sigma, **({"label": "max σ(S)"} if j == 0 else grey))
+        if self.constraints.m_s is not None:
+            first.axhline(self.constraints.m_s, color="black", linestyle="--", label="bound")
+        for each in (first, second):
+            each.grid(True, alpha=0.3)
+            each.legend()
+        second.set_xlabel("frequency [rad/s]")
+        return drawn[:, 0]
+
+
+_PLACES = ("inputs", "outputs")
+
+
+def quantity(objective: str) -> str:
+    """Return what the cost of an axis is, as text."""
+    return "∫|y|" if objective == "load-iae" else "1/k_i"
+
+
+def tune_axes(
+    plant: Any,
+    axes: Axes,
+    *,
+    constraints: Constraints | None = None,
+    disk: float | None = None,
+    B0_off: float = 0.0,
+    operating_points: Sequence[Any] | None = None,
+    objective: str = "load-iae",
+    check_samples: int = 200,
+    seed: int = 0,
+    setup: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> TunedAxes:
+    """Return axes with the best bandwidths under bounds for the coupled loop.
+
+    omega_c and omega_o of each axis are chosen; all else of the axes, and B0, stays. Learners are
+    not in the bounds. How it works, and what is bounded, stands in ``quell.tuning.axes``.
+
+    Parameters
+    ----------
+    plant
+        a plant with an output for each axis, as for ``analysis.analyse_axes``, in continuous time:
+        a ``MultivariableLinearPlant`` or matrices (A, B, C), one behind delays or encoders (which
+        are left out), or a nonlinear one with its operating points.
+    axes
+        the controller, whose orders, forms of observers, B0 and names are kept.
+    constraints
+        bounds m_s, m_t, m_ks [1/s^n], damping, noise_over_pi and omega_o_dt; those of ``tune`` by
+        default, m_ks from the tuning of each axis alone. The others are refused.
+    disk
+        least disk margin of all inputs, and of all outputs, at once; by default what a single loop
+        has with m_s and m_t.
+    B0_off
+        share by which each entry of B0 may be off, 0.2 for 20 %.
+    operating_points
+        of a nonlinear plant, the nominal one first: states x, for which the u that holds them is
+        found, or (x, u). The bounds hold at each of them.
+    objective
+        ``"load-iae"`` or ``"load"``, as for ``tune``.
+    check_samples
+        drawn errors of B0 with which the result is checked.
+    seed
+        of the drawn errors.
+    setup
+        tables of a setup file of these axes, which ``TunedAxes.toml`` completes.
+    progress
+        called with what is done and its share.
+
+    Returns
+    -------
+    TunedAxes
+        ``met`` says whether all bounds hold; if they can't, a line that begins with NOT says what
+        to do.
+
+    Raises
+    ------
+    ValueError
+        for arguments out of range, a plant that does not fit or is sampled, an axis that cannot be
+        tuned alone (it is named), or one whose law is not linear.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import quell as ql
+    >>> M = np.array([[1.2, 0.35], [0.35, 0.2]])
+    >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron(np.linalg.inv(M), [[0], [1]])
+    >>> arm = ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    >>> arm = ql.plants.delayed_inputs(arm, 2e-3, 1e-3)
+    >>> joint = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3), omega_c=8.0)
+    >>> tuned = ql.tuning.tune_axes(arm, ql.Axes([joint, joint], M=M), B0_off=0.1)
+    >>> tuned.met, max(axis.m_s for axis in tuned.axes) <= 1.602
+    (True, True)
+    """
+    if not isinstance(axes, Axes):
+        raise ValueError(f"axes = {axes!r:.80}: must be quell.Axes; of one axis, use tune")
+    checks.one_of("objective", objective, OBJECTIVES)
+    B0_off = checks.finite("B0_off", B0_off)
+    if not 0.0 <= B0_off < 1.0:
+        raise ValueError(f"B0_off = {B0_off!r}: must be a share from 0 to below 1, 0.2 for 20 %")
+    bounds = _checked_bounds(constraints)
+    least = checks.optional(checks.positive, "disk", disk) or _disk_of(bounds)
+    if least >= 2.0:
+        raise ValueError(f"disk = {disk!r}: must be below 2, the margin without any feedback")
+    for name, axis in zip(axes.names, axes.axes, strict=True):
+        _check_linear(name, axis)
+    checks.whole("check_samples", check_samples, 1)
+    report = progress or (lambda part, share: None)
+    points: list[Any] = [None]
+    if operating_points is not None:
+        points = [held_at(plant, each) for each in operating_points]
+    if not points:
+        raise ValueError("operating_points = []: give at least one state, or leave it out")
+    nominal = _nominal(plant, axes, points)
+    parts = len(axes.names) + 2
+    alone: dict[str, Tuned] = {}
+    own = []
+    with one_blas_thread():
+        for i, name in enumerate(axes.names):
+            report(f"{name} alone", i / parts)
+            entry, alone[name] = _alone(plant, axes, i, points[0], bounds, objective)
+            own.append(entry)
+        patterns = [_with_errors(one, B0_off, seed) for one in nominal]
+        plants = [*nominal, *(each for part in patterns for each in part)]
+        dead = max(linear_part_of(plant, axes.dt, points[0])[1], default=0)
+        loops = partial(CoupledLoops, dt=axes.dt, dead=dead, objective=objective)
+        limits, start, costs = _each_alone(alone, own, dead, axes, bounds, least, loops)
+        loops = partial(loops, axes=axes.axes, alone=costs)
+        report("together", (parts - 2) / parts)
+        found, judged, excess = _search(loops, plants, len(nominal), axes, limits, start, bounds)
+        report("check", (parts - 1) / parts)
+        checked = None
+        if B0_off > 0.0:
+            drawn = partial(loops, limits=limits)
+            checked = _check(nominal, B0_off, drawn, found, check_samples, seed)
+        made = _made(axes, found.values)
+        A, B, C, R = nominal[0]
+        bandwidth = float(np.max(np.sqrt(found.values[:, 0] * found.values[:, 1])))
+        shown = tuple(_loop(each, made, found.values) for each in judged)
+        return TunedAxes(
+            controller=made,
+            axes=_results(made, shown, judged, found, costs),
+            loops=shown,
+            alone=alone,
+            constraints=bounds,
+            disk=least,
+            met=excess <= _TOLERANCE,
+            excess=excess,
+            B0_off=B0_off,
+            points=len(points),
+            plants=len(plants),
+            objective=objective,
+            left=_relative_gains(A, B @ R, C, axes, bandwidth),
+            of_plant=_relative_gains(A, B, C, axes, bandwidth),
+            check=checked,
+            with_learners=_with_learners(plant, made, points[0]),
+            setup=dict(setup or {}),
+        )
+
+
+# ---- Arguments ----
+
+
+def _checked_bounds(given: Constraints | None) -> Constraints:
+    bounds = given or Constraints()
+    for name in _NOT_HERE:
+        if getattr(bounds, name) is not None:
+            raise ValueError(
+                f"constraints: {name} is not bounded for axes; bound m_ks, the gain from y to v"
+            )
+    return bounds
+
+
+def _disk_of(bounds: Constraints) -> float:
+    """Return the disk margin of any single loop with these M_s and M_t."""
+    # |T| ≤ 1 + |S| and the reverse, where one of them is not bounded.
+    m_s = bounds.m_s or 1.0 + float(bounds.m_t or 0.0)
+    m_t = bounds.m_t or 1.0 + float(bounds.m_s or 0.0)
+    return 1.0 / math.sqrt(0.5 * (m_s**2 + m_t**2) - 0.25)
+
+
+def _check_linear(name: str, axis: ADRC) -> None:
+    if axis.feedback is not None:
+        raise ValueError(f"axis {name}: feedback is not linear; tune without it")
+    if axis.observer.disturbance_order > 1:
+        raise ValueError(
+            f"axis {name}: disturbance_order = {axis.observer.disturbance_order} of its observer: "
+            "must be 1"
+        )
+
+
+def _nominal(plant: Any, axes: Axes, points: Sequence[Any]) -> list[Plant]:
+    """Return the plant at each operating point."""
+    found = []
+    for point in points:
+        A, B, C = sampled_matrices(plant, axes.dt, point)
+        if (C.shape[0], B.shape[1]) != (axes.outputs, axes.inputs):
+            raise ValueError(
+                f"plant has {B.shape[1]} inputs and {C.shape[0]} outputs: the controller has "
+                f"{axes.outputs} axes and {axes.inputs} actuators"
+            )
+        R = gain_at(axes, estimates_at(axes, plant, point))[1]
+        found.append(Plant(A, B, C, R))
+    return found
+
+
+def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
+    """Return the plants whose B0 differs from the controller's by a share."""
+    if off == 0.0:
+        return []
+    B0 = np.linalg.pinv(nominal.R)
+    entries = int(np.count_nonzero(B0))
+    if 2**entries <= _MOST_PATTERNS:
+        patterns = np.array(list(itertools.product((-1.0, 1.0), repeat=entries)))
+    else:
+        rng = np.random.default_rng([seed, 2])
+        patterns = rng.choice(np.array([-1.0, 1.0]), size=(_MOST_PATTERNS, entries))
+    return [_off_by(nominal, B0, off * signs) for signs in patterns]
+
+
+def _off_by(nominal: Plant, B0: Matrix, shares: Any) -> Plant:
+    """Return the plant with the entries of B0 that are not zero off by shares."""
+    error = np.zeros(B0.shape)
+    error[B0 != 0.0] = shares * B0[B0 != 0.0]
+    return nominal._replace(B=nominal.B + nominal.B @ nominal.R @ error)
+
+
+# ---- Each axis alone ----
+
+
+def _alone(
+    plant: Any, axes: Axes, i: int, point: Any, bounds: Constraints, objective: str
+) -> tuple[tuple[Vector, Vector], Tuned]:
+    """Return the plant that one axis is tuned on alone, and its tuning.
+
+    It is the diagonal entry of the plant behind B0. There the other axes are free, and an arm may
+    fall, so that no controller of this axis helps: then it is ``b/s^n``.
+    """
+    name, axis = axes.names[i], axes.axes[i]
+    observer, structure = axis.observer, "bandwidths"
+    if axis.half_gain:
+        structure = "half-gain-law"
+    elif observer.form == "reduced":
+        structure = "reduced"
+    elif not observer.has_one_pole and observer.poles is None:
+        structure = "half-gain"
+    waiting = linear_part_of(plant, axes.dt, point)[1]
+    how: dict[str, Any] = {"structure": structure, "order": observer.order, "compare": ()}
+    how |= {"objective": objective, "constraints": bounds}
+    late = max(waiting, default=0) * axes.dt
+    try:
+        own = diagonal_plant(plant, axes, i, point)
+        if own[0][0] < 0.0:
+            raise ValueError("v moves it the wrong way: check the signs of B0")
+        try:
+            return own, tune(own, axes.dt, delay=late, **how)
+        except ValueError:
+            chain = own[0][:1], np.eye(1, observer.order + 1)[0]
+            return chain, tune(chain, axes.dt, delay=late, **how)
+    except ValueError as error:
+        raise ValueError(f"axis {name} alone: {error}") from None
+
+
+def diagonal_plant(plant: Any, axes: Axes, i: int, point: Any) -> tuple[Vector, Vector]:
+    """Return the transfer function from v_i to y_i, without delays."""
+    linear = linear_part_of(plant, axes.dt, point)[0]
+    R = gain_at(axes, estimates_at(axes, plant, point))[1]
+    return diagonal_entry(linear.A, linear.B @ R[:, i], linear.C[i])
+
+
+def diagonal_entry(A: Matrix, b: Vector, c: Vector) -> tuple[Vector, Vector]:
+    """Return numerator and denominator from one input to one output, without what cancels.
+
+    The poles of the other axes are zeros as well, so that they leave. Raises ``ValueError`` if the
+    input does not move the output.
+    """
+    poles = np.linalg.eigvals(A).astype(complex).tolist()
+    zeros = invariant_zeros(A, b[:, None], c[None, :]).values.astype(complex).tolist()
+    row, gain = c.copy(), 0.0
+    for _ in range(A.shape[0]):
+        gain = float(row @ b)
+        if abs(gain) > 1e-9 * float(np.abs(row) @ np.abs(b)):
+            break
+        row, gain = row @ A, 0.0
+    if gain == 0.0:
+        raise ValueError("its v does not move its y; check B0 and the order of the outputs")
+    fastest = float(np.max(np.abs(poles), initial=0.0))
+    for zero in list(zeros):
+        distance = [abs(pole - zero) for pole in poles]
+        nearest = int(np.argmin(distance)) if poles else -1
+        near = _CANCEL * abs(zero) + _CANCEL_OF_FASTEST * fastest
+        if poles and distance[nearest] <= near:
+            del poles[nearest]
+            zeros.remove(zero)
+    num, den = (np.atleast_1d(np.real(np.poly(roots))) for roots in (zeros, poles))
+    return gain * num, den
+
+
+def _each_alone(
+    alone: Mapping[str, Tuned],
+    own_plants: Sequence[tuple[Vector, Vector]],
+    dead: int,
+    axes: Axes,
+    bounds: Constraints,
+    least: float,
+    loops: Callable[..., CoupledLoops],
+) -> tuple[Limits, Matrix, Vector]:
+    """Return the bounds, the best bandwidths of each axis alone with b0 = 1, and their costs.
+
+    ``tune`` has another b0, which is the gain of the axis here.
+    """
+    rows, costs, known = [], [], []
+    for i, name in enumerate(axes.names):
+        values = alone[name].design.values
+        m_ks = alone[name].constraints.m_ks
+        known.append(m_ks)
+        own = bounds.m_s, bounds.m_t, None if m_ks is None else (m_ks,), least, bounds.damping
+        linear = LinearPlant.of(own_plants[i])
+        one = MultivariableLinearPlant(linear.A, linear.B.reshape(-1, 1), linear.C.reshape(1, -1))
+        late = delayed_inputs(one, dead * axes.dt, axes.dt) if dead else one
+        single = Plant(*sampled_matrices(late, axes.dt), np.eye(1))
+        task = loops([single], [axes.axes[i]], Limits(*own), alone=np.ones(1))
+        start = np.array([[values["omega_c"], values["omega_o"]]])
+        low, high = _ends(start, bounds, axes.dt)
+        first = starts(task, start, low, high, _STARTS)
+        ends = [optimum(task, each.values, low, high) for each in first]
+        best = min(ends, key=lambda each: each.rank)
+        rows.append(best.values[0])
+        costs.append(best.measured.costs[0])
+    of_noise = None if None in known else tuple(each for each in known if each is not None)
+    limits = Limits(bounds.m_s, bounds.m_t, of_noise, least, bounds.damping)
+    return limits, np.array(rows), np.array(costs)
+
+
+def _ends(start: Matrix, bounds: Constraints, dt: float) -> tuple[Vector, Vector]:
+    """Return the least and the largest omega_c and omega_o."""
+    return np.full(2, _SLOWEST * float(np.min(start))), np.full(2, bounds.omega_o_dt / dt)
+
+
+# ---- All axes ----
+
+
+def _search(
+    loops: Callable[..., CoupledLoops],
+    plants: Sequence[Plant],
+    points: int,
+    axes: Axes,
+    limits: Limits,
+    start: Matrix,
+    bounds: Constraints,
+) -> tuple[Found, list[Plant], float]:
+    """Return the best bandwidths, the plants they are judged on, and their largest excess there.
+
+    The search has the plants of the operating points, and those with errors of B0 that turned out
+    to be the worst so far. Excesses are those on exact responses.
+    """
+    low, high = _ends(start, bounds, axes.dt)
+    asked = limits
+    every = loops(plants, limits=limits)
+    members = list(range(points))
+    first = starts(every, start, low, high, _STARTS)
+    for i in range(len(start) if len(start) > 1 and first[0].rank[0] else 0):
+        apart = start.copy()
+        apart[i] /= _APART
+        first += starts(every, apart, low, high, 1)
+    first = sorted(first, key=lambda each: each.rank)[:_STARTS]
+    for each in first:
+        members = _with_worst(every, each, members)
+    now, found, excess = [each.values for each in first], first[0], math.inf
+    for _ in range(_REPAIRS):
+        few = loops([plants[j] for j in members], limits=limits)
+        ends = [optimum(few, each, low, high) for each in now]
+        ends = [Found(each.values, every.measured(each.values)) for each in ends]
+        best = min(ends, key=lambda each: each.rank)
+        members = _with_worst(every, best, members)
+        worst = max(_exact([plants[j] for j in members], axes, best.values, asked)) - 1.0
+        if worst < excess:
+            excess, found = worst, best
+        if worst <= _TOLERANCE or worst > _HOPELESS:
+            break
+        now, limits = [best.values], _tightened(limits, 1.0 + min(1.2 * worst, _MOST_TIGHTER))
+    return found, [plants[j] for j in members], max(excess, 0.0)
+
+
+def _with_worst(loops: CoupledLoops, found: Found, members: list[int]) -> list[int]:
+    """Return the members of a set, and the plants with the least slacks at a result."""
+    slacks = np.min(loops.measured(found.values).slacks, axis=1)
+    return sorted({*members, *np.argsort(slacks)[:_WORST].tolist()})
+
+
+def _tightened(limits: Limits, share: float) -> Limits:
+    """Return bounds that are tighter by a share."""
+    return Limits(
+        None if limits.m_s is None else max(limits.m_s / share, 1.001),
+        None if limits.m_t is None else max(limits.m_t / share, 1.001),
+        None if limits.m_ks is None else tuple(value / share for value in limits.m_ks),
+        limits.disk * share,
+        None if limits.damping is None else 1.0 - (1.0 - limits.damping) / share,
+    )
+
+
+def _made(axes: Axes, values: Matrix) -> Axes:
+    """Return axes with these bandwidths, at their start."""
+    made = copy.copy(axes)
+    for axis, (omega_c, omega_o) in zip(made.axes, values.tolist(), strict=True):
+        axis.retune(omega_c=omega_c, observer=with_gains(axis.observer, 1.0, omega_o))
+    made._update_parameters()
+    made._pack_again()
+    return made
+
+
+def _loop(plant: Plant, axes: Axes, values: Matrix) -> MultivariableLoop:
+    """Return the loop of a plant with plain axes of these bandwidths."""
+    laws = [Law(axis).at(*map(float, row)) for axis, row in zip(axes.axes, values, strict=True)]
+    law = joined(laws, plant.R)
+    return MultivariableLoop((plant.A, plant.B, plant.C), law, axes.dt, outputs=axes.names)
+
+
+class _Peaks(NamedTuple):
+    """Largest sizes over all frequencies of one loop."""
+
+    outputs: Matrix  # |S|, |T| (2, p)
+    actuators: Matrix  # (2, m)
+    noise: Vector  # |C S| from y_i to v_i (p,)
+
+
+def _peaks(loop: MultivariableLoop, plant: Plant) -> _Peaks:
+    omega = loop.omega[1:]
+    S_o, S_i = (np.einsum("kii->ki", loop.response(name, omega)) for name in ("S_o", "S_i"))
+    to_v = np.einsum("kii->ki", np.linalg.pinv(plant.R) @ loop.response("CS", omega))
+    outputs, actuators = (
+        np.array([np.max(np.abs(S), axis=0), np.max(np.abs(1.0 - S), axis=0)]) for S in (S_o, S_i)
+    )
+    return _Peaks(outputs, actuators, np.max(np.abs(to_v), axis=0))
+
+
+def _exact(plants: Sequence[Plant], axes: Axes, values: Matrix, limits: Limits) -> list[float]:
+    """Return the ratios to all bounds on the dense grids of ``MultivariableLoop``."""
+    found = [0.0]
+    for plant in plants:
+        loop = _loop(plant, axes, values)
+        if not loop.stable:
+            return [math.inf]
+        peaks = _peaks(loop, plant)
+        for row, limit in ((0, limits.m_s), (1, limits.m_t)):
+            if limit is not None:
+                found += (peaks.outputs[row] / limit).tolist()
+                found += (peaks.actuators[row] / limit).tolist()
+        if limits.m_ks is not None:
+            found += (peaks.noise / np.array(limits.m_ks)).tolist()
+        found += [limits.disk / loop.disk_margin(at).alpha for at in _PLACES]
+    return found
+
+
+def _results(
+    axes: Axes,
+    loops: Sequence[MultivariableLoop],
+    plants: Sequence[Plant],
+    found: Found,
+    alone: Vector,
+) -> tuple[AxisResult, ...]:
+    nan = np.full(len(axes.names), math.inf)
+    peaks = [
+        _peaks(loop, plant) if loop.stable else _Peaks(np.array([nan, nan]), np.array([nan]), nan)
+        for loop, plant in zip(loops, plants, strict=True)
+    ]
+    rows = []
+    for i, name in enumerate(axes.names):
+        rows.append(
+            AxisResult(
+                name,
+                float(found.values[i, 0]),
+                float(found.values[i, 1]),
+                float(found.measured.costs[i]),
+                float(alone[i]),
+                max(float(each.outputs[0, i]) for each in peaks),
+                max(float(each.outputs[1, i]) for each in peaks),
+                max(float(each.noise[i]) for each in peaks),
+            )
+        )
+    return tuple(rows)
+
+
+def _check(
+    nominal: Sequence[Plant],
+    off: float,
+    loops: Callable[..., CoupledLoops],
+    found: Found,
+    samples: int,
+    seed: int,
+) -> AxesCheck:
+    """Return how the result does with drawn errors of B0."""
+    rng = np.random.default_rng([seed, 3])
+    drawn = []
+    for k in range(samples):
+        one = nominal[k % len(nominal)]
+        B0 = np.linalg.pinv(one.R)
+        drawn.append(_off_by(one, B0, rng.uniform(-off, off, int(np.count_nonzero(B0)))))
+    measured = loops(drawn).measured(found.values)
+    ratios = np.exp(-np.min(measured.slacks, axis=1))
+    stable = measured.slacks[:, -1] > UNSTABLE
+    bad = int(np.sum((ratios > 1.0 + 2.0 * _TOLERANCE) | ~stable))
+    return AxesCheck(samples, int(np.sum(~stable)), bad, share_interval(bad, samples))
+
+
+def _relative_gains(A: Matrix, B: Matrix, C: Matrix, axes: Axes, at: float) -> Coupling | None:
+    """Return the relative gains at a frequency; None where there are none."""
+    if B.shape[1] != C.shape[0]:
+        return None
+    plant = SimpleNamespace(A=A, B=B, C=C, dt=axes.dt)
+    try:
+        found = coupling(plant, axes.dt, min(at, 0.9 * math.pi / axes.dt), axes.names)
+    except ValueError:
+        return None
+    return replace(found, at=found.at[-1:])
+
+
+def _with_learners(plant: Any, axes: Axes, point: Any) -> MultivariableLoop | None:
+    """Return the nominal loop with learners at rest; None without any."""
+    if all(isinstance(axis.learner, NoLearner) for axis in axes.axes):
+        return None
+    return analyse_axes(plant, axes, point)

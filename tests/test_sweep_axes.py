@@ -1,0 +1,88 @@
+"""Sweeps over setups of several axes: each run is that of ``simulate``, each measure that of its axis."""
+
+from __future__ import annotations
+
+import copy
+import json
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.setup import SetupError, made_axes
+from quell.setup.axes import sweep_of_axes
+from quell.sweeping.runs import Measure, Plan, as_measures
+from quell.tuning.report import toml_text
+
+from .commands import Shown
+from .setups import GANTRY
+
+SWEEP = {
+    "parameters": {"axis[1].controller.omega_c": [4.0, 8.0, -1.0], "plant.B": [[[0, 0], [5, 0.5], [0, 0], [0.4, 6]]]},
+    "metrics": ["rms", "peak_error"],
+    "limits": {"rms": 0.05},
+}  # fmt: skip
+
+
+def gantry(**changes: Any) -> dict[str, Any]:
+    """Return the tables of a short run of a gantry with a sweep."""
+    data = copy.deepcopy(tomllib.loads(GANTRY))
+    data["scenario"] = data["scenario"] | {"duration": 0.3}
+    return data | {"sweep": SWEEP} | changes
+
+
+def test_each_run_is_that_of_simulate(tmp_path: Path) -> None:
+    """Measures of both axes, bit for bit; a run that cannot be built is recorded, and the others are done."""
+    setup = made_axes("gantry.toml", gantry())
+    found = ql.sweep(**sweep_of_axes(setup), folder=tmp_path / "sweep", workers=1)
+    assert sorted(sweep_of_axes(setup)["metrics"]) == [
+        "x.peak_error",
+        "x.rms",
+        "y.peak_error",
+        "y.rms",
+    ]
+    for i, omega_c in enumerate((4.0, 8.0)):
+        data = gantry()
+        data["axis"][1]["controller"]["omega_c"] = omega_c
+        one = made_axes("gantry.toml", data)
+        # The run has the seed of its draw.
+        plan = Plan(setup.sweep["parameters"], 1, "latin-hypercube", 0)  # type: ignore[index]
+        scenario = replace(one.needed("scenario"), seed=plan.part(i, i + 1).seed(i))
+        run = ql.simulate(one.plant, one.controller, scenario)
+        for name in ("x", "y"):
+            expected = run.metrics(0.1)[name]["rms"]
+            assert float(found.dataset[f"{name}.rms"][i]) == expected
+    assert int(found.dataset["status"][2]) == -1
+    assert np.isnan(float(found.dataset["x.rms"][2]))
+
+
+def test_a_measure_names_its_axis() -> None:
+    """Before the name of the measure; without an axis, or with one too many, the error says so."""
+    assert as_measures(["elbow.rms"]) == {"elbow.rms": Measure("rms", axis="elbow")}
+    with pytest.raises(ValueError, match="'rsm' is unknown"):
+        as_measures(["elbow.rsm"])
+    with pytest.raises(SetupError, match="sweep.limits.iae: is none of the metrics"):
+        sweep_of_axes(made_axes("a.toml", gantry(sweep=SWEEP | {"limits": {"iae": 1.0}})))
+    with pytest.raises(SetupError, match="sweep.parameters: axis.9..controller.omega_c"):
+        sweep_of_axes(
+            made_axes("a.toml", gantry(sweep={"parameters": {"axis[9].controller.omega_c": [1.0]}}))
+        )
+    with pytest.raises(SetupError, match="sweep: missing"):
+        sweep_of_axes(made_axes("a.toml", {k: v for k, v in gantry().items() if k != "sweep"}))
+
+
+def test_the_command_sweeps_and_repeats_a_run(quell: Callable[..., Shown], tmp_path: Path) -> None:
+    """Of two axes; the run that is repeated has the stored measures."""
+    (tmp_path / "gantry.toml").write_text(toml_text(gantry()))
+    shown = quell("sweep", "gantry.toml", "--workers", "1", "--no-figures", "--json", "a.json")
+    assert shown.code == 0, shown.err
+    assert "y.rms" in shown.out
+    assert json.loads((tmp_path / "a.json").read_text())["setup"]["axis"]
+    again = quell("sweep", "gantry.toml", "--repeat", "1", "--no-figures")
+    assert again.code == 0, again.err
+    assert "the same, bit for bit" in again.out
