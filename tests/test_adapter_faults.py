@@ -243,5 +243,5 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
         ("jax", "jax", ql.learners.JaxModel),
     ):
         monkeypatch.setitem(sys.modules, module, None)
-        with pytest.raises(ImportError, match=rf"pip install 'quell\[{extra}\]'"):
+        with pytest.raises(ImportError, match=rf"pip install 'quell-control\[{extra}\]'"):
             make(object())

@@ -98,5 +98,5 @@ def test_without_python_control_all_but_its_systems_is_there(
     monkeypatch.setattr(importlib, "import_module", missing)
     loop = analysis.analyse(PLANT, adrc(2))
     assert loop.margins.phase > 0.0
-    with pytest.raises(ImportError, match=r"pip install 'quell\[control\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'quell-control\[control\]'"):
         loop.system("L")

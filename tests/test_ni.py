@@ -270,7 +270,7 @@ def test_without_a_driver_one_line_says_where_to_get_it(monkeypatch):
 def test_without_the_package_one_line_says_which_extra(monkeypatch):
     """The extra is called ni."""
     monkeypatch.setitem(sys.modules, "nidaqmx", None)
-    with pytest.raises(ImportError, match=r"pip install 'quell\[ni\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'quell-control\[ni\]'"):
         NiDevice("Dev1/ctr0", "Dev2/ao0")
 
 

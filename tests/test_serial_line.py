@@ -223,5 +223,5 @@ def test_other_systems_are_told_what_to_do(monkeypatch):
 def test_without_pyserial_one_line_says_which_extra(monkeypatch):
     """The extra is called serial."""
     monkeypatch.setitem(__import__("sys").modules, "serial", None)
-    with pytest.raises(ImportError, match=r"pip install 'quell\[serial\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'quell-control\[serial\]'"):
         SerialDevice("serial:///dev/ttyS0", DT)

@@ -458,7 +458,7 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     """One line, before the loop starts."""
     recorded(NARROW, counted(3), McapSink(tmp_path / "run.mcap"))
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ImportError, match=r"pip install 'quell\[telemetry\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'quell-control\[telemetry\]'"):
         load(tmp_path / "run.mcap") if module == "mcap" else McapSink(tmp_path / "other.mcap").open(
             NARROW
         )
