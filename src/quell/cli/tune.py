@@ -541,7 +541,8 @@ def _tune_axes(
 ) -> int:
     """Tune the bandwidths of all axes of a setup, for the coupled loop."""
     from quell.setup.axes import axes_task
-    from quell.tuning.axes import quantity, tune_axes
+    from quell.tuning.axes import tune_axes
+    from quell.tuning.tuned_axes import quantity
 
     usable = {"m_s", "m_t", "m_ks", "damping", "objective"}
     rule = "is for one axis; of several m_s, m_t, m_ks, damping and objective count, and [tune]"

@@ -6,7 +6,7 @@ the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` p
 and returns a ``Tuned``.
 """
 
-from quell.tuning.axes import AxesCheck, AxisResult, TunedAxes, tune_axes
+from quell.tuning.axes import tune_axes
 from quell.tuning.compensator import TunedCompensator, tune_compensator
 from quell.tuning.constraints import Constraints
 from quell.tuning.plants import identified_plants
@@ -14,6 +14,7 @@ from quell.tuning.schedules import TunedSchedule, tune_schedule
 from quell.tuning.structures import STRUCTURES
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
+from quell.tuning.tuned_axes import AxesCheck, AxisResult, TunedAxes
 
 __all__ = [
     "STRUCTURES",
