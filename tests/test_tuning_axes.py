@@ -16,9 +16,12 @@ import pytest
 
 import quell as ql
 from quell.analysis import MultivariableLoop, analyse_axes
+from quell.lti.models import System, zero_order_hold
 from quell.setup import SetupError, load_axes, made_axes
 from quell.tuning import Constraints, TunedAxes, tune_axes
 from quell.tuning.axes import diagonal_entry
+from quell.tuning.optimiser.coupled import CoupledLoops, Law, Limits, Plant, integral_gain
+from quell.tuning.optimiser.loops import area_of_step, pulse_in_blocks
 
 from .benchmark_module import benchmark
 from .commands import Shown
@@ -250,3 +253,30 @@ def test_a_drawn_machine_keeps_its_bounds() -> None:
     worst = trial.ratios(analyse_axes(drawn.plant, found.controller), found)
     assert found.met
     assert max(worst.values()) <= 1.002
+
+
+@pytest.mark.parametrize(
+    "bandwidths", [(5.0, 50.0), (0.5, 5.0), (0.05, 5.0), (0.05, 0.5), (1e-3, 1e-3)]
+)
+def test_the_cost_of_a_slow_loop_with_fast_samples_is_its_whole_response(
+    bandwidths: tuple[float, float],
+) -> None:
+    """Of 1/s without overshoot the integral of ``|y|`` is that of y, 1/k_i, however slow the loop is."""
+    plain = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=50.0, dt=1e-4), 5.0)
+    one = Plant(np.eye(2), 1e-4 * np.eye(2), np.eye(2), np.eye(2))
+    limits = Limits(2.0, 2.0, None, 0.5, None)
+    loops = CoupledLoops([one], [plain, plain], limits, 1e-4, 0, np.ones(2), "load-iae")
+    k_i = integral_gain(Law(plain).at(*bandwidths), 1e-4)
+    costs = loops.measured(np.array([bandwidths, (5.0, 50.0)])).costs
+    assert costs[0] == pytest.approx(1.0 / k_i, rel=1e-6)
+    assert costs[1] == pytest.approx(0.008398, rel=1e-3)
+
+
+def test_distances_that_double_change_no_sum_of_an_oscillation() -> None:
+    """Of two slow oscillations with the damping of 0.2 and 0.02 it is the sum of all samples, to 1e-4."""
+    for damping in (0.2, 0.02):
+        A = np.array([[0.0, 1.0], [-1.0, -2.0 * damping]])
+        A, (B,) = zero_order_hold(A, [np.array([[0.0], [1.0]])], 1e-4)
+        system = System(A - np.eye(2), B[:, 0], np.array([0.0, 1.0]), 0.0)  # y' of a step
+        y = np.cumsum(pulse_in_blocks(system, 1_000_000))
+        assert area_of_step(system, 1_000_000) == pytest.approx(np.sum(np.abs(y)), rel=1e-4)

@@ -32,7 +32,7 @@ from quell.controllers.adrc import ADRC
 from quell.controllers.linear import LinearLaw
 from quell.lti.models import MatrixSystem, System
 from quell.observers.eso import with_gains
-from quell.tuning.optimiser.loops import law_of, pulse_in_blocks
+from quell.tuning.optimiser.loops import area_of_step, law_of
 from quell.tuning.optimiser.requirements import counted_of, modes_of
 from quell.types import DesignWarning, Matrix, Vector
 
@@ -41,8 +41,8 @@ _POINTS_PER_DECADE, _LOWEST = 24, 1e-5
 # Laws that are kept: those of a difference quotient and some more.
 _KEPT = 64
 # The response to a load ends after so many time constants of the slowest pole, when a share of e⁻²⁰
-# is left, or after so many samples.
-_TIME_CONSTANTS, _MOST_SAMPLES = 20.0, 50_000
+# is left.
+_TIME_CONSTANTS = 20.0
 # What an unstable loop costs, in units of the cost alone: more than any search gains.
 _UNSTABLE = 100.0
 UNSTABLE = -1.0
@@ -237,13 +237,12 @@ class CoupledLoops:
         if self.objective == "load":
             return np.array([1.0 / integral_gain(law, self.dt) for law in laws])
         slowest = float(np.min(-s.real))
-        size = min(math.ceil(_TIME_CONSTANTS / (slowest * self.dt)) + 2, _MOST_SAMPLES)
+        size = math.ceil(_TIME_CONSTANTS / (slowest * self.dt)) + 2
         rest = np.zeros(N.shape[0] - plant.A.shape[0])
         B, found = plant.B @ plant.R, []
         for i, row in enumerate(plant.C):
             system = System(N, np.append(B[:, i], rest), np.append(row, rest), 0.0)
-            y = np.cumsum(pulse_in_blocks(system, size))
-            found.append(float(np.sum(np.abs(y))) * self.dt)
+            found.append(area_of_step(system, size) * self.dt)
         return np.array(found)
 
 
