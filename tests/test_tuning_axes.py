@@ -7,6 +7,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from quell.analysis import MultivariableLoop, analyse_axes
 from quell.lti.models import System, zero_order_hold
 from quell.setup import SetupError, load_axes, made_axes
 from quell.tuning import Constraints, TunedAxes, tune_axes
-from quell.tuning.axes import diagonal_entry
+from quell.tuning.axes import _exact, _nominal, diagonal_entry
 from quell.tuning.optimiser.coupled import CoupledLoops, Law, Limits, Plant, integral_gain
 from quell.tuning.optimiser.loops import area_of_step, pulse_in_blocks
 
@@ -280,3 +281,42 @@ def test_distances_that_double_change_no_sum_of_an_oscillation() -> None:
         system = System(A - np.eye(2), B[:, 0], np.array([0.0, 1.0]), 0.0)  # y' of a step
         y = np.cumsum(pulse_in_blocks(system, 1_000_000))
         assert area_of_step(system, 1_000_000) == pytest.approx(np.sum(np.abs(y)), rel=1e-4)
+
+
+def test_a_bound_of_damping_is_judged_as_the_others_are() -> None:
+    """Its value is that of the poles of ``analyse_axes``, its ratio decides, and the line with NOT names it alone."""
+    values = np.array([[30.0, 60.0], [60.0, 40.0]])
+    observers = [ql.ESO.model_free(order=2, b0=1.0, omega_o=each, dt=DT) for each in values[:, 1]]
+    given = ql.Axes(
+        [ql.ADRC(one, each) for one, each in zip(observers, values[:, 0], strict=True)], M=M
+    )
+    limits = Limits(5.0, 5.0, None, 0.1, 0.99)
+    plants = _nominal(machine(), given, [None])
+    loops = CoupledLoops(plants, given.axes, limits, DT, 2, np.ones(2), "load-iae")
+    found = {each.name.split()[0]: each for each in _exact(loops, [0], given, values)}
+    s = np.array(
+        [np.log(complex(p.z)) / DT for p in analyse_axes(machine(), given).poles if abs(p.z) > 1e-3]
+    )
+    s = s[(s.imag > 1e-6 * np.abs(s)) & (s.imag < math.pi / (4 * DT))]
+    assert found["damping"].value == pytest.approx(np.min(-s.real / np.abs(s)), rel=1e-6)
+    assert found["damping"].ratio > 2.0
+    assert found["M_s"].ratio < 1.0
+    assert found["disk"].ratio < 1.0
+    told = replace(tuned(), met=False, excess=1.0, bounds=tuple(found.values())).verdicts()
+    line = next(each for each in told if each.startswith("NOT met"))
+    assert f"damping of the poles is {found['damping'].value:.4g}, at least 0.99" in line
+    assert "M_s" not in line
+
+
+@pytest.mark.slow
+def test_a_result_without_enough_damping_does_not_meet_its_bounds() -> None:
+    """Though its M_s is kept, or all but kept."""
+    B0 = np.array([[1.0, 0.4], [0.4, 1.0]])
+    plant = ql.plants.MultivariableLinearPlant(np.zeros((2, 2)), B0, np.eye(2))
+    one = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=60.0, dt=DT), 8.0)
+    bounds = Constraints(m_s=3.0, m_t=3.0, damping=0.9999)
+    late = ql.plants.delayed_inputs(plant, 2 * DT, DT)
+    found = tune_axes(late, ql.Axes([one, one], B0=B0), constraints=bounds, B0_off=0.2)
+    assert not found.met
+    assert "damping of the poles is" in found.summary()
+    assert found.to_json()["bounds"][-1]["name"] == "damping of the poles"

@@ -14,10 +14,11 @@ from quell.tuning.schedules import TunedSchedule, tune_schedule
 from quell.tuning.structures import STRUCTURES
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
-from quell.tuning.tuned_axes import AxesCheck, AxisResult, TunedAxes
+from quell.tuning.tuned_axes import AxesBound, AxesCheck, AxisResult, TunedAxes
 
 __all__ = [
     "STRUCTURES",
+    "AxesBound",
     "AxesCheck",
     "AxisResult",
     "Constraints",

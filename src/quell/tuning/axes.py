@@ -73,7 +73,14 @@ from quell.tuning.optimiser.coupled import (
 )
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
-from quell.tuning.tuned_axes import PLACES, AxesCheck, AxisResult, TunedAxes
+from quell.tuning.tuned_axes import (
+    PLACES,
+    TOLERANCE,
+    AxesBound,
+    AxesCheck,
+    AxisResult,
+    TunedAxes,
+)
 from quell.types import Matrix, Progress, Vector
 
 # Sign patterns of the errors of B0 that are in the set at most.
@@ -82,9 +89,8 @@ _MOST_PATTERNS = 16
 _APART = 10.0
 # Starts of a search.
 _STARTS = 3
-# A bound counts as kept up to this share beyond it, on the exact response; limits are lowered by
-# as much as a result exceeds them, so many times.
-_TOLERANCE, _REPAIRS = 1e-3, 4
+# Limits are lowered by as much as a result exceeds them, so many times.
+_REPAIRS = 4
 # An excess that is not repaired, and the most that bounds are tightened by in a round.
 _HOPELESS, _MOST_TIGHTER = 0.5, 0.1
 # Plants with errors of B0 that join the search in a round, and the lowest bandwidth in units of the
@@ -207,7 +213,8 @@ def tune_axes(
         limits, start, costs = _each_alone(alone, own, dead, axes, bounds, least, loops)
         loops = partial(loops, axes=axes.axes, alone=costs)
         report("together", (parts - 2) / parts)
-        found, judged, excess = _search(loops, plants, len(nominal), axes, limits, start, bounds)
+        found, judged, worst = _search(loops, plants, len(nominal), axes, limits, start, bounds)
+        excess = _excess(worst)
         report("check", (parts - 1) / parts)
         checked = None
         if B0_off > 0.0:
@@ -224,8 +231,9 @@ def tune_axes(
             alone=alone,
             constraints=bounds,
             disk=least,
-            met=excess <= _TOLERANCE,
+            met=excess <= TOLERANCE,
             excess=excess,
+            bounds=tuple(worst),
             B0_off=B0_off,
             points=len(points),
             plants=len(plants),
@@ -428,14 +436,13 @@ def _search(
     limits: Limits,
     start: Matrix,
     bounds: Constraints,
-) -> tuple[Found, list[Plant], float]:
-    """Return the best bandwidths, the plants they are judged on, and their largest excess there.
+) -> tuple[Found, list[Plant], list[AxesBound]]:
+    """Return the best bandwidths, the plants they are judged on, and the bounds there.
 
     The search has the plants of the operating points, and those with errors of B0 that turned out
-    to be the worst so far. Excesses are those on exact responses.
+    to be the worst so far. Bounds are judged on exact responses.
     """
     low, high = _ends(start, bounds, axes.dt)
-    asked = limits
     every = loops(plants, limits=limits)
     members = list(range(points))
     first = starts(every, start, low, high, _STARTS)
@@ -446,20 +453,26 @@ def _search(
     first = sorted(first, key=lambda each: each.rank)[:_STARTS]
     for each in first:
         members = _with_worst(every, each, members)
-    now, found, excess = [each.values for each in first], first[0], math.inf
+    now, found, reached = [each.values for each in first], first[0], [_NOT_STABLE]
     for _ in range(_REPAIRS):
         few = loops([plants[j] for j in members], limits=limits)
         ends = [optimum(few, each, low, high) for each in now]
         ends = [Found(each.values, every.measured(each.values)) for each in ends]
         best = min(ends, key=lambda each: each.rank)
         members = _with_worst(every, best, members)
-        worst = max(_exact([plants[j] for j in members], axes, best.values, asked)) - 1.0
-        if worst < excess:
-            excess, found = worst, best
-        if worst <= _TOLERANCE or worst > _HOPELESS:
+        there = _exact(every, members, axes, best.values)
+        worst = _excess(there)
+        if worst < _excess(reached):
+            reached, found = there, best
+        if worst <= TOLERANCE or worst > _HOPELESS:
             break
         now, limits = [best.values], _tightened(limits, 1.0 + min(1.2 * worst, _MOST_TIGHTER))
-    return found, [plants[j] for j in members], max(excess, 0.0)
+    return found, [plants[j] for j in members], reached
+
+
+def _excess(bounds: Sequence[AxesBound]) -> float:
+    """Return the largest ratio to a bound, less one, or 0."""
+    return max(max(each.ratio for each in bounds) - 1.0, 0.0)
 
 
 def _with_worst(loops: CoupledLoops, found: Found, members: list[int]) -> list[int]:
@@ -514,22 +527,45 @@ def _peaks(loop: MultivariableLoop, plant: Plant) -> _Peaks:
     return _Peaks(outputs, actuators, np.max(np.abs(to_v), axis=0))
 
 
-def _exact(plants: Sequence[Plant], axes: Axes, values: Matrix, limits: Limits) -> list[float]:
-    """Return the ratios to all bounds on the dense grids of ``MultivariableLoop``."""
-    found = [0.0]
-    for plant in plants:
+_NOT_STABLE = AxesBound("the loop is not stable", math.nan, math.nan, math.inf)
+
+
+def _exact(
+    loops: CoupledLoops, members: Sequence[int], axes: Axes, values: Matrix
+) -> list[AxesBound]:
+    """Return the worst of each bound, over frequency on the grids of ``MultivariableLoop``."""
+    found: dict[str, list[AxesBound]] = {}
+
+    def add(kind: str, of: str, value: float, limit: float) -> None:
+        found.setdefault(kind, []).append(AxesBound(f"{kind} of {of}", value, limit, value / limit))
+
+    limits = loops.limits
+    for j in members:
+        plant = loops.plants[j]
         loop = _loop(plant, axes, values)
         if not loop.stable:
-            return [math.inf]
+            return [_NOT_STABLE]
         peaks = _peaks(loop, plant)
-        for row, limit in ((0, limits.m_s), (1, limits.m_t)):
+        for row, kind, limit in ((0, "M_s", limits.m_s), (1, "M_t", limits.m_t)):
             if limit is not None:
-                found += (peaks.outputs[row] / limit).tolist()
-                found += (peaks.actuators[row] / limit).tolist()
-        if limits.m_ks is not None:
-            found += (peaks.noise / np.array(limits.m_ks)).tolist()
-        found += [limits.disk / loop.disk_margin(at).alpha for at in PLACES]
-    return found
+                sizes = np.concatenate([peaks.outputs[row], peaks.actuators[row]]).tolist()
+                for channel, size in zip((*loop.outputs, *loop.inputs), sizes, strict=True):
+                    add(kind, channel, size, limit)
+        for name, size, limit in zip(
+            axes.names, peaks.noise.tolist(), limits.m_ks or (), strict=False
+        ):
+            add("M_ks", name, size, limit)
+        for at in PLACES:
+            alpha = loop.disk_margin(at).alpha
+            found.setdefault("disk", []).append(
+                AxesBound(f"disk margin of all {at}", alpha, limits.disk, limits.disk / alpha, True)
+            )
+        pole = loops.least_damped(values, j)
+        if pole is not None:
+            found.setdefault("damping", []).append(
+                AxesBound("damping of the poles", pole.damping, pole.least, pole.ratio, True)
+            )
+    return [max(each, key=lambda bound: bound.ratio) for each in found.values()]
 
 
 def _results(
@@ -579,7 +615,7 @@ def _check(
     measured = loops(drawn).measured(found.values)
     ratios = np.exp(-np.min(measured.slacks, axis=1))
     stable = measured.slacks[:, -1] > UNSTABLE
-    bad = int(np.sum((ratios > 1.0 + 2.0 * _TOLERANCE) | ~stable))
+    bad = int(np.sum((ratios > 1.0 + 2.0 * TOLERANCE) | ~stable))
     return AxesCheck(samples, int(np.sum(~stable)), bad, share_interval(bad, samples))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ from quell.tuning.tuned import Tuned
 
 # A gain that changes by less with the other loops closed: as in ``analysis.coupling``.
 _INDEPENDENT = 1.25
+TOLERANCE = 1e-3
+"""A bound counts as kept up to this share beyond it, on the exact response."""
 PLACES = ("inputs", "outputs")
 """Where disk margins are bounded."""
 
@@ -41,6 +44,23 @@ class AxisResult(NamedTuple):
     def ratio(self) -> float:
         """The cost over that of the axis alone: what the coupling takes."""
         return self.cost / self.alone
+
+
+class AxesBound(NamedTuple):
+    """A bound, and what the loops have."""
+
+    name: str  #: with the channel, as ``M_s of x``
+    value: float  #: NaN where it has none, as stability
+    limit: float
+    ratio: float  #: above 1 if the bound is exceeded; of a damping ζ it is (1 − ζ)/(1 − limit)
+    least: bool = False  #: whether the value must be at least the limit
+
+    def __str__(self) -> str:
+        """Return the bound as text."""
+        if not math.isfinite(self.value):
+            return self.name
+        end = "least" if self.least else "most"
+        return f"{self.name} is {self.value:.4g}, at {end} {self.limit:.4g} is asked for"
 
 
 class AxesCheck(NamedTuple):
@@ -82,7 +102,10 @@ class TunedAxes:
     met : bool
         whether all bounds hold.
     excess : float
-        the largest ratio to a bound, less one.
+        the largest ratio to a bound, less one; 0 if none is exceeded.
+    bounds : tuple of AxesBound
+        what the loops have of M_s, M_t, M_ks, disk margin and damping, the worst of all channels
+        and plants.
     left : Coupling or None
         relative gains behind B0: how much the axes notice each other through it.
     of_plant : Coupling or None
@@ -101,6 +124,7 @@ class TunedAxes:
     disk: float
     met: bool
     excess: float
+    bounds: tuple[AxesBound, ...]
     B0_off: float
     points: int
     plants: int
@@ -146,9 +170,9 @@ class TunedAxes:
             f"at least {self.disk:.3f} is asked for; max σ(S) {self.m_s:.3f} at the outputs"
         ]
         if not self.met:
+            missed = "; ".join(str(each) for each in self.bounds if each.ratio > 1.0 + TOLERANCE)
             lines.append(
-                f"NOT met: a bound is exceeded by {100.0 * self.excess:.3g} % with the best "
-                f"bandwidths that were found; {self._remedy()}"
+                f"NOT met with the best bandwidths that were found: {missed}; {self._remedy()}"
             )
         lines += self._advice()
         if self.check is not None:
@@ -260,6 +284,7 @@ class TunedAxes:
                 "disk": self.disk,
                 "met": self.met,
                 "excess": self.excess,
+                "bounds": [each._asdict() for each in self.bounds],
                 "axes": [each._asdict() | {"ratio": each.ratio} for each in self.axes],
                 "disk_margin": {"inputs": inputs, "outputs": outputs},
                 "max_singular_value": self.m_s,

@@ -33,7 +33,7 @@ from quell.controllers.linear import LinearLaw
 from quell.lti.models import MatrixSystem, System
 from quell.observers.eso import with_gains
 from quell.tuning.optimiser.loops import area_of_step, law_of
-from quell.tuning.optimiser.requirements import counted_of, modes_of
+from quell.tuning.optimiser.requirements import Pole, counted_of, modes_of
 from quell.types import DesignWarning, Matrix, Vector
 
 # Points of the grid per decade, and its lowest frequency in units of half the sampling rate.
@@ -222,15 +222,29 @@ class CoupledLoops:
 
     def _damped(self, s: Complex, modes: tuple[Complex, int], inside: bool) -> float:
         """Return the slack of the least damped pole; of an unstable loop that of the worst."""
-        least = self.limits.damping
         worst = float(np.max(s.real / np.abs(s), initial=-1.0))
         if not inside:
             return UNSTABLE - max(worst, 0.0)
-        if least is None:
+        if self.limits.damping is None:
             return min(-worst, 1.0)
-        poles = counted_of(s, modes, self.dead, least, self.dt)
-        slack = [(pole.damping - pole.least) / (1.0 - pole.least) for pole in poles]
-        return max(min(slack, default=1.0), 0.99 * UNSTABLE)
+        pole = self._least_damped(s, modes)
+        return 1.0 if pole is None else max(1.0 - pole.ratio, 0.99 * UNSTABLE)
+
+    def _least_damped(self, s: Complex, modes: tuple[Complex, int]) -> Pole | None:
+        """Return the pole with the largest ratio to its bound; None if none has to be damped."""
+        poles = counted_of(s, modes, self.dead, float(self.limits.damping or 0.0), self.dt)
+        return max(poles, key=lambda pole: pole.ratio, default=None)
+
+    def least_damped(self, values: Matrix, member: int) -> Pole | None:
+        """Return the pole with the largest ratio to its bound, with one plant of the set.
+
+        It is None if none has to be damped, or without a bound.
+        """
+        if self.limits.damping is None:
+            return None
+        laws = [law.at(*map(float, row)) for law, row in zip(self.laws, values, strict=True)]
+        s = in_s_plane(eigenvalues(closed(self.plants[member], laws)), self.dt)
+        return self._least_damped(s[np.isfinite(s)], self._modes[member])
 
     def _costs(self, plant: Plant, N: Matrix, s: Complex, laws: Sequence[LinearLaw]) -> Vector:
         """Return the cost of each axis: the integral of y_i or ``|y_i|`` after a step in v_i."""
