@@ -16,7 +16,8 @@ import pytest
 import quell as ql
 from quell.setup import SetupError, made_axes
 from quell.setup.axes import sweep_of_axes
-from quell.sweeping.runs import Measure, Plan, as_measures
+from quell.sweeping.measures import Measure, as_measures
+from quell.sweeping.runs import Plan
 from quell.tuning.report import toml_text
 
 from .commands import Shown
@@ -74,6 +75,45 @@ def test_a_measure_names_its_axis() -> None:
         )
     with pytest.raises(SetupError, match="sweep: missing"):
         sweep_of_axes(made_axes("a.toml", {k: v for k, v in gantry().items() if k != "sweep"}))
+
+
+@pytest.mark.parametrize(
+    ("metrics", "message"),
+    [
+        ([".rms"], r"metrics: '.rms': has no axis before the point; give rms, or AXIS.rms"),
+        ({"a": ".rms"}, r"'.rms': has no axis before the point"),
+        (["elbow."], "metrics: '' is unknown"),
+        (["rms", Measure("rms")], r"metrics\[1\] = Measure.*: a list has names"),
+        ([np.max], r"metrics\[0\] = <.*: a list has names"),
+        ({Measure("rms"): "rms"}, "the name of a measure must be a text"),
+        ({"": "rms"}, "the name of a measure must be a text"),
+        ({3: Measure("rms")}, "metrics: 3: the name of a measure must be a text"),
+    ],
+)
+def test_measures_without_a_name_of_their_own_are_refused(metrics: Any, message: str) -> None:
+    """A variable of the results needs one that is a text."""
+    with pytest.raises(ValueError, match=message):
+        as_measures(metrics)
+    with pytest.raises(ValueError, match="axis = 3: must be the name of an axis"):
+        Measure("rms", axis=3)  # type: ignore[arg-type]
+
+
+def test_an_unknown_axis_is_refused_before_anything_is_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The line has the name that was meant; nothing is written."""
+    setup = made_axes("gantry.toml", gantry())
+    given = sweep_of_axes(setup)
+    monkeypatch.setattr("quell.sweeping.runs.simulate", lambda *parts: pytest.fail("a run"))
+    given |= {"limits": {}, "workers": 1, "folder": tmp_path / "sweep"}
+    for metrics, message in (
+        (["xx.rms"], "metrics: xx.rms: the run has no axis 'xx', did you mean x"),
+        ({"late": Measure("rms", axis="z")}, "metrics: z.rms: the run has no axis 'z'"),
+        (["rms"], "metrics: rms: the run has several axes; name one, x.rms"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ql.sweep(**given | {"metrics": metrics})
+    assert not (tmp_path / "sweep").exists()
 
 
 def test_the_command_sweeps_and_repeats_a_run(quell: Callable[..., Shown], tmp_path: Path) -> None:

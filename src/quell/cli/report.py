@@ -297,7 +297,8 @@ def stored_alike(
     import numpy as np
 
     from quell.sweeping import Sweep
-    from quell.sweeping.runs import MANIFEST, measure_run
+    from quell.sweeping.measures import measure_run
+    from quell.sweeping.runs import MANIFEST
 
     if not (folder / MANIFEST).exists():
         return None

@@ -50,7 +50,8 @@ from quell.setup.schema import (
     read,
 )
 from quell.simulation.driver import Scenario
-from quell.sweeping.runs import Measure, as_values, hash_of
+from quell.sweeping.measures import Measure
+from quell.sweeping.runs import as_values, hash_of
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import SIMPLEST, range_of_u
 from quell.tuning.plants import with_known_noise

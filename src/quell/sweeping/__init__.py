@@ -3,7 +3,8 @@
 May import ``simulation``, ``records``, ``plants`` and what these import.
 """
 
-from quell.sweeping.runs import Measure, Normal, Plan, Range
+from quell.sweeping.measures import Measure
+from quell.sweeping.runs import Normal, Plan, Range
 from quell.sweeping.sweep import Sweep, sweep
 
 __all__ = ["Measure", "Normal", "Plan", "Range", "Sweep", "sweep"]

@@ -1,4 +1,4 @@
-"""Runs of a sweep: plan and values, what a worker does and measures, the folder.
+"""Runs of a sweep: plan and values, what a worker does, the folder.
 
 The plan of a sweep: the parameters, seed and name of each run.
 
@@ -24,7 +24,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +36,17 @@ from quell.lti.models import is_linear_model
 from quell.parallel import one_blas_thread
 from quell.plants.base import Plant, check_plant
 from quell.plants.linear import LinearPlant
-from quell.records.axes import AxesTrajectory
-from quell.records.metrics import MEASURES, SETTLING_BAND
 from quell.records.record import netcdf_of
-from quell.records.trajectory import Trajectory
 from quell.signals import Signal
 from quell.simulation.driver import Scenario, check_scenario
 from quell.simulation.simulate import simulate
+from quell.sweeping.measures import (
+    Measure,
+    Measures,
+    check_axis,
+    describe_measures,
+    measure_runs,
+)
 from quell.types import Matrix, Vector
 
 # ---- The values of a sweep's parameters ----
@@ -375,142 +379,6 @@ class Plan:
         return np.clip(shares, np.finfo(np.float64).tiny, 1.0 - np.finfo(np.float64).epsneg)
 
 
-# ---- Measures of each run that a sweep stores ----
-
-UNITS = {
-    "overshoot": ("overshoot, as a fraction of the step", "1"),
-    "settling_time": ("time after which y stays near the target", "s"),
-    "rise_time": ("time from 10 % to 90 % of the step", "s"),
-    "peak_error": ("largest |r - y|", "y-unit"),
-    "rms": ("root mean square of r - y", "y-unit"),
-    "iae": ("integral of |r - y|", "y-unit s"),
-    "ise": ("integral of (r - y)^2", "y-unit^2 s"),
-    "itae": ("integral of t |r - y|", "y-unit s^2"),
-    "control_variation": ("sum of the moves of u, without the first", "u-unit"),
-    "total_variation": ("sum of the moves of u", "u-unit"),
-}
-"""Description and unit of each measure, in files."""
-
-
-@dataclass(frozen=True)
-class Measure:
-    """A measure of ``Trajectory.metrics`` in a window of time.
-
-    Parameters
-    ----------
-    name
-        ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae``, ``control_variation``,
-        ``total_variation``, ``overshoot``, ``settling_time`` or ``rise_time``.
-    start, stop, target, band
-        as those of ``Trajectory.metrics``.
-    axis
-        name of the axis, of a run of several axes.
-
-    Raises
-    ------
-    ValueError
-        for an unknown measure, or a window that ends before it begins.
-    """
-
-    name: str
-    start: float = 0.0
-    stop: float | None = None
-    target: float | None = None
-    band: float = SETTLING_BAND
-    axis: str = ""
-
-    def __post_init__(self) -> None:
-        if self.name not in MEASURES:
-            hint = checks.nearest(str(self.name), MEASURES)
-            raise ValueError(f"metrics: {self.name!r} is unknown, {hint}")
-        checks.finite("start", self.start)
-        if self.stop is not None:
-            checks.interval("start", self.start, "stop", self.stop)
-        checks.optional(checks.finite, "target", self.target)
-        checks.positive("band", self.band)
-
-    @property
-    def window(self) -> tuple[Any, ...]:
-        """Start, stop, target and band."""
-        return self.start, self.stop, self.target, self.band
-
-
-Measures: TypeAlias = Mapping[str, Measure | Callable[[Any], float]]
-
-
-def as_measures(metrics: Any) -> Measures:
-    """Return the measures of a sweep by the name of their variable.
-
-    ``metrics`` has names of measures, or a measure or a function of a run for each name. Of several
-    axes the name of the axis stands before it, as ``"elbow.rms"``.
-    """
-    if isinstance(metrics, str) or not isinstance(metrics, Mapping | Sequence):
-        raise ValueError(f"metrics = {metrics!r:.60}: must be names, or measures by name")
-    if not isinstance(metrics, Mapping):
-        metrics = {name: name for name in metrics}
-    found: dict[str, Any] = {}
-    for name, each in metrics.items():
-        found[name] = _named(each) if isinstance(each, str) else each
-        if not isinstance(found[name], Measure) and not callable(found[name]):
-            rule = "must be a quell.sweeping.Measure, or a function of a Trajectory"
-            raise ValueError(f"metrics[{name!r}] = {each!r:.60}: {rule}")
-    if not found:
-        raise ValueError("metrics is empty: must name at least one measure")
-    return found
-
-
-def _named(text: str) -> Measure:
-    """Return the measure of a name, before which the name of an axis may stand."""
-    axis, _, name = text.rpartition(".")
-    return Measure(name, axis=axis)
-
-
-def measure_runs(
-    runs: Sequence[Trajectory | AxesTrajectory], measures: Measures
-) -> tuple[dict[str, Vector], list[str]]:
-    """Return each measure (runs,), NaN where there is none, and the error of each run, if any."""
-    values = {name: np.full(len(runs), np.nan) for name in measures}
-    errors = [""] * len(runs)
-    for i in range(len(runs)):
-        try:
-            for name, value in measure_run(runs[i], measures).items():
-                values[name][i] = value
-        except Exception as error:  # a function of the user's may raise anything
-            errors[i] = f"{type(error).__name__}: {error}"
-    return values, errors
-
-
-def measure_run(run: Trajectory | AxesTrajectory, measures: Measures) -> dict[str, float]:
-    """Return each measure of a run, NaN where there is none."""
-    windows: dict[tuple[Any, ...], dict[str, str]] = {}
-    for name, each in measures.items():
-        if isinstance(each, Measure):
-            windows.setdefault((each.axis, *each.window), {})[name] = each.name
-    values: dict[str, float] = {}
-    for (axis, start, stop, target, band), wanted in windows.items():
-        one = _one_axis(run, axis, wanted)
-        if one.diverged and one.window(start, np.inf).start >= len(one):  # ended before it
-            values |= dict.fromkeys(wanted, np.nan)
-            continue
-        found = one.metrics_of(tuple(wanted.values()), start, stop, target, band)
-        values |= {name: found.get(measure, np.nan) for name, measure in wanted.items()}
-    own = {name: each for name, each in measures.items() if not isinstance(each, Measure)}
-    return values | {name: float(function(run)) for name, function in own.items()}
-
-
-def _one_axis(run: Trajectory | AxesTrajectory, axis: str, wanted: Mapping[str, str]) -> Trajectory:
-    """Return the record that measures of an axis are taken of."""
-    first = next(iter(wanted.values()))
-    if isinstance(run, Trajectory):
-        if axis:
-            raise ValueError(f"metrics: {axis}.{first}: the run has one axis; give {first}")
-        return run
-    if not axis:
-        example = f"{run.axis_names[0]}.{first}" if run.axis_names else first
-        raise ValueError(f"metrics: {first}: the run has several axes; name one, {example}")
-    return run.axis(axis)
-
-
 # ---- The runs of a part of a sweep ----
 
 ERROR = -1
@@ -606,6 +474,9 @@ def built(job: Job, part: Part, run: int) -> Parts:
     check_plant(plant)
     check_controller(controller, several=True)
     check_scenario(scenario)
+    for each in job.measures.values():
+        if isinstance(each, Measure):
+            check_axis(each.axis, each.name, _axes_of(controller))
     if not job.takes_seed and is_random(scenario):
         scenario = replace(scenario, seed=seed)
     return Parts(plant, controller, scenario)
@@ -672,6 +543,10 @@ def _batch_key(parts: Parts) -> Hashable:
 
 def _is_of_axes(controller: Any) -> bool:
     return hasattr(controller, "inputs")
+
+
+def _axes_of(controller: Any) -> tuple[str, ...] | None:
+    return tuple(getattr(controller, "names", ())) if _is_of_axes(controller) else None
 
 
 def _run_group(job: Job, group: Sequence[tuple[int, Parts]], outcome: Outcome) -> None:
@@ -779,21 +654,6 @@ class Store:
 def parameter_variable(name: str) -> str:
     """Return the name of a parameter's variable: a slash would be a group of the file."""
     return f"parameter_{name.replace('/', '_')}"
-
-
-def describe_measures(measures: Measures) -> dict[str, Any]:
-    """Return the attributes of the variable of each measure."""
-    found: dict[str, Any] = {}
-    for name, each in measures.items():
-        if isinstance(each, Measure):
-            about, unit = UNITS[each.name]
-            window: dict[str, Any] = {"start": each.start, "stop": each.stop}
-            window |= {"target": each.target, "axis": each.axis or None}
-            given = {key: value for key, value in window.items() if value is not None}
-            found[name] = {"long_name": about, "units": unit, **given, "band": each.band}
-        else:
-            found[name] = {"long_name": getattr(each, "__qualname__", type(each).__name__)}
-    return found
 
 
 def open_store(folder: str | os.PathLike[str]) -> Store:

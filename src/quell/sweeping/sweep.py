@@ -30,14 +30,13 @@ from quell.plants.base import signals_of
 from quell.quantities import UNKNOWN, Signals
 from quell.records.trajectory import Trajectory
 from quell.simulation.simulate import simulate
+from quell.sweeping.measures import as_measures, describe_measures
 from quell.sweeping.runs import (
     Job,
     Parts,
     Plan,
     Store,
-    as_measures,
     built,
-    describe_measures,
     existing_store,
     hash_of,
     name_of,
