@@ -97,3 +97,39 @@ def test_the_input_that_holds_a_pose_is_found() -> None:
         held_at(ql.plants.MultivariableLinearPlant(np.eye(1), np.eye(1), np.eye(1)), [0.0])
     with pytest.raises(ValueError, match=r"points = \[\]"):
         analyse_points(robot, axes(robot), [])
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (5, "points = 5: must be a list of operating points"),
+        ("here", "points = 'here': must be a list of operating points"),
+        ({"x": [0.0] * 4}, "must be a list of operating points"),
+        ([3], r"points = \[3\]: must be a list of operating points.* write \[\[…\]\]"),
+        ([0.0, 0.1, 0.0, 0.0], r"of one state write \[\[…\]\]"),
+        (np.zeros(4), r"of one state write \[\[…\]\]"),
+        ([[0.0] * 4, 3.0], r"points\[1\]: operating point 3.0: must be a state of 4 entries"),
+        ([[0.0] * 4, None], r"points\[1\]: operating point None: must be a state of 4 entries"),
+        (
+            [[0.0] * 3],
+            r"points\[0\]: operating point .*: must be a state of 4 entries, or \(x, u\)",
+        ),
+        (
+            ([0.0] * 4, [1.0, 2.0]),
+            r"points\[1\]: operating point \[1.0, 2.0\]: must be a state of 4",
+        ),
+        ([([0.0] * 4, [1.0])], r"points\[0\]: u has shape"),
+    ],
+)
+def test_what_is_no_list_of_points_is_refused(points: object, message: str) -> None:
+    """By the name of the argument and the number of the point; a single state is the likely slip."""
+    robot = ql.plants.arm(gravity=0.0, viscous=0.1)
+    with pytest.raises(ValueError, match=message):
+        analyse_points(robot, axes(robot), points)  # type: ignore[arg-type]
+
+
+def test_points_may_be_the_rows_of_an_array() -> None:
+    """As they come from a grid."""
+    robot = ql.plants.arm(gravity=0.0, viscous=0.1)
+    rows = analyse_points(robot, axes(robot), np.array(POSES))  # type: ignore[arg-type]
+    assert rows.summary() == analysed(False, POSES).summary()

@@ -28,7 +28,7 @@ from quell.analysis.matrices import estimates_at, gain_at
 from quell.analysis.multivariable import MultivariableLoop, analyse_axes
 from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none
-from quell.plants.linearise import held_at
+from quell.plants.linearise import held_points
 from quell.types import Matrix, Vector
 
 # Step of the estimates for the derivative of B0, and the share of s^n at the peak of S from which
@@ -187,14 +187,12 @@ def analyse_points(plant: Any, axes: Axes, points: Sequence[Any]) -> LoopsAtPoin
     >>> found.stable, round(found.disk_margin("inputs")[0], 1)
     (True, 0.8)
     """
-    given = [held_at(plant, each) for each in points]
-    if not given:
-        raise ValueError("points = []: give at least one state, or (x, u)")
+    given = held_points("points", plant, points)
     loops = tuple(analyse_axes(plant, axes, point) for point in given)
     stiffness = np.array(
         [_stiffness(axes, plant, each, loop) for each, loop in zip(given, loops, strict=True)]
     )
-    return LoopsAtPoints(tuple(given), loops, stiffness, callable(axes.B0) or callable(axes.M))
+    return LoopsAtPoints(given, loops, stiffness, callable(axes.B0) or callable(axes.M))
 
 
 def _stiffness(

@@ -96,6 +96,28 @@ def linearised(plant: Any, x: Any, u: Any = 0.0, *, w: Any = None, t: float = 0.
     raise ValueError(f"plant = {getattr(plant, 'name', plant)!r}: {rule}")
 
 
+def held_points(name: str, plant: Any, points: Any) -> tuple[tuple[Vector, Vector], ...]:
+    """Return the operating points (x, u) of a list of them, each as ``held_at`` does.
+
+    ``name`` is that of the argument. Raises ``ValueError`` for what is no list of points, an empty
+    one, and as ``held_at``.
+    """
+    rule = "must be a list of operating points, states x or (x, u)"
+    if not _has_entries(points):
+        raise ValueError(f"{name} = {points!r:.60}: {rule}")
+    if len(points) == 0:
+        raise ValueError(f"{name} = []: give at least one state, or (x, u)")
+    if _of_several_signals(plant).order > 1 and not any(_has_entries(each) for each in points):
+        raise ValueError(f"{name} = {points!r:.60}: {rule}; of one state write [[…]]")
+    found = []
+    for i, each in enumerate(points):
+        try:
+            found.append(held_at(plant, each))
+        except ValueError as error:
+            raise ValueError(f"{name}[{i}]: {error}") from None
+    return tuple(found)
+
+
 def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
     """Return an operating point (x, u) of a plant with several signals; u holds x at rest.
 
@@ -112,18 +134,15 @@ def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
     ValueError
         for another plant, a state of unsuitable length, and one that no u holds at rest.
     """
-    while isinstance(plant, DelayedInputs | EncodedOutputs):
-        plant = plant.plant
-    if not isinstance(plant, MultivariableNonlinearPlant):
-        name = getattr(plant, "name", plant)
-        raise ValueError(
-            f"plant = {name!r}: must be a nonlinear plant with several signals; a linear one is "
-            "the same at all points"
-        )
-    if len(point) == 2 and np.ndim(point[0]) > 0:
+    plant = _of_several_signals(plant)
+    if isinstance(point, list | tuple) and len(point) == 2 and np.ndim(point[0]) > 0:
         x = checks.vector("x", point[0], plant.order)
         return x, checks.vector("u", point[1], plant.inputs)
-    x = checks.vector("x", point, plant.order)
+    try:
+        x = checks.vector("x", point, plant.order)
+    except ValueError:
+        rule = f"must be a state of {plant.order} entries, or (x, u)"
+        raise ValueError(f"operating point {point!r:.60}: {rule}") from None
     model: Any = plant.sampled(1.0, interpret=True)
     w = np.zeros(plant.disturbances)
 
@@ -140,6 +159,23 @@ def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
             "a state with rates of zero, and of an elastic joint with its deflection, or (x, u)"
         )
     return x, u
+
+
+def _has_entries(value: Any) -> bool:
+    return checks.is_sequence(value) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
+def _of_several_signals(plant: Any) -> MultivariableNonlinearPlant:
+    """Return a nonlinear plant with several signals, without its delays and encoders."""
+    while isinstance(plant, DelayedInputs | EncodedOutputs):
+        plant = plant.plant
+    if not isinstance(plant, MultivariableNonlinearPlant):
+        name = getattr(plant, "name", plant)
+        raise ValueError(
+            f"plant = {name!r}: must be a nonlinear plant with several signals; a linear one is "
+            "the same at all points"
+        )
+    return plant
 
 
 def _with_spring_of(plant: CubicSpringPlant, x: Vector) -> LinearPlant:
