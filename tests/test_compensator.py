@@ -196,6 +196,7 @@ def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
         (ql.ADRC(OBSERVER, 3.0), {}, "has an observer"),
         (None, {}, "must be a controller"),
         (PID, {"speeds": 0.9}, "speeds"),
+        (PID, {"constraints": 3}, "constraints = 3: must be quell.tuning.Constraints"),
         (PID, {"speeds": (0.9, 1.0, 1.1)}, "speeds"),
         (PID, {"speeds": (0.0, 1.2)}, "must be a factor up to 1"),
     ],

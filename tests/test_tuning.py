@@ -478,6 +478,7 @@ def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
             {"plant": lambda a: ([a], [1.0, 1.0]), "uncertain": {"b": (1.0, 2.0)}},
             "uncertain: plant can't be called with these: missing a required argument: 'a'",
         ),
+        ({"constraints": 3}, "constraints = 3: must be quell.tuning.Constraints"),
         ({"scenario": 3.0}, "scenario = 3.0: must be a quell.Scenario"),
         ({"scenario": [3.0]}, r"scenario\[0\] = 3.0: must be a quell.Scenario"),
     ],

@@ -20,7 +20,7 @@ from quell.analysis import MultivariableLoop, analyse_axes
 from quell.lti.models import System, zero_order_hold
 from quell.setup import SetupError, load_axes, made_axes
 from quell.tuning import Constraints, TunedAxes, tune_axes
-from quell.tuning.axes import _exact, _nominal, diagonal_entry
+from quell.tuning.axes import _exact, _made, _nominal, diagonal_entry
 from quell.tuning.optimiser.coupled import CoupledLoops, Law, Limits, Plant, integral_gain
 from quell.tuning.optimiser.loops import area_of_step, pulse_in_blocks
 
@@ -162,6 +162,10 @@ def test_learners_and_limits_stay_and_are_not_in_the_bounds() -> None:
         ({"operating_points": [[0.0] * 4]}, "a linear one is the same at all points"),
         ({"operating_points": []}, r"operating_points = \[\]"),
         ({"check_samples": 0, "B0_off": 0.02}, "check_samples"),
+        ({"seed": -1}, "seed = -1"),
+        ({"constraints": 3}, "constraints = 3: must be quell.tuning.Constraints"),
+        ({"operating_points": 5}, "operating_points = 5: must be a list of operating points"),
+        ({"operating_points": "here"}, "operating_points = 'here': must be a list"),
     ],
 )
 def test_bad_arguments_are_named(how: dict[str, Any], message: str) -> None:
@@ -180,6 +184,42 @@ def test_an_axis_that_cannot_be_tuned_is_named() -> None:
         tune_axes(([[0.0]], [[1.0]], [[1.0]]), axes())
     with pytest.raises(ValueError, match="must be quell.Axes"):
         tune_axes(machine(), axes().axes[0])  # type: ignore[arg-type]
+
+
+def test_axes_that_have_no_bandwidths_of_their_own_are_refused() -> None:
+    """Compensators have no law, and axes that share a learner one lag filter; the error says what to do."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=DT)
+    with pytest.raises(ValueError, match="axes: NOT tuned, they are compensators"):
+        tune_axes(machine(), ql.Axes([ql.Compensator(observer)] * 2, M=M))
+    shared = ql.Axes([ql.ADRC(observer, 8.0)] * 2, M=M, learner=of_all())
+    with pytest.raises(ValueError, match="learner: NOT tuned with one for all axes"):
+        tune_axes(machine(), shared)
+
+
+def of_all() -> Any:
+    """Return a learner that sees the states of all axes."""
+    return ql.learners.RLS(ql.features.AllAxes(ql.features.State()))
+
+
+def test_learners_of_all_axes_are_designed_for_the_tuned_bandwidths_and_told() -> None:
+    """Parameters are those of axes that are made with these bandwidths; the margins don't have what they learn."""
+    values = np.array([[20.0, 300.0], [30.0, 150.0]])
+    one = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=DT), 8.0)
+    made = _made(ql.Axes([one, one], M=M, learner=[of_all(), of_all()]), values)
+    fresh = ql.Axes(
+        [
+            ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=omega_o, dt=DT), omega_c)
+            for omega_c, omega_o in values.tolist()
+        ],
+        M=M,
+        learner=[of_all(), of_all()],
+    )
+    for mine, theirs in zip(made.axes, fresh.axes, strict=True):
+        assert repr(mine.parameters.learner) == repr(theirs.parameters.learner)
+        assert mine.learner.view.observers[0].omega_o == 300.0
+    told = "NOT in any margin: what learners learn from the states of other axes"
+    assert told in replace(tuned(), controller=made).summary()
+    assert told not in tuned().summary()
 
 
 def test_the_diagonal_entry_has_no_poles_of_the_other_axes() -> None:

@@ -50,17 +50,16 @@ from quell.analysis.matrices import (
     sampled_matrices,
 )
 from quell.analysis.multivariable import MultivariableLoop, analyse_axes
-from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
 from quell.learners.base import NoLearner
 from quell.lti.zeros import invariant_zeros
 from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
-from quell.plants.linearise import held_at
+from quell.plants.linearise import held_points
 from quell.plants.multivariable import MultivariableLinearPlant, delayed_inputs
 from quell.sweeping.sweep import share_interval
-from quell.tuning.constraints import Constraints
+from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.optimiser.coupled import (
     UNSTABLE,
     CoupledLoops,
@@ -163,7 +162,8 @@ def tune_axes(
     ------
     ValueError
         for arguments out of range, a plant that does not fit or is sampled, an axis that cannot be
-        tuned alone (it is named), or one whose law is not linear.
+        tuned alone (it is named), one whose law is not linear, axes of compensators, and those
+        with one learner for all.
 
     Examples
     --------
@@ -188,15 +188,13 @@ def tune_axes(
     least = checks.optional(checks.positive, "disk", disk) or _disk_of(bounds)
     if least >= 2.0:
         raise ValueError(f"disk = {disk!r}: must be below 2, the margin without any feedback")
-    for name, axis in zip(axes.names, axes.axes, strict=True):
-        _check_linear(name, axis)
+    _check_tunable(axes)
     checks.whole("check_samples", check_samples, 1)
+    checks.whole("seed", seed, 0)
     report = progress or (lambda part, share: None)
     points: list[Any] = [None]
     if operating_points is not None:
-        points = [held_at(plant, each) for each in operating_points]
-    if not points:
-        raise ValueError("operating_points = []: give at least one state, or leave it out")
+        points = list(held_points("operating_points", plant, operating_points))
     nominal = _nominal(plant, axes, points)
     parts = len(axes.names) + 2
     alone: dict[str, Tuned] = {}
@@ -250,7 +248,7 @@ def tune_axes(
 
 
 def _checked_bounds(given: Constraints | None) -> Constraints:
-    bounds = given or Constraints()
+    bounds = given_constraints(given)
     for name in _NOT_HERE:
         if getattr(bounds, name) is not None:
             raise ValueError(
@@ -267,14 +265,27 @@ def _disk_of(bounds: Constraints) -> float:
     return 1.0 / math.sqrt(0.5 * (m_s**2 + m_t**2) - 0.25)
 
 
-def _check_linear(name: str, axis: ADRC) -> None:
-    if axis.feedback is not None:
-        raise ValueError(f"axis {name}: feedback is not linear; tune without it")
-    if axis.observer.disturbance_order > 1:
+def _check_tunable(axes: Axes) -> None:
+    """Raise a ``ValueError`` for axes whose bandwidths cannot be tuned."""
+    if axes.compensates:
         raise ValueError(
-            f"axis {name}: disturbance_order = {axis.observer.disturbance_order} of its observer: "
-            "must be 1"
+            "axes: NOT tuned, they are compensators, which have no omega_c, and whose loops others "
+            "close; tune_compensator tunes one for its own controller"
         )
+    if axes.learning.learns and axes.learning.is_shared:
+        raise ValueError(
+            "learner: NOT tuned with one for all axes: its features pass through one lag filter, "
+            "so that all omega_o would have to be equal; tune axes without it, or give a list with "
+            "a learner for each axis"
+        )
+    for name, axis in zip(axes.names, axes.axes, strict=True):
+        if axis.feedback is not None:
+            raise ValueError(f"axis {name}: feedback is not linear; tune without it")
+        if axis.observer.disturbance_order > 1:
+            raise ValueError(
+                f"axis {name}: disturbance_order = {axis.observer.disturbance_order} of its "
+                "observer: must be 1"
+            )
 
 
 def _nominal(plant: Any, axes: Axes, points: Sequence[Any]) -> list[Plant]:
@@ -493,12 +504,15 @@ def _tightened(limits: Limits, share: float) -> Limits:
 
 
 def _made(axes: Axes, values: Matrix) -> Axes:
-    """Return axes with these bandwidths, at their start."""
+    """Return axes with these bandwidths, at their start, as if they were made with them."""
     made = copy.copy(axes)
     for axis, (omega_c, omega_o) in zip(made.axes, values.tolist(), strict=True):
         axis.retune(omega_c=omega_c, observer=with_gains(axis.observer, 1.0, omega_o))
-    made._update_parameters()
-    made._pack_again()
+        # A learner keeps its scales when a running axis is retuned.
+        axis._learner_omega_c = omega_c
+        axis._initialise()
+    made.learning.update(made.axes)
+    made._initialise()
     return made
 
 

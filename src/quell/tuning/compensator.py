@@ -37,7 +37,7 @@ from quell.controllers.compensator import Compensator
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
-from quell.tuning.constraints import Constraints
+from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.optimiser.loops import Inputs, PlantSet, law_of, load_step, response
 from quell.tuning.plants import Given, given_plants, model_of, plant_set
 from quell.tuning.report import toml_text
@@ -217,7 +217,7 @@ def tune_compensator(
             f"controller = {controller!r}: its loop with the plant is unstable; a compensator "
             "needs one that is stable without it"
         )
-    bounds = constraints or Constraints(m_s=_PEAKS, m_t=_PEAKS, damping=None)
+    bounds = given_constraints(constraints, Constraints(m_s=_PEAKS, m_t=_PEAKS, damping=None))
     if bounds.m_ks is None:
         bounds = replace(bounds, m_ks=_NOISE * before.m_ks)
     model = model_of(given, plants.all, bounds)

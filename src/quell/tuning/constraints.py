@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from quell import checks
 
@@ -124,3 +125,12 @@ class Constraints:
             ("|p| dt ≤ {:g} for poles of observers and filters", self.omega_o_dt),
         ]
         return ", ".join(text.format(value) for text, value in parts if value is not None)
+
+
+def given_constraints(given: Any, default: Constraints | None = None) -> Constraints:
+    """Return the constraints that a user gave, or the default ones for None."""
+    if given is None:
+        return Constraints() if default is None else default
+    if not isinstance(given, Constraints):
+        raise ValueError(f"constraints = {given!r:.60}: must be quell.tuning.Constraints(m_s=…)")
+    return given

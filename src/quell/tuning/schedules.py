@@ -36,7 +36,7 @@ from quell.files import nonfinite_to_none, written_atomically
 from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
-from quell.tuning.constraints import Constraints
+from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import range_of_u
 from quell.tuning.optimiser.loops import area_of_step
 from quell.tuning.plants import Given, given_plants, with_known_noise
@@ -381,7 +381,7 @@ def tune_schedule(
     limits = {k: v for k, v in options.items() if k in ("u_min", "u_max", "rate_limit")}
     # The scaled plants below have no encoder.
     bounds = with_known_noise(
-        options.get("constraints") or Constraints(), plant_at(grid[0]), range_of_u(limits)
+        given_constraints(options.get("constraints")), plant_at(grid[0]), range_of_u(limits)
     )
     how: dict[str, Any] = {"structure": structure, "order": order, "compare": (), **late, **options}
     how["constraints"] = bounds

@@ -18,7 +18,7 @@ from quell.plants.base import signals_of
 from quell.plants.linear import LinearPlant
 from quell.signals.shapes import Signal
 from quell.tuning.by_simulation import tune_by_simulation
-from quell.tuning.constraints import Constraints
+from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import (
     SIMPLEST,
     Task,
@@ -184,7 +184,7 @@ def tune(
     """
     u_limits = range_of_u(limits)
     if uncertain is None:
-        constraints = with_known_noise(constraints or Constraints(), as_list(plant)[0], u_limits)
+        constraints = with_known_noise(given_constraints(constraints), as_list(plant)[0], u_limits)
     if scenario is not None or not isinstance(objective, str) or objective not in OBJECTIVES:
         how: dict[str, Any] = {"structure": structure, "order": order, "constraints": constraints}
         how |= {"compare": compare, "delay": delay, "actuator_lag": actuator_lag, "setup": setup}
@@ -223,7 +223,7 @@ def tune(
     if setup is None or "scenario" not in setup:
         known_rest = rest_within(LinearPlant.of(given.linear[0]), known_rest, u_limits)
     plants = plant_set(given, dt)
-    bounds = constraints or Constraints()
+    bounds = given_constraints(constraints)
     model = model_of(given, plants, bounds)
     late = float(np.ravel(delay)[0]) + actuator_lag
     known = as_list(plant)[0] if operating_point is None else given.linear[0]

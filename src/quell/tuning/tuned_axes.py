@@ -87,7 +87,8 @@ class TunedAxes:
     Attributes
     ----------
     controller : Axes
-        the axes with their bandwidths, and learners, guards and limits as they were.
+        axes with the bandwidths, at their start: the kinds of learners, guards and limits are as
+        they were, what was learned before is not in them.
     axes : tuple of AxisResult
         bandwidths and figures of each axis.
     loops : tuple of MultivariableLoop
@@ -191,8 +192,11 @@ class TunedAxes:
             lines.append(
                 "NOT proved for fast motion: margins are those of B0 held at each operating point"
             )
-        if getattr(self.controller, "learner", None) is not None:
-            lines.append("NOT in any margin: the learner that sees all axes; simulate with it")
+        if self.controller.learning.learns:
+            lines.append(
+                "NOT in any margin: what learners learn from the states of other axes; simulate "
+                "with them"
+            )
         loop = self.with_learners
         if loop is not None:
             if not loop.stable:
