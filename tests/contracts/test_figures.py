@@ -126,6 +126,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     add_on = ql.tuning.tune_compensator(([1.0], [1.0, 1.0, 0.0]), pid, speeds=(1.0, 1.0))
     axes = ql.Axes([adrc(), adrc()])
     lags = ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2))
+    coupled = ql.tuning.tune_axes(lags, axes)
     machine = ql.simulate(lags, axes, ql.Scenario((1.0, 0.5), duration=1.0))
     points = {at: ql.plants.LinearPlant.of(([at], [1.0, 1.0])) for at in (1.0, 2.0)}
     schedule = ql.tune_schedule(points, DT)
@@ -133,6 +134,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         "Trajectory": Case(run.plot, 5),
         "axes": Case(machine.plot, 7),
         "tuned schedule": Case(schedule.plot, 3),
+        "tuned axes": Case(coupled.plot, 2),
         "BatchTrajectory": Case(batch.plot, 2),
         "Tuned": Case(tuned.plot, 4),
         "TunedCompensator": Case(add_on.plot, 1),
@@ -189,6 +191,7 @@ _PUBLIC = {
     "tuning/schedules.py plot": "tuned schedule",
     "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory
     "tuning/tuned.py plot": "Tuned",
+    "tuning/tuned_axes.py plot": "tuned axes",
     "tuning/compensator.py plot": "TunedCompensator",
     "identification/result.py plot": "Identified",
     "commissioning.py plot": "Verification",

@@ -164,9 +164,9 @@ def measure_run(run: Trajectory | AxesTrajectory, measures: Measures) -> dict[st
 
 def _one_axis(run: Trajectory | AxesTrajectory, axis: str, wanted: Mapping[str, str]) -> Trajectory:
     """Return the record that measures of an axis are taken of."""
-    alone = isinstance(run, Trajectory)
-    check_axis(axis, next(iter(wanted.values())), None if alone else run.axis_names)
-    return run if alone else run.axis(axis)
+    axes = None if isinstance(run, Trajectory) else run.axis_names
+    check_axis(axis, next(iter(wanted.values())), axes)
+    return run if isinstance(run, Trajectory) else run.axis(axis)
 
 
 def check_axis(axis: str, name: str, axes: Sequence[str] | None) -> None:
