@@ -222,6 +222,14 @@ def test_learners_of_all_axes_are_designed_for_the_tuned_bandwidths_and_told() -
     assert told not in tuned().summary()
 
 
+def test_what_the_margin_with_learners_does_not_have_is_told() -> None:
+    """Remarks of that loop on learners; those on other operating points are told in other words."""
+    loop = copy.copy(tuned().loops[0])
+    loop.remark = "NOT in these margins: how MLP of x adapts\nNOT judged at other points"
+    lines = replace(tuned(), with_learners=loop).verdicts()
+    assert lines[-1] == "NOT in these margins: how MLP of x adapts"
+
+
 def test_the_diagonal_entry_has_no_poles_of_the_other_axes() -> None:
     """Of a coupled plant in unlike units, the response is that of the state space."""
     A = np.array([[0, 1, 0, 0], [-40.0, -2, 3, 0], [0, 0, 0, 1], [0, 0, -9e4, -30.0]])

@@ -206,6 +206,8 @@ class TunedAxes:
                 lines.append(
                     f"with the learners at rest the disk margin is {d:.3f}, which no bound is for"
                 )
+            told = loop.remark.splitlines()
+            lines += [line for line in told if line.startswith("NOT in these margins")]
         return lines
 
     def _remedy(self) -> str:
