@@ -424,7 +424,9 @@ class Axes(StatefulController):
 
     @property
     def derivatives(self) -> tuple[int, ...]:
-        """Number of derivatives of the reference that each axis feeds forward."""
+        """Number of derivatives of each reference that are fed forward; of u_0 none."""
+        if self.takes_u_0:
+            return (0,) * self.inputs
         return tuple(axis.derivatives for axis in self.axes)
 
     @property
@@ -461,7 +463,7 @@ class Axes(StatefulController):
             self._actuators,
             self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
-            np.array(self.derivatives, dtype=np.int64),
+            np.array([axis.derivatives for axis in self.axes], dtype=np.int64),
             safe_axes_design(self._has_bands, self._gain.weights),
             given_design(self.compensates, self.drives),
         )
