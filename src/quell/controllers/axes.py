@@ -169,7 +169,7 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     flags = take_references(design.given, state.given, state.gain, r, y, state.wish)
     look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags |= ask_axes(design.axes, state.axes, 0, state.wish, y, state.v, state.x)
-    learn_of_all(design.learning, state.learning, design.axes, state.axes)
+    flags |= learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
