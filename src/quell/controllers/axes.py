@@ -369,6 +369,7 @@ class Axes(StatefulController):
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self.drives = checked_drives(drives, self.names, self.inputs, self.dt)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        self._check_safe_sets(self._actuators)
         self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
         self.learning.attach(self.axes)
         self._initialise()
@@ -449,9 +450,11 @@ class Axes(StatefulController):
         """Limits of the actuators (m,): ``low``, ``high``, and the largest changes in a sample."""
         return self._actuators
 
-    def _update_parameters(self) -> None:
+    def _check_safe_sets(self, limits: ActuatorLimits) -> None:
         safe_sets = [axis.safe_set for axis in self.axes]
-        check_safe_sets(safe_sets, self.names, self._gain.first, self._actuators)
+        check_safe_sets(safe_sets, self.names, self._gain.first, limits)
+
+    def _update_parameters(self) -> None:
         designs: Any = NoAxis()
         for axis in reversed(self.axes):
             designs = AxisDesigns(axis.parameters, designs)
@@ -464,7 +467,7 @@ class Axes(StatefulController):
             self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
             np.array([axis.derivatives for axis in self.axes], dtype=np.int64),
-            safe_axes_design(self._has_bands, self._gain.weights),
+            safe_axes_design([axis.safe_set for axis in self.axes], self._gain.weights),
             given_design(self.compensates, self.drives),
         )
 
@@ -642,10 +645,13 @@ class Axes(StatefulController):
     def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
         """Change limits of the actuators while running; what is not given stays.
 
-        Parameters are those of ``Axes``. The next ``step`` is within the new limits of u.
+        Parameters are those of ``Axes``. The next ``step`` is within the new limits of u. Raises
+        ``ValueError`` as for new ``Axes``; then the limits are unchanged.
         """
         given = (u_min, u_max, rate_limit)
-        self._actuators = changed_actuator_limits(self._actuators, *given, self.inputs, self.dt)
+        new = changed_actuator_limits(self._actuators, *given, self.inputs, self.dt)
+        self._check_safe_sets(new)
+        self._actuators = new
         self._update_parameters()
         self._pack_again()
 
