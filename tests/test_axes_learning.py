@@ -204,6 +204,29 @@ class TestOperation:
         assert np.all(np.isfinite(u))
         assert np.any(before != u)
 
+    def test_the_order_of_axes_does_not_matter(self) -> None:
+        """With two bandwidths: one learner for all has the frequency of the slowest axis."""
+        found = []
+        for order in (1, -1):
+            axes = [joint(), ql.ADRC(joint().observer, 24.0)][::order]
+            learning = ql.Axes(axes, learner=RLS(AllAxes(State()) + Bias())).parameters.learning
+            linear = learning.shared.linear
+            found.append([linear.inputs.gate.forget, linear.rule.forget])
+            floors = np.split(linear.inputs.scaling.floors[:4], 2)
+            assert np.array_equal(*floors)
+        assert found[0] == found[1]
+
+    @pytest.mark.parametrize("name", ["RLS for all", "RLS for each"])
+    def test_a_copy_designs_its_own_learners(self, name: str) -> None:
+        """Retuning one of both does not reach the other."""
+        axes = axes_with(KINDS[name]())
+        twin = copy.copy(axes)
+        view, before = axes.axes[0].learner, axes.learning._view
+        twin.retune("elbow", omega_c=6.0)
+        assert twin.learning is not axes.learning
+        assert axes.axes[0].learner is view
+        assert axes.learning._view is before
+
     def test_another_observer_needs_a_learner_for_each(self) -> None:
         """Features that all axes share pass through one filter."""
         faster = ql.ESO.model_free(order=2, b0=1.0, omega_o=80.0, dt=DT)
@@ -372,6 +395,9 @@ def test_an_axis_does_not_run_alone() -> None:
             lambda axis=axis: ql.simulate(plant, axis, ql.Scenario(1.0, duration=0.01)),
             lambda axis=axis: c_source(axis, "axis"),
             lambda axis=axis: ql.Axes([axis, joint()]),
+            lambda axis=axis: axis.step(0.1, 0.0),
+            lambda axis=axis: axis.track(0.1, 0.0, 0.0),
+            lambda axis=axis: axis.prepare_retune(omega_c=6.0),
         ):
             with pytest.raises(ValueError, match="needs the signals of all axes"):
                 use()

@@ -310,7 +310,8 @@ class Axes(StatefulController):
     learner
         one that sees the states of all axes, with features ``AllAxes(...)``: one for all axes,
         which have one gain and θ of their own (``RLS``, ``NLMS``), or a list or dictionary with one
-        for each, None for an axis without. A learner that sees its own axis belongs into its ADRC.
+        for each, None for an axis without. One for all takes its frequency from the slowest axis.
+        A learner that sees its own axis belongs into its ADRC.
     guard
         of these learners: a description, of which each axis has its own guard, or one for each.
 
@@ -705,6 +706,7 @@ class Axes(StatefulController):
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
         self.axes = tuple(copy.copy(axis) for axis in self.axes)
+        self.learning = copy.copy(self.learning)  # it designs the learners of these axes again
         self._gain = self._checked_gain()
         self._initialise()
         self.state = kept["state"]

@@ -394,7 +394,8 @@ class LearningOfAxes:
     def _design_for(self, axes: Sequence[ADRC]) -> None:
         self._view = AxesView(self._names, tuple(axis.observer for axis in axes))
         if self.is_shared:
-            omega_c = float(axes[0]._learner_omega_c)
+            # Scales and memory are for the slowest axis: shorter ones would be too short for it.
+            omega_c = min(float(axis._learner_omega_c) for axis in axes)
             self._shared = SharedLearner(self.learner, self._view, omega_c)
 
     def _learner_of(self, i: int) -> Any:

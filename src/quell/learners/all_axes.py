@@ -681,7 +681,11 @@ class OneOutput:
 
 
 class SharedLearner:
-    """One linear learner with an output for each axis; ``Axes`` makes it."""
+    """One linear learner with an output for each axis; ``Axes`` makes it.
+
+    Its frequency, from which scales, thresholds of noise and the time of its memory follow, is
+    ``omega_c``, the least of all axes, unless the learner gives one.
+    """
 
     def __init__(self, learner: Any, view: AxesView, omega_c: float) -> None:
         if not isinstance(learner, Linear):
