@@ -51,7 +51,6 @@ from quell.controllers.base import (
     RateLimit,
     change_parameters,
     changed_limits,
-    check_runs_alone,
     checked_limits,
     reset_loop,
 )
@@ -702,14 +701,6 @@ class Compensator(StatefulController):
         )
         state.loop[0].has_reference = has_reference_at_start(design.feedforward)
         return state
-
-    def prepare(self) -> None:
-        """Compile ``step``, or load it from the disk cache, so that its first call is fast.
-
-        Raises ``ValueError`` for an axis of ``quell.Axes`` whose learner sees all axes.
-        """
-        check_runs_alone("step", self)
-        super().prepare()
 
     def step(self, u_0: float, y: float) -> float:
         """Take one sample: return the control signal [u-unit] for u_0 and the measurement.
