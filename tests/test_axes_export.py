@@ -55,6 +55,11 @@ def guarded() -> list[ql.ADRC]:
     return [joint(safe_set=wide), joint(1, safe_set=narrow), joint()]
 
 
+def stated() -> ql.SafeSet:
+    """Return a band with the largest v that errors of B0 are a share of."""
+    return ql.SafeSet(-1.0, 1.0, alpha=8.0, f_rate=1.0, gain_error=0.02, largest_u=24.0)
+
+
 def adding() -> list[ql.Compensator]:
     """Return compensators of axes, with a learner and with a safe set."""
     first, second = (ql.ESO.model_free(order, 1.0, 60.0, DT) for order in (2, 1))
@@ -103,6 +108,9 @@ ROWS: dict[str, Any] = {
     "one axis": lambda: ql.Axes([joint()]),
     "nested tuples": lambda: ql.Axes([joint(), joint()], gain_functions.nested_tuples, **LIMITS),
     "an array as M": lambda: ql.Axes([joint(), joint()], M=gain_functions.array, **LIMITS),
+    "a function, whose v may be larger than stated": lambda: ql.Axes(
+        [joint(safe_set=stated()), joint()], gain_functions.nested_tuples, **LIMITS
+    ),
     "a function, more actuators": lambda: ql.Axes(
         [joint(), joint()], gain_functions.wide, weights=[1, 2, 1], **LIMITS
     ),

@@ -14,6 +14,8 @@ import quell as ql
 from quell import analysis
 from quell.analysis.disk import best_scales, worst_change
 from quell.analysis.multivariable import MultivariableLoop
+from quell.features import AllAxes, Bias, State
+from quell.kernels.dispatch import as_python
 from quell.lti.models import zero_order_hold
 
 DT = 1e-3
@@ -400,3 +402,122 @@ def test_what_is_no_loop_of_axes_is_refused() -> None:
     sampled = control.ss(0.5 * np.eye(2), np.eye(2), np.eye(2), 0.0 * np.eye(2), 0.01)
     with pytest.raises(ValueError, match=r"plant is sampled with dt = 0.01 s, the controller with"):
         analysis.analyse_axes(sampled, ql.Axes([joint(), joint()]))
+
+
+DOUBLE = (np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]]), np.kron(np.eye(2), [[0.0], [1.0]]))
+
+
+def two_masses(B: Any = None) -> ql.plants.MultivariableLinearPlant:
+    """Return two masses, which the matrix B couples."""
+    inputs = DOUBLE[1] if B is None else np.kron(B, [[0.0], [1.0]])
+    return ql.plants.MultivariableLinearPlant(DOUBLE[0], inputs, np.eye(4)[[0, 2]])
+
+
+def of_all(**parts: Any) -> Any:
+    """Return a learner that sees all axes and has a bias."""
+    return ql.learners.RLS(AllAxes(State()) + Bias(), **parts)
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_the_bias_of_a_learner_of_all_axes_is_in_the_margins(each: bool) -> None:
+    """As that of a learner of the own axis: M_s is 2.07, and 1.53 without a bias."""
+    observer = joint().observer
+    own = ql.ADRC(observer, 8.0, learner=ql.learners.RLS(State() + Bias()))
+    known = analysis.analyse_axes(two_masses(), ql.Axes([own, own])).m_s("outputs").value
+    learner = [of_all(), of_all()] if each else of_all()
+    loop = analysis.analyse_axes(two_masses(), ql.Axes([joint(), joint()], learner=learner))
+    assert known == pytest.approx(2.067, abs=1e-3)
+    assert loop.m_s("outputs").value == pytest.approx(known, rel=1e-9)
+    assert not loop.remark
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_a_learner_of_all_axes_at_rest_is_the_loop_that_a_run_shows(each: bool) -> None:
+    """One that may learn no θ: the closed loop is that of ``ql.simulate``, the bias included."""
+    true = np.array([[2.0, -0.9], [-0.9, 1.5]])
+    learner = [of_all(prior=1e-9), of_all(prior=1e-9)] if each else of_all(prior=1e-9)
+    axes = ql.Axes([joint(), joint()], 1.2 * true, learner=learner)
+    scenario = ql.Scenario([ql.signals.Step(0.3, 0.5), ql.signals.Step(-0.1, 0.5)], duration=1.2)
+    run = ql.simulate(two_masses(true), axes, scenario, interpret=True)
+    system = analysis.analyse_axes(two_masses(true), axes).closed_loop("r", "y")
+    x, y = np.zeros(system.N.shape[0]), []
+    for k in range(1200):
+        y.append(system.C @ x)
+        x = x + system.N @ x + system.B @ np.array([0.3, -0.1]) * (k >= 500)
+    np.testing.assert_allclose(run["y"][:1200], y, atol=1e-6)
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_what_was_learned_of_other_axes_is_named_as_not_in_the_margins(each: bool) -> None:
+    """A learner that has learned nothing is all in them; after motion the summary says what lacks."""
+    learner = [of_all(), None] if each else of_all()
+    axes = ql.Axes({"x": joint(), "y": joint()}, 1.2 * np.eye(2), learner=learner)
+    assert not analysis.analyse_axes(two_masses(), axes).remark
+    x = np.zeros(4)
+    with as_python():
+        for k in range(800):
+            u = axes.step([0.3 * np.sin(0.01 * k), 0.2 * np.sin(0.013 * k)], x[[0, 2]])
+            x[[0, 2]] += DT * x[[1, 3]]
+            x[[1, 3]] += DT * (u - 20.0 * x[[2, 0]])
+    loop = analysis.analyse_axes(two_masses(), axes)
+    named = "in x;" if each else "in x, y;"
+    assert "NOT in these margins: what learners have learned from states of all axes" in loop.remark
+    assert named in loop.summary()
+    single = analysis.analyse(([1.0], [1.0, 0.0, 0.0]), axes.axes[0])
+    assert "NOT in these margins: what the learner has learned from states" in single.summary()
+
+
+def drive() -> ql.baselines.PID:
+    """Return a drive of an axis."""
+    return ql.baselines.PID(kp=200.0, ki=100.0, kd=20.0, tf=0.002, dt=DT)
+
+
+def model_based() -> ql.Compensator:
+    """Return a compensator that knows ``1/(s² + 20 s + 100)``."""
+    observer = ql.ESO.model_based(([1.0], [1.0, 20.0, 100.0]), omega_o=60.0, dt=DT)
+    return ql.Compensator(observer)
+
+
+def test_drives_are_in_the_margins_of_axes() -> None:
+    """Each loop is that of ``Compensated``; without drives the summary says that they lack."""
+    lag = (np.kron(np.eye(2), [[0.0, 1.0], [-100.0, -20.0]]), DOUBLE[1], np.eye(4)[[0, 2]])
+    single = analysis.analyse(
+        ([1.0], [1.0, 20.0, 100.0]), ql.Compensated(drive(), model_based())
+    ).margins
+    parts = [model_based(), model_based()]
+    loop = analysis.analyse_axes(lag, ql.Axes(parts, drives=[drive(), drive()]))
+    assert loop.m_s("inputs").value == pytest.approx(1.0 / single.modulus, rel=1e-6)
+    assert not loop.remark
+    alone = analysis.analyse_axes(lag, ql.Axes(parts))
+    assert abs(alone.m_s("inputs").value - loop.m_s("inputs").value) > 0.05
+    assert "NOT in these margins: the loop that u_0 closes" in alone.summary()
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_axes_with_drives_are_the_loop_that_a_run_shows(given: bool) -> None:
+    """With a B0 that is not diagonal; and from u_0 with three actuators for two axes."""
+    true = np.array([[2.0, -0.9], [-0.9, 1.5]])
+    observer = joint().observer
+    if given:
+        axes = ql.Axes([ql.Compensator(observer)] * 2, 1.2 * true, drives=[drive(), drive()])
+    else:
+        true = np.hstack([true, [[0.4], [0.3]]])
+        axes = ql.Axes([ql.Compensator(observer)] * 2, 1.2 * true)
+    r = np.array([0.3, -0.1] if given else [0.3, -0.1, 0.2])
+    plant = two_masses(true)
+    run = ql.simulate(plant, axes, ql.Scenario(r.tolist(), duration=0.2), interpret=True)
+    system = analysis.analyse_axes(plant, axes).closed_loop("r", "y")
+    x, y = np.zeros(system.N.shape[0]), []
+    for _ in range(200):
+        y.append(system.C @ x)
+        x = x + system.N @ x + system.B @ r
+    np.testing.assert_allclose(run["y"][:200], y, atol=1e-9)
+
+
+def test_a_drive_without_a_linear_law_is_not_judged() -> None:
+    """A controller of a user, in whose place an ADRC that changes its b0 stands here."""
+    axes = ql.Axes([model_based()] * 2, drives=[drive(), drive()])
+    changing = ql.ADRC(joint().observer, 8.0, schedule=ql.OnlineGain(0.5, 2.0))
+    axes.drives = (axes.drives[0], changing)
+    with pytest.raises(ValueError, match="drives: axis2: NOT judged, it has no linear law"):
+        analysis.analyse_axes(two_masses(), axes)

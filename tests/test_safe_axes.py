@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -13,6 +14,7 @@ import quell as ql
 from quell.controllers import safe_axes
 from quell.controllers.allocation import GainMemory
 from quell.controllers.safe_axes import SafeAxesDesign, nearest, safe_axes_memory
+from quell.kernels.dispatch import as_python
 
 DT = 1e-3
 
@@ -58,7 +60,7 @@ def solved(case: dict[str, Any], soft: bool = False) -> tuple[bool, Any, Any]:
     """Return whether there is a u, u, and the room with the multipliers."""
     B = case["B"]
     n, m = B.shape
-    memory = safe_axes_memory(SafeAxesDesign(case["weights"]), n, m)
+    memory = safe_axes_memory(SafeAxesDesign(case["weights"], np.full(n, math.inf)), n, m)
     gain = GainMemory(B, np.zeros((m, n)), np.zeros((n, m)), np.zeros((n, 2 * n)))
     memory.low[:], memory.high[:], memory.start[:] = case["low"], case["high"], case["start"]
     u = case["start"].copy()
@@ -303,6 +305,55 @@ class TestLoop:
             run = ql.simulate(masses(wrong), axes, FAR)
             assert 0.95 < np.max(np.abs(run["y"])) <= 1.0
             assert (ql.Status.UNSAFE in run.status) == (not more)
+
+
+def test_limits_that_are_refused_change_nothing() -> None:
+    """Neither of axes nor of a single loop: the next change of something else is possible."""
+    axes = _axes_with(largest_u=150.0)
+    single = ql.Compensator(
+        ql.ESO.model_free(2, 1.0, 150.0, DT), u_min=-1.0, u_max=1.0,
+        safe_set=ql.SafeSet(y_max=1.0, gain_error=0.1),
+    )  # fmt: skip
+    for loop, more in ((axes, 100.0), (single, math.inf)):
+        low, high, *_ = copy.deepcopy(loop.limits)
+        with pytest.raises(ValueError, match=r"must be at least 160|give u_min and u_max"):
+            loop.set_limits(u_max=more)
+        loop.set_limits(rate_limit=1e3)
+        assert np.array_equal(loop.limits.low, low)
+        assert np.array_equal(loop.limits.high, high)
+        assert np.array_equal(loop.parameters.limits.high, high)
+    axes.retune("y", omega_c=13.0)
+    assert axes.axes[1].omega_c == 13.0
+
+
+def growing(x):  # type: ignore[no-untyped-def]
+    """Return a B0 whose entries are twice as large from y_1 = 0.2 on."""
+    return (1.0 + (x[0, 0] > 0.2), 0.4), (0.2, 2.0)
+
+
+def _growing(gain_error: float = 0.02, largest_u: float = 70.0) -> ql.Axes:
+    more = {"gain_error": gain_error, "largest_u": largest_u} if gain_error else {}
+    bands = ql.SafeSet(-1e6, 1e6, alpha=12.0, f_rate=1.0, **more)  # is far
+    return ql.Axes({"x": joint(bands), "y": joint()}, growing, u_min=-50.0, u_max=50.0)
+
+
+@pytest.mark.parametrize(
+    "make", [_growing, lambda: _growing(largest_u=121.0), lambda: _growing(0.0)]
+)
+def test_a_b0_that_makes_more_v_than_was_stated_is_unsafe(make: Any) -> None:
+    """In the samples where the sum of |B0_ik u_k| is larger, of the axis whose margin it is."""
+    axes = make()
+    stated = axes.axes[0].safe_set.largest_u
+    seen = set()
+    with as_python():
+        for k in range(60):
+            u = axes.step([0.9, 3.0], [0.01 * k, 0.0])
+            larger = (1.0 + (axes.axes[0]._state.estimates[0] > 0.2)) * abs(u[0]) + 0.4 * abs(u[1])
+            unsafe = [ql.Status.UNSAFE in axis.estimate.status for axis in axes.axes]
+            assert unsafe == [larger > stated, False]
+            assert (ql.Status.UNSAFE in axes.status) == unsafe[0]
+            seen.add(unsafe[0])
+    assert seen == ({False, True} if stated == 70.0 else {False})
 
 
 def _axes_with(**safe: Any) -> ql.Axes:

@@ -54,6 +54,10 @@ so ``d ← d + α (1 + x̂_1² + u²) Σ Δf̂``.
 
 Frequencies that are still being adapted, a guard's changes of authority, and what is learned in
 motion are not in it.
+
+A learner that sees all axes (``learners/all_axes.py``) adapts its bias as one of its own axis does.
+Its feedback of the states of other axes is not in the law of an axis: ``knows_other_axes`` says
+whether there is one.
 """
 
 from __future__ import annotations
@@ -83,6 +87,7 @@ from quell.controllers.schedule import is_scheduled
 from quell.guard import UnguardedDesign, UnguardedMemory
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import cos, sin
+from quell.learners.all_axes import OutputDesign, SeeingDesign, SeeingMemory
 from quell.learners.base import (
     NoLearner,
     NoLearnerDesign,
@@ -210,8 +215,7 @@ def _from_state(controller: Compensator, state: Any) -> Frozen:
             "period, so it has no gain at an instant; analyse the loop without it"
         )
     learner, memory = controller.parameters.learner, copy_state(state.learner)
-    if hasattr(memory, "gate"):
-        memory.gate.variance[:] = np.inf  # all signals move
+    _open_gate(memory)
     known = controller.read(state)
     seen, u = np.append(known.x, known.f_residual), known.u
     sizes = _signal_sizes(controller, memory, seen, u)
@@ -231,6 +235,39 @@ def _from_state(controller: Compensator, state: Any) -> Frozen:
     gains = [derivative(i) for i in range(seen.size + 1)]
     slope = float(predict(learner, copy_state(memory), seen, u)[1])
     return _with_authority(controller, np.array(gains[:-1]), gains[-1], slope, known.authority)
+
+
+def _open_gate(memory: Any) -> None:
+    """Let all signals of a learner's memory move."""
+    own = memory.inner if isinstance(memory, SeeingMemory) else memory
+    if hasattr(own, "gate"):
+        own.gate.variance[:] = np.inf
+
+
+def knows_other_axes(controller: Compensator) -> bool:
+    """Whether a learner that sees all axes has learned what ``linear_law`` does not have.
+
+    That is a feedback of states of other axes; of an output of a learner that all axes share it is
+    one of any state.
+    """
+    learner, memory = controller.parameters.learner, copy_state(controller._state.learner)
+    if isinstance(learner, OutputDesign):
+        return bool(np.any(memory.theta != 0.0))
+    if not isinstance(learner, SeeingDesign):
+        return False
+    _open_gate(memory)
+    known = controller.read(controller._state)
+    seen = np.append(known.x, known.f_residual)
+
+    def output(now: Vector) -> tuple[float, float]:
+        memory.now[:] = now
+        found: tuple[float, float] = predict(learner, copy_state(memory), seen, known.u)
+        return found
+
+    # Numbers without a pattern: a product of states is not zero at them. Own states are written
+    # over them.
+    moved = np.random.default_rng(0).uniform(0.5, 1.0, memory.now.size)
+    return output(memory.now.copy()) != output(moved)
 
 
 def _with_authority(
@@ -399,6 +436,8 @@ def adapting(controller: Controller, run: Any = None, t: float | None = None) ->
     design = controller.parameters.learner
     state = controller._state if run is None else getattr(run, "final_state", run)
     memory = (controller.initial_state() if state is None else _learning_state(state)).learner
+    if isinstance(design, SeeingDesign):
+        design, memory = design.inner, memory.inner
     rates = adaptation_of(design, memory)
     lag: Any = getattr(design, "lag", controller.parameters.lag)
     angles = rates.omega * controller.dt
@@ -416,6 +455,10 @@ def adaptation_memory(learner: Adapting) -> AdaptingMemory:
 
 def adaptation_of(design: Any, memory: Any) -> Adaptation:
     """Return the steady gains of a learner's parameters, with its frequencies in ``memory``."""
+    if isinstance(design, SeeingDesign):
+        return adaptation_of(design.inner, memory.inner)
+    if isinstance(design, OutputDesign):
+        return NOTHING._replace(level=design.bias_gain)
     if isinstance(design, KalmanDesign):
         return _of_kalman(design, memory.omega)
     if isinstance(design, LinearDesign | OnlineDesign):
@@ -429,8 +472,10 @@ def adaptation_of(design: Any, memory: Any) -> Adaptation:
 
 def is_known(design: Any) -> bool:
     """Whether the adaptation of a learner's parameters is known here."""
-    kinds = (KalmanDesign, LinearDesign, OnlineDesign, BatchDesign, NoLearnerDesign, Frozen)
-    return isinstance(design, kinds)
+    if isinstance(design, SeeingDesign):
+        return is_known(design.inner)
+    kinds = (KalmanDesign, LinearDesign, OnlineDesign, OutputDesign, BatchDesign, NoLearnerDesign)
+    return isinstance(design, (*kinds, Frozen))
 
 
 def lag_response(lag: Any, angles: Vector) -> Any:

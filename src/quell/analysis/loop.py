@@ -20,7 +20,7 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.certificate import Certificate, certify
-from quell.analysis.linearise import Frozen, is_known, linear_law
+from quell.analysis.linearise import Frozen, is_known, knows_other_axes, linear_law
 from quell.analysis.margins import (
     Complex,
     Margins,
@@ -219,6 +219,8 @@ def analyse(
         if not is_known(design):
             name = type(part.learner).__name__
             note = f"NOT in these margins: how {name} adapts; measure it (docs/analysis_learners)"
+        elif knows_other_axes(part):
+            note = "NOT in these margins: what the learner has learned from states of all axes"
     return LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note)
 
 

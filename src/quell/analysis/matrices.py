@@ -199,8 +199,45 @@ def estimates_at(axes: Axes, plant: Any, operating_point: Any) -> Matrix | None:
 
 
 def law_of_axes(axes: Axes, x: Any = None) -> MatrixLaw:
-    """Return the linear law of axes without limits, learners at rest, B0 as in ``gain_at``."""
-    return joined([linear_law(axis) for axis in axes.axes], gain_at(axes, x)[1])
+    """Return the linear law of axes without limits, learners at rest, B0 as in ``gain_at``.
+
+    The references are those of the axes; of compensators without drives u_0 (m,) takes their
+    place. With drives the law is that of drives and compensators together. Raises ``ValueError``
+    for a drive without a linear law.
+    """
+    B0, inverse = gain_at(axes, x)
+    law = joined([linear_law(axis) for axis in axes.axes], inverse)
+    if not axes.compensates:
+        return law
+    # Each compensator is asked for (B0 u_0)_i; what B0 does not see of u_0 passes (more actuators
+    # than axes).
+    passes = np.eye(B0.shape[1]) - inverse @ B0
+    law = law._replace(B_r=law.B_r @ B0, D_r=law.D_r @ B0 + passes)
+    return _behind(_law_of_drives(axes), law) if axes.drives else law
+
+
+def _law_of_drives(axes: Axes) -> MatrixLaw:
+    """Return the law of the drives, from y and r to u_0."""
+    laws = []
+    for name, drive in zip(axes.names, axes.drives, strict=True):
+        try:
+            laws.append(linear_law(drive))
+        except ValueError as error:
+            raise ValueError(f"drives: {name}: NOT judged, it has no linear law: {error}") from None
+    return joined(laws, np.eye(len(laws)))
+
+
+def _behind(drives: MatrixLaw, law: MatrixLaw) -> MatrixLaw:
+    """Return the law with drives whose u_0 takes the place of its references."""
+    k = drives.A.shape[0]
+    return MatrixLaw(
+        A=np.block([[drives.A, np.zeros((k, law.A.shape[0]))], [law.B_r @ drives.C, law.A]]),
+        B_y=np.vstack([drives.B_y, law.B_y + law.B_r @ drives.D_y]),
+        B_r=np.vstack([drives.B_r, law.B_r @ drives.D_r]),
+        C=np.hstack([law.D_r @ drives.C, law.C]),
+        D_y=law.D_y + law.D_r @ drives.D_y,
+        D_r=law.D_r @ drives.D_r,
+    )
 
 
 def axes_law(laws: Sequence[LinearLaw], B0: Any) -> MatrixLaw:

@@ -45,6 +45,7 @@ from quell.analysis.disk import (
     singular,
     worst_change,
 )
+from quell.analysis.linearise import is_known, knows_other_axes
 from quell.analysis.loop import duration
 from quell.analysis.margins import (
     Complex,
@@ -170,7 +171,7 @@ class MultivariableLoop:
         self._size = np.concatenate(sizes)
         self._response = MatrixResponse(self._broken())
         self.remark = ""
-        """A line on what the loop stands for, at the end of the summary."""
+        """Lines on what the loop stands for, at the end of the summary."""
 
     def __repr__(self) -> str:
         m, p = len(self.inputs), len(self.outputs)
@@ -485,9 +486,12 @@ class MultivariableLoop:
 def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> MultivariableLoop:
     """Analyse the loop of a plant and several axes, unlimited, with learners at rest.
 
-    Learners are taken as ``analyse`` takes them. A B0 that is a function of the estimates is a
-    constant here, the one at the operating point: what its changes do is not in these margins, and
-    the summary says so (``analyse_points`` judges several points).
+    Learners are taken as ``analyse`` takes them; what those of all axes have learned from states
+    of other axes is not in the loop, and the summary says so. Compensators are taken with their
+    drives; without drives the loop that u_0 closes is not in it, which the summary says, too. A B0
+    that is a function of the estimates is a constant here, the one at the operating point: what its
+    changes do is not in these margins, and the summary says so (``analyse_points`` judges several
+    points).
 
     Parameters
     ----------
@@ -505,7 +509,7 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
     ------
     ValueError
         for another plant or controller, sizes that do not fit, a nonlinear plant without operating
-        point.
+        point, a drive without a linear law.
 
     Examples
     --------
@@ -529,12 +533,41 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
         )
     law = law_of_axes(axes, estimates_at(axes, plant, operating_point))
     loop = MultivariableLoop(matrices, law, axes.dt, outputs=axes.names)
+    lines = not_in_margins(axes)
     if callable(axes.B0) or callable(axes.M):
-        loop.remark = (
+        lines.append(
             "NOT judged at other operating points than this one, where B0 is another: "
             "analyse_points takes several"
         )
+    loop.remark = "\n".join(lines)
     return loop
+
+
+def not_in_margins(axes: Axes) -> list[str]:
+    """Return a line on each part of a loop with these axes that its margins do not have."""
+    lines = []
+    if axes.takes_u_0:
+        lines.append(
+            "NOT in these margins: the loop that u_0 closes; give its controllers to Axes as "
+            "drives, or analyse them on the plant with these compensators"
+        )
+    for name, axis in zip(axes.names, axes.axes, strict=True):
+        if not is_known(axis.parameters.learner):
+            kind = type(axis.learner).__name__
+            lines.append(
+                f"NOT in these margins: how {kind} of {name} adapts; measure it "
+                "(docs/analysis_learners)"
+            )
+    knowing = [
+        name for name, axis in zip(axes.names, axes.axes, strict=True) if knows_other_axes(axis)
+    ]
+    if knowing:
+        lines.append(
+            "NOT in these margins: what learners have learned from states of all axes, in "
+            f"{', '.join(knowing)}; their biases are. Analyse new axes, and simulate the loop with "
+            "what was learned"
+        )
+    return lines
 
 
 def _channel_names(

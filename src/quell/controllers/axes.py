@@ -169,7 +169,7 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     flags = take_references(design.given, state.given, state.gain, r, y, state.wish)
     look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags |= ask_axes(design.axes, state.axes, 0, state.wish, y, state.v, state.x)
-    learn_of_all(design.learning, state.learning, design.axes, state.axes)
+    flags |= learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
@@ -310,7 +310,8 @@ class Axes(StatefulController):
     learner
         one that sees the states of all axes, with features ``AllAxes(...)``: one for all axes,
         which have one gain and θ of their own (``RLS``, ``NLMS``), or a list or dictionary with one
-        for each, None for an axis without. A learner that sees its own axis belongs into its ADRC.
+        for each, None for an axis without. One for all takes its frequency from the slowest axis.
+        A learner that sees its own axis belongs into its ADRC.
     guard
         of these learners: a description, of which each axis has its own guard, or one for each.
 
@@ -369,6 +370,7 @@ class Axes(StatefulController):
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self.drives = checked_drives(drives, self.names, self.inputs, self.dt)
         self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        self._check_safe_sets(self._actuators)
         self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
         self.learning.attach(self.axes)
         self._initialise()
@@ -424,7 +426,9 @@ class Axes(StatefulController):
 
     @property
     def derivatives(self) -> tuple[int, ...]:
-        """Number of derivatives of the reference that each axis feeds forward."""
+        """Number of derivatives of each reference that are fed forward; of u_0 none."""
+        if self.takes_u_0:
+            return (0,) * self.inputs
         return tuple(axis.derivatives for axis in self.axes)
 
     @property
@@ -447,9 +451,11 @@ class Axes(StatefulController):
         """Limits of the actuators (m,): ``low``, ``high``, and the largest changes in a sample."""
         return self._actuators
 
-    def _update_parameters(self) -> None:
+    def _check_safe_sets(self, limits: ActuatorLimits) -> None:
         safe_sets = [axis.safe_set for axis in self.axes]
-        check_safe_sets(safe_sets, self.names, self._gain.first, self._actuators)
+        check_safe_sets(safe_sets, self.names, self._gain.first, limits)
+
+    def _update_parameters(self) -> None:
         designs: Any = NoAxis()
         for axis in reversed(self.axes):
             designs = AxisDesigns(axis.parameters, designs)
@@ -461,8 +467,8 @@ class Axes(StatefulController):
             self._actuators,
             self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
-            np.array(self.derivatives, dtype=np.int64),
-            safe_axes_design(self._has_bands, self._gain.weights),
+            np.array([axis.derivatives for axis in self.axes], dtype=np.int64),
+            safe_axes_design([axis.safe_set for axis in self.axes], self._gain.weights),
             given_design(self.compensates, self.drives),
         )
 
@@ -640,10 +646,13 @@ class Axes(StatefulController):
     def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
         """Change limits of the actuators while running; what is not given stays.
 
-        Parameters are those of ``Axes``. The next ``step`` is within the new limits of u.
+        Parameters are those of ``Axes``. The next ``step`` is within the new limits of u. Raises
+        ``ValueError`` as for new ``Axes``; then the limits are unchanged.
         """
         given = (u_min, u_max, rate_limit)
-        self._actuators = changed_actuator_limits(self._actuators, *given, self.inputs, self.dt)
+        new = changed_actuator_limits(self._actuators, *given, self.inputs, self.dt)
+        self._check_safe_sets(new)
+        self._actuators = new
         self._update_parameters()
         self._pack_again()
 
@@ -697,6 +706,7 @@ class Axes(StatefulController):
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
         self.axes = tuple(copy.copy(axis) for axis in self.axes)
+        self.learning = copy.copy(self.learning)  # it designs the learners of these axes again
         self._gain = self._checked_gain()
         self._initialise()
         self.state = kept["state"]

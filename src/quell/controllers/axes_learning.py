@@ -15,6 +15,7 @@ import numpy as np
 from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
+from quell.controllers.law import start_learning_again
 from quell.guard import Guard
 from quell.kernels.dispatch import generic, generic_with_default
 from quell.kernels.sized import Size, Work
@@ -28,7 +29,6 @@ from quell.learners.all_axes import (
     check_learner_of_axes,
     confidence_in,
     find_gain,
-    forget_uncertainty,
     look,
     share,
     show,
@@ -38,10 +38,13 @@ from quell.learners.base import (
     NoLearner,
     NoLearnerDesign,
     NoLearnerMemory,
+    forget,
     meaning,
     restart,
 )
-from quell.types import Vector
+from quell.types import Status, Vector
+
+_OVERFLOWED = int(Status.OVERFLOWED)
 
 # ---- What the learners of all axes know together ----
 
@@ -84,8 +87,9 @@ def look_at_all(learning: Any, memory: Any, axes: Any, states: Any) -> None:
 
 
 @generic_with_default
-def learn_of_all(learning: Any, memory: Any, axes: Any, states: Any) -> None:
-    """End a sample, all axes have run: let outputs of a shared learner learn."""
+def learn_of_all(learning: Any, memory: Any, axes: Any, states: Any) -> int:
+    """End a sample, all axes have run: let outputs of a shared learner learn; return the flags."""
+    return 0
 
 
 @generic_with_default
@@ -129,8 +133,14 @@ def take_gains(axes: Any, states: Any, shared: Any, memory: Any) -> None:
 
 
 @generic
-def look_for_forgotten(axes: Any, states: Any, shared: Any, memory: Any) -> None:
-    """Set the uncertainty back to the prior if the θ of an output was forgotten."""
+def has_forgotten(axes: Any, states: Any) -> bool:
+    """Return whether the θ of an output was forgotten in this sample, or in a restart before."""
+    raise TypeError
+
+
+@generic
+def start_all_again(axes: Any, states: Any) -> None:
+    """Let all axes start learning again; those that have not forgotten their θ do it now."""
     raise TypeError
 
 
@@ -220,17 +230,29 @@ def _take(
     take_gains(axes.others, states.others, shared, memory)
 
 
-@look_for_forgotten.register(NoAxis)
-def _none_forgotten(axes: NoAxis, states: Any, shared: Any, memory: Any) -> None:
+@has_forgotten.register(NoAxis)
+def _none_has_forgotten(axes: NoAxis, states: Any) -> bool:
+    return False
+
+
+@has_forgotten.register(AxisDesigns)
+def _has_forgotten(axes: AxisDesigns, states: AxisStates) -> bool:
+    return states.axis.learner.loop[0].forgot != 0.0 or has_forgotten(axes.others, states.others)
+
+
+@start_all_again.register(NoAxis)
+def _start_none_again(axes: NoAxis, states: Any) -> None:
     pass
 
 
-@look_for_forgotten.register(AxisDesigns)
-def _look_for_forgotten(
-    axes: AxisDesigns, states: AxisStates, shared: SharedDesign, memory: SharedMemory
-) -> None:
-    forget_uncertainty(shared, memory, states.axis.learner)
-    look_for_forgotten(axes.others, states.others, shared, memory)
+@start_all_again.register(AxisDesigns)
+def _start_again(axes: AxisDesigns, states: AxisStates) -> None:
+    # The observers of these axes take over what was fed forward, as after an overflow of their own.
+    if states.axis.learner.loop[0].forgot == 0.0:
+        start_learning_again(axes.axis, states.axis)
+        states.axis.loop[0].status = int(states.axis.loop[0].status) | _OVERFLOWED
+    states.axis.learner.loop[0].forgot = 0.0
+    start_all_again(axes.others, states.others)
 
 
 @generic_with_default
@@ -247,16 +269,21 @@ def _begin_shared(
 
 
 @generic_with_default
-def end_shared(shared: Any, memory: Any, axes: Any, states: Any) -> None:
-    """End a sample of a shared learner; by default there is none."""
+def end_shared(shared: Any, memory: Any, axes: Any, states: Any) -> int:
+    """End a sample of a shared learner, return the flags; by default there is none."""
+    return 0
 
 
 @end_shared.register(SharedDesign)
-def _end_shared(shared: SharedDesign, memory: SharedMemory, axes: Any, states: Any) -> None:
-    look_for_forgotten(axes, states, shared, memory)
+def _end_shared(shared: SharedDesign, memory: SharedMemory, axes: Any, states: Any) -> int:
+    if has_forgotten(axes, states):
+        forget(shared, memory)
+        start_all_again(axes, states)
+        return _OVERFLOWED
     least = least_confidence(axes, states, 0, shared, memory)
     if least <= 1.0 and find_gain(shared, memory, least):
         take_gains(axes, states, shared, memory)
+    return 0
 
 
 @look_at_all.register(LearningDesign)
@@ -268,8 +295,8 @@ def _look_at_all(learning: LearningDesign, memory: LearningMemory, axes: Any, st
 
 
 @learn_of_all.register(LearningDesign)
-def _learn_of_all(learning: LearningDesign, memory: LearningMemory, axes: Any, states: Any) -> None:
-    end_shared(learning.shared, memory.shared, axes, states)
+def _learn_of_all(learning: LearningDesign, memory: LearningMemory, axes: Any, states: Any) -> int:
+    return end_shared(learning.shared, memory.shared, axes, states)
 
 
 @restart_of_all.register(LearningDesign)
@@ -367,7 +394,8 @@ class LearningOfAxes:
     def _design_for(self, axes: Sequence[ADRC]) -> None:
         self._view = AxesView(self._names, tuple(axis.observer for axis in axes))
         if self.is_shared:
-            omega_c = float(axes[0]._learner_omega_c)
+            # Scales and memory are for the slowest axis: shorter ones would be too short for it.
+            omega_c = min(float(axis._learner_omega_c) for axis in axes)
             self._shared = SharedLearner(self.learner, self._view, omega_c)
 
     def _learner_of(self, i: int) -> Any:

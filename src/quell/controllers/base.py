@@ -62,7 +62,12 @@ def check_controller(value: Any, name: str = "controller", *, several: bool = Fa
             f"{value.outputs} outputs: NOT possible here yet, one of each is; quell.simulate, "
             "quell.analysis.analyse_axes and quell.export.c take several"
         )
-    if hasattr(getattr(value, "learner", None), "of_axes"):
+    check_runs_alone(name, value)
+
+
+def check_runs_alone(name: str, controller: Any) -> None:
+    """Raise a ``ValueError`` for an axis of ``quell.Axes`` whose learner sees all axes."""
+    if hasattr(getattr(controller, "learner", None), "of_axes"):
         raise ValueError(
             f"{name}: is an axis of quell.Axes, whose learner needs the signals of all axes: NOT "
             "possible alone; give the Axes, or an ADRC with a learner of its own"

@@ -46,7 +46,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import RateLimit, change_parameters, checked_limits, reset_loop
+from quell.controllers.base import (
+    Limits,
+    RateLimit,
+    change_parameters,
+    changed_limits,
+    checked_limits,
+    reset_loop,
+)
 from quell.controllers.held import HeldPlant, NoHeldMemory, NoHeldPlant, check_rest, look_anew
 from quell.controllers.law import (
     AdrcDesign,
@@ -506,13 +513,14 @@ class Compensator(StatefulController):
             **law,
         )
 
-    def _safe_set_design(self, observer: ESO) -> Any:
+    def _safe_set_design(self, observer: ESO, limits: Limits | None = None) -> Any:
+        """Return the parameters of the safe set for limits, by default the present ones."""
         if self.safe_set is None:
             return NoSafeSet()
         ratio = 1.0
         if isinstance(self.schedule, Schedule):
             ratio = self.schedule.largest_ratio(observer)
-        return self.safe_set.design(observer, self._limits, ratio)
+        return self.safe_set.design(observer, limits or self._limits, ratio)
 
     def _check_schedule(self) -> None:
         """Raise a ``ValueError`` for parts that are made for one b0 or one omega_o."""
@@ -626,11 +634,11 @@ class Compensator(StatefulController):
         rate_limit: RateLimit | None = None,
     ) -> None:
         """Change limits of the control signal while running; see ``StatefulController``."""
-        super().set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
         if self.safe_set is not None and self.safe_set.gain_error > 0.0:
-            safe_set = self._safe_set_design(self.observer)
+            new = changed_limits(self._limits, self.dt, u_min, u_max, rate_limit)
+            safe_set = self._safe_set_design(self.observer, new)
             self.parameters = self.parameters._replace(safe_set=safe_set)
-            self._pack_again()
+        super().set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
 
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints; no learner is none."""

@@ -592,7 +592,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             lost = True
         if lost:
             status |= _OVERFLOWED
-            _start_learning_again(design, state)
+            start_learning_again(design, state)
     loop.status = status
     return u
 
@@ -634,7 +634,7 @@ def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured
 
 
 @kernel
-def _start_learning_again(design: AdrcDesign, state: AdrcState) -> None:
+def start_learning_again(design: AdrcDesign, state: AdrcState) -> None:
     """Forget what was learned; the observer's estimate takes over what was fed forward.
 
     If that was out of all proportion, the whole estimate is useless, and the observer begins at y.

@@ -43,10 +43,11 @@ single loop holds for each axis, because v_i is within its bounds in each sample
 the sum of ``|B0_ik u_k|``. The margin ε of an axis has to cover what its plant
 ``y_i^(n) = f_i + (B0 u)_i`` does beyond B0: ``f_rate`` is that of f_i with everything that the
 other axes do to it. For a B0 whose entries are wrong by a share, v is wrong by as much of the sum
-of ``|B0_ik u_k|``: give the share as ``gain_error``, and ``largest_u`` for the sum. From a start
-outside of a band the axis returns as ``safe_set.py`` has it. That (1) has a solution in the next
-sample does not follow from this one: the actuators need enough authority for the α of all bands at
-once.
+of ``|B0_ik u_k|``: give the share as ``gain_error``, and ``largest_u`` for the sum. A constant B0
+keeps to it, which is checked beforehand. Where B0 is a function, an axis has ``UNSAFE`` in its
+status in each sample in which the sum is larger: its margin is then too small. From a start outside
+of a band the axis returns as ``safe_set.py`` has it. That (1) has a solution in the next sample
+does not follow from this one: the actuators need enough authority for the α of all bands at once.
 """
 
 from __future__ import annotations
@@ -100,6 +101,7 @@ class SafeAxesDesign(NamedTuple):
     """Parameters of the safe sets of several axes."""
 
     weights: Vector  # W of the actuators (m,)
+    largest: Vector  # sum of |B0_ik u_k| with which the margin of an axis reckons, or inf (n,)
 
 
 class SafeAxesMemory(NamedTuple):
@@ -121,7 +123,10 @@ class SafeAxesMemory(NamedTuple):
 def check_safe_sets(
     safe_sets: Sequence[Any], names: Sequence[str], B0: Matrix, limits: ActuatorLimits
 ) -> None:
-    """Check that the largest v, of which the errors of B0 are a share, is that of the actuators."""
+    """Check that the largest v, of which the errors of B0 are a share, is that of the actuators.
+
+    ``B0`` is that before the first sample; where it is a function, each sample is checked, too.
+    """
     reach = np.maximum(np.abs(limits.low), np.abs(limits.high))
     for name, row, safe_set in zip(names, B0, safe_sets, strict=True):
         if safe_set is None or safe_set.gain_error == 0.0:
@@ -137,9 +142,16 @@ def check_safe_sets(
             raise ValueError(f"axes: {name}: safe_set.largest_u = {safe_set.largest_u!r}: {what}")
 
 
-def safe_axes_design(has_bands: bool, weights: Vector) -> Any:
-    """Return the parameters; ``has_bands`` says whether an axis has a safe set."""
-    return SafeAxesDesign(weights) if has_bands else NoSafeAxes()
+def safe_axes_design(safe_sets: Sequence[Any], weights: Vector) -> Any:
+    """Return the parameters for the safe set of each axis, None for one without."""
+    if all(each is None for each in safe_sets):
+        return NoSafeAxes()
+    reckons = [each is not None and each.gain_error > 0.0 for each in safe_sets]
+    largest = [
+        each.largest_u if known else math.inf
+        for each, known in zip(safe_sets, reckons, strict=True)
+    ]
+    return SafeAxesDesign(weights, np.array(largest))
 
 
 def safe_axes_memory(design: Any, n: int, m: int) -> Any:
@@ -198,7 +210,7 @@ def _keep_in_bands(
     for i in range(n):
         outside = outside or missed(gain, memory, m + i, u) != 0.0
     if not outside:
-        return 0
+        return _flag_axes(design, memory, axes, states, gain, u)
     if not nearest(gain, design.weights, memory, False, u):
         rates = False
         for i in range(n):
@@ -215,12 +227,33 @@ def _keep_in_bands(
             u[k] = memory.high[k] if memory.held[k] > 0.0 else memory.low[k]
             at_end = u[k] == limits.high[k] or u[k] == limits.low[k]
             flags |= _SATURATED if at_end else _RATE_LIMITED
+    return flags | _flag_axes(design, memory, axes, states, gain, u)
+
+
+@kernel
+def _flag_axes(
+    design: SafeAxesDesign,
+    memory: SafeAxesMemory,
+    axes: Any,
+    states: Any,
+    gain: GainMemory,
+    u: Vector,
+) -> int:
+    """Flag axes whose v is outside of its bounds, or larger than their margin reckons with."""
+    n, m = gain.B.shape
+    flags = 0
     for i in range(n):
         memory.flags[i] = 0.0
-        if missed(gain, memory, m + i, u) != 0.0:
+        size = 0.0
+        for k in range(m):
+            size += abs(gain.B[i, k] * u[k])
+        share = _ROUNDING_SINGLE if is_single(size) else _ROUNDING
+        beyond = size > design.largest[i] * (1.0 + share)
+        if beyond or missed(gain, memory, m + i, u) != 0.0:
             memory.flags[i] = _UNSAFE
             flags |= _UNSAFE
-    add_axes_flags(axes, states, 0, memory.flags)
+    if flags != 0:
+        add_axes_flags(axes, states, 0, memory.flags)
     return flags
 
 

@@ -28,6 +28,7 @@ from quell.controllers.base import (
     RateLimit,
     change_parameters,
     changed_limits,
+    check_runs_alone,
     control,
     set_applied_control,
 )
@@ -297,7 +298,11 @@ class StatefulController(Described):
         raise NotImplementedError
 
     def prepare(self) -> None:
-        """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
+        """Compile ``step``, or load it from the disk cache, so that its first call is fast.
+
+        Raises ``ValueError`` for an axis of ``quell.Axes`` whose learner sees all axes.
+        """
+        check_runs_alone("step", self)
         packed = PackedController(self.parameters, self._state)
         with explain_compile_errors(self.parameters):
             self._step = entry_point(dispatcher_for(step_packed, self.parameters), packed)

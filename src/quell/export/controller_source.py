@@ -222,8 +222,6 @@ def parts_of(controller: Any, precision: str = "double") -> Parts:
             design = single_design(design)
             state = single_state(design, state)
         counts = controller.derivatives
-        if isinstance(controller, Axes) and controller.takes_u_0:
-            counts = (0,) * controller.references
         sizes = (len(counts), controller.outputs, controller.inputs)
         members = axes_source.names_in_c(controller.names)
         return Parts(controller, design, state, _OF_SEVERAL, sizes, counts, members)

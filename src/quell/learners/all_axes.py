@@ -21,6 +21,8 @@ the same p features these are the θ of n learners of their own, in p² + n p op
 n p². It needs one lag filter, so observers of one order, bandwidth and form. Where features differ
 from axis to axis, or bandwidths, each axis needs its own learner. Each axis has its own scale of f,
 its own bias and its own guard; a learner that the guard cuts off in one axis goes on in the others.
+Where θ of one axis has to be forgotten, those of all are, with scales, filters and P: the samples
+that have spoiled it are in the features of all.
 """
 
 from __future__ import annotations
@@ -69,7 +71,6 @@ from quell.learners.regression import (
     LinearMemory,
     NlmsRule,
     rescale,
-    reset_uncertainty,
 )
 from quell.learners.rls import RlsMemory, RlsRule, least_squares_gain
 from quell.observers.eso import ESO
@@ -398,7 +399,7 @@ class OutputLoop(Scalars):
     ready: float  # 1 if there are features
     learns: float  # 1 if the error is one of this sample
     error: float  # target − θ·φ^F, scaled
-    forgot: float  # 1 if θ was forgotten in this sample
+    forgot: float  # 1 if θ was forgotten, and what is shared was not yet
 
 
 class OutputDesign(NamedTuple):
@@ -639,12 +640,9 @@ def _restart_shared(shared: SharedDesign, memory: SharedMemory) -> None:
     restart(shared.linear, memory.linear)
 
 
-@kernel
-def forget_uncertainty(shared: SharedDesign, memory: SharedMemory, output: OutputMemory) -> None:
-    """Set P back to the prior if an output has forgotten its θ, which it has to learn again."""
-    if output.loop[0].forgot != 0.0:
-        output.loop[0].forgot = 0.0
-        reset_uncertainty(shared.linear.rule, memory.linear.rule)
+@forget.register(SharedDesign)
+def _forget_shared(shared: SharedDesign, memory: SharedMemory) -> None:
+    forget(shared.linear, memory.linear)
 
 
 class OneOutput:
@@ -683,7 +681,11 @@ class OneOutput:
 
 
 class SharedLearner:
-    """One linear learner with an output for each axis; ``Axes`` makes it."""
+    """One linear learner with an output for each axis; ``Axes`` makes it.
+
+    Its frequency, from which scales, thresholds of noise and the time of its memory follow, is
+    ``omega_c``, the least of all axes, unless the learner gives one.
+    """
 
     def __init__(self, learner: Any, view: AxesView, omega_c: float) -> None:
         if not isinstance(learner, Linear):
