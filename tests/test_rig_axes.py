@@ -18,6 +18,7 @@ from quell.kernels.dispatch import compiled, interpreted
 from quell.quantities import AxesSignals
 from quell.realtime import Safety, TwinDevice, load, replay, run_rig, wire
 from quell.realtime.cycle import ControlLoop
+from quell.realtime.devices import handle_of, read_measurement
 from quell.realtime.recordings import (
     CsvSink,
     Event,
@@ -69,9 +70,14 @@ def gantry(*, learning: bool = False, **options: Any) -> ql.Axes:
 class Scripted:
     """A twin in Python, with numbers added to single measurements of some samples."""
 
-    def __init__(self, added: dict[int, tuple[float, float]] | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        added: dict[int, tuple[float, float]] | None = None,
+        counts: tuple[int, int] = (2, 2),
+        **options: Any,
+    ) -> None:
         self.twin, self.added = TwinDevice(PLANT, DT, **options), added or {}
-        self.signal_counts, self.count = self.twin.signal_counts, -1
+        self.signal_counts, self.count = counts, -1
         self.written: list[Any] = []
 
     def read(self) -> Any:
@@ -322,6 +328,13 @@ def test_devices_without_a_wire_say_how_many_signals_they_have() -> None:
     single = axis(u_min=-1.0, u_max=1.0)
     with pytest.raises(ValueError, match="has 2 measurements .* the controller one measurement"):
         run_rig(Scripted(), single, 0.0, duration=0.1)
+    one = ql.Axes([axis()], u_min=-1.0, u_max=1.0)
+    with pytest.raises(
+        ValueError, match=r"Device: gives y .* as numbers, .*signal_counts = \(1, 1\)"
+    ):
+        run_rig(TwinDevice(ql.plants.two_mass_spring(), DT), one, 0.0, duration=0.1)
+    with pytest.raises(ValueError, match="Scripted: gives y .* lists of one number, .*leave out"):
+        run_rig(Scripted(counts=(1, 1)), single, 0.0, duration=0.1)
     with pytest.raises(
         ValueError, match="has one y and one u, NOT 2 and 2: several axes need a wire"
     ):
@@ -329,6 +342,36 @@ def test_devices_without_a_wire_say_how_many_signals_they_have() -> None:
     for wrong in ((0, 1), (1, 17), (2,), 3, "ab"):
         with pytest.raises(ValueError, match="signals"):
             open_device("udp://127.0.0.1:1", DT, signals=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("given", [[0.5], [0.5, 0.5, 0.5], [], 0.5])
+def test_a_device_in_python_that_gives_another_number_of_y_has_made_an_error(given: Any) -> None:
+    """One number is not the y of both axes: nothing was measured, and the error is kept."""
+    device = Scripted()
+    handle = handle_of(device)
+    device.read = lambda: given  # type: ignore[method-assign]
+    y, state = read_measurement(handle, None, 0)
+    assert math.isnan(y)
+    assert state == 0
+    assert np.isnan(handle.y).all()
+    assert handle.faults[0] == 1
+    assert given == 0.5 or f"gave {len(given)} numbers: must give 2" in str(handle.errors[0])
+
+
+def test_compensators_alone_take_no_reference() -> None:
+    """At a rig and in a replay: they would take it for the control signal of a host."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=DT)
+    pair = [ql.Compensator(observer), ql.Compensator(observer)]
+    alone = ql.Axes(dict(zip(("x", "y"), pair, strict=True)), B0, u_min=-3.0, u_max=3.0)
+    wide = ql.Axes(pair, np.hstack([B0, [[0.5], [0.3]]]), u_min=-3.0, u_max=3.0)
+    rule = "controller = Axes of Compensators: takes u_0 .*drives="
+    for controller in (alone, wide):
+        device = Scripted()
+        with pytest.raises(ValueError, match=rule):
+            run_rig(device, controller, (0.0, 0.0), duration=0.1)
+        assert not np.any(device.written)
+    with pytest.raises(ValueError, match=rule):
+        replay(Outcome(duration=0.2).run, alone)
 
 
 # ---- The loop ----

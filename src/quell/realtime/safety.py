@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from quell import checks
 from quell.controllers import ADRC, Axes
 from quell.controllers.base import Controller
+from quell.controllers.compensated import takes_control
+from quell.controllers.prefilters import without_prefilters
 from quell.kernels.sized import Buffer
 from quell.realtime.supervisor import AxesLimits, AxesRules, Rules
 from quell.records.record import in_steps
@@ -81,6 +83,21 @@ def plausible_range(reference: ArrayLike, reach: float) -> tuple[float, float]:
 _MOST_SAMPLES = 10_000_000
 # s(τ) of the least jerk from rest at 0 to rest at 1 (Flash & Hogan, J. Neuroscience 5, 1985, (3)).
 _LEAST_JERK = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
+
+
+def check_takes_reference(controller: Any) -> None:
+    """Raise a ``ValueError`` for compensators alone, which take u_0 in the place of a reference."""
+    if isinstance(controller, Axes):
+        if controller.takes_u_0:
+            raise ValueError(
+                "controller = Axes of Compensators: takes u_0 of a host, not a reference; give it "
+                "the controllers of u_0 as quell.Axes(…, drives=…)"
+            )
+    elif takes_control(without_prefilters(getattr(controller, "controller", controller))):
+        raise ValueError(
+            "controller = Compensator: takes u_0 of a host, not a reference; run it between "
+            "host and drive (quell proxy), or with its controller as quell.Compensated"
+        )
 
 
 class ReferenceSamples(NamedTuple):
