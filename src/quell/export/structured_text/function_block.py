@@ -14,7 +14,6 @@ import numpy as np
 from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
-from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
@@ -125,7 +124,7 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
             "the function out, or use --to c"
         )
     try:
-        block = _Block(source, takes_control(in_double_precision(controller)))
+        block = _Block(source)
         return block.text(controller), block.values(controller)
     except TranslationError as error:
         kind = type(in_double_precision(controller)).__name__
@@ -162,10 +161,10 @@ def _check_limits(controller: Any) -> None:
 class _Block:
     """Writer of a function block."""
 
-    def __init__(self, source: CSource, gives_control: bool) -> None:
+    def __init__(self, source: CSource) -> None:
         self.source, name = source, source.name
         self.file = CFile(source.header, source.source)
-        self.given = "u_0" if gives_control else "r"
+        self.given = source.given
         inputs = [(each, "REAL") for each in (self.given, "y", *source.further)]
         if "track" in source.operations:
             inputs += _MANUAL
