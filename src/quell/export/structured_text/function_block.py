@@ -198,7 +198,7 @@ class _Block:
             was = writer.variable("was_manual", "bool", "state")
             writer.emit("IF manual THEN")
             self._within(lambda: self._operation("track", [*given, "u_manual", *source.further]))
-            writer.emit("    u := u_manual;")
+            self._within(lambda: writer.assign(u, self._applied(self.state)))
             writer.emit("ELSE")
             writer.emit(lambda: f"    IF {_text(was)} THEN")
             self._within(lambda: self._operation("hand_over", []), 2)
@@ -232,6 +232,20 @@ class _Block:
         found = self.writer.call(function, [self.state, *nodes], None)
         if result is not None and isinstance(found, Node):
             self.writer.assign(result, found)
+
+    def _applied(self, state: Record) -> Node:
+        """Return the variable with the u that acts, as the observer knows it.
+
+        In manual operation it is ``u_manual``, or the u before where that is no number.
+        """
+        names = [each.name for each in self.file.structs[state.struct]]
+        inner = next(each for each in ("u", "compensator", "controller", "loop") if each in names)
+        found = self.writer.member(state, inner)
+        if isinstance(found, Record):
+            return self._applied(found)
+        if not isinstance(found, Node):
+            raise AssertionError
+        return found
 
     # ---- The text ----
 
@@ -298,8 +312,9 @@ class _Block:
             "kind": type(in_double_precision(controller)).__name__,
             "further": "".join(
                 f"| `{each}` | {_meaning(each)} |\n" for each in self.source.further),
-            "manual": "| `manual`, `u_manual` | manual operation: u is `u_manual`; the next sample "
-                "without `manual` continues from it |\n" if has_manual else "",
+            "manual": "| `manual`, `u_manual` | manual operation: u is `u_manual`, which is NOT "
+                "limited here, so limit it before; for no number u is the one before. The next "
+                "sample without `manual` continues from it |\n" if has_manual else "",
         }  # fmt: skip
 
 
