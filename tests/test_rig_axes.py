@@ -546,6 +546,19 @@ def test_lists_are_for_several_axes_and_channels_for_one() -> None:
         run_rig(TwinDevice(PLANT, DT), gantry(), (0.0, 0.0, 0.0), duration=0.1)
 
 
+def test_the_first_motion_is_checked_only_where_b0_is_known() -> None:
+    """Of compensators with drives nothing tells how far u may move y, as of a single PID."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=DT)
+    pair = [ql.Compensator(observer), ql.Compensator(observer)]
+    drives = [ql.baselines.PID(kp=1.0, ki=0.1, dt=DT)] * 2
+    rules = Safety().rules(ql.Axes(pair, B0, drives=drives, u_min=-3.0, u_max=3.0))
+    assert rules.limits.direction.tolist() == [0.0, 0.0]
+    assert "first motion not checked" in rules.text(DT)
+    assert Safety().rules(gantry()).limits.direction.tolist() == [1.0, 1.0]
+    unchecked = Safety(check_direction=False).rules(gantry())
+    assert unchecked.limits.direction.tolist() == [0.0, 0.0]
+
+
 # ---- Records ----
 
 

@@ -317,6 +317,9 @@ class Safety:
     def __post_init__(self) -> None:
         for name in _FOR_EACH:
             if checks.is_sequence(value := getattr(self, name)):
+                if not value or None in value:
+                    rule = "must be a number, or a list of numbers, one for each"
+                    raise ValueError(f"{name} = {value!r}: {rule}; infinite ones are no limits")
                 object.__setattr__(self, name, tuple(value))  # lists have no hash
         lists = [value for name in _FOR_EACH if isinstance(value := getattr(self, name), tuple)]
         for i in range(max(map(len, lists), default=1)):
@@ -329,8 +332,7 @@ class Safety:
                 *("y_max", math.inf if y_max is None else y_max),
             )
             for name, value in (("most_error", most_error), ("most_f", most_f)):
-                if value != math.inf:
-                    checks.positive(name, value)
+                checks.positive_or_infinite(name, value)
         for count in _COUNTS:
             samples, time = getattr(self, count.samples), getattr(self, count.time)
             checks.optional(checks.whole, count.samples, samples, count.fewest)
@@ -347,7 +349,7 @@ class Safety:
         value = getattr(self, name)
         if not isinstance(value, tuple):
             return value
-        return value[min(i, len(value) - 1)] if value else getattr(type(self), name)
+        return value[min(i, len(value) - 1)]
 
     def rules(self, controller: Any, scenario: Scenario | None = None) -> Any:
         """Return the supervisor's rules for a controller, with the narrower limits of both.
@@ -438,7 +440,7 @@ class Safety:
                 most_f=self._each("most_f", outputs, "axes"),
                 y_low=y_low,
                 y_high=y_high,
-                direction=np.full(outputs, 1.0 if self.check_direction else 0.0),
+                direction=np.where(np.isfinite(scale) & self.check_direction, 1.0, 0.0),
                 reach=scale,
                 push=push,
                 **self._counts(axes.dt),
