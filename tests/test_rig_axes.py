@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -618,6 +619,15 @@ def test_a_recording_comes_back_bit_by_bit(tmp_path: Path, suffix: str) -> None:
         alone = load(path)
         np.testing.assert_array_equal(alone.log, found.run.log)
         assert alone.axis_names == ("x", "y")
+
+
+def test_names_of_axes_that_differ_in_their_case_only_have_fields_of_their_own() -> None:
+    """Fields of ROS messages have small letters; names that others have already get a number."""
+    pair = ql.Axes({"A": axis(), "a": axis()}, B0, u_min=-3.0, u_max=3.0)
+    header = Header(row_channels(pair.channels, (), 2, 2), DT, notes={"axes": {"A": [], "a": []}})
+    fields = re.findall(r"^float64(?:\[\d+\])? (\w+)", definition(header), re.M)
+    assert len(fields) == len({*fields})
+    assert {"r_a", "r_a_2", "a_x_hat", "a_x_hat_2", "a_status", "a_status_2"} <= {*fields}
 
 
 def test_gaps_are_filled_in_all_columns() -> None:
