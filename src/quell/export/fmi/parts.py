@@ -479,7 +479,7 @@ def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
 
 
 def _omega_o_lines(known: Bandwidths, coefficients: Matrix, cast: str) -> list[str]:
-    """Return the lines for L as a polynomial in ``ω = 1 − exp(−omega_o dt)`` (bandwidths.py)."""
+    """Return the lines for L as a polynomial in ``ω = 1 − exp(−omega_o dt)``."""
     rows, columns = coefficients.shape
     return [
         f"if (m->real[AT_OMEGA_O] != {known.omega_o!r}) {{ /* else the numbers of the export */",
