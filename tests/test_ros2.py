@@ -132,6 +132,32 @@ int acting()
 }
 """
 
+# A reference of before the activation does not act, whoever has the lock meanwhile; a later one does.
+_ACTIVATED = """
+int activated()
+{
+  Loop loop(1000, {"axis/effort"}, {"axis/position"});
+
+  if (!loop.start()) return 1;
+  (void)loop.states[0]->set_value(0.0);
+  const auto reference = [&loop] { return *loop.controller->references()[0]->get_optional(); };
+  loop.update();
+  if (!std::isnan(reference())) return 2;
+  loop.send({5.0});
+  loop.update();
+  if (reference() != 5.0) return 3;
+  (void)loop.controller->on_deactivate({});
+  realtime_tools::held = true;
+  if (loop.controller->on_activate({}) != CallbackReturn::SUCCESS) return 4;
+  realtime_tools::held = false;
+  loop.update();
+  if (!std::isnan(reference()) || loop.command(0) != 0.0) return 5;
+  loop.send({6.0});
+  loop.update();
+  return reference() == 6.0 ? 0 : 6;
+}
+"""
+
 # Another rate, names without a joint, too many names, limits of which the lower is not below.
 _REFUSED = """
 int refused()
@@ -173,8 +199,9 @@ def test_the_commands_have_the_bits_of_the_c_code(tmp_path: Path) -> None:
     What really acts is told to the controller: a joint limit cuts u, and a command that can't be
     written leaves the one before. Wrong parameters are refused at configuration, with one message.
     """
-    main = "int main() { return bits() + 10 * acting() + 100 * refused(); }\n"
-    ran(exported(tmp_path), bits(0, "loop/axis/position") + _ACTING + _REFUSED + main)
+    main = "int main() { return bits() + 10 * acting() + 30 * refused() + 40 * activated(); }\n"
+    programs = bits(0, "loop/axis/position") + _ACTING + _REFUSED + _ACTIVATED
+    ran(exported(tmp_path), programs + main)
 
 
 @needs_gpp
