@@ -138,6 +138,10 @@ def test_an_identified_plant_takes_its_numbers_in_place_of_a_file(files: Path) -
         ({"path": "model.json", "num": [1.0]}, "num: go without path"),
         ({"num": [1.0]}, "path: missing; give the file of results, or num and den"),
         ({"num": [1.0], "den": [1.0, 1.0], "friction": 0.1}, "give both or none"),
+        (
+            {"num": [1.0], "den": [1.0, 1.0], "friction": 0.1, "friction_width": 0.0},
+            "friction_width = 0.0: must be finite and greater than zero",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             plant_of({"kind": "identified"} | wrong, DT)

@@ -187,8 +187,8 @@ def observer_within(
     if first.m_s.value <= bound:
         return first
     least, before, factor = first.m_s.value, (1.0, 1.0), 1.0
-    while factor * _STEP <= most * (1.0 + 1e-9):
-        factor *= _STEP
+    while factor < most * (1.0 - 1e-9):
+        factor = min(factor * _STEP, most)
         found = []
         for side, at_factor in enumerate((factor, 1.0 / factor)):
             try:

@@ -166,7 +166,7 @@ def _compiled(_: list[Finding]) -> Iterator[Finding]:
     place = cache_path()
     if place is None:
         text = "can't be created or written to, or is another user's: each run compiles anew"
-        yield Finding(part, "folder", BROKEN, text, "set NUMBA_CACHE_DIR to a folder of your own")
+        yield Finding(part, "folder", MISSING, text, "set NUMBA_CACHE_DIR to a folder of your own")
     else:
         files = [file for file in place.rglob("*") if file.is_file()]
         size = sum(file.stat().st_size for file in files) / 1e6
@@ -219,13 +219,14 @@ def _programs(_: list[Finding]) -> Iterator[Finding]:
         try:
             option = "-version" if name == "frama-c" else "--version"
             done = subprocess.run(
-                [place, option], capture_output=True, text=True, timeout=_SECONDS, check=True
+                [place, option], capture_output=True, timeout=_SECONDS, check=True
             )
         except (OSError, subprocess.SubprocessError) as error:
             text = f"{place} does not run ({type(error).__name__})"
             yield Finding(part, name, MISSING, text, remedy)
             continue
-        line = next(iter(done.stdout.strip().splitlines()), "")
+        said = done.stdout.decode(errors="replace").strip()  # in any language
+        line = next(iter(said.splitlines()), "")
         yield Finding(part, name, WORKS, f"{line}, for {purpose}")
 
 

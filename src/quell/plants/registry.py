@@ -78,8 +78,12 @@ def identified(
             raise ValueError("path: missing; give the file of results, or num and den")
         if (friction is None) != (friction_width is None):
             raise ValueError("friction and friction_width go together: give both or none")
+        if friction:
+            checks.positive("friction_width", friction_width, "y-unit/s")
         name, before = "identified plant", ""
         model: Mapping[str, Any] = dict(given)
+    elif not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path = {path!r}: must be the path of a file of results")
     elif given:
         raise ValueError(f"{', '.join(given)}: go without path = {os.fspath(path)!r}; give one")
     else:

@@ -18,7 +18,9 @@ from quell.analysis import LoopAnalysis, analyse, analyse_axes
 from quell.analysis.margins import Margins
 from quell.controllers.axes import Axes
 from quell.kernels.cache import compile_time
-from quell.plants.linearise import linear_model, linear_part
+from quell.plants.base import PlantWrapper
+from quell.plants.linearise import held_at, linear_model, linear_part
+from quell.plants.multivariable import MultivariableNonlinearPlant
 from quell.records.axes import AxesTrajectory
 from quell.records.record import describe
 from quell.records.trajectory import Trajectory
@@ -237,14 +239,19 @@ def _metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
 def _analysis_of_axis(setup: Setup, axis: int) -> tuple[dict[str, Any], dict[str, Vector]]:
     """Return the numbers and the curves of the loop of an axis, the others closed.
 
-    A nonlinear plant is linearised at the start of the scenario, without control signals.
+    A nonlinear plant is linearised at the start of the scenario, under the control signals that
+    hold it there; it has no margins if none do.
     """
     plant: Any = setup.needed("plant")
     controller: Any = setup.controller
     scenario = setup.needed("scenario")
-    x0 = np.zeros(plant.order) if scenario.x0 is None else np.asarray(scenario.x0, dtype=float)
-    is_linear = hasattr(plant, "A") or hasattr(getattr(plant, "plant", None), "A")
-    point = None if is_linear else (x0, np.zeros(plant.inputs))
+    inner = plant
+    while isinstance(inner, PlantWrapper):
+        inner = inner.plant
+    point = None
+    if isinstance(inner, MultivariableNonlinearPlant):
+        start = np.zeros(plant.order) if scenario.x0 is None else np.asarray(scenario.x0)
+        point = held_at(plant, start[: inner.order])
     loop = analyse_axes(plant, controller, point)
     name = controller.names[axis]
     omega = _shown(loop.omega[1:], loop.dt)
@@ -252,6 +259,7 @@ def _analysis_of_axis(setup: Setup, axis: int) -> tuple[dict[str, Any], dict[str
     curves = _diagrams(omega, 1.0 / S - 1.0, S)
     numbers: dict[str, Any] = {"stable": loop.stable}
     numbers["largest_pole"] = max(abs(each.z) for each in loop.poles)
+    numbers["remark"] = " ".join(filter(None, [loop.note, loop.remark]))
     if loop.stable:
         numbers |= _margins(loop.channel_margins(name))
         numbers["gains_at_once"] = list(loop.disk_margin("inputs").gain)

@@ -69,7 +69,7 @@ export class Picture {
     if (!this.watching) this.age(false);
     this.loop = header.loop;
     this.loopArrays = arrays;
-    write(home("loop-reason"), { textContent: header.loop.reason ?? "" });
+    write(home("loop-reason"), { textContent: header.loop.reason ?? header.loop.remark ?? "" });
     this.drawLoop();
     this.lastLoop = header.seconds;
     clearTimeout(this.restTimer);
