@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import math
+import re
 import shutil
 import subprocess
 import zipfile
@@ -271,6 +272,28 @@ def test_several_signals_have_a_variable_each(name: str, made: Maker, tmp_path: 
         assert running.get("v[2]") == law._state.v[1]
     else:
         assert running.get("d_hat[1]") == law.estimate[1][0]
+
+
+def test_compensators_take_u_0_of_each_actuator(made: Maker, tmp_path: Path) -> None:
+    """With three actuators for two axes; u has the bits of the kernels."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=30.0, dt=DT)
+    pair = {"x": ql.Compensator(observer), "y": ql.Compensator(observer)}
+    law = ql.Axes(pair, [[1.0, 0.4, 0.5], [0.2, 2.0, 0.3]], u_min=-4.0, u_max=4.0)
+    fmu(law, tmp_path / "adding.fmu")
+    running, random, u = made("adding").begin(), np.random.default_rng(2), np.zeros(3)
+    for k in range(60):
+        u_0, y = np.sin(0.1 * k + np.arange(3)), 0.01 * random.standard_normal(2)
+        given = {f"u_0[{i + 1}]": u_0[i] for i in range(3)} | {"y.x": y[0], "y.y": y[1]}
+        with np.errstate(all="ignore"), as_python():
+            control_all(law.parameters, law._state, u_0, y, u)
+        running.advance(DT, given)
+        assert [running.get(f"u[{i + 1}]") for i in range(3)] == u.tolist()
+    with zipfile.ZipFile(tmp_path / "adding.fmu") as archive:
+        text = archive.read("modelDescription.xml").decode()
+    assert re.findall(r'name="(u_0\[\d\]|r\b[^"]*|held[^"]*)"', text) == [
+        *(f"u_0[{i}]" for i in (1, 2, 3)), "held.x", "held.y",
+    ]  # fmt: skip
+    assert text.count('description="control signal of another controller"') == 3
 
 
 @pytest.mark.slow

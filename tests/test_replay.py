@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -172,6 +173,14 @@ def test_skipped_deadlines_are_replayed_as_on_the_rig() -> None:
         )
 
 
+def widened(run: ql.Trajectory, signal: str) -> ql.Trajectory:
+    """Return a run with one more column of a signal, as a file that somebody made may have."""
+    at = [name for name, _ in run.channels].index(signal)
+    column = sum(width for _, width in run.channels[:at])
+    channels = tuple((name, width + (name == signal)) for name, width in run.channels)
+    return replace(run, log=np.insert(run.log, column, 7.0, axis=1), channels=channels)
+
+
 def test_what_can_not_be_replayed_is_refused() -> None:
     """The message says what to do."""
     run = simulated(1.0)
@@ -190,6 +199,11 @@ def test_what_can_not_be_replayed_is_refused() -> None:
         ("run.mcap", controller(), "run = 'run.mcap': must be a Trajectory"),
         (blind, controller(), "run has no finite y_measured"),
         (unknown, controller(), "run has no finite u at 0.3 s"),
+        (run, ql.Compensator(OBSERVER), "controller = Compensator: takes u_0 of a host"),
+        (widened(run, "y"), controller(), "run has 2 measurements and one control signal, the"),
+        (widened(run, "u"), controller(), "run has one measurement and 2 control signals, the"),
+        (widened(run, "r"), controller(), "run has 2 columns of r and 1 of y: must be as many"),
+        (widened(run, "y_measured"), controller(), "run has 2 columns of y_measured and 1 of y"),
     ]:
         with pytest.raises(ValueError, match=rule):
             replay(given, other)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from quell.kernels.dispatch import compiled, interpreted
 from quell.quantities import AxesSignals
 from quell.realtime import Safety, TwinDevice, load, replay, run_rig, wire
 from quell.realtime.cycle import ControlLoop
+from quell.realtime.devices import handle_of, read_measurement
 from quell.realtime.recordings import (
     CsvSink,
     Event,
@@ -69,9 +71,14 @@ def gantry(*, learning: bool = False, **options: Any) -> ql.Axes:
 class Scripted:
     """A twin in Python, with numbers added to single measurements of some samples."""
 
-    def __init__(self, added: dict[int, tuple[float, float]] | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        added: dict[int, tuple[float, float]] | None = None,
+        counts: tuple[int, int] = (2, 2),
+        **options: Any,
+    ) -> None:
         self.twin, self.added = TwinDevice(PLANT, DT, **options), added or {}
-        self.signal_counts, self.count = self.twin.signal_counts, -1
+        self.signal_counts, self.count = counts, -1
         self.written: list[Any] = []
 
     def read(self) -> Any:
@@ -322,6 +329,13 @@ def test_devices_without_a_wire_say_how_many_signals_they_have() -> None:
     single = axis(u_min=-1.0, u_max=1.0)
     with pytest.raises(ValueError, match="has 2 measurements .* the controller one measurement"):
         run_rig(Scripted(), single, 0.0, duration=0.1)
+    one = ql.Axes([axis()], u_min=-1.0, u_max=1.0)
+    with pytest.raises(
+        ValueError, match=r"Device: gives y .* as numbers, .*signal_counts = \(1, 1\)"
+    ):
+        run_rig(TwinDevice(ql.plants.two_mass_spring(), DT), one, 0.0, duration=0.1)
+    with pytest.raises(ValueError, match="Scripted: gives y .* lists of one number, .*leave out"):
+        run_rig(Scripted(counts=(1, 1)), single, 0.0, duration=0.1)
     with pytest.raises(
         ValueError, match="has one y and one u, NOT 2 and 2: several axes need a wire"
     ):
@@ -329,6 +343,36 @@ def test_devices_without_a_wire_say_how_many_signals_they_have() -> None:
     for wrong in ((0, 1), (1, 17), (2,), 3, "ab"):
         with pytest.raises(ValueError, match="signals"):
             open_device("udp://127.0.0.1:1", DT, signals=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("given", [[0.5], [0.5, 0.5, 0.5], [], 0.5])
+def test_a_device_in_python_that_gives_another_number_of_y_has_made_an_error(given: Any) -> None:
+    """One number is not the y of both axes: nothing was measured, and the error is kept."""
+    device = Scripted()
+    handle = handle_of(device)
+    device.read = lambda: given  # type: ignore[method-assign]
+    y, state = read_measurement(handle, None, 0)
+    assert math.isnan(y)
+    assert state == 0
+    assert np.isnan(handle.y).all()
+    assert handle.faults[0] == 1
+    assert given == 0.5 or f"gave {len(given)} numbers: must give 2" in str(handle.errors[0])
+
+
+def test_compensators_alone_take_no_reference() -> None:
+    """At a rig and in a replay: they would take it for the control signal of a host."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=DT)
+    pair = [ql.Compensator(observer), ql.Compensator(observer)]
+    alone = ql.Axes(dict(zip(("x", "y"), pair, strict=True)), B0, u_min=-3.0, u_max=3.0)
+    wide = ql.Axes(pair, np.hstack([B0, [[0.5], [0.3]]]), u_min=-3.0, u_max=3.0)
+    rule = "controller = Axes of Compensators: takes u_0 .*drives="
+    for controller in (alone, wide):
+        device = Scripted()
+        with pytest.raises(ValueError, match=rule):
+            run_rig(device, controller, (0.0, 0.0), duration=0.1)
+        assert not np.any(device.written)
+    with pytest.raises(ValueError, match=rule):
+        replay(Outcome(duration=0.2).run, alone)
 
 
 # ---- The loop ----
@@ -503,6 +547,19 @@ def test_lists_are_for_several_axes_and_channels_for_one() -> None:
         run_rig(TwinDevice(PLANT, DT), gantry(), (0.0, 0.0, 0.0), duration=0.1)
 
 
+def test_the_first_motion_is_checked_only_where_b0_is_known() -> None:
+    """Of compensators with drives nothing tells how far u may move y, as of a single PID."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=DT)
+    pair = [ql.Compensator(observer), ql.Compensator(observer)]
+    drives = [ql.baselines.PID(kp=1.0, ki=0.1, dt=DT)] * 2
+    rules = Safety().rules(ql.Axes(pair, B0, drives=drives, u_min=-3.0, u_max=3.0))
+    assert rules.limits.direction.tolist() == [0.0, 0.0]
+    assert "first motion not checked" in rules.text(DT)
+    assert Safety().rules(gantry()).limits.direction.tolist() == [1.0, 1.0]
+    unchecked = Safety(check_direction=False).rules(gantry())
+    assert unchecked.limits.direction.tolist() == [0.0, 0.0]
+
+
 # ---- Records ----
 
 
@@ -562,6 +619,15 @@ def test_a_recording_comes_back_bit_by_bit(tmp_path: Path, suffix: str) -> None:
         alone = load(path)
         np.testing.assert_array_equal(alone.log, found.run.log)
         assert alone.axis_names == ("x", "y")
+
+
+def test_names_of_axes_that_differ_in_their_case_only_have_fields_of_their_own() -> None:
+    """Fields of ROS messages have small letters; names that others have already get a number."""
+    pair = ql.Axes({"A": axis(), "a": axis()}, B0, u_min=-3.0, u_max=3.0)
+    header = Header(row_channels(pair.channels, (), 2, 2), DT, notes={"axes": {"A": [], "a": []}})
+    fields = re.findall(r"^float64(?:\[\d+\])? (\w+)", definition(header), re.M)
+    assert len(fields) == len({*fields})
+    assert {"r_a", "r_a_2", "a_x_hat", "a_x_hat_2", "a_status", "a_status_2"} <= {*fields}
 
 
 def test_gaps_are_filled_in_all_columns() -> None:

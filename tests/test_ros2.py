@@ -39,6 +39,10 @@ ROBOT = ql.Axes(
 )
 
 
+ADDING = {"shoulder": ql.Compensator(joint().observer), "elbow": ql.Compensator(joint().observer)}
+ADDING_WIDE = ql.Axes(ADDING, [[1.0, 0.2, 0.5], [0.1, 2.0, 0.3]], u_min=-5.0, u_max=5.0)
+
+
 def exported(folder: Path, controller: Any = SERVO, name: str = "servo", **options: Any) -> Path:
     """Export a package; return its folder."""
     ql.export.ros2(controller, folder / name, name=name, **options)
@@ -128,6 +132,32 @@ int acting()
 }
 """
 
+# A reference of before the activation does not act, whoever has the lock meanwhile; a later one does.
+_ACTIVATED = """
+int activated()
+{
+  Loop loop(1000, {"axis/effort"}, {"axis/position"});
+
+  if (!loop.start()) return 1;
+  (void)loop.states[0]->set_value(0.0);
+  const auto reference = [&loop] { return *loop.controller->references()[0]->get_optional(); };
+  loop.update();
+  if (!std::isnan(reference())) return 2;
+  loop.send({5.0});
+  loop.update();
+  if (reference() != 5.0) return 3;
+  (void)loop.controller->on_deactivate({});
+  realtime_tools::held = true;
+  if (loop.controller->on_activate({}) != CallbackReturn::SUCCESS) return 4;
+  realtime_tools::held = false;
+  loop.update();
+  if (!std::isnan(reference()) || loop.command(0) != 0.0) return 5;
+  loop.send({6.0});
+  loop.update();
+  return reference() == 6.0 ? 0 : 6;
+}
+"""
+
 # Another rate, names without a joint, too many names, limits of which the lower is not below.
 _REFUSED = """
 int refused()
@@ -169,8 +199,9 @@ def test_the_commands_have_the_bits_of_the_c_code(tmp_path: Path) -> None:
     What really acts is told to the controller: a joint limit cuts u, and a command that can't be
     written leaves the one before. Wrong parameters are refused at configuration, with one message.
     """
-    main = "int main() { return bits() + 10 * acting() + 100 * refused(); }\n"
-    ran(exported(tmp_path), bits(0, "loop/axis/position") + _ACTING + _REFUSED + main)
+    main = "int main() { return bits() + 10 * acting() + 30 * refused() + 40 * activated(); }\n"
+    programs = bits(0, "loop/axis/position") + _ACTING + _REFUSED + _ACTIVATED
+    ran(exported(tmp_path), programs + main)
 
 
 @needs_gpp
@@ -232,6 +263,57 @@ int main()
 }
 """
     ran(exported(tmp_path, ROBOT, "robot"), program, "robot")
+
+
+@pytest.mark.parametrize("actuators", [2, 3])
+def test_compensators_of_axes_have_a_reference_for_each_actuator(
+    tmp_path: Path, actuators: int
+) -> None:
+    """It is u_0, with the names of the commands; in code, parameters and README."""
+    controller = ADDING_WIDE if actuators == 3 else ql.Axes(ADDING, [[1.0, 0.2], [0.1, 2.0]])
+    folder = exported(tmp_path, controller, "robot")
+    header = (folder / "src/robot_controller.hpp").read_text()
+    assert f"constexpr std::size_t REFERENCES = {actuators};" in header
+    assert "// Numbers in ~/reference: u_0 of each actuator." in header
+    code = (folder / "src/robot_controller.cpp").read_text()
+    assert "for (const auto & name : command_names_) {\n    add(" in code
+    assert "u_0 of each actuator. Until the first one u_0 is 0." in (
+        folder / "README.md"
+    ).read_text().replace("\n", " ")
+
+
+@needs_gpp
+@pytest.mark.slow
+def test_compensators_of_axes_have_the_bits_of_the_c_code(tmp_path: Path) -> None:
+    """Two axes with three actuators, whose u_0 come as a message."""
+    program = """
+int main()
+{
+  Loop loop(1000, {"a/effort", "b/effort", "c/effort"}, {"a/position", "b/position"});
+  robot_state own;
+  double y[2] = {0.1, -0.2}, u[3];
+
+  if (!loop.start() || loop.controller->references().size() != 3) return 2;
+  if (loop.controller->references()[2]->get_name() != "loop/c/effort") return 3;
+  robot_init(&own);
+  for (int k = 0; k < 500; k++) {
+    const double u_0[3] = {std::sin(2e-3 * k), 1.0, -0.5};
+
+    for (std::size_t i = 0; i < 2; i++) {
+      y[i] += 1e-3 * noise();
+      (void)loop.states[i]->set_value(y[i]);
+    }
+    loop.send({u_0[0], u_0[1], u_0[2]});
+    loop.update();
+    robot_step(&own, u_0, y, u);
+    for (std::size_t i = 0; i < 3; i++) {
+      if (!same(loop.command(i), u[i])) return 1;
+    }
+  }
+  return 0;
+}
+"""
+    ran(exported(tmp_path, ADDING_WIDE, "robot"), program, "robot")
 
 
 @needs_gpp

@@ -152,6 +152,11 @@ def test_rules_are_told_in_a_line() -> None:
         ({"y_min": 2.0, "y_max": 1.0}, "y_min must be less than y_max"),
         ({"y_min": math.nan}, "y_min = nan"),
         ({"check_direction": 1}, "check_direction = 1: must be True or False"),
+        ({"most_error": -5.0}, "most_error = -5.0: must be greater than zero"),
+        ({"most_f": -math.inf}, "most_f = -inf: must be greater than zero"),
+        ({"u_max": [], "most_error": -5.0, "y_min": math.nan}, r"u_max = \[\]: must be a number"),
+        ({"y_min": [-1.0, None]}, r"y_min = \[-1.0, None\]: must be a number, or a list of"),
+        ({"u_max": [None, 1.0]}, r"u_max = \[None, 1.0\]: must be a number, or a list of"),
     ],
 )
 def test_wrong_bounds_are_named(options: dict[str, Any], message: str) -> None:

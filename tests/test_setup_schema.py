@@ -87,3 +87,13 @@ def test_what_some_editors_write_for_inf_is_no_error(schema: dict[str, Any]) -> 
     assert judge.is_valid(data)
     data["controller"]["omega_c"] = None
     assert not judge.is_valid(data)
+
+
+def test_a_limit_may_be_infinite_where_loading_takes_it(schema: dict[str, Any]) -> None:
+    """``most_error = inf`` is the default, and zero none."""
+    data = tomllib.loads((EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"))
+    judge = jsonschema.Draft7Validator(schema)
+    for name in ("most_error", "most_f"):
+        for value, taken in ((float("inf"), True), ([float("inf"), 1.0], True), (0.0, False)):
+            data["rig"] = {"device": "twin", "safety": {name: value}}
+            assert judge.is_valid(data) == taken, (name, value)

@@ -15,6 +15,8 @@ import pytest
 import quell as ql
 from quell.export import TranslationError, c_source, st_source
 from quell.export.structured_text.c_reader import CFile
+from quell.export.structured_text.places import Node, Whole
+from quell.export.structured_text.translator import Translator
 
 from .commands import in_this_process
 from .in_c import InC, needs_gcc
@@ -74,6 +76,7 @@ def samples(count: int, further: int) -> Any:
             math.nan if k % 71 == 70 else 1e70 if k % 93 == 92 else y + 1e-3 * random.normal()
         )
         r = math.nan if k < 20 else 1.0 if k < 300 else -5.0 if k < 600 else 0.1 * random.normal()
+        r = 50.0 if 100 <= k < 160 else r  # a compensator, too, comes to a limit of u
         u = yield {
             "r": r, "y": measured, "manual": 400 <= k < 460,
             "u_manual": math.nan if k % 50 == 49 else 0.3,
@@ -98,7 +101,7 @@ def test_the_text_read_as_python_has_the_bits_of_the_c_code(
     has_manual, was_manual = "track" in source.operations, False
     given = "u_0" if controller is COMPENSATOR else "r"
     run = samples(900, len(source.further))
-    now, flags = next(run), 0
+    now, flags, before = next(run), 0, 0.0
     for k in range(900):
         inputs = {
             given: now["r"],
@@ -111,16 +114,20 @@ def test_the_text_read_as_python_has_the_bits_of_the_c_code(
         block.call(**inputs)
         if now["limited"]:
             own.run("applied", now["u_limited"])
+            usable = math.isfinite(now["u_limited"])
+            before = float(source_real(source)(now["u_limited"])) if usable else before
         if now["restart"]:
             own.run("reset")
+            before = 0.0
         if has_manual and now["manual"]:
             own.run("track", now["r"], now["y"], now["u_manual"], *now["further"])
-            u = float(source_real(source)(now["u_manual"]))
+            usable = math.isfinite(now["u_manual"])
+            u = float(source_real(source)(now["u_manual"])) if usable else before
         else:
             if has_manual and was_manual:
                 own.run("hand_over")
             u = own.run("step", now["r"], now["y"], *now["further"])
-        was_manual = now["manual"]
+        was_manual, before = now["manual"], u
         found = float(block.v["u"])
         assert found.hex() == u.hex(), f"sample {k}: {found!r}, must be {u!r}"
         flags |= block.v["status"]
@@ -159,7 +166,7 @@ int main(void)
 {
     static AXIS block;
     static axis_state own;
-    real y = 0, v = 0;
+    real y = 0, v = 0, before = 0;
     int was = 0;
     AXIS_init__(&block, 0);
     axis_init(&own);
@@ -174,12 +181,12 @@ int main(void)
         block.LIMITED.value = limited;
         block.U_LIMITED.value = ul;
         block.RESTART.value = restart;
-        if (limited) axis_applied(&own, ul);
-        if (restart) axis_reset(&own);
+        if (limited) { axis_applied(&own, ul); if (ul == ul) before = ul; }
+        if (restart) { axis_reset(&own); before = 0; }
 #if MANUAL
         block.MANUAL_.value = manual;
         block.U_MANUAL.value = um;
-        if (manual) { axis_track(&own, r, measured, um FURTHER); u = um; }
+        if (manual) { axis_track(&own, r, measured, um FURTHER); u = um == um ? um : before; }
         else { if (was) axis_hand_over(&own); u = axis_step(&own, r, measured FURTHER); }
         was = manual;
 #else
@@ -188,6 +195,7 @@ int main(void)
         INPUTS
         AXIS_body__(&block);
         found = block.U.value;
+        before = u;
         if (memcmp(&found, &u, sizeof u) || block.STATUS.value != (unsigned)axis_status(&own)) {
             printf("sample %d: %.17g, must be %.17g\\n", k, (double)found, (double)u);
             return 1;
@@ -286,6 +294,74 @@ def test_what_has_no_text_is_refused_and_nothing_is_written(
     with pytest.raises(ValueError, match=re.escape(rule)):
         ql.export.st(controller, tmp_path / "out", name=name)
     assert not any(tmp_path.iterdir())
+
+
+FUNCTIONS = """
+static double sq(double a)
+{
+    return a * a;
+}
+static double add(double a, double b)
+{
+    return a + b;
+}
+static double twice(double a)
+{
+    double b = sq(a + 1.0);
+    return b + b;
+}
+double f(double x, double y, double z)
+{
+    return EXPRESSION;
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("sq(x + y) + sq(x - y)", 50.0),
+        ("add(x + 1.0, add(y + 1.0, z))", 18.0),
+        ("add(add(x + 1.0, y), add(y + 1.0, z))", 22.0),
+        ("twice(x + 0.5) - sq(twice(y) - sq(z + 1.0))", -2459.5),
+        ("x > y ? sq(y + z) : sq(x + z)", 144.0),
+    ],
+)
+def test_calls_of_small_functions_in_one_expression_keep_their_arguments(
+    expression: str, value: float
+) -> None:
+    """Each call has its own, also where calls are arguments of calls."""
+    writer = Translator(CFile("", FUNCTIONS.replace("EXPRESSION", expression)), False, ("u",))
+    given = [writer.variable(each, "real", "state") for each in "xyz"]
+    found = writer.call(writer.file.function("f"), given)
+    assert isinstance(found, Node)
+    writer.assign(Node("real", lambda: "u", 9, True), found)
+    declared = "".join(
+        f"{each.name} : LREAL;\n" for section in writer.variables.values() for each in section
+    )
+    block = FunctionBlock(f"VAR\nu : LREAL;\n{declared}END_VAR\n\n{writer.text()}")
+    block.call(x=3.0, y=4.0, z=9.0)
+    assert block.v["u"] == value
+
+
+@pytest.mark.parametrize(
+    ("text", "number"), [("0x1F", 31), ("0xfU", 15), ("31UL", 31), ("0", 0), ("1", 1)]
+)
+def test_whole_numbers_are_read_with_their_base(text: str, number: int) -> None:
+    """Hexadecimal ones, too."""
+    writer = Translator(CFile("", f"int f(int x)\n{{\n    return {text};\n}}\n"), False, ())
+    found = writer.call(writer.file.function("f"), [Node(Whole(), lambda: "x")])
+    assert isinstance(found, Node)
+    assert found.text() == str(number)
+
+
+@pytest.mark.parametrize("text", ["017", "0x1.8p3", "12ab", "1.5x", "0b11", "0x"])
+def test_numbers_that_have_no_text_are_refused(text: str) -> None:
+    """Octal and binary ones, and what is no number."""
+    file = CFile("", f"double f(double x)\n{{\n    return {text};\n}}\n")
+    writer = Translator(file, False, ())
+    with pytest.raises(TranslationError, match=r"C code|number 017 of C"):
+        writer.call(file.function("f"), [Node("real", lambda: "x")])
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from threading import Event as ThreadEvent
 from typing import Any
@@ -25,6 +26,7 @@ from quell.realtime.recordings import (
     K,
     MemorySink,
     file_sink,
+    header_path,
     load,
     row_channels,
     trajectory_of,
@@ -167,6 +169,21 @@ def test_a_csv_file_without_its_header_still_knows_its_sample_time(
     np.testing.assert_array_equal(run.log, rows)
     np.testing.assert_array_equal(run["k"] * run.dt, rows[:, K] * dt)
     assert run.dt == pytest.approx(dt, rel=1e-15)
+
+
+def test_a_csv_file_without_its_header_is_of_one_axis_if_no_axis_has_an_estimate(
+    run: ql.Trajectory, rows: Matrix, tmp_path: Path
+) -> None:
+    """A dot in the name of a channel makes no axes."""
+    before, path = header_of(run, controller()), tmp_path / "run.csv"
+    channels = (*before.channels, ("motor.temp", 1))
+    more = np.column_stack([rows, np.arange(rows.shape[0])])
+    recorded(replace(before, channels=channels), more, CsvSink(path))
+    header_path(path).unlink()
+    again = load(path)
+    assert isinstance(again, ql.Trajectory)
+    np.testing.assert_array_equal(again["motor.temp"], more[:, -1])
+    np.testing.assert_array_equal(again["y"], run["y"])
 
 
 def test_a_message_is_what_its_definition_says(

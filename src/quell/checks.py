@@ -73,13 +73,19 @@ def positive(name: str, value: Any, unit: str = "") -> float:
     return number
 
 
+def positive_or_infinite(name: str, value: Any, unit: str = "") -> float:
+    """Return ``value`` as a float above zero; it may be infinite."""
+    number, unit = _number(name, value), unit and f" [{unit}]"
+    if not number > 0.0:
+        raise broken(
+            f"{name} = {value!r}: must be greater than zero{unit}", name, exclusiveMinimum=0
+        )
+    return number
+
+
 def time_constant(name: str, value: Any) -> float:
     """Return ``value`` [s] as a float above zero; it may be infinite."""
-    number = _number(name, value)
-    if not number > 0.0:
-        message = f"{name} = {value!r}: must be greater than zero [s]"
-        raise broken(message, name, exclusiveMinimum=0)
-    return number
+    return positive_or_infinite(name, value, "s")
 
 
 def non_negative(name: str, value: Any, unit: str = "") -> float:

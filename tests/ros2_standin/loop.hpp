@@ -5,6 +5,7 @@
 #include <limits>
 
 #include "controller_interface/chainable_controller_interface.hpp"
+#include "realtime_tools/realtime_thread_safe_box.hpp"
 #include "std_msgs/msg/float64_multi_array.hpp"
 
 std::shared_ptr<controller_interface::ChainableControllerInterface> exported_class();

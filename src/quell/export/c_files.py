@@ -106,6 +106,8 @@ class CSource:
         names of several axes in C.
     sizes
         numbers of r, y and u where they are arrays, and ``derivatives``, too; None for one of each.
+    given
+        what ``step`` takes before y: ``"r"``, or ``"u_0"``, control signals of other controllers.
     """
 
     name: str
@@ -119,6 +121,7 @@ class CSource:
     signals: int = 0
     axes: tuple[str, ...] = ()
     sizes: tuple[int, int, int] | None = None
+    given: str = "r"
 
     @property
     def further(self) -> tuple[str, ...]:

@@ -437,7 +437,7 @@ class _Writer:
             )
         ]  # fmt: skip
         source = files.write(self._title(), channels, defines, self.derivatives, self.signals)
-        return replace(source, axes=self.parts.members, sizes=self.parts.sizes)
+        return replace(source, axes=self.parts.members, sizes=self.parts.sizes, given=self.given)
 
     def _sizes(self, observing: tuple[Any, ...]) -> Iterator[str]:
         """Yield the defines of the sizes."""

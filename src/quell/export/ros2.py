@@ -14,7 +14,6 @@ from typing import Any
 
 from quell import checks
 from quell.controllers.base import check_controller
-from quell.controllers.compensated import takes_control
 from quell.controllers.single import SinglePrecision
 from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
@@ -141,10 +140,10 @@ def _values(controller: Any, source: CSource, rate: int) -> dict[str, object]:
     """Return the values of the templates."""
     name, several = source.name, bool(source.axes)
     axes, actuators = (len(source.axes), source.sizes[2]) if source.sizes else (1, 1)
-    references = axes * (1 + len(source.further))
-    given = "u_0" if takes_control(in_double_precision(controller)) else "r"
-    meaning = ", ".join(f"{each} of each axis" if several else each
-                        for each in (given, *source.further))  # fmt: skip
+    given, own = source.given, source.sizes[0] if source.sizes else 1
+    references = own * (1 + len(source.further))
+    owner = " of each actuator" if given == "u_0" else " of each axis"
+    meaning = ", ".join(f"{each}{owner * several}" for each in (given, *source.further))
     step = _step_of_axes(source) if several else _step(source)
     limits = "limits" if several else limits_path(controller)
     low, high = (f"parameters_.{limits}.{each}{'[k]' * several}" for each in ("low", "high"))

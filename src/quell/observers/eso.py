@@ -185,7 +185,7 @@ class ESO:
         ValueError
             as for ``canonical``, for more than 8 states, and if a zero at s = 0 hides a constant f.
         """
-        far = checks.positive("far", far) if far != math.inf else far
+        far = checks.positive_or_infinite("far", far)
         found = canonical(plant, E)
         keep_zeros = checks.flag("keep_zeros", keep_zeros)
         if found.matched and found.zeros.size and far < math.inf and not keep_zeros:

@@ -8,9 +8,7 @@ after the next deadline has overrun: the deadlines that have passed are skipped 
 controller they are samples without a measurement in which u stayed the same, so its observer
 follows the plant.
 
-The loop around a device with a clock of its own is in ``ticks``; it has the same control step.
-
-The loop around a device with a clock of its own: it takes a control step for each tick.
+The loop around a device with a clock of its own takes the same control step for each tick.
 
 The device numbers its ticks, so the loop knows them all, however late their measurements come. If
 several wait, because the loop, the device or the wire was late, the loop takes a step for each of

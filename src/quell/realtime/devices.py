@@ -186,7 +186,23 @@ def counts_text(counts: SignalCounts | None) -> str:
 
 
 def other_counts(device: str, theirs: SignalCounts | None, ours: SignalCounts | None) -> str:
-    """Return the message for a device with other numbers of signals than the controller."""
+    """Return the message for a device with other numbers of signals than the controller.
+
+    ``None`` is one y and one u as numbers, and (1, 1) a list of one number each.
+    """
+    if counts_text(theirs) == counts_text(ours) and ours is None:
+        return (
+            f"device = {device}: gives y and takes u as lists of one number, the controller as "
+            "numbers: must be the same; leave out signals of the device (a device in Python: "
+            "signal_counts), or take quell.Axes of this controller"
+        )
+    if counts_text(theirs) == counts_text(ours):
+        return (
+            f"device = {device}: gives y and takes u as numbers, the controller, an Axes of one "
+            "axis, as lists of one number: must be the same; open the device with signals=(1, 1) "
+            "(a device in Python: the attribute signal_counts = (1, 1)), or take the controller of "
+            "the axis"
+        )
     return (
         f"device = {device}: has {counts_text(theirs)}, the controller {counts_text(ours)}: must "
         "be as many; take the device of this machine, or a setup with a table [[axis]] for each "
@@ -234,7 +250,10 @@ def _read_measurement(handle: PythonHandle, clock: Any, until: int) -> tuple[flo
         found: Any = handle.device.read()
         if not handle.y.size:
             return float(found), 0
-        handle.y[:] = [float(value) for value in found]
+        values = [float(value) for value in found]
+        if len(values) != handle.y.size:  # a list of one number would be taken for all
+            raise ValueError(f"read() gave {len(values)} numbers: must give {handle.y.size}")
+        handle.y[:] = values
         return first_if_finite(handle.y), 0
     except Exception as error:  # whatever a driver raises, the loop must go on to its safe action
         _count_error(handle, error)

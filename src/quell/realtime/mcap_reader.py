@@ -31,7 +31,7 @@ _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA = 0x03, 0x04, 0x05, 0x06, 0x0C
 _START = struct.Struct("<BQ")  # opcode and length of a record
 _MESSAGE_START = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
 # Messages that are converted to an array at once; chosen by hand, not tuned further.
-_BLOCK_MCAP_READER = 4096
+_BLOCK = 4096
 # A record counts as at least so many bytes, however short it is: about what it takes in memory, and
 # a limit of the time that many empty records can take. Chosen by hand.
 _LEAST_RECORD = 64
@@ -62,7 +62,7 @@ def read_mcap(path: Path, most: int) -> tuple[str, Matrix]:
             if opcode == _MESSAGE:
                 if int.from_bytes(body[:2], "little") in ours and len(body) >= _MESSAGE_START.size:
                     messages.append(body[_MESSAGE_START.size :])
-                    if len(messages) == _BLOCK_MCAP_READER:
+                    if len(messages) == _BLOCK:
                         blocks.append(_rows(messages))
                         messages = []
             elif opcode == _SCHEMA:

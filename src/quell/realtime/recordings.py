@@ -123,7 +123,7 @@ class Header:
     Parameters
     ----------
     channels : tuple of pairs
-        names and widths in a row, in order; the first ones are ``LOOP_CHANNELS``.
+        names and widths in a row, in order; the first ones are those of ``loop_channels``.
     dt
         sample time [s]: row k belongs to the time ``k dt``.
     features
@@ -368,13 +368,13 @@ def _channels(columns: list[str]) -> Channels:
 def _axes_in(columns: list[str], channels: Channels) -> dict[str, Any]:
     """Return the names of several axes in columns, as ``Header.notes`` has them.
 
-    Their features are unknown.
+    Their features are unknown. Each axis has its estimate; another channel may have a dot, too.
     """
-    dotted = [name.partition(".")[0] for name, _ in channels if "." in name]
-    if not dotted:
+    estimated = [name.removesuffix(".x_hat") for name, _ in channels if name.endswith(".x_hat")]
+    if not estimated:
         return {}
     labels = [each[2:].rstrip("]") for each in columns if each.startswith("y[")]
-    return {"axes": {name: [] for name in labels or dict.fromkeys(dotted)}}
+    return {"axes": {name: [] for name in labels or estimated}}
 
 
 def _sample_time(time: Vector, k: Vector) -> float:
@@ -397,20 +397,31 @@ def _sample_time(time: Vector, k: Vector) -> float:
 
 def definition(header: Header) -> str:
     """Return the definition of a row's message, with meanings and units as comments."""
-    lines = []
+    lines, taken = list[str](), set[str]()
+
+    def field_of(name: str) -> str:
+        """Return a field that no other channel has: of axes ``A`` and ``a`` the second has a 2."""
+        plain, number = _field_name(name), 2
+        found = plain
+        while found in taken:
+            found, number = f"{plain}_{number}", number + 1
+        taken.add(found)
+        return found
+
     for name, width in header.channels:
         if not width:
             continue
         text, unit = describe(name, header.signals)
         units = units_of(name, width, header.signals)
-        unit, own = header.units.get(name, unit), _field_name(name)
+        unit = header.units.get(name, unit)
         if header.axis_names and width > 1 and name in (*OF_AXES, "u"):
             # A field for each signal, with its name: the same bytes as an array.
             for label, of_it in zip(header.labels(name, width), units, strict=True):
-                lines.append(f"float64 {own}_{_field_name(label)}  # {text}, {label} [{of_it}]")
+                own = field_of(f"{name}_{label}")
+                lines.append(f"float64 {own}  # {text}, {label} [{of_it}]")
         else:
             kind = f"float64[{width}]" if is_vector(name, width) else "float64"
-            lines.append(f"{kind} {own}  # {text} [{unit}]")
+            lines.append(f"{kind} {field_of(name)}  # {text} [{unit}]")
     return "\n".join(lines) + "\n"
 
 

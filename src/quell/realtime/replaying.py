@@ -31,7 +31,7 @@ from quell.realtime.axes_supervisor import set_applied_controls
 from quell.realtime.channels import ChannelInputs, channel_inputs, checked_channels, pass_channels
 from quell.realtime.devices import SignalCounts, counts_text
 from quell.realtime.recordings import check_one
-from quell.realtime.safety import default_hold
+from quell.realtime.safety import check_takes_reference, default_hold
 from quell.realtime.supervisor import Mode
 from quell.records.axes import AxesTrajectory
 from quell.records.record import signals_of_loop
@@ -82,12 +82,14 @@ def replay(
     Raises
     ------
     ValueError
-        for a run without r, y, y_measured or u, with samples left out, without measurements, or
-        with another sample time; for ``u_before`` with a controller that can't start under load;
+        for a controller that takes u_0 in the place of a reference; for a run without r, y,
+        y_measured or u, with samples left out, without measurements, with another sample time or
+        other numbers of signals; for ``u_before`` with a controller that can't start under load;
         for a schedule without its signals, and channels that the run does not have.
     """
     axes = controller if isinstance(controller, Axes) else None
     check_controller(controller, several=axes is not None)
+    check_takes_reference(controller)
     if not isinstance(run, Trajectory | AxesTrajectory):
         raise ValueError(
             f"run = {run!r}: must be a Trajectory, for example quell.realtime.load('run.mcap')"
@@ -165,14 +167,19 @@ def _check_axes_of(run: Any, axes: Axes | None) -> None:
     """Raise a ``ValueError`` unless a run has as many signals as the controller."""
     if axes is None:
         check_one(run, "run")
-        return
-    found = [run[name].reshape(len(run), -1).shape[1] for name in ("y", "u")]
-    if found != [axes.outputs, axes.inputs]:
-        theirs, ours = SignalCounts(*found), SignalCounts(axes.outputs, axes.inputs)
+    outputs, inputs = (1, 1) if axes is None else (axes.outputs, axes.inputs)
+    found = {name: run[name].reshape(len(run), -1).shape[1] for name in _RECORDED}
+    if (found["y"], found["u"]) != (outputs, inputs):
+        theirs, ours = SignalCounts(found["y"], found["u"]), SignalCounts(outputs, inputs)
         raise ValueError(
             f"run has {counts_text(theirs)}, the controller {counts_text(ours)}: must be as many; "
             "take the setup with which it was recorded, or one with as many [[axis]]"
         )
+    for name in ("r", "y_measured"):
+        if found[name] != outputs:
+            raise ValueError(
+                f"run has {found[name]} columns of {name} and {outputs} of y: must be as many"
+            )
 
 
 def _started(controller: Any, y: Any, u: Any, r: Any) -> tuple[Any, Any]:

@@ -19,8 +19,6 @@ from quell.controllers.base import (
     Controller,
     check_controller,
 )
-from quell.controllers.compensated import takes_control
-from quell.controllers.prefilters import without_prefilters
 from quell.quantities import UNKNOWN, AxesSignals, Signals
 from quell.realtime.channels import (
     await_channels,
@@ -48,6 +46,7 @@ from quell.realtime.safety import (
     Safety,
     as_scenario,
     axes_reference,
+    check_takes_reference,
     reference_samples,
 )
 from quell.realtime.supervisor import (
@@ -368,9 +367,9 @@ def run_rig(
     Raises
     ------
     ValueError
-        for u without finite limits, a device of another dt or with other numbers of signals, a
-        reference that is not finite, a schedule without its signals, and channels that the device
-        or the controller does not know.
+        for a controller that takes u_0 in the place of a reference, u without finite limits, a
+        device of another dt or with other numbers of signals, a reference that is not finite, a
+        schedule without its signals, and channels that the device or the controller does not know.
     ConnectionError
         if a call of the device's driver does not return, or a channel does not come.
     """
@@ -378,11 +377,7 @@ def run_rig(
     with closing(device):
         axes = controller if isinstance(controller, Axes) else None
         check_controller(controller, several=axes is not None)
-        if takes_control(without_prefilters(getattr(controller, "controller", controller))):
-            raise ValueError(
-                "controller = Compensator: takes u_0 of a host, not a reference; run it between "
-                "host and drive (quell proxy), or with its controller as quell.Compensated"
-            )
+        check_takes_reference(controller)
         dt = controller.dt
         own = getattr(device, "dt", dt)
         if abs(own - dt) > 1e-9 * dt:  # allows for the rounding of 1 / rate
@@ -467,9 +462,10 @@ def run_rig(
 
 def check_counts(device: Any, axes: Axes | None) -> None:
     """Raise a ``ValueError`` unless a device has as many signals as the controller."""
-    theirs = getattr(device, "signal_counts", None)
+    given = getattr(device, "signal_counts", None)
+    theirs = None if given is None else SignalCounts(*given)
     ours = None if axes is None else SignalCounts(axes.outputs, axes.inputs)
-    if (theirs is None) != (ours is None) or tuple(theirs or ()) != tuple(ours or ()):
+    if theirs != ours:
         raise ValueError(other_counts(type(device).__name__, theirs, ours))
 
 

@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from quell import checks
 from quell.controllers import ADRC, Axes
 from quell.controllers.base import Controller
+from quell.controllers.compensated import takes_control
+from quell.controllers.prefilters import without_prefilters
 from quell.kernels.sized import Buffer
 from quell.realtime.supervisor import AxesLimits, AxesRules, Rules
 from quell.records.record import in_steps
@@ -81,6 +83,21 @@ def plausible_range(reference: ArrayLike, reach: float) -> tuple[float, float]:
 _MOST_SAMPLES = 10_000_000
 # s(τ) of the least jerk from rest at 0 to rest at 1 (Flash & Hogan, J. Neuroscience 5, 1985, (3)).
 _LEAST_JERK = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
+
+
+def check_takes_reference(controller: Any) -> None:
+    """Raise a ``ValueError`` for compensators alone, which take u_0 in the place of a reference."""
+    if isinstance(controller, Axes):
+        if controller.takes_u_0:
+            raise ValueError(
+                "controller = Axes of Compensators: takes u_0 of a host, not a reference; give it "
+                "the controllers of u_0 as quell.Axes(…, drives=…)"
+            )
+    elif takes_control(without_prefilters(getattr(controller, "controller", controller))):
+        raise ValueError(
+            "controller = Compensator: takes u_0 of a host, not a reference; run it between "
+            "host and drive (quell proxy), or with its controller as quell.Compensated"
+        )
 
 
 class ReferenceSamples(NamedTuple):
@@ -300,6 +317,9 @@ class Safety:
     def __post_init__(self) -> None:
         for name in _FOR_EACH:
             if checks.is_sequence(value := getattr(self, name)):
+                if not value or None in value:
+                    rule = "must be a number, or a list of numbers, one for each"
+                    raise ValueError(f"{name} = {value!r}: {rule}; infinite ones are no limits")
                 object.__setattr__(self, name, tuple(value))  # lists have no hash
         lists = [value for name in _FOR_EACH if isinstance(value := getattr(self, name), tuple)]
         for i in range(max(map(len, lists), default=1)):
@@ -312,8 +332,7 @@ class Safety:
                 *("y_max", math.inf if y_max is None else y_max),
             )
             for name, value in (("most_error", most_error), ("most_f", most_f)):
-                if value != math.inf:
-                    checks.positive(name, value)
+                checks.positive_or_infinite(name, value)
         for count in _COUNTS:
             samples, time = getattr(self, count.samples), getattr(self, count.time)
             checks.optional(checks.whole, count.samples, samples, count.fewest)
@@ -330,7 +349,7 @@ class Safety:
         value = getattr(self, name)
         if not isinstance(value, tuple):
             return value
-        return value[min(i, len(value) - 1)] if value else getattr(type(self), name)
+        return value[min(i, len(value) - 1)]
 
     def rules(self, controller: Any, scenario: Scenario | None = None) -> Any:
         """Return the supervisor's rules for a controller, with the narrower limits of both.
@@ -421,7 +440,7 @@ class Safety:
                 most_f=self._each("most_f", outputs, "axes"),
                 y_low=y_low,
                 y_high=y_high,
-                direction=np.full(outputs, 1.0 if self.check_direction else 0.0),
+                direction=np.where(np.isfinite(scale) & self.check_direction, 1.0, 0.0),
                 reach=scale,
                 push=push,
                 **self._counts(axes.dt),

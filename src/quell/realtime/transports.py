@@ -2,17 +2,17 @@
 
 Frames over UDP: one datagram each.
 
-``frames`` handles datagrams that are lost, duplicated or overtaken. The device listens at
+``wire.accept`` handles datagrams that are lost, duplicated or overtaken. The device listens at
 ``udp://HOST:PORT``; the loop uses any free port.
 
-Frames over a serial line: 40 bytes, framed by ``cobs`` with a final zero, so 42 bytes per frame;
+Frames over a serial line: 40 bytes, in COBS with a final zero, so 42 bytes per frame;
 8 more for each further signal.
 
 A byte takes 10 bits on the line (8N1: no parity, one stop bit), a frame 420: 0.46 ms at 921600
 baud. The measurement arrives later by this time, and so does the command. A frame must fit into a
 sample, dt ≥ 420 / baud; a frame each way should, dt ≥ 840 / baud.
 
-If bytes are lost, inserted or changed, the CRC and the rules of ``frames`` reject their frame, and
+If bytes are lost, inserted or changed, the CRC and the rules of ``wire`` reject their frame, and
 the next one too if the zero between them is lost.
 
 Frames on a stream of bytes: consistent overhead byte stuffing (COBS).
@@ -267,7 +267,7 @@ BAUD = 921600
 # The bits of a framed frame on the line: 42 bytes with start and stop bit.
 FRAME_BITS = 10 * (LENGTH + 2)
 # A longer packet is not a frame: the longest one, with a byte of COBS, and one more.
-_LONGEST_SERIAL_LINE = LENGTH + 8 * MOST_SIGNALS
+_LONGEST_FRAME = LENGTH + 8 * MOST_SIGNALS
 # Bytes per read from the system, and reads at once: a sender that floods the line can't keep the
 # loop from its cycle. Chosen by hand; not tuned further.
 _READ_SIZE = 256
@@ -300,8 +300,7 @@ def serial_transport(fd: int) -> SerialTransport:
     """Return the transport of the file descriptor of a serial line in raw mode."""
     os.set_blocking(fd, False)
     raw, packet, out = (
-        np.zeros(size, dtype=np.uint8)
-        for size in (_READ_SIZE, _LONGEST_SERIAL_LINE, _LONGEST_SERIAL_LINE + 3)
+        np.zeros(size, dtype=np.uint8) for size in (_READ_SIZE, _LONGEST_FRAME, _LONGEST_FRAME + 3)
     )
     coded, state = out[1:], np.array([0, 0, 0, 1])
     return SerialTransport(
@@ -317,7 +316,7 @@ def _receive_serial_line(serial: SerialTransport, frame: Buffer) -> int:
             byte = serial.raw[state[_NEXT]]
             state[_NEXT] += 1
             if byte != 0:
-                if state[_SIZE] < _LONGEST_SERIAL_LINE:
+                if state[_SIZE] < _LONGEST_FRAME:
                     serial.packet[state[_SIZE]] = byte
                 state[_SIZE] += 1
             elif state[_SIZE] > 0:

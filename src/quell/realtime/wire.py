@@ -115,7 +115,7 @@ _CRC = _crc_table()
 class Buffer(NamedTuple):
     """Memory for a frame as bytes and as numbers; all arrays share it, except ``length``."""
 
-    bytes: NDArray[np.uint8]  # (48,): longer than a frame, to notice a datagram that is too long
+    bytes: NDArray[np.uint8]  # (40 + 8 signals,), longer than a frame: so long datagrams are seen
     shorts: NDArray[np.uint16]
     words: NDArray[np.uint32]
     longs: NDArray[np.int64]

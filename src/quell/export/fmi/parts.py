@@ -283,14 +283,14 @@ class ControllerPart:
         """Return the names of signals: of each axis, or counted."""
         if self.source.sizes is None:
             return [signal]
-        if self.source.axes and signal != "u":
+        if self.source.axes and signal not in ("u", "u_0"):
             return [f"{signal}.{member}" for member in self.source.axes]
         return [f"{signal}[{i + 1}]" for i in range(self.source.sizes[place])]
 
     @property
     def references(self) -> list[str]:
-        """Names of the references."""
-        return self._names("r", 0)
+        """Names of the references; of several compensators alone those of u_0."""
+        return self._names("r" if self.source.sizes is None else self.source.given, 0)
 
     @property
     def measurements(self) -> list[str]:
@@ -305,7 +305,7 @@ class ControllerPart:
     @property
     def held(self) -> list[str]:
         """Names of the inputs that say whether the plant, or an axis, is held."""
-        return self._names("held", 0) if self.can_be_held else []
+        return self._names("held", 1) if self.can_be_held else []
 
     def derivatives_of(self, place: int) -> list[str]:
         """Return the names of the derivatives of a reference."""
@@ -314,10 +314,12 @@ class ControllerPart:
 
     @property
     def inputs(self) -> list[Variable]:
-        """Reference and its derivatives, signals of the schedule, whether the plant is held."""
+        """Reference or u_0, derivatives, signals of the schedule, whether the plant is held."""
+        is_u_0 = self.source.given == "u_0"
+        given = "control signal of another controller" if is_u_0 else "reference"
         held = "whether the plant is held, by a brake for instance: u does not act until it is not"
         return [
-            *(Variable(name, INPUT, "reference") for name in self.references),
+            *(Variable(name, INPUT, given) for name in self.references),
             *(
                 Variable(name, INPUT, f"derivative {i + 1} of the reference")
                 for place in range(len(self.derivatives))
@@ -477,7 +479,7 @@ def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
 
 
 def _omega_o_lines(known: Bandwidths, coefficients: Matrix, cast: str) -> list[str]:
-    """Return the lines for L as a polynomial in ``ω = 1 − exp(−omega_o dt)`` (bandwidths.py)."""
+    """Return the lines for L as a polynomial in ``ω = 1 − exp(−omega_o dt)``."""
     rows, columns = coefficients.shape
     return [
         f"if (m->real[AT_OMEGA_O] != {known.omega_o!r}) {{ /* else the numbers of the export */",

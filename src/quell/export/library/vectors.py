@@ -211,7 +211,7 @@ FIRST, PART = 60, 20
 # A start under load takes twice the samples in which the observer settles; longer ones are left
 # out, because the kernels are interpreted here (20 us a sample).
 LONGEST_START = 4000
-# A measurement beyond all physical quantities, by precision (``controllers.bad_samples``).
+# A measurement beyond all physical quantities, by precision.
 ABSURD, ABSURD_SINGLE = 1e80, 1e30
 # Samples between the beginnings of references: they shall not move alike.
 _APART = 13

@@ -14,7 +14,6 @@ import numpy as np
 from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
-from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
@@ -125,7 +124,7 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
             "the function out, or use --to c"
         )
     try:
-        block = _Block(source, takes_control(in_double_precision(controller)))
+        block = _Block(source)
         return block.text(controller), block.values(controller)
     except TranslationError as error:
         kind = type(in_double_precision(controller)).__name__
@@ -162,10 +161,10 @@ def _check_limits(controller: Any) -> None:
 class _Block:
     """Writer of a function block."""
 
-    def __init__(self, source: CSource, gives_control: bool) -> None:
+    def __init__(self, source: CSource) -> None:
         self.source, name = source, source.name
         self.file = CFile(source.header, source.source)
-        self.given = "u_0" if gives_control else "r"
+        self.given = source.given
         inputs = [(each, "REAL") for each in (self.given, "y", *source.further)]
         if "track" in source.operations:
             inputs += _MANUAL
@@ -199,7 +198,7 @@ class _Block:
             was = writer.variable("was_manual", "bool", "state")
             writer.emit("IF manual THEN")
             self._within(lambda: self._operation("track", [*given, "u_manual", *source.further]))
-            writer.emit("    u := u_manual;")
+            self._within(lambda: writer.assign(u, self._applied(self.state)))
             writer.emit("ELSE")
             writer.emit(lambda: f"    IF {_text(was)} THEN")
             self._within(lambda: self._operation("hand_over", []), 2)
@@ -233,6 +232,20 @@ class _Block:
         found = self.writer.call(function, [self.state, *nodes], None)
         if result is not None and isinstance(found, Node):
             self.writer.assign(result, found)
+
+    def _applied(self, state: Record) -> Node:
+        """Return the variable with the u that acts, as the observer knows it.
+
+        In manual operation it is ``u_manual``, or the u before where that is no number.
+        """
+        names = [each.name for each in self.file.structs[state.struct]]
+        inner = next(each for each in ("u", "compensator", "controller", "loop") if each in names)
+        found = self.writer.member(state, inner)
+        if isinstance(found, Record):
+            return self._applied(found)
+        if not isinstance(found, Node):
+            raise AssertionError
+        return found
 
     # ---- The text ----
 
@@ -299,8 +312,9 @@ class _Block:
             "kind": type(in_double_precision(controller)).__name__,
             "further": "".join(
                 f"| `{each}` | {_meaning(each)} |\n" for each in self.source.further),
-            "manual": "| `manual`, `u_manual` | manual operation: u is `u_manual`; the next sample "
-                "without `manual` continues from it |\n" if has_manual else "",
+            "manual": "| `manual`, `u_manual` | manual operation: u is `u_manual`, which is NOT "
+                "limited here, so limit it before; for no number u is the one before. The next "
+                "sample without `manual` continues from it |\n" if has_manual else "",
         }  # fmt: skip
 
 

@@ -198,7 +198,10 @@ class Translator:
         return atom(name, kind)._replace(is_fixed=section in ("constant", "parameter"))
 
     def _local(self, key: tuple[str, str], make: Callable[[], Place]) -> Place:
-        """Return the local variable of a function; one for all calls, which never overlap."""
+        """Return the local variable of a function; one for all calls, which do not overlap.
+
+        Calls of a function that is one expression do overlap: each has a key of its own.
+        """
         if key not in self._locals:
             self._locals[key] = make()
         return self._locals[key]
@@ -302,11 +305,16 @@ class Translator:
             if may_stand and parameter.name not in changed:
                 names[parameter.name] = given
                 continue
-            place = self._local_scalar(function.name, parameter.name, parameter.kind)
+            key = (function.name, parameter.name)
+            if _is_expression(function):
+                # Its text is used after this call, perhaps after another call of it.
+                key = (f"{function.name} {len(self._locals)}", parameter.name)
+            place = self._local_scalar(*key, parameter.kind)
             self.assign(place, given)
             names[parameter.name] = place
-        if len(function.body) == 1 and isinstance(function.body[0], Return) and result is None:
-            value = function.body[0].value
+        only = function.body[0] if _is_expression(function) else None
+        if isinstance(only, Return) and result is None:
+            value = only.value
             if value is None:
                 return None
             self._scopes.append(_Scope(function.name, names, None))
@@ -629,14 +637,17 @@ class Translator:
             self._conditional -= 1
 
     def _number(self, text: str) -> Node:
-        if re.fullmatch(r"\d+U?L*", text):
-            number, kind = int(text.rstrip("UL")), Whole()
+        if re.fullmatch(r"(0x[0-9a-fA-F]+|[1-9]\d*|0)U?L*", text):
+            digits, kind = text.rstrip("UL"), Whole()
+            number = int(digits, 16 if digits.startswith("0x") else 10)
 
             def shown() -> str:
                 forms = {"DWORD": f"DWORD#16#{number:X}", "REAL": f"{number}.0"}
                 return forms.get(kind.name, str(number))
 
             return Node(kind, shown, is_fixed=True)
+        if not re.fullmatch(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?[fF]?", text) or text.isdigit():
+            raise TranslationError(f"number {text} of C: {NO_TEXT}")  # octal numbers, for instance
         return self.extreme(float(text.rstrip("fF")))
 
     def _named(self, name: str) -> Place:

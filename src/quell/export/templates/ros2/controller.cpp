@@ -116,9 +116,6 @@ CallbackReturn @class@::on_configure(const rclcpp_lifecycle::State &)
   if (!read_names() || !read_limits()) {
     return CallbackReturn::ERROR;
   }
-  References nothing;
-  nothing.fill(NOTHING);
-  received_.set(nothing);
   subscription_ = get_node()->create_subscription<Message>(
     "~/reference", rclcpp::SystemDefaultsQoS(), [this](std::shared_ptr<const Message> message) {
       if (message->data.size() != REFERENCES) {
@@ -127,11 +124,12 @@ CallbackReturn @class@::on_configure(const rclcpp_lifecycle::State &)
           message->data.size(), REFERENCES);
         return;
       }
-      References references;
+      Received received;
       for (std::size_t i = 0; i < REFERENCES; i++) {
-        references[i] = message->data[i];
+        received.numbers[i] = message->data[i];
       }
-      received_.set(references);
+      received.message = ++messages_;
+      received_.set(received);
     });
   return CallbackReturn::SUCCESS;
 }
@@ -183,9 +181,7 @@ CallbackReturn @class@::on_activate(const rclcpp_lifecycle::State &)
   for (const auto & reference : ordered_exported_reference_interfaces_) {
     (void)reference->set_value(NOTHING);
   }
-  References nothing;
-  nothing.fill(NOTHING);
-  (void)received_.try_set(nothing);
+  old_ = messages_;
   acting_.fill(NOTHING);
   return CallbackReturn::SUCCESS;
 }
@@ -205,11 +201,14 @@ CallbackReturn @class@::on_deactivate(const rclcpp_lifecycle::State &)
 return_type @class@::update_reference_from_subscribers(
   const rclcpp::Time &, const rclcpp::Duration &)
 {
-  const auto references = received_.try_get();
+  const auto received = received_.try_get();
 
-  for (std::size_t i = 0; references.has_value() && i < REFERENCES; i++) {
-    if (!std::isnan((*references)[i])) {
-      (void)ordered_exported_reference_interfaces_[i]->set_value((*references)[i]);
+  if (!received.has_value() || received->message <= old_) {
+    return return_type::OK;
+  }
+  for (std::size_t i = 0; i < REFERENCES; i++) {
+    if (!std::isnan(received->numbers[i])) {
+      (void)ordered_exported_reference_interfaces_[i]->set_value(received->numbers[i]);
     }
   }
   return return_type::OK;

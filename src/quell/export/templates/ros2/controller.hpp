@@ -3,7 +3,9 @@
 #define @NAME@_CONTROLLER_HPP_
 
 #include <array>
+#include <atomic>
 #include <cstddef>
+#include <cstdint>
 #include <string>
 #include <vector>
 
@@ -52,6 +54,12 @@ private:
   using References = std::array<double, REFERENCES>;
   using Message = std_msgs::msg::Float64MultiArray;
 
+  struct Received
+  {
+    References numbers{};
+    std::uint64_t message{0};  // counts from 1; 0 is none
+  };
+
   bool read_names();
   bool read_limits();
 
@@ -60,8 +68,10 @@ private:
   @name@_parameters parameters_{};
   @name@_state state_{};
   rclcpp::Subscription<Message>::SharedPtr subscription_;
-  // What came last in ~/reference; NaN where nothing has come since it was read.
-  realtime_tools::RealtimeThreadSafeBox<References> received_;
+  // What came last in ~/reference; reading does not clear it, so it acts until another one comes.
+  realtime_tools::RealtimeThreadSafeBox<Received> received_;
+  std::atomic<std::uint64_t> messages_{0};  // counts those that came in ~/reference
+  std::uint64_t old_{0};  // messages up to this one came before the activation: they do not act
   std::array<double, ACTUATORS> acting_{};  // commands as they were read back; NaN before
 };
 
