@@ -133,3 +133,12 @@ def test_points_may_be_the_rows_of_an_array() -> None:
     robot = ql.plants.arm(gravity=0.0, viscous=0.1)
     rows = analyse_points(robot, axes(robot), np.array(POSES))  # type: ignore[arg-type]
     assert rows.summary() == analysed(False, POSES).summary()
+
+
+def test_what_margins_do_not_have_is_told_of_points_too() -> None:
+    """The loop that u_0 closes over compensators, for instance."""
+    robot = ql.plants.arm(gravity=0.0, viscous=0.1)
+    on_top = ql.Compensator(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3))
+    found = analyse_points(robot, ql.Axes([on_top, on_top], M=robot.inertia), POSES)
+    (told,) = [line for line in found.verdicts() if "u_0" in line]
+    assert told.startswith("NOT in these margins: the loop that u_0 closes")

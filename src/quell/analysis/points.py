@@ -133,7 +133,8 @@ class LoopsAtPoints:
                 f"{i + 1}, a stiffness that changes the loop at the peak of S by about "
                 f"{100.0 * largest:.3g} %; simulate small steps there"
             )
-        return lines
+        told = self.loops[0].remark.splitlines()  # of learners and drives: the same at all points
+        return lines + [line for line in told if line.startswith("NOT in these margins")]
 
     def __repr__(self) -> str:
         return f"LoopsAtPoints of {len(self.points)} points:\n{self.summary()}"
