@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import quell as ql
-from quell.checks import DISTRIBUTION, install
 from quell.cli import doctor
+from quell.lazy import DISTRIBUTION, install
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(

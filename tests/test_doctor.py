@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from quell.checks import install
 from quell.cli import doctor
 from quell.cli.exit_codes import ExitCode
+from quell.lazy import install
 
 from .commands import Shown, in_this_process
 

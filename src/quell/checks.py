@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from quell.lazy import install
 from quell.types import Matrix, Vector
 
 # ---- Checks of arguments ----
@@ -273,15 +274,6 @@ def _has_other(value: Any) -> bool:
 
 
 # ---- Import of packages that only extras of quell install ----
-
-
-DISTRIBUTION = "quell-control"
-"""Name of the distribution on the package index."""
-
-
-def install(extra: str = "") -> str:
-    """Return the command that installs quell, with an extra."""
-    return f"pip install '{DISTRIBUTION}[{extra}]'" if extra else f"pip install {DISTRIBUTION}"
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:

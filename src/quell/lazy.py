@@ -1,4 +1,4 @@
-"""Public names of a package that are imported when they are first used."""
+"""Public names that are imported when they are first used; how to install what is missing."""
 
 from __future__ import annotations
 
@@ -35,3 +35,12 @@ def imported_on_use(
         return value
 
     return get
+
+
+DISTRIBUTION = "quell-control"
+"""Name of the distribution on the package index."""
+
+
+def install(extra: str = "") -> str:
+    """Return the command that installs quell, with an extra."""
+    return f"pip install '{DISTRIBUTION}[{extra}]'" if extra else f"pip install {DISTRIBUTION}"

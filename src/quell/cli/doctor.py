@@ -17,9 +17,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from quell import __version__
-from quell.checks import DISTRIBUTION, install
 from quell.cli.exit_codes import ExitCode
 from quell.cli.options import RESULT_OUTPUTS, ResultOutputs
+from quell.lazy import DISTRIBUTION, install
 
 WORKS, MISSING, BROKEN = "works", "missing", "NOT"
 """States of what is found: it works; it is not here, and not needed; it is needed and fails."""
