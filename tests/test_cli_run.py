@@ -417,7 +417,7 @@ def test_a_run_that_is_ended_while_it_is_compiled_gives_the_device_free(
     """At once, with a line; what stood before minds the signal again."""
     closed: list[bool] = []
     device = SimpleNamespace(close=lambda: closed.append(True))
-    monkeypatch.setattr("quell.realtime.open_device", lambda url, dt: device)
+    monkeypatch.setattr("quell.realtime.open_device", lambda url, dt, *rest: device)
     monkeypatch.setattr(
         "quell.realtime.run_rig",
         lambda *arguments, **options: os.kill(os.getpid(), number),

@@ -326,7 +326,7 @@ def test_a_setup_file_has_it_and_is_the_same_after_saving(tmp_path: Path, m: int
 
 def test_the_form_of_the_studio_has_a_field_for_it() -> None:
     """Of every kind of observer, with its default; the page shows it with its range."""
-    for about in forms(Granted((), trust=True))["observer"].values():
+    for about in forms(Granted((), trust=True))["one"]["observer"].values():
         (field,) = (key for key in about["keys"] if key["key"] == "disturbance_order")
         assert (field["type"], field["default"], field["needed"]) == ("whole number", 1, False)
     page = resources.files("quell.studio") / "page/panels/forms.js"

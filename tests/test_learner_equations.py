@@ -305,7 +305,8 @@ def test_algorithm_1_on_scaled_features_follows_its_equations(rng: np.random.Gen
 
 def test_rounding_of_a_large_measurement_counts_as_its_noise() -> None:
     """1e-8 of y, also where the observer agrees with it exactly."""
-    gate, memory = noise_gate(OBSERVER, FREQUENCY), noise_gate_memory(2)
+    gate = noise_gate(OBSERVER, FREQUENCY)
+    memory = noise_gate_memory(gate)
     update_gate(gate, memory, np.array([5e3, 0.0, 0.0]), 5e3, 0.0)
     assert memory.noise[0] == pytest.approx(gate.forget * 5e-5**2, rel=1e-12)
 

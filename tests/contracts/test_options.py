@@ -216,6 +216,7 @@ class _Server:
 
     def __init__(self, *arguments: Any, listener: Any = None, **options: Any) -> None:
         self.given = arguments, getattr(listener, "url", "").rpartition(":")[0], options
+        self.signal_counts = None  # one measurement and one control signal
 
     def __enter__(self) -> _Server:
         return self

@@ -308,7 +308,9 @@ class ControllerPart:
         return self._names("held", 1) if self.can_be_held else []
 
     def derivatives_of(self, place: int) -> list[str]:
-        """Return the names of the derivatives of a reference."""
+        """Return the names of the derivatives of a reference; u_0 has none."""
+        if self.derivatives[place] == 0:
+            return []
         member = f".{self.source.axes[place]}" if self.source.axes else ""
         return [f"r_derivative{member}[{i + 1}]" for i in range(self.derivatives[place])]
 
