@@ -245,6 +245,7 @@ def test_pins_are_at_most_five_and_go_back_to_their_designs(page: Any) -> None:
     page.locator(".pin button").first.click()
     wait_for(lambda: page.locator(OMEGA_O).get_attribute("aria-valuetext") == f"{first:g}")
     assert before != f"{first:g}"
+    wait_for(lambda: page.evaluate("window.studio.saved()"))  # what follows is a step of its own
     page.locator(".pin button").nth(1).click()
     assert page.locator(".pin").count() == 4
     wait_for(lambda: page.evaluate("window.studio.saved()"))
