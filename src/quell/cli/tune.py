@@ -476,12 +476,16 @@ def _tune_compensator(
         with written_atomically(out, outputs.overwrite) as part:
             part.write_text(text, encoding="utf-8")
         print_line(console, f"Setup: {out}")
+    return _written(console, tuned, tuned.plot() if outputs.figures else None, outputs)
+
+
+def _written(console: Console, tuned: Any, axes: Any, outputs: Outputs) -> int:
+    """Save the figure of ``axes``, if there is one, and the results; return the exit code."""
     paths = []
-    if outputs.figures:
+    if outputs.figures is not None and axes is not None:
         from quell.experiments.common import save_figure
 
-        figure = tuned.plot().figure
-        paths += save_figure(figure, outputs.figures, "tuned", outputs.overwrite)
+        paths += save_figure(axes.figure, outputs.figures, "tuned", outputs.overwrite)
     write_results(console, tuned.to_json(), outputs, paths)
     return ExitCode.DONE
 
@@ -521,14 +525,7 @@ def _tune_schedule(
     if out is not None:
         tuned.save(out, outputs.overwrite)
         print_line(console, f"Setup: {out}")
-    paths = []
-    if outputs.figures:
-        from quell.experiments.common import save_figure
-
-        figure = tuned.plot()[0].figure
-        paths += save_figure(figure, outputs.figures, "tuned", outputs.overwrite)
-    write_results(console, tuned.to_json(), outputs, paths)
-    return ExitCode.DONE
+    return _written(console, tuned, tuned.plot()[0] if outputs.figures else None, outputs)
 
 
 def _tune_axes(
@@ -565,14 +562,7 @@ def _tune_axes(
     if out is not None:
         tuned.save(out, outputs.overwrite)
         print_line(console, f"Setup: {out}")
-    paths = []
-    if outputs.figures:
-        from quell.experiments.common import save_figure
-
-        figure = tuned.plot()[0].figure
-        paths += save_figure(figure, outputs.figures, "tuned", outputs.overwrite)
-    write_results(console, tuned.to_json(), outputs, paths)
-    return ExitCode.DONE
+    return _written(console, tuned, tuned.plot()[0] if outputs.figures else None, outputs)
 
 
 def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:

@@ -78,6 +78,15 @@ class GainMemory(NamedTuple):
     work: Work  # (n, 2 n)
 
 
+@kernel
+def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
+    """Write ``B0 u`` into ``v``."""
+    for i in range(v.size):
+        v[i] = 0.0
+        for k in range(u.size):
+            v[i] += memory.B[i, k] * u[k]
+
+
 class ConstantGain(NamedTuple):
     """A constant B0: the memory has it from the start."""
 

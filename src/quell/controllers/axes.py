@@ -34,6 +34,7 @@ from quell.controllers.allocation import (
     Gain,
     GainMemory,
     RangeMemory,
+    apply_to_axes,
     changed_actuator_limits,
     checked_actuator_limits,
     checked_gain,
@@ -104,9 +105,6 @@ from quell.controllers.several import (
     tell_applied,
 )
 from quell.controllers.stateful import StatefulController
-from quell.kernels.dispatch import (
-    kernel,
-)
 from quell.kernels.sized import Scalars, Work, clear
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -152,15 +150,6 @@ class AxesState(NamedTuple):
     wish: Work  # what each axis is asked for: its reference, or v of given control signals (n,)
     r_given: Work  # references and measurements of a call from Python (n,)
     y_given: Work
-
-
-@kernel
-def apply_to_axes(memory: GainMemory, u: Vector, v: Vector) -> None:
-    """Write ``B0 u`` into ``v``."""
-    for i in range(v.size):
-        v[i] = 0.0
-        for k in range(u.size):
-            v[i] += memory.B[i, k] * u[k]
 
 
 @control_all.register(AxesDesign)

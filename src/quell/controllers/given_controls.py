@@ -34,6 +34,7 @@ from quell.controllers.allocation import (
     GainMemory,
     RangeMemory,
     allocate,
+    apply_to_axes,
     set_range,
 )
 from quell.controllers.axes_chain import AxisDesigns, AxisStates
@@ -228,12 +229,9 @@ def _take_controls(
 @kernel
 def _act(gain: GainMemory, memory: GivenMemory, wish: Vector) -> None:
     """Write ``B0 u_0``."""
-    n, m = gain.B.shape
-    for i in range(n):
-        total = 0.0
-        for k in range(m):
-            total += gain.B[i, k] * memory.u_0[k]
-        memory.v_0[i] = wish[i] = total
+    apply_to_axes(gain, memory.u_0, memory.v_0)
+    for i in range(wish.size):
+        wish[i] = memory.v_0[i]
 
 
 @generic_with_default

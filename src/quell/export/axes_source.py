@@ -11,12 +11,11 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from quell.controllers.allocation import CutEach, FunctionGain
+from quell.controllers.allocation import CutEach, FunctionGain, apply_to_axes
 from quell.controllers.axes import (
     Axes,
     AxesDesign,
     AxesState,
-    apply_to_axes,
     begin_manual,
     end_manual,
 )

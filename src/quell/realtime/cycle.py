@@ -38,7 +38,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.axes import Axes, apply_to_axes
+from quell.controllers.allocation import apply_to_axes
+from quell.controllers.axes import Axes
 from quell.controllers.base import (
     bumpless_transfer,
     control,

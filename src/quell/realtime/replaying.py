@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.axes import Axes, apply_to_axes
+from quell.controllers.allocation import apply_to_axes
+from quell.controllers.axes import Axes
 from quell.controllers.base import (
     bumpless_transfer,
     check_controller,
