@@ -159,7 +159,7 @@ def sweep(
     folder
         Where the results are; by default the setup's name with -sweep.
     dask
-        Address tcp://HOST:PORT of a Dask scheduler, whose workers do the runs; docs/scale.
+        Address tcp://HOST:PORT of a Dask scheduler, whose workers do the runs; docs/scale_cluster.
     workers
         Number of processes on this machine; the number of cores by default.
     repeat
