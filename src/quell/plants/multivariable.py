@@ -647,3 +647,22 @@ def check_several(value: Any, name: str = "plant") -> None:
 def is_several(plant: Plant) -> bool:
     """Return whether u and y of a plant are vectors."""
     return hasattr(plant, "inputs")
+
+
+class ChannelNames(NamedTuple):
+    """Names that a plant's signals have where it comes from, in a file for instance; for errors."""
+
+    u: tuple[str, ...] = ()
+    y: tuple[str, ...] = ()
+    w: tuple[str, ...] = ()
+
+
+def named(plant: Any, channel: str) -> str:
+    """Return the names of the channel ``u``, ``y`` or ``w`` of a plant, `` (a, b)``, or no text.
+
+    They are found behind delays and encoders, too.
+    """
+    while isinstance(plant, PlantWrapper):
+        plant = plant.plant
+    names = getattr(getattr(plant, "channel_names", ChannelNames()), channel)
+    return f" ({', '.join(names)})" if names else ""
