@@ -31,12 +31,12 @@ from quell.realtime.channels import (
     channel_inputs,
     checked_channels,
     pass_channels,
+    read_inputs,
 )
 from quell.realtime.devices import (
     Device,
     PythonHandle,
     handle_of,
-    read_channels,
     read_measurement,
     write_command,
 )
@@ -63,8 +63,7 @@ class ProxyDesign(NamedTuple):
 @measure.register(ProxyDesign)
 def _measure(proxy: ProxyDesign, x: Vector) -> float:
     y, _ = read_measurement(proxy.handle, proxy.clock, now(proxy.clock))
-    if proxy.inputs.values.size > 0:
-        read_channels(proxy.handle, proxy.inputs.values)
+    read_inputs(proxy.inputs, proxy.handle)
     x[_MISSING] = 1.0
     if is_finite(y):
         x[_Y] = y
@@ -81,8 +80,7 @@ def _measure_channels(proxy: ProxyDesign, x: Vector, values: Vector) -> None:
 @advance.register(ProxyDesign)
 def _advance(proxy: ProxyDesign, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
     y = x[_Y] if x[_MISSING] == 0.0 else np.nan
-    if proxy.inputs.values.size > 0:
-        pass_channels(proxy.inputs, proxy.design, proxy.state, proxy.hold)
+    pass_channels(proxy.inputs, proxy.design, proxy.state, proxy.hold)
     acting = control(proxy.design, proxy.state, u, y)
     if write_command(proxy.handle, acting) != 0:
         x[_UNSENT] += 1.0

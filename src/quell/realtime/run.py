@@ -388,9 +388,6 @@ def run_rig(
         scenario = as_scenario(scenario, duration)
         rules = (Safety() if safety is None else safety).rules(controller, scenario)
         names = checked_channels(controller, channels)
-        if axes is not None and names:
-            rule = "are NOT for several axes yet; leave them out"
-            raise ValueError(f"channels = {list(names)!r}: {rule}")
         reference: Any
         if axes is not None:
             reference = axes_reference(scenario, axes, approach)
