@@ -511,6 +511,25 @@ def test_a_recording_comes_back_bit_by_bit(tmp_path: Path, suffix: str) -> None:
         assert alone.axis_names == ("x", "y")
 
 
+def test_a_table_alone_has_the_names_of_axes_and_actuators(tmp_path: Path) -> None:
+    """Without the header beside it; columns of anything else are refused, and say so."""
+    found = Outcome(duration=0.3)
+    texts = AxesSignals.of(("x", "y"), ("way [m]", ""), ("left [N]", "right")).texts()
+    sink = CsvSink(tmp_path / "run.csv")
+    sink.open(Header(found.header.channels, DT, notes={**found.header.notes, "signals": texts}))
+    sink.write(found.rows)
+    sink.close()
+    header_path(tmp_path / "run.csv").unlink()
+    alone = load(tmp_path / "run.csv")
+    np.testing.assert_array_equal(alone.log, found.run.log)
+    assert alone.axis_names == ("x", "y")
+    assert [each.name for each in alone.signals.u] == ["left", "right"]
+    text = (tmp_path / "run.csv").read_text().replace("u[right]", "u[1 [N]")
+    (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(ValueError, match="its columns differ from those of a recording"):
+        load(tmp_path / "run.csv")
+
+
 def test_names_of_axes_that_differ_in_their_case_only_have_fields_of_their_own() -> None:
     """Fields of ROS messages have small letters; names that others have already get a number."""
     pair = ql.Axes({"A": axis(), "a": axis()}, B0, u_min=-3.0, u_max=3.0)

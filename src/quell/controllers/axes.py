@@ -665,7 +665,12 @@ class Axes(StatefulController):
     @property
     def estimates(self) -> dict[str, Estimate]:
         """Estimates and status of each axis after the last step, by its name."""
-        return {name: axis.estimate for name, axis in zip(self.names, self.axes, strict=True)}
+        return self.read(self._state)
+
+    def read(self, state: AxesState) -> dict[str, Estimate]:
+        """Return the estimates and status of each axis in ``state``, by its name."""
+        parts = zip(self.names, self.axes, self._states(state), strict=True)
+        return {name: axis.read(own) for name, axis, own in parts}
 
     @property
     def status(self) -> Status:

@@ -161,7 +161,7 @@ def drop_signals(handle: Any) -> None:
 
 
 def counts_of(plant: Any) -> SignalCounts | None:
-    """Return how many signals a plant has; None for one y and one u."""
+    """Return how many signals a plant, or a controller, has; None for one y and one u."""
     return SignalCounts(plant.outputs, plant.inputs) if is_several(plant) else None
 
 
@@ -208,6 +208,14 @@ def other_counts(device: str, theirs: SignalCounts | None, ours: SignalCounts | 
         "be as many; take the device of this machine, or a setup with a table [[axis]] for each "
         "measurement and limits in [axes] for each actuator"
     )
+
+
+def check_counts(device: Any, ours: SignalCounts | None) -> None:
+    """Raise a ``ValueError`` unless a device has as many signals as the controller, ``ours``."""
+    given = getattr(device, "signal_counts", None)
+    theirs = None if given is None else SignalCounts(*given)
+    if theirs != ours:
+        raise ValueError(other_counts(type(device).__name__, theirs, ours))
 
 
 @kernel

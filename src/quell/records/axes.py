@@ -102,7 +102,7 @@ class AxesTrajectory(Record):
         prefix = f"{self.axis_names[i]}."
         own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
         own = [each for each in own if each[2].startswith(prefix)]
-        apart = {"r", "y", "y_measured", "u", "u_wished", "v", "status", *(name for name, *_ in own)}
+        apart = {"r", "y", "y_measured", "u", "u_wished", "v", "status", *(each[0] for each in own)}
         whole = [(name, width, name) for name, width in self.channels if "." not in name]
         whole = [each for each in whole if each[0] not in apart]
         singles = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
