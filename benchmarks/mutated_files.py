@@ -90,6 +90,7 @@ def command(reader: str, path: Path, valid: Path) -> str:
     """
     from quell.cli import app as cli
     from quell.cli.exit_codes import ExitCode
+    from quell.kernels.dispatch import as_python
 
     of_axes = path.name.startswith("axes")
     setup, record = ("axes.toml", "axes.csv") if of_axes else ("replay.toml", "run.csv")
@@ -104,7 +105,9 @@ def command(reader: str, path: Path, valid: Path) -> str:
     whole, shown, code = cli.app, io.StringIO(), 0
     cli.app = lambda: whole([*map(str, arguments), "--no-figures"])
     try:
-        with contextlib.redirect_stderr(shown), contextlib.redirect_stdout(io.StringIO()):
+        # A setup of axes has types of its own: compiling them is not what is tried.
+        how = as_python() if of_axes else contextlib.nullcontext()
+        with contextlib.redirect_stderr(shown), contextlib.redirect_stdout(io.StringIO()), how:
             cli.main()
     except SystemExit as ended:
         code = ended.code

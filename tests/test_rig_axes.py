@@ -228,10 +228,10 @@ def test_devices_without_a_wire_say_how_many_signals_they_have() -> None:
         run_rig(TwinDevice(ql.plants.two_mass_spring(), DT), one, 0.0, duration=0.1)
     with pytest.raises(ValueError, match="Scripted: gives y .* lists of one number, .*leave out"):
         run_rig(Scripted(counts=(1, 1)), single, 0.0, duration=0.1)
-    with pytest.raises(
-        ValueError, match="has one y and one u, NOT 2 and 2: several axes need a wire"
-    ):
+    with pytest.raises(ValueError, match="has one measurement .* the controller 2 measurements"):
         open_device("ni://Dev1/ctr0+Dev2/ao0", DT, signals=(2, 2))
+    with pytest.raises(ValueError, match="has 2 measurements and one .* the controller one"):
+        open_device("ni://Dev1/ctr0,Dev1/ctr1+Dev2/ao0", DT)
     for wrong in ((0, 1), (1, 17), (2,), 3, "ab"):
         with pytest.raises(ValueError, match="signals"):
             open_device("udp://127.0.0.1:1", DT, signals=wrong)  # type: ignore[arg-type]
