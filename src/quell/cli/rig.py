@@ -387,8 +387,6 @@ def run_rig(
     if several:
         rule = "is for one axis; change the bandwidths of each [[axis]] in the file"
         refuse({"omega_c": (omega_c, None), "omega_o": (omega_o, None)}, rule)
-        rule = "is of one axis; record the run, and watch one axis of it"
-        refuse({"watch": (watch, None)}, rule)
     given = _loaded(name, _changed(data, changes), trust)
     if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
@@ -462,8 +460,10 @@ def _watching(console: Console, path: Path, setup: Setup) -> WatchSink:
     """Return the sink that watches the machine."""
     from quell.monitoring import Machine, WatchSink
 
-    observer = getattr(setup.controller, "observer", None)
-    machine = Machine(order=min(getattr(observer, "degree", 2), 2))
+    parts = getattr(setup.controller, "axes", (setup.controller,))
+    observers = [getattr(each, "observer", None) for each in parts]
+    orders = [min(getattr(observer, "degree", 2), 2) for observer in observers]
+    machine = Machine(order=orders[0] if len(set(orders)) == 1 else orders)
     return WatchSink(path, machine, lambda alarm: print_line(console, alarm.describe()))
 
 
