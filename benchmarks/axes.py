@@ -31,6 +31,7 @@ import argparse
 import math
 import time
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -300,7 +301,7 @@ def part_quadrotor(draws: int, seed: int) -> None:
         )  # fmt: skip
         axes = {name: joint(omega_c=c, omega_o=o) for name, (c, o) in ATTITUDE.items()}
         controller = ql.Axes(
-            axes, gain_of_attitude(level), saturation=["roll", "pitch", "yaw"],
+            axes, partial(gain_of_attitude, level=level), saturation=["roll", "pitch", "yaw"],
             u_min=0.2, u_max=most, wished=[hover] * 4,
         )  # fmt: skip
         run = ql.simulate(craft, controller, scenario)
@@ -320,27 +321,23 @@ def part_quadrotor(draws: int, seed: int) -> None:
           f"{np.median(roll_and_pitch):.2f}, {np.max(roll_and_pitch):.2f}")  # fmt: skip
 
 
-def gain_of_attitude(level: Any) -> Any:
-    """Return B0 as a function of the angles, from that of the level craft (3, 4)."""
-
-    def gain(x):  # type: ignore[no-untyped-def]
-        roll, pitch = x[0, 0], x[1, 0]
-        W = np.zeros((3, 3))  # from rates of the body to rates of the angles
-        W[0, 0], W[0, 1], W[0, 2] = (
-            1.0,
-            math.sin(roll) * math.tan(pitch),
-            math.cos(roll) * math.tan(pitch),
-        )
-        W[1, 1], W[1, 2] = math.cos(roll), -math.sin(roll)
-        W[2, 1], W[2, 2] = math.sin(roll) / math.cos(pitch), math.cos(roll) / math.cos(pitch)
-        out = np.zeros((3, 4))
-        for i in range(3):
-            for j in range(4):
-                for k in range(3):
-                    out[i, j] += W[i, k] * level[k, j]
-        return out
-
-    return gain
+def gain_of_attitude(x, level):  # type: ignore[no-untyped-def]
+    """Return B0 at the angles, from that of the level craft (3, 4)."""
+    roll, pitch = x[0, 0], x[1, 0]
+    W = np.zeros((3, 3))  # from rates of the body to rates of the angles
+    W[0, 0], W[0, 1], W[0, 2] = (
+        1.0,
+        math.sin(roll) * math.tan(pitch),
+        math.cos(roll) * math.tan(pitch),
+    )
+    W[1, 1], W[1, 2] = math.cos(roll), -math.sin(roll)
+    W[2, 1], W[2, 2] = math.sin(roll) / math.cos(pitch), math.cos(roll) / math.cos(pitch)
+    out = np.zeros((3, 4))
+    for i in range(3):
+        for j in range(4):
+            for k in range(3):
+                out[i, j] += W[i, k] * level[k, j]
+    return out
 
 
 def single_loops(craft: Any, B0: Any, r: Any, scenario: Any, hover: float, most: float) -> Any:
