@@ -1,6 +1,7 @@
 """Several axes: an arm with and without its mass matrix, arms of MuJoCo, a quadrotor, and the cost.
 
-    python benchmarks/axes.py [--part arm|learners|mujoco|quadrotor|cost] [--draws 100] [--seed 7]
+    python benchmarks/axes.py [--part arm|draws|learners|mujoco|quadrotor|cost] [--draws 100]
+                              [--seed 7]
 
 *arm*: random rigid two-link arms (those of ``quell stress --loops axes``) that follow sines,
 ω_c/ω_o = 8/60: RMS error against the response that the design asks for, from 5 s on, with M(q),
@@ -20,6 +21,9 @@ learner over none.
 up to 30 % off. One ``Axes`` with B0 of the attitude, roll and pitch before yaw, against three
 single loops, each with the limits of its torque, whose torques are mixed and cut behind them. RMS
 of the error against the response that the design asks for, all angles.
+
+*draws*: processor time to make each of some drawn arms and its ``Axes`` with M(q) and to take the
+first samples, and that of a sample in the loop.
 
 *cost*: ``step`` of three axes over three times ``step`` of one, and the compiled loop likewise; and
 the loop of three axes with one learner for all over that with one for each.
@@ -104,6 +108,26 @@ def part_arm(draws: int, seed: int) -> None:
         worst = np.max(np.array(errors) / plain)
         print(f"  {kind:16} {'Harmonic, guard' if learns else 'no learner':16} "
               f"{one:7.2f} {two:7.2f}   worst over none {worst:.3f}")  # fmt: skip
+
+
+def part_draws(draws: int, seed: int) -> None:
+    """Print what each further arm takes: its code is that of the first."""
+    times = []
+    for i in range(draws):
+        drawn = draw_arm(np.random.default_rng([seed, i]))
+        start = [0.0, drawn.elbow, 0.0, 0.0]
+        begin = time.process_time()
+        plant = ql.plants.arm(drawn.lengths, drawn.masses, gravity=drawn.gravity)
+        axes = ql.Axes([joint(), joint()], M=plant.inertia)
+        ql.simulate(plant, axes, ql.Scenario(0.1, 0.01, x0=start))
+        times.append(time.process_time() - begin)
+    samples = []
+    for _ in range(5):
+        begin = time.process_time()
+        ql.simulate(plant, axes, ql.Scenario(0.1, 20.0, x0=start), record_every=1000)
+        samples.append((time.process_time() - begin) / 20000.0)
+    print(f"{draws} arms, processor time of making one: the first {times[0]:.2f} s, the others "
+          f"{np.median(times[1:]):.3f} s; a sample {1e6 * min(samples):.2f} us")  # fmt: skip
 
 
 # ---- Learners that see both joints ----
@@ -419,6 +443,7 @@ def part_cost(draws: int, seed: int) -> None:
 
 PARTS: dict[str, Any] = {
     "arm": part_arm,
+    "draws": part_draws,
     "learners": part_learners,
     "mujoco": part_mujoco,
     "quadrotor": part_quadrotor,
