@@ -72,10 +72,9 @@ class SampledAxes:
         noise = _one_for_each("noise", scenario.noise, controller.outputs)
         given = tuple(map(as_signal, scenario.disturbances))
         if len(given) > inputs:
-            raise ValueError(
-                f"disturbances has {len(given)} signals: the plant has {inputs} disturbance inputs"
-                f"{named(plant, 'w')}"
-            )
+            have = checks.counted(len(given), "signal")
+            most = checks.counted(inputs, "disturbance input")
+            raise ValueError(f"disturbances has {have}: the plant has {most}{named(plant, 'w')}")
         if scenario.schedule:
             raise ValueError("scenario.schedule: axes have no schedule; leave it out")
         # Signals are seeded apart, so the noise of each output has numbers of its own.
@@ -125,7 +124,8 @@ def _one_for_each(name: str, given: Any, axes: int) -> tuple[Signal, ...]:
         return (as_signal(given, name),) * axes
     if len(given) != axes:
         what = "axes" if name == "reference" else "outputs"
-        raise ValueError(f"{name} has {len(given)} signals: there are {axes} {what}, give one each")
+        have = checks.counted(len(given), "signal")
+        raise ValueError(f"{name} has {have}: there are {axes} {what}, give one each")
     return tuple(as_signal(each, f"{name}[{i}]") for i, each in enumerate(given))
 
 
