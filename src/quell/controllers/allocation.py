@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numba
@@ -648,7 +648,8 @@ def checked_gain(
     x = np.zeros((n, most))
     if callable(given):
         rule = f"it takes x, an array ({n}, {most}) of estimates x[axis, derivative]"
-        first = user_functions.attempt(f"{name}(zeros)", rule, given, x)
+        plain, values = user_functions.separated(name, given, 1)
+        first = user_functions.attempt(f"{name}(zeros)", rule, partial(plain, **values), x)
         first = checks.matrix(f"{name}(zeros)", first)
     else:
         first = checks.matrix(name, given)
@@ -673,7 +674,6 @@ def checked_gain(
     start: Matrix = np.asarray(np.linalg.inv(first) if name == "M" else first, dtype=np.float64)
     if not callable(given):
         return Gain(ConstantGain(start), None, (n, count), start, of_actuators)
-    plain, values = user_functions.separated(name, given, 1)
     shapes = user_functions.shapes_of(values)
     try:
         code = _compiled_gain(plain, shapes, (n, most), first.shape)

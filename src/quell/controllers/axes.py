@@ -283,7 +283,9 @@ class Axes(StatefulController):
         from the control signals to the axes (n, m) [y-unit/s^n per u-unit]: a matrix, or a function
         of the estimates that returns it. The function takes ``x[axis, derivative]``, so ``x[0, 0]``
         is the position of the first axis and ``x[1, 1]`` the rate of the second; it is compiled.
-        By default the unit matrix: each actuator moves one axis.
+        Parameters that ``functools.partial`` binds by name, numbers, vectors or matrices, are data:
+        other values of them compile nothing. By default the unit matrix: each actuator moves one
+        axis.
     M
         the inverse of B0 instead, of a robot its mass matrix: a matrix or a function.
     u_min, u_max
