@@ -584,7 +584,8 @@ class Axes(StatefulController):
         usual = given if self.takes_u_0 else rest
         goals = usual if r is None else checks.vector("r", r, self.references)
         samples = [samples_to_settle(axis.observer) for axis in self.axes]
-        start_all(self.parameters, self._state, samples, rest, given, goals)
+        signals = (each.astype(self._state.v.dtype) for each in (rest, given, goals))
+        start_all(self.parameters, self._state, samples, *signals)
 
     def track(
         self,
@@ -596,8 +597,8 @@ class Axes(StatefulController):
 
         ``hand_over`` ends it.
         """
-        given = checks.vector("u", u, self.inputs)
         state = self._state
+        given = checks.vector("u", u, self.inputs).astype(state.v.dtype)
         with self._manual_operation(given):
             self.step(r, y)
         state.u[:] = given

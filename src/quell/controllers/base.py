@@ -207,9 +207,8 @@ def checked_limits(u_min: float, u_max: float, rate_limit: RateLimit, dt: float)
 def _rates(rate_limit: Any) -> tuple[float, float]:
     """Return the lowest rate, at most zero, and the highest, at least zero."""
     if not checks.is_sequence(rate_limit):
-        if rate_limit != math.inf:
-            rate_limit = checks.positive("rate_limit", rate_limit, "u-unit/s")
-        return -float(rate_limit), float(rate_limit)
+        fastest = checks.positive_or_infinite("rate_limit", rate_limit, "u-unit/s")
+        return -fastest, fastest
     rule = "must be a number, or (lowest, highest) with lowest <= 0 <= highest, not both zero"
     try:
         lowest, highest = map(float, rate_limit)

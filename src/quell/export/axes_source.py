@@ -11,9 +11,8 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from quell.controllers.allocation import CutEach, FunctionGain, apply_to_axes
+from quell.controllers.allocation import apply_to_axes
 from quell.controllers.axes import (
-    Axes,
     AxesDesign,
     AxesState,
     begin_manual,
@@ -33,7 +32,6 @@ from quell.export.translate.structs import ascii_text
 from quell.export.translate.text import (
     Array,
     Number,
-    TranslationError,
     Value,
     identifier,
     unique,
@@ -129,23 +127,6 @@ def _retune_axes(old: AxesDesign, new: AxesDesign, state: AxesState) -> None:
 
 
 # ---- Names of axes in C, and what is known of each ----
-
-
-def check_single(controller: Axes) -> None:
-    """Raise a ``TranslationError`` for axes that can not be in single precision."""
-    design = controller.parameters
-    if isinstance(design.gain, FunctionGain):
-        raise TranslationError(
-            "precision = 'single': B0 or M is a function, which is compiled in double precision; "
-            "export in double, or take a constant matrix"
-        )
-    if isinstance(design.rule, CutEach) and controller.inputs > controller.outputs:
-        raise TranslationError(
-            f"precision = 'single': {controller.inputs} actuators for {controller.outputs} axes "
-            "with saturation = 'each' need least squares with a weight of 1e8, for which single "
-            "precision has too few digits; take saturation = 'direction' or the axes in the order "
-            "of their priority, or export in double"
-        )
 
 
 def names_in_c(names: tuple[str, ...]) -> tuple[str, ...]:
