@@ -139,6 +139,7 @@ SINGLE = (
     "safe sets, rates",
     "drives, direction",
     "more actuators, direction",
+    "more actuators, priority",
     "priority",
     "orders 1, 3 and 2",
 )
