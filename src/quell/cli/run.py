@@ -361,11 +361,9 @@ def export(
     if precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
     file, data = read(setup)
-    several = is_of_axes(data)
-    given = (made_axes if several else made)(file, data, trust)
-    # Single precision is compared with double in a simulated run, of one axis.
-    plant, scenario = (None, None) if several else (given.plant, given.scenario)
-    if precision == "single" and not (accept or several):
+    given = (made_axes if is_of_axes(data) else made)(file, data, trust)
+    # Single precision is compared with double in a simulated run.
+    if precision == "single" and not accept:
         given.needed("plant")
         given.needed("scenario")
     exported = c(
@@ -373,8 +371,8 @@ def export(
         out,
         name=name or "controller",
         precision=precision,
-        plant=plant,
-        scenario=scenario,
+        plant=given.plant,
+        scenario=given.scenario,
         resolution=resolution,
         accept=accept,
         proof=prove,
@@ -474,9 +472,9 @@ def _differences(found: Comparison) -> list[str]:
     """Return lines about single precision, next to the effect of the noise."""
     if found.diverged:
         return ["Single precision: the run diverges; in double precision it does not"]
-    rows = {"u": (found.u, found.u_noise), "y": (found.y, found.y_noise)}
+    rows = [("u", found.u, found.u_noise), ("y", found.y, found.y_noise)]
     lines = []
-    for signal, (difference, noise) in rows.items():
+    for signal, difference, noise in found.each or rows:
         text = f"Single precision changes {signal} by {100 * difference:.2g} % RMS"
         if noise is not None:
             text += f"; the measurement noise changes it by {100 * noise:.2g} %"

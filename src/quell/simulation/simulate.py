@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, check_controller, limits_of
-from quell.controllers.single import check_compilable, in_single_precision
+from quell.controllers.single import SeveralInSingle, check_compilable, in_single_precision
 from quell.controllers.state_space import StateFeedback
 from quell.kernels import dispatch
 from quell.kernels.cache import cache_path
@@ -273,12 +273,13 @@ def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
 @overload
 def simulate(
     plant: Any,
-    controller: Axes | StateFeedback,
+    controller: Axes | StateFeedback | SeveralInSingle,
     scenario: Scenario,
     *,
     record_every: int = 1,
     limit: float | None = None,
     interpret: bool = False,
+    precision: str = "double",
     progress: Callable[[float], None] | None = None,
 ) -> AxesTrajectory: ...
 @overload
@@ -364,11 +365,12 @@ def simulate(
     interpret = interpret or dispatch.interpret_all
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
-    if isinstance(controller, Axes | StateFeedback):
-        for name, value, usual in (
-            ("precision", precision, "double"), ("record", record, None), ("workers", workers, None)
-        ):  # fmt: skip
-            if value != usual:
+    single = checks.one_of("precision", precision, ("double", "single")) == "single"
+    if single and not interpret:
+        check_compilable()
+    if isinstance(controller, Axes | StateFeedback | SeveralInSingle):
+        for name, value in (("record", record), ("workers", workers)):
+            if value is not None:
                 raise ValueError(f"{name} = {value!r}: several axes are simulated without it")
         for name, value in (("plant", plant), ("scenario", scenario)):
             if checks.is_sequence(value):
@@ -378,10 +380,10 @@ def simulate(
                 )
         check_plant(plant)
         check_scenario(scenario)
+        if single:
+            controller = in_single_precision(controller)
         return simulate_axes(plant, controller, scenario, record_every, limit, interpret, progress)
-    if checks.one_of("precision", precision, ("double", "single")) == "single":
-        if not interpret:
-            check_compilable()
+    if single:
         several = checks.is_sequence(controller)
         controller = _in_single(controller) if several else in_single_precision(controller)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
