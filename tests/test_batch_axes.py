@@ -128,6 +128,18 @@ def test_an_axis_of_all_runs_is_a_batch_of_one_axis(tmp_path: Path) -> None:
         ql.AxesBatch.load(tmp_path / "one.nc")
 
 
+def test_batches_run_in_single_precision_too() -> None:
+    """Bit for bit as the run alone; axes that are single already, too."""
+    short = replace(SCENARIO, duration=0.02, rest_at=())
+    law = axes(learner=False)
+    runs = ql.simulate(PLANTS, law, short, precision="single", record="all")
+    for i, plant in enumerate(PLANTS):
+        check_run(runs, i, ql.simulate(plant, law, short, precision="single"))
+    given = ql.simulate(PLANTS, ql.controllers.in_single_precision(law), short)
+    np.testing.assert_array_equal(given["y"], runs["y"])
+    assert np.any(runs["u"] != ql.simulate(PLANTS, law, short)["u"])
+
+
 def test_a_run_that_diverges_ends_alone() -> None:
     """The others reach the end; its samples are NaN from there on, and its measures those up to there."""
     laws = [axes(learner=False), axes(sign=-1.0, learner=False)]
@@ -177,7 +189,6 @@ def test_a_plot_has_two_rows_of_axes() -> None:
     ("call", "message"),
     [
         (partial(ql.simulate, [gantry()] * 2, [axes(), axes()], [SCENARIO] * 3), "controller has 2 entries, plant 2|scenario has 3 entries"),
-        (partial(ql.simulate, [gantry()] * 2, axes(), SCENARIO, precision="single"), "precision = 'single': several axes are simulated without it"),
         (partial(ql.simulate, gantry(), [axes(), axes().axes[1]], SCENARIO), r"controller\[1\] has channels"),
         (partial(ql.simulate, [ql.plants.two_mass_spring()], axes(), SCENARIO), "has one control signal and one output, the controller 2 and 2"),
         (partial(ql.simulate, PlantBatch([gantry()]), axes().axes[1], SCENARIO), "has 2 control signals and 2 outputs, the controller one of each"),

@@ -125,6 +125,11 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def counted(count: int, what: str) -> str:
+    """Return a number with the things of it, as a message has them: ``1 signal``, ``2 signals``."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 def interval(low_name: str, low: Any, high_name: str, high: Any) -> tuple[float, float]:
     """Return two limits in order; either may be infinite, neither NaN."""
     low_value, high_value = _number(low_name, low), _number(high_name, high)

@@ -376,11 +376,10 @@ class SafeSet:
         if self.gain_error >= 1.0:
             rule = "must be below 1, or the sign of b is not known"
             raise ValueError(f"gain_error = {self.gain_error!r}: {rule}")
-        if self.largest_u != math.inf:
-            checks.positive("largest_u", self.largest_u, "u-unit")
-            if self.gain_error == 0.0:
-                rule = "says what gain_error is of, which is 0; leave it out or give gain_error"
-                raise ValueError(f"largest_u = {self.largest_u!r}: {rule}")
+        checks.positive_or_infinite("largest_u", self.largest_u, "u-unit")
+        if math.isfinite(self.largest_u) and self.gain_error == 0.0:
+            rule = "says what gain_error is of, which is 0; leave it out or give gain_error"
+            raise ValueError(f"largest_u = {self.largest_u!r}: {rule}")
 
     def design(self, observer: ESO, limits: Limits, ratio: float = 1.0) -> SafeSetDesign:
         """Return the parameters for an observer and limits of u.

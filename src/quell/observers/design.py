@@ -202,8 +202,8 @@ def _sampled_design(
         difference, gammas = with_motion_of_f(difference, m), with_rates(gammas, m)
         step = omega_o * dt
         gain = np.full(size, np.nan)
-        if np.all(np.isfinite(phi)):
-            difference *= step ** (power[None, :] - power[:, None])
+        difference *= step ** (power[None, :] - power[:, None])
+        if np.all(np.isfinite(phi)) and np.all(np.isfinite(difference)):
             offsets = np.full(size, -math.expm1(-step), dtype=complex)
             offsets[: kept.size] = sampled_zeros(difference[: n + 1, : n + 1], kept, dt)
             if pattern is not None:

@@ -236,6 +236,11 @@ class Trajectory(Record):
         """
 
         def made(stored: Stored, fields: dict[str, Any]) -> Trajectory:
+            if "axis_names" in stored.attributes:
+                rule = (
+                    "NOT possible here, it must be of one y and one u; AxesTrajectory.load reads it"
+                )
+                raise ValueError(f"it has several signals: {rule}")
             return cls(
                 **fields,
                 status=Status(int(stored.attributes["status"])),
@@ -441,6 +446,9 @@ class BatchTrajectory(Record):
         """
 
         def made(stored: Stored, fields: dict[str, Any]) -> Any:
+            if "axis_names" in stored.attributes and not cls.stored_attributes:
+                rule = "NOT possible here, they must be of one y and one u; AxesBatch.load reads it"
+                raise ValueError(f"its runs have several signals: {rule}")
             runs, samples, _ = fields["log"].shape
             values = {name: stored.values[name] for name in (*_PER_RUN, *stored.parameters)}
             lengths = values["lengths"]

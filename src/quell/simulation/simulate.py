@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, check_controller, limits_of
-from quell.controllers.single import check_compilable, in_single_precision
+from quell.controllers.single import SeveralInSingle, check_compilable, in_single_precision
 from quell.controllers.state_space import StateFeedback
 from quell.kernels import dispatch
 from quell.kernels.cache import cache_path
@@ -147,7 +147,7 @@ def simulate_batch(
 
 def is_of_several(controller: Any) -> bool:
     """Return whether a controller has several signals, as ``Axes`` and ``StateFeedback``."""
-    return isinstance(controller, Axes | StateFeedback)
+    return isinstance(controller, Axes | StateFeedback | SeveralInSingle)
 
 
 def _run_loops(
@@ -304,12 +304,13 @@ def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
 @overload
 def simulate(
     plant: Any,
-    controller: Axes | StateFeedback,
+    controller: Axes | StateFeedback | SeveralInSingle,
     scenario: Scenario,
     *,
     record_every: int = 1,
     limit: float | None = None,
     interpret: bool = False,
+    precision: str = "double",
     progress: Callable[[float], None] | None = None,
 ) -> AxesTrajectory: ...
 @overload
@@ -329,12 +330,13 @@ def simulate(
 @overload
 def simulate(
     plant: Any,
-    controller: Axes | StateFeedback | Sequence[Axes] | Sequence[StateFeedback],
+    controller: Axes | StateFeedback | SeveralInSingle | Sequence[Axes] | Sequence[StateFeedback],
     scenario: Scenario | Sequence[Scenario],
     *,
     record_every: int = 1,
     limit: float | None = None,
     interpret: bool = False,
+    precision: str = "double",
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
@@ -409,11 +411,8 @@ def simulate(
     interpret = interpret or dispatch.interpret_all
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
-    checks.one_of("precision", precision, ("double", "single"))
-    every_controller = controller if checks.is_sequence(controller) else (controller,)
-    if precision != "double" and any(map(is_of_several, every_controller)):
-        raise ValueError(f"precision = {precision!r}: several axes are simulated without it")
-    if precision == "single":
+    single = checks.one_of("precision", precision, ("double", "single")) == "single"
+    if single:
         if not interpret:
             check_compilable()
         several = checks.is_sequence(controller)
