@@ -281,7 +281,8 @@ class TestOperation:
         """The first u is that which holds the arm."""
         arm = ql.plants.arm()
         q = np.array([0.3, 0.4])
-        holding = -arm.f(0.0, np.array([*q, 0.0, 0.0]), np.zeros(2), np.zeros(2))[2:]
+        at_rest = np.array([*q, 0.0, 0.0])
+        holding = -arm.f(0.0, at_rest, np.zeros(2), np.zeros(2), *arm.parameters.values())[2:]
         u = arm.mass_matrix(q) @ holding
         axes = ql.Axes([joint(), joint()], M=arm.inertia)
         axes.start(q, u)
