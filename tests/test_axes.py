@@ -494,20 +494,8 @@ BAD: tuple[tuple[object, str], ...] = (
         r"reference = \(1, 2\): is a list of 2 signals, and the loop has one output",
     ),
     (
-        lambda: ql.simulate([two_masses()] * 2, ql.Axes(GOOD), ql.Scenario()),
-        "plant has 2 entries: batches of several axes are NOT possible yet",
-    ),
-    (
-        lambda: ql.simulate(two_masses(), [ql.Axes(GOOD)] * 2, ql.Scenario()),
-        "2 control signals and 2 outputs: NOT possible here yet",
-    ),
-    (
         lambda: ql.controllers.Prefiltered(ql.Axes(GOOD), ql.baselines.ZV(3.0)),
         "2 control signals and 2 outputs: NOT possible here yet",
-    ),
-    (
-        lambda: ql.simulate(two_masses(), ql.Axes(GOOD), ql.Scenario(), precision="single"),
-        "precision = 'single': several axes are simulated without it",
     ),
 )
 
