@@ -448,8 +448,8 @@ BAD: tuple[tuple[object, str], ...] = (
         "2 control signals and 2 outputs: NOT possible here yet",
     ),
     (
-        lambda: ql.simulate(two_masses(), ql.Axes(GOOD), ql.Scenario(), precision="single"),
-        "precision = 'single': several axes are simulated without it",
+        lambda: ql.simulate(two_masses(), ql.Axes(GOOD), ql.Scenario(), workers=2),
+        "workers = 2: several axes are simulated without it",
     ),
 )
 
