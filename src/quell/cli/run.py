@@ -67,7 +67,7 @@ def run(
     Parameters
     ----------
     setup
-        The file, in TOML; docs/setup has all keys.
+        The file, in TOML; docs/setup_keys has all keys.
     example
         Print such a file, and do no more.
     """
@@ -155,11 +155,11 @@ def sweep(
     Parameters
     ----------
     setup
-        The file, in TOML; docs/setup has all keys, docs/scale an example.
+        The file, in TOML; docs/setup_keys has all keys, docs/scale an example.
     folder
         Where the results are; by default the setup's name with -sweep.
     dask
-        Address tcp://HOST:PORT of a Dask scheduler, whose workers do the runs; docs/scale.
+        Address tcp://HOST:PORT of a Dask scheduler, whose workers do the runs; docs/scale_cluster.
     workers
         Number of processes on this machine; the number of cores by default.
     repeat
@@ -306,7 +306,7 @@ def export(
     Parameters
     ----------
     setup
-        The file, in TOML; docs/setup has all keys.
+        The file, in TOML; docs/setup_keys has all keys.
     to
         c; fmu, which is an FMU of FMI 3.0 for co-simulation; ros2, a package with a chainable
         controller of ros2_control; or st, a function block in Structured Text for a PLC.

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numba
@@ -45,7 +46,7 @@ from quell.controllers.base import Limits, RateLimit, checked_limits
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
-from quell.kernels.sized import Flag, Work
+from quell.kernels.sized import Buffer, Flag, Work
 from quell.kernels.user_functions import POINTER, call
 from quell.learners.base import meaning
 from quell.types import Matrix, Status, Vector, warn
@@ -99,11 +100,12 @@ class FunctionGain(NamedTuple):
     address: int
     is_inverse: Flag
     weights: Vector  # of the actuators (m,)
+    numbers: Buffer  # parameters of the function
 
 
 @meaning.register(FunctionGain)
 def _meaning(gain: FunctionGain) -> Any:
-    return gain.address, gain.is_inverse
+    return gain.address, gain.is_inverse, *([gain.numbers] if gain.numbers.size else [])
 
 
 @kernel
@@ -159,7 +161,7 @@ def _constant(gain: ConstantGain, memory: GainMemory, x: Matrix) -> int:
 
 @update_gain.register(FunctionGain)
 def _by_function(gain: FunctionGain, memory: GainMemory, x: Matrix) -> int:
-    call(gain.address, x, memory.fresh)
+    call(gain.address, x, gain.numbers, memory.fresh)
     n, m = memory.B.shape
     fresh = memory.fresh
     if n == m:
@@ -671,9 +673,18 @@ def checked_gain(
     start: Matrix = np.asarray(np.linalg.inv(first) if name == "M" else first, dtype=np.float64)
     if not callable(given):
         return Gain(ConstantGain(start), None, (n, count), start, of_actuators)
-    code = _compiled_gain(name, given, (n, most), first.shape)
-    design = FunctionGain(code.address, name == "M", of_actuators)
-    user_functions.set_origin(code.address, given)
+    plain, values = user_functions.separated(name, given, 1)
+    shapes = user_functions.shapes_of(values)
+    try:
+        code = _compiled_gain(plain, shapes, (n, most), first.shape)
+    except user_functions.NotCompilableError as error:
+        raise ValueError(
+            f"{name} can't be compiled ({error}): it must be a function of numbers and arrays that "
+            "returns a matrix, as nested tuples or an array, without Python objects"
+        ) from None
+    numbers = user_functions.as_array(values)
+    design = FunctionGain(code.address, name == "M", of_actuators, numbers)
+    user_functions.set_origin(code.address, plain, numbers=(0, shapes))
     return Gain(design, code, (n, count), start, of_actuators)
 
 
@@ -706,26 +717,32 @@ def _check_condition(name: str, matrix: Matrix, names: Sequence[str]) -> None:
         )
 
 
+# Functions whose code is kept, for axes that are made again with other parameters. Chosen by hand:
+# more than the functions of a study.
+_KEPT = 32
+
+
+@lru_cache(maxsize=_KEPT)
 def _compiled_gain(
-    name: str, function: Callable[..., Any], inner: tuple[int, int], outer: tuple[int, int]
+    function: Callable[..., Any],
+    shapes: user_functions.Shapes,
+    inner: tuple[int, int],
+    outer: tuple[int, int],
 ) -> Any:
-    """Return the compiled function that writes the matrix for estimates."""
-    try:
-        own = user_functions.jit_user_function(function)
+    """Return the compiled function that writes the matrix for estimates and parameters.
 
-        def write(px, pout):  # type: ignore[no-untyped-def]
-            out = numba.carray(pout, outer)
-            matrix = own(numba.carray(px, inner))
-            for i in range(outer[0]):
-                for j in range(outer[1]):
-                    out[i, j] = matrix[i][j]
+    Raises ``NotCompilableError`` if Numba can't compile it.
+    """
+    own, parameters = user_functions.jit_user_function(function), user_functions.reader(shapes)
 
-        return user_functions.compile_cfunc(nb_types.void(POINTER, POINTER), write)
-    except user_functions.NotCompilableError as error:
-        raise ValueError(
-            f"{name} can't be compiled ({error}): it must be a function of numbers and arrays that "
-            "returns a matrix, as nested tuples or an array, without Python objects"
-        ) from None
+    def write(px, pp, pout):  # type: ignore[no-untyped-def]
+        out = numba.carray(pout, outer)
+        matrix = own(numba.carray(px, inner), *parameters(pp))
+        for i in range(outer[0]):
+            for j in range(outer[1]):
+                out[i, j] = matrix[i][j]
+
+    return user_functions.compile_cfunc(nb_types.void(POINTER, POINTER, POINTER), write)
 
 
 def checked_rule(

@@ -50,6 +50,7 @@ from quell.controllers.axes_chain import (
     ask_axes,
     continue_axes,
     have_started,
+    hold_axis,
     reset_axes,
     set_axes_derivatives,
     set_axes_manual,
@@ -67,6 +68,7 @@ from quell.controllers.base import (
     Controller,
     RateLimit,
     reset_loop,
+    set_axis_held,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -155,7 +157,9 @@ class AxesState(NamedTuple):
 @control_all.register(AxesDesign)
 def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
     loop = state.loop[0]
-    flags = take_references(design.given, state.given, state.gain, r, y, state.wish)
+    flags = take_references(
+        design.given, state.given, design.axes, state.axes, state.gain, r, y, state.wish
+    )
     look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags |= ask_axes(design.axes, state.axes, 0, state.wish, y, state.v, state.x)
     flags |= learn_of_all(design.learning, state.learning, design.axes, state.axes)
@@ -254,6 +258,11 @@ def _write_row(design: AxesDesign, state: AxesState, row: Vector) -> None:
 @set_reference_derivatives.register(AxesDesign)
 def _set_derivatives(design: AxesDesign, state: AxesState, derivatives: Vector) -> None:
     set_axes_derivatives(design.axes, state.axes, design.derivatives, 0, derivatives)
+
+
+@set_axis_held.register(AxesDesign)
+def _set_axis_held(design: AxesDesign, state: AxesState, axis: int, held: bool) -> None:
+    hold_axis(design.axes, state.axes, 0, axis, held)
 
 
 # ---- The controller ----
@@ -657,7 +666,12 @@ class Axes(StatefulController):
     @property
     def estimates(self) -> dict[str, Estimate]:
         """Estimates and status of each axis after the last step, by its name."""
-        return {name: axis.estimate for name, axis in zip(self.names, self.axes, strict=True)}
+        return self.read(self._state)
+
+    def read(self, state: AxesState) -> dict[str, Estimate]:
+        """Return the estimates and status of each axis in ``state``, by its name."""
+        parts = zip(self.names, self.axes, self._states(state), strict=True)
+        return {name: axis.read(own) for name, axis, own in parts}
 
     @property
     def status(self) -> Status:

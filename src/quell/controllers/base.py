@@ -101,6 +101,15 @@ def set_held(controller: Any, state: Any, held: bool) -> None:
     """
 
 
+@generic_with_default
+def set_axis_held(controller: Any, state: Any, axis: int, held: bool) -> None:
+    """Set whether an axis is held: its share of u does not act until it is not.
+
+    A controller of one axis has that of the plant.
+    """
+    set_held(controller, state, held)
+
+
 @generic
 def write_row(controller: Any, state: Any, row: Vector) -> None:
     """Write the controller's ``channels`` into ``row``."""

@@ -71,6 +71,7 @@ from quell.simulation.driver import (
     SampledScenario,
     Scenario,
     check_scenario,
+    is_random,
     logged_channels,
     run_samples,
 )
@@ -248,7 +249,8 @@ class Episodes:
         self._scenario, self._plant, self._controller = scenario, plant, controller
         #: an episode that does not depend on the seed of the environment
         self.example = self._sampled(self._drawn(np.random.default_rng(0)))
-        self._shared = None if self._is_random() else self._tabulated(self.example)
+        may_differ = callable(scenario) or is_random(scenario)
+        self._shared = None if may_differ else self._tabulated(self.example)
 
     @property
     def are_equal(self) -> bool:
@@ -291,17 +293,6 @@ class Episodes:
         whole = scenario.segment(0, scenario.samples)
         parts: list[Any] = [whole.r, whole.noise, whole.derivatives, whole.w]
         return Episode(np.column_stack(parts), scenario.x0)
-
-    def _is_random(self) -> bool:
-        """Return whether episodes differ, or may differ."""
-        if callable(self._scenario):
-            return True
-        seeds = (replace(self._scenario, seed=seed) for seed in (0, 1))
-        first, second = (each.seeded_signals(self._plant.disturbances) for each in seeds)
-        try:
-            return bool(first != second)
-        except ValueError:  # signals that hold arrays
-            return True
 
 
 # ---- Many states of one layout, one after the other in memory, for a compiled loop over them ----

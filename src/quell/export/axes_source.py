@@ -37,7 +37,7 @@ from quell.export.translate.text import (
     unique,
     wrapped,
 )
-from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.dispatch import is_finite, kernel
 from quell.types import Channels, Status, Vector
 
 # ---- Operations besides a step ----
@@ -108,29 +108,6 @@ def track_axes(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Ve
     tell_applied(design, state)
     state.loop[0].started = 1.0
     add_flag_of_axes(design, state, missing)
-
-
-@generic
-def set_axis_held(axes: Any, states: Any, i: int, axis: int, held: bool) -> None:
-    """Set whether an axis is held: its v does not act until it is not."""
-    raise TypeError
-
-
-@set_axis_held.register(NoAxis)
-def _set_none_held(axes: NoAxis, states: Any, i: int, axis: int, held: bool) -> None:
-    pass
-
-
-@set_axis_held.register(AxisDesigns)
-def _set_axis_held(axes: AxisDesigns, states: AxisStates, i: int, axis: int, held: bool) -> None:
-    if axis == i:
-        states.axis.loop[0].held = 1.0 if held else 0.0
-    set_axis_held(axes.others, states.others, i + 1, axis, held)
-
-
-def set_held_of_axes(design: AxesDesign, state: AxesState, axis: int, held: bool) -> None:
-    """Set whether an axis is held."""
-    set_axis_held(design.axes, state.axes, 0, axis, held)
 
 
 @change_parameters.register(NoAxis)

@@ -17,6 +17,7 @@ from quell.controllers.base import (
     check_controller,
     control,
     reset_loop,
+    set_axis_held,
     set_held,
     set_reference_derivatives,
     status_flags,
@@ -161,7 +162,7 @@ _OF_SEVERAL = Kernels(
     axes_source.start_axes_from,
     axes_source.track_axes,
     hand_over_all,
-    axes_source.set_held_of_axes,
+    set_axis_held,
 )
 
 

@@ -305,7 +305,8 @@ def _interval(node: ast.expr, known: dict[str, tuple[int, int]]) -> Interval:
         return _operation(node.op, _interval(node.left, known), _interval(node.right, known))
     if isinstance(node, ast.Call) and len(node.args) == 2:
         name, pair = getattr(node.func, "id", ""), [_interval(each, known) for each in node.args]
-        lows, highs = ([each[i] for each in pair if each[i] is not None] for i in (0, 1))
+        lows = [low for low, _ in pair if low is not None]
+        highs = [high for _, high in pair if high is not None]
         if name == "minimum_int":
             return min(lows) if len(lows) == 2 else None, min(highs, default=None)
         if name == "maximum_int":

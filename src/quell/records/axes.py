@@ -84,6 +84,8 @@ class AxesTrajectory(Record):
     def axis(self, which: int | str) -> Trajectory:
         """Return one axis as a record of its own: its u is v_i [y-unit/s^n].
 
+        What is of the whole machine, as channels of its device, is in the record of each axis.
+
         Parameters
         ----------
         which
@@ -100,8 +102,9 @@ class AxesTrajectory(Record):
         prefix = f"{self.axis_names[i]}."
         own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
         own = [each for each in own if each[2].startswith(prefix)]
-        shared = ("w", "x", "k", "lateness", "step_time", "mode", "events")
-        whole = [(name, width, name) for name, width in self.channels if name in shared]
+        apart = {"r", "y", "y_measured", "u", "u_wished", "v", "status", *(each[0] for each in own)}
+        whole = [(name, width, name) for name, width in self.channels if "." not in name]
+        whole = [each for each in whole if each[0] not in apart]
         singles = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
         columns = [columns_of(self.channels, source).start + i for _, source in singles]
         for _, _, source in (*whole, *own):

@@ -236,6 +236,11 @@ class Trajectory(Record):
         """
 
         def made(stored: Stored, fields: dict[str, Any]) -> Trajectory:
+            if "axis_names" in stored.attributes:
+                rule = (
+                    "NOT possible here, it must be of one y and one u; AxesTrajectory.load reads it"
+                )
+                raise ValueError(f"it has several signals: {rule}")
             return cls(
                 **fields,
                 status=Status(int(stored.attributes["status"])),

@@ -165,6 +165,21 @@ def check_scenario(value: Any, name: str = "scenario") -> None:
         raise ValueError(f"{name} = {value!r}: must be a quell.Scenario")
 
 
+def is_random(scenario: Scenario) -> bool:
+    """Return whether another seed changes a signal of a scenario."""
+    given = (scenario.reference, scenario.noise, scenario.disturbances, scenario.schedule)
+    several: list[Any] = [each if checks.is_sequence(each) else (each,) for each in given]
+    return any(_is_drawn(as_signal(each)) for signals in several for each in signals)
+
+
+def _is_drawn(signal: Signal) -> bool:
+    one, other = signal.seeded(0), signal.seeded(1)
+    try:
+        return one is not other and one != other
+    except ValueError:  # signals that hold arrays
+        return True
+
+
 # ---- A scenario as the samples of a loop, evaluated in segments ----
 
 # Samples for which signals are evaluated at once: enough that Python's share of the time is small,

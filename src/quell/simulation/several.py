@@ -16,7 +16,7 @@ from quell.controllers.base import set_reference_derivatives, status_flags, writ
 from quell.controllers.several import control_all
 from quell.kernels.dispatch import compiled_loop
 from quell.plants.base import advance
-from quell.plants.multivariable import is_several, measure_all
+from quell.plants.multivariable import is_several, measure_all, named
 from quell.records.axes import AxesTrajectory
 from quell.signals import Constant, Signal, as_signal, seeded_apart
 from quell.signals.shapes import check_derivative
@@ -74,7 +74,7 @@ class SampledAxes:
         if len(given) > inputs:
             have = checks.counted(len(given), "signal")
             most = checks.counted(inputs, "disturbance input")
-            raise ValueError(f"disturbances has {have}: the plant has {most}")
+            raise ValueError(f"disturbances has {have}: the plant has {most}{named(plant, 'w')}")
         if scenario.schedule:
             raise ValueError("scenario.schedule: axes have no schedule; leave it out")
         # Signals are seeded apart, so the noise of each output has numbers of its own.
@@ -259,13 +259,14 @@ def check_fit(plant: Any, controller: Any) -> None:
             f"{controller.inputs} and {controller.outputs}: must be a plant with as many, for "
             "example quell.plants.arm()"
         )
-    for what, own, of_plant in (
-        ("control signals", controller.inputs, plant.inputs),
-        ("outputs", controller.outputs, plant.outputs),
+    for what, channel, own, of_plant in (
+        ("control signals", "u", controller.inputs, plant.inputs),
+        ("outputs", "y", controller.outputs, plant.outputs),
     ):
         if own != of_plant:
             raise ValueError(
-                f"plant = {name!r} has {of_plant} {what}, the controller {own}: must be the same"
+                f"plant = {name!r} has {of_plant} {what}{named(plant, channel)}, the controller "
+                f"{own}: must be the same"
             )
 
 
