@@ -297,6 +297,17 @@ def set_range(limits: ActuatorLimits, before: Vector, memory: RangeMemory) -> No
 
 
 @kernel
+def _clamped(memory: RangeMemory, i: int, wish: float) -> float:
+    """Return the value within the range of actuator i that is nearest to a wish."""
+    value = wish
+    if value > memory.high[i]:
+        value = memory.high[i]
+    elif value < memory.low[i]:
+        value = memory.low[i]
+    return value
+
+
+@kernel
 def _cut(memory: RangeMemory, limits: ActuatorLimits, i: int, wish: float) -> tuple[float, int]:
     """Return a value of actuator i within its range, and the flag of what cut it.
 
@@ -500,31 +511,32 @@ def solve_free(H: Matrix, L: Matrix, slope: Vector, free: Vector, step: Vector) 
 
 
 @kernel
-def _share_within(memory: RangeMemory, u: Vector) -> float:
-    """Return the largest share in [0, 1] of ``memory.step`` that keeps u in its range."""
-    share = 1.0
-    for k in range(u.size):
-        step = memory.step[k]
-        if step > memory.high[k] - u[k]:
-            share = min(share, max(memory.high[k] - u[k], 0.0) / step)
-        elif step < memory.low[k] - u[k]:
-            share = min(share, max(u[k] - memory.low[k], 0.0) / -step)
+def _share_within(memory: RangeMemory, i: int, at: float, share: float) -> float:
+    """Return how much of a share of ``memory.step`` from ``at`` keeps actuator i in its range."""
+    step = memory.step[i]
+    if step > memory.high[i] - at:
+        return min(share, max(memory.high[i] - at, 0.0) / step)
+    if step < memory.low[i] - at:
+        return min(share, max(at - memory.low[i], 0.0) / -step)
     return share
 
 
 @kernel
-def _go(memory: RangeMemory, limits: ActuatorLimits, u: Vector) -> int:
-    """Move u by ``memory.step`` as far as its range allows; return the flags."""
-    share = _share_within(memory, u)
+def _go(memory: RangeMemory, limits: ActuatorLimits, share: float, u: Vector) -> int:
+    """Move u by a share of ``memory.step``, the largest that its range allows; return the flags."""
     flags = 0
     for k in range(u.size):
-        u[k], wrong = _cut(memory, limits, k, u[k] + share * memory.step[k])
-        flags |= wrong & _OVERFLOWED
-        if share < 1.0 and (u[k] == memory.high[k] or u[k] == memory.low[k]):
-            at_end = u[k] == limits.high[k] or u[k] == limits.low[k]
-            flags |= _SATURATED if at_end else _RATE_LIMITED
-    if share < 1.0 and flags == 0:  # rounding left u just inside of the range
-        flags = _SATURATED
+        u[k] = _clamped(memory, k, u[k] + share * memory.step[k])
+        if not is_finite(u[k]):
+            u[k] = min(max(0.0, limits.low[k]), limits.high[k])
+            flags |= _OVERFLOWED
+    if share < 1.0:
+        for k in range(u.size):
+            if u[k] == memory.high[k] or u[k] == memory.low[k]:
+                at_end = u[k] == limits.high[k] or u[k] == limits.low[k]
+                flags |= _SATURATED if at_end else _RATE_LIMITED
+        if flags == 0:  # rounding left u just inside of the range
+            flags = _SATURATED
     return flags
 
 
@@ -540,15 +552,16 @@ def _keep_direction(
 ) -> int:
     set_range(limits, before, memory)
     _wish(gain, rule.wished, v, memory.rest, u)
-    flags = 0
+    flags, share = 0, 1.0
     for k in range(u.size):
         wish = u[k]
         if not is_finite(wish):
             wish = 0.0
             flags |= _OVERFLOWED
-        u[k], _ = _cut(memory, limits, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
+        u[k] = _clamped(memory, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
         memory.step[k] = wish - u[k]
-    return flags | _go(memory, limits, u)
+        share = _share_within(memory, k, u[k], share)
+    return flags | _go(memory, limits, share, u)
 
 
 @allocate.register(ByPriority)
@@ -564,7 +577,7 @@ def _by_priority(
     n, m = gain.B.shape
     set_range(limits, before, memory)
     for k in range(m):
-        u[k], _ = _cut(memory, limits, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
+        u[k] = _clamped(memory, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
     flags = 0
     for i in range(n):
         memory.target[i] = v[i]
