@@ -497,13 +497,6 @@ BAD: tuple[tuple[object, str], ...] = (
         lambda: ql.controllers.Prefiltered(ql.Axes(GOOD), ql.baselines.ZV(3.0)),
         "2 control signals and 2 outputs: NOT possible here yet",
     ),
-<<<<<<< HEAD
-=======
-    (
-        lambda: ql.simulate(two_masses(), ql.Axes(GOOD), ql.Scenario(), workers=2),
-        "workers = 2: several axes are simulated without it",
-    ),
->>>>>>> single
 )
 
 
