@@ -7,7 +7,8 @@ seconds after the compilation, with new episodes where they end. A *sample* is a
 controller; a step of the environment has ``action_repeat`` of them. Wall time depends on what else
 the machine does; CPU time, of all threads together, hardly. A million steps a second on two cores
 take 2 µs of CPU a step. *fixed* environments have the same signals in all episodes; *drawn* ones
-get scenarios of their own, whose signals Python evaluates when an episode begins.
+get scenarios of their own, whose signals Python evaluates when an episode begins. The last rows
+are two coupled axes, with a residual action for each.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ NAMES = ("quell/two-mass-v0", "quell/two-mass-residual-v0")
 def measured(env: Any, seconds: float) -> tuple[float, float]:
     """Return steps a second and CPU time a step [s]."""
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-0.1, 0.1, (64, env.num_envs, 1))
+    actions = rng.uniform(-0.1, 0.1, (64, *env.action_space.shape))
     env.reset(seed=0)
     env.step(actions[0])
     steps, wall, cpu = 0, time.perf_counter(), time.process_time()
@@ -39,6 +40,20 @@ def measured(env: Any, seconds: float) -> tuple[float, float]:
         steps += actions.shape[0]
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return steps * env.num_envs / wall, cpu / (steps * env.num_envs)
+
+
+def two_axes(lanes: int, repeat: int) -> Any:
+    """Return loops of a gantry whose drives act on both axes, each with an ADRC and a policy."""
+    A = [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]]
+    B = [[0, 0], [5, 0.5], [0, 0], [0.4, 6]]
+    plant = ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3)
+    one = ql.ADRC(observer, omega_c=8.0, learner=quell.envs.Policy(), guard=ql.Guard())
+    limits = {"u_min": -25.0, "u_max": 25.0}
+    axes = ql.Axes({"x": one, "y": one}, B0=[[5.0, 0.5], [0.4, 6.0]], **limits)
+    references = (ql.signals.Sinusoid(0.1, 5.0), ql.signals.Sinusoid(0.2, 3.0))
+    scenario = ql.Scenario(references, 2.0)
+    return quell.envs.VectorEnv(lanes, plant, scenario, axes, action_repeat=repeat)
 
 
 def main() -> None:
@@ -55,14 +70,22 @@ def main() -> None:
             for repeat in (1, 10):
                 given = {"action_repeat": repeat, "limit": 10.0} | changes
                 env = gymnasium.make_vec(name, num_envs=options.lanes, **given)
-                rate, cpu = measured(env, options.seconds)
+                show(name, signals, repeat, *measured(env, options.seconds))
                 env.close()
-                row = (rate, rate * repeat, 1e9 * cpu, 1e9 * cpu / repeat)
-                print(
-                    f"{name:28} {signals:>8} {repeat:7d} {row[0]:12.3g} {row[1]:12.3g} "
-                    f"{row[2]:12.0f} {row[3]:8.0f}",
-                    flush=True,
-                )
+    for repeat in (1, 10):
+        env = two_axes(options.lanes, repeat)
+        show("two axes, residual", "fixed", repeat, *measured(env, options.seconds))
+        env.close()
+
+
+def show(name: str, signals: str, repeat: int, rate: float, cpu: float) -> None:
+    """Print a row."""
+    row = (rate, rate * repeat, 1e9 * cpu, 1e9 * cpu / repeat)
+    print(
+        f"{name:28} {signals:>8} {repeat:7d} {row[0]:12.3g} {row[1]:12.3g} "
+        f"{row[2]:12.0f} {row[3]:8.0f}",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
