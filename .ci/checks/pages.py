@@ -26,6 +26,7 @@ NOT_HERE = {
     "import equinox": "JAX",
     "SLURMCluster": "a cluster",
     '"drive.fmu"': "a unit of somebody's",
+    '"robot.fmu"': "a unit of somebody's",
     "controller.set(r=": "the interface of a unit, in words",
     "Relay(": "a rig",
 }
