@@ -45,7 +45,13 @@ from quell.realtime.registry import listen, open_device
 from quell.realtime.rig import APPLIED, Rig
 
 DT, LIMIT, WATCHDOG = 0.01, 5.0, 50
-PLANT = ql.plants.two_mass_spring()
+ONE = ql.plants.two_mass_spring()
+# Three masses with a spring between neighbours: as many measurements and control signals.
+SEVERAL = ql.plants.MultivariableLinearPlant(
+    np.block([[np.zeros((3, 3)), np.eye(3)], [-np.diag([2.0, 3.0, 1.0]) + 0.5, -0.4 * np.eye(3)]]),
+    np.vstack([np.zeros((3, 3)), np.eye(3) + 0.2]),
+    np.hstack([np.eye(3), np.zeros((3, 3))]),
+)
 # Attacks per tick: a queue of the system holds some hundred datagrams.
 AT_ONCE = 60
 # Part of the packets that are new; the others were sent before, to this session or an older one.
@@ -56,17 +62,22 @@ ABSURD = (float("nan"), float("inf"), -1e300, 1e9, 5e-324, -0.0)
 
 
 def signed(head: bytes) -> bytes:
-    """Return 36 bytes with their CRC."""
+    """Return what is before the CRC of a frame, 36 bytes for one number, with it."""
     return head + struct.pack("<I", zlib.crc32(head))
 
 
 class Session:
     """A rig that ticks when it is told, and a loop; ``tick`` exchanges a frame and checks it."""
 
-    def __init__(self, stack: ExitStack, url: str, exact: bool, draw: random.Random) -> None:
+    def __init__(
+        self, stack: ExitStack, url: str, exact: bool, draw: random.Random, several: bool
+    ) -> None:
+        self.plant: Any = SEVERAL if several else ONE
         self.rig = stack.enter_context(
-            Rig(PLANT, DT, listen(url), u_max=LIMIT, watchdog=WATCHDOG, rest=True)
+            Rig(self.plant, DT, listen(url), u_max=LIMIT, watchdog=WATCHDOG, rest=True)
         )
+        self.counts = self.rig.signal_counts
+        self.outputs, self.inputs = self.counts or (1, 1)
         stack.callback(self.rig.listener.close)
         self.rig.prepare()
         self.url, self.exact, self.draw = self.rig.listener.url, exact, draw
@@ -90,7 +101,7 @@ class Session:
             self._while_ticking(self.loop.close)
             self.rig.tick(2)
         opened: list[Any] = []
-        self._while_ticking(lambda: opened.append(open_device(self.url, DT)))
+        self._while_ticking(lambda: opened.append(open_device(self.url, DT, False, self.counts)))
         if not opened:
             raise RuntimeError(f"{self.url}: the loop got no session")
         self.loop = opened[0]
@@ -98,9 +109,9 @@ class Session:
         while numbers[frames.RECEIVED] < self.rig.model.endpoint.numbers[frames.SENT]:
             self.loop.read()
         ask(self.loop.handle)
-        self.commands: deque[float] = deque([0.0], maxlen=WATCHDOG)
+        self.u = np.zeros(self.inputs)
+        self.commands: deque[np.ndarray] = deque([self.u], maxlen=WATCHDOG)
         self.twin: TwinDevice | None = None
-        self.u = 0.0
 
     def _while_ticking(self, work: Callable[[], Any]) -> None:
         thread = threading.Thread(target=work)
@@ -113,28 +124,34 @@ class Session:
         """Let the rig tick, read, answer; the attacks were sent before."""
         self.rig.tick()
         y = self.loop.read() if self.exact else self._read_soon()
-        applied = float(self.rig.model.signals[APPLIED, 0])
+        applied = self.rig.model.signals[APPLIED].copy()
         rig_numbers = self.rig.model.endpoint.numbers
-        self._check(abs(applied) <= LIMIT, f"u = {applied!r}")
+        self._check(np.all(np.abs(applied) <= LIMIT), f"u = {applied!r}")
         self._check(rig_numbers[frames.SESSION] == self.number, "a foreign session")
         if self.exact:
-            self._check(applied == min(max(self.u, -LIMIT), LIMIT), f"u = {applied!r} for {self.u}")
+            right = np.array_equal(applied, np.clip(self.u, -LIMIT, LIMIT))
+            self._check(right, f"u = {applied!r} for {self.u}")
             self._check(self.rig.state in ("live", "waiting"), self.rig.state)
             if self.twin is None:
-                self.twin = TwinDevice(ql.plants.delayed(PLANT, DT, DT), DT)
+                late: Any = ql.plants.delayed_inputs if self.counts else ql.plants.delayed
+                self.twin = TwinDevice(late(self.plant, DT, DT), DT)
             expected = self.twin.read()
-            self._check(y == expected, f"y = {y!r}, and not {expected!r}")
-        else:
-            own = [min(max(u, -LIMIT), LIMIT) for u in self.commands]
-            self._check(applied in own or applied == 0.0, f"u = {applied!r} is of nobody")
-        self.u = self.draw.uniform(-1.2 * LIMIT, 1.2 * LIMIT)
+            self._check(np.array_equal(y, expected), f"y = {y!r}, and not {expected!r}")
+        else:  # a command acts as a whole, or not at all
+            own = any(np.array_equal(applied, np.clip(u, -LIMIT, LIMIT)) for u in self.commands)
+            self._check(own or not np.any(applied), f"u = {applied!r} is of nobody")
+        self.u = np.array([self.draw.uniform(-1.2 * LIMIT, 1.2 * LIMIT) for _ in self.u])
         if self.twin is not None:
-            self.twin.write(min(max(self.u, -LIMIT), LIMIT))
+            self.twin.write(self._given(np.clip(self.u, -LIMIT, LIMIT)))
         self.commands.append(self.u)
         with suppress(ConnectionError):  # attacks on the line may trip the watchdog
-            self.loop.write(self.u)
-        out = self.loop.handle.outbox.bytes[: frames.LENGTH].tobytes()
-        self.seen += [out, self.rig.model.outbox.bytes[: frames.LENGTH].tobytes()]
+            self.loop.write(self._given(self.u))
+        for box in (self.loop.handle.outbox, self.rig.model.outbox):
+            self.seen.append(box.bytes[: box.length[0]].tobytes())
+
+    def _given(self, u: np.ndarray) -> Any:
+        """Return control signals as a device takes them."""
+        return u if self.counts else float(u[0])
 
     def _read_soon(self) -> float:
         """Read without waiting for a measurement that an attack has destroyed."""
@@ -151,13 +168,15 @@ class Session:
         ahead = draw.choice((1, 2, 100, 2**31 - 1, draw.randrange(2**32)))
         number = (int(sent[frames.RECEIVED]) + ahead) % 2**32
         answers = (int(sent[frames.SENT]) - draw.choice((0, 0, 1, 30, 10**6))) % 2**32
-        value = draw.choice((*ABSURD, DT, draw.uniform(-9.0, 9.0)))
+        values = [draw.choice((*ABSURD, DT, draw.uniform(-9.0, 9.0)))]
         version, state = draw.choice((1, 1, 1, 2, 0)), draw.choice((0, 0, 1, 8, draw.randrange(9)))
-        return signed(
-            struct.pack(
-                *("<2sBBIIIqdI", b"QL", version, kind, session, number, answers, 0, value, state)
-            )
-        )
+        if self.counts:  # as many as the session has, fewer, more, or too many for any
+            count = draw.choice((*(self.inputs,) * 4, 1, draw.randrange(1, 20)))
+            values += [draw.choice((*ABSURD, DT, 1.0)) for _ in range(count - 1)]
+            word = frames.signals_word(self.outputs, self.inputs)
+            state |= draw.choice((0, word, draw.randrange(2**24)))
+        head = struct.pack("<2sBBIIIq", b"QL", version, kind, session, number, answers, 0)
+        return signed(head + struct.pack(f"<{len(values)}dI", *values, state))
 
     def changed(self) -> bytes:
         """Return a frame of the session with some bits changed, sometimes with a correct CRC."""
@@ -184,7 +203,7 @@ def attack_udp(session: Session, strangers: list[socket.socket]) -> tuple[int, i
     for stranger in strangers:
         with suppress(BlockingIOError):
             while True:
-                returned += len(stranger.recv(100))
+                returned += len(stranger.recv(4096))
     return sent, returned
 
 
@@ -199,14 +218,14 @@ def _packet(session: Session) -> bytes:
     if kind == 2:
         return session.changed()
     if kind == 3:
-        return signed(session.changed()[:36])
+        return signed(session.changed()[:-4])
     return session.forged(draw.choice((session.number, session.ended, 0, 77)))
 
 
 def attack_serial(session: Session, ends: tuple[int, int]) -> None:
     """Write bytes to both directions of the line, beside the frames."""
     draw = session.draw
-    coded = np.zeros(60, dtype=np.uint8)
+    coded = np.zeros(400, dtype=np.uint8)
     for _ in range(AT_ONCE // 4):
         kind = draw.randrange(5)
         data = draw.randbytes(draw.randrange(60))
@@ -230,10 +249,12 @@ def resources() -> tuple[int, int]:
     return pages * resource.getpagesize(), sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
-def attacks(wire: str, stack: ExitStack, draw: random.Random) -> Iterator[tuple[int, Session, Any]]:
+def attacks(
+    wire: str, stack: ExitStack, draw: random.Random, several: bool
+) -> Iterator[tuple[int, Session, Any]]:
     """Attack a session over one kind of wire, and yield the number of attacks after each tick."""
     url = {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}[wire]
-    session = Session(stack, url, wire == "udp", draw)
+    session = Session(stack, url, wire == "udp", draw, several)
     strangers = []
     for i in range(4):
         stranger = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -253,11 +274,16 @@ def attacks(wire: str, stack: ExitStack, draw: random.Random) -> Iterator[tuple[
         yield AT_ONCE if wire == "udp" else AT_ONCE // 4, session, tuple(balance)
 
 
-def trial(wire: str, count: int, seconds: float, seed: int) -> dict[str, Any]:
-    """Attack a wire ``count`` times or for ``seconds``, whichever ends first."""
+def trial(
+    wire: str, count: int, seconds: float, seed: int, several: bool = False
+) -> dict[str, Any]:
+    """Attack a wire ``count`` times or for ``seconds``, whichever ends first.
+
+    It has one measurement and one control signal, or ``several``, three of each.
+    """
     done, before = 0, (0, 0)
     with ExitStack() as stack:
-        attacked = attacks(wire, stack, random.Random(seed))
+        attacked = attacks(wire, stack, random.Random(seed), several)
         next(attacked)  # compiles the rig and the loop
         begin = time.monotonic()
         while True:
@@ -291,16 +317,19 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="time in all")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    shares = {"udp": 0.9, "serial": 0.1}
+    shares = {("udp", 1): 0.6, ("serial", 1): 0.1, ("udp", 3): 0.25, ("serial", 3): 0.05}
     bad = 0
     print(
-        f"{'wire':<8} {'attacks':>9} {'time':>7} {'wrong':>6} {'memory':>10} {'files':>6}  returned"
+        f"{'wire':<8} {'signals':>7} {'attacks':>9} {'time':>7} {'wrong':>6} {'memory':>10} "
+        f"{'files':>6}  returned"
     )
-    for wire, share in shares.items():
-        found = trial(wire, round(share * options.count), share * options.seconds, options.seed)
+    for (wire, signals), share in shares.items():
+        most = round(share * options.count), share * options.seconds
+        found = trial(wire, *most, options.seed, signals > 1)
         part = found["returned"] / found["sent"] if found["sent"] else 0.0
         print(
-            f"{wire:<8} {found['attacks']:>9} {found['seconds']:>5.0f} s {len(found['wrong']):>6} "
+            f"{wire:<8} {signals:>7} {found['attacks']:>9} {found['seconds']:>5.0f} s "
+            f"{len(found['wrong']):>6} "
             f"{found['memory'] / 1024:>6.0f} KiB {found['files']:>6}  {100 * part:.1f} %",
             flush=True,
         )

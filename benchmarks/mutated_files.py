@@ -50,6 +50,7 @@ READERS = {
     "record": ("load", "quell identify"),
     "samples": ("load", "quell reproduce acc"),
     "setup": ("load", "quell run", "quell run-rig", "quell replay --setup"),
+    "setup of axes": ("load", "quell run", "quell run-rig", "quell replay --setup"),
 }
 
 
@@ -59,13 +60,15 @@ def read(kind: str, path: Path) -> None:
     from quell.experiments.acc import loops
     from quell.identification import read_record
     from quell.realtime import load
+    from quell.records.axes import AxesTrajectory
     from quell.setup import load as load_setup
+    from quell.setup import load_axes
 
     if kind in ("recording in CSV", "header", "recording in MCAP", "NetCDF"):
-        batch = path.name.startswith("runs")
         loader: Callable[..., Any] = load
         if kind == "NetCDF":
-            loader = ql.BatchTrajectory.load if batch else ql.Trajectory.load
+            loaders = {"runs": ql.BatchTrajectory.load, "axes": AxesTrajectory.load}
+            loader = loaders.get(path.stem, ql.Trajectory.load)
         run = loader(path)
         run.to_xarray()
         _ = run.message
@@ -77,7 +80,7 @@ def read(kind: str, path: Path) -> None:
             for cubic in (False, True):
                 loops.plant(row, cubic)
     else:
-        load_setup(path).as_json()
+        (load_axes if kind == "setup of axes" else load_setup)(path).as_json()
 
 
 def command(reader: str, path: Path, valid: Path) -> str:
@@ -87,10 +90,13 @@ def command(reader: str, path: Path, valid: Path) -> str:
     """
     from quell.cli import app as cli
     from quell.cli.exit_codes import ExitCode
+    from quell.kernels.dispatch import as_python
 
+    of_axes = path.name.startswith("axes")
+    setup, record = ("axes.toml", "axes.csv") if of_axes else ("replay.toml", "run.csv")
     arguments = {
-        "quell replay": ["replay", path, "--setup", valid / "replay.toml"],
-        "quell replay --setup": ["replay", valid / "run.csv", "--setup", path],
+        "quell replay": ["replay", path, "--setup", valid / setup],
+        "quell replay --setup": ["replay", valid / record, "--setup", path],
         "quell identify": ["identify", path, "--order", "1"],
         "quell reproduce acc": ["reproduce", "acc", "--samples", path],
         "quell run": ["run", path],
@@ -99,7 +105,9 @@ def command(reader: str, path: Path, valid: Path) -> str:
     whole, shown, code = cli.app, io.StringIO(), 0
     cli.app = lambda: whole([*map(str, arguments), "--no-figures"])
     try:
-        with contextlib.redirect_stderr(shown), contextlib.redirect_stdout(io.StringIO()):
+        # A setup of axes has types of its own: compiling them is not what is tried.
+        how = as_python() if of_axes else contextlib.nullcontext()
+        with contextlib.redirect_stderr(shown), contextlib.redirect_stdout(io.StringIO()), how:
             cli.main()
     except SystemExit as ended:
         code = ended.code
@@ -191,6 +199,7 @@ def work(folder: Path, seed: int, numbers: Iterator[int]) -> None:
 
     with contextlib.suppress(Exception):  # what is compiled once does not count
         command("quell replay", valid / "run.csv", valid)
+        command("quell replay", valid / "axes.csv", valid)
         command("quell identify", valid / "named.csv", valid)
     memory = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (memory + int(2e6 * MOST_MB),) * 2)

@@ -167,7 +167,7 @@ CLASSES: tuple[tuple[str, str], ...] = (
     ),
     ("files and code that a setup names", r"can't be read|No such file|give --trust"),
     ("more memory than there is", r"Unable to allocate"),
-    ("a list in the place of one signal", r"has \d+ signals"),
+    ("a list in the place of one signal", r"has \d+ signals?:|is a list of \d+ signal"),
     (
         "shapes of lists, and inf and nan in them",
         r"has shape|got tuple|every entry must|has \d+ values",

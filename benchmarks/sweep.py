@@ -9,9 +9,9 @@ are stored. ``--noise`` adds measurement noise, drawn anew for each run. Memory 
 process and its workers together: PSS counts a page that several of them share once, RSS once for
 each.
 
-With ``--cluster`` a Dask scheduler and two worker processes are started as docs/scale does it by
-hand. One of them is killed (SIGKILL) after a quarter of the runs. The results must be those of this
-machine's processes, bit for bit.
+With ``--cluster`` a Dask scheduler and two worker processes are started as docs/scale_cluster does
+it by hand. One of them is killed (SIGKILL) after a quarter of the runs. The results must be those
+of this machine's processes, bit for bit.
 """
 
 from __future__ import annotations

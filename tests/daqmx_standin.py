@@ -10,6 +10,7 @@ import threading
 from dataclasses import dataclass, field
 
 from nidaqmx.constants import AngleUnits, EncoderType, Level
+from nidaqmx.utils import unflatten_channel_string
 
 INVALID_DEVICE = -200220
 NO_CHANNEL = -200170
@@ -45,11 +46,13 @@ class Card:
 
     counters: int = 0
     outputs: int = 0
+    inputs: int = 0
     lines: int = 0
     bits: int = 32
     watchdog: bool = False
     present: bool = True
     volts: dict = field(default_factory=dict)
+    """Of its analog outputs, and those that are at its inputs."""
     levels: dict = field(default_factory=dict)
     history: list = field(default_factory=list)
     """All that happened to its outputs and lines, in order."""
@@ -59,18 +62,18 @@ class Card:
         return (
             {f"ctr{i}" for i in range(self.counters)}
             | {f"ao{i}" for i in range(self.outputs)}
+            | {f"ai{i}" for i in range(self.inputs)}
             | {f"port0/line{i}" for i in range(self.lines)}
         )
 
 
 @dataclass
 class Task:
-    """A task of the driver."""
+    """A task of the driver: its channels, with their limits, are on one device."""
 
     kind: str = ""
     device: str = ""
-    channel: str = ""
-    limits: tuple = (-10.0, 10.0)
+    channels: dict = field(default_factory=dict)
     running: bool = False
     origin: int = 0
     attributes: dict = field(default_factory=dict)
@@ -102,6 +105,8 @@ class Rack:
         self.last_channel = ""
         self.edges = 0
         """Where the shaft is [edges of A and B]."""
+        self.shafts = {}
+        """Where the shafts of single counters are, by physical channel; others see ``edges``."""
         for name in dir(type(self)):
             if name.startswith("DAQmx"):
                 setattr(self, name, _Function(self._guarded(getattr(self, name))))
@@ -160,12 +165,26 @@ class Rack:
             raise DriverError(INVALID_DEVICE)
         if channel not in self.cards[device].channels():
             raise DriverError(NO_CHANNEL)
-        task.kind, task.device, task.channel = kind, device, channel
+        if task.channels and (kind == "counter" or task.device != device):
+            raise DriverError(INVALID_VALUE)
+        task.kind, task.device = kind, device
+        task.channels[channel] = (-10.0, 10.0)
         self.last_channel = physical
 
     def _is_taken(self, task):
         others = (other for other in self.tasks.values() if other is not task and other.running)
-        return any((other.device, other.channel) == (task.device, task.channel) for other in others)
+        return any(
+            other.device == task.device
+            # Analog inputs of a card have one converter, which one task has.
+            and (
+                other.kind == task.kind == "input"
+                or not other.channels.keys().isdisjoint(task.channels)
+            )
+            for other in others
+        )
+
+    def _edges(self, task):
+        return self.shafts.get(f"{task.device}/{next(iter(task.channels))}", self.edges)
 
     def _new(self, handle, task):
         handle._obj.value = 1 + max(self.tasks, default=0)
@@ -215,9 +234,17 @@ class Rack:
     def DAQmxCreateAOVoltageChan(self, handle, channel, name, low, high, units, scale):
         task = self._task(handle)
         self._claim(task, channel, "output")
+        self._limit(task, channel, low, high)
+
+    def DAQmxCreateAIVoltageChan(self, handle, channel, name, terminals, low, high, units, scale):
+        task = self._task(handle)
+        self._claim(task, channel, "input")
+        self._limit(task, channel, low, high)
+
+    def _limit(self, task, physical, low, high):
         if not -10.0 <= low < high <= 10.0:
             raise DriverError(INVALID_VALUE)
-        task.limits = (low, high)
+        task.channels[physical.partition("/")[2]] = (low, high)
 
     def DAQmxCreateDOChan(self, handle, lines, name, grouping):
         self._claim(self._task(handle), lines, "line")
@@ -236,23 +263,36 @@ class Rack:
             raise DriverError(-201477)
         task.running = True
         if task.kind == "counter":
-            task.origin = self.edges
+            task.origin = self._edges(task)
 
     def DAQmxReadCounterScalarU32(self, handle, timeout, out, reserved):
         task = self._task(handle)
         card = self._card(task)
         if not task.running:
-            task.origin = self.edges  # an implicit start begins to count anew
-        out._obj.value = (self.edges - task.origin) % (1 << card.bits)
+            task.origin = self._edges(task)  # an implicit start begins to count anew
+        out._obj.value = (self._edges(task) - task.origin) % (1 << card.bits)
 
-    def DAQmxWriteAnalogScalarF64(self, handle, auto_start, timeout, value, reserved):
+    def DAQmxReadAnalogF64(self, handle, samples, timeout, layout, out, size, read, reserved):
+        task = self._task(handle)
+        card = self._card(task)
+        assert samples == 1
+        assert size == len(task.channels)
+        out[:] = [card.volts.get(channel, 0.0) for channel in task.channels]
+        read._obj.value = 1
+
+    def DAQmxWriteAnalogF64(
+        self, handle, samples, auto_start, timeout, layout, values, written, reserved
+    ):
         task = self._writable(handle, auto_start)
-        if not task.limits[0] <= value <= task.limits[1]:
+        assert samples == 1
+        assert values.shape == (len(task.channels),)
+        card, step = self.cards[task.device], 20.0 / (1 << 16)
+        pairs = list(zip(task.channels.items(), values.tolist(), strict=True))
+        if not all(low <= value <= high for (_, (low, high)), value in pairs):
             raise DriverError(INVALID_AO_DATA)
-        step = 20.0 / (1 << 16)
-        card = self.cards[task.device]
-        card.volts[task.channel] = min(math.floor(value / step + 0.5), (1 << 15) - 1) * step
-        card.history.append((task.channel, value))
+        for (channel, _), value in pairs:
+            card.volts[channel] = min(math.floor(value / step + 0.5), (1 << 15) - 1) * step
+            card.history.append((channel, value))
 
     def DAQmxWriteDigitalLines(
         self, handle, samples, auto_start, timeout, layout, values, written, reserved
@@ -261,8 +301,9 @@ class Rack:
         assert samples == 1
         assert values.shape == (1,)
         card = self.cards[task.device]
-        card.levels[task.channel] = bool(values[0])
-        card.history.append((task.channel, bool(values[0])))
+        (line,) = task.channels
+        card.levels[line] = bool(values[0])
+        card.history.append((line, bool(values[0])))
 
     def _writable(self, handle, auto_start):
         task = self._task(handle)
@@ -280,10 +321,13 @@ class Rack:
             raise DriverError(INVALID_DEVICE)
         if not self.cards[device].watchdog:
             raise DriverError(NO_WATCHDOG)
-        self._new(out, Task("watchdog", device, "watchdog", timeout=timeout, left=timeout))
+        self._new(out, Task("watchdog", device, timeout=timeout, left=timeout))
 
     def DAQmxCfgWatchdogAOExpirStates(self, handle, names, states, types, size):
-        self._task(handle).expires[names.partition("/")[2]] = float(states[0])
+        every = unflatten_channel_string(names)
+        assert size == len(every)
+        for name, state in zip(every, states, strict=True):
+            self._task(handle).expires[name.partition("/")[2]] = float(state)
 
     def DAQmxCfgWatchdogDOExpirStates(self, handle, names, states, size):
         self._task(handle).expires[names.partition("/")[2]] = states[0] == Level.HIGH.value

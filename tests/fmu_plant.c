@@ -1,5 +1,7 @@
 /* A mass with position y and velocity v, v' = gain u + w, as an FMU of FMI 2.0 or 3.0 for tests.
 
+   With -DARM it is a planar arm of two rods with torques tau and push at its joints, solved by a
+   step of Runge-Kutta of order 4 in each communication step.
    -DFMI=2 or -DFMI=3 chooses the version. At the time fail_at [s] a step fails with the status
    fail_with: 2 asks to end the simulation, 3 is an error, 6 an early return (FMI 3.0 only).
    It is written after the standards' texts and shares nothing with the FMUs that quell exports. */
@@ -9,7 +11,11 @@
 #include <stdlib.h>
 #include <string.h>
 
+#ifdef ARM
+enum { TIME, TAU, TAU_2, PUSH, PUSH_2, Q, Q_2, V, V_2, GAIN, FAIL_AT, FAIL_WITH, COUNT, VARIABLES };
+#else
 enum { TIME, U, W, Y, V, GAIN, FAIL_AT, FAIL_WITH, COUNT, VARIABLES };
+#endif
 enum { OK = 0, DISCARD = 2, ERROR = 3, EARLY = 6 };
 
 typedef struct {
@@ -35,13 +41,46 @@ static Mass *make(void *log, void *environment) {
     return mass;
 }
 
+#ifdef ARM
+/* Rods of 0.4 m, 2 kg and 0.3 m, 1 kg. M(q) in the angles of the joints, textbook form. */
+static void rate(const double *x, const double z[4], double d[4]) {
+    const double g = 9.81, l = 0.4, alpha = 2.0 * l * l / 3.0 + 0.3 * 0.3 / 3.0 + l * l;
+    const double beta = l * 0.15, delta = 0.3 * 0.3 / 3.0;
+    double c = cos(z[1]), s = sin(z[1]);
+    double m11 = alpha + 2.0 * beta * c, m12 = delta + beta * c, m22 = delta;
+    double g2 = 0.15 * g * cos(z[0] + z[1]), g1 = (2.0 * 0.2 + l) * g * cos(z[0]) + g2;
+    double b1 = x[GAIN] * x[TAU] + x[PUSH] + beta * s * (2.0 * z[2] + z[3]) * z[3] - g1;
+    double b2 = x[GAIN] * x[TAU_2] + x[PUSH_2] - beta * s * z[2] * z[2] - g2;
+    double det = m11 * m22 - m12 * m12;
+    d[0] = z[2];
+    d[1] = z[3];
+    d[2] = (m22 * b1 - m12 * b2) / det;
+    d[3] = (m11 * b2 - m12 * b1) / det;
+}
+
+static void move(double *x, double h) {
+    double k[4][4], at[4];
+    for (int part = 0; part < 4; part++) {
+        double share = part == 0 ? 0.0 : part == 3 ? h : 0.5 * h;
+        for (int i = 0; i < 4; i++) at[i] = x[Q + i] + (part ? share * k[part - 1][i] : 0.0);
+        rate(x, at, k[part]);
+    }
+    for (int i = 0; i < 4; i++)
+        x[Q + i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
+}
+#else
+static void move(double *x, double h) {
+    double force = x[GAIN] * x[U] + x[W];
+    x[Y] += h * x[V] + 0.5 * h * h * force;
+    x[V] += h * force;
+}
+#endif
+
 static int step(Mass *mass, double t, double h) {
     double *x = mass->value;
     if (fabs(t - x[TIME]) > 1e-9) return ERROR;
     if (t + h > x[FAIL_AT]) return (int)x[FAIL_WITH];
-    double force = x[GAIN] * x[U] + x[W];
-    x[Y] += h * x[V] + 0.5 * h * h * force;
-    x[V] += h * force;
+    move(x, h);
     x[TIME] += h;
     x[COUNT] += 1.0;
     return OK;

@@ -1,4 +1,4 @@
-"""FMUs for tests: a mass in C (``fmu_plant.c``), compiled and packed for FMI 2.0 or 3.0."""
+"""FMUs for tests: a mass or an arm in C (``fmu_plant.c``), compiled and packed for FMI 2.0 or 3.0."""
 
 from __future__ import annotations
 
@@ -13,19 +13,32 @@ from typing import Any
 
 SOURCE = Path(__file__).parent / "fmu_plant.c"
 
-_PARAMETERS = ("gain", "fail_at")
-_NAMES = ("time", "u", "w", "y", "v", "gain", "fail_at", "fail_with", "count")
+_NAMES = {
+    "mass": ("time", "u", "w", "y", "v", "gain", "fail_at", "fail_with", "count"),
+    "arm": (
+        "time", "tau[1]", "tau[2]", "push[1]", "push[2]", "q[1]", "q[2]", "v[1]", "v[2]",
+        "gain", "fail_at", "fail_with", "count",
+    ),
+}  # fmt: skip
+_ROLES = {
+    "time": "independent", "u": "input", "w": "input", "tau": "input", "push": "input",
+    "y": "output", "q": "output", "v": "local", "count": "local",
+}  # fmt: skip
+_STARTS = {"gain": "1", "fail_at": "1e300", "fail_with": "3"}
 
 
-def _variables(version: int) -> str:
+def _role(name: str) -> str:
+    return _ROLES.get(name.partition("[")[0], "parameter")
+
+
+def _variables(version: int, model: str) -> str:
     """Return the elements of all variables."""
-    causality = {"time": "independent", "u": "input", "w": "input", "y": "output", "v": "local"}
     text = ""
-    for reference, name in enumerate(_NAMES):
+    for reference, name in enumerate(_NAMES[model]):
         whole = name in ("fail_with", "count")
         kind = {2: "Integer", 3: "Int32"}[version] if whole else {2: "Real", 3: "Float64"}[version]
-        role = causality.get(name, "local" if name == "count" else "parameter")
-        start = {"gain": "1", "fail_at": "1e300", "fail_with": "3", "u": "0", "w": "0"}.get(name)
+        role = _role(name)
+        start = "0" if role == "input" else _STARTS.get(name)
         value = f' start="{start}"' if start else ""
         vary = ' variability="fixed"' if role == "parameter" else ""
         vary = ' variability="discrete"' if name == "count" else vary
@@ -38,47 +51,50 @@ def _variables(version: int) -> str:
     return text
 
 
-def description(version: int) -> str:
+def description(version: int, model: str = "mass") -> str:
     """Return the model description."""
+    outputs = [i for i, name in enumerate(_NAMES[model]) if _role(name) == "output"]
     if version == 2:
+        unknowns = "".join(f'<Unknown index="{i + 1}"/>' for i in outputs)
         return (
-            '<fmiModelDescription fmiVersion="2.0" modelName="mass" guid="{mass}">'
-            '<CoSimulation modelIdentifier="mass" canHandleVariableCommunicationStepSize="true" '
-            f'canGetAndSetFMUstate="true"/><ModelVariables>{_variables(2)}</ModelVariables>'
-            '<ModelStructure><Outputs><Unknown index="4"/></Outputs></ModelStructure>'
+            f'<fmiModelDescription fmiVersion="2.0" modelName="{model}" guid="{{mass}}">'
+            f'<CoSimulation modelIdentifier="{model}" canHandleVariableCommunicationStepSize="true" '
+            f'canGetAndSetFMUstate="true"/><ModelVariables>{_variables(2, model)}</ModelVariables>'
+            f"<ModelStructure><Outputs>{unknowns}</Outputs></ModelStructure>"
             "</fmiModelDescription>"
         )
+    unknowns = "".join(f'<Output valueReference="{i}"/>' for i in outputs)
     return (
-        '<fmiModelDescription fmiVersion="3.0" modelName="mass" instantiationToken="{mass}">'
-        '<CoSimulation modelIdentifier="mass" canHandleVariableCommunicationStepSize="true"/>'
-        f"<ModelVariables>{_variables(3)}</ModelVariables>"
-        '<ModelStructure><Output valueReference="3"/></ModelStructure></fmiModelDescription>'
+        f'<fmiModelDescription fmiVersion="3.0" modelName="{model}" instantiationToken="{{mass}}">'
+        f'<CoSimulation modelIdentifier="{model}" canHandleVariableCommunicationStepSize="true"/>'
+        f"<ModelVariables>{_variables(3, model)}</ModelVariables>"
+        f"<ModelStructure>{unknowns}</ModelStructure></fmiModelDescription>"
     )
 
 
 @functools.cache
-def binary(version: int) -> bytes:
+def binary(version: int, model: str = "mass") -> bytes:
     """Return the compiled library."""
     with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "mass.so"
-        command = ["gcc", "-shared", "-fPIC", "-O1", f"-DFMI={version}", str(SOURCE)]
-        subprocess.run([*command, "-o", str(library), "-lm"], check=True)
+        library = Path(folder) / f"{model}.so"
+        command = ["gcc", "-shared", "-fPIC", "-O1", f"-DFMI={version}", f"-D{model.upper()}"]
+        subprocess.run([*command, str(SOURCE), "-o", str(library), "-lm"], check=True)
         return library.read_bytes()
 
 
-def place(version: int) -> str:
+def place(version: int, model: str = "mass") -> str:
     """Return the name of the binary in the archive."""
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
         platform.machine().lower(), platform.machine().lower()
     )
-    return f"binaries/{'linux64' if version == 2 else machine + '-linux'}/mass.so"
+    return f"binaries/{'linux64' if version == 2 else machine + '-linux'}/{model}.so"
 
 
-def contents(version: int) -> dict[str, bytes]:
-    """Return the files of a good FMU."""
+def contents(version: int, model: str = "mass") -> dict[str, bytes]:
+    """Return the files of a good FMU: of a mass, or of an arm of two rods."""
     return {
-        "modelDescription.xml": description(version).encode(),
-        place(version): binary(version),
+        "modelDescription.xml": description(version, model).encode(),
+        place(version, model): binary(version, model),
         "resources/table.txt": b"1 2 3\n",
         "sources/fmu_plant.c": SOURCE.read_bytes(),
     }

@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 
 import quell as ql
-from quell.realtime.recordings import MARK, SCHEMA, TOPIC, Header, file_sink, row_channels
+from quell.realtime.recordings import (
+    MARK,
+    SCHEMA,
+    TOPIC,
+    Header,
+    file_sink,
+    row_channels,
+    trajectory_of,
+)
 from quell.setup import EXAMPLES
 
 HEADER = Header(
@@ -21,6 +29,28 @@ HEADER = Header(
     device="a lift",
     units={"y": "m"},
 )
+OF_ONE = (("x_hat", 2), ("f_residual", 1), ("f_learned", 1), ("status", 1), ("theta", 2))
+HEADER_OF_AXES = Header(
+    row_channels(
+        (
+            *(("v", 2), ("status", 1)),
+            *((f"{axis}.{name}", width) for axis in ("x", "y") for name, width in OF_ONE),
+        ),
+        ("load", "x.held"),
+        *(2, 2),
+    ),
+    dt=0.01,
+    device="a gantry",
+    notes={
+        "axes": {"x": ["x1", "bias"], "y": ["x1", "bias"]},
+        "signals": {
+            "axes": ["x", "y"],
+            "y": ["way [m]", "way [m]"],
+            "u": ["left [N]", "right [N]"],
+        },
+    },
+)
+"""Of two axes, with a channel of the device and one of an axis."""
 NUMBER = re.compile(rb"(?<![\w.])[-+]?\d[\d_]*\.?\d*(?:[eE][-+]?\d+)?")
 WORD = re.compile(rb"[A-Za-z_][\w-]*")
 # Values that are no good in most places, and some that are.
@@ -33,9 +63,9 @@ NASTY = [
 U64 = [0, 1, 8, 255, 2**16, 2**31, 2**32, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1]
 
 
-def rows(count: int = 60) -> np.ndarray:
+def rows(header: Header = HEADER, count: int = 60) -> np.ndarray:
     """Return rows of a loop at which nothing happens."""
-    made = np.zeros((count, HEADER.width))
+    made = np.zeros((count, header.width))
     made[:, 0] = np.arange(count)
     made[:, 3] = 1.0
     made[:, 5:9] = np.sin(0.1 * made[:, :1])
@@ -43,30 +73,36 @@ def rows(count: int = 60) -> np.ndarray:
 
 
 def write_seeds(folder: Path) -> dict[str, list[Path]]:
-    """Write valid files; return them by kind."""
-    recording = folder / "run.csv"
-    for path in (recording, folder / "run.mcap"):
-        sink = file_sink(path)
-        sink.open(HEADER)
-        sink.write(rows())
-        sink.close()
-    (folder / "alone.csv").write_bytes(recording.read_bytes())
-    mcap = [folder / "run.mcap"]
+    """Write valid files; return them by kind. Names of those of axes begin with ``axes``."""
+    names, headers = ("run", "axes"), (HEADER, HEADER_OF_AXES)
+    for name, header in zip(names, headers, strict=True):
+        for path in (folder / f"{name}.csv", folder / f"{name}.mcap"):
+            sink = file_sink(path)
+            sink.open(header)
+            sink.write(rows(header))
+            sink.close()
+    for name, alone in (("run", "alone"), ("axes", "axes_alone")):
+        (folder / f"{alone}.csv").write_bytes((folder / f"{name}.csv").read_bytes())
+    mcap = [folder / f"{name}.mcap" for name in names]
     for compression in ("ZSTD", "LZ4", "NONE"):
         mcap.append(folder / f"{compression}.mcap")
-        _write_mcap(mcap[-1], compression)
+        _write_mcap(mcap[-1], compression, HEADER)
+    mcap.append(folder / "axes_LZ4.mcap")
+    _write_mcap(mcap[-1], "LZ4", HEADER_OF_AXES)
+    recordings = ("run", "alone", "axes", "axes_alone")
     return {
-        "recording in CSV": [recording, folder / "alone.csv"],
-        "header": [folder / "run.csv.json"],
+        "recording in CSV": [folder / f"{name}.csv" for name in recordings],
+        "header": [folder / f"{name}.csv.json" for name in names],
         "recording in MCAP": mcap,
         "NetCDF": _write_netcdf(folder),
         "record": _write_records(folder),
         "samples": _write_samples(folder),
         "setup": _write_setups(folder),
+        "setup of axes": _write_setups_of_axes(folder),
     }
 
 
-def _write_mcap(path: Path, compression: str) -> None:
+def _write_mcap(path: Path, compression: str, header: Header) -> None:
     from mcap.writer import CompressionType, Writer
 
     with path.open("wb") as file:
@@ -75,9 +111,9 @@ def _write_mcap(path: Path, compression: str) -> None:
         channel = writer.register_channel(
             TOPIC, "cdr", writer.register_schema(SCHEMA, "ros2msg", b"")
         )
-        for row in rows():
+        for row in rows(header):
             writer.add_message(channel, 10**18, MARK + row.tobytes(), 10**18)
-        writer.add_metadata("quell", {"header": HEADER.to_json()})
+        writer.add_metadata("quell", {"header": header.to_json()})
         writer.finish()
 
 
@@ -97,7 +133,8 @@ def _write_netcdf(folder: Path) -> list[Path]:
     with xarray.open_dataset(folder / "run.nc", engine="h5netcdf") as data:
         encoding = {name: {"zlib": True} for name in data.data_vars}
         data.to_netcdf(folder / "packed.nc", engine="h5netcdf", encoding=encoding)
-    return [folder / name for name in ("run.nc", "runs.nc", "packed.nc")]
+    trajectory_of(HEADER_OF_AXES, rows(HEADER_OF_AXES)).save(folder / "axes.nc")
+    return [folder / name for name in ("run.nc", "runs.nc", "packed.nc", "axes.nc")]
 
 
 def _write_records(folder: Path) -> list[Path]:
@@ -125,7 +162,7 @@ def _write_samples(folder: Path) -> list[Path]:
 
 
 def _write_setups(folder: Path) -> list[Path]:
-    made = [folder / path.name for path in EXAMPLES.glob("*.toml")]
+    made = [folder / path.name for path in EXAMPLES.glob("*.toml") if path.stem != "arm"]
     for path in made:
         path.write_bytes((EXAMPLES / path.name).read_bytes())
     base = "dt = 0.01\nplant = 'two-mass'\n[scenario]\nduration = 10.0\nreference = ['step', {kind = 'ramp', slope = 2.0}]\n[rig]\ndevice = 'twin:two-mass'\n[rig.safety]\nmost_error = 2.0\n"
@@ -143,6 +180,36 @@ def _write_setups(folder: Path) -> list[Path]:
     for i, part in enumerate(parts):
         made.append(folder / f"setup{i}.toml")
         made[-1].write_text(base + part)
+    return made
+
+
+def _write_setups_of_axes(folder: Path) -> list[Path]:
+    """Write setups of several axes; that of recordings is ``axes.toml``."""
+    axis = "[[axis]]\nname = '{name}'\nobserver = {{kind = 'model-free', order = 2, omega_o = 15.0}}\n{more}\n"
+    base = (
+        "dt = 0.01\nplant = {kind = 'multivariable-linear', A = [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]], "
+        "B = [[0, 0], [5, 0.5], [0, 0], [0.4, 6]], C = [[1, 0, 0, 0], [0, 0, 1, 0]]}\n"
+        "axes = {B0 = [[5, 0.5], [0.4, 6]], u_max = [20.0, 30.0], u_min = -25.0, actuators = ['left [N]', 'right [N]']}\n"
+        "scenario = {duration = 0.5, disturbances = [0.0, {kind = 'step', at = 0.2}], seed = 3}\n"
+        "[rig]\ndevice = 'twin:'\nchannels = ['load', 'x.held']\n[rig.safety]\nmost_error = [2.0, 3.0]\nu_max = [15.0, 9.0]\n"
+    )
+    law = "controller = {omega_c = 2.0}\nreference = {kind = 'step', height = 0.1}\nsignal = 'way [m]'"
+    drive = "compensator = {omega_c = 2.0}\ndrive = {kp = 2.0, ki = 0.2, kd = 1.0, tf = 0.1}"
+    learner = "learner = {kind = 'rls', features = ['state', 'bias']}\nguard = {bound = 40.0}"
+    shared = "learner = {kind = 'rls', features = [{kind = 'all-axes', features = ['state']}]}"
+    band = "controller = {omega_c = 2.0, safe_set = {y_min = -1.0, y_max = 1.0, rate_min = -3.0, rate_max = 3.0, alpha = 8.0, f_rate = 1.0}}"
+    made = [folder / "axes_arm.toml"]
+    made[0].write_bytes((EXAMPLES / "arm.toml").read_bytes())
+    for name, more in (
+        ("axes", law),
+        ("axes_drives", drive),
+        ("axes_learner", f"{law}\n{learner}"),
+        ("axes_shared", f"{law}\n{shared}"),
+        ("axes_bands", band),
+    ):
+        made.append(folder / f"{name}.toml")
+        both = "".join(axis.format(name=each, more=more) for each in ("x", "y"))
+        made[-1].write_text(base + both)
     return made
 
 

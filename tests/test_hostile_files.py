@@ -27,6 +27,7 @@ from quell.identification import read_record
 from quell.realtime.recordings import LOOP_CHANNELS, MARK, SCHEMA, TOPIC, Header, load, row_channels
 from quell.records import netcdf, netcdf_reader
 from quell.setup import load as load_setup
+from quell.setup import load_axes
 from tests.mutations import mutated, write_seeds
 
 HEADER = Header(row_channels((("status", 1),)), dt=0.01)
@@ -326,9 +327,10 @@ def test_random_changes_of_files_are_read_or_refused_in_a_line(tmp_path: Path) -
         "record": read_record,
         "samples": read_samples,
         "setup": load_setup,
+        "setup of axes": load_axes,
     }
     results = Counter[bool]()
-    for _ in range(200):
+    for _ in range(240):
         kind = random_.choice([*readers])
         path = random_.choice(seeds[kind])
         other = random_.choice(seeds["setup"]).read_bytes()

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.realtime.devices import TwinDevice, handle_of, read_measurement, write_command
 from quell.realtime.ni import NiDevice, ni_device
+from quell.realtime.registry import open_device
 from quell.realtime.system import virtual_clock
 
-from . import scripted
+from . import scripted, scripted_axes
 from .daqmx_standin import Card, Rack
 
 library = pytest.importorskip("nidaqmx._lib").lib_importer
@@ -100,7 +101,9 @@ def test_u_comes_out_in_volts_and_is_cut_at_its_limits(rack):
     for u in (0.5, -7.0, 99.0):
         device.write(u)
     assert rack.cards["Dev2"].history == [("ao1", 0.0), ("ao1", -1.0), ("ao1", 2.0), ("ao1", -8.0)]
-    assert next(task.limits for task in rack.tasks.values() if task.kind == "output") == (-8.0, 2.0)
+    assert next(task.channels for task in rack.tasks.values() if task.kind == "output") == {
+        "ao1": (-8.0, 2.0)
+    }
     device.close()
 
 
@@ -381,3 +384,165 @@ def test_the_loop_goes_to_its_safe_state_when_the_counter_card_is_lost(rack):
     rack.cards["Dev1"].present = True
     shaft.close()
     assert not rack.cards["Dev2"].levels["port0/line0"]
+
+
+# ---- Several axes ----
+
+
+@pytest.fixture
+def wide(rack):
+    """Two counters and an analog input, two outputs of one card and one of another."""
+    rack.cards["Dev3"] = Card(outputs=1, inputs=2, lines=2, watchdog=True)
+    rack.cards["Dev4"] = Card(outputs=2, lines=1, watchdog=True)
+    return rack
+
+
+def several(**options):
+    """Return the device of three axes on these cards."""
+    inputs = ["Dev1/ctr0", "Dev3/ai1", "Dev1/ctr2"]
+    outputs = ["Dev4/ao0", "Dev3/ao0", "Dev4/ao1"]
+    given = {"counts": [16000, None, 8000], "ratio": [1.0, 2.5, -1.0], "zero": [None, 0.5, None]}
+    return NiDevice(inputs, outputs, **(given | options))
+
+
+def test_each_axis_has_its_own_channel_counts_and_ratio(wide):
+    """Each number at its place, whichever card it comes from."""
+    with closing(several()) as device:
+        assert device.signal_counts == (3, 3)
+        assert device.read().tolist() == [0.0, -1.25, 0.0]
+        wide.shafts |= {"Dev1/ctr0": 8000, "Dev1/ctr2": 2000}
+        wide.cards["Dev3"].volts["ai1"] = 1.5
+        assert device.read().tolist() == [TAU / 2, 2.5, -TAU / 4]
+
+
+def test_outputs_are_cut_one_by_one_and_end_at_zero(wide):
+    """Those of a card are written at once; the others follow."""
+    device = several(volts=[1.0, -2.0, 1.0], u_min=-3.0, u_max=[3.0, 2.0, 1.0])
+    device.write([9.0, 9.0, 9.0])
+    device.write(np.array([-9.0, -1.0, 0.5]))
+    with pytest.raises(ValueError, match="u = .*: must be 3 numbers"):
+        device.write([1.0, 2.0])
+    with pytest.raises(ValueError, match="must be a finite number; the output is zero now"):
+        device.write([1.0, math.nan, 1.0])
+    device.close()
+    values = {card: wide.cards[card].history for card in ("Dev3", "Dev4")}
+    zero = [("ao0", 0.0), ("ao1", 0.0)]
+    assert values["Dev4"] == [
+        *zero,
+        *(("ao0", 3.0), ("ao1", 1.0)),
+        *(("ao0", -3.0), ("ao1", 0.5)),
+        *zero,
+        *zero,
+    ]
+    assert [value for _, value in values["Dev3"]] == [0.0, -4.0, 2.0, 0.0, 0.0]
+
+
+def test_each_card_has_its_watchdog(wide):
+    """All are reset by a write; whichever is late sets its outputs to zero."""
+    device = several(watchdog=0.01, enable="Dev4/port0/line0")
+    for _ in range(5):
+        wide.pass_time(0.009)
+        device.write([1.0, 2.0, 3.0])
+    assert [wide.cards["Dev4"].volts[name] for name in ("ao0", "ao1")] == pytest.approx(
+        [1.0, 3.0], abs=1e-3
+    )
+    wide.pass_time(0.011)
+    for card, name in (("Dev3", "ao0"), ("Dev4", "ao0"), ("Dev4", "ao1")):
+        assert wide.cards[card].volts[name] == 0.0
+    assert not wide.cards["Dev4"].levels["port0/line0"]
+    with pytest.raises(OSError, match="-200678.*because the loop was late"):
+        device.write([0.0, 0.0, 0.0])
+    with pytest.warns(RuntimeWarning, match="Dev4/ao0, Dev4/ao1 can't be set to zero"):
+        device.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"counts": [1, 2]}, "counts = .*: must be one number, or 3, one for each channel"),
+        ({"counts": [1, 2, 3]}, "counts = .*must be None for a channel that is not an encoder"),
+        ({"zero": [1.0, 0.0, None]}, "zero = .*None for a channel that is not an analog input"),
+        ({"u_max": [1.0, 2.0, -1.0]}, "u_max"),
+        ({"u_min": [0.5, 0.0, 0.0]}, "u_min = 0.5, u_max = 10.0: must enclose zero"),
+        ({"volts": [1.0, 0.0, 1.0]}, "volts = 0.0: must not be zero"),
+        ({"ratio": []}, "ratio = .*must be one number, or 3"),
+        ({"counter": []}, "counter = .*must be a physical channel, or of several axes a list"),
+        ({"output": ["Dev3/ao0", "Dev3/ao0"]}, "output = .*must be different channels"),
+        ({"counter": ["Dev1/ctr0", 3]}, "counter = .*must be a physical channel"),
+        ({"counter": ["Dev3/ai7"], "counts": None, "zero": None, "ratio": 1.0}, "Dev3/ai7' from -10 to 10 V: .*-200170"),
+        ({"counter": ["Dev3/ai0"], "zero": None, "ratio": 1.0}, "counts = .*has no effect, no channel is an encoder"),
+        ({"counter": ["Dev1/ctr0"], "counts": None, "ratio": 1.0}, "zero = .*has no effect, no channel is an analog input"),
+    ],
+)  # fmt: skip
+def test_lists_that_do_not_fit_are_refused(wide, options, says):
+    """In one line, and no task stays behind."""
+    inputs = ["Dev1/ctr0", "Dev3/ai1", "Dev1/ctr2"]
+    given = {
+        "counter": inputs,
+        "output": ["Dev4/ao0", "Dev3/ao0", "Dev4/ao1"],
+        "counts": [16000, None, 8000],
+        "zero": [None, 0.5, None],
+    }
+    with pytest.raises(ValueError, match=says) as caught:
+        NiDevice(**(given | options))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_address_has_channels_and_numbers_between_commas(wide):
+    """As many as the controller has; a single one may be a list, too."""
+    url = "ni://Dev1/ctr0,Dev3/ai1+Dev4/ao0,Dev4/ao1?counts=8000,&zero=,0.5&u_max=5,3&ratio=1,2"
+    with closing(open_device(url, 1e-3, signals=(2, 2))) as device:
+        wide.shafts["Dev1/ctr0"] = 8000
+        assert device.read() == pytest.approx([TAU, -1.0])
+        device.write([9.0, 9.0])
+        assert wide.cards["Dev4"].history[-2:] == [("ao0", 5.0), ("ao1", 3.0)]
+    with closing(open_device("ni://Dev1/ctr0+Dev4/ao0", 1e-3, signals=(1, 1))) as device:
+        assert device.read().tolist() == [0.0]
+    for wrong, signals, says in (
+        (url, (3, 2), "has 2 measurements and 2 control signals, the controller 3"),
+        (url, None, "has 2 measurements and 2 control signals, the controller one"),
+        ("ni://Dev1/ctr0,+Dev4/ao0", (2, 1), "must be ni://COUNTER.OUTPUT"),
+        ("ni://Dev1/ctr0,Dev1/ctr1+Dev4/ao0?counts=8,x", (2, 1), "counts = 'x' must be a whole"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            open_device(wrong, 1e-3, signals=signals)
+
+
+class Axes2:
+    """Two coupled axes behind the cards: positions are voltages, a sample passes with a write."""
+
+    def __init__(self, rack, device):
+        self.rack, self.device, self.twin = rack, device, TwinDevice(scripted_axes.PLANT, 0.01)
+        self.signal_counts, self.close, self.count = device.signal_counts, device.close, 0
+        self.lost = 10**9
+
+    def read(self):
+        """Let the converter see where the axes are, and read it."""
+        self.count += 1
+        self.rack.cards["Dev3"].present = self.count < self.lost
+        volts = self.rack.cards["Dev3"].volts
+        volts["ai0"], volts["ai1"] = self.twin.read().tolist()
+        return self.device.read()
+
+    def write(self, u):
+        """Write u, and let the voltages act for a sample."""
+        self.device.write(u)
+        volts = self.rack.cards["Dev4"].volts
+        self.twin.write([volts["ao0"], volts["ao1"]])
+
+
+def test_a_loop_of_two_axes_runs_through_the_cards(wide):
+    """As around the twin, but for the steps of the outputs; a lost card ramps both to zero."""
+    ideal = scripted_axes.Outcome(duration=1.0).run
+    channels = ["Dev3/ai0", "Dev3/ai1"], ["Dev4/ao0", "Dev4/ao1"]
+    with closing(Axes2(wide, NiDevice(*channels, u_min=-3.0, u_max=3.0))) as device:
+        found = scripted_axes.Outcome(device, duration=1.0)
+    np.testing.assert_allclose(found.run["y"], ideal["y"], atol=2e-3)
+    assert np.ptp(found.run["y"][:, 0]) > 0.1
+    with closing(Axes2(wide, NiDevice(*channels, u_min=-3.0, u_max=3.0))) as device:
+        device.lost = 60
+        found = scripted_axes.Outcome(device, duration=1.0)
+        assert "RAMP" in [change[1].name for change in found.changes]
+        assert "-200324: the card is gone" in str(found.loop.handle.errors[0])
+        wide.cards["Dev3"].present = True
+    assert [wide.cards["Dev4"].volts[name] for name in ("ao0", "ao1")] == [0.0, 0.0]

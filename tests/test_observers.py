@@ -241,3 +241,9 @@ def test_a_mistake_in_a_model_is_named(plant: object, message: str) -> None:
     """Assumptions that fail are said, with by how much."""
     with pytest.raises(ValueError, match=message):
         ESO.model_based(plant, omega_o=10.0, dt=1e-3)
+
+
+def test_an_omega_o_whose_powers_overflow_is_refused() -> None:
+    """By its name; not by an error of a library."""
+    with pytest.raises(ValueError, match=r"omega_o = 1e\+100 rad/s with dt = 0.01 s: powers of"):
+        ql.ESO.model_free(order=4, b0=1.0, omega_o=1e100, dt=0.01)

@@ -406,3 +406,19 @@ def test_a_mistake_is_named(make: Any, message: str) -> None:
     """With the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    "learner",
+    [ql.learners.MLP(), ql.learners.GaussianProcess(), ql.learners.Repetitive(1.0)],
+    ids=lambda learner: type(learner).__name__,
+)
+def test_an_observer_too_slow_for_the_memory_of_a_learner_is_refused(learner: Any) -> None:
+    """By the number of samples of its lag, before memory for them is asked for."""
+    slow = ql.ESO.model_free(order=2, b0=1.0, omega_o=1e-9, dt=0.01)
+    rule = r"its lag is 3e\+09 s, 3e\+11 samples of dt = 0.01 s: must be at most 100000 for "
+    with pytest.raises(ValueError, match=rule + type(learner).__name__):
+        ql.ADRC(slow, omega_c=1e-10, learner=learner)
+    oven = ql.ESO.model_free(order=1, b0=0.01, omega_o=1e-3, dt=1.0)
+    ql.ADRC(oven, omega_c=2e-4, learner=learner if learner.__class__ is not ql.learners.Repetitive
+            else ql.learners.Repetitive(600.0))  # fmt: skip

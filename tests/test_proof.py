@@ -254,6 +254,11 @@ def test_the_passes_of_loops_are_counted() -> None:
     open_end = structure(LOOPS.replace("minimum_int(truncated(r), 7)", "truncated(r)"), "a_step")
     assert open_end.passes["a_step"] is None
     assert [each.partition(":")[0] for each in open_end.by_data] == ["19"]
+    header = "int k = 0, end = minimum_int(truncated(r), 7); k < end; k += 2"
+    between = "int k = minimum_int(2, 5) + 1; k < maximum_int(2, 5) + 1; k++"  # 3, 4, 5
+    joints = structure(LOOPS.replace(header, between), "a_step")
+    assert joints.problems == []
+    assert joints.passes["a_step"] == 4 + 16 + 48 + 3
 
 
 def test_an_index_beyond_an_array_that_is_an_argument_is_named() -> None:

@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 from quell.identification import Measured
 from quell.monitoring import rank
 from quell.monitoring.rank import correlation_time, period_of
+from quell.records.axes import AxesTrajectory
 from tests.commands import in_this_process
 
 DT = 0.01
@@ -257,3 +258,48 @@ def test_the_command_names_the_best_and_takes_parts_of_logs(
     beyond = in_this_process(["rank", f"{file}@0:80", f"b={file}@160:900"], monkeypatch, capsys)
     assert beyond.code == 2
     assert "must be a part of the 320 s of the log" in beyond.err
+
+
+def axes_log(path: Path, sizes: tuple[float, float], seed: int, load: float = 1.0) -> str:
+    """Write a saved run of two axes whose errors have these sizes."""
+    noise = np.random.default_rng(seed).normal(size=(4, 6000))
+    errors = np.column_stack([size * each for size, each in zip(sizes, noise, strict=False)])
+    u = load + 0.1 * noise[2:].T
+    log = np.column_stack([np.zeros((6000, 2)), errors, errors, u, u])
+    channels = (("r", 2), ("y", 2), ("y_measured", 2), ("u", 2), ("v", 2))
+    AxesTrajectory(log, channels, 0.1, axis_names=("x", "y")).save(path)
+    return str(path)
+
+
+def test_tunings_of_several_axes_are_judged_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that is best for all is best; where axes disagree, or one is open, a line says NOT."""
+    before = [axes_log(tmp_path / f"a{k}.nc", (1.0, 1.0), k) for k in range(2)]
+    for sizes, verdict in (
+        ((0.7, 0.8), "best for all axes: B, at 95 % for all axes together"),
+        ((0.7, 1.4), "NOT one best tuning, at 95 % for all axes together: B for x, A for y"),
+        ((0.7, 1.0), "NOT decided for y, at 95 % for all axes together"),
+    ):
+        after = [axes_log(tmp_path / f"b{k}{sizes}.nc", sizes, 10 + k) for k in range(2)]
+        logs = [
+            f"{n}={p}" for p, q in zip(before, after, strict=True) for n, p in (("A", p), ("B", q))
+        ]
+        file = tmp_path / f"{sizes}.json"
+        shown = in_this_process(["rank", *logs, "--json", str(file)], monkeypatch, capsys)
+        assert shown.code == 0, shown.err
+        assert verdict in shown.out
+        assert "x: Tunings, the lowest criterion first" in shown.out
+        found = json.loads(file.read_text())
+        assert found["axes"]["x"]["best"] == "B"
+        assert found["axes"]["x"]["confidence"] == pytest.approx(0.975)
+        assert found["verdict"].startswith(verdict)
+    one = tmp_path / "one.csv"
+    np.savetxt(one, np.ones((600, 4)), delimiter=",", header="t,u,y,r", comments="")
+    table = np.column_stack([0.1 * np.arange(600), *np.random.default_rng(1).normal(size=(3, 600))])
+    np.savetxt(one, table, delimiter=",", header="t,u,y,r", comments="")
+    shown = in_this_process(["rank", f"A={before[0]}", f"B={one}"], monkeypatch, capsys)
+    assert (shown.code, "has one y, the logs before x, y: must be the same" in shown.err) == (
+        2,
+        True,
+    )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +16,6 @@ import quell as ql
 from quell.kernels.dispatch import compiled, interpreted
 from quell.quantities import AxesSignals
 from quell.realtime import Safety, TwinDevice, load, replay, run_rig, wire
-from quell.realtime.cycle import ControlLoop
 from quell.realtime.devices import handle_of, read_measurement
 from quell.realtime.recordings import (
     CsvSink,
@@ -32,139 +29,34 @@ from quell.realtime.recordings import (
 )
 from quell.realtime.registry import open_device
 from quell.realtime.run import mode_changes, silence_of
-from quell.realtime.safety import axes_reference
 from quell.realtime.supervisor import Cause, Mode
-from quell.realtime.system import virtual_clock
-from quell.realtime.telemetry import drain, ring
 from quell.records.axes import AxesTrajectory
 from quell.setup import made_axes
 
 from .commands import Shown
 from .rig_bench import TIME
+from .scripted_axes import (
+    B0,
+    DT,
+    PLANT,
+    SESSION,
+    THREE,
+    Outcome,
+    Scripted,
+    accepted,
+    axis,
+    frame_of,
+    gantry,
+    offered,
+)
 from .setups import GANTRY
 
-DT = 0.01
-A = [[0, 1, 0, 0], [0, -0.5, 0, 0], [0, 0, 0, 1], [0, 0, 0, -0.3]]
-B0 = [[2.0, 0.5], [0.4, 3.0]]
-PLANT = ql.plants.MultivariableLinearPlant(
-    A, [[0, 0], B0[0], [0, 0], B0[1]], [[1, 0, 0, 0], [0, 0, 1, 0]]
-)
-THREE = ql.plants.MultivariableLinearPlant(np.zeros((3, 3)), np.eye(3), np.eye(3))
-SESSION = 0x5EED0001
-FAST = Safety(settle=10, hold=4, ramp=10)
-
-
-def axis(learner: Any = None, omega_o: float = 12.0, **options: Any) -> ql.ADRC:
-    """Return the controller of an axis."""
-    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=omega_o, dt=DT)
-    guard = None if learner is None else ql.Guard()
-    return ql.ADRC(observer, omega_c=1.5, learner=learner, guard=guard, **options)
-
-
-def gantry(*, learning: bool = False, **options: Any) -> ql.Axes:
-    """Return the controller of ``PLANT``."""
-    learners = (ql.learners.Kalman(), ql.learners.Harmonic()) if learning else (None, None)
-    pair = dict(zip(("x", "y"), map(axis, learners), strict=True))
-    return ql.Axes(pair, B0, **({"u_min": -3.0, "u_max": 3.0} | options))
-
-
-class Scripted:
-    """A twin in Python, with numbers added to single measurements of some samples."""
-
-    def __init__(
-        self,
-        added: dict[int, tuple[float, float]] | None = None,
-        counts: tuple[int, int] = (2, 2),
-        **options: Any,
-    ) -> None:
-        self.twin, self.added = TwinDevice(PLANT, DT, **options), added or {}
-        self.signal_counts, self.count = counts, -1
-        self.written: list[Any] = []
-
-    def read(self) -> Any:
-        """Measure."""
-        self.count += 1
-        return self.twin.read() + np.array(self.added.get(self.count, (0.0, 0.0)))
-
-    def write(self, u: Any) -> None:
-        """Apply."""
-        self.written.append(u)
-        self.twin.write(u)
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-class Outcome:
-    """A loop on a virtual clock, after its end."""
-
-    def __init__(
-        self,
-        device: Any = None,
-        controller: Any = None,
-        references: Any = (1.0, -0.5),
-        *,
-        duration: float = 2.0,
-        approach: float = 0.0,
-        late: Any = (0,),
-        safety: Safety = FAST,
-    ) -> None:
-        self.device = TwinDevice(PLANT, DT) if device is None else device
-        self.controller = gantry() if controller is None else controller
-        scenario = ql.Scenario(tuple(references), duration)
-        self.rules = safety.rules(self.controller, scenario)
-        channels = row_channels(self.controller.channels, (), 2, 2)
-        self.loop = ControlLoop.of(
-            self.device,
-            self.controller,
-            axes_reference(scenario, self.controller, approach),
-            self.rules,
-            virtual_clock(late),
-            ring(4096, sum(width for _, width in channels)),
-        )
-        self.loop.run()
-        pairs = zip(self.controller.names, self.controller.axes, strict=True)
-        notes = {"axes": {name: list(each.features) for name, each in pairs}}
-        self.header = Header(channels, DT, notes=notes)
-        self.rows = drain(self.loop.controller.log.ring)
-        self.run = trajectory_of(self.header, self.rows)
-
-    @property
-    def changes(self) -> list[tuple[int, Mode, Cause, str]]:
-        """Changes of mode: sample, mode, cause, signal."""
-        state = self.loop.controller.supervisor
-        found = mode_changes(state, DT, axis_names=self.controller.names)
-        return [(round(each.t / DT), each.mode, each.cause, each.signal) for each in found]
-
-
 # ---- Frames ----
-
-
-def frame_of(
-    kind: int, number: int, answers: int, values: Any, state: int = 0, session: int = SESSION
-) -> bytes:
-    """Return a frame of several numbers, made without the package."""
-    head = struct.pack("<2sBBIIIq", b"QL", 1, kind, session, number, answers, TIME)
-    body = head + struct.pack(f"<{len(values)}dI", *values, state)
-    return body + struct.pack("<I", zlib.crc32(body))
 
 
 @compiled
 def _written(out: Any, own: Any, values: Any) -> None:
     wire.write_next_numbers(out, own, wire.MEASUREMENT, TIME, values, 0)
-
-
-@compiled
-def _accepted(frame: Any, size: int, own: Any) -> bool:
-    return wire.is_well_formed(frame, size, own.counters) and wire.accept(frame, own)
-
-
-def offered(own: Any, data: bytes, entry: Any = None) -> bool:
-    """Offer a packet to an endpoint, as a link would put it into its buffer."""
-    frame = wire.buffer(wire.MOST_SIGNALS)
-    cut = data[: frame.bytes.size]
-    frame.bytes[: len(cut)] = np.frombuffer(cut, dtype=np.uint8)
-    return bool((entry or interpreted(_accepted))(frame, len(cut), own))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, wire.MOST_SIGNALS])
@@ -189,8 +81,8 @@ def test_compiled_frames_of_several_numbers_are_the_same() -> None:
     expected = frame_of(wire.MEASUREMENT, 1, 0, (1.0, math.pi, -0.0))
     assert out.bytes[: len(expected)].tobytes() == expected
     receiver = wire.endpoint(wire.MEASUREMENT, SESSION, 20, 3)
-    assert offered(receiver, expected, _accepted)
-    assert not offered(receiver, expected, _accepted)
+    assert offered(receiver, expected, accepted)
+    assert not offered(receiver, expected, accepted)
 
 
 def test_a_frame_with_another_number_of_signals_is_refused() -> None:
@@ -336,10 +228,10 @@ def test_devices_without_a_wire_say_how_many_signals_they_have() -> None:
         run_rig(TwinDevice(ql.plants.two_mass_spring(), DT), one, 0.0, duration=0.1)
     with pytest.raises(ValueError, match="Scripted: gives y .* lists of one number, .*leave out"):
         run_rig(Scripted(counts=(1, 1)), single, 0.0, duration=0.1)
-    with pytest.raises(
-        ValueError, match="has one y and one u, NOT 2 and 2: several axes need a wire"
-    ):
+    with pytest.raises(ValueError, match="has one measurement .* the controller 2 measurements"):
         open_device("ni://Dev1/ctr0+Dev2/ao0", DT, signals=(2, 2))
+    with pytest.raises(ValueError, match="has 2 measurements and one .* the controller one"):
+        open_device("ni://Dev1/ctr0,Dev1/ctr1+Dev2/ao0", DT)
     for wrong in ((0, 1), (1, 17), (2,), 3, "ab"):
         with pytest.raises(ValueError, match="signals"):
             open_device("udp://127.0.0.1:1", DT, signals=wrong)  # type: ignore[arg-type]
@@ -533,14 +425,12 @@ def test_limits_that_do_not_fit_are_refused(options: dict[str, Any], message: st
         Safety(**options).rules(gantry())
 
 
-def test_lists_are_for_several_axes_and_channels_for_one() -> None:
-    """Neither has an effect at the other, so both are refused."""
+def test_lists_are_for_several_axes() -> None:
+    """They have no effect at one, so they are refused; and what axes can not have."""
     with pytest.raises(
         ValueError, match="most_error = .*must be one number; lists are for several"
     ):
         Safety(most_error=[1.0]).rules(axis(u_min=-1.0, u_max=1.0))
-    with pytest.raises(ValueError, match="channels = .*NOT for several axes yet"):
-        run_rig(TwinDevice(PLANT, DT), gantry(), 0.0, duration=0.1, channels=["load"])
     with pytest.raises(ValueError, match="must be finite for a real device"):
         Safety().rules(gantry(u_min=-math.inf))
     with pytest.raises(ValueError, match="reference has 3 signals: there are 2 axes"):
@@ -619,6 +509,25 @@ def test_a_recording_comes_back_bit_by_bit(tmp_path: Path, suffix: str) -> None:
         alone = load(path)
         np.testing.assert_array_equal(alone.log, found.run.log)
         assert alone.axis_names == ("x", "y")
+
+
+def test_a_table_alone_has_the_names_of_axes_and_actuators(tmp_path: Path) -> None:
+    """Without the header beside it; columns of anything else are refused, and say so."""
+    found = Outcome(duration=0.3)
+    texts = AxesSignals.of(("x", "y"), ("way [m]", ""), ("left [N]", "right")).texts()
+    sink = CsvSink(tmp_path / "run.csv")
+    sink.open(Header(found.header.channels, DT, notes={**found.header.notes, "signals": texts}))
+    sink.write(found.rows)
+    sink.close()
+    header_path(tmp_path / "run.csv").unlink()
+    alone = load(tmp_path / "run.csv")
+    np.testing.assert_array_equal(alone.log, found.run.log)
+    assert alone.axis_names == ("x", "y")
+    assert [each.name for each in alone.signals.u] == ["left", "right"]
+    text = (tmp_path / "run.csv").read_text().replace("u[right]", "u[1 [N]")
+    (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(ValueError, match="its columns differ from those of a recording"):
+        load(tmp_path / "run.csv")
 
 
 def test_names_of_axes_that_differ_in_their_case_only_have_fields_of_their_own() -> None:
@@ -753,6 +662,9 @@ def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None
         shown = quell(*command)
         assert shown.code == 2
         assert "has several axes (x, y): NOT possible here" in shown.err
+    shown = quell("run-rig", "gantry.toml", "--watch", "watch.json", "--no-figures")
+    assert shown.code == 0, shown.err
+    assert "NOT watched: no whole window of 60 s; run longer" in shown.out
     shown = quell("run-rig", "gantry.toml", "--omega-c", "3.0")
     assert (shown.code, "--omega-c" in shown.err) == (2, True)
     assert (

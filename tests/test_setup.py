@@ -344,7 +344,7 @@ def test_the_page_of_all_keys_has_a_row_for_each_and_says_what_it_means() -> Non
     for tables in (PLANTS, OBSERVERS, FEATURES, LEARNERS, CONTROLLERS):
         page = markdown(tables)
         for kind, table in tables.items():
-            assert f"**`{kind}`**" in page
+            assert f"<summary><code>{kind}</code> " in page
             assert [key for key, *_, words in keys(table) if not words] == []
         assert page.count("\n| `") == sum(len(keys(table)) for table in tables.values())
     assert "| `omega_o` | number | **needed** | observer bandwidth [rad/s]" in markdown(OBSERVERS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from typing import Any
 
@@ -97,3 +98,20 @@ def test_a_limit_may_be_infinite_where_loading_takes_it(schema: dict[str, Any]) 
         for value, taken in ((float("inf"), True), ([float("inf"), 1.0], True), (0.0, False)):
             data["rig"] = {"device": "twin", "safety": {name: value}}
             assert judge.is_valid(data) == taken, (name, value)
+
+
+def test_limits_that_may_be_infinite_are_so_in_the_schema(schema: dict[str, Any]) -> None:
+    """``rate_limit = inf`` and ``largest_u = inf`` are taken by both, zero and less by none."""
+    judge = jsonschema.Draft7Validator(schema)
+    data = tomllib.loads((EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"))
+    band = {"y_max": 5.0, "alpha": 4.0, "f_rate": 0.1}
+    for value, taken in ((math.inf, True), (30.0, True), (0.0, False), (-1.0, False)):
+        data["controller"]["rate_limit"] = value
+        assert judge.is_valid(data) == taken
+        assert (trial.refusal("two_mass.toml", data) is None) == taken
+    data["controller"]["rate_limit"] = math.inf
+    for value, taken in ((math.inf, True), (0.0, False), (-1.0, False)):
+        data["controller"]["safe_set"] = {**band, "largest_u": value}
+        assert judge.is_valid(data) == taken
+        told = trial.refusal("two_mass.toml", data)
+        assert ("largest_u" not in (told or "")) == taken

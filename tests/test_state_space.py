@@ -203,8 +203,7 @@ class TestC:
         (lambda: ql.simulate(drive(), controller(), ql.Scenario((1.0, 2.0))),
          "reference has 2 signals"),
         (lambda: ql.export.c_source(controller(), resolution=1e-6), "StateFeedback takes y in its"),
-        (lambda: ql.export.c(controller(), "firmware", precision="single"), "NOT compared"),
-        (lambda: ql.controllers.in_single_precision(controller()), "double precision only"),
+        (lambda: ql.export.c(controller(), "firmware", precision="single"), "needs plant"),
         (lambda: ql.analysis.analyse(drive(), controller()), "1 inputs and 2 outputs, here there is one of each; several: quell.plants"),
     ],
 )  # fmt: skip

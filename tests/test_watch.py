@@ -16,6 +16,7 @@ from quell.monitoring.windows import signals_of
 from quell.realtime.recordings import CsvSink
 from tests.commands import in_this_process
 from tests.recordings import controller, header_of, rows_of, simulated
+from tests.scripted_axes import Outcome, gantry
 
 NAMES = ("a", "b", "c")
 
@@ -412,3 +413,96 @@ def signals_of_rows(run: ql.Trajectory) -> Signals:
     """Return the samples of a run, as the sink has them."""
     theta = {name: run["theta"][:, i] for i, name in enumerate(run.features)}
     return Signals(run["u"], run["y_measured"], run["r"], run["f_hat"], theta, run.dt)
+
+
+# ---- Several axes ----
+
+
+def test_each_axis_is_judged_by_its_own_numbers() -> None:
+    """The alarm names the axis; axes that change together may have one cause, which is said."""
+    for changed, told in ((("y",), "y"), (("x", "y"), "x, y")):
+        machine = Machine(window=2.0)
+        for k in range(11):
+            dry = {name: 120.0 if k >= 8 and name in changed else 50.0 for name in ("x", "y")}
+            day = {name: driven(20 * k + i, dry=dry[name]) for i, name in enumerate(("x", "y"))}
+            machine.take(day, f"day {k}")
+        text = machine.describe()
+        alarmed = {alarm.feature for alarm in machine.watch.alarms}
+        assert {f"{name}: coulomb" for name in changed} <= alarmed
+        assert {name.partition(": ")[0] for name in alarmed} == set(changed)
+        assert f"ALARM: {changed[-1]}: coulomb rose" in text
+        assert "bearings" in text
+        if len(changed) == 1:
+            assert "no alarm in 110 windows: x" in text
+            assert "NOT decided which" not in text
+        else:
+            assert f"NOT decided which of the axes it is: {told} changed within" in text
+
+
+def test_other_axes_are_refused_and_orders_may_differ(tmp_path: Path) -> None:
+    """The state knows its axes, through a file, too; one written before has one y."""
+    day = driven(1)
+    machine, path = Machine(window=20.0, order=[2, 1]), tmp_path / "state.json"
+    machine.take({"x": day, "y": day}, "day")
+    assert "y: viscous" not in machine.watch.features
+    assert "x: viscous" in machine.watch.features
+    machine.save(path)
+    again = Machine.load(path)
+    assert again.axes == ("x", "y")
+    assert again.settings == machine.settings
+    for other in (day, {"y": day, "x": day}, {"x": day}):
+        with pytest.raises(ValueError, match="record: has .*, the state x, y: must be the same"):
+            again.take(other, "day 2")
+    with pytest.raises(ValueError, match=r"order = \[2, 1\]: must be one number, or 3"):
+        Machine(order=[2, 1]).take(dict.fromkeys("abc", day), "day")
+    single = Machine(window=20.0)
+    single.take(day, "day")
+    single.save(path)
+    state = json.loads(path.read_text())
+    del state["axes"]
+    path.write_text(json.dumps(state))
+    with pytest.raises(ValueError, match="has x, the state one y"):
+        Machine.load(path).take({"x": day}, "day")
+
+
+def test_a_window_that_lacks_too_much_of_one_axis_is_left_out() -> None:
+    """Of all: their numbers are of the same time."""
+    whole = driven(1)
+    y = whole.y.copy()
+    y[5000:5100] = math.nan
+    machine = Machine(window=20.0)
+    machine.take({"x": whole, "y": whole._replace(y=y)}, "day")
+    assert (machine.left_out, machine.watch.labels) == (1, [])
+
+
+def test_a_recording_of_axes_is_watched_as_the_running_loop_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In blocks of any size; by the command, from a recording and from a saved run."""
+    move = ql.signals.Sinusoid(1.0, 3.0)
+    found = Outcome(None, gantry(learning=True), (move, move), duration=5.0)
+    sink = WatchSink(tmp_path / "watch.json", Machine(window=2.0))
+    csv = CsvSink(tmp_path / "run.csv")
+    for each in (sink, csv):
+        each.open(found.header)
+        for begin in range(0, len(found.rows), 37):
+            each.write(found.rows[begin : begin + 37])
+        each.close()
+    kept, again = Machine.load(tmp_path / "watch.json"), Machine(window=2.0)
+    again.take(signals_of(tmp_path / "run.csv"), "run.csv")
+    assert kept.axes == again.axes == ("x", "y")
+    assert kept.watch.features == again.watch.features
+    assert {"x: b0", "y: f_rms", "y: error"} <= set(kept.watch.features)
+    assert any(name.startswith("y: theta ") for name in kept.watch.features)
+    for name in kept.watch.features:
+        np.testing.assert_allclose(kept.watch.values(name), again.watch.values(name), rtol=1e-6)
+    found.run.save(tmp_path / "run.nc")
+    for name in ("run.csv", "run.nc"):
+        shown = in_this_process(
+            ["watch", str(tmp_path / name), "--window", "2"], monkeypatch, capsys
+        )
+        assert shown.code == 0, shown.err
+        assert f"{name}: 2 windows" in shown.out
+        assert "y: b0" in shown.out
+    with pytest.raises(ValueError, match="must be the same axes"):
+        WatchSink(tmp_path / "watch.json").open(header_of(simulated(5.0), controller()))

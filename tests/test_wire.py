@@ -290,13 +290,14 @@ def test_a_stranger_who_knows_the_session_can_not_use_it(bench: Callable[..., Be
 
 
 @pytest.mark.skipif(not HOSTILE.exists(), reason="the trial is in the repository only")
+@pytest.mark.parametrize("several", [False, True])
 @pytest.mark.parametrize("wire", WIRES)
-def test_hostile_packets_bytes_and_files_do_nothing(wire: str) -> None:
-    """The trial of ``benchmarks/hostile_wire.py``, six hundred attacks."""
+def test_hostile_packets_bytes_and_files_do_nothing(wire: str, several: bool) -> None:
+    """The trial of ``benchmarks/hostile_wire.py``, six hundred attacks; with three signals, too."""
     if wire == "serial":
         pytest.importorskip("serial")
     trial = benchmark("hostile_wire")
-    found = trial.trial(wire, 600, 60.0, seed=5)
+    found = trial.trial(wire, 600, 60.0, seed=5, several=several)
     assert found["attacks"] >= 600
     assert found["wrong"] == []
     assert found["files"] == 0

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -270,6 +271,36 @@ def recorded_run(
     if path.suffix.lower() == ".mcap" or header.is_file():
         return load_one(path, max_size)
     return None
+
+
+def runs_in(
+    path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
+) -> dict[str, Trajectory]:
+    """Return the runs in a file that quell wrote: that of each axis by its name, or one without.
+
+    The u of an axis is v = B0 u, as applied. No run for a table in text.
+    """
+    if columns or dt is not None or time_unit is not None:
+        return {}
+    if path.suffix.lower() == ".nc":
+        run = _saved_run(path, max_size)
+    elif path.suffix.lower() == ".mcap" or header_path(path).is_file():
+        run = load(path, max_size)
+    else:
+        return {}
+    if isinstance(run, AxesTrajectory):
+        return {name: run.axis(name) for name in run.axis_names}
+    return {"": run}
+
+
+def _saved_run(path: Path, max_size: float) -> Trajectory | AxesTrajectory:
+    """Return what is in a NetCDF file; its error is that of a run of one y and one u."""
+    try:
+        return Trajectory.load(path, max_size)
+    except ValueError as error:
+        with suppress(ValueError):
+            return AxesTrajectory.load(path, max_size)
+        raise error from None
 
 
 def measured_records(

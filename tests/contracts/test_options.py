@@ -51,6 +51,7 @@ WORK = {
     "compare": (
         "quell.experiments.compare.two_mass",
         "quell.experiments.compare.of_setup",
+        "quell.experiments.over_seeds.of_setups",
     ),
     "identify": ("quell.identification.identify",),
     "tune": (
@@ -103,6 +104,7 @@ _TWIN = (*_TWIN, "--y-min=-9", "--y-max=9")
 _PLANT = ("--num", "2", "--den", "1,1", "--dt", "0.05", *_FIGURES)
 _BENCHMARK = ("--controllers", "pid", *_FIGURES)
 _OF_SETUP = (*_SETUP, *_FIGURES)
+_TWO_SETUPS = (*_SETUP, "other.toml", *_FIGURES)
 Case = tuple[str, ...] | tuple[tuple[str, ...], tuple[str, ...]]
 # For each option what is added to the command's base; or a base and a call of its own.
 CASES: dict[str, dict[str, Case]] = {
@@ -111,7 +113,7 @@ CASES: dict[str, dict[str, Case]] = {
     "reproduce acc": {"--samples": ("--samples", "plants.csv"), "--count": ("--count", "4"), "--spread": ("--spread", "2"), "--seed": ("--seed", "1"), "--box": ("--box",)},
     "stress": {"--runs": ("--runs", "12"), "--honest": ("--honest", "3"), "--seed": ("--seed", "1"), "--guard": ("--no-guard",), "--loops": ("--loops", "all")},
     "compare": {
-        "SETUP": (_BENCHMARK, _OF_SETUP), "--controllers": (_BENCHMARK, ("--controllers", "lqg", *_FIGURES)), "--m-s": (_OF_SETUP, (*_OF_SETUP, "--m-s", "1.7")), "--m-t": (_OF_SETUP, (*_OF_SETUP, "--m-t", "1.7")),
+        "SETUPS": (_BENCHMARK, _OF_SETUP), "--seeds": (_TWO_SETUPS, (*_TWO_SETUPS, "--seeds", "3")), "--criterion": (_TWO_SETUPS, (*_TWO_SETUPS, "--criterion", "iae")), "--controllers": (_BENCHMARK, ("--controllers", "lqg", *_FIGURES)), "--m-s": (_OF_SETUP, (*_OF_SETUP, "--m-s", "1.7")), "--m-t": (_OF_SETUP, (*_OF_SETUP, "--m-t", "1.7")),
         "--m-ks": (_OF_SETUP, (*_OF_SETUP, "--m-ks", "9")), "--load-at": (_OF_SETUP, (*_OF_SETUP, "--load-at", "3")),
         **{f"--{name}": (_BENCHMARK, (*_BENCHMARK, f"--{name}", value)) for name, value in {"m1": "1.1", "m2": "1.1", "k": "1.1", "dt": "0.01", "u-max": "9", "seed": "1"}.items()},
     },

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import OUTPUTS, Outputs, Trust, Whole, refuse
+from rich.markup import escape
+
+from quell.cli.exit_codes import ExitCode, exit_if_diverged
+from quell.cli.options import OUTPUTS, Outputs, Trust, Whole, WholeOrNone, refuse
 from quell.cli.output import (
     COMPILING,
     Console,
@@ -20,12 +23,14 @@ from quell.cli.output import (
     table,
     write_results,
 )
+from quell.cli.report import COLUMNS
 from quell.files import nonfinite_to_none
 
 if TYPE_CHECKING:
     from quell.analysis import Certificate
     from quell.controllers import Controller
     from quell.experiments.compare import Benchmark, Comparison, Entry
+    from quell.experiments.over_seeds import SeedComparison
     from quell.setup import Setup
     from quell.tuning import Constraints
 
@@ -148,7 +153,7 @@ def _short(value: float, decimals: int) -> str:
 
 
 def compare(
-    setup: Path | None = None,
+    setups: list[Path] | None = None,
     *,
     controllers: str | None = None,
     m1: float = 1.0,
@@ -161,20 +166,25 @@ def compare(
     m_t: float | None = None,
     m_ks: float | None = None,
     load_at: float | None = None,
+    seeds: WholeOrNone = None,
+    criterion: str | None = None,
     trust: Trust = False,
     outputs: Outputs = OUTPUTS,
 ) -> None:
-    """Compare controllers: by published rules, and tuned under the same constraints.
+    """Compare controllers: by published rules, tuned under the same constraints, or of setups.
 
     Without a setup: on two masses and a spring, designed for m1 = m2 = k = 1, with a step, a force
     on the load, and noise. Tuned controllers have the best load rejection (largest integral gain)
     that M_s, M_t and M_ks of mf-eso allow. With a setup: its own controller, and tuned ones for its
-    plant, in its scenario. If a run diverges the exit code is 4.
+    plant, in its scenario. With several setups, of one axis or of the same [[axis]]: their
+    controllers on the plant and in the scenario of the first, over seeds of its noise, with
+    intervals; a verdict that the seeds do not allow is a line that begins with NOT. If a run
+    diverges the exit code is 4.
 
     Parameters
     ----------
-    setup
-        A setup file in TOML.
+    setups
+        Setup files in TOML: none, one of one axis, or several.
     controllers
         Names of controllers, with commas between; by default all. Without a setup zv+ or zvd+
         before a name that is not tuned shapes its reference, as in zv+lqg.
@@ -200,15 +210,30 @@ def compare(
     load_at
         With a setup: time from which on a disturbance is scored [s]; by default the first time at
         which one of the scenario's begins.
+    seeds
+        With several setups: number of seeds; by default 10, or one if nothing in the scenario is
+        random.
+    criterion
+        With several setups: what is to be low: rms, iae or peak_error of the error r − y; by
+        default rms.
     """
-    if setup is not None:
-        from quell.setup import load
-
-        _only_for(setup=False, m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
-        given = load(setup, trust)
-        _compare_setup(setup.stem, given, controllers, (m_s, m_t, m_ks), load_at, outputs)
+    of_benchmark = {"m1": m1, "m2": m2, "k": k, "dt": dt, "u_max": u_max, "seed": seed}
+    of_setup = {"m_s": m_s, "m_t": m_t, "m_ks": m_ks, "load_at": load_at}
+    of_several = {"seeds": seeds, "criterion": criterion}
+    if setups:
+        _only_for("is in the setup itself", **of_benchmark)
+    if not setups or len(setups) == 1:
+        _only_for("is for a comparison of several setups; give two or more", **of_several)
+    if setups and len(setups) > 1:
+        rule = "is for one setup, whose plant controllers are tuned for; give one"
+        _only_for(rule, controllers=controllers, **of_setup)
+        _compare_setups(setups, seeds, criterion or "rms", trust, outputs)
         return
-    _only_for(setup=True, m_s=m_s, m_t=m_t, m_ks=m_ks, load_at=load_at)
+    if setups:
+        given = _one_setup(setups[0], trust)
+        _compare_setup(setups[0].stem, given, controllers, (m_s, m_t, m_ks), load_at, outputs)
+        return
+    _only_for("is for a comparison of a setup; give one", **of_setup)
     from quell.experiments import compare as experiment
     from quell.experiments.compare import STRUCTURES
     from quell.plants import two_mass_spring
@@ -247,6 +272,132 @@ def compare(
         results["controllers"][name]["certificate"] = shown
     write_results(console, {"settings": about | limit, **results}, outputs, paths)
     exit_if_diverged(result.runs.values())
+
+
+def _one_setup(path: Path, trust: bool) -> Setup:
+    """Read a setup of one axis, whose controller is compared with tuned ones."""
+    from quell.setup import SetupError, made, read
+    from quell.setup.description import is_of_axes
+
+    name, data = read(path)
+    if is_of_axes(data):
+        rule = (
+            "NOT for a setup of several axes alone: structures are tuned for one axis; give two "
+            "setups or more, quell compare a.toml b.toml, or tune it by quell tune"
+        )
+        raise SetupError([f"{name}: {rule}"])
+    return made(name, data, trust)
+
+
+# ---- Several setups, over seeds ----
+
+
+def _compare_setups(
+    paths: Sequence[Path], seeds: int | None, criterion: str, trust: bool, outputs: Outputs
+) -> None:
+    from quell.experiments import over_seeds as experiment
+    from quell.setup import SetupError, made, made_axes, read
+    from quell.setup.description import is_of_axes
+
+    stems = [path.stem for path in paths]
+    names = stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
+    if len(set(names)) < len(names):
+        raise ValueError(f"setups: {', '.join(names)}: must be different files")
+    figure = f"{stems[0]}-compare"
+    setups = {}
+    for key, path in zip(names, paths, strict=True):
+        name, data = read(path)
+        setups[key] = (made_axes if is_of_axes(data) else made)(name, data, trust)
+    outputs = check_outputs(outputs, [figure])
+    console = Console()
+    first = next(iter(setups.values()))
+    with progress_bar(console, COMPILING) as report:
+        progress = partial(report, COMPILING)
+        how: dict[str, Any] = {"seeds": seeds, "criterion": criterion, "progress": progress}
+        try:
+            found = experiment.of_setups(setups, **how)
+        except ValueError as error:
+            if isinstance(error, SetupError):
+                raise
+            raise SetupError([f"{first.file}: {error}"]) from None
+    print_over_seeds(console, first.title, found)
+    paths_of_figure = []
+    if outputs.figures:
+        paths_of_figure = experiment.save(found, outputs.figures, outputs.overwrite, figure)
+    about = {"setups": {name: setup.as_json() for name, setup in setups.items()}}
+    write_results(console, found.to_json() | about, outputs, paths_of_figure)
+    if found.diverged.any():
+        sys.exit(ExitCode.DIVERGED)
+
+
+def print_over_seeds(console: Console, title: str, found: SeedComparison) -> None:
+    """Print for each window which is best for each axis, all other measures, and the verdicts."""
+    from quell.experiments.over_seeds import ALL_AXES, CRITERIA
+
+    count = len(found.seeds)
+    what = CRITERIA[found.criterion]
+    of_seeds = "one run each" if count == 1 else f"mean of {count} seeds ± half its 95 % interval"
+    per_window = len(found.verdicts) // len(found.windows)
+    print_line(console, f"{title}: {of_seeds}")
+    for k, (start, stop) in enumerate(found.windows):
+        where = f"{what}, {start:g} … {stop:g} s"
+        rows = table(where, "", *found.names, padding=(0, 1, 0, 0), pad_edge=False)
+        rows.add_column("best")
+        for verdict in found.verdicts[k * per_window : (k + 1) * per_window]:
+            axis = verdict.axis
+            if axis == ALL_AXES:
+                label = f"all, of {found.names[0]}"
+                cells = [_with_reach(*found.ratio(name, k)) for name in found.names]
+            else:
+                i = found.axes.index(axis)
+                unit = found.units[i] if found.units else ""
+                unit = f"{unit} s".strip() if found.criterion == "iae" else unit
+                label = f"{axis} [{unit}]" if unit else axis or "y"
+                cells = [
+                    _with_reach(*found.mean(found.criterion, name, k, i)) for name in found.names
+                ]
+            rows.add_row(escape(label), *cells, escape(verdict.best or "NOT decided"))
+        console.print(rows)
+        _print_means(console, found, k)
+    for line in found.describe().splitlines():
+        print_line(console, line)
+
+
+def _print_means(console: Console, found: SeedComparison, window: int) -> None:
+    """Print the mean of each measure that any axis and setup has."""
+    from math import isfinite
+
+    means = {
+        f"{axis} {name}".strip(): {
+            each.key: value
+            for each in COLUMNS
+            if isfinite(value := found.mean(each.key, name, window, i)[0])
+        }
+        for i, axis in enumerate(found.axes)
+        for name in found.names
+    }
+    columns = [each for each in COLUMNS if any(each.key in row for row in means.values())]
+    headings = [column.heading for column in columns]
+    rows = table("All measures, means", "", *headings, padding=(0, 1, 0, 0), pad_edge=False)
+    for label, row in means.items():
+        rows.add_row(escape(label), *(column.cell(row) for column in columns))
+    console.print(rows)
+    if any(len(row) < len(columns) for row in means.values()):
+        print_line(console, "–: not in all runs: no step, not settled, or diverged.")
+    if len(found.axes) > 1:
+        print_line(console, "u of an axis is its v.")
+
+
+def _with_reach(value: float, half: float) -> str:
+    """Return a number with half of its interval; a dash for none."""
+    from math import isfinite
+
+    if not isfinite(value):
+        return "–"
+    return f"{value:.3g} ± {half:.2g}" if isfinite(half) and half > 0.0 else f"{value:.4g}"
+
+
+# ---- One setup, with tuned controllers ----
 
 
 def _compare_setup(
@@ -297,14 +448,13 @@ def _compare_setup(
     exit_if_diverged(run.result.runs.values())
 
 
-def _only_for(*, setup: bool, **options: Any) -> None:
-    """Refuse options that the other kind of comparison has, unless they have their defaults."""
+def _only_for(rule: str, **options: Any) -> None:
+    """Refuse options that another kind of comparison has, unless they have their defaults."""
     import inspect
 
     defaults = inspect.signature(compare).parameters
     for name, value in options.items():
         if value != defaults[name].default:
-            rule = "is for a comparison of a setup; give one" if setup else "is in the setup itself"
             raise ValueError(f"--{name.replace('_', '-')} = {value!r}: {rule}")
 
 

@@ -49,15 +49,16 @@ def rank(
 ) -> None:
     """Decide which of several tunings was best, from logs of the running machine.
 
-    A verdict that the logs do not allow is a line that begins with NOT, with what to do.
+    A verdict that the logs do not allow is a line that begins with NOT, with what to do. Logs of
+    several axes are judged for each of them, with v = B0 u in the place of u.
 
     Parameters
     ----------
     logs
         Files of records: tables of t,u,y,r in text, recordings of `quell run-rig`, saved runs
-        (.nc). NAME=FILE gives the name of the tuning, that of the file by default; several logs of
-        one name belong to one tuning. FILE@600:1200 is the part from 600 to 1200 s. Alternate the
-        tunings (A, B, A, B), so that what drifts is in both.
+        (.nc), of one axis or of several. NAME=FILE gives the name of the tuning, that of the file
+        by default; several logs of one name belong to one tuning. FILE@600:1200 is the part from
+        600 to 1200 s. Alternate the tunings (A, B, A, B), so that what drifts is in both.
     criterion
         What is to be low: rms or iae of the error r − y, or effort, the mean of |du/dt|.
     confidence
@@ -65,21 +66,56 @@ def rank(
     dt
         Sample time [s] of tables without times; columns are then u,y,r by default.
     """
-    from quell.commissioning import measured
+    from quell.commissioning import measured, measured_run, runs_in
     from quell.monitoring import rank as rank_logs
 
     outputs = check_outputs(outputs)
     given = [_named(text) for text in logs]
-    tunings: dict[str, list[Measured]] = {}
+    axes: dict[str, dict[str, list[Measured]]] = {}
     for one in given:
         how = read.columns, dt, read.time_unit, read.max_size
-        record = measured(one.path, *how, reference=True)
-        tunings.setdefault(one.name, []).append(_part(record, one))
-    found = rank_logs(tunings, criterion=criterion, confidence=confidence)
+        runs = {axis: measured_run(run) for axis, run in runs_in(one.path, *how).items()}
+        records = runs or {"": measured(one.path, *how, reference=True)}
+        if axes and [*axes] != [*records]:
+            theirs, ours = (", ".join(filter(None, each)) or "one y" for each in (records, axes))
+            raise ValueError(f"{one.path}: has {theirs}, the logs before {ours}: must be the same")
+        for axis, record in records.items():
+            axes.setdefault(axis, {}).setdefault(one.name, []).append(_part(record, one))
+    if not axes:
+        axes[""] = {}
+    # The level is shared by the axes.
+    level = confidence if len(axes) == 1 else 1.0 - (1.0 - confidence) / len(axes)
+    found = {
+        axis: rank_logs(tunings, criterion=criterion, confidence=level)
+        for axis, tunings in axes.items()
+    }
     console = Console()
-    _print_scores(console, found)
-    print_line(console, found.describe())
-    write_results(console, found.to_json(), outputs)
+    for axis, ranking in found.items():
+        _print_scores(console, ranking, axis)
+        print_line(console, ranking.describe())
+    if len(found) == 1:
+        write_results(console, next(iter(found.values())).to_json(), outputs)
+        return
+    verdict = _together({axis: ranking.best for axis, ranking in found.items()}, confidence)
+    print_line(console, verdict)
+    results = {"axes": {axis: each.to_json() for axis, each in found.items()}, "verdict": verdict}
+    write_results(console, results, outputs)
+
+
+def _together(best: dict[str, str | None], confidence: float) -> str:
+    """Return the verdict on the tunings of several axes, of which each has its best one or none."""
+    level = f"at {100.0 * confidence:g} % for all axes together"
+    names = set(best.values())
+    if None in names:
+        open_ = ", ".join(axis for axis, name in best.items() if name is None)
+        return f"NOT decided for {open_}, {level}: axes that act on each other have one tuning"
+    if len(names) > 1:
+        each = ", ".join(f"{name} for {axis}" for axis, name in best.items())
+        return (
+            f"NOT one best tuning, {level}: {each}; axes that act on each other have one tuning: "
+            "weigh their errors, or combine the settings of each and log again"
+        )
+    return f"best for all axes: {names.pop()}, {level}"
 
 
 def _named(text: str) -> _Named:
@@ -109,7 +145,7 @@ def _part(record: Measured, one: _Named) -> Measured:
     return record._replace(u=record.u[begin:end], y=record.y[begin:end], reference=r)
 
 
-def _print_scores(console: Console, found: Ranking) -> None:
+def _print_scores(console: Console, found: Ranking, axis: str) -> None:
     headings = (
         "RMS error",
         "mean |error|",
@@ -118,7 +154,8 @@ def _print_scores(console: Console, found: Ranking) -> None:
         "logged [s]",
         "batches",
     )
-    rows = table("Tunings, the lowest criterion first", "", *headings)
+    title = "Tunings, the lowest criterion first"
+    rows = table(f"{axis}: {title}" if axis else title, "", *headings)
     for name, scores in found.scores.items():
         beyond = None if scores.overshoot != scores.overshoot else scores.overshoot
         cells = [number(value, ".4g") for value in (scores.rms, scores.iae, scores.effort)]
@@ -147,15 +184,17 @@ def watch(
 ) -> None:
     """Watch the numbers of a machine over its records, and raise an alarm when one has changed.
 
-    b0, friction, stiffness, a resonance, noise, load, and f of recorded runs, in each window. The
+    b0, friction, stiffness, a resonance, noise, load, and f of recorded runs, in each window; of a
+    run of several axes for each of them, with v = B0 u in the place of u. The
     probability of a false alarm, over all time, is --alpha at most, as long as windows differ by
     chance only. The exit code is 6 where there is an alarm.
 
     Parameters
     ----------
     records
-        Records in the order of time: recordings of `quell run-rig`, saved runs (.nc), or tables of
-        t,u,y in text; with --columns t,u,y,r the error is watched, too.
+        Records in the order of time: recordings of `quell run-rig`, saved runs (.nc), both of one
+        axis or of several, or tables of t,u,y in text; with --columns t,u,y,r the error is watched,
+        too.
     state
         File, in JSON, that is continued, or begun: run the command each day on the day's records.
         Records that are in it already are left out.

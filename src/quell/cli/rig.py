@@ -44,7 +44,7 @@ from quell.files import MAX_SIZE
 from quell.realtime.registry import examples
 
 if TYPE_CHECKING:
-    from quell.controllers import Compensator
+    from quell.controllers import Axes, Compensator
     from quell.monitoring import WatchSink
     from quell.realtime import Rig, RigRun
     from quell.realtime.run import ModeChange
@@ -191,6 +191,14 @@ def _print_counters(server: Rig) -> None:
         print(f"the log lacks {server.unlogged} ticks: it could not be written as quickly")
 
 
+def _loaded(name: str, data: Mapping[str, Any], trust: bool) -> Setup:
+    """Return the objects of a file of one axis, or of several."""
+    from quell.setup import made, made_axes
+    from quell.setup.description import is_of_axes
+
+    return (made_axes if is_of_axes(data) else made)(name, data, trust)
+
+
 # ---- quell proxy ----
 
 _HOST = (
@@ -214,13 +222,15 @@ def proxy(
 ) -> None:
     """Put a compensator between a host and a drive that both stay as they are.
 
-    The host's commands are u_0; to the host the proxy is the drive, to the drive it is the host.
+    The host's commands are u_0; to the host the proxy is the drive, to the drive it is the host. A
+    setup with [[axis]] stands between a host and a drive of as many measurements and control
+    signals.
 
     Parameters
     ----------
     setup
         The file, in TOML, with [controller] kind = "compensator", limits of u, and the drive in
-        [rig].
+        [rig]; of several axes with a compensator in each [[axis]].
     watchdog
         After so many ticks in a row without a command of the host u_0 is zero until a new session.
     seconds
@@ -232,19 +242,20 @@ def proxy(
     cpu
         Number of the processor for the ticks; any by default.
     """
-    from quell.realtime import CompensatedDrive, open_device
+    from quell.realtime import CompensatedDrive
+    from quell.realtime.devices import counts_text
     from quell.realtime.registry import listen
     from quell.realtime.rig import Rig
-    from quell.setup import load
+    from quell.setup import read
 
-    loaded = load(setup, trust)
+    loaded = _loaded(*read(setup), trust)
     url = str(loaded.needed("rig")["device"]) if device is None else device
     _check_pace(seconds, priority, cpu)
-    compensator, dt = cast("Compensator", loaded.controller), float(loaded.controller.dt)
+    compensator, dt = cast("Compensator | Axes", loaded.controller), float(loaded.controller.dt)
     limits: dict[str, Any] = {"watchdog": watchdog, "log": log, "overwrite": overwrite}
     names = (loaded.rig or {}).get("channels", ())
     with (
-        closing(open_device(url, dt, trust)) as behind,
+        closing(_device(url, loaded)) as behind,
         closing(CompensatedDrive(behind, compensator, channels=names)) as drive,
         closing(listen(host)) as listener,
         Rig(drive, dt, listener=listener, **limits) as server,
@@ -255,11 +266,15 @@ def proxy(
             drive.device.restart_session()  # compiling may have taken longer than it waits
         rule = f"u_0 = 0 after {watchdog} ticks without a command"
         between = f"compensator between {listener.url} and {url}"
-        line = f"{between}: a tick every {dt:g} s, {rule}"
+        of = "" if server.signal_counts is None else f", with {counts_text(server.signal_counts)}"
+        line = f"{between}{of}: a tick every {dt:g} s, {rule}"
         notes = _served(server, line, seconds, priority, cpu)
         _print_counters(server)
-        estimate = drive.estimate
-        print(f"last tick: u = {estimate.u:.6g}, f = {estimate.f:.6g}, {estimate.status!r}")
+        several, found = hasattr(drive, "inputs"), drive.estimate
+        for axis, each in found.items() if several else (("", found),):
+            of_axis, of = (f"{axis}: ", "v") if several else ("", "u")
+            text = f"{of} = {each.u:.6g}, f = {each.f:.6g}, {each.status!r}"
+            print(f"last tick: {of_axis}{text}")
     for note in notes:
         print(note)
 
@@ -331,7 +346,7 @@ def run_rig(
         while it runs: an alarm is printed at once. A new file is a new state; make it with quell
         watch for other windows.
     """
-    from quell.setup import EXAMPLES, made, made_axes, read
+    from quell.setup import EXAMPLES, read
     from quell.setup.description import is_of_axes
 
     numbers: dict[str, Any] = {
@@ -372,9 +387,7 @@ def run_rig(
     if several:
         rule = "is for one axis; change the bandwidths of each [[axis]] in the file"
         refuse({"omega_c": (omega_c, None), "omega_o": (omega_o, None)}, rule)
-        rule = "is of one axis; record the run, and watch one axis of it"
-        refuse({"watch": (watch, None)}, rule)
-    given = (made_axes if several else made)(name, _changed(data, changes), trust)
+    given = _loaded(name, _changed(data, changes), trust)
     if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
 
@@ -447,8 +460,10 @@ def _watching(console: Console, path: Path, setup: Setup) -> WatchSink:
     """Return the sink that watches the machine."""
     from quell.monitoring import Machine, WatchSink
 
-    observer = getattr(setup.controller, "observer", None)
-    machine = Machine(order=min(getattr(observer, "degree", 2), 2))
+    parts = getattr(setup.controller, "axes", (setup.controller,))
+    observers = [getattr(each, "observer", None) for each in parts]
+    orders = [min(getattr(observer, "degree", 2), 2) for observer in observers]
+    machine = Machine(order=orders[0] if len(set(orders)) == 1 else orders)
     return WatchSink(path, machine, lambda alarm: print_line(console, alarm.describe()))
 
 
@@ -631,13 +646,13 @@ def replay(
     from quell.realtime import load as load_record
     from quell.realtime import replay as replay_record
     from quell.records import metrics
-    from quell.setup import EXAMPLES, made, made_axes, read
+    from quell.setup import EXAMPLES, read
     from quell.setup.description import is_of_axes
     from quell.setup.schema import with_path
 
     file, data = read(setup or EXAMPLES / "torsional_rig.toml")
     several = is_of_axes(data)
-    given = (made_axes if several else made)(file, data, trust)
+    given = _loaded(file, data, trust)
     name = f"{record.stem}-replayed"
     outputs = check_outputs(outputs, [name])
     recorded = load_record(record, max_size)

@@ -67,7 +67,7 @@ def run(
     Parameters
     ----------
     setup
-        The file, in TOML; docs/setup has all keys.
+        The file, in TOML; docs/setup_keys has all keys.
     example
         Print such a file, and do no more.
     """
@@ -155,11 +155,11 @@ def sweep(
     Parameters
     ----------
     setup
-        The file, in TOML; docs/setup has all keys, docs/scale an example.
+        The file, in TOML; docs/setup_keys has all keys, docs/scale an example.
     folder
         Where the results are; by default the setup's name with -sweep.
     dask
-        Address tcp://HOST:PORT of a Dask scheduler, whose workers do the runs; docs/scale.
+        Address tcp://HOST:PORT of a Dask scheduler, whose workers do the runs; docs/scale_cluster.
     workers
         Number of processes on this machine; the number of cores by default.
     repeat
@@ -306,7 +306,7 @@ def export(
     Parameters
     ----------
     setup
-        The file, in TOML; docs/setup has all keys.
+        The file, in TOML; docs/setup_keys has all keys.
     to
         c; fmu, which is an FMU of FMI 3.0 for co-simulation; ros2, a package with a chainable
         controller of ros2_control; or st, a function block in Structured Text for a PLC.
@@ -361,11 +361,9 @@ def export(
     if precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
     file, data = read(setup)
-    several = is_of_axes(data)
-    given = (made_axes if several else made)(file, data, trust)
-    # Single precision is compared with double in a simulated run, of one axis.
-    plant, scenario = (None, None) if several else (given.plant, given.scenario)
-    if precision == "single" and not (accept or several):
+    given = (made_axes if is_of_axes(data) else made)(file, data, trust)
+    # Single precision is compared with double in a simulated run.
+    if precision == "single" and not accept:
         given.needed("plant")
         given.needed("scenario")
     exported = c(
@@ -373,8 +371,8 @@ def export(
         out,
         name=name or "controller",
         precision=precision,
-        plant=plant,
-        scenario=scenario,
+        plant=given.plant,
+        scenario=given.scenario,
         resolution=resolution,
         accept=accept,
         proof=prove,
@@ -474,9 +472,9 @@ def _differences(found: Comparison) -> list[str]:
     """Return lines about single precision, next to the effect of the noise."""
     if found.diverged:
         return ["Single precision: the run diverges; in double precision it does not"]
-    rows = {"u": (found.u, found.u_noise), "y": (found.y, found.y_noise)}
+    rows = [("u", found.u, found.u_noise), ("y", found.y, found.y_noise)]
     lines = []
-    for signal, (difference, noise) in rows.items():
+    for signal, difference, noise in found.each or rows:
         text = f"Single precision changes {signal} by {100 * difference:.2g} % RMS"
         if noise is not None:
             text += f"; the measurement noise changes it by {100 * noise:.2g} %"

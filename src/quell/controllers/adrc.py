@@ -409,7 +409,7 @@ class ADRC(Compensator):
         """
         if self._packed is None:
             self.prepare()
-        if derivatives or self.derivatives:
+        if derivatives or self.feedforward:  # an attribute: this is called in every sample
             self._set_derivatives(derivatives)
         try:
             u: float = self._step(self._packed, r, y)

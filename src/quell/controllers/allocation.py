@@ -47,6 +47,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numba
@@ -58,7 +59,7 @@ from quell.controllers.base import Limits, RateLimit, checked_limits
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
-from quell.kernels.sized import Flag, Work
+from quell.kernels.sized import Buffer, Flag, Work
 from quell.kernels.user_functions import POINTER, call
 from quell.learners.base import meaning
 from quell.types import Matrix, Status, Vector, warn
@@ -115,11 +116,12 @@ class FunctionGain(NamedTuple):
     address: int
     is_inverse: Flag
     weights: Vector  # of the actuators (m,)
+    numbers: Buffer  # parameters of the function
 
 
 @meaning.register(FunctionGain)
 def _meaning(gain: FunctionGain) -> Any:
-    return gain.address, gain.is_inverse
+    return gain.address, gain.is_inverse, *([gain.numbers] if gain.numbers.size else [])
 
 
 @kernel
@@ -175,7 +177,7 @@ def _constant(gain: ConstantGain, memory: GainMemory, x: Matrix) -> int:
 
 @update_gain.register(FunctionGain)
 def _by_function(gain: FunctionGain, memory: GainMemory, x: Matrix) -> int:
-    call(gain.address, x, memory.fresh)
+    call(gain.address, x, gain.numbers, memory.fresh)
     n, m = memory.B.shape
     fresh = memory.fresh
     if n == m:
@@ -292,6 +294,17 @@ def set_range(limits: ActuatorLimits, before: Vector, memory: RangeMemory) -> No
         low, high = limits.low[i], limits.high[i]
         memory.low[i] = min(max(before[i] + limits.least_change[i], low), high)
         memory.high[i] = max(min(before[i] + limits.most_change[i], high), low)
+
+
+@kernel
+def _clamped(memory: RangeMemory, i: int, wish: float) -> float:
+    """Return the value within the range of actuator i that is nearest to a wish."""
+    value = wish
+    if value > memory.high[i]:
+        value = memory.high[i]
+    elif value < memory.low[i]:
+        value = memory.low[i]
+    return value
 
 
 @kernel
@@ -498,31 +511,32 @@ def solve_free(H: Matrix, L: Matrix, slope: Vector, free: Vector, step: Vector) 
 
 
 @kernel
-def _share_within(memory: RangeMemory, u: Vector) -> float:
-    """Return the largest share in [0, 1] of ``memory.step`` that keeps u in its range."""
-    share = 1.0
-    for k in range(u.size):
-        step = memory.step[k]
-        if step > memory.high[k] - u[k]:
-            share = min(share, max(memory.high[k] - u[k], 0.0) / step)
-        elif step < memory.low[k] - u[k]:
-            share = min(share, max(u[k] - memory.low[k], 0.0) / -step)
+def _share_within(memory: RangeMemory, i: int, at: float, share: float) -> float:
+    """Return how much of a share of ``memory.step`` from ``at`` keeps actuator i in its range."""
+    step = memory.step[i]
+    if step > memory.high[i] - at:
+        return min(share, max(memory.high[i] - at, 0.0) / step)
+    if step < memory.low[i] - at:
+        return min(share, max(at - memory.low[i], 0.0) / -step)
     return share
 
 
 @kernel
-def _go(memory: RangeMemory, limits: ActuatorLimits, u: Vector) -> int:
-    """Move u by ``memory.step`` as far as its range allows; return the flags."""
-    share = _share_within(memory, u)
+def _go(memory: RangeMemory, limits: ActuatorLimits, share: float, u: Vector) -> int:
+    """Move u by a share of ``memory.step``, the largest that its range allows; return the flags."""
     flags = 0
     for k in range(u.size):
-        u[k], wrong = _cut(memory, limits, k, u[k] + share * memory.step[k])
-        flags |= wrong & _OVERFLOWED
-        if share < 1.0 and (u[k] == memory.high[k] or u[k] == memory.low[k]):
-            at_end = u[k] == limits.high[k] or u[k] == limits.low[k]
-            flags |= _SATURATED if at_end else _RATE_LIMITED
-    if share < 1.0 and flags == 0:  # rounding left u just inside of the range
-        flags = _SATURATED
+        u[k] = _clamped(memory, k, u[k] + share * memory.step[k])
+        if not is_finite(u[k]):
+            u[k] = min(max(0.0, limits.low[k]), limits.high[k])
+            flags |= _OVERFLOWED
+    if share < 1.0:
+        for k in range(u.size):
+            if u[k] == memory.high[k] or u[k] == memory.low[k]:
+                at_end = u[k] == limits.high[k] or u[k] == limits.low[k]
+                flags |= _SATURATED if at_end else _RATE_LIMITED
+        if flags == 0:  # rounding left u just inside of the range
+            flags = _SATURATED
     return flags
 
 
@@ -538,15 +552,16 @@ def _keep_direction(
 ) -> int:
     set_range(limits, before, memory)
     _wish(gain, rule.wished, v, memory.rest, u)
-    flags = 0
+    flags, share = 0, 1.0
     for k in range(u.size):
         wish = u[k]
         if not is_finite(wish):
             wish = 0.0
             flags |= _OVERFLOWED
-        u[k], _ = _cut(memory, limits, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
+        u[k] = _clamped(memory, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
         memory.step[k] = wish - u[k]
-    return flags | _go(memory, limits, u)
+        share = _share_within(memory, k, u[k], share)
+    return flags | _go(memory, limits, share, u)
 
 
 @allocate.register(ByPriority)
@@ -562,7 +577,7 @@ def _by_priority(
     n, m = gain.B.shape
     set_range(limits, before, memory)
     for k in range(m):
-        u[k], _ = _cut(memory, limits, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
+        u[k] = _clamped(memory, k, rule.wished[k] if rule.wished.size > 0 else 0.0)
     flags = 0
     for i in range(n):
         memory.target[i] = v[i]
@@ -697,7 +712,8 @@ def checked_gain(
     x = np.zeros((n, most))
     if callable(given):
         rule = f"it takes x, an array ({n}, {most}) of estimates x[axis, derivative]"
-        first = user_functions.attempt(f"{name}(zeros)", rule, given, x)
+        plain, values = user_functions.separated(name, given, 1)
+        first = user_functions.attempt(f"{name}(zeros)", rule, partial(plain, **values), x)
         first = checks.matrix(f"{name}(zeros)", first)
     else:
         first = checks.matrix(name, given)
@@ -722,9 +738,17 @@ def checked_gain(
     start: Matrix = np.asarray(np.linalg.inv(first) if name == "M" else first, dtype=np.float64)
     if not callable(given):
         return Gain(ConstantGain(start), None, (n, count), start, of_actuators)
-    code = _compiled_gain(name, given, (n, most), first.shape)
-    design = FunctionGain(code.address, name == "M", of_actuators)
-    user_functions.set_origin(code.address, given)
+    shapes = user_functions.shapes_of(values)
+    try:
+        code = _compiled_gain(plain, shapes, (n, most), first.shape)
+    except user_functions.NotCompilableError as error:
+        raise ValueError(
+            f"{name} can't be compiled ({error}): it must be a function of numbers and arrays that "
+            "returns a matrix, as nested tuples or an array, without Python objects"
+        ) from None
+    numbers = user_functions.as_array(values)
+    design = FunctionGain(code.address, name == "M", of_actuators, numbers)
+    user_functions.set_origin(code.address, plain, numbers=(0, shapes))
     return Gain(design, code, (n, count), start, of_actuators)
 
 
@@ -757,26 +781,32 @@ def _check_condition(name: str, matrix: Matrix, names: Sequence[str]) -> None:
         )
 
 
+# Functions whose code is kept, for axes that are made again with other parameters. Chosen by hand:
+# more than the functions of a study.
+_KEPT = 32
+
+
+@lru_cache(maxsize=_KEPT)
 def _compiled_gain(
-    name: str, function: Callable[..., Any], inner: tuple[int, int], outer: tuple[int, int]
+    function: Callable[..., Any],
+    shapes: user_functions.Shapes,
+    inner: tuple[int, int],
+    outer: tuple[int, int],
 ) -> Any:
-    """Return the compiled function that writes the matrix for estimates."""
-    try:
-        own = user_functions.jit_user_function(function)
+    """Return the compiled function that writes the matrix for estimates and parameters.
 
-        def write(px, pout):  # type: ignore[no-untyped-def]
-            out = numba.carray(pout, outer)
-            matrix = own(numba.carray(px, inner))
-            for i in range(outer[0]):
-                for j in range(outer[1]):
-                    out[i, j] = matrix[i][j]
+    Raises ``NotCompilableError`` if Numba can't compile it.
+    """
+    own, parameters = user_functions.jit_user_function(function), user_functions.reader(shapes)
 
-        return user_functions.compile_cfunc(nb_types.void(POINTER, POINTER), write)
-    except user_functions.NotCompilableError as error:
-        raise ValueError(
-            f"{name} can't be compiled ({error}): it must be a function of numbers and arrays that "
-            "returns a matrix, as nested tuples or an array, without Python objects"
-        ) from None
+    def write(px, pp, pout):  # type: ignore[no-untyped-def]
+        out = numba.carray(pout, outer)
+        matrix = own(numba.carray(px, inner), *parameters(pp))
+        for i in range(outer[0]):
+            for j in range(outer[1]):
+                out[i, j] = matrix[i][j]
+
+    return user_functions.compile_cfunc(nb_types.void(POINTER, POINTER, POINTER), write)
 
 
 def checked_rule(

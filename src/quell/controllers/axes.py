@@ -50,6 +50,7 @@ from quell.controllers.axes_chain import (
     ask_axes,
     continue_axes,
     have_started,
+    hold_axis,
     reset_axes,
     set_axes_derivatives,
     set_axes_manual,
@@ -67,6 +68,7 @@ from quell.controllers.base import (
     Controller,
     RateLimit,
     reset_loop,
+    set_axis_held,
     set_reference_derivatives,
     status_flags,
     write_row,
@@ -155,7 +157,9 @@ class AxesState(NamedTuple):
 @control_all.register(AxesDesign)
 def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Vector) -> None:
     loop = state.loop[0]
-    flags = take_references(design.given, state.given, state.gain, r, y, state.wish)
+    flags = take_references(
+        design.given, state.given, design.axes, state.axes, state.gain, r, y, state.wish
+    )
     look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags |= ask_axes(design.axes, state.axes, 0, state.wish, y, state.v, state.x)
     flags |= learn_of_all(design.learning, state.learning, design.axes, state.axes)
@@ -256,6 +260,11 @@ def _set_derivatives(design: AxesDesign, state: AxesState, derivatives: Vector) 
     set_axes_derivatives(design.axes, state.axes, design.derivatives, 0, derivatives)
 
 
+@set_axis_held.register(AxesDesign)
+def _set_axis_held(design: AxesDesign, state: AxesState, axis: int, held: bool) -> None:
+    hold_axis(design.axes, state.axes, 0, axis, held)
+
+
 # ---- The controller ----
 
 
@@ -274,7 +283,9 @@ class Axes(StatefulController):
         from the control signals to the axes (n, m) [y-unit/s^n per u-unit]: a matrix, or a function
         of the estimates that returns it. The function takes ``x[axis, derivative]``, so ``x[0, 0]``
         is the position of the first axis and ``x[1, 1]`` the rate of the second; it is compiled.
-        By default the unit matrix: each actuator moves one axis.
+        Parameters that ``functools.partial`` binds by name, numbers, vectors or matrices, are data:
+        other values of them compile nothing. By default the unit matrix: each actuator moves one
+        axis.
     M
         the inverse of B0 instead, of a robot its mass matrix: a matrix or a function.
     u_min, u_max
@@ -576,7 +587,8 @@ class Axes(StatefulController):
         usual = given if self.takes_u_0 else rest
         goals = usual if r is None else checks.vector("r", r, self.references)
         samples = [samples_to_settle(axis.observer) for axis in self.axes]
-        start_all(self.parameters, self._state, samples, rest, given, goals)
+        signals = (each.astype(self._state.v.dtype) for each in (rest, given, goals))
+        start_all(self.parameters, self._state, samples, *signals)
 
     def track(
         self,
@@ -588,8 +600,8 @@ class Axes(StatefulController):
 
         ``hand_over`` ends it.
         """
-        given = checks.vector("u", u, self.inputs)
         state = self._state
+        given = checks.vector("u", u, self.inputs).astype(state.v.dtype)
         with self._manual_operation(given):
             self.step(r, y)
         state.u[:] = given
@@ -662,7 +674,12 @@ class Axes(StatefulController):
     @property
     def estimates(self) -> dict[str, Estimate]:
         """Estimates and status of each axis after the last step, by its name."""
-        return {name: axis.estimate for name, axis in zip(self.names, self.axes, strict=True)}
+        return self.read(self._state)
+
+    def read(self, state: AxesState) -> dict[str, Estimate]:
+        """Return the estimates and status of each axis in ``state``, by its name."""
+        parts = zip(self.names, self.axes, self._states(state), strict=True)
+        return {name: axis.read(own) for name, axis, own in parts}
 
     @property
     def status(self) -> Status:

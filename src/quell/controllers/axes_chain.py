@@ -112,6 +112,12 @@ def set_axes_manual(axes: Any, states: Any, manual: float, i: int, v: Vector) ->
     raise TypeError
 
 
+@generic
+def hold_axis(axes: Any, states: Any, i: int, axis: int, held: bool) -> None:
+    """Set whether an axis, of those from the i-th on, is held."""
+    raise TypeError
+
+
 @ask_axes.register(NoAxis)
 def _ask_none(axes: NoAxis, states: Any, i: int, r: Any, y: Any, v: Any, x: Any) -> int:
     return 0
@@ -221,6 +227,18 @@ def _set_none_manual(axes: NoAxis, states: Any, manual: float, i: int, v: Any) -
 def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v: Vector) -> None:
     states.axis.loop[0].manual, states.axis.loop[0].u_manual = manual, v[i]
     set_axes_manual(axes.others, states.others, manual, i + 1, v)
+
+
+@hold_axis.register(NoAxis)
+def _hold_none(axes: NoAxis, states: Any, i: int, axis: int, held: bool) -> None:
+    pass
+
+
+@hold_axis.register(AxisDesigns)
+def _hold_axis(axes: AxisDesigns, states: AxisStates, i: int, axis: int, held: bool) -> None:
+    if axis == i:
+        states.axis.loop[0].held = 1.0 if held else 0.0
+    hold_axis(axes.others, states.others, i + 1, axis, held)
 
 
 @write_axes_bounds.register(AxisDesigns)

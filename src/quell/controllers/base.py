@@ -101,6 +101,15 @@ def set_held(controller: Any, state: Any, held: bool) -> None:
     """
 
 
+@generic_with_default
+def set_axis_held(controller: Any, state: Any, axis: int, held: bool) -> None:
+    """Set whether an axis is held: its share of u does not act until it is not.
+
+    A controller of one axis has that of the plant.
+    """
+    set_held(controller, state, held)
+
+
 @generic
 def write_row(controller: Any, state: Any, row: Vector) -> None:
     """Write the controller's ``channels`` into ``row``."""
@@ -198,9 +207,8 @@ def checked_limits(u_min: float, u_max: float, rate_limit: RateLimit, dt: float)
 def _rates(rate_limit: Any) -> tuple[float, float]:
     """Return the lowest rate, at most zero, and the highest, at least zero."""
     if not checks.is_sequence(rate_limit):
-        if rate_limit != math.inf:
-            rate_limit = checks.positive("rate_limit", rate_limit, "u-unit/s")
-        return -float(rate_limit), float(rate_limit)
+        fastest = checks.positive_or_infinite("rate_limit", rate_limit, "u-unit/s")
+        return -fastest, fastest
     rule = "must be a number, or (lowest, highest) with lowest <= 0 <= highest, not both zero"
     try:
         lowest, highest = map(float, rate_limit)

@@ -53,6 +53,7 @@ from quell.controllers.law import AdrcDesign, AdrcState, known_now, unlimited_co
 from quell.controllers.prefilters import Wrapper, without_prefilters
 from quell.controllers.schedule import control_as_observed
 from quell.controllers.stateful import StatefulController
+from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Scalars, clear
 from quell.observers.eso import ESO
 from quell.observers.forms import acting_control, expected_measurement
@@ -82,18 +83,21 @@ class CompensatedState(NamedTuple):
     loop: NDArray[CompensatedLoop]  # (1,)
 
 
+@kernel
+def measured_or_expected(design: AdrcDesign, state: AdrcState, y: float) -> float:
+    """Return y, or what the observer of a compensator expects where none has come."""
+    inner = state.loop[0]
+    if is_usable(y) or inner.started == 0.0:
+        return y
+    known = known_now(design, state, acting_control(design.eso, state.z, inner.u))
+    observed = control_as_observed(design.schedule, state.schedule, inner.u)
+    return expected_measurement(design.eso, state.z, observed, known)
+
+
 @control.register(CompensatedDesign)
 def _control(design: CompensatedDesign, state: CompensatedState, r: float, y: float) -> float:
     loop, inner = state.loop[0], state.compensator.loop[0]
-    measured = y
-    if not is_usable(y) and inner.started != 0.0:
-        eso, z = design.compensator.eso, state.compensator.z
-        acting = acting_control(eso, z, inner.u)
-        known = known_now(design.compensator, state.compensator, acting)
-        observed = control_as_observed(
-            design.compensator.schedule, state.compensator.schedule, inner.u
-        )
-        measured = expected_measurement(eso, z, observed, known)
+    measured = measured_or_expected(design.compensator, state.compensator, y)
     given = control(design.controller, state.controller, r, measured)
     u = control(design.compensator, state.compensator, given, y)
     if inner.held != 0.0:

@@ -17,7 +17,8 @@ in the change of u that of this sample.
 
 *A controller* is told that it applied ``u − B0⁺ (v_∞ − v_0)``, with the v_∞ of the axes before
 limits and bands: its u_0 less what those took, so its integrator does not wind up. While its axis
-is held, as by a brake, the integrator stays as it is.
+is held, as by a brake, the integrator stays as it is. Where a measurement is missing, it receives
+the one that the observer of its axis expects, as ``Compensated`` has it.
 """
 
 from __future__ import annotations
@@ -47,7 +48,11 @@ from quell.controllers.base import (
     set_applied_control,
     status_flags,
 )
-from quell.controllers.compensated import check_takes_compensator, takes_control
+from quell.controllers.compensated import (
+    check_takes_compensator,
+    measured_or_expected,
+    takes_control,
+)
 from quell.controllers.compensator import Compensator
 from quell.controllers.law import unlimited_control
 from quell.kernels.dispatch import generic, generic_with_default, kernel
@@ -189,6 +194,7 @@ class GivenMemory(NamedTuple):
     before: Work  # last u less u_0 (m,)
     told: Vector  # what the drives were told (m,)
     held: Work  # 1 for axes that are held, else 0 (m,)
+    y: Work  # what the drives receive: measured, or expected by the observers (n,)
     limits: Any  # LimitsOfChange, in the place of ActuatorLimits
 
 
@@ -208,8 +214,28 @@ def _write_unlimited(
 
 
 @generic_with_default
+def write_expected(axes: Any, states: Any, i: int, y: Vector, expected: Vector) -> None:
+    """Write the measurements of the axes from the i-th on, or what their observers expect."""
+
+
+@write_expected.register(AxisDesigns)
+def _write_expected(
+    axes: AxisDesigns, states: AxisStates, i: int, y: Vector, expected: Vector
+) -> None:
+    expected[i] = measured_or_expected(axes.axis, states.axis, y[i])
+    write_expected(axes.others, states.others, i + 1, y, expected)
+
+
+@generic_with_default
 def take_references(
-    given: Any, memory: Any, gain: GainMemory, r: Vector, y: Vector, wish: Vector
+    given: Any,
+    memory: Any,
+    axes: Any,
+    states: Any,
+    gain: GainMemory,
+    r: Vector,
+    y: Vector,
+    wish: Vector,
 ) -> int:
     """Write what each axis is asked for, a reference or v_0; return the flags."""
     for i in range(wish.size):
@@ -219,9 +245,17 @@ def take_references(
 
 @take_references.register(GivenControls)
 def _take_controls(
-    given: GivenControls, memory: GivenMemory, gain: GainMemory, r: Vector, y: Vector, wish: Vector
+    given: GivenControls,
+    memory: GivenMemory,
+    axes: Any,
+    states: Any,
+    gain: GainMemory,
+    r: Vector,
+    y: Vector,
+    wish: Vector,
 ) -> int:
-    flags = ask_drives(given.drives, memory.drives, 0, r, y, memory.u_0)
+    write_expected(axes, states, 0, y, memory.y)
+    flags = ask_drives(given.drives, memory.drives, 0, r, memory.y, memory.u_0)
     _act(gain, memory, wish)
     return flags
 
@@ -455,4 +489,5 @@ def given_memory(design: Any, drives: Sequence[Any], n: int, m: int) -> Any:
         states = DriveStates(drive.initial_state(), states)
     limits = LimitsOfChange(*(np.zeros(m) for _ in range(4)))
     u_0, before, told, held = (np.zeros(m) for _ in range(4))
-    return GivenMemory(states, u_0, np.zeros(n), np.zeros(n), before, told, held, limits)
+    v_0, free, y = (np.zeros(n) for _ in range(3))
+    return GivenMemory(states, u_0, v_0, free, before, told, held, y, limits)

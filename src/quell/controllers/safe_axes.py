@@ -70,6 +70,7 @@ from quell.kernels.functions import is_single, sqrt
 from quell.kernels.sized import Work
 from quell.types import Matrix, Status, Vector
 
+_OVERFLOWED = int(Status.OVERFLOWED)
 _SATURATED = int(Status.SATURATED)
 _RATE_LIMITED = int(Status.RATE_LIMITED)
 _SAFE_SET_ACTED = int(Status.SAFE_SET_ACTED)
@@ -222,11 +223,16 @@ def _keep_in_bands(
         _take_bounds(memory, 2)
     flags = _SAFE_SET_ACTED
     for k in range(m):
-        u[k] = min(max(u[k], memory.low[k]), memory.high[k])
+        value = min(max(u[k], memory.low[k]), memory.high[k])
         if memory.held[k] != 0.0:  # rounding has left it just inside
-            u[k] = memory.high[k] if memory.held[k] > 0.0 else memory.low[k]
-            at_end = u[k] == limits.high[k] or u[k] == limits.low[k]
+            value = memory.high[k] if memory.held[k] > 0.0 else memory.low[k]
+            at_end = value == limits.high[k] or value == limits.low[k]
             flags |= _SATURATED if at_end else _RATE_LIMITED
+        if is_finite(value):
+            u[k] = value
+        else:  # sums have overflowed; what the axes were given is a number within the limits
+            u[k] = memory.start[k]
+            flags |= _OVERFLOWED
     return flags | _flag_axes(design, memory, axes, states, gain, u)
 
 

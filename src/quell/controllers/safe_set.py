@@ -368,19 +368,18 @@ class SafeSet:
         borders = (self.y_min, self.y_max, self.rate_min, self.rate_max)
         checks.interval("y_min", self.y_min, "y_max", self.y_max)
         checks.interval("rate_min", self.rate_min, "rate_max", self.rate_max)
-        if not any(map(math.isfinite, borders)):
-            raise ValueError("no border is finite: give y_min, y_max, rate_min or rate_max")
         checks.positive("alpha", self.alpha, "rad/s")
         for name in ("f_rate", "noise", "gain_error"):
             checks.non_negative(name, getattr(self, name))
         if self.gain_error >= 1.0:
             rule = "must be below 1, or the sign of b is not known"
             raise ValueError(f"gain_error = {self.gain_error!r}: {rule}")
-        if self.largest_u != math.inf:
-            checks.positive("largest_u", self.largest_u, "u-unit")
-            if self.gain_error == 0.0:
-                rule = "says what gain_error is of, which is 0; leave it out or give gain_error"
-                raise ValueError(f"largest_u = {self.largest_u!r}: {rule}")
+        checks.positive_or_infinite("largest_u", self.largest_u, "u-unit")
+        if not any(map(math.isfinite, borders)):
+            raise ValueError("no border is finite: give y_min, y_max, rate_min or rate_max")
+        if math.isfinite(self.largest_u) and self.gain_error == 0.0:
+            rule = "says what gain_error is of, which is 0; leave it out or give gain_error"
+            raise ValueError(f"largest_u = {self.largest_u!r}: {rule}")
 
     def design(self, observer: ESO, limits: Limits, ratio: float = 1.0) -> SafeSetDesign:
         """Return the parameters for an observer and limits of u.

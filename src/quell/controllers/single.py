@@ -6,18 +6,21 @@ A controller that calculates in single precision, as it does on a processor with
 
 Its parameters are designed in double precision and then rounded, its state is single, and its
 observer or linear law is in delta form (``observers/forms.py``). The plant, the clock and the
-record stay in double: r and y are rounded where the controller receives them.
+record stay in double: r and y are rounded where the controller receives them. Several axes and
+state feedback run so, too, with arrays of r, y and u.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 from quell import checks
+from quell.controllers.allocation import CutEach, FunctionGain
 from quell.controllers.axes import Axes, AxesDesign
 from quell.controllers.axes_chain import AxisDesigns
 from quell.controllers.base import (
@@ -42,7 +45,9 @@ from quell.controllers.linear import LinearLaw, delta_law
 from quell.controllers.memory import Layout, images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper
 from quell.controllers.safe_set import SafeSetDesign
+from quell.controllers.several import control_all
 from quell.controllers.state_space import StateFeedback
+from quell.controllers.stateful import StatefulController
 from quell.features.base import CustomDesign
 from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels import dispatch
@@ -55,7 +60,7 @@ from quell.learners.base import Lag, NoiseGate, NoiseGateMemory
 from quell.learners.kalman import KalmanDesign, KalmanMemory, needs_carries
 from quell.learners.python_model import PythonDesign
 from quell.observers.forms import delta_form
-from quell.types import Vector
+from quell.types import Channels, Status, Vector
 
 # ---- Parameters and states of controllers in single precision ----
 
@@ -185,6 +190,18 @@ def _control(design: SingleDesign, state: Any, r: float, y: float) -> float:
     return np.float64(control(design.controller, state, single(r), single(y)))
 
 
+@control_all.register(SingleDesign)
+@in_both_precisions
+def _control_all(design: SingleDesign, state: Any, r: Vector, y: Vector, u: Vector) -> None:
+    for i in range(r.size):
+        state.r_given[i] = single(r[i])
+    for i in range(y.size):
+        state.y_given[i] = single(y[i])
+    control_all(design.controller, state, state.r_given, state.y_given, state.u)
+    for k in range(u.size):
+        u[k] = np.float64(state.u[k])
+
+
 @set_reference_derivatives.register(SingleDesign)
 @in_both_precisions
 def _set_reference_derivatives(design: SingleDesign, state: Any, derivatives: Vector) -> None:
@@ -246,14 +263,17 @@ def check_compilable() -> None:
         )
 
 
-def in_single_precision(controller: Controller) -> SinglePrecision:
+def in_single_precision(controller: Controller) -> SinglePrecision | SeveralInSingle:
     """Return a controller that calculates what ``controller`` does, in single precision.
+
+    Of ``Axes`` and ``StateFeedback`` it takes and returns arrays, as they do.
 
     Raises
     ------
     ValueError
-        for what is no controller; for a parameter out of the range of single precision; and for
-        models in Python and ``features.Custom``, which work in double precision only.
+        for what is no controller; for a parameter out of the range of single precision; for
+        models in Python and ``features.Custom``, which work in double precision only; and for axes
+        whose B0 is a function, or with more actuators than axes and ``saturation = "each"``.
 
     Examples
     --------
@@ -263,14 +283,10 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
     >>> single.step(r=1.0, y=0.0)
     0.10000000149011612
     """
-    if isinstance(controller, SinglePrecision):
+    if isinstance(controller, SinglePrecision | SeveralInSingle):
         return controller
     if isinstance(controller, Axes | StateFeedback):
-        what = "several axes run" if isinstance(controller, Axes) else "state feedback runs"
-        raise ValueError(
-            f"controller = {type(controller).__name__}(…): {what} in Python in double precision "
-            "only; quell.export.c(…, precision='single', accept=True) writes the C code in single"
-        )
+        return SeveralInSingle(controller)
     return SinglePrecision(controller)
 
 
@@ -347,7 +363,189 @@ def _acting_on(controller: Any, design: Any, state: Any) -> Any:
     elif isinstance(controller, Compensated):
         parts = design.compensator, state.compensator
         acting.compensator = _acting_on(controller.compensator, *parts)
+    elif isinstance(controller, Axes):
+        acting.axes = tuple(_axes_acting_on(controller.axes, design.axes, state.axes))
     return acting
 
 
-__all__ = ["SinglePrecision", "check_compilable", "in_single_precision"]
+def _axes_acting_on(axes: tuple[Any, ...], design: Any, state: Any) -> Iterator[Any]:
+    for axis in axes:
+        yield _acting_on(axis, design.axis, state.axis)
+        design, state = design.others, state.others
+
+
+# ---- Several axes, and state feedback ----
+
+
+def _check_axes(controller: Any) -> None:
+    """Raise a ``ValueError`` for axes that can not be in single precision."""
+    design = controller.parameters
+    if isinstance(controller, Axes) and isinstance(design.gain, FunctionGain):
+        raise ValueError(
+            "precision = 'single': B0 or M is a function, which is compiled in double precision; "
+            "stay in double, or take a constant matrix"
+        )
+    if (
+        isinstance(controller, Axes)
+        and isinstance(design.rule, CutEach)
+        and controller.inputs > controller.outputs
+    ):
+        raise ValueError(
+            f"precision = 'single': {controller.inputs} actuators for {controller.outputs} axes "
+            "with saturation = 'each' need least squares with a weight of 1e8, for which single "
+            "precision has too few digits; take saturation = 'direction' or the axes in the order "
+            "of their priority, or stay in double"
+        )
+
+
+class SeveralInSingle(StatefulController):
+    """Several axes, or state feedback, in single precision; see ``in_single_precision``.
+
+    The given controller is copied and not changed; what it has learned is kept.
+    ``parameters.controller`` and the state are single. The methods are those of ``Axes`` and
+    ``StateFeedback`` of the same names, but for ``retune``: make it again from retuned axes.
+    """
+
+    def __init__(self, controller: Axes | StateFeedback) -> None:
+        _check_axes(controller)
+        self.controller: Any = copy.deepcopy(controller)  # in double: it designs the parameters
+        self._initialise()
+        self._use_state(single_state(self.parameters.controller, learned_state(controller)))
+
+    def _update_parameters(self) -> None:
+        self.parameters = SingleDesign(single_design(self.controller.parameters))
+
+    def initial_state(self) -> Any:
+        """Return a state before the first sample."""
+        return single_state(self.parameters.controller, self.controller.initial_state())
+
+    def _use_state(self, state: Any) -> None:
+        super()._use_state(state)
+        self._acting = _acting_on(self.controller, self.parameters.controller, state)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy is made from."""
+        return {name: value for name, value in super().__getstate__().items() if name != "_acting"}
+
+    def _images(self) -> Layout:
+        images: Layout = self._acting._images()
+        return images
+
+    # ---- Sample by sample ----
+
+    def prepare(self) -> None:
+        """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
+        if not dispatch.interpret_all:
+            check_compilable()
+        self._acting.prepare()
+
+    def step(  # type: ignore[override]
+        self, r: Sequence[float] | Vector, y: Sequence[float] | Vector, *derivatives: Any
+    ) -> Vector:
+        """Take one sample: return the control signals (m,) [u-unit], in double precision."""
+        if self._acting._packed is None:
+            self.prepare()
+        with np.errstate(over="ignore"):  # a number out of the range of single becomes infinite
+            found: Vector = self._acting.step(r, y, *derivatives).astype(np.float64)
+        return found
+
+    def applied(self, u: Sequence[float] | Vector) -> None:  # type: ignore[override]
+        """Set the control signals that were really applied since the last ``step`` (m,)."""
+        self._acting.applied(u)
+
+    def start(self, y: Any, u: Any = None, r: Any = None) -> None:
+        """Start at a machine that rests at ``y`` under ``u``: ``step`` continues from there."""
+        given = np.zeros(self.inputs) if u is None else u
+        self._acting.start(y, given, r)
+
+    def track(self, r: Any, y: Any, u: Any) -> None:
+        """Take one sample in manual operation, see ``Axes.track``; of axes only."""
+        self._axes("track").track(r, y, u)
+
+    def hand_over(self) -> None:
+        """End manual operation, see ``Axes.hand_over``; of axes only."""
+        self._axes("hand_over").hand_over()
+
+    def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
+        """Change limits of the actuators while running; what is not given stays."""
+        self.controller.set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
+        self._update_parameters()
+        acting = self._acting
+        acting.parameters = self.parameters.controller
+        acting._pack_again()
+
+    def _axes(self, what: str) -> Any:
+        if not isinstance(self.controller, Axes):
+            raise ValueError(f"{what}: is of axes; StateFeedback has none")
+        return self._acting
+
+    # ---- What it is, and what it knows ----
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return float(self.controller.dt)
+
+    @property
+    def limits(self) -> Any:
+        """Limits of the actuators (m,)."""
+        return self.controller.limits
+
+    @property
+    def inputs(self) -> int:
+        """Number of control signals m."""
+        return int(self.controller.inputs)
+
+    @property
+    def outputs(self) -> int:
+        """Number of measurements."""
+        return int(self.controller.outputs)
+
+    @property
+    def references(self) -> int:
+        """Number of references, or of u_0 of compensators."""
+        return int(self.controller.references)
+
+    @property
+    def derivatives(self) -> tuple[int, ...]:
+        """Number of derivatives of each reference that are fed forward."""
+        found: tuple[int, ...] = self.controller.derivatives
+        return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the axes; none of state feedback."""
+        return tuple(self.controller.names)
+
+    @property
+    def axes(self) -> tuple[Any, ...]:
+        """The controllers of the axes, acting on this state; none of state feedback."""
+        return tuple(self._acting.axes)
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """No names: each axis has its own."""
+        return ()
+
+    @property
+    def channels(self) -> Channels:
+        """Name and width of each recorded channel, in order."""
+        channels: Channels = self.controller.channels
+        return channels
+
+    @property
+    def estimates(self) -> Any:
+        """Estimates and status of each axis by its name, see ``Axes.estimates``; of axes only."""
+        return self._axes("estimates").estimates
+
+    @property
+    def status(self) -> Status:
+        """Flags of the last step."""
+        return Status(int(status_flags(self.parameters, self._state)))
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``repr`` prints."""
+        return {"controller": self.controller}
+
+
+__all__ = ["SeveralInSingle", "SinglePrecision", "check_compilable", "in_single_precision"]

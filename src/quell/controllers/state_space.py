@@ -379,7 +379,8 @@ class StateFeedback(StatefulController):
         rest, given = checks.vector("y", y, self.outputs), checks.vector("u", u, self.inputs)
         state = self._state
         goals = state.reference if r is None else checks.vector("r", r, self.references)
-        start_all(self.parameters, state, 0, rest, given, goals)
+        signals = (each.astype(state.u.dtype) for each in (rest, given, goals))
+        start_all(self.parameters, state, 0, *signals)
 
     def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
         """Change limits of the actuators while running; what is not given stays."""

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
-    from quell.experiments import acc, compare, stress, torsional, two_mass_spring
+    from quell.experiments import acc, compare, over_seeds, stress, torsional, two_mass_spring
 
-__all__ = ["acc", "compare", "stress", "torsional", "two_mass_spring"]
+__all__ = ["acc", "compare", "over_seeds", "stress", "torsional", "two_mass_spring"]
 
 __getattr__ = imported_on_use(__name__, {}, __all__)

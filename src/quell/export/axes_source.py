@@ -11,9 +11,8 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from quell.controllers.allocation import CutEach, FunctionGain, apply_to_axes
+from quell.controllers.allocation import apply_to_axes
 from quell.controllers.axes import (
-    Axes,
     AxesDesign,
     AxesState,
     begin_manual,
@@ -33,13 +32,12 @@ from quell.export.translate.structs import ascii_text
 from quell.export.translate.text import (
     Array,
     Number,
-    TranslationError,
     Value,
     identifier,
     unique,
     wrapped,
 )
-from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.dispatch import is_finite, kernel
 from quell.types import Channels, Status, Vector
 
 # ---- Operations besides a step ----
@@ -112,29 +110,6 @@ def track_axes(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Ve
     add_flag_of_axes(design, state, missing)
 
 
-@generic
-def set_axis_held(axes: Any, states: Any, i: int, axis: int, held: bool) -> None:
-    """Set whether an axis is held: its v does not act until it is not."""
-    raise TypeError
-
-
-@set_axis_held.register(NoAxis)
-def _set_none_held(axes: NoAxis, states: Any, i: int, axis: int, held: bool) -> None:
-    pass
-
-
-@set_axis_held.register(AxisDesigns)
-def _set_axis_held(axes: AxisDesigns, states: AxisStates, i: int, axis: int, held: bool) -> None:
-    if axis == i:
-        states.axis.loop[0].held = 1.0 if held else 0.0
-    set_axis_held(axes.others, states.others, i + 1, axis, held)
-
-
-def set_held_of_axes(design: AxesDesign, state: AxesState, axis: int, held: bool) -> None:
-    """Set whether an axis is held."""
-    set_axis_held(design.axes, state.axes, 0, axis, held)
-
-
 @change_parameters.register(NoAxis)
 def _retune_none(old: NoAxis, new: NoAxis, state: Any) -> None:
     pass
@@ -152,23 +127,6 @@ def _retune_axes(old: AxesDesign, new: AxesDesign, state: AxesState) -> None:
 
 
 # ---- Names of axes in C, and what is known of each ----
-
-
-def check_single(controller: Axes) -> None:
-    """Raise a ``TranslationError`` for axes that can not be in single precision."""
-    design = controller.parameters
-    if isinstance(design.gain, FunctionGain):
-        raise TranslationError(
-            "precision = 'single': B0 or M is a function, which is compiled in double precision; "
-            "export in double, or take a constant matrix"
-        )
-    if isinstance(design.rule, CutEach) and controller.inputs > controller.outputs:
-        raise TranslationError(
-            f"precision = 'single': {controller.inputs} actuators for {controller.outputs} axes "
-            "with saturation = 'each' need least squares with a weight of 1e8, for which single "
-            "precision has too few digits; take saturation = 'direction' or the axes in the order "
-            "of their priority, or export in double"
-        )
 
 
 def names_in_c(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from quell.controllers.base import (
     check_controller,
     control,
     reset_loop,
+    set_axis_held,
     set_held,
     set_reference_derivatives,
     status_flags,
@@ -29,12 +30,7 @@ from quell.controllers.memory import images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.several import control_all
-from quell.controllers.single import (
-    SinglePrecision,
-    in_single_precision,
-    single_design,
-    single_state,
-)
+from quell.controllers.single import SeveralInSingle, SinglePrecision, in_single_precision
 from quell.controllers.state_space import StateFeedback
 from quell.export import axes_source, c_files
 from quell.export.axes_source import (
@@ -54,13 +50,18 @@ from quell.types import Channels
 
 def in_double_precision(controller: Any) -> Any:
     """Return the controller, or the one in double precision that it was made from."""
-    return controller.controller if isinstance(controller, SinglePrecision) else controller
+    return controller.controller if is_in_single(controller) else controller
+
+
+def is_in_single(controller: Any) -> bool:
+    """Return whether a controller is one of ``in_single_precision``."""
+    return isinstance(controller, SinglePrecision | SeveralInSingle)
 
 
 def parameters_of(controller: Any) -> Any:
     """Return the parameters of the kernels, in the controller's precision."""
     parameters = controller.parameters
-    return parameters.controller if isinstance(controller, SinglePrecision) else parameters
+    return parameters.controller if is_in_single(controller) else parameters
 
 
 def limits_path(controller: Any) -> str:
@@ -102,6 +103,7 @@ def check_counts(controller: Any, resolution: float) -> None:
         if u changes: for a model with a position in it, such as a spring; for a learner; and for
         controllers whose origin can't be moved.
     """
+    controller = in_double_precision(controller)
     if isinstance(controller, Axes | StateFeedback):
         what = "several axes take" if isinstance(controller, Axes) else "StateFeedback takes"
         raise TranslationError(
@@ -109,7 +111,6 @@ def check_counts(controller: Any, resolution: float) -> None:
             "and hand over differences to a position near the work"
         )
     checks.positive("resolution", resolution, "y-unit per count")
-    controller = in_double_precision(controller)
     design = controller.parameters
     if type(design) not in c_files.move_origin.implementations:
         raise TranslationError(
@@ -161,7 +162,7 @@ _OF_SEVERAL = Kernels(
     axes_source.start_axes_from,
     axes_source.track_axes,
     hand_over_all,
-    axes_source.set_held_of_axes,
+    set_axis_held,
 )
 
 
@@ -214,24 +215,18 @@ def parts_of(controller: Any, precision: str = "double") -> Parts:
     ValueError
         for what single precision can not do.
     """
-    if isinstance(controller, Axes | StateFeedback):
-        design, state = controller.parameters, learned_state(controller)
-        if precision == "single":
-            if isinstance(controller, Axes):
-                axes_source.check_single(controller)
-            design = single_design(design)
-            state = single_state(design, state)
-        counts = controller.derivatives
-        sizes = (len(counts), controller.outputs, controller.inputs)
-        members = axes_source.names_in_c(controller.names)
-        return Parts(controller, design, state, _OF_SEVERAL, sizes, counts, members)
     if precision == "single":
         controller = in_single_precision(controller)
     described = in_double_precision(controller)
+    parameters, state = parameters_of(controller), learned_state(controller)
+    if isinstance(described, Axes | StateFeedback):
+        counts = described.derivatives
+        sizes = (len(counts), described.outputs, described.inputs)
+        members = axes_source.names_in_c(described.names)
+        return Parts(described, parameters, state, _OF_SEVERAL, sizes, counts, members)
     count = int(getattr(described, "external_signals", 0))
     if not isinstance(described, Prefiltered):  # it makes the derivatives itself
         count += int(getattr(described, "derivatives", 0))
-    parameters, state = parameters_of(controller), learned_state(controller)
     return Parts(described, parameters, state, _OF_ONE, None, (count,), ())
 
 

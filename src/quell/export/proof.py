@@ -50,7 +50,7 @@ from quell.files import written_atomically
 _KEYWORDS = frozenset({"if", "for", "while", "switch", "return", "sizeof", "do"})
 _FUNCTION = re.compile(r"^(?:[A-Za-z_][\w ]*[ *])(\w+)\(([^;{}]*)\)\n\{\n(.*?)^\}", re.M | re.S)
 _LOOP = re.compile(
-    r"for \(int (\w+) = ([^;,]+?)(?:, (\w+) = ([^;]+))?; "
+    r"for \(int (\w+) = ((?:[^;,]|\([^();]*\))+?)(?:, (\w+) = ([^;]+))?; "
     r"\1 (<|>) ([^;]+); \1(\+\+|--| \+= (-?\d+))\) \{"
 )
 _CALL = re.compile(r"(?<![\w.>])([A-Za-z_]\w*)\(")
@@ -303,11 +303,14 @@ def _interval(node: ast.expr, known: dict[str, tuple[int, int]]) -> Interval:
         return None if high is None else -high, None if low is None else -low
     if isinstance(node, ast.BinOp):
         return _operation(node.op, _interval(node.left, known), _interval(node.right, known))
-    if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "minimum_int":
-        one, other = (_interval(each, known) for each in node.args)
-        highs = [each for each in (one[1], other[1]) if each is not None]
-        low = None if one[0] is None or other[0] is None else min(one[0], other[0])
-        return low, min(highs, default=None)
+    if isinstance(node, ast.Call) and len(node.args) == 2:
+        name, pair = getattr(node.func, "id", ""), [_interval(each, known) for each in node.args]
+        lows = [low for low, _ in pair if low is not None]
+        highs = [high for _, high in pair if high is not None]
+        if name == "minimum_int":
+            return min(lows) if len(lows) == 2 else None, min(highs, default=None)
+        if name == "maximum_int":
+            return max(lows, default=None), max(highs) if len(highs) == 2 else None
     return None, None
 
 

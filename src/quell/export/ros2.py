@@ -14,10 +14,14 @@ from typing import Any
 
 from quell import checks
 from quell.controllers.base import check_controller
-from quell.controllers.single import SinglePrecision
 from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
-from quell.export.controller_source import c_source, in_double_precision, limits_path
+from quell.export.controller_source import (
+    c_source,
+    in_double_precision,
+    is_in_single,
+    limits_path,
+)
 from quell.export.library.vectors import fill, golden_vectors, test_program
 from quell.export.translate.text import TranslationError, checked_name
 from quell.files import check_folder, write_folder
@@ -79,14 +83,14 @@ def ros2(
         or C (``TranslationError``). Nothing is written then.
     """
     check_controller(controller, several=True)
-    if isinstance(controller, StateFeedback):
+    if isinstance(in_double_precision(controller), StateFeedback):
         raise TranslationError(
             "controller is StateFeedback: a package is of one u and y, or of axes; write its C "
             "with quell.export.c and call it in a controller of your own"
         )
     _check_name(name)
     check_folder(folder, checks.flag("overwrite", overwrite))
-    if isinstance(controller, SinglePrecision):
+    if is_in_single(controller):
         raise TranslationError(
             "controller is in single precision: the interfaces of ros2_control are in double; "
             "export the controller itself, without in_single_precision"

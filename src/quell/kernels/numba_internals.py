@@ -76,7 +76,6 @@ try:
     from numba.core.targetconfig import ConfigStack
     from numba.core.typed_passes import NativeLowering
     from numba.core.untyped_passes import IRProcessing
-    from numba.np.unsafe.ndarray import to_fixed_tuple
 except ImportError as error:
     raise ImportError(
         f"quell is tested with Numba 0.68, and {numba.__version__} lacks what it needs ({error}); "
@@ -112,5 +111,4 @@ __all__ = [
     "numba_ir",
     "pointer_add",
     "register_pass",
-    "to_fixed_tuple",
 ]

@@ -5,6 +5,9 @@ compiled for all such functions and cached on disk. ``call`` and ``evaluate`` ju
 from compiled code, and use ``ctypes`` from Python. Keep a reference to the compiled function as
 long as its address is in use; addresses are not valid in another process.
 
+Numbers and arrays that a user's function takes by name are data, not code: one array holds all of
+them, and compiled code reads it by a pointer. Other numbers of the same shapes compile nothing.
+
 Trial of user-defined functions, interpreted, so that mistakes are reported before compilation.
 
 Each error names the user's class and the rule. Classes of this package are not tried.
@@ -13,7 +16,10 @@ Each error names the user's class and the rule. Classes of this package are not 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
+from math import prod
 from typing import Any, NamedTuple
 
 import numba
@@ -21,12 +27,15 @@ import numpy as np
 from numba import types as nb_types
 from numba.extending import intrinsic, overload
 
+from quell import checks
 from quell.kernels.dispatch import Generic, set_display_name
 from quell.kernels.numba_internals import ir
 from quell.kernels.sized import Scalars
 from quell.types import Vector
 
 POINTER = nb_types.CPointer(nb_types.float64)
+Shapes = tuple[tuple[int, ...], ...]
+"""Shapes of parameters in their order; that of a number is empty."""
 
 
 class Origin(NamedTuple):
@@ -34,9 +43,9 @@ class Origin(NamedTuple):
 
     function: Callable[..., Any]
     c_function: str | None  # name of the same function in C, if the user has one
-    # Where its own parameters begin in the array of numbers that is passed, and how many there are;
-    # None if no such array is passed.
-    numbers: tuple[int, int] | None = None
+    # Where its own parameters begin in the array of numbers that is passed, and their shapes; None
+    # if no such array is passed.
+    numbers: tuple[int, Shapes] | None = None
 
 
 _origins: dict[int, Origin] = {}
@@ -46,7 +55,7 @@ def set_origin(
     address: int,
     function: Callable[..., Any],
     c_function: str | None = None,
-    numbers: tuple[int, int] | None = None,
+    numbers: tuple[int, Shapes] | None = None,
 ) -> None:
     """Note what the function at an address was made of, for its translation to C."""
     _origins[address] = Origin(function, c_function, numbers)
@@ -143,6 +152,116 @@ def compile_cfunc(signature: Any, function: Callable[..., Any]) -> Any:
     except Exception as error:  # compilation can raise anything
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise NotCompilableError(" ".join(lines[:2])) from error
+
+
+# ---- Parameters of a user's function, which are data of its compiled code ----
+
+# Sets of shapes whose reader is kept. Chosen by hand: more than the functions of a study.
+_KEPT = 64
+
+
+def named_parameters(function: Callable[..., Any], first: int) -> dict[str, Any]:
+    """Return the parameters of a function after its ``first`` ones, and their defaults."""
+    try:
+        takes = [*inspect.signature(function).parameters.values()][first:]
+    except (TypeError, ValueError):
+        return {}
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return {each.name: each.default for each in takes if each.kind not in variable}
+
+
+def checked_value(name: str, value: Any) -> Any:
+    """Return the value of a parameter: a number, or an array with one or two dimensions.
+
+    Raises
+    ------
+    ValueError
+        for anything else, for an array without entries, and for what is not finite.
+    """
+    if np.ndim(value) == 0 if isinstance(value, np.ndarray) else not checks.is_sequence(value):
+        return checks.finite(name, value)
+    array = checks.numbers(name, value)
+    if array.ndim not in (1, 2) or array.size == 0:
+        raise ValueError(
+            f"{name} has shape {array.shape}: must be a number, or an array with one or two "
+            "dimensions and at least one entry"
+        )
+    array.flags.writeable = False
+    return array
+
+
+def separated(name: str, function: Any, first: int) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Return a function that ``functools.partial`` may have bound, and its values in their order.
+
+    ``name`` is that of the argument, and ``first`` the number of arguments that are no parameters.
+
+    Raises
+    ------
+    ValueError
+        for values that are bound without a name, a name that the function does not take, and a
+        parameter without a value.
+    """
+    if not isinstance(function, partial):
+        return function, {}
+    plain, given = function.func, function.keywords
+    if function.args:
+        raise ValueError(f"{name}: partial(…) binds {len(function.args)} values without a name: "
+                         "give all by name")  # fmt: skip
+    known, found = named_parameters(plain, first), {}
+    for each in given:
+        if each not in known:
+            hint = checks.nearest(each, [*known]) if known else "it takes none"
+            raise ValueError(f"{name}: partial(…) binds {each}, which is no parameter; {hint}")
+    for each, default in known.items():
+        value = given.get(each, default)
+        if value is inspect.Parameter.empty:
+            raise ValueError(f"{name}: parameter {each} has no value: bind it by partial(…)")
+        found[each] = checked_value(f"{name}: {each}", value)
+    return plain, found
+
+
+def shapes_of(values: Mapping[str, Any]) -> Shapes:
+    """Return the shapes of parameters, in their order."""
+    return tuple(np.shape(value) for value in values.values())
+
+
+def count_of(shapes: Shapes) -> int:
+    """Return how many numbers parameters of these shapes have."""
+    return sum(map(prod, shapes))
+
+
+def as_array(*values: Mapping[str, Any]) -> Vector:
+    """Return all parameters in one array, in their order, rows of matrices after each other."""
+    parts = [np.ravel(value) for each in values for value in each.values()]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+@intrinsic
+def _behind(typing_context: Any, pointer: Any, count: Any) -> Any:
+    """Return the pointer to the number that is ``count`` places behind."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.gep(values[0], [values[1]])
+
+    return POINTER(POINTER, nb_types.intp), generate
+
+
+@lru_cache(maxsize=_KEPT)
+def reader(shapes: Shapes, first: int = 0) -> Any:
+    """Return the compiled function from the pointer to all numbers to a tuple of parameters.
+
+    Those of these ``shapes`` begin at the number ``first``.
+    """
+    if not shapes:
+        return numba.njit(lambda pointer: ())
+    shape, others = shapes[0], reader(shapes[1:], first + prod(shapes[0]))
+    if shape == ():
+        return numba.njit(
+            lambda pointer: (numba.carray(pointer, (first + 1,))[first], *others(pointer))
+        )
+    return numba.njit(
+        lambda pointer: (numba.carray(_behind(pointer, first), shape), *others(pointer))
+    )
 
 
 UNKNOWN = object()  # the result of a function that fails for the numbers of the trial

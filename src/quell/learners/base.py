@@ -643,6 +643,21 @@ def _response(observer: ESO) -> Response:
     return response(without_delay(observer.model), observer.estimates, observer.order)
 
 
+# Most samples of lag for which a learner keeps or calculates something in each: 100 s at 1 kHz.
+_LONGEST_LAG = 100_000
+
+
+def check_lag(observer: Any, learner: str) -> None:
+    """Raise a ``ValueError`` for an observer too slow for a learner with memory of its lag."""
+    samples = observer.lag_time / observer.dt
+    if not samples <= _LONGEST_LAG:
+        raise ValueError(
+            f"observer: its omega_o is so low that its lag is {observer.lag_time:.3g} s, "
+            f"{samples:.3g} samples of dt = {observer.dt!r} s: must be at most {_LONGEST_LAG} for "
+            f"{learner}, which keeps something for each; raise omega_o, or take learner=Kalman()"
+        )
+
+
 @functools.singledispatch
 def group_delay(observer: Any) -> float:
     """Return the lag in samples of f^F, as the next estimate shows it, behind slow changes of f.

@@ -54,6 +54,7 @@ from quell.learners.base import (
     Inputs,
     NoiseGateMemory,
     adapt,
+    check_lag,
     coefficients,
     commit,
     confidence,
@@ -311,6 +312,7 @@ class Online(FeatureLearner):
 
     def design(self, observer: ESO, omega_c: float) -> OnlineDesign:
         """Return the parameters for an observer and the controller's bandwidth [rad/s]."""
+        check_lag(observer, type(self).__name__)
         inputs, p = self._inputs(observer, omega_c), len(self.features.names(observer.order))
         return OnlineDesign(
             inputs=inputs,

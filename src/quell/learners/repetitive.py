@@ -43,6 +43,7 @@ from quell.kernels.functions import is_single
 from quell.kernels.sized import Buffer, Scalars, clear
 from quell.learners.base import (
     adapt,
+    check_lag,
     coefficients,
     commit,
     forget,
@@ -285,6 +286,7 @@ class Repetitive:
 
     def design(self, observer: ESO, omega_c: float) -> RepetitiveDesign:
         """Return the parameters for an observer; the controller's bandwidth is not used."""
+        check_lag(observer, "Repetitive")
         samples = self.samples(observer.dt)
         lag = lag_of(observer)
         weights = self.gain * correction_weights(observer, lag)

@@ -445,16 +445,34 @@ def _compared(
     # Of neighbours: the variance of batch means lacks half a correlation time, and the correlation
     # time of a short record is found too short by more.
     spread *= math.sqrt(1.0 + 2.0 * shared.share)
-    half = _quantile(1.0 - 0.5 * level, freedom) * spread
-    decided = d > half and not reasons
+    found = decide(d, spread, freedom, level)
     # ln of the ratio of criteria, as a share by which the better one is lower.
-    lower, least, most = (-math.expm1(-power * each) for each in (d, d - half, d + half))
+    lower, least, most = (-math.expm1(-power * each) for each in found.ends)
+    decided = found.decided and not reasons
     duration = max(sum(log.y.size for log in tunings[name]) for name in (first, other)) * dt
     needed = math.nan
-    if not decided and d * _HOPELESS > half:
-        enough = ((half + _POWER * spread) / d) ** 2
-        needed = max(duration * (enough - 1.0), 0.1 * duration)
+    if not decided and not math.isnan(found.enough):
+        needed = max(duration * (found.enough - 1.0), 0.1 * duration)
     return Comparison(first, other, lower, least, most, decided, needed, reasons)
+
+
+class Decision(NamedTuple):
+    """What samples say of the logarithm d of a ratio."""
+
+    ends: tuple[float, float, float]  #: d, and the ends of its interval
+    decided: bool  #: whether the interval is above zero
+    enough: float  #: times as many samples would decide a difference like this; NaN: far too many
+
+
+def decide(d: float, spread: float, freedom: float, level: float) -> Decision:
+    """Decide whether the logarithm ``d`` of a ratio, of standard error ``spread``, is above zero.
+
+    The interval is that of Student's t with ``freedom`` degrees of freedom; it misses the true
+    value with the probability ``level``.
+    """
+    half = _quantile(1.0 - 0.5 * level, freedom) * spread
+    enough = ((half + _POWER * spread) / d) ** 2 if d * _HOPELESS > half else math.nan
+    return Decision((d, d - half, d + half), d > half, enough)
 
 
 def _quantile(share: float, freedom: float) -> float:

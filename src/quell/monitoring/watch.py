@@ -42,7 +42,7 @@ import math
 import os
 import random
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,6 +58,7 @@ from quell.monitoring.windows import (
     windows_of,
     without_gaps,
 )
+from quell.records.record import columns_of
 from quell.types import Vector
 
 # Shifts that are bet on, in deviations of the windows, in both directions with equal weights.
@@ -93,7 +94,7 @@ _HINTS = {
 class Alarm(NamedTuple):
     """A feature that has changed."""
 
-    feature: str
+    feature: str  #: of one of several axes with its name before it, ``elbow: b0``
     window: int  #: number of the window at which the alarm came, from 1 on
     at: str  #: its label
     since: int  #: number of the window with which the change probably began
@@ -106,7 +107,7 @@ class Alarm(NamedTuple):
         """Return the change in a line."""
         change = self.after - self.before
         share = f" ({100.0 * change / abs(self.before):+.3g} %)" if self.before else ""
-        hint = _HINTS.get((self.feature, 1 if change > 0.0 else -1))
+        hint = _HINTS.get((self.feature.rpartition(": ")[2], 1 if change > 0.0 else -1))
         return (
             f"ALARM: {self.feature} {'rose' if change > 0.0 else 'fell'} from {self.before:.4g} "
             f"± {self.spread:.2g} to {self.after:.4g}{share} since window {self.since} "
@@ -439,16 +440,22 @@ def _track_of(name: str, kept: Any, windows: int) -> _Track:
 
 # ---- A machine that is watched: its records, their windows, the state on disk ----
 
+# Alarms of axes whose changes began within so many windows may have one cause: begins are known to
+# some three windows. Chosen by hand.
+_TOGETHER = 5
+
 
 class Machine:
     """The watch of one machine, with how its windows are made; kept in a file.
+
+    Of several axes each has its numbers, ``elbow: b0``, and alpha is shared by all of them.
 
     Parameters
     ----------
     window
         length of a window [s]: long against what makes neighbouring windows alike.
     order
-        1 or 2: u acts on this derivative of y.
+        1 or 2: u acts on this derivative of y. Of several axes one for all, or one for each.
     band
         band of the regression [rad/s], see ``windows.features_of``.
     alpha
@@ -464,15 +471,21 @@ class Machine:
         self,
         *,
         window: float = 60.0,
-        order: int = 2,
+        order: int | Sequence[int] = 2,
         band: float | None = None,
         alpha: float = 0.01,
     ) -> None:
         self.window = checks.positive("window", window, "s")
-        self.order = checks.whole("order", order, 1, 2)
+        given: Any = order
+        self.order: int | list[int]
+        if checks.is_sequence(given):
+            self.order = [checks.whole("order", each, 1, 2) for each in given]
+        else:
+            self.order = checks.whole("order", given, 1, 2)
         self.band = checks.optional(checks.positive, "band", band, "rad/s")
         self.watch = Watch(alpha=alpha)
         self.records: list[str] = []
+        self.axes: tuple[str, ...] | None = None  #: names of the axes; None before the first window
         self.left_out = 0  #: windows with too many missing samples, since it was made or loaded
 
     @property
@@ -481,31 +494,93 @@ class Machine:
         names = {"window": self.window, "order": self.order, "band": self.band}
         return {**names, "alpha": self.watch.alpha}
 
-    def take(self, signals: Signals, label: str) -> list[Alarm]:
+    def take(self, signals: Signals | Mapping[str, Signals], label: str) -> list[Alarm]:
         """Take all windows of a record, in order; return the alarms that they raise.
 
-        Raises ``ValueError`` for a record that is shorter than a window, and as ``features_of``.
+        Parameters
+        ----------
+        signals
+            the record; of several axes by their names.
+        label
+            its name, in the labels of windows.
+
+        Raises
+        ------
+        ValueError
+            for a record that is shorter than a window, other axes than those before, and as
+            ``features_of``.
         """
+        axes = {"": signals} if isinstance(signals, Signals) else signals
+        self.check_axes(tuple(axes))
         new: list[Alarm] = []
         count = 0
-        for count, part in enumerate(windows_of(signals, self.window), start=1):
-            whole = without_gaps(part)
-            if whole is None:
-                self.left_out += 1
-                continue
-            row = features_of(whole, self.order, self.band)
-            new += self.watch.update(row, f"{label}, {(count - 1) * self.window:g} s")
+        every = zip(*(windows_of(each, self.window) for each in axes.values()), strict=True)
+        for count, parts in enumerate(every, start=1):
+            at = f"{label}, {(count - 1) * self.window:g} s"
+            new += self.take_window(dict(zip(axes, parts, strict=True)), at)
         if count == 0:
-            duration = signals.y.size * signals.dt
+            first = next(iter(axes.values()))
+            duration = first.y.size * first.dt
             raise ValueError(
                 f"{label}: {duration:g} s: must have a window of {self.window:g} s at least; "
                 "record longer, or take shorter windows in a new state"
             )
         return new
 
+    def check_axes(self, axes: tuple[str, ...]) -> None:
+        """Raise a ``ValueError`` unless axes are those of the windows so far."""
+        before = self.axes
+        if before is not None and before != axes:
+            theirs, ours = (", ".join(filter(None, each)) or "one y" for each in (axes, before))
+            raise ValueError(
+                f"record: has {theirs}, the state {ours}: must be the same axes in the same order; "
+                "begin a new state"
+            )
+        if isinstance(self.order, list) and len(self.order) != len(axes):
+            raise ValueError(
+                f"order = {self.order!r}: must be one number, or {len(axes)}, one for each axis"
+            )
+
+    def take_window(self, parts: Mapping[str, Signals], label: str) -> list[Alarm]:
+        """Take a window of each axis; leave it out if too much is missing in one of them."""
+        self.axes = tuple(parts)
+        row: dict[str, float] = {}
+        for i, (name, part) in enumerate(parts.items()):
+            whole = without_gaps(part)
+            if whole is None:
+                self.left_out += 1
+                return []
+            order = self.order[i] if isinstance(self.order, list) else self.order
+            own = features_of(whole, order, self.band)
+            row |= {f"{name}: {key}" if name else key: value for key, value in own.items()}
+        return self.watch.update(row, label)
+
+    def _coupled(self) -> list[str]:
+        """Return lines on axes without alarm, and on alarms of several that may have one cause."""
+        found = [(each.feature.rpartition(": ")[0], each) for each in self.watch.alarms]
+        quiet = [name for name in self.axes or () if name not in dict(found)]
+        lines = []
+        if found and quiet:
+            lines.append(f"no alarm in {len(self.watch.labels)} windows: {', '.join(quiet)}")
+        near = {
+            axis
+            for axis, one in found
+            for other, two in found
+            if other != axis and abs(one.since - two.since) <= _TOGETHER
+        }
+        if near:
+            names = ", ".join(name for name in self.axes or () if name in near)
+            lines.append(
+                f"NOT decided which of the axes it is: {names} changed within {_TOGETHER} windows: "
+                "axes that share actuators, a structure or a load show one cause in each; look "
+                "first at what they have in common, then at the axis whose numbers changed most"
+            )
+        return lines
+
     def describe(self) -> str:
         """Return alarms, and in lines with NOT what can not be said."""
         lines = [self.watch.describe()] if self.watch.labels else []
+        lines += self._coupled()
         if self.left_out:
             lines.append(
                 f"NOT watched: {self.left_out} windows in which more than {MOST_MISSING:.1%} of "
@@ -516,6 +591,7 @@ class Machine:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to a JSON file, whole or not at all; replace the one before."""
         value = {"settings": self.settings, "records": self.records, **self.watch.to_json()}
+        value["axes"] = None if self.axes is None else list(self.axes)
         write_json(path, value, overwrite=True)
 
     @classmethod
@@ -528,6 +604,8 @@ class Machine:
             made = cls(**value["settings"])
             made.records = [str(each) for each in value["records"]]
             made.watch = Watch.from_json(value)
+            axes = value.get("axes", [""] if made.watch.labels else None)
+            made.axes = None if axes is None else tuple(map(str, axes))
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise ValueError(f"path = {name!r}: no state of quell watch ({error})") from None
         return made
@@ -563,25 +641,25 @@ class WatchSink:
         self.windows = 0
         self._on_alarm = on_alarm or (lambda alarm: None)
         self._rows: list[Any] = []
-        self._columns: dict[str, int] = {}
-        self._features: tuple[str, ...] = ()
+        self._header: Any = None
         self._count, self._label, self._dt = 0, "", math.nan
 
     def open(self, header: Any) -> None:
         """Begin a record."""
         from datetime import UTC, datetime
 
-        self._columns = {name: i for i, name in enumerate(header.columns)}
-        self._features = tuple(header.features)
+        self._header = header
+        self.machine.check_axes(header.axis_names or ("",))
         self._dt, self._rows, self._count = header.dt, [], 0
         check_window(round(self.machine.window / self._dt))
         self._label = datetime.fromtimestamp(1e-9 * header.started, UTC).isoformat("T", "seconds")
 
     def write(self, rows: Any) -> None:
         """Take rows; at the end of a window, its numbers."""
+        from quell.realtime.recordings import MODE
         from quell.realtime.supervisor import Mode
 
-        running = rows[rows[:, self._columns["mode"]] == Mode.RUN]
+        running = rows[rows[:, MODE] == Mode.RUN]
         if running.size == 0:
             return
         self._rows.append(running.copy())
@@ -594,31 +672,45 @@ class WatchSink:
 
     def _take(self, rows: Any) -> None:
         """Take the rows of a window."""
-        at = self._columns
-        k, y = rows[:, at["k"]], rows[:, at["y_measured"]].copy()
+        from quell.realtime.recordings import K
+
+        k = rows[:, K]
         skipped = np.sum(np.diff(k) - 1.0)
         if skipped > MOST_MISSING * k.size:
             self.machine.left_out += 1
             return
-        f = None
-        if "f_residual" in at:
-            f = rows[:, at["f_residual"]] + rows[:, at["f_learned"]]
-        names = [f"theta[{i}]" for i in range(len(self._features))]
-        theta = {
-            of: rows[:, at[name]]
-            for of, name in zip(self._features, names, strict=True)
-            if name in at
-        }
-        signals = without_gaps(Signals(rows[:, at["u"]], y, rows[:, at["r"]], f, theta, self._dt))
-        if signals is None:
-            self.machine.left_out += 1
-            return
-        row = features_of(signals, self.machine.order, self.machine.band)
-        label = f"{self._label} + {k[0] * self._dt:g} s"
-        for alarm in self.machine.watch.update(row, label):
+        label, left_out = f"{self._label} + {k[0] * self._dt:g} s", self.machine.left_out
+        for alarm in self.machine.take_window(self._signals(rows), label):
             self._on_alarm(alarm)
+        if self.machine.left_out > left_out:
+            return
         self.windows += 1
         self.machine.save(self.path)
+
+    def _signals(self, rows: Any) -> dict[str, Signals]:
+        """Return the signals of each axis in rows."""
+        header = self._header
+        names = header.axis_names or ("",)
+        features = header.axis_features if header.axis_names else (header.features,)
+        found = {}
+        for i, (name, of) in enumerate(zip(names, features, strict=True)):
+            prefix, u = (f"{name}.", "v") if name else ("", "u")
+            own = {
+                each: rows[:, columns_of(header.channels, f"{prefix}{each}")]
+                for each in ("f_residual", "f_learned", "theta")
+                if (f"{prefix}{each}") in dict(header.channels)
+            }
+            f = None
+            if "f_residual" in own:
+                f = (own["f_residual"] + own["f_learned"])[:, 0]
+            theta = own.get("theta", np.zeros((len(rows), 0)))
+            learned = {key: theta[:, j] for j, key in enumerate(of) if j < theta.shape[1]}
+            y, r, acts = (
+                rows[:, columns_of(header.channels, each).start + i].copy()
+                for each in ("y_measured", "r", u)
+            )
+            found[name] = Signals(acts, y, r, f, learned, self._dt)
+        return found
 
     def describe(self) -> str:
         """Return what the watch says, and which windows this record had."""

@@ -11,6 +11,8 @@ filter forwards and backwards. In a loop the regression is biased by the noise t
 the loop and the noise are those of the other windows, so is the bias, and a change shows all the
 same. The numbers are for comparison: use ``quell b0`` for a gain with an honest interval.
 
+Of several axes each has its own numbers, with v = B0 u in the place of u.
+
 Beside them: the noise of y, from its third differences; the frequency and the height of the highest
 peak of y's spectrum above its trend, a resonance of the mechanics; the RMS error r − y and the RMS
 u; and of a recorded run of an ADRC the mean and the RMS value of f̂, and the learner's coefficients.
@@ -27,9 +29,10 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.commissioning import controlled, measured, measured_run, recorded_run
+from quell.commissioning import controlled, measured, measured_run, runs_in
 from quell.files import MAX_SIZE
 from quell.realtime.recordings import Event
+from quell.records.trajectory import Trajectory
 from quell.types import Vector
 
 # A gain whose standard error is above this share of it is not known. Chosen by hand.
@@ -73,7 +76,7 @@ def signals_of(
     dt: float | None = None,
     time_unit: str | None = None,
     max_size: float = MAX_SIZE,
-) -> Signals:
+) -> dict[str, Signals]:
     """Read a record of any kind; of a run under control the part in which the loop ran.
 
     Parameters
@@ -81,15 +84,25 @@ def signals_of(
     path, columns, dt, time_unit, max_size
         as for ``quell.commissioning.measured``.
 
+    Returns
+    -------
+    dict
+        the signals of each axis by its name; of a record of one y and one u the name is empty.
+
     Raises
     ------
     ValueError
         as ``quell.commissioning.measured``.
     """
-    run = recorded_run(path, columns, dt, time_unit, max_size)
-    if run is None:
+    runs = runs_in(path, columns, dt, time_unit, max_size)
+    if not runs:
         found = measured(path, columns, dt, time_unit, max_size)
-        return Signals(found.u, found.y, found.reference, None, {}, found.dt)
+        return {"": Signals(found.u, found.y, found.reference, None, {}, found.dt)}
+    return {name: _signals_in(run) for name, run in runs.items()}
+
+
+def _signals_in(run: Trajectory) -> Signals:
+    """Return the signals of a run while it was under control."""
     part, known = controlled(run), measured_run(run)
     # As received: NaN where nothing was, or where the loop skipped the deadline.
     y = run["y_measured"][part].copy()

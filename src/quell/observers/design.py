@@ -202,8 +202,14 @@ def _sampled_design(
         difference, gammas = with_motion_of_f(difference, m), with_rates(gammas, m)
         step = omega_o * dt
         gain = np.full(size, np.nan)
+        ratios = step ** (power[None, :] - power[:, None])
+        if not np.all(np.isfinite(ratios)):
+            raise ValueError(
+                f"omega_o = {omega_o!r} rad/s with dt = {dt!r} s: powers of omega_o dt up to "
+                f"{power[-1]} are out of the range of numbers; take an omega_o below 1/dt"
+            )
         if np.all(np.isfinite(phi)):
-            difference *= step ** (power[None, :] - power[:, None])
+            difference *= ratios
             offsets = np.full(size, -math.expm1(-step), dtype=complex)
             offsets[: kept.size] = sampled_zeros(difference[: n + 1, : n + 1], kept, dt)
             if pattern is not None:

@@ -12,7 +12,7 @@ from quell.plants.flexible import (
     n_mass,
     two_mass_spring,
 )
-from quell.plants.fmu import FMU
+from quell.plants.fmu import FMU, MultivariableFMU
 from quell.plants.linear import LinearPlant, delayed, encoded
 from quell.plants.linearise import linearised
 from quell.plants.multibody import Arm, Craft, arm, quadrotor_attitude, rotor_levers
@@ -26,10 +26,10 @@ from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.testbeds import DcMotor, TorsionalPlant, dc_motor, torsional, torsional_identified
 
 __all__ = [
-    "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "LinearPlant", "MultivariableLinearPlant",
-    "MultivariableNonlinearPlant", "NMassPlant", "NonlinearPlant", "Plant", "PlantBatch",
-    "TorsionalPlant", "arm", "batch", "dc_motor", "delayed", "delayed_inputs", "encoded",
-    "encoded_outputs", "labelled", "lagged_two_mass_spring", "linearised", "n_mass",
-    "quadrotor_attitude", "rotor_levers", "signals_of", "torsional", "torsional_identified",
-    "two_mass_spring",
+    "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "LinearPlant", "MultivariableFMU",
+    "MultivariableLinearPlant", "MultivariableNonlinearPlant", "NMassPlant", "NonlinearPlant",
+    "Plant", "PlantBatch", "TorsionalPlant", "arm", "batch", "dc_motor", "delayed",
+    "delayed_inputs", "encoded", "encoded_outputs", "labelled", "lagged_two_mass_spring",
+    "linearised", "n_mass", "quadrotor_attitude", "rotor_levers", "signals_of", "torsional",
+    "torsional_identified", "two_mass_spring",
 ]  # fmt: skip

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import partial
 from typing import Any
 
 import numba
@@ -51,13 +51,18 @@ class Arm(MultivariableNonlinearPlant):
     The states are the angles of the joints, their rates, then angles and rates of the motors of
     elastic joints. u are the torques of the motors, w further torques at the links.
 
-    Attributes
-    ----------
-    inertia
-        the function M(x) of the arm for ``quell.Axes(M=…)``, of estimates ``x[axis, derivative]``.
+    Its numbers are ``parameters`` of compiled code that all arms share: however many arms are made,
+    one of each number of links is compiled.
     """
 
-    inertia: Callable[[Matrix], Matrix]
+    @property
+    def inertia(self) -> Callable[[Matrix], Matrix]:
+        """The function M(x) of the arm for ``quell.Axes(M=…)``, of ``x[axis, derivative]``.
+
+        It is the inertia that u meets at low frequencies: with the motors behind elastic joints.
+        """
+        numbers: Any = self.parameters
+        return partial(_inertia, a=numbers["a"], motor=numbers["joints"][_MOTOR])
 
     def mass_matrix(self, q: Any) -> Matrix:
         """Return M(q) (n, n) [kg m²] for angles of the joints (n,) [rad]."""
@@ -155,16 +160,16 @@ def arm(
     friction = (_each("viscous", viscous, n), _each("coulomb", coulomb, n))
     width = checks.positive("coulomb_width", coulomb_width, "rad/s")
     rigid_inertia = np.where(elastic, 0.0, motor)
-    joints = (motor, np.where(elastic, spring, 0.0), _each("damping", damping, n), elastic)
-    rate = _arm_rate(a, g, rigid_inertia, friction, width, joints)
     order = 2 * n + 2 * int(np.sum(elastic))
-    made = Arm(
-        rate, order, n, _encoder_rows(encoders, elastic, order), n, substeps,
-        name or f"arm of {n} links",
+    parts = (motor, np.where(elastic, spring, 0.0), _each("damping", damping, n), elastic)
+    parameters = {
+        "a": a, "g": g, "friction": np.array(friction), "width": width,
+        "joints": np.array([*parts, rigid_inertia], dtype=np.float64),
+    }  # fmt: skip
+    return Arm(
+        _arm_rate, order, n, _encoder_rows(encoders, elastic, order), n, substeps,
+        name or f"arm of {n} links", parameters,
     )  # fmt: skip
-    # The inertia that u meets at low frequencies: with the motors behind elastic joints, too.
-    object.__setattr__(made, "inertia", _inertia_function(a, motor))
-    return made
 
 
 def _each(name: str, value: Any, count: int, *, finite: bool = True) -> Vector:
@@ -207,111 +212,93 @@ def _encoder_rows(encoders: str, elastic: Any, order: int) -> Matrix:
     return rows[encoders]
 
 
-def _inertia_function(a: Matrix, motor: Vector) -> Callable[[Matrix], Matrix]:
+# Rows of the parameters of the joints: inertia and stiffness of the motors, damping, whether a
+# joint is elastic, and the inertia of motors without a spring before them.
+_MOTOR, _SPRING, _DAMPING, _ELASTIC, _RIGID = range(5)
+
+
+def _inertia(x, a, motor):  # type: ignore[no-untyped-def]
     n = motor.size
-
-    def inertia(x):  # type: ignore[no-untyped-def]
-        M = np.zeros((n, n))
-        for i in range(n):
-            for j in range(n):
-                between = 0.0  # θ_i − θ_j
-                for k in range(min(i, j) + 1, max(i, j) + 1):
-                    between += x[k, 0]
-                share = a[i, j] * math.cos(between)
-                for row in range(i + 1):
-                    for column in range(j + 1):
-                        M[row, column] += share
-            M[i, i] += motor[i]
-        return M
-
-    return inertia
-
-
-@cache
-def _solver() -> Any:
-    @numba.njit(error_model="numpy")
-    def solved(M, b):  # type: ignore[no-untyped-def]
-        """Solve M x = b for a positive definite M by Gauss; both are overwritten."""
-        n = b.size
-        for k in range(n):
-            for i in range(k + 1, n):
-                factor = M[i, k] / M[k, k]
-                for j in range(k, n):
-                    M[i, j] -= factor * M[k, j]
-                b[i] -= factor * b[k]
-        for k in range(n - 1, -1, -1):
-            for j in range(k + 1, n):
-                b[k] -= M[k, j] * b[j]
-            b[k] /= M[k, k]
-        return b
-
-    return solved
-
-
-def _arm_rate(
-    a: Matrix,
-    g: Vector,
-    rigid_inertia: Vector,
-    friction: tuple[Vector, Vector],
-    width: float,
-    joints: tuple[Vector, Vector, Vector, Any],
-) -> Callable[..., Any]:
-    """Return the function f(t, x, u, w) of an arm."""
-    n = g.size
-    viscous, coulomb = friction
-    motor, spring, damping, elastic = joints
-    solved = _solver()
-
-    def rate(t, x, u, w):  # type: ignore[no-untyped-def]
-        dx, M, tau = np.zeros(x.size), np.zeros((n, n)), np.zeros(n)
-        at = 2 * n
-        for i in range(n):
-            dx[i] = x[n + i]
-            tau[i] = u[i]
-            if elastic[i]:
-                twist, speed = x[at] - x[i], x[at + 1] - x[n + i]
-                tau[i] = spring[i] * twist + damping[i] * speed
-                dx[at] = x[at + 1]
-                dx[at + 1] = (u[i] - tau[i]) / motor[i]
-                at += 2
-            tau[i] += w[i] - viscous[i] * x[n + i] - coulomb[i] * math.tanh(x[n + i] / width)
-            M[i, i] += rigid_inertia[i]
-        theta = 0.0
-        for i in range(n):
-            theta += x[i]
-            weight = g[i] * math.cos(theta)
-            other = omega = 0.0
-            for j in range(n):
-                other += x[j]
-                omega += x[n + j]
-                weight += a[i, j] * math.sin(theta - other) * omega * omega
-                share = a[i, j] * math.cos(theta - other)
-                for row in range(i + 1):
-                    for column in range(j + 1):
-                        M[row, column] += share
+    M = np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            between = 0.0  # θ_i − θ_j
+            for k in range(min(i, j) + 1, max(i, j) + 1):
+                between += x[k, 0]
+            share = a[i, j] * math.cos(between)
             for row in range(i + 1):
-                tau[row] -= weight
-        acceleration = solved(M, tau)
-        for i in range(n):
-            dx[n + i] = acceleration[i]
-        return dx
+                for column in range(j + 1):
+                    M[row, column] += share
+        M[i, i] += motor[i]
+    return M
 
-    return rate
+
+@numba.njit(error_model="numpy")
+def _solved(M, b):  # type: ignore[no-untyped-def]
+    """Solve M x = b for a positive definite M by Gauss; both are overwritten."""
+    n = b.size
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = M[i, k] / M[k, k]
+            for j in range(k, n):
+                M[i, j] -= factor * M[k, j]
+            b[i] -= factor * b[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            b[k] -= M[k, j] * b[j]
+        b[k] /= M[k, k]
+    return b
+
+
+def _arm_rate(t, x, u, w, a, g, friction, width, joints):  # type: ignore[no-untyped-def]
+    n = g.size
+    dx, M, tau = np.zeros(x.size), np.zeros((n, n)), np.zeros(n)
+    at = 2 * n
+    for i in range(n):
+        dx[i] = x[n + i]
+        tau[i] = u[i]
+        if joints[_ELASTIC, i] != 0.0:
+            twist, speed = x[at] - x[i], x[at + 1] - x[n + i]
+            tau[i] = joints[_SPRING, i] * twist + joints[_DAMPING, i] * speed
+            dx[at] = x[at + 1]
+            dx[at + 1] = (u[i] - tau[i]) / joints[_MOTOR, i]
+            at += 2
+        viscous, coulomb = friction[0, i], friction[1, i]
+        tau[i] += w[i] - viscous * x[n + i] - coulomb * math.tanh(x[n + i] / width)
+        M[i, i] += joints[_RIGID, i]
+    theta = 0.0
+    for i in range(n):
+        theta += x[i]
+        weight = g[i] * math.cos(theta)
+        other = omega = 0.0
+        for j in range(n):
+            other += x[j]
+            omega += x[n + j]
+            weight += a[i, j] * math.sin(theta - other) * omega * omega
+            share = a[i, j] * math.cos(theta - other)
+            for row in range(i + 1):
+                for column in range(j + 1):
+                    M[row, column] += share
+        for row in range(i + 1):
+            tau[row] -= weight
+    acceleration = _solved(M, tau)
+    for i in range(n):
+        dx[n + i] = acceleration[i]
+    return dx
 
 
 # ---- The attitude of a craft with rotors ----
 
 
 class Craft(MultivariableNonlinearPlant):
-    """The attitude of a craft; make it with ``quadrotor_attitude``.
+    """The attitude of a craft; make it with ``quadrotor_attitude``."""
 
-    Attributes
-    ----------
-    B0
-        the matrix from the thrusts to the angles near the horizontal, K/I (3, m) [rad/s² per N].
-    """
-
-    B0: Matrix
+    @property
+    def B0(self) -> Matrix:  # noqa: N802
+        """The matrix from the thrusts to the angles near the horizontal, K/I [rad/s² per N]."""
+        numbers: Any = self.parameters
+        found: Matrix = numbers["lever"] / numbers["inertia"][:, None]
+        return found
 
 
 def quadrotor_attitude(
@@ -347,33 +334,33 @@ def quadrotor_attitude(
     >>> craft.order, craft.inputs, craft.outputs
     (10, 4, 3)
     """
-    ixx, iyy, izz = checks.vector("inertia", checks.positive_vector("inertia", inertia), 3).tolist()
+    about = checks.vector("inertia", checks.positive_vector("inertia", inertia), 3)
     lag = checks.positive("motor_lag", motor_lag, "s")
     lever = rotor_levers(arm, drag)
+    parameters = {"inertia": about, "lever": lever, "lag": lag}
+    return Craft(_craft_rate, 10, 4, np.eye(10)[:3], 3, None, name, parameters)
 
-    def rate(t, x, u, w):  # type: ignore[no-untyped-def]
-        dx = np.zeros(10)
-        roll, pitch = x[0], x[1]
-        p, q, r = x[3], x[4], x[5]
-        turn = q * math.sin(roll) + r * math.cos(roll)
-        dx[0] = p + math.tan(pitch) * turn
-        dx[1] = q * math.cos(roll) - r * math.sin(roll)
-        dx[2] = turn / math.cos(pitch)
-        torque = np.zeros(3)
-        for i in range(3):
-            torque[i] = w[i]
-            for j in range(4):
-                torque[i] += lever[i, j] * x[6 + j]
-        dx[3] = (torque[0] + (iyy - izz) * q * r) / ixx
-        dx[4] = (torque[1] + (izz - ixx) * r * p) / iyy
-        dx[5] = (torque[2] + (ixx - iyy) * p * q) / izz
+
+def _craft_rate(t, x, u, w, inertia, lever, lag):  # type: ignore[no-untyped-def]
+    dx = np.zeros(10)
+    ixx, iyy, izz = inertia[0], inertia[1], inertia[2]
+    roll, pitch = x[0], x[1]
+    p, q, r = x[3], x[4], x[5]
+    turn = q * math.sin(roll) + r * math.cos(roll)
+    dx[0] = p + math.tan(pitch) * turn
+    dx[1] = q * math.cos(roll) - r * math.sin(roll)
+    dx[2] = turn / math.cos(pitch)
+    torque = np.zeros(3)
+    for i in range(3):
+        torque[i] = w[i]
         for j in range(4):
-            dx[6 + j] = (u[j] - x[6 + j]) / lag
-        return dx
-
-    made = Craft(rate, 10, 4, np.eye(10)[:3], 3, None, name)
-    object.__setattr__(made, "B0", lever / np.array([[ixx], [iyy], [izz]]))
-    return made
+            torque[i] += lever[i, j] * x[6 + j]
+    dx[3] = (torque[0] + (iyy - izz) * q * r) / ixx
+    dx[4] = (torque[1] + (izz - ixx) * r * p) / iyy
+    dx[5] = (torque[2] + (ixx - iyy) * p * q) / izz
+    for j in range(4):
+        dx[6 + j] = (u[j] - x[6 + j]) / lag
+    return dx
 
 
 def rotor_levers(arm: float, drag: float) -> Matrix:

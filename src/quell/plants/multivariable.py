@@ -25,9 +25,16 @@ from quell import checks
 from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
-from quell.kernels.numba_internals import to_fixed_tuple
-from quell.kernels.sized import Size
-from quell.kernels.user_functions import POINTER, call
+from quell.kernels.sized import Buffer, Size
+from quell.kernels.user_functions import (
+    POINTER,
+    Shapes,
+    as_array,
+    call,
+    count_of,
+    reader,
+    shapes_of,
+)
 from quell.lti.models import zero_order_hold
 from quell.plants.base import (
     Plant,
@@ -40,7 +47,6 @@ from quell.plants.base import (
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel, quantized
 from quell.plants.nonlinear import (
     EquationPlant,
-    as_array,
     derivatives,
     runge_kutta,
     value_or_nan,
@@ -223,7 +229,7 @@ class CompiledMultivariable(NamedTuple):
     output: int
     step: float  # length of a sub-step [s]
     substeps: int
-    parameters: Vector  # those of the rate, then those of the output
+    parameters: Buffer  # those of the rate, then those of the output
 
 
 class PythonMultivariable(NamedTuple):
@@ -270,14 +276,14 @@ _KEPT = 32
 
 
 class _Sizes(NamedTuple):
-    """Numbers of states, control signals, outputs and disturbances, and of parameters."""
+    """Numbers of states, control signals, outputs and disturbances, and shapes of parameters."""
 
     n: int
     m: int
     p: int
     q: int
-    own: int  # parameters of f
-    more: int  # parameters of the output
+    own: Shapes  # of the parameters of f
+    more: Shapes  # of those of the output
 
 
 @lru_cache(maxsize=_KEPT)
@@ -285,41 +291,28 @@ def _machine_code(
     rate_of: Callable[..., Any], output_of: Callable[..., Any], sizes: _Sizes
 ) -> tuple[Any, Any]:
     """Return the compiled f and output; raise ``NotCompilableError`` if Numba can't."""
-    n, m, p, q, own, more = sizes
+    n, m, p, q, of_rate, of_output = sizes
+    own, more = reader(of_rate), reader(of_output, count_of(of_rate))
     f = user_functions.jit_user_function(rate_of)
     h = user_functions.jit_user_function(output_of)
 
     def rate(t, px, pu, pw, pp, pdx):  # type: ignore[no-untyped-def]
         dx = numba.carray(pdx, (n,))
-        found = f(t, numba.carray(px, (n,)), numba.carray(pu, (m,)), numba.carray(pw, (q,)))
-        for i in range(n):
-            dx[i] = found[i]
-
-    def rate_with(t, px, pu, pw, pp, pdx):  # type: ignore[no-untyped-def]
-        dx = numba.carray(pdx, (n,))
-        values = to_fixed_tuple(numba.carray(pp, (own,)), own)
         signals = (numba.carray(px, (n,)), numba.carray(pu, (m,)), numba.carray(pw, (q,)))
-        found = f(t, signals[0], signals[1], signals[2], *values)
+        found = f(t, signals[0], signals[1], signals[2], *own(pp))
         for i in range(n):
             dx[i] = found[i]
 
     def output(px, pp, py):  # type: ignore[no-untyped-def]
         y = numba.carray(py, (p,))
-        found = h(numba.carray(px, (n,)))
-        for i in range(p):
-            y[i] = found[i]
-
-    def output_with(px, pp, py):  # type: ignore[no-untyped-def]
-        y = numba.carray(py, (p,))
-        values = to_fixed_tuple(numba.carray(pp, (own + more,))[own:], more)
-        found = h(numba.carray(px, (n,)), *values)
+        found = h(numba.carray(px, (n,)), *more(pp))
         for i in range(p):
             y[i] = found[i]
 
     compile_cfunc = user_functions.compile_cfunc
     return (
-        compile_cfunc(_RATE_SIGNATURE, rate_with if own else rate),
-        compile_cfunc(_OUTPUT_SIGNATURE, output_with if more else output),
+        compile_cfunc(_RATE_SIGNATURE, rate),
+        compile_cfunc(_OUTPUT_SIGNATURE, output),
     )
 
 
@@ -363,8 +356,8 @@ class MultivariableNonlinearPlant(EquationPlant):
     name
         for tables and plots.
     parameters
-        numbers by name that f and output take as further arguments; ``with_parameters`` changes
-        them, and compiles nothing.
+        numbers, vectors and matrices by name that f and output take as further arguments;
+        ``with_parameters`` changes them, and compiles nothing for the same shapes.
 
     Raises
     ------
@@ -387,7 +380,7 @@ class MultivariableNonlinearPlant(EquationPlant):
     disturbances: int = 1
     substeps: int | None = None
     name: str = "nonlinear plant"
-    parameters: Mapping[str, float] | None = None
+    parameters: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         n = checks.whole("order", self.order, 1)
@@ -427,8 +420,8 @@ class MultivariableNonlinearPlant(EquationPlant):
             )
         object.__setattr__(self, "_outputs", len(found))
 
-    def with_parameters(self, **values: float) -> MultivariableNonlinearPlant:
-        """Return the plant with other numbers for some parameters; nothing is compiled again."""
+    def with_parameters(self, **values: Any) -> MultivariableNonlinearPlant:
+        """Return the plant with other values of some parameters; nothing is compiled again."""
         return replace(self, parameters={**(self.parameters or {}), **values})
 
     @property
@@ -447,7 +440,7 @@ class MultivariableNonlinearPlant(EquationPlant):
         return np.zeros(self.inputs)
 
     def _machine_code_of_both(self) -> tuple[Any, Any]:
-        own, more = (len(each) for each in self._numbers)
+        own, more = map(shapes_of, self._numbers)
         sizes = _Sizes(self.order, self.inputs, self.outputs, self.disturbances, own, more)
         return _machine_code(self.f, self._output_function, sizes)
 
@@ -457,7 +450,7 @@ class MultivariableNonlinearPlant(EquationPlant):
         if interpret or self._machine_code is None:
             return PythonMultivariable(self._rate, self._measured, step, substeps)
         rate, output = self._machine_code
-        numbers = as_array(*self._numbers) if self.parameters else np.zeros(1)
+        numbers = as_array(*self._numbers)
         return CompiledMultivariable(rate.address, output.address, step, substeps, numbers)
 
 
@@ -647,3 +640,22 @@ def check_several(value: Any, name: str = "plant") -> None:
 def is_several(plant: Plant) -> bool:
     """Return whether u and y of a plant are vectors."""
     return hasattr(plant, "inputs")
+
+
+class ChannelNames(NamedTuple):
+    """Names that a plant's signals have where it comes from, in a file for instance; for errors."""
+
+    u: tuple[str, ...] = ()
+    y: tuple[str, ...] = ()
+    w: tuple[str, ...] = ()
+
+
+def named(plant: Any, channel: str) -> str:
+    """Return the names of the channel ``u``, ``y`` or ``w`` of a plant, `` (a, b)``, or no text.
+
+    They are found behind delays and encoders, too.
+    """
+    while isinstance(plant, PlantWrapper):
+        plant = plant.plant
+    names = getattr(getattr(plant, "channel_names", ChannelNames()), channel)
+    return f" ({', '.join(names)})" if names else ""

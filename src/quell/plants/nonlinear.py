@@ -36,8 +36,18 @@ from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
 from quell.kernels.functions import tanh
-from quell.kernels.numba_internals import to_fixed_tuple
-from quell.kernels.user_functions import POINTER, call, evaluate
+from quell.kernels.user_functions import (
+    POINTER,
+    Shapes,
+    as_array,
+    call,
+    checked_value,
+    count_of,
+    evaluate,
+    named_parameters,
+    reader,
+    shapes_of,
+)
 from quell.plants.base import Plant, advance, labelled, measure, signals_of
 from quell.plants.linear import LinearPlant, delayed
 from quell.types import Matrix, Vector, warn
@@ -53,28 +63,19 @@ _OUTPUT_SIGNATURE = nb_types.float64(POINTER, POINTER)
 _KEPT = 32
 
 
-def named_parameters(function: Callable[..., Any], first: int) -> dict[str, Any]:
-    """Return the parameters of a function after its ``first`` ones, and their defaults."""
-    try:
-        takes = [*inspect.signature(function).parameters.values()][first:]
-    except (TypeError, ValueError):
-        return {}
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return {each.name: each.default for each in takes if each.kind not in variable}
-
-
 def checked_parameters(
     given: Mapping[str, Any], f: Callable[..., Any], output: Any
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the numbers that f and the output take after (t, x, u, w) and (x), in their order.
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what f and the output take after (t, x, u, w) and (x), in their order.
 
     Raises
     ------
     ValueError
-        for a name that neither takes, a missing one, or a value that is no finite number.
+        for a name that neither takes, a missing one, or a value that is no finite number and no
+        vector or matrix of them.
     """
     if not isinstance(given, Mapping):
-        raise ValueError(f"parameters = {given!r:.60}: must be numbers by name")
+        raise ValueError(f"parameters = {given!r:.60}: must be numbers or arrays by name")
     taken = named_parameters(f, 4), named_parameters(output, 1) if callable(output) else {}
     known = list(dict.fromkeys([*taken[0], *taken[1]]))
     for name in given:
@@ -88,12 +89,12 @@ def checked_parameters(
             value = given.get(name, default)
             if value is inspect.Parameter.empty:
                 raise ValueError(f"parameters: {name} is missing, f or output takes it")
-            values[name] = checks.finite(f"parameters[{name!r}]", value)
+            values[name] = checked_value(f"parameters[{name!r}]", value)
         found.append(values)
     return found[0], found[1]
 
 
-def bound(function: Callable[..., Any], values: Mapping[str, float]) -> Callable[..., Any]:
+def bound(function: Callable[..., Any], values: Mapping[str, Any]) -> Callable[..., Any]:
     """Return a function with its numbers given, for Python."""
     return partial(function, **values) if values else function
 
@@ -116,7 +117,7 @@ def machine_code(
     rate_of: Callable[..., Any],
     output_of: Callable[..., Any],
     sizes: tuple[int, int],
-    counts: tuple[int, int],
+    shapes: tuple[Shapes, Shapes],
 ) -> tuple[Any, Any]:
     """Return the compiled f and output, which take a pointer to all numbers as well.
 
@@ -126,37 +127,30 @@ def machine_code(
         the user's functions.
     sizes
         numbers of states and of disturbances.
-    counts
-        numbers of parameters of f and of the output, which follow each other in the array.
+    shapes
+        of the parameters of f and of the output, which follow each other in the array.
 
     Raises
     ------
     NotCompilableError
         if Numba can't compile a function.
     """
-    (n, m), (own, more) = sizes, counts
-    every = own + more
+    n, m = sizes
+    own, more = (reader(*each) for each in zip(shapes, (0, count_of(shapes[0])), strict=True))
     f = user_functions.jit_user_function(rate_of)
     h = user_functions.jit_user_function(output_of)
 
     def rate(t, px, u, pw, pp, pdx):  # type: ignore[no-untyped-def]
         dx = numba.carray(pdx, (n,))
-        values = to_fixed_tuple(numba.carray(pp, (every,))[:own], own)
-        derivatives = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (m,)), *values)
+        derivatives = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (m,)), *own(pp))
         for i in range(n):
             dx[i] = derivatives[i]
 
     def output(px, pp):  # type: ignore[no-untyped-def]
-        values = to_fixed_tuple(numba.carray(pp, (every,))[own:], more)
-        return h(numba.carray(px, (n,)), *values)
+        return h(numba.carray(px, (n,)), *more(pp))
 
     compile_cfunc = user_functions.compile_cfunc
     return compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
-
-
-def as_array(*values: Mapping[str, float]) -> Vector:
-    """Return all numbers in their order."""
-    return np.array([number for each in values for number in each.values()])
 
 
 # ---- The equation of a nonlinear plant in a sample ----
@@ -306,7 +300,7 @@ class EquationPlant(Described):
     disturbances: int
     substeps: int | None
     name: str
-    parameters: Mapping[str, float] | None
+    parameters: Mapping[str, Any] | None
 
     @cached_property
     def _output_function(self) -> Callable[..., Any]:
@@ -323,8 +317,8 @@ class EquationPlant(Described):
         return 0.0
 
     @property
-    def _numbers(self) -> tuple[dict[str, float], dict[str, float]]:
-        """The numbers that f and the output take, in their order."""
+    def _numbers(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The numbers and arrays that f and the output take, in their order."""
         if self.parameters is None:
             return {}, {}
         return checked_parameters(self.parameters, self.f, self.output)
@@ -422,8 +416,8 @@ class NonlinearPlant(EquationPlant):
     name
         for tables and plots.
     parameters
-        numbers by name that f and output take as further arguments; ``with_parameters`` changes
-        them, and compiles nothing.
+        numbers, vectors and matrices by name that f and output take as further arguments;
+        ``with_parameters`` changes them, and compiles nothing for the same shapes.
     operating_point
         state and control signal (x, u) about which designs and ``analyse`` take the plant as
         linear. By default x and u are zero if that is a state of rest.
@@ -454,7 +448,7 @@ class NonlinearPlant(EquationPlant):
     disturbances: int = 1
     substeps: int | None = None
     name: str = "nonlinear plant"
-    parameters: Mapping[str, float] | None = None
+    parameters: Mapping[str, Any] | None = None
     operating_point: Any = None
 
     def __post_init__(self) -> None:
@@ -488,8 +482,8 @@ class NonlinearPlant(EquationPlant):
         ):
             raise ValueError("output(x) must return one number")
 
-    def with_parameters(self, **values: float) -> NonlinearPlant:
-        """Return the plant with other numbers for some parameters; nothing is compiled again."""
+    def with_parameters(self, **values: Any) -> NonlinearPlant:
+        """Return the plant with other values of some parameters; nothing is compiled again."""
         made = replace(self, parameters={**(self.parameters or {}), **values})
         signals = signals_of(self)
         return labelled(made, *signals[:3]) if signals.known else made
@@ -517,9 +511,8 @@ class NonlinearPlant(EquationPlant):
             return h(numba.carray(px, (n,)))
 
         if self.parameters is not None:
-            own, more = self._numbers
-            both, counts = (self.f, self._output_function), (len(own), len(more))
-            return machine_code(*both, (n, m), counts)
+            own, more = map(shapes_of, self._numbers)
+            return machine_code(self.f, self._output_function, (n, m), (own, more))
         f = user_functions.jit_user_function(self.f)
         h = user_functions.jit_user_function(self._output_function)
         compile_cfunc = user_functions.compile_cfunc
@@ -538,9 +531,9 @@ class NonlinearPlant(EquationPlant):
             set_origin(rate.address, self.f)
             set_origin(output.address, self._output_function)
             return CompiledNonlinear(rate.address, output.address, step, substeps)
-        own, more = (len(each) for each in self._numbers)
+        own, more = map(shapes_of, self._numbers)
         set_origin(rate.address, self.f, numbers=(0, own))
-        set_origin(output.address, self._output_function, numbers=(own, more))
+        set_origin(output.address, self._output_function, numbers=(count_of(own), more))
         numbers = as_array(*self._numbers)
         return CompiledParametric(rate.address, output.address, step, substeps, numbers)
 

@@ -16,7 +16,7 @@ from quell import checks
 from quell.files import whole_text
 from quell.plants.base import Plant, check_plant
 from quell.plants.flexible import lagged_two_mass_spring, n_mass, two_mass_spring
-from quell.plants.fmu import FMU
+from quell.plants.fmu import FMU, MultivariableFMU
 from quell.plants.linear import LinearPlant, delayed, encoded
 from quell.plants.multibody import arm, quadrotor_attitude
 from quell.plants.multivariable import (
@@ -352,9 +352,10 @@ AXES_PLANTS: Mapping[str, Callable[..., Any]] = {
     "quadrotor-attitude": quadrotor_attitude,
     "encoded-outputs": encoded_outputs,
     "delayed-inputs": delayed_inputs,
+    "fmu": MultivariableFMU,
     "python": python_plant,
 }
 """Plants with several signals that a setup of several axes can have, by their ``kind``."""
 
-RUN_CODE: tuple[Callable[..., Plant], ...] = (FMU,)
+RUN_CODE: tuple[Callable[..., Plant], ...] = (FMU, MultivariableFMU)
 """Plants that are programs: a setup file can only have them if the user trusts it."""

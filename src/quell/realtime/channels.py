@@ -3,7 +3,9 @@
 A device may give further numbers with each measurement: the load of a crane, the extension of an
 axis, the state of a brake. ``run_rig(channels=…)`` names them in the device's order. The first ones
 are the external signals of the controller's schedule, as many as it follows; the one called
-``held`` says whether the plant is held (above one half: it is); all are recorded.
+``held`` says whether the plant is held (above one half: it is); all are recorded. Of several axes
+``held`` says it of all, ``elbow.held`` of the axis called elbow, and any other name may begin with
+that of an axis: it is then in the record of that axis.
 
 What is missing, that is not finite or not there, is held: the schedule keeps its last value
 (``Status.SCHEDULE_HELD``), and ``held`` keeps its last state for ``Safety.hold`` samples. After
@@ -24,14 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.base import is_usable, set_held, set_schedule_signals
+from quell.controllers.axes import Axes
+from quell.controllers.base import is_usable, set_axis_held, set_schedule_signals
 from quell.controllers.compensated import can_be_held
 from quell.kernels.dispatch import kernel
+from quell.realtime.devices import read_channels
 from quell.realtime.recordings import LOOP_CHANNELS
 from quell.types import Vector
 
 HELD = "held"
-"""Name of the channel that says whether the plant is held."""
+"""Name of the channel that says whether the plant is held; ``elbow.held`` says it of an axis."""
 
 # A channel above it says that the plant is held: it is sent as 0 or 1.
 _IS_HELD = 0.5
@@ -46,18 +50,58 @@ class ChannelInputs(NamedTuple):
     """The channels of a sample, and what they are for; make it with ``channel_inputs``."""
 
     values: Vector  #: in this sample, in the device's order (c,)
-    missing: NDArray[np.int64]
-    """Samples since ``held`` was usable, and whether a channel that is used is missing now (2,)."""
+    missing: NDArray[np.int64]  #: whether a channel that is used is missing now (1,)
     external: int  #: how many of the first ones are signals of the schedule
-    held: int  #: place of ``held``; −1 if there is none
+    held: NDArray[np.int64]
+    """Of each channel that says what is held: its place, the axis (−1 for all), samples since it
+    was usable, and what it says (h, 4)."""
+    axes: int  #: how many the controller has
+
+
+_PLACE, _AXIS, _SINCE, _SAYS = range(4)
 
 
 def channel_inputs(controller: Any, names: Sequence[str]) -> ChannelInputs:
     """Return the channels of a controller, all missing; ``names`` as ``checked_channels`` does."""
     external = int(getattr(controller, "external_signals", 0))
-    held = names.index(HELD) if HELD in names else -1
-    values = np.full(len(names), np.nan)
-    return ChannelInputs(values, np.zeros(2, dtype=np.int64), external, held)
+    held = [(place, axis, 0, 0) for place, axis in _places_of_held(controller, names)]
+    return ChannelInputs(
+        values=np.full(len(names), np.nan),
+        missing=np.zeros(1, dtype=np.int64),
+        external=external,
+        held=np.array(held, dtype=np.int64).reshape(-1, 4),
+        axes=len(_axes_of(controller)),
+    )
+
+
+def _places_of_held(controller: Any, names: Sequence[str]) -> list[tuple[int, int]]:
+    """Return the place of each channel that says what is held, and its axis; −1 for all."""
+    of = {HELD: -1} | {f"{name}.{HELD}": i for i, name in enumerate(_names_of(controller))}
+    return [(place, of[name]) for place, name in enumerate(names) if name in of]
+
+
+def _names_of(controller: Any) -> tuple[str, ...]:
+    """Return the names of several axes; none of another controller."""
+    return controller.names if isinstance(controller, Axes) else ()
+
+
+def _axes_of(controller: Any) -> tuple[Any, ...]:
+    """Return the controllers of several axes; the controller itself of one."""
+    return controller.axes if isinstance(controller, Axes) else (controller,)
+
+
+@kernel
+def read_inputs(inputs: ChannelInputs, handle: Any) -> None:
+    """Read the channels of a device, if there are some."""
+    if inputs.values.size > 0:
+        read_channels(handle, inputs.values)
+
+
+@kernel
+def record_channels(inputs: ChannelInputs, row: Vector) -> None:
+    """Write the channels of a sample into ``row`` (c,)."""
+    for i in range(inputs.values.size):
+        row[i] = inputs.values[i]
 
 
 @kernel
@@ -67,22 +111,30 @@ def pass_channels(inputs: ChannelInputs, design: Any, state: Any, hold: int) -> 
     ``held`` keeps its state for ``hold`` samples.
     """
     values, missing = inputs.values, inputs.missing
-    missing[1] = 0
+    missing[0] = 0
     for i in range(inputs.external):
         if not is_usable(values[i]):
-            missing[1] = 1
+            missing[0] = 1
     if inputs.external > 0:
         set_schedule_signals(design, state, values[: inputs.external])
-    if inputs.held >= 0:
-        value = values[inputs.held]
-        if is_usable(value):
-            missing[0] = 0
-            set_held(design, state, value > _IS_HELD)
-        else:
-            missing[0] += 1
-            missing[1] = 1
-            if missing[0] > hold:
-                set_held(design, state, False)
+    if inputs.held.shape[0] > 0:
+        for each in range(inputs.held.shape[0]):
+            value = values[inputs.held[each, _PLACE]]
+            if is_usable(value):
+                inputs.held[each, _SINCE] = 0
+                inputs.held[each, _SAYS] = 1 if value > _IS_HELD else 0
+            else:
+                missing[0] = 1
+                inputs.held[each, _SINCE] += 1
+                if inputs.held[each, _SINCE] > hold:
+                    inputs.held[each, _SAYS] = 0
+        for axis in range(inputs.axes):
+            held = 0
+            for each in range(inputs.held.shape[0]):
+                of = inputs.held[each, _AXIS]
+                if of == axis or of < 0:
+                    held |= inputs.held[each, _SAYS]
+            set_axis_held(design, state, axis, held != 0)
 
 
 def checked_channels(controller: Any, names: Any) -> tuple[str, ...]:
@@ -98,12 +150,15 @@ def checked_channels(controller: Any, names: Any) -> tuple[str, ...]:
         rule = "must be a list of names, in the order in which the device gives them"
         raise ValueError(f"channels = {names!r}: {rule}")
     found = tuple(names)
+    axes = _names_of(controller)
     taken = {name for name, _ in (*LOOP_CHANNELS, *controller.channels)} | {"time"}
     for name in found:
-        if not isinstance(name, str) or not _NAME.fullmatch(name):
+        axis, dot, own = str(name).rpartition(".")
+        if not isinstance(name, str) or not _NAME.fullmatch(own) or (dot and axis not in axes):
             rule = "must be small letters, digits and _, a letter first"
-            raise ValueError(f"channels: {name!r} {rule}")
-        if name in taken or found.count(name) > 1:
+            before = f"; before it may be an axis and a dot, {axes[0]}.{HELD}" if axes else ""
+            raise ValueError(f"channels: {name!r} {rule}{before}")
+        if name in taken or (dot and own in taken) or found.count(name) > 1:
             raise ValueError(f"channels: {name!r} is the name of another column; take another one")
     external = int(getattr(controller, "external_signals", 0))
     if found[:external].count(HELD) or len(found) < external:
@@ -113,11 +168,15 @@ def checked_channels(controller: Any, names: Any) -> tuple[str, ...]:
             f"external {signals}; name the device's channels, these first, or follow 'reference', "
             "'y' or 'speed', or take the controller at one point, controller.at(…)"
         )
-    if HELD in found and not can_be_held(controller):
-        raise ValueError(
-            f"channels: {HELD!r} says nothing to a {type(controller).__name__}, which has no "
-            "observer that knows the plant at rest; leave it out, or record it by another name"
-        )
+    for place, of in _places_of_held(controller, found):
+        for i, part in enumerate(_axes_of(controller)):
+            if of in (i, -1) and not can_be_held(part):
+                axis = f"axis {axes[i]}, a " if axes else ""
+                raise ValueError(
+                    f"channels: {found[place]!r} says nothing to {axis or 'a '}"
+                    f"{type(part).__name__}, which has no observer that knows the plant at rest; "
+                    "leave it out, or record it by another name"
+                )
     return found
 
 
@@ -138,7 +197,7 @@ def await_channels(device: Any, inputs: ChannelInputs, names: Sequence[str], dt:
             f"channels = {list(names)!r}: {type(device).__name__} gives y only; a device with "
             "channels has read_channels()"
         )
-    used = [*range(inputs.external), *([inputs.held] if inputs.held >= 0 else [])]
+    used = [*range(inputs.external), *inputs.held[:, _PLACE].tolist()]
     device.read()  # the first one may compile, which must not count as waiting
     end = time.monotonic() + max(_FIRST, _FIRST_SAMPLES * dt)
     while True:

@@ -68,7 +68,13 @@ from quell.realtime.axes_supervisor import (
     supervise_outputs,
     update_axes_mode,
 )
-from quell.realtime.channels import ChannelInputs, channel_inputs, pass_channels
+from quell.realtime.channels import (
+    ChannelInputs,
+    channel_inputs,
+    pass_channels,
+    read_inputs,
+    record_channels,
+)
 from quell.realtime.devices import (
     Device,
     PythonHandle,
@@ -77,7 +83,6 @@ from quell.realtime.devices import (
     drop_signals,
     handle_of,
     read_acting,
-    read_channels,
     read_measurement,
     read_signals,
     read_tick,
@@ -219,9 +224,7 @@ def finish_signals(controller: Any, handle: Any, u: float) -> None:
 
 @take_inputs.register(SupervisedController)
 def _take_channels(controller: SupervisedController, handle: Any) -> None:
-    inputs = controller.inputs
-    if inputs.values.size > 0:
-        read_channels(handle, inputs.values)
+    read_inputs(controller.inputs, handle)
 
 
 @send_control.register(SupervisedController)
@@ -249,7 +252,7 @@ def _finish_signals(controller: SupervisedController, handle: Any, u: float) -> 
 @kernel
 def _channel_event(inputs: ChannelInputs) -> int:
     """Return the ``Event`` flag of a missing channel."""
-    return _CHANNEL if inputs.missing[1] != 0 else 0
+    return _CHANNEL if inputs.missing[0] != 0 else 0
 
 
 @kernel
@@ -331,11 +334,8 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
         memory.offset = y - reference.r[0]
         first = k
     awake = memory.mode != Mode.STOPPED and is_finite(memory.y)
-    inputs = controller.inputs
-    if inputs.values.size > 0:
-        pass_channels(inputs, design, state, rules.hold)
-        for i in range(inputs.values.size):
-            row[controller.log.channels + i] = inputs.values[i]
+    pass_channels(controller.inputs, design, state, rules.hold)
+    record_channels(controller.inputs, row[controller.log.channels :])
     r, wished, f_hat = 0.0, 0.0, 0.0
     for i in range(first, k + 1):
         r = _set_reference(design, state, reference, memory, i)
@@ -391,7 +391,7 @@ class SupervisedAxes(NamedTuple):
     supervisor: SupervisorState
     reference: AxesReference
     log: CycleLog
-    inputs: ChannelInputs  #: none
+    inputs: ChannelInputs
     axes: AxesMemory
     f_hat: NDArray[np.int64]
     """Places in a row of the learned and of the observer's part of f̂ of each axis; −1 (n, 2)."""
@@ -400,6 +400,7 @@ class SupervisedAxes(NamedTuple):
 @take_inputs.register(SupervisedAxes)
 def _take_signals(controller: SupervisedAxes, handle: Any) -> None:
     read_signals(handle, controller.axes.y)
+    read_inputs(controller.inputs, handle)
 
 
 @skip_inputs.register(SupervisedAxes)
@@ -461,6 +462,8 @@ def _control_axes(controller: SupervisedAxes, k: int, left_out: int, y: float) -
             axes.offset[i] = axes.y[i] - reference.r[0, i]
         first = k
     awake = memory.mode != Mode.STOPPED and all_measured(axes)
+    pass_channels(controller.inputs, design, state, rules.hold)
+    record_channels(controller.inputs, row[controller.log.channels :])
     for c in range(axes.u.size):
         axes.wished[c] = 0.0
     for i in range(first, k + 1):

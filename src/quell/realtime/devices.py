@@ -161,7 +161,7 @@ def drop_signals(handle: Any) -> None:
 
 
 def counts_of(plant: Any) -> SignalCounts | None:
-    """Return how many signals a plant has; None for one y and one u."""
+    """Return how many signals a plant, or a controller, has; None for one y and one u."""
     return SignalCounts(plant.outputs, plant.inputs) if is_several(plant) else None
 
 
@@ -208,6 +208,14 @@ def other_counts(device: str, theirs: SignalCounts | None, ours: SignalCounts | 
         "be as many; take the device of this machine, or a setup with a table [[axis]] for each "
         "measurement and limits in [axes] for each actuator"
     )
+
+
+def check_counts(device: Any, ours: SignalCounts | None) -> None:
+    """Raise a ``ValueError`` unless a device has as many signals as the controller, ``ours``."""
+    given = getattr(device, "signal_counts", None)
+    theirs = None if given is None else SignalCounts(*given)
+    if theirs != ours:
+        raise ValueError(other_counts(type(device).__name__, theirs, ours))
 
 
 @kernel
@@ -321,11 +329,17 @@ def _read_measurement_twin(handle: TwinHandle, clock: Any, until: int) -> tuple[
     return measure(handle.plant, handle.x), 0
 
 
+@kernel
+def _copy_channels(channels: Matrix, samples: float, values: Vector) -> None:
+    """Write the channels of a twin that has taken so many samples."""
+    row = min(int(samples), channels.shape[0] - 1)
+    for i in range(values.size):
+        values[i] = channels[row, i] if i < channels.shape[1] else math.nan
+
+
 @read_channels.register(TwinHandle)
 def _read_channels_twin(handle: TwinHandle, values: Vector) -> None:
-    row = min(int(handle.t[0]), handle.channels.shape[0] - 1)
-    for i in range(values.size):
-        values[i] = handle.channels[row, i] if i < handle.channels.shape[1] else math.nan
+    _copy_channels(handle.channels, handle.t[0], values)
 
 
 @write_command.register(TwinHandle)
@@ -343,6 +357,7 @@ class AxesTwinHandle(NamedTuple):
     scratch: Vector
     w: Vector  # disturbances: zero (q,)
     t: Vector  # samples since the start, and the sample time [s] (2,)
+    channels: Matrix  # as of ``TwinHandle``
     y: Vector  # last measurements (p,)
 
 
@@ -356,6 +371,11 @@ def _read_measurement_of_axes(handle: AxesTwinHandle, clock: Any, until: int) ->
 def _read_signals_of_axes(handle: AxesTwinHandle, y: Vector) -> None:
     for i in range(y.size):
         y[i] = handle.y[i]
+
+
+@read_channels.register(AxesTwinHandle)
+def _read_channels_of_axes(handle: AxesTwinHandle, values: Vector) -> None:
+    _copy_channels(handle.channels, handle.t[0], values)
 
 
 @write_signals.register(AxesTwinHandle)
@@ -431,7 +451,7 @@ class TwinDevice:
         self._handle: Any = TwinHandle(model, x, scratch, w, t, given)
         if self.signal_counts is not None:
             y = np.full(self.signal_counts.outputs, np.nan)
-            self._handle = AxesTwinHandle(model, x, scratch, w, t, y)
+            self._handle = AxesTwinHandle(model, x, scratch, w, t, given, y)
         # Without a public handle the loop runs as Python.
         self.handle = self._handle if plant.compiled else None
 
@@ -479,10 +499,10 @@ class TwinDevice:
 
     def close(self) -> None:
         """Put a plant whose state is destroyed back to ``x0``, so that the device can be reused."""
-        plant, x, scratch, _, t, _ = self._handle
-        if is_destroyed(x, self._x0):
-            x[:], t[0] = self._x0, 0.0
-            begin_run(plant, x, scratch)
+        handle = self._handle
+        if is_destroyed(handle.x, self._x0):
+            handle.x[:], handle.t[0] = self._x0, 0.0
+            begin_run(handle.plant, handle.x, handle.scratch)
 
 
 def _checked_rows(channels: ArrayLike) -> Matrix:

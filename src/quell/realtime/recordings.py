@@ -324,7 +324,8 @@ def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
         dt = _sample_time(time, rows[:, K])
         header = Header(channels, dt, notes=_axes_in(names[1:], channels), started=0)
     if header.columns != tuple(names[1:]):
-        raise ValueError(f"its columns differ from those in {beside.name}")
+        others = f"those in {beside.name}" if beside.is_file() else "those of a recording"
+        raise ValueError(f"its columns differ from {others}")
     return header, rows
 
 
@@ -366,15 +367,22 @@ def _channels(columns: list[str]) -> Channels:
 
 
 def _axes_in(columns: list[str], channels: Channels) -> dict[str, Any]:
-    """Return the names of several axes in columns, as ``Header.notes`` has them.
+    """Return the names of several axes and actuators in columns, as ``Header.notes`` has them.
 
-    Their features are unknown. Each axis has its estimate; another channel may have a dot, too.
+    Features and units are unknown. Each axis has its estimate; another channel may have a dot, too.
     """
     estimated = [name.removesuffix(".x_hat") for name, _ in channels if name.endswith(".x_hat")]
     if not estimated:
         return {}
-    labels = [each[2:].rstrip("]") for each in columns if each.startswith("y[")]
-    return {"axes": {name: [] for name in labels or estimated}}
+    labels, actuators = (
+        [each[2:].rstrip("]") for each in columns if each.startswith(begin)]
+        for begin in ("y[", "u[")
+    )
+    notes: dict[str, Any] = {"axes": {name: [] for name in labels or estimated}}
+    if not all(map(str.isdigit, actuators)):
+        names = [*notes["axes"]]
+        notes["signals"] = {"axes": names, "y": [""] * len(names), "u": actuators}
+    return notes
 
 
 def _sample_time(time: Vector, k: Vector) -> float:

@@ -67,7 +67,7 @@ def open_device(
     ------
     ValueError
         for a URL of no known device, an object that is not a device, and a device with other
-        numbers of signals, or one that can have one of each only.
+        numbers of signals.
     ConnectionError
         if the device does not answer.
     """
@@ -79,11 +79,6 @@ def open_device(
     more: dict[str, Any] = {"trust": trust} if device.startswith("twin:") else {}
     made = _end(device, listening=False)
     if signals is not None and not more:
-        if not SCHEMES[device.partition(":")[0]].listener:
-            raise ValueError(
-                f"device = {device!r}: has one y and one u, NOT {signals[0]} and {signals[1]}: "
-                "several axes need a wire, udp:// or serial://, or a device of your own"
-            )
         more = {"signals": signals}
     return made(device, dt, **more)
 

@@ -27,7 +27,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.several import control_all
-from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors
+from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors, kernel
 from quell.realtime.axes_supervisor import set_applied_controls
 from quell.realtime.channels import ChannelInputs, channel_inputs, checked_channels, pass_channels
 from quell.realtime.devices import SignalCounts, counts_text
@@ -144,7 +144,9 @@ def replay(
             )
         else:
             wished = np.zeros(axes.inputs)
-            status = call_specialised(_follow_axes, design, state, places, began, log, wished)
+            status = call_specialised(
+                _follow_axes, design, state, places, began, log, wished, inputs, given, hold
+            )
     common: dict[str, Any] = {
         "log": log,
         "channels": columns,
@@ -194,6 +196,16 @@ def _started(controller: Any, y: Any, u: Any, r: Any) -> tuple[Any, Any]:
     return follower.parameters, follower._state
 
 
+@kernel
+def _give_channels(
+    inputs: ChannelInputs, given: Matrix, k: int, design: Any, state: Any, hold: int
+) -> None:
+    """Hand the device's channels of sample k over to a controller."""
+    for i in range(inputs.values.size):
+        inputs.values[i] = given[k, i]
+    pass_channels(inputs, design, state, hold)
+
+
 @compiled
 def _follow(
     design: Any,
@@ -214,10 +226,7 @@ def _follow(
         if k == began and k > 0:
             bumpless_transfer(design, state)
         set_reference_derivatives(design, state, derivatives)
-        if inputs.values.size > 0:
-            for i in range(inputs.values.size):
-                inputs.values[i] = given[k, i]
-            pass_channels(inputs, design, state, hold)
+        _give_channels(inputs, given, k, design, state, hold)
         wished = control(design, state, log[k, 0], log[k, 2])
         status |= status_flags(design, state)
         log[k, 4] = wished
@@ -229,26 +238,34 @@ def _follow(
 
 @compiled
 def _follow_axes(
-    design: Any, state: Any, places: NDArray[np.int64], began: int, log: Matrix, wished: Vector
+    design: Any,
+    state: Any,
+    places: NDArray[np.int64],
+    began: int,
+    log: Matrix,
+    wished: Vector,
+    inputs: ChannelInputs,
+    given: Matrix,
+    hold: int,
 ) -> int:
     """Do what ``_follow`` does for several axes.
 
     ``places`` are the first columns of r, y, y_measured, u and u_wished.
     """
-    status = 0
-    inputs = wished.size
+    status, count = 0, wished.size
     for k in range(log.shape[0]):
         if k == began and k > 0:
             bumpless_transfer(design, state)
-        u = log[k, places[3] : places[3] + inputs]
+        _give_channels(inputs, given, k, design, state, hold)
+        u = log[k, places[3] : places[3] + count]
         r = log[k, places[0] : places[1]]
         control_all(design, state, r, log[k, places[2] : places[3]], wished)
         status |= status_flags(design, state)
         different = False
-        for c in range(inputs):
+        for c in range(count):
             log[k, places[4] + c] = wished[c]
             different |= u[c] != wished[c]
-        at = places[4] + inputs
+        at = places[4] + count
         write_row(design, state, log[k, at:])
         apply_to_axes(state.gain, u, log[k, at : at + r.size])  # v as applied
         if different:

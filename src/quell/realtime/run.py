@@ -29,9 +29,9 @@ from quell.realtime.cycle import ControlLoop
 from quell.realtime.devices import (
     Device,
     PythonHandle,
-    SignalCounts,
+    check_counts,
+    counts_of,
     handle_of,
-    other_counts,
 )
 from quell.realtime.memory_file import MemoryFile, memory_file
 from quell.realtime.recordings import (
@@ -384,13 +384,10 @@ def run_rig(
             raise ValueError(
                 f"device has dt = {own!r} s, the controller {dt!r} s: must be the same"
             )
-        check_counts(device, axes)
+        check_counts(device, counts_of(controller))
         scenario = as_scenario(scenario, duration)
         rules = (Safety() if safety is None else safety).rules(controller, scenario)
         names = checked_channels(controller, channels)
-        if axes is not None and names:
-            rule = "are NOT for several axes yet; leave them out"
-            raise ValueError(f"channels = {list(names)!r}: {rule}")
         reference: Any
         if axes is not None:
             reference = axes_reference(scenario, axes, approach)
@@ -458,15 +455,6 @@ def run_rig(
         notes=tuple(notes),
         rules=rules,
     )
-
-
-def check_counts(device: Any, axes: Axes | None) -> None:
-    """Raise a ``ValueError`` unless a device has as many signals as the controller."""
-    given = getattr(device, "signal_counts", None)
-    theirs = None if given is None else SignalCounts(*given)
-    ours = None if axes is None else SignalCounts(axes.outputs, axes.inputs)
-    if theirs != ours:
-        raise ValueError(other_counts(type(device).__name__, theirs, ours))
 
 
 def _last_save(kept: MemoryFile, supervisor: SupervisorState, dt: float) -> str:

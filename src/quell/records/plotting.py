@@ -32,6 +32,8 @@ _MARKED = (
     Reason.EXPLODED,
     Reason.NOT_FINITE,
 )
+# A longer label [characters] is higher than its panel of a run: its unit stands below.
+_LABEL = 20
 # Widths of a figure over one and two columns of IEEE's journals, 3.5 and 7.16 inches, and the share
 # of its width that its height is.
 _WIDTHS, _HEIGHT = {1: 3.5, 2: 7.16}, 0.62
@@ -114,7 +116,7 @@ def plot_run(run: Any, diverged_at: float | None, axes: Any = None) -> Any:
         panels.append(_draw_error)
         count = len(panels)
         # The error is below the output, and last in the array.
-        below = _new_axes(count, 2.0)
+        below = _new_axes(count, 1.5)
         axes = below[[0, *range(2, count), 1]]
     elif np.size(axes) == len(panels) + 1:
         panels.append(_draw_error)
@@ -127,6 +129,8 @@ def plot_run(run: Any, diverged_at: float | None, axes: Any = None) -> Any:
         # Beside the axes, where it hides no data.
         ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize="small", frameon=False)
         ax.grid(alpha=0.3)
+        if new and len(label := ax.get_ylabel()) > _LABEL:
+            ax.set_ylabel(label.replace(" [", "\n["))
     axes[-2 if new else -1].set_xlabel("time [s]")
     if diverged_at is not None:
         axes[0].set_title(f"ended at {diverged_at:.3g} s: diverged", color="C3")
@@ -281,6 +285,25 @@ def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: A
     axes[1].set_xlabel("time [s]")
     title = f"{diverged.size} runs, {lost.size} diverged"
     axes[0].set_title(title, color="C3" if lost.size else "0.2", fontsize="medium")
+    return axes
+
+
+def plot_batch_of_axes(runs: Any, axes: Any = None) -> Any:
+    """Draw output and v of each axis of a batch of machines; return the axes (2 n,), y first."""
+    count = len(runs.axis_names)
+    if not count:
+        raise ValueError("the loop has several signals and no axes: plot columns of runs['y']")
+    if axes is None:
+        axes = new_figure(1.0 + 4.2 * count, 5.0).subplots(2, count, sharex=True)
+    axes = np.ravel(axes)
+    if axes.size != 2 * count:
+        raise ValueError(f"axes: must be {2 * count} matplotlib axes, got {axes.size}")
+    for i, name in enumerate(runs.axis_names):
+        plot_batch(runs.axis(i), runs.diverged, runs.ended, axes[i::count])
+        axes[i].set_title(f"{name}: {axes[i].get_title()}", fontsize="medium")
+        axes[count + i].set_ylabel("v")
+        if i < count - 1:
+            axes[i].get_legend().remove()
     return axes
 
 

@@ -11,6 +11,7 @@ A setup with other values: what sweeps and tuning change of a file.
 
 from __future__ import annotations
 
+import html
 import os
 import re
 import threading
@@ -299,10 +300,13 @@ def table(of: type[Table]) -> str:
 
 
 def markdown(kinds: Mapping[str, type[CallTable]]) -> str:
-    """Return the kinds of a table and their keys in Markdown."""
-    return "\n\n".join(
-        f"**`{kind}`** {of.__doc__}\n\n{table(of)}".replace("``", "`") for kind, of in kinds.items()
-    )
+    """Return the kinds of a table in Markdown, each with its keys folded below it."""
+    folds = []
+    for kind, of in kinds.items():
+        about = re.sub("`+([^`]+)`+", r"<code>\1</code>", html.escape(str(of.__doc__), False))
+        title = f"<summary><code>{kind}</code> {about}</summary>"
+        folds.append(f"<details>{title}\n\n{table(of)}\n\n</details>")
+    return "\n\n".join(folds)
 
 
 def _default(value: Any) -> str:

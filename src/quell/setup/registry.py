@@ -408,7 +408,7 @@ Tune = call_table(
 _NO_KEYS = ("duration", "on_change", "overwrite")
 Sweep = call_table("sweep", sweep_table, only=True)
 Rig = call_table("rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NO_KEYS)
-_NOT_OF_AXES = (*_NO_KEYS, "signals", "channels")
+_NOT_OF_AXES = (*_NO_KEYS, "signals")
 AxesRig = call_table(
     "rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NOT_OF_AXES
 )

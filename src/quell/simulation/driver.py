@@ -139,13 +139,17 @@ class Scenario:
     def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
         """Return the reference, ``inputs`` disturbances and the noise, seeded."""
         if len(self.disturbances) > inputs:
-            plant = f"the plant has {inputs} disturbance inputs"
-            raise ValueError(f"disturbances has {len(self.disturbances)} signals: {plant}")
+            have = checks.counted(len(self.disturbances), "signal")
+            most = checks.counted(inputs, "disturbance input")
+            raise ValueError(f"disturbances has {have}: the plant has {most}")
         for name in ("reference", "noise"):
-            if checks.is_sequence(getattr(self, name)):
+            listed = getattr(self, name)
+            if checks.is_sequence(listed):
+                have = checks.counted(len(listed), "signal")
                 raise ValueError(
-                    f"{name} has {len(getattr(self, name))} signals: must be one, the loop has one "
-                    "output; several axes are controlled by quell.Axes"
+                    f"{name} = {listed!s:.60}: is a list of {have}, "
+                    "and the loop has one output: must be one number or signal, without brackets; "
+                    "several axes are controlled by quell.Axes"
                 )
         one: Any = self.reference, self.noise
         given = (as_signal(one[0]), *map(as_signal, self.disturbances))
@@ -159,6 +163,21 @@ def check_scenario(value: Any, name: str = "scenario") -> None:
     """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a scenario."""
     if isinstance(value, type) or not hasattr(value, "seeded_signals"):
         raise ValueError(f"{name} = {value!r}: must be a quell.Scenario")
+
+
+def is_random(scenario: Scenario) -> bool:
+    """Return whether another seed changes a signal of a scenario."""
+    given = (scenario.reference, scenario.noise, scenario.disturbances, scenario.schedule)
+    several: list[Any] = [each if checks.is_sequence(each) else (each,) for each in given]
+    return any(_is_drawn(as_signal(each)) for signals in several for each in signals)
+
+
+def _is_drawn(signal: Signal) -> bool:
+    one, other = signal.seeded(0), signal.seeded(1)
+    try:
+        return one is not other and one != other
+    except ValueError:  # signals that hold arrays
+        return True
 
 
 # ---- A scenario as the samples of a loop, evaluated in segments ----
@@ -270,8 +289,8 @@ def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal
     given, used = len(scenario.schedule), int(getattr(controller, "external_signals", 0))
     if given != used:
         raise ValueError(
-            f"scenario.schedule has {given} signals, and the schedule of the controller follows "
-            f"{used} external ones: must be as many"
+            f"scenario.schedule has {checks.counted(given, 'signal')}, and the schedule of the "
+            f"controller follows {used} external ones: must be as many"
         )
     if not given:
         return []

@@ -16,7 +16,7 @@ from quell.controllers.base import set_reference_derivatives, status_flags, writ
 from quell.controllers.several import control_all
 from quell.kernels.dispatch import compiled_loop
 from quell.plants.base import advance
-from quell.plants.multivariable import is_several, measure_all
+from quell.plants.multivariable import is_several, measure_all, named
 from quell.records.axes import AxesTrajectory
 from quell.signals import Constant, Signal, as_signal, seeded_apart
 from quell.signals.shapes import check_derivative
@@ -72,9 +72,9 @@ class SampledAxes:
         noise = _one_for_each("noise", scenario.noise, controller.outputs)
         given = tuple(map(as_signal, scenario.disturbances))
         if len(given) > inputs:
-            raise ValueError(
-                f"disturbances has {len(given)} signals: the plant has {inputs} disturbance inputs"
-            )
+            have = checks.counted(len(given), "signal")
+            most = checks.counted(inputs, "disturbance input")
+            raise ValueError(f"disturbances has {have}: the plant has {most}{named(plant, 'w')}")
         if scenario.schedule:
             raise ValueError("scenario.schedule: axes have no schedule; leave it out")
         # Signals are seeded apart, so the noise of each output has numbers of its own.
@@ -124,7 +124,8 @@ def _one_for_each(name: str, given: Any, axes: int) -> tuple[Signal, ...]:
         return (as_signal(given, name),) * axes
     if len(given) != axes:
         what = "axes" if name == "reference" else "outputs"
-        raise ValueError(f"{name} has {len(given)} signals: there are {axes} {what}, give one each")
+        have = checks.counted(len(given), "signal")
+        raise ValueError(f"{name} has {have}: there are {axes} {what}, give one each")
     return tuple(as_signal(each, f"{name}[{i}]") for i, each in enumerate(given))
 
 
@@ -249,6 +250,12 @@ def logged_channels(plant: Any, controller: Any) -> Channels:
     return (*signals, ("w", plant.disturbances), ("x", plant.order), *controller.channels)
 
 
+def names_of_axes(controller: Any) -> dict[str, Any]:
+    """Return the names of the axes, and of the features of each, for a record."""
+    features = tuple(axis.features for axis in controller.axes)
+    return {"axis_names": controller.names, "axis_features": features}
+
+
 def check_fit(plant: Any, controller: Any) -> None:
     """Raise a ``ValueError`` unless a plant has the signals of a controller of several axes."""
     name = getattr(plant, "name", plant)
@@ -258,13 +265,14 @@ def check_fit(plant: Any, controller: Any) -> None:
             f"{controller.inputs} and {controller.outputs}: must be a plant with as many, for "
             "example quell.plants.arm()"
         )
-    for what, own, of_plant in (
-        ("control signals", controller.inputs, plant.inputs),
-        ("outputs", controller.outputs, plant.outputs),
+    for what, channel, own, of_plant in (
+        ("control signals", "u", controller.inputs, plant.inputs),
+        ("outputs", "y", controller.outputs, plant.outputs),
     ):
         if own != of_plant:
             raise ValueError(
-                f"plant = {name!r} has {of_plant} {what}, the controller {own}: must be the same"
+                f"plant = {name!r} has {of_plant} {what}{named(plant, channel)}, the controller "
+                f"{own}: must be the same"
             )
 
 
@@ -293,7 +301,6 @@ def simulate_axes(
         ended=loop.ended * dt,
         limit=sampled.limit,
         plant=plant.name,
-        axis_names=controller.names,
-        axis_features=tuple(axis.features for axis in controller.axes),
+        **names_of_axes(controller),
         final_state=loop.state,
     )

@@ -42,7 +42,7 @@ class Constraints:
     damping
         least damping of the closed loop's poles, ``−Re s/|s|``; 0.4 overshoots by 25 % alone. Poles
         of a dead time, with a half period below it, do not count, and a flexible mode of the plant
-        keeps half of its own damping (docs/tuning_method).
+        keeps half of its own damping (docs/tuning_damping).
     u_max
         largest ``|u|`` in the responses of the objective's scenario [u-unit].
     rate_max

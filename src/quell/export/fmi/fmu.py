@@ -31,9 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
-from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
-from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import plant_source
 from quell.export.controller_source import c_source
 from quell.export.fmi.parts import (
@@ -610,7 +608,7 @@ def _parts(part: Any) -> tuple[Any, Any]:
         plant, controller = part, None
     if controller is not None:
         check_controller(controller, several=True)
-    if isinstance(controller, Axes | StateFeedback) and plant is not None:
+    if hasattr(controller, "inputs") and plant is not None:
         what = f"{controller.outputs} axes" if controller.axes else "StateFeedback"
         raise TranslationError(
             f"{what}: an FMU with a plant is of one u and one y; write the FMU of the controller "

@@ -22,13 +22,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
 from quell.controllers.prefilters import without_prefilters
-from quell.controllers.single import SinglePrecision
-from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
-from quell.export.controller_source import c_source, in_double_precision, limits_path
+from quell.export.controller_source import (
+    c_source,
+    in_double_precision,
+    is_in_single,
+    limits_path,
+)
 from quell.export.library.packages import package_files, package_note
 from quell.export.library.vectors import (
     TOLERANCE_REASON,
@@ -41,7 +43,6 @@ from quell.export.proof import Proof, proof_files, prove
 from quell.export.translate.text import checked_name
 from quell.files import check_folder, write_folder
 from quell.learners.gaussian_process import SINGLE_NOVELTY, GaussianProcess
-from quell.plants.base import Plant
 from quell.simulation.driver import Scenario
 from quell.simulation.simulate import simulate
 
@@ -138,7 +139,8 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
     path, several = limits_path(controller), source.sizes is not None
     limit = f"{path}.high{'[0]' if several else ''}" if path else ""
     values = _values(source, controller.dt, limit)
-    values |= (_texts_of_several if several else _texts_of_one)(controller, source)
+    described = in_double_precision(controller)
+    values |= (_texts_of_several if several else _texts_of_one)(described, source)
     kind = "_axes" if several else ""
     values["loop"] = filled(f"loop{kind}.md", values).rstrip("\n")
     name = source.name
@@ -155,7 +157,7 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
 def _texts_of_one(controller: Any, source: CSource) -> dict[str, str]:
     """Return the texts of a controller of one u and y."""
     return {
-        "title": f"Controller {type(in_double_precision(controller)).__name__}",
+        "title": f"Controller {type(controller).__name__}",
         **_with_signals(_reference_texts(source), source),
         "operations": _operation_rows(source, _OPERATIONS),
     }
@@ -505,17 +507,38 @@ def _edges(calls: str) -> dict[str, set[str]]:
 LIMIT = 0.01
 
 
+class Difference(NamedTuple):
+    """RMS differences of a signal of several axes, relative to its RMS in double precision.
+
+    Attributes
+    ----------
+    name
+        ``u of actuator 1``, ``v of elbow``, ``y of elbow``; of state feedback ``y 1``.
+    single
+        of a run in single precision.
+    noise
+        of a run in double precision without measurement noise; None if the scenario has none.
+    """
+
+    name: str
+    single: float
+    noise: float | None
+
+
 class Comparison(NamedTuple):
     """RMS differences in a scenario, relative to the RMS of the signal in double precision.
 
     Attributes
     ----------
     u, y
-        of a run in single precision.
+        of a run in single precision; of several signals the largest.
     u_noise, y_noise
-        of a run in double precision without measurement noise; None if the scenario has none.
+        of a run in double precision without measurement noise, of the same signals; None if the
+        scenario has none.
     diverged
         whether the run in single precision diverged, and that in double did not.
+    each
+        of controllers of several signals, each u, v and y; else empty.
     """
 
     u: float
@@ -523,55 +546,83 @@ class Comparison(NamedTuple):
     u_noise: float | None
     y_noise: float | None
     diverged: bool
+    each: tuple[Difference, ...] = ()
 
     def check(self, controller: Any) -> None:
         """Raise a ``ValueError`` if single precision differs too much for ``controller``."""
         if not self.diverged and self.u <= LIMIT:
             return
-        what = "diverges" if self.diverged else f"changes u by {100 * self.u:.2g} % RMS"
+        signal = next((own.name for own in self.each if own.single == self.u), "u")
+        what = "diverges" if self.diverged else f"changes {signal} by {100 * self.u:.2g} % RMS"
         raise ValueError(
             f"precision = 'single': {what} in this scenario, and {100 * LIMIT:g} % is the limit; "
-            f"{_remedy(controller)}, or double precision would help; accept=True (--accept) "
-            "writes it all the same"
+            f"{self._remedy(in_double_precision(controller))}, or double precision would help; "
+            "accept=True (--accept) writes it all the same"
         )
 
+    def _remedy(self, controller: Any) -> str:
+        """Return what makes rounding smaller: of a learner's points, or else of y."""
+        several = hasattr(controller, "inputs")
+        for each in controller.axes if several else (without_prefilters(controller),):
+            learner = getattr(each, "learner", None)
+            if isinstance(learner, GaussianProcess) and learner.model.novelty < SINGLE_NOVELTY:
+                return (
+                    f"novelty={SINGLE_NOVELTY:g} of GaussianProcess (points so close that the "
+                    "inverse of their covariance loses its digits are then not stored)"
+                )
+        if not several:
+            return (
+                "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
+                "resolution=, --resolution)"
+            )
+        asked = [own for own in self.each if own.name.startswith("v of ")]
+        worst = max(asked, key=lambda own: own.single, default=None)
+        of = "" if worst is None or self.diverged else f"{worst.name.removeprefix('v')} "
+        return f"a lower omega_o{of.rstrip()}, y as a difference from a position near the work"
 
-def _remedy(controller: Any) -> str:
-    """Return what makes rounding smaller: of the learner's points, or else of y."""
-    learner = getattr(without_prefilters(in_double_precision(controller)), "learner", None)
-    if isinstance(learner, GaussianProcess) and learner.model.novelty < SINGLE_NOVELTY:
-        return (
-            f"novelty={SINGLE_NOVELTY:g} of GaussianProcess (points so close that the inverse of "
-            "their covariance loses its digits are then not stored)"
-        )
-    return (
-        "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
-        "resolution=, --resolution)"
-    )
 
+def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
+    """Return what single precision changes in a scenario, and what the measurement noise does.
 
-def compared(plant: Plant, controller: Any, scenario: Scenario) -> Comparison:
-    """Return what single precision changes in a scenario, and what the measurement noise does."""
+    A signal of several axes is compared with its own RMS.
+    """
     controller = in_double_precision(controller)
     double = simulate(plant, controller, scenario)
     single = simulate(plant, controller, scenario, precision="single")
-    u_noise = y_noise = None
+    diverged, quiet = single.diverged and not double.diverged, None
     if not (isinstance(scenario.noise, int | float) and scenario.noise == 0.0):
         quiet = simulate(plant, controller, replace(scenario, noise=0.0))
-        u_noise, y_noise = (_difference(double, quiet, name) for name in ("u", "y"))
-    return Comparison(
-        _difference(double, single, "u"),
-        _difference(double, single, "y"),
-        u_noise,
-        y_noise,
-        single.diverged and not double.diverged,
+    each = [
+        Difference(
+            name,
+            _difference(double, single, *place),
+            None if quiet is None else _difference(double, quiet, *place),
+        )
+        for name, place in _signals_of(controller)
+    ]
+    u, y = (
+        max((own for own in each if own.name.startswith(kind)), key=lambda own: own.single)
+        for kind in "uy"
     )
+    several = tuple(each) if hasattr(controller, "inputs") else ()
+    return Comparison(u.single, y.single, u.noise, y.noise, diverged, several)
 
 
-def _difference(reference: Any, other: Any, name: str) -> float:
-    """Return the RMS difference, relative to the RMS of the reference."""
+def _signals_of(controller: Any) -> list[tuple[str, tuple[str, int]]]:
+    """Return names of the signals that are compared, with channel and column of a record."""
+    if not hasattr(controller, "inputs"):
+        return [("u", ("u", 0)), ("y", ("y", 0))]
+    inputs, outputs, names = controller.inputs, controller.outputs, controller.names
+    found = [(f"u of actuator {k + 1}", ("u", k)) for k in range(inputs)]
+    found += [(f"v of {name}", ("v", i)) for i, name in enumerate(names)]
+    measured = [f"y of {name}" for name in names] or [f"y {i + 1}" for i in range(outputs)]
+    return found + [(name, ("y", i)) for i, name in enumerate(measured)]
+
+
+def _difference(reference: Any, other: Any, name: str, column: int) -> float:
+    """Return the RMS difference of a signal, relative to the RMS of the reference."""
     count = min(len(reference), len(other))
-    one, two = reference[name][:count], other[name][:count]
+    one, two = (each[name][:count].reshape(count, -1)[:, column] for each in (reference, other))
     size, change = (float(np.sqrt(np.mean(np.square(each)))) for each in (one, two - one))
     if change == 0.0:
         return 0.0
@@ -613,7 +664,7 @@ def c(
     *,
     name: str = "controller",
     precision: str = "double",
-    plant: Plant | None = None,
+    plant: Any = None,
     scenario: Scenario | None = None,
     resolution: float | None = None,
     accept: bool = False,
@@ -641,7 +692,8 @@ def c(
     precision
         ``"double"`` or ``"single"``.
     plant, scenario
-        for single precision: the loop in which it is compared with double.
+        for single precision: the loop in which it is compared with double; of several axes with
+        a plant of as many signals.
     resolution
         of an encoder [y-unit per count]: adds ``NAME_step_counts``, which takes r and y as integers
         and computes with differences to the last count. For an ADRC without model of the position.
@@ -682,9 +734,7 @@ def c(
     check_folder(folder, checks.flag("overwrite", overwrite))
     checks.flag("accept", accept)
     checks.flag("proof", proof)
-    single = single or isinstance(controller, SinglePrecision)
-    if isinstance(controller, Axes | StateFeedback):
-        _check_options_of_several(controller, single, accept, plant, scenario)
+    single = single or is_in_single(controller)
     source = c_source(controller, name, precision=precision, resolution=resolution)
     comparison = None
     if single and plant is not None and scenario is not None:
@@ -696,28 +746,6 @@ def c(
     files = write_folder(folder, library_files(controller, source, vectors) | proving, overwrite)
     done = prove(Path(folder), source, sizes=_function_table(source)) if proof else None
     return Exported(Path(folder), files, source, comparison, done)
-
-
-def _check_options_of_several(
-    controller: Any,
-    single: bool,
-    accept: bool,
-    plant: Any,
-    scenario: Any,
-) -> None:
-    """Refuse what ``c`` does for one u and y only."""
-    what = f"{controller.outputs} axes" if controller.axes else "several signals"
-    if plant is not None or scenario is not None:
-        raise ValueError(
-            f"plant, scenario: the comparison of single with double precision is of controllers "
-            f"with one u and one y, these are {what}; leave them out and give accept=True"
-        )
-    if single and not accept:
-        raise ValueError(
-            f"precision = 'single': NOT compared with double precision, which is done for "
-            f"controllers with one u and one y, and these are {what}; compare each axis by itself "
-            "as an ADRC, then give accept=True"
-        )
 
 
 def _function_table(source: CSource) -> str:

@@ -100,17 +100,18 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
     """Return the function block, and the values of its README."""
     check_controller(controller, several=True)
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
-    if isinstance(controller, Axes):
+    given = in_double_precision(controller)
+    if isinstance(given, Axes):
         raise TranslationError(
             f"controller has {controller.outputs} axes: a function block is of one u and one y; "
             "export each axis by itself as an ADRC"
         )
-    if isinstance(controller, StateFeedback):
+    if isinstance(given, StateFeedback):
         raise TranslationError(
             "controller is StateFeedback: a function block is of one u and one y; use --to c"
         )
     _check_name(name)
-    learner = getattr(without_prefilters(in_double_precision(controller)), "learner", None)
+    learner = getattr(without_prefilters(given), "learner", None)
     if not isinstance(learner, NoLearner | None):
         raise TranslationError(
             f"learner = {type(learner).__name__}: learners have no Structured Text; leave it out "

@@ -14,6 +14,7 @@ import inspect
 import math
 import operator
 from collections.abc import Callable
+from math import prod
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -670,7 +671,7 @@ class Calls:
             raise body.fail(node, "calls a function by its address")
         given = arguments[1:]
         if origin.numbers is not None:
-            given = _with_numbers(given, origin.numbers, returns)
+            given = _with_numbers(given, origin.numbers, returns, self.program.literals.real)
         if origin.c_function is not None:
             return self._c_function(body, origin.c_function, given)
         if returns:
@@ -695,17 +696,25 @@ class Calls:
         return real
 
 
-def _with_numbers(given: list[Value], numbers: tuple[int, int], returns: bool) -> list[Value]:
+def _with_numbers(
+    given: list[Value], numbers: tuple[int, user_functions.Shapes], returns: bool, real: str
+) -> list[Value]:
     """Return arguments with the function's own parameters in place of the array of all of them.
 
-    The array is the last argument, or the last but one of a function that ``returns`` nothing.
+    The array is the last argument, or the last but one of a function that ``returns`` nothing. A
+    vector is a part of it, and a matrix such a part that is read as rows.
     """
-    first, count = numbers
+    first, shapes = numbers
     at = len(given) - (1 if returns else 2)
     array = given[at]
-    kind = array.kind.element
-    own = [
-        Value(kind, f"{array.at(ATOM)}[{i}]", ATOM, root=array.root, mutable=array.mutable)
-        for i in range(first, first + count)
-    ]
+    own = []
+    for shape in shapes:
+        element = f"{array.at(ATOM)}[{first}]"
+        kind = Array(shape, array.kind.element) if shape else array.kind.element
+        code = f"&{element}" if shape else element
+        if len(shape) > 1:
+            code = f"(const {real} (*)[{shape[1]}]){code}"
+        level = UNARY if shape else ATOM
+        own.append(Value(kind, code, level, root=array.root, mutable=array.mutable))
+        first += prod(shape)
     return [*given[:at], *own, *given[at + 1 :]]

@@ -1,0 +1,511 @@
+"""Controllers side by side over seeds: of one axis or several, with intervals.
+
+Each controller runs through the scenario once for each seed, so all meet the same noise and random
+disturbances. A criterion c of an axis then is compared in pairs: with ``d_s = ln c_B − ln c_A`` for
+seed s, its mean and Student's t for the mean of the d_s give the share by which A is lower, with an
+interval (``monitoring.rank.decide``). The level is shared by all pairs of controllers, axes and
+windows (Bonferroni), so that in 95 % of all cases no controller is called better that is not.
+
+*All axes together* are the geometric mean of the axes' ratios, as their criteria have different
+units: d_s is the mean over the axes. Without anything random in the scenario there is one run of
+each controller, and differences are what they are in this scenario.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+from quell.controllers.base import check_controller
+from quell.experiments.common import save_figures
+from quell.files import nonfinite_to_none
+from quell.monitoring.rank import decide
+from quell.parallel import in_parallel, part_of
+from quell.plants.base import signals_of
+from quell.records.metrics import MEASURES
+from quell.records.plotting import given_axes, grid_of_axes, new_figure
+from quell.setup.axes import signals_in
+from quell.setup.description import is_of_axes
+from quell.setup.loading import Setup
+from quell.simulation import Scenario, simulate
+from quell.simulation.driver import is_random
+from quell.sweeping.measures import Measure, measure_run
+from quell.sweeping.sweep import share_interval
+from quell.tuning.simulated.problem import half_width_of_mean
+from quell.types import Vector
+
+CRITERIA = {"rms": "RMS error", "iae": "∫|error|", "peak_error": "largest |error|"}
+"""Measures by which controllers are compared, with their names in sentences."""
+ALL_AXES = "all axes"
+"""Name of the verdict on all axes together."""
+# Seeds by default: with ten, differences of a third of their spread are decided for two axes.
+SEEDS = 10
+# Without seeds a smaller difference is called alike: no model is as exact. Chosen by hand.
+_ALIKE = 1e-3
+
+# ---- Verdicts ----
+
+
+class Pair(NamedTuple):
+    """How much lower the criterion of one controller is than that of another."""
+
+    better: str  #: the one with the lower criterion, whether that is decided or not
+    other: str
+    lower: float  #: share by which ``better`` is lower than ``other``
+    least: float  #: lower end of the interval of ``lower``; negative if it may be higher
+    most: float  #: upper end
+    decided: bool  #: whether ``better`` is better
+    needed: int  #: seeds that would decide a difference like this; 0 if far too many, or decided
+
+
+class Verdict(NamedTuple):
+    """Which controller is best for an axis, or for all axes, in a window of time."""
+
+    axis: str  #: its name; ``ALL_AXES``; "" if there is one axis only
+    start: float  #: begin of the window [s]
+    stop: float  #: its end [s]
+    first: str | None  #: the lowest criterion; None if all diverged
+    pairs: tuple[Pair, ...]  #: all pairs of those that never diverged, those with ``first`` first
+
+    @property
+    def best(self) -> str | None:
+        """The controller that is better than each other one; None if that is not decided."""
+        decided = all(pair.decided for pair in self.pairs if pair.better == self.first)
+        return self.first if decided else None
+
+    def describe(self, criterion: str, seeds: int) -> list[str]:
+        """Return lines, of which those that begin with NOT decide nothing."""
+        where = f"{self.axis}, " if self.axis else ""
+        where += f"{self.start:g} to {self.stop:g} s"
+        if self.first is None:
+            return [f"NOT decided: {where}: all diverged"]
+        what, exact = CRITERIA[criterion], seeds == 1
+        lower: dict[str, list[str]] = {}
+        undecided = []
+        for pair in self.pairs:
+            ends = "" if exact else f" ({100.0 * pair.least:.3g} to {100.0 * pair.most:.3g} %)"
+            share = f"{100.0 * pair.lower:.3g} %{ends}"
+            if pair.decided:
+                lower.setdefault(pair.better, []).append(f"{share} lower than of {pair.other}")
+            elif pair.better == self.first:
+                remedy = "alike" if exact else f"alike, as far as {seeds} seeds show"
+                remedy = f"give {pair.needed} seeds" if pair.needed else remedy
+                text = f"{self.first} and {pair.other} differ by {share} in {what}"
+                undecided.append(f"NOT decided: {where}: {text}: {remedy}")
+        if not self.pairs:
+            return [f"{where}: {self.first} is the only one that never diverged"]
+        lines = []
+        for better, shown in lower.items():
+            word = "best is " if better == self.best else ""
+            lines.append(f"{where}: {word}{better}: {what} {', '.join(shown)}")
+        return lines + undecided
+
+
+@dataclass(frozen=True)
+class SeedComparison:
+    """Controllers over seeds: the measures of all runs, and verdicts."""
+
+    names: tuple[str, ...]  #: of the controllers
+    axes: tuple[str, ...]  #: names of the axes; one empty name if there is one axis
+    windows: tuple[tuple[float, float], ...]  #: begin and end of each [s]
+    seeds: tuple[int, ...]  #: one if nothing in the scenario is random
+    criterion: str
+    #: each measure by its name (controllers, windows, axes, seeds), NaN where a run diverged or has
+    #: none
+    values: Mapping[str, NDArray[np.float64]]
+    diverged: NDArray[np.bool_]  #: which runs diverged (controllers, seeds)
+    verdicts: tuple[Verdict, ...]  #: for each window the axes and, of several, all together
+    units: tuple[str, ...] = ()  #: unit of the y of each axis, empty if it is not known
+    notes: tuple[str, ...] = field(default=())
+
+    def mean(self, measure: str, name: str, window: int, axis: int) -> tuple[float, float]:
+        """Return mean and half of the 95 % interval of a measure; NaN where there is none."""
+        found = self.values[measure][self.names.index(name), window, axis]
+        known = bool(np.all(np.isfinite(found)))
+        half = half_width_of_mean(found) if known and found.size > 1 else math.nan
+        return (float(np.mean(found)) if known else math.nan), half
+
+    def ratio(self, name: str, window: int) -> tuple[float, float]:
+        """Return the geometric mean of the axes' ratios to the first controller.
+
+        With half of its 95 % interval; NaN for one that diverged.
+        """
+        d = _logarithms(self.values[self.criterion])[:, window].mean(axis=1)
+        d = d[self.names.index(name)] - d[0]
+        ratio = math.exp(float(np.mean(d)))
+        half = half_width_of_mean(d) if d.size > 1 and np.all(np.isfinite(d)) else math.nan
+        return ratio, ratio * half
+
+    def describe(self) -> str:
+        """Return the verdicts as text: which is best for each axis, and NOT where that is open."""
+        count = len(self.seeds)
+        lines = [line for each in self.verdicts for line in each.describe(self.criterion, count)]
+        for name, lost in zip(self.names, self.diverged, strict=True):
+            if found := int(np.sum(lost)):
+                low, high = (100.0 * end for end in share_interval(found, count))
+                share = f", {low:.3g} to {high:.3g} % of all" if count > 1 else ""
+                lines.append(f"NOT stable: {name} diverged in {found} of {count} runs{share}")
+        if count == 1:
+            lines.append(
+                "NOT shown for other noise and disturbances: nothing in the scenario is random, so "
+                "there is one run of each; add noise or random disturbances, and give seeds"
+            )
+        return "\n".join([*lines, *self.notes])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all numbers for JSON."""
+        value = {
+            "criterion": self.criterion,
+            "controllers": list(self.names),
+            "axes": list(self.axes),
+            "windows": [list(window) for window in self.windows],
+            "seeds": list(self.seeds),
+            "diverged": self.diverged.tolist(),
+            "values": {name: array.tolist() for name, array in self.values.items()},
+            "verdicts": [
+                verdict._asdict()
+                | {"best": verdict.best, "pairs": [pair._asdict() for pair in verdict.pairs]}
+                for verdict in self.verdicts
+            ],
+            "report": self.describe().splitlines(),
+        }
+        return dict(nonfinite_to_none(value))
+
+
+# ---- The runs ----
+
+
+def over_seeds(
+    plant: Any,
+    controllers: Mapping[str, Any],
+    scenario: Scenario,
+    *,
+    seeds: int | None = None,
+    windows: Sequence[Mapping[str, Any]] = (),
+    criterion: str = "rms",
+    confidence: float = 0.95,
+    progress: Callable[[float], None] | None = None,
+) -> SeedComparison:
+    """Run controllers on a plant through a scenario, once for each seed, and decide which is best.
+
+    Parameters
+    ----------
+    plant, scenario
+        as for ``simulate``; the seeds are that of the scenario and those that follow it.
+    controllers
+        by name, two or more: all of one axis, or all ``quell.Axes`` of the same axes; with any
+        sample times.
+    seeds
+        number of seeds; by default 10, or one where nothing in the scenario is random.
+    windows
+        begin and end [s] of the windows that are judged, as ``{"start": 4.0, "stop": 9.0}``; also
+        ``target`` and ``band`` as those of ``Trajectory.metrics``. By default one from the last
+        start from rest on.
+    criterion
+        ``"rms"``, ``"iae"`` or ``"peak_error"`` of r − y; lower is better.
+    confidence
+        probability with which all verdicts hold together.
+    progress
+        called with the finished share, 0 to 1.
+
+    Returns
+    -------
+    SeedComparison
+        with all ``MEASURES`` of each run, axis and window, and verdicts that begin with NOT where
+        the seeds do not decide. u of an axis of several is its v.
+
+    Raises
+    ------
+    ValueError
+        for fewer than two controllers, controllers of different axes, a window without samples,
+        several seeds where nothing is random, one where something is, and what ``simulate`` raises.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> lag = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
+    >>> noisy = ql.Scenario(1.0, 5.0, noise=ql.signals.BandLimitedNoise(1e-6, 0.01))
+    >>> some = {"slow": ql.baselines.PID(kp=2.0, ki=2.0, dt=0.01)}
+    >>> some["quick"] = ql.baselines.PID(kp=6.0, ki=6.0, dt=0.01)
+    >>> over_seeds(lag, some, noisy).verdicts[0].best
+    'quick'
+    """
+    checks.one_of("criterion", criterion, tuple(CRITERIA))
+    confidence = checks.positive("confidence", confidence)
+    if confidence >= 1.0:
+        raise ValueError(f"confidence = {confidence!r}: must be below 1, such as 0.95")
+    if len(controllers) < 2:
+        raise ValueError(f"controllers has {len(controllers)}: give two or more to compare")
+    axes = _axes_of(controllers)
+    numbers = _seeds(scenario, seeds)
+    judged = _windows(scenario, windows)
+    measures = {
+        f"{i}.{axis}.{name}": Measure(name, **window, axis=axis)
+        for i, window in enumerate(judged)
+        for axis in axes
+        for name in MEASURES
+    }
+
+    def run(controller: Any, seed: int) -> tuple[dict[str, float], bool]:
+        found = simulate(plant, controller, replace(scenario, seed=seed))
+        return measure_run(found, measures), bool(found.diverged)
+
+    made = [*controllers.values()]
+    # The first seed of each compiles what is not compiled yet; the others then only run.
+    total = len(made) * len(numbers)
+    results: list[tuple[dict[str, float], bool]] = []
+    for batch in (numbers[:1], numbers[1:]):
+        jobs = [partial(run, controller, seed) for seed in batch for controller in made]
+        share = part_of(progress, len(results), len(results) + len(jobs), total)
+        results += in_parallel(jobs, share) if jobs else []
+    shape = len(numbers), len(made), len(judged), len(axes), len(MEASURES)
+    table = np.array([[found[name] for name in measures] for found, _ in results]).reshape(shape)
+    diverged = np.array([lost for _, lost in results]).reshape(shape[:2])
+    table[diverged] = np.nan
+    values = {name: np.moveaxis(table[..., k], 0, -1) for k, name in enumerate(MEASURES)}
+    spans = tuple(_span(window, scenario.duration) for window in judged)
+    names = tuple(controllers)
+    verdicts = _verdicts(
+        names, axes, spans, values[criterion], diverged.T, _level(confidence, names, axes, spans)
+    )
+    return SeedComparison(names, axes, spans, numbers, criterion, values, diverged.T, verdicts)
+
+
+def _axes_of(controllers: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the axes, which all controllers have; ``("",)`` of one axis."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name, controller in controllers.items():
+        if hasattr(controller, "inputs"):  # of several signals
+            found[name] = tuple(getattr(controller, "names", ()))
+            if not found[name]:
+                rule = "has no axes; compare quell.Axes, or controllers of one axis"
+                raise ValueError(f"controllers[{name!r}] = {controller!r:.60}: {rule}")
+        else:
+            check_controller(controller, f"controllers[{name!r}]")
+            found[name] = ("",)
+    (first, axes), *others = found.items()
+    for name, each in others:
+        if each != axes:
+            texts = [", ".join(some) if some != ("",) else "one axis" for some in (axes, each)]
+            raise ValueError(
+                f"{name} has {texts[1]}, {first} {texts[0]}: must have the same axes, in this order"
+            )
+    return axes
+
+
+def _seeds(scenario: Scenario, seeds: int | None) -> tuple[int, ...]:
+    """Return the seeds of the runs."""
+    random = is_random(scenario)
+    count = (SEEDS if random else 1) if seeds is None else checks.whole("seeds", seeds, 1)
+    if random and count == 1:
+        rule = "one run cannot tell luck from better; give two or more, or leave it out"
+        raise ValueError(f"seeds = 1: {rule}")
+    if not random and count > 1:
+        rule = (
+            "nothing in the scenario is random, so all runs would be one; add noise or random "
+            "disturbances, or leave it out"
+        )
+        raise ValueError(f"seeds = {count}: {rule}")
+    return tuple(range(scenario.seed, scenario.seed + count))
+
+
+def _windows(
+    scenario: Scenario, windows: Sequence[Mapping[str, Any]]
+) -> tuple[dict[str, Any], ...]:
+    """Return the windows, each with a begin within the scenario."""
+    rests = [float(time) for time in scenario.rest_at]
+    found = tuple(dict(window) for window in windows) or ({"start": rests[-1] if rests else 0.0},)
+    for i, window in enumerate(found):
+        if window.get("start", 0.0) >= scenario.duration:
+            rule = f"must be less than the scenario's duration, {scenario.duration:g} s"
+            raise ValueError(f"windows[{i}].start = {window['start']:g}: {rule}")
+    return found
+
+
+def _span(window: Mapping[str, Any], duration: float) -> tuple[float, float]:
+    stop = window.get("stop")
+    return float(window.get("start", 0.0)), duration if stop is None else min(stop, duration)
+
+
+def _level(confidence: float, names: Sequence[Any], axes: Sequence[Any], spans: Any) -> float:
+    """Return the level of each of the comparisons, so that all hold together."""
+    each = len(axes) + (len(axes) > 1)
+    return (1.0 - confidence) / (len(list(combinations(names, 2))) * each * len(spans))
+
+
+def _logarithms(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the logarithms of a criterion, of zero that of the smallest number."""
+    logarithms: NDArray[np.float64] = np.log(np.maximum(values, np.finfo(np.float64).tiny))
+    return logarithms
+
+
+def _verdicts(
+    names: tuple[str, ...],
+    axes: tuple[str, ...],
+    spans: Sequence[tuple[float, float]],
+    values: NDArray[np.float64],
+    diverged: NDArray[np.bool_],
+    level: float,
+) -> tuple[Verdict, ...]:
+    """Return the verdicts of ``values`` (controllers, windows, axes, seeds) of the criterion."""
+    stable = [i for i in range(len(names)) if not np.any(diverged[i])]
+    logarithms = _logarithms(values)
+    found = []
+    for k, span in enumerate(spans):
+        rows = {name: logarithms[:, k, i] for i, name in enumerate(axes)}
+        if len(axes) > 1:
+            rows[ALL_AXES] = logarithms[:, k].mean(axis=1)
+        for axis, row in rows.items():
+            order = sorted(stable, key=lambda i: float(np.mean(row[i])))
+            pairs = tuple(
+                _pair(names[i], names[j], row[j] - row[i], level) for i, j in combinations(order, 2)
+            )
+            first = names[order[0]] if order else None
+            found.append(Verdict(axis, *span, first, pairs))
+    return tuple(found)
+
+
+def _pair(better: str, other: str, d: Vector, level: float) -> Pair:
+    """Compare two controllers by the logarithms of their ratio (seeds,)."""
+    middle = float(np.mean(d))
+    if d.size == 1:
+        lower = -math.expm1(-middle)
+        return Pair(better, other, lower, lower, lower, lower > _ALIKE, 0)
+    spread = float(np.std(d, ddof=1)) / math.sqrt(d.size)
+    found = decide(middle, spread, d.size - 1.0, level)
+    lower, least, most = (-math.expm1(-each) for each in found.ends)
+    open_ = not found.decided and not math.isnan(found.enough)
+    needed = math.ceil(max(found.enough, 1.1) * d.size) if open_ else 0
+    return Pair(better, other, lower, least, most, found.decided, needed)
+
+
+# ---- Setups ----
+
+
+def of_setups(
+    setups: Mapping[str, Setup],
+    *,
+    seeds: int | None = None,
+    criterion: str = "rms",
+    progress: Callable[[float], None] | None = None,
+) -> SeedComparison:
+    """Compare the controllers of setups on the plant and in the scenario of the first.
+
+    Parameters
+    ----------
+    setups
+        by name, two or more; all of one axis, or all of the same axes. Where another one has a
+        plant, a scenario, references or windows of its own that differ, a note that begins with NOT
+        says that they are not used.
+    seeds, criterion, progress
+        as for ``over_seeds``; the windows are those of [[metrics]].
+    """
+    if len(setups) < 2:
+        raise ValueError(f"setups has {len(setups)}: give two or more to compare")
+    (name, first), *others = setups.items()
+    plant, scenario = first.needed("plant"), first.needed("scenario")
+    controllers = {key: setup.controller for key, setup in setups.items()}
+    how: dict[str, Any] = {"seeds": seeds, "criterion": criterion, "progress": progress}
+    found = over_seeds(plant, controllers, scenario, windows=first.windows, **how)
+    given = first.tables()
+    notes = []
+    for key, setup in others:
+        unlike = [what for what in _task(given) if _unlike(what, given, setup.tables())]
+        if unlike:
+            its = ", ".join(unlike)
+            notes.append(f"NOT its own {its}: {key} runs with the {its} of {name}, as all do")
+    if is_of_axes(given):
+        signals = signals_in(first.description, first.controller)
+        units = tuple(each.unit for each in signals.y)
+    else:
+        units = (signals_of(plant).y.unit,)
+    return replace(found, units=units, notes=tuple(notes))
+
+
+def _task(given: Mapping[str, Any]) -> tuple[str, ...]:
+    of_axes = ("reference", "noise") if is_of_axes(given) else ()
+    return "plant", "scenario", "metrics", *of_axes
+
+
+def _unlike(what: str, given: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether another setup has a task of its own, that differs."""
+    if what not in ("reference", "noise"):
+        return what in other and other[what] != given.get(what)
+    own, its = ([axis.get(what) for axis in tables["axis"]] for tables in (given, other))
+    return any(b is not None and b != a for a, b in zip(own, its, strict=False))
+
+
+# ---- The figure ----
+
+
+def draw(result: SeedComparison, axes: Any = None, *, ax: Any = None) -> Any:
+    """Draw the criterion of each controller: a dot for each seed, the mean and its 95 % interval.
+
+    Parameters
+    ----------
+    result
+        of ``over_seeds``.
+    axes, ax
+        matplotlib axes, a row for each window, a column for each axis; a new figure by default.
+
+    Returns
+    -------
+    numpy.ndarray
+        the axes (windows, axes).
+    """
+    rows, columns = len(result.windows), len(result.axes)
+    make = partial(new_figure, 1.5 + 3.0 * columns, 0.8 + 2.6 * rows)
+    grid = grid_of_axes(given_axes(axes, ax), make, rows, columns)
+    unit = "{}" if result.criterion != "iae" else "{} s"
+    for k, i in product(range(rows), range(columns)):
+        here, axis = grid[k, i], result.axes[i]
+        for j, name in enumerate(result.names):
+            values = result.values[result.criterion][j, k, i]
+            spread = np.linspace(-0.15, 0.15, values.size) if values.size > 1 else [0.0]
+            here.plot(j + np.asarray(spread), values, ".", color=f"C{j}", alpha=0.4)
+            middle, half = result.mean(result.criterion, name, k, i)
+            if math.isfinite(middle):
+                reach = half if math.isfinite(half) else 0.0
+                here.errorbar(j, middle, reach, fmt="o", capsize=4, color=f"C{j}")
+        here.set_xticks(range(len(result.names)), result.names)
+        here.set_ylim(bottom=0.0)
+        here.grid(alpha=0.3)
+        start, stop = result.windows[k]
+        where = f"{axis}, " if axis else ""
+        here.set_title(f"{where}{start:g} to {stop:g} s", fontsize="medium")
+        known = f" [{unit.format(result.units[i])}]" if result.units and result.units[i] else ""
+        here.set_ylabel(f"{CRITERIA[result.criterion]}{known}")
+    return grid
+
+
+def save(
+    result: SeedComparison,
+    folder: str | os.PathLike[str],
+    overwrite: bool = False,
+    name: str = "over-seeds",
+) -> list[Path]:
+    """Write the figure into ``folder``, created if missing; return the paths."""
+    return save_figures({name: partial(draw, result)}, folder, overwrite=overwrite)
+
+
+__all__ = [
+    "ALL_AXES",
+    "CRITERIA",
+    "Pair",
+    "SeedComparison",
+    "Verdict",
+    "draw",
+    "of_setups",
+    "over_seeds",
+    "save",
+]

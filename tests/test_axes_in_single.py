@@ -1,0 +1,187 @@
+"""Several axes, and state feedback, in single precision: runs, steps, and the comparison."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.controllers import in_single_precision
+from quell.controllers.stateful import named_arrays
+from quell.export import c_source
+from quell.export.library.exported import compared
+
+from . import gain_functions
+from .test_axes_export import ROWS, SINGLE, WIDE, joint, three
+from .test_state_space import controller as feedback
+from .test_state_space import drive
+
+
+def plant(gain: Any) -> Any:
+    """Return axes with springs and friction, which the others move, too."""
+    n, m = np.shape(gain)
+    A, B = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m))
+    A[:n, n:], A[n:, :n] = np.eye(n), 0.5 - 4.0 * np.eye(n)
+    A[n:, n:], B[n:] = -0.2 * np.eye(n), 1.1 * np.asarray(gain)
+    return ql.plants.MultivariableLinearPlant(A, B, np.eye(2 * n)[:n])
+
+
+def scenario(controller: Any, duration: float = 0.12, **parts: Any) -> ql.Scenario:
+    """Return references that move, with noise and a start from rest in the middle."""
+    count = controller.references
+    moves = tuple(ql.signals.Sinusoid(0.3, 2.0 + i) for i in range(count))
+    noise = ql.signals.BandLimitedNoise(1e-12, 1e-3)
+    return ql.Scenario(moves, duration=duration, rest_at=(0.08,), noise=noise, **parts)
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_axes_in_single_precision_do_what_they_do_in_double(name: str) -> None:
+    """Their state and u are single throughout; ``precision`` of ``simulate`` is the same run."""
+    axes = ROWS[name]()
+    parts = plant(axes.first_gain), in_single_precision(axes), scenario(axes)
+    run, double = ql.simulate(*parts), ql.simulate(parts[0], axes, parts[2])
+    for each, array in named_arrays(run.final_state).items():
+        assert array.dtype != np.float64, f"{each} is double"
+    assert np.array_equal(run["u"], run["u"].astype(np.float32))
+    assert run.status == double.status
+    difference = run["u"] - double["u"]
+    assert np.any(difference != 0.0)
+    assert np.sqrt(np.mean(difference**2)) < 1e-3 * np.sqrt(np.mean(double["u"] ** 2))
+    again = ql.simulate(parts[0], axes, parts[2], precision="single")
+    np.testing.assert_array_equal(again.log, run.log)
+
+
+def test_a_step_in_python_gives_the_u_of_the_run() -> None:
+    """Bit by bit, with feedforward and learners; a copy and an image go on in the same way."""
+    axes = ROWS["each, with rates"]()
+    single = in_single_precision(axes)
+    given = ql.Scenario((0.2, 0.3, -0.1), duration=0.03)
+    run = ql.simulate(plant(axes.first_gain), single, given)
+    flags = ql.Status.OK
+    for k in range(len(run)):
+        u = single.step(run["r"][k], run["y_measured"][k])
+        np.testing.assert_array_equal(u, run["u"][k])
+        flags |= single.status
+    assert flags == run.status
+    assert u.dtype == np.float64
+    other = in_single_precision(axes)
+    other.restore(single.memory(), running=True)
+    signals = run["r"][-1], run["y_measured"][-1] + 1e-3
+    twin = copy.copy(single)
+    found = [each.step(*signals).tolist() for each in (single, other, twin)]
+    assert found[0] == found[1] == found[2]
+    assert single.estimates["elbow"].x.dtype == np.float32
+
+
+def test_axes_in_single_precision_start_are_tracked_and_get_other_limits() -> None:
+    """As those in double precision, to the digits of single."""
+    axes = ROWS["priority"]()
+    both = axes, in_single_precision(axes)
+    zero, u = np.zeros(3), [0.5, -0.25, 1.0]
+    found = []
+    for each in both:
+        each.start([0.1, 0.2, 0.3], u, [0.1, 0.2, 0.3])
+        rows = [each.step([0.1, 0.2, 0.3], [0.1, 0.2, 0.3])]
+        each.track(zero, [0.1, 0.2, 0.3], u)
+        each.hand_over()
+        rows.append(each.step(zero, [0.1, 0.2, 0.3]))
+        each.set_limits(u_max=0.125)
+        rows.append(each.step([1.0, 1.0, 1.0], [0.1, 0.2, 0.3]))
+        each.applied(zero)
+        rows.append(each.step([1.0, 1.0, 1.0], [0.1, 0.2, 0.3]))
+        found.append(np.array(rows))
+    np.testing.assert_allclose(found[1], found[0], rtol=2e-5, atol=2e-5)
+    assert np.max(found[1][2:]) == 0.125
+    with pytest.raises(ValueError, match="hand_over: there was no sample yet"):
+        in_single_precision(axes).hand_over()
+
+
+def test_state_feedback_in_single_precision_does_what_it_does_in_double() -> None:
+    """In a loop, with a start; it has no axes to track."""
+    law = feedback(u_max=0.5)
+    single = in_single_precision(law)
+    given = ql.Scenario(0.3, duration=0.3)
+    run, double = ql.simulate(drive(), single, given), ql.simulate(drive(), law, given)
+    assert np.array_equal(run["u"], run["u"].astype(np.float32))
+    assert 0.0 < np.max(np.abs(run["u"] - double["u"])) < 1e-3
+    for each in (law, single):
+        each.start([0.2, 0.2], [0.0], [0.2])
+    assert single.step([0.2], [0.2, 0.2])[0] == pytest.approx(0.0, abs=1e-5)
+    with pytest.raises(ValueError, match="track: is of axes; StateFeedback has none"):
+        single.track([0.2], [0.2, 0.2], [0.0])
+
+
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: ql.Axes([joint(), joint()], gain_functions.nested_tuples), "B0 or M is a function"),
+    (lambda: ql.Axes(three(), WIDE), "4 actuators for 3 axes"),
+])  # fmt: skip
+def test_what_single_precision_can_not_do_is_named(make: Any, message: str) -> None:
+    """In a run as in C."""
+    with pytest.raises(ValueError, match=message):
+        in_single_precision(make())
+
+
+def test_the_code_of_axes_in_single_precision_is_that_of_the_axes_in_single() -> None:
+    """``quell.export`` takes both, and what has no counterpart in another form is refused."""
+    axes = ROWS["priority"]()
+    single = in_single_precision(axes)
+    assert c_source(single, "robot") == c_source(axes, "robot", precision="single")
+    with pytest.raises(ValueError, match="several axes take y in its unit"):
+        c_source(single, resolution=1e-3)
+
+
+def test_the_comparison_has_figures_of_each_axis_and_actuator(tmp_path: Path) -> None:
+    """The largest decides; a few units of the last digit are written."""
+    axes = ROWS["priority"]()
+    given = plant(axes.first_gain), axes, scenario(axes, duration=0.2)
+    found = compared(*given)
+    names = ("shoulder", "elbow", "wrist")
+    assert [each.name for each in found.each] == [
+        *(f"u of actuator {k}" for k in (1, 2, 3)),
+        *(f"{signal} of {name}" for signal in "vy" for name in names),
+    ]
+    assert found.u == max(each.single for each in found.each[:3])
+    assert found.y == max(each.single for each in found.each[6:])
+    assert all(0.0 < each.single < 1e-4 for each in found.each)
+    assert all(each.noise is not None and each.noise > each.single for each in found.each)
+    done = ql.export.c(axes, tmp_path / "out", name="robot", precision="single",
+                       plant=given[0], scenario=given[2])  # fmt: skip
+    assert done.comparison == found
+
+
+def test_single_precision_that_changes_u_of_one_actuator_too_much_is_refused(
+    tmp_path: Path,
+) -> None:
+    """The message names the actuator, and the axis whose omega_o is too high; nothing is written."""
+    fast = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=300.0, dt=1e-3), 10.0)
+    chain = np.diag(np.ones(5), 1)
+    chain[1] = chain[5] = 0.0
+    B = np.zeros((6, 2))
+    B[1, 0] = B[5, 1] = 1.0
+    machine = ql.plants.MultivariableLinearPlant(chain, B, np.eye(6)[[0, 2]])
+    axes = ql.Axes({"slow": joint(), "fast": fast})
+    run = ql.Scenario(tuple(ql.signals.Sinusoid(1.0, 3.0) for _ in range(2)), duration=0.5)
+    options: dict[str, Any] = {"precision": "single", "plant": machine, "scenario": run}
+    with pytest.raises(ValueError, match=r"changes u of actuator 2 by .* a lower omega_o of fast"):
+        ql.export.c(axes, tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+    done = ql.export.c(axes, tmp_path / "out", accept=True, **options)
+    assert done.comparison is not None
+    assert done.comparison.u > 0.01
+    assert done.comparison.each[0].single < 1e-3
+
+
+@pytest.mark.compiled
+@pytest.mark.slow
+def test_compiled_axes_in_single_precision_differ_from_interpreted_ones_by_rounding() -> None:
+    """Compiled code uses fused operations."""
+    axes = ql.Axes([joint(), joint()], [[1.0, 0.3], [0.2, 2.0]], u_min=-20.0, u_max=20.0)
+    given = plant(axes.first_gain), axes, scenario(axes, duration=0.2)
+    compiled = ql.simulate(*given, precision="single")
+    plain = ql.simulate(*given, precision="single", interpret=True)
+    assert np.array_equal(compiled["u"], compiled["u"].astype(np.float32))
+    np.testing.assert_allclose(compiled["u"], plain["u"], rtol=0.0, atol=1e-4)
