@@ -1,6 +1,6 @@
 """Several axes: an arm with and without its mass matrix, arms of MuJoCo, a quadrotor, and the cost.
 
-    python benchmarks/axes.py [--part arm|draws|learners|mujoco|quadrotor|cost] [--draws 100]
+    python benchmarks/axes.py [--part arm|draws|learners|mujoco|quadrotor|yaw|cost] [--draws 100]
                               [--seed 7]
 
 *arm*: random rigid two-link arms (those of ``quell stress --loops axes``) that follow sines,
@@ -22,6 +22,10 @@ up to 30 % off. One ``Axes`` with B0 of the attitude, roll and pitch before yaw,
 single loops, each with the limits of its torque, whose torques are mixed and cut behind them. RMS
 of the error against the response that the design asks for, all angles.
 
+*yaw*: the same draws: the least RMS of yaw that the rotors allow, for a level craft, with its
+inertia and the lag of its rotors known: at each step of the reference, not before, u is planned
+for what is left of the response that the design asks for, with all of the torque for yaw.
+
 *draws*: processor time to make each of some drawn arms and its ``Axes`` with M(q) and to take the
 first samples, and that of a sample in the loop.
 
@@ -39,6 +43,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.linalg import expm, toeplitz
+from scipy.optimize import lsq_linear
 from scipy.signal import lsim
 
 import quell as ql
@@ -297,6 +303,8 @@ def part_mujoco(draws: int, seed: int) -> None:
 
 ATTITUDE = {"roll": (8.0, 40.0), "pitch": (8.0, 40.0), "yaw": (6.0, 30.0)}
 TARGETS = (0.7, 0.7, 0.8)  # largest angles [rad]
+INERTIA = np.array([0.012, 0.012, 0.022])  # [kg m²]
+HOVER, LEAST, MOST = 2.5, 0.2, 6.0  # thrusts of a rotor [N]
 
 
 def moves(rng: Any, size: float) -> Any:
@@ -309,24 +317,28 @@ def moves(rng: Any, size: float) -> Any:
     )
 
 
+def drawn_flight(seed: int, i: int) -> tuple[Any, ql.Scenario]:
+    """Return B0 of the level craft as the controllers have it, and what it flies through."""
+    rng = np.random.default_rng([seed, i])
+    level = rotor_levers(0.17, 0.015) / (INERTIA * rng.uniform(0.7, 1.3, 3))[:, None]
+    gusts = [ql.signals.Sinusoid(0.05, float(rng.uniform(2.0, 8.0))) for _ in range(2)]
+    return level, ql.Scenario(
+        [moves(rng, size) for size in TARGETS], duration=20.0, disturbances=gusts,
+        x0=[0.0] * 6 + [HOVER] * 4, seed=i,
+    )  # fmt: skip
+
+
 def part_quadrotor(draws: int, seed: int) -> None:
     """Print the RMS of Axes over that of three single loops, all angles."""
     ratios, roll_and_pitch = [], []
-    hover, most = 2.5, 6.0
+    hover, most = HOVER, MOST
     for i in range(draws):
-        rng = np.random.default_rng([seed, i])
-        true = np.array([0.012, 0.012, 0.022])
-        craft = ql.plants.quadrotor_attitude(true)
-        level = rotor_levers(0.17, 0.015) / (true * rng.uniform(0.7, 1.3, 3))[:, None]
-        gusts = [ql.signals.Sinusoid(0.05, float(rng.uniform(2.0, 8.0))) for _ in range(2)]
-        scenario = ql.Scenario(
-            [moves(rng, size) for size in TARGETS], duration=20.0, disturbances=gusts,
-            x0=[0.0] * 6 + [hover] * 4, seed=i,
-        )  # fmt: skip
+        level, scenario = drawn_flight(seed, i)
+        craft = ql.plants.quadrotor_attitude(INERTIA)
         axes = {name: joint(omega_c=c, omega_o=o) for name, (c, o) in ATTITUDE.items()}
         controller = ql.Axes(
             axes, partial(gain_of_attitude, level=level), saturation=["roll", "pitch", "yaw"],
-            u_min=0.2, u_max=most, wished=[hover] * 4,
+            u_min=LEAST, u_max=most, wished=[hover] * 4,
         )  # fmt: skip
         run = ql.simulate(craft, controller, scenario)
         asked = np.stack(
@@ -383,12 +395,40 @@ def single_loops(craft: Any, B0: Any, r: Any, scenario: Any, hover: float, most:
         measure_all(model, x, y)
         angles[k] = y
         v = np.array([loop.step(r[k, i], y[i]) for i, loop in enumerate(loops)])
-        u = np.clip(hover + mixer @ v, 0.2, most)
+        u = np.clip(hover + mixer @ v, LEAST, most)
         advance(model, x, scratch, t[k], u, w[k])
         if not np.all(np.abs(x) < 1e6):
             angles[k:] = 10.0
             break
     return angles
+
+
+def part_yaw(draws: int, seed: int, dt: float = 0.02, ahead: float = 3.0) -> None:
+    """Print the least RMS of yaw of each draw."""
+    torque = 2.0 * (MOST - LEAST) * 0.015
+    plant, design = np.zeros((4, 4)), np.zeros((3, 3))
+    plant[0, 1], plant[1, 2], plant[2, 2:] = 1.0, 1.0 / INERTIA[2], (-50.0, 50.0 * torque)
+    omega = ATTITUDE["yaw"][0]
+    design[0, 1], design[1] = 1.0, (-(omega**2), -2.0 * omega, omega**2)
+    A, B, ask = expm(plant * dt)[:3, :3], expm(plant * dt)[:3, 3], expm(design * dt)[:2]
+    size = int(ahead / dt)
+    pulse, x = np.zeros(size), B
+    for k in range(size):
+        pulse[k], x = x[0], A @ x
+    H = np.tril(toeplitz(pulse))
+    for i in range(draws):
+        r = drawn_flight(seed, i)[1].reference[2](dt * np.arange(int(20.0 / dt)))
+        x, f, u, missed = np.zeros(3), np.zeros(2), np.zeros(0), []
+        for k, now in enumerate(r):
+            missed.append(f[0] - x[0])
+            if u.size == 0 or now != r[k - 1]:
+                rest, free, asked = x, f, []
+                for _ in range(size):
+                    rest, free = A @ rest, ask @ np.append(free, now)
+                    asked.append(free[0] - rest[0])
+                u = lsq_linear(H, asked, (-1.0, 1.0), method="bvls", max_iter=500).x
+            x, f, u = A @ x + B * u[0], ask @ np.append(f, now), u[1:]
+        print(f"draw {i}: RMS of yaw at best {np.sqrt(np.mean(np.square(missed))):.4f} rad")
 
 
 # ---- The cost ----
@@ -447,6 +487,7 @@ PARTS: dict[str, Any] = {
     "learners": part_learners,
     "mujoco": part_mujoco,
     "quadrotor": part_quadrotor,
+    "yaw": part_yaw,
     "cost": part_cost,
 }
 

@@ -129,6 +129,26 @@ def test_b0_that_is_off_is_designed_for_and_checked() -> None:
     assert "NOT known for another B0" not in found.summary()
 
 
+def test_steps_that_the_limits_of_u_do_not_allow_are_named() -> None:
+    """A larger step of the reference meets the limits at once, a smaller one does not."""
+    made = copy.copy(tuned().controller)
+    assert "NOT looked at: limits of u" not in tuned().summary()
+    made.set_limits(u_min=-3.0, u_max=3.0)
+    found = replace(tuned(), controller=made)
+    line = next(each for each in found.verdicts() if "limits of u" in each)
+    steps = [
+        float(each.split()[0]) for each in line.split("above ")[1].split(" asks")[0].split(",")
+    ]
+    for i, step in enumerate(steps):
+        for share in (0.98, 1.02):
+            made.reset()
+            r = np.zeros(len(steps))
+            made.step(r, r)
+            r[i] = share * step
+            u = made.step(r, np.zeros(len(steps)))
+            assert bool(np.max(np.abs(u)) < 3.0) == (share < 1.0)
+
+
 @pytest.mark.slow
 def test_what_cannot_be_met_is_told_with_what_to_do() -> None:
     """A B0 with the wrong sign of a coupling that all but inverts the machine."""

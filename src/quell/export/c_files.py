@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -111,8 +111,8 @@ class CSource:
     """
 
     name: str
-    header: str
-    source: str
+    header: str = field(repr=False)
+    source: str = field(repr=False)
     precision: str
     channels: tuple[tuple[str, int], ...]
     operations: tuple[str, ...]

@@ -192,6 +192,7 @@ class TunedAxes:
             lines.append(
                 "NOT proved for fast motion: margins are those of B0 held at each operating point"
             )
+        lines += self._limits()
         if self.controller.learning.learns:
             lines.append(
                 "NOT in any margin: what learners learn from the states of other axes; simulate "
@@ -209,6 +210,26 @@ class TunedAxes:
             told = loop.remark.splitlines()
             lines += [line for line in told if line.startswith("NOT in these margins")]
         return lines
+
+    def _limits(self) -> list[str]:
+        """Return which steps of the references the actuators can not follow, where they end."""
+        low, high = self.controller.limits.low, self.controller.limits.high
+        half, steps = 0.5 * (high - low), []
+        if not np.any(np.isfinite(half)):
+            return []
+        inverse = np.linalg.pinv(self.controller.first_gain)
+        for i, (tuned, axis) in enumerate(zip(self.axes, self.controller.axes, strict=True)):
+            asked = np.abs(inverse[:, i]) * tuned.omega_c**axis.observer.order
+            largest = float(np.min(half[asked > 0.0] / asked[asked > 0.0]))
+            if np.isfinite(largest):
+                steps.append(f"{largest:.3g} of {tuned.name}")
+        if not steps:
+            return []
+        return [
+            f"NOT looked at: limits of u. A step of a reference above {', '.join(steps)} asks for "
+            "more than half the range of an actuator, and may then overshoot: simulate the motions "
+            "of the machine, give a profile or a prefilter, or bound M_ks"
+        ]
 
     def _remedy(self) -> str:
         left = self.left
