@@ -3,6 +3,13 @@
 May import everything in ``export`` but ``fmi``.
 """
 
-from quell.export.library.exported import Comparison, Exported, NoCompilerError, Sizes, c
+from quell.export.library.exported import (
+    Comparison,
+    Difference,
+    Exported,
+    NoCompilerError,
+    Sizes,
+    c,
+)
 
-__all__ = ["Comparison", "Exported", "NoCompilerError", "Sizes", "c"]
+__all__ = ["Comparison", "Difference", "Exported", "NoCompilerError", "Sizes", "c"]
