@@ -1,6 +1,7 @@
 """Several axes: an arm with and without its mass matrix, arms of MuJoCo, a quadrotor, and the cost.
 
-    python benchmarks/axes.py [--part arm|learners|mujoco|quadrotor|cost] [--draws 100] [--seed 7]
+    python benchmarks/axes.py [--part arm|draws|learners|mujoco|quadrotor|cost] [--draws 100]
+                              [--seed 7]
 
 *arm*: random rigid two-link arms (those of ``quell stress --loops axes``) that follow sines,
 ω_c/ω_o = 8/60: RMS error against the response that the design asks for, from 5 s on, with M(q),
@@ -21,6 +22,9 @@ up to 30 % off. One ``Axes`` with B0 of the attitude, roll and pitch before yaw,
 single loops, each with the limits of its torque, whose torques are mixed and cut behind them. RMS
 of the error against the response that the design asks for, all angles.
 
+*draws*: processor time to make each of some drawn arms and its ``Axes`` with M(q) and to take the
+first samples, and that of a sample in the loop.
+
 *cost*: ``step`` of three axes over three times ``step`` of one, and the compiled loop likewise; and
 the loop of three axes with one learner for all over that with one for each.
 """
@@ -31,6 +35,7 @@ import argparse
 import math
 import time
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -103,6 +108,26 @@ def part_arm(draws: int, seed: int) -> None:
         worst = np.max(np.array(errors) / plain)
         print(f"  {kind:16} {'Harmonic, guard' if learns else 'no learner':16} "
               f"{one:7.2f} {two:7.2f}   worst over none {worst:.3f}")  # fmt: skip
+
+
+def part_draws(draws: int, seed: int) -> None:
+    """Print what each further arm takes: its code is that of the first."""
+    times = []
+    for i in range(draws):
+        drawn = draw_arm(np.random.default_rng([seed, i]))
+        start = [0.0, drawn.elbow, 0.0, 0.0]
+        begin = time.process_time()
+        plant = ql.plants.arm(drawn.lengths, drawn.masses, gravity=drawn.gravity)
+        axes = ql.Axes([joint(), joint()], M=plant.inertia)
+        ql.simulate(plant, axes, ql.Scenario(0.1, 0.01, x0=start))
+        times.append(time.process_time() - begin)
+    samples = []
+    for _ in range(5):
+        begin = time.process_time()
+        ql.simulate(plant, axes, ql.Scenario(0.1, 20.0, x0=start), record_every=1000)
+        samples.append((time.process_time() - begin) / 20000.0)
+    print(f"{draws} arms, processor time of making one: the first {times[0]:.2f} s, the others "
+          f"{np.median(times[1:]):.3f} s; a sample {1e6 * min(samples):.2f} us")  # fmt: skip
 
 
 # ---- Learners that see both joints ----
@@ -300,7 +325,7 @@ def part_quadrotor(draws: int, seed: int) -> None:
         )  # fmt: skip
         axes = {name: joint(omega_c=c, omega_o=o) for name, (c, o) in ATTITUDE.items()}
         controller = ql.Axes(
-            axes, gain_of_attitude(level), saturation=["roll", "pitch", "yaw"],
+            axes, partial(gain_of_attitude, level=level), saturation=["roll", "pitch", "yaw"],
             u_min=0.2, u_max=most, wished=[hover] * 4,
         )  # fmt: skip
         run = ql.simulate(craft, controller, scenario)
@@ -320,27 +345,23 @@ def part_quadrotor(draws: int, seed: int) -> None:
           f"{np.median(roll_and_pitch):.2f}, {np.max(roll_and_pitch):.2f}")  # fmt: skip
 
 
-def gain_of_attitude(level: Any) -> Any:
-    """Return B0 as a function of the angles, from that of the level craft (3, 4)."""
-
-    def gain(x):  # type: ignore[no-untyped-def]
-        roll, pitch = x[0, 0], x[1, 0]
-        W = np.zeros((3, 3))  # from rates of the body to rates of the angles
-        W[0, 0], W[0, 1], W[0, 2] = (
-            1.0,
-            math.sin(roll) * math.tan(pitch),
-            math.cos(roll) * math.tan(pitch),
-        )
-        W[1, 1], W[1, 2] = math.cos(roll), -math.sin(roll)
-        W[2, 1], W[2, 2] = math.sin(roll) / math.cos(pitch), math.cos(roll) / math.cos(pitch)
-        out = np.zeros((3, 4))
-        for i in range(3):
-            for j in range(4):
-                for k in range(3):
-                    out[i, j] += W[i, k] * level[k, j]
-        return out
-
-    return gain
+def gain_of_attitude(x, level):  # type: ignore[no-untyped-def]
+    """Return B0 at the angles, from that of the level craft (3, 4)."""
+    roll, pitch = x[0, 0], x[1, 0]
+    W = np.zeros((3, 3))  # from rates of the body to rates of the angles
+    W[0, 0], W[0, 1], W[0, 2] = (
+        1.0,
+        math.sin(roll) * math.tan(pitch),
+        math.cos(roll) * math.tan(pitch),
+    )
+    W[1, 1], W[1, 2] = math.cos(roll), -math.sin(roll)
+    W[2, 1], W[2, 2] = math.sin(roll) / math.cos(pitch), math.cos(roll) / math.cos(pitch)
+    out = np.zeros((3, 4))
+    for i in range(3):
+        for j in range(4):
+            for k in range(3):
+                out[i, j] += W[i, k] * level[k, j]
+    return out
 
 
 def single_loops(craft: Any, B0: Any, r: Any, scenario: Any, hover: float, most: float) -> Any:
@@ -422,6 +443,7 @@ def part_cost(draws: int, seed: int) -> None:
 
 PARTS: dict[str, Any] = {
     "arm": part_arm,
+    "draws": part_draws,
     "learners": part_learners,
     "mujoco": part_mujoco,
     "quadrotor": part_quadrotor,

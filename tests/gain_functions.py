@@ -28,6 +28,22 @@ def wide(x: Any) -> Any:
     return (1.0, c, 0.3), (c, 0.5, -0.3)
 
 
+def parametric(x: Any, inertia: float, arms: Any, coupling: Any) -> Any:
+    """Return M of two axes with a number, a vector and a matrix as parameters."""
+    c = coupling[0, 1] * math.cos(x[1, 0])
+    d = coupling[1, 0] * math.cos(x[1, 0])
+    return (inertia + arms[0] ** 2, c), (d, 0.5 * inertia + arms[1] ** 2 + coupling[1, 1])
+
+
+def with_default(x: Any, K: Any, scale: float = 0.5) -> Any:
+    """Return B0 of two axes with three actuators, of a matrix and a number that has a default."""
+    out = np.zeros((2, 3))
+    for i in range(2):
+        for k in range(3):
+            out[i, k] = K[i, k] * (1.0 + scale * math.sin(x[i, 0]))
+    return out
+
+
 def sometimes_singular(x: Any) -> Any:
     """Return B0 that has no inverse, or no number, at some places."""
     if x[0, 0] > 0.5:

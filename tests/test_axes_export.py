@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import re
 import subprocess
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,12 @@ def two() -> list[ql.ADRC]:
     return [joint(learner=learner, guard=ql.Guard()) for learner in learners]
 
 
+def parametric(inertia: float) -> Any:
+    """Return a function M with its parameters."""
+    coupling = np.array([[9.0, 0.2], [0.15, 0.1]])
+    return partial(gain_functions.parametric, inertia=inertia, arms=(0.3, 0.2), coupling=coupling)
+
+
 ARM = ql.plants.arm(lengths=(0.4, 0.3), masses=(2.0, 1.0), gravity=0.0)
 RANKED = ["wrist", "elbow", "shoulder"]
 ROWS: dict[str, Any] = {
@@ -117,6 +124,14 @@ ROWS: dict[str, Any] = {
     "sometimes singular": lambda: ql.Axes(
         [joint(), joint()], gain_functions.sometimes_singular, **LIMITS
     ),
+    "a function with parameters as M": lambda: ql.Axes(
+        [joint(), joint()], M=parametric(0.8), **LIMITS
+    ),
+    "a function with parameters, more actuators": lambda: ql.Axes(
+        [joint(), joint()],
+        partial(gain_functions.with_default, K=[[1.0, 0.2, 0.3], [0.1, 0.5, -0.3]]),
+        **LIMITS,
+    ),
     "mass matrix of the arm": lambda: ql.Axes([joint(), joint()], M=ARM.inertia, **LIMITS),
 }
 SINGLE = (
@@ -124,6 +139,7 @@ SINGLE = (
     "safe sets, rates",
     "drives, direction",
     "more actuators, direction",
+    "more actuators, priority",
     "priority",
     "orders 1, 3 and 2",
 )
@@ -305,6 +321,14 @@ class TestMemory:
         """What is learned of an axis is relative to B0."""
         with pytest.raises(ValueError, match="of another controller"):
             other().restore(taught(learning(), 10).memory())
+
+    def test_an_image_of_a_robot_with_other_links_is_refused(self) -> None:
+        """The parameters of a function are compared, as a constant B0 is; limits are not."""
+        robot = ql.Axes(two(), M=parametric(0.8), **LIMITS)
+        image = taught(robot, 10).memory()
+        ql.Axes(two(), M=parametric(0.8), u_max=3.0, u_min=-3.0).restore(image)
+        with pytest.raises(ValueError, match="of another controller"):
+            ql.Axes(two(), M=parametric(0.81), **LIMITS).restore(image)
 
     def test_flags_of_manual_operation_are_none_in_an_image(self) -> None:
         """An image that was made in the middle of ``track`` is refused."""

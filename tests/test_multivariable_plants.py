@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 import quell as ql
-from quell.plants.base import advance
+from quell.kernels import user_functions
+from quell.plants.base import advance, measure
 from quell.plants.multivariable import measure_all
+from quell.plants.nonlinear import derivatives
 
 
 def moved(plant, x, u, w, dt: float, samples: int = 1):  # type: ignore[no-untyped-def]
@@ -171,10 +176,11 @@ def test_quadrotor_turns_as_its_rotors_push() -> None:
     craft = ql.plants.quadrotor_attitude()
     thrusts = np.array([2.0, 2.5, 3.0, 2.2])
     torque = ql.plants.rotor_levers(0.17, 0.015) @ thrusts
-    dx = craft.f(0.0, np.array([0.0] * 6 + [*thrusts]), thrusts, np.zeros(3))
+    rate = craft.sampled(1e-3, interpret=True).rate
+    dx = rate(0.0, np.array([0.0] * 6 + [*thrusts]), thrusts, np.zeros(3))
     np.testing.assert_allclose(dx[3:6], torque / [0.012, 0.012, 0.022], rtol=1e-12)
     spinning = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 3.0] + [0.0] * 4)
-    dx = craft.f(0.0, spinning, np.zeros(4), np.zeros(3))
+    dx = rate(0.0, spinning, np.zeros(4), np.zeros(3))
     rates, inertia = spinning[3:6], np.array([0.012, 0.012, 0.022])
     np.testing.assert_allclose(dx[3:6], -np.cross(rates, inertia * rates) / inertia, rtol=1e-12)
 
@@ -249,3 +255,117 @@ def test_what_does_not_fit_is_named(wrong, message: str) -> None:  # type: ignor
     """Errors name both shapes and the rule."""
     with pytest.raises(ValueError, match=message):
         wrong()
+
+
+def drawn_arm(rng: np.random.Generator) -> ql.plants.Arm:
+    """Return an arm of two links with other numbers of every kind."""
+    return ql.plants.arm(
+        rng.uniform(0.2, 0.5, 2), rng.uniform(0.5, 3.0, 2), viscous=rng.uniform(0.0, 0.2, 2),
+        coulomb=rng.uniform(0.0, 0.3, 2), motor_inertia=rng.uniform(2e-4, 0.05, 2),
+        gravity=rng.uniform(0.0, 9.81), payload=rng.uniform(0.0, 0.5), substeps=2,
+    )  # fmt: skip
+
+
+def joint() -> ql.ADRC:
+    """Return the controller of a joint."""
+    return ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3), omega_c=8.0)
+
+
+@pytest.mark.compiled
+def test_a_hundred_drawn_arms_compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their equation and their M(q) are the same code with other numbers; each computes its own values."""
+    compiled: list[Any] = []
+    compile_cfunc = user_functions.compile_cfunc
+
+    def counted(*arguments: Any) -> Any:
+        compiled.append(arguments)
+        return compile_cfunc(*arguments)
+
+    monkeypatch.setattr(user_functions, "compile_cfunc", counted)
+    rng, addresses = np.random.default_rng(3), set()
+    for i in range(100):
+        arm = drawn_arm(rng)
+        model, gain = arm.sampled(1e-3), ql.Axes([joint(), joint()], M=arm.inertia).parameters.gain
+        addresses.add((model.rate, model.output, gain.address))
+        if i % 10:
+            continue
+        x, u, w = rng.standard_normal(4), rng.standard_normal(2), rng.standard_normal(2)
+        found, fresh = np.zeros(4), np.zeros((2, 2))
+        derivatives(model, 0.0, x, u, w, found)
+        np.testing.assert_array_equal(found, arm._rate(0.0, x, u, w))
+        user_functions.call(gain.address, x.reshape(2, 2), gain.numbers, fresh)
+        np.testing.assert_array_equal(fresh, arm.inertia(x.reshape(2, 2)))
+    assert len(addresses) == 1
+    assert len(compiled) <= 3
+
+
+def rates(t, x, u, w, gain, K, offsets=(0.5, 0.25)):  # type: ignore[no-untyped-def]
+    """Return the equation of a plant with a number, a matrix and a vector."""
+    return K[0, 1] * x[1] + offsets[0] * w[0], gain * u[0] - K[1, 0] * x[0] + K[1, 1] * offsets[1]
+
+
+def combined(x, H, gain):  # type: ignore[no-untyped-def]
+    """Return an output that shares a parameter with the equation."""
+    return H[0, 0] * x[0] + H[0, 1] * x[1], gain * x[1]
+
+
+@pytest.mark.compiled
+def test_parameters_are_numbers_vectors_and_matrices() -> None:
+    """Compiled code reads them in their order, and other numbers compile nothing; a default is data, too."""
+    K = [[0.0, 3.0], [5.0, 7.0]]
+    several = ql.plants.MultivariableNonlinearPlant(
+        rates, 2, 1, combined, parameters={"gain": 2.0, "K": K, "H": [[1.5, -0.5]]}
+    )
+    one = ql.plants.NonlinearPlant(
+        lambda t, x, u, w, K, c: (K[0, 1] * x[1], c[1] * u - K[1, 0] * x[0] + c[0]), 2,
+        lambda x, row: row[0] * x[0] + row[1] * x[1],
+        parameters={"K": K, "c": [0.1, 2.0], "row": (0.5, 2.0)},
+    )  # fmt: skip
+    for plant, u in ((several, np.array([0.7])), (one, 0.7)):
+        changed = plant.with_parameters(K=[[0.0, 1.0], [2.0, -1.0]])
+        addresses = {each.sampled(0.01).rate for each in (plant, changed)}
+        assert len(addresses) == 1
+        for each in (plant, changed):
+            values = []
+            for model in (each.sampled(0.01), each.sampled(0.01, interpret=True)):
+                dx, y = np.zeros(2), np.zeros(2)
+                derivatives(model, 0.0, np.array([0.3, -0.2]), u, np.array([0.3]), dx)
+                if plant is one:
+                    y[0] = measure(model, np.array([0.3, -0.2]))
+                else:
+                    measure_all(model, np.array([0.3, -0.2]), y)
+                values.append([*dx, *y])
+            np.testing.assert_array_equal(*values)
+            assert np.all(np.array(values[0][:3]) != 0.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda p: ql.plants.MultivariableNonlinearPlant(rates, 2, 1, np.eye(2), parameters=p),
+         r"parameters\['K'\]: entry \(0, 0\) is nan"),
+        (lambda p: ql.Axes([joint(), joint()], M=partial(gain, K=p["K"])), r"M: K: entry \(0, 0\)"),
+        (lambda p: ql.Axes([joint(), joint()], M=partial(gain, k=1.0)),
+         r"M: partial\(…\) binds k, which is no parameter; must be one of K"),
+        (lambda p: ql.Axes([joint(), joint()], B0=partial(gain, np.zeros((2, 2)))),
+         r"B0: partial\(…\) binds 1 values without a name"),
+        (lambda p: ql.Axes([joint(), joint()], B0=partial(gain, K=np.ones((2, 2, 1)))),
+         r"B0: K has shape \(2, 2, 1\): must be a number, or an array with one or two dim"),
+        (lambda p: ql.Axes([joint(), joint()], B0=partial(gain, K="stiff")), "B0: K = 'stiff': must"),
+        (lambda p: ql.Axes([joint(), joint()], B0=partial(two_of, K=1.0)), "B0: parameter d has no"),
+    ],
+)  # fmt: skip
+def test_parameters_that_do_not_fit_are_named(wrong: Any, message: str) -> None:
+    """By argument, name, value and rule."""
+    with pytest.raises(ValueError, match=message):
+        wrong({"gain": 1.0, "K": [[np.nan, 1.0], [1.0, 1.0]]})
+
+
+def gain(x, K):  # type: ignore[no-untyped-def]
+    """Return a matrix that depends on parameters."""
+    return np.eye(2) + np.sum(K)
+
+
+def two_of(x, K, d):  # type: ignore[no-untyped-def]
+    """Return a matrix that depends on two parameters."""
+    return np.eye(2) + K * d

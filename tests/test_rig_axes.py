@@ -662,6 +662,9 @@ def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None
         shown = quell(*command)
         assert shown.code == 2
         assert "has several axes (x, y): NOT possible here" in shown.err
+    shown = quell("run-rig", "gantry.toml", "--watch", "watch.json", "--no-figures")
+    assert shown.code == 0, shown.err
+    assert "NOT watched: no whole window of 60 s; run longer" in shown.out
     shown = quell("run-rig", "gantry.toml", "--omega-c", "3.0")
     assert (shown.code, "--omega-c" in shown.err) == (2, True)
     assert (

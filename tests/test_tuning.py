@@ -15,6 +15,7 @@ from quell.analysis import analyse
 from quell.quantities import Signals
 from quell.setup import load
 from quell.tuning import Constraints, designs
+from quell.tuning.optimiser import loops
 from quell.tuning.optimiser.requirements import sizes
 from quell.tuning.plants import given_plants, model_of, plant_set
 from quell.tuning.structures.adrc import equivalents
@@ -335,6 +336,49 @@ def test_the_integral_of_the_error_is_that_of_a_simulation() -> None:
     assert integral["load-iae"] <= integral["load"]
 
 
+@pytest.mark.parametrize(
+    ("plant", "dt", "how"),
+    [
+        # An oven of 50 K at full power, three lags of an hour, 1 Hz; 312 000 samples long.
+        (([50.0], np.poly([-1 / 3600] * 3) * 3600.0**3), 1.0, {}),
+        # One lag of an hour and 10 s of dead time, and noise that allows a slow loop only.
+        (([50.0], [3600.0, 1.0]), 1.0, {"delay": 10.0, "m_ks": 0.02}),
+        # A servo of 2e-4 kg m² with 1e-4 N m s/rad and a slow current loop, 20 kHz.
+        (([1.0], [2e-4, 1e-4, 0.0]), 5e-5, {"actuator_lag": 0.02}),
+    ],
+    ids=["oven", "oven with noise", "servo"],
+)
+def test_the_integral_of_the_error_has_the_end_of_a_slow_response(
+    plant: Any, dt: float, how: dict[str, Any]
+) -> None:
+    """The measure is that of all samples until y is at rest, so never below 1/k_i."""
+    bounds = Constraints(m_ks=how.pop("m_ks", None))
+    tuned = ql.tune(
+        plant, dt, structure="pi", compare=(), objective="load", constraints=bounds, **how
+    )
+    loop = analyse(plant, tuned.controller, **how)
+    system = loop.closed_loop("d", "y")
+    assert system.largest_pole < 1.0
+    length = int(20.0 / -np.log(system.largest_pole))
+    y = np.cumsum(loops.pulse_in_blocks(system, length))
+    total = dt * float(np.sum(np.abs(y)))
+    assert tuned.design.measures["iae"] == pytest.approx(total, rel=1e-3)
+    assert tuned.design.measures["iae"] >= (1.0 - 1e-3) / tuned.design.k_i
+
+
+def test_a_slow_response_at_a_distance_is_that_of_all_samples() -> None:
+    """Every fourth sample of y and u of a loop is the same."""
+    plant = ([50.0], np.poly([-1 / 3600] * 3) * 3600.0**3)
+    tuned = ql.tune(plant, 4.0, structure="pi", compare=(), objective="load")
+    plants, law = tuned.task.plants, loops.law_of(tuned.controller)
+    one = np.ones(4001)
+    for target in ("y", "u"):
+        whole = loops.response(plants.scaled()[0], law, loops.Inputs(0.0 * one, one), target)
+        apart = loops.Inputs(0.0 * one, one, distance=4)
+        part = loops.response(plants.scaled()[0], law, apart, target)
+        np.testing.assert_allclose(part[:1000], whole[:4000:4], rtol=1e-6, atol=1e-9)
+
+
 def test_a_profile_is_tracked_within_limits_of_u() -> None:
     """The largest u of the simulated run is the limit."""
     profile = ql.signals.Trapezoid(distance=1.0, duration=6.0)
@@ -479,6 +523,13 @@ def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
             "uncertain: plant can't be called with these: missing a required argument: 'a'",
         ),
         ({"constraints": 3}, "constraints = 3: must be quell.tuning.Constraints"),
+        ({"compare": 3}, "compare = 3: must be a list of structures"),
+        ({"compare": "pid"}, "compare = 'pid': must be a list of structures"),
+        ({"seed": -1}, "seed = -1: must be a whole number of at least 0"),
+        (
+            {"objective": "tracking", "reference": ql.signals.Step(), "duration": 1e6},
+            r"duration = 1e\+06 s has 100000000 samples of dt = 0.01 s: .* give a shorter duration",
+        ),
         ({"scenario": 3.0}, "scenario = 3.0: must be a quell.Scenario"),
         ({"scenario": [3.0]}, r"scenario\[0\] = 3.0: must be a quell.Scenario"),
     ],
@@ -486,7 +537,7 @@ def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
 def test_arguments_that_do_not_fit_are_named(arguments: dict[str, Any], message: str) -> None:
     """Before anything is searched, whatever would have failed later."""
     with pytest.raises(ValueError, match=message):
-        ql.tune(arguments.pop("plant", ([1.0], [1.0, 1.0])), 0.01, compare=(), **arguments)
+        ql.tune(arguments.pop("plant", ([1.0], [1.0, 1.0])), 0.01, **{"compare": (), **arguments})
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from quell.lti.canonical import canonical
     from quell.observers.eso import ESO
     from quell.records import metrics
-    from quell.records.axes import AxesTrajectory
+    from quell.records.axes import AxesBatch, AxesTrajectory
     from quell.records.plotting import style
     from quell.records.trajectory import BatchTrajectory, Trajectory
     from quell.simulation.driver import Scenario
@@ -68,6 +68,7 @@ __version__ = "0.2.0"
 _HOMES = {
     "ADRC": "controllers.adrc",
     "Axes": "controllers.axes",
+    "AxesBatch": "records.axes",
     "AxesTrajectory": "records.axes",
     "Compensated": "controllers.compensated",
     "Compensator": "controllers.compensator",
@@ -102,7 +103,8 @@ _MODULES = (
 )  # fmt: skip
 
 __all__ = [
-    "ADRC", "ESO", "Axes", "AxesTrajectory", "BatchTrajectory", "Compensated", "Compensator",
+    "ADRC", "ESO", "Axes", "AxesBatch", "AxesTrajectory", "BatchTrajectory", "Compensated",
+    "Compensator",
     "DesignWarning", "Estimate", "Feedforward", "Guard", "HeldPlant", "OnlineGain", "Reason",
     "SafeSet", "Scenario", "Schedule", "Status", "Trajectory", "Tuned", "analysis", "baselines",
     "canonical", "controllers", "envs", "experiments", "export", "features", "identification",

@@ -11,7 +11,7 @@ import inspect
 import math
 import unicodedata
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -363,6 +363,9 @@ def text(value: Any) -> str:
         return f"({inside},)" if len(value) == 1 else f"({inside})"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key!r}: {text(part)}" for key, part in value.items()) + "}"
+    if isinstance(value, partial):
+        named = (f"{name}={text(part)}" for name, part in value.keywords.items())
+        return f"partial({', '.join([text(value.func), *map(text, value.args), *named])})"
     if inspect.isroutine(value) or isinstance(value, type):
         return str(getattr(value, "__qualname__", type(value).__name__))
     kind: Any = type(value)

@@ -34,9 +34,14 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
 
 
 def _swing(
-    t: float, x: Any, u: float, w: Any, m: float, length: float = 0.5
+    t: float, x: Any, u: float, w: Any, m: float, friction: Any, length: float = 0.5
 ) -> tuple[float, float]:
-    return x[1], (u + w[0]) / (m * length) - math.sin(x[0]) - 0.1 * x[1]
+    return x[1], (u + w[0]) / (m * length) - math.sin(x[0]) - friction[1] * x[1] - friction[0]
+
+
+def _mixed(x: Any, gain: float, rows: Any) -> float:
+    value: float = gain * x[0] + rows[1, 0] * x[1] + rows[0, 2]
+    return value
 
 
 FROM_FILES = ("fmu", "identified", "python")
@@ -59,7 +64,15 @@ PLANTS: dict[str, Any] = {
         lambda t, x, u, w: (x[1], u + w[0] - math.sin(x[0]) - 0.1 * x[1]), order=2
     ),
     "NonlinearPlant, parameters": ql.plants.NonlinearPlant(
-        _swing, 2, lambda x, gain: gain * x[0], parameters={"m": 2.0, "gain": 1.5}
+        _swing,
+        2,
+        _mixed,
+        parameters={
+            "m": 2.0,
+            "gain": 1.5,
+            "friction": [0.0, 0.1],
+            "rows": [[0.0, 3.0, 0.0], [0.02, 1.0, 2.0]],
+        },
     ),
 }
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])

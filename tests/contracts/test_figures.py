@@ -16,7 +16,7 @@ import pytest
 import quell as ql
 from quell import analysis
 from quell.commissioning import Verification
-from quell.experiments import acc, compare, stress, torsional, two_mass_spring
+from quell.experiments import acc, compare, over_seeds, stress, torsional, two_mass_spring
 from quell.experiments.acc import study as acc_figures
 from quell.experiments.acc.loops import Judged
 from quell.experiments.torsional import FRICTION, LINEAR
@@ -128,6 +128,9 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     lags = ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2))
     coupled = ql.tuning.tune_axes(lags, axes)
     machine = ql.simulate(lags, axes, ql.Scenario((1.0, 0.5), duration=1.0))
+    short = ql.Scenario((1.0, 0.5), duration=0.2)
+    machines = ql.simulate([lags] * 2, axes, short)
+    seeded = over_seeds.over_seeds(lags, {"a": axes, "b": axes}, short)
     points = {at: ql.plants.LinearPlant.of(([at], [1.0, 1.0])) for at in (1.0, 2.0)}
     schedule = ql.tune_schedule(points, DT)
     plots = {
@@ -136,6 +139,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         "tuned schedule": Case(schedule.plot, 3),
         "tuned axes": Case(coupled.plot, 2),
         "BatchTrajectory": Case(batch.plot, 2),
+        "AxesBatch": Case(machines.plot, 4),
         "Tuned": Case(tuned.plot, 4),
         "TunedCompensator": Case(add_on.plot, 1),
         "Identified": Case(model.plot, 7),
@@ -145,6 +149,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         "Histogram": Case(histogram.plot, 1),
         "Timing": Case(Timing(histogram, histogram).plot, 1),
         "compare": Case(lambda ax=None: compare.draw(compared, ax=ax), 2),
+        "over seeds": Case(lambda ax=None: over_seeds.draw(seeded, ax=ax), 2),
         "bode": Case(lambda ax=None: analysis.plot_bode(loop, ax=ax), 2),
         "gang": Case(lambda ax=None: analysis.plot_gang_of_four(loop, ax=ax), 4),
         "nyquist": Case(lambda ax=None: analysis.plot_nyquist(loop, ax=ax), 1),
@@ -187,7 +192,7 @@ def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str
 _DRAWS = re.compile(r"^ *def (plot(?:_\w+)?|draw)\(", re.MULTILINE)
 # Files of functions that draw, and those that are drawn above.
 _PUBLIC = {
-    "records/axes.py plot": "axes",
+    "records/axes.py plot": "axes",  # and AxesBatch
     "tuning/schedules.py plot": "tuned schedule",
     "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory
     "tuning/tuned.py plot": "Tuned",
@@ -198,6 +203,7 @@ _PUBLIC = {
     "sweeping/sweep.py plot": "Sweep",
     "realtime/system.py plot": "Timing",
     "experiments/compare.py draw": "compare",
+    "experiments/over_seeds.py draw": "over seeds",
     "experiments/stress/figures.py draw": "stress",
     "experiments/two_mass_spring.py draw": "position",
     "experiments/torsional.py draw": "torsional-position",
@@ -213,6 +219,7 @@ _PUBLIC = {
 _INSIDE = {
     "records/plotting.py plot_run",
     "records/plotting.py plot_batch",
+    "records/plotting.py plot_batch_of_axes",
     "records/plotting.py plot_axes",
     "sweeping/sweep.py plot_over",
     "tuning/report.py draw",

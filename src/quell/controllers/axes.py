@@ -283,7 +283,9 @@ class Axes(StatefulController):
         from the control signals to the axes (n, m) [y-unit/s^n per u-unit]: a matrix, or a function
         of the estimates that returns it. The function takes ``x[axis, derivative]``, so ``x[0, 0]``
         is the position of the first axis and ``x[1, 1]`` the rate of the second; it is compiled.
-        By default the unit matrix: each actuator moves one axis.
+        Parameters that ``functools.partial`` binds by name, numbers, vectors or matrices, are data:
+        other values of them compile nothing. By default the unit matrix: each actuator moves one
+        axis.
     M
         the inverse of B0 instead, of a robot its mass matrix: a matrix or a function.
     u_min, u_max
@@ -293,8 +295,8 @@ class Axes(StatefulController):
         each.
     saturation
         what happens at the limits: ``"each"`` cuts each actuator, ``"direction"`` scales all, so
-        that v keeps its direction, and a list of all axes gives them what they ask for in this
-        order.
+        that v keeps its direction, and a list of all axes is their order of priority: what an
+        axis misses counts 100 times as much, squared, as what the next one misses.
     weights
         of the actuators, where there are more than axes: u is the smallest ``Σ W (u − wished)²``
         that does what the axes ask for (m,). If an axis has a safe set, also of the change of u
@@ -480,7 +482,7 @@ class Axes(StatefulController):
             axes=states,
             learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
-            range=range_memory(n, m),
+            range=range_memory(n, m, self._rule),
             safe=safe_axes_memory(self.parameters.safe, n, m),
             given=given_memory(self.parameters.given, self.drives, n, m),
             loop=AxesLoop.zeros(),
@@ -495,8 +497,9 @@ class Axes(StatefulController):
 
     def _use_state(self, state: AxesState) -> None:
         super()._use_state(state)
-        for axis, own in zip(self.axes, self._states(state), strict=True):
+        for name, axis, own in zip(self.names, self.axes, self._states(state), strict=True):
             axis._use_state(own)
+            axis._axis = name
 
     @staticmethod
     def _states(state: AxesState) -> Iterator[Any]:
@@ -637,7 +640,12 @@ class Axes(StatefulController):
             omega_c = changes["omega_c"]
             raise ValueError(f"omega_c = {omega_c!r}: a compensator has no law; give an observer")
         self.learning.check_retuning(changes)
-        self.axes[self.index(axis)].retune(**changes)
+        place = self.index(axis)
+        self.axes[place]._axis = ""
+        try:
+            self.axes[place].retune(**changes)
+        finally:
+            self.axes[place]._axis = self.names[place]
         self.learning.update(self.axes)
         self._update_parameters()
         self._pack_again()

@@ -634,6 +634,7 @@ class Compensator(StatefulController):
         rate_limit: RateLimit | None = None,
     ) -> None:
         """Change limits of the control signal while running; see ``StatefulController``."""
+        self._check_own("set_limits")
         if self.safe_set is not None and self.safe_set.gain_error > 0.0:
             new = changed_limits(self._limits, self.dt, u_min, u_max, rate_limit)
             safe_set = self._safe_set_design(self.observer, new)

@@ -326,7 +326,7 @@ class StateFeedback(StatefulController):
             reference=np.zeros(self.references),
             nothing=np.zeros(observer.E.shape[1]),
             u=np.zeros(self.inputs),
-            range=range_memory(self.inputs, self.inputs),
+            range=range_memory(self.inputs, self.inputs, None),
             wished=np.zeros(self.inputs),
             r_given=np.zeros(self.references),
             y_given=np.zeros(self.outputs),

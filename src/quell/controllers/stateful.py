@@ -179,7 +179,7 @@ def _step_as_python(packed: Any, r: float, y: float) -> float:
 
 
 # A copy makes these again: compiled functions and shared arrays belong to one process.
-_NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
+_NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step", "_axis")
 
 
 @compiled_call
@@ -219,6 +219,7 @@ class StatefulController(Described):
     _limits: Limits
     _packed: Any
     _step: Callable[..., Any]
+    _axis = ""  # its name, if it is one of ``quell.Axes``; a copy is none
 
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints: arguments by name, and finite limits of u and its rate."""
@@ -260,6 +261,7 @@ class StatefulController(Described):
         If it ``compiles``, they are packed and the change is compiled beforehand. After new limits
         they are designed again.
         """
+        self._check_own("retune")
         found, limits = design(), self.limits
         ready: PackedController | None = None
         change: Any = None
@@ -289,6 +291,18 @@ class StatefulController(Described):
             self._pack_again()
 
         return apply
+
+    def _check_own(self, change: str) -> None:
+        """Raise a ``ValueError`` for an axis: its parameters are also those of all axes."""
+        if self._axis:
+            use = {
+                "retune": f"axes.retune({self._axis!r}, ...)",
+                "set_limits": "axes.set_limits(...), whose limits are those of the actuators",
+            }
+            raise ValueError(
+                f"{change}: is the axis {self._axis!r} of quell.Axes, which would not know of the "
+                f"change; call {use[change]}"
+            )
 
     def _update_parameters(self) -> None:
         raise NotImplementedError
@@ -361,8 +375,10 @@ class StatefulController(Described):
         Raises
         ------
         ValueError
-            as for a new controller; then the limits are unchanged.
+            as for a new controller, and for an axis of ``quell.Axes``; then the limits are
+            unchanged.
         """
+        self._check_own("set_limits")
         this: Any = self
         self._limits = changed_limits(self._limits, float(this.dt), u_min, u_max, rate_limit)
         self.parameters = self.parameters._replace(limits=self._limits)

@@ -28,13 +28,16 @@ import numpy as np
 from quell import checks, plants
 from quell.checks import import_extra
 from quell.controllers.adrc import ADRC
+from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, checked_limits
+from quell.envs.axes import Actions, LoopsOfAxes, labels_of, loop_of_axes, observed_by_default
 from quell.envs.loops import Draw, GivenControl, GivenDesign, Loops, Policy
 from quell.guard import Guard
 from quell.lti.models import is_linear_model
 from quell.observers.eso import ESO
 from quell.plants.base import check_plant, signals_of
 from quell.plants.linear import LinearPlant
+from quell.plants.multivariable import is_several
 from quell.quantities import UNKNOWN, Signals
 from quell.records.record import columns_of
 from quell.signals import BandLimitedNoise, Sinusoid, Step
@@ -59,7 +62,7 @@ class Action(NamedTuple):
 
 
 def loop_of(
-    controller: ADRC | None, dt: float | None, u_min: float, u_max: float
+    controller: Any, dt: float | None, u_min: float, u_max: float
 ) -> tuple[Controller, Action]:
     """Return the controller of the loop and the meaning of its action.
 
@@ -113,11 +116,14 @@ class Observed:
         self,
         names: Sequence[str] | None,
         loop: Loops,
-        action: Action,
+        action: Action | Actions,
         x_limit: Any,
     ) -> None:
-        is_adrc = isinstance(loop.controller, ADRC)
-        default = OBSERVED_WITH_F if is_adrc else OBSERVED_WITH_U
+        if isinstance(loop, LoopsOfAxes):
+            default = observed_by_default(loop.controller)
+        else:
+            is_adrc = isinstance(loop.controller, ADRC)
+            default = OBSERVED_WITH_F if is_adrc else OBSERVED_WITH_U
         if isinstance(names, str):
             names = (names,)
         if names is not None and not checks.is_sequence(names):
@@ -131,9 +137,14 @@ class Observed:
         most = _bounds(loop, action, x_limit)
         high = [np.broadcast_to(most.get(name, loop.limit), widths[name]) for name in self.names]
         low = [
-            np.full(1, action.u_min) if name == "u" else -each
+            np.broadcast_to(action.u_min, widths[name]) if name == "u" else -each
             for name, each in zip(self.names, high, strict=True)
         ]
+        axes = getattr(loop.controller, "names", ())
+        #: a name for each number of an observation, as ``"r[elbow]"``
+        self.labels = tuple(
+            label for name in self.names for label in labels_of(name, widths[name], axes)
+        )
         self.high: Vector = np.concatenate(high).astype(np.float64)
         self.low: Vector = np.concatenate(low).astype(np.float64)
         every = range(sum(widths.values()))
@@ -145,7 +156,7 @@ class Observed:
         return np.clip(rows[..., self.columns], self.low, self.high)
 
 
-def _bounds(loop: Loops, action: Action, x_limit: Any) -> dict[str, Any]:
+def _bounds(loop: Loops, action: Any, x_limit: Any) -> dict[str, Any]:
     """Return the bounds that are not the limit, by channel."""
     order, limit = loop.plant.order, loop.limit
     x = np.full(order, limit) if x_limit is None else np.atleast_1d(x_limit)
@@ -155,15 +166,29 @@ def _bounds(loop: Loops, action: Action, x_limit: Any) -> dict[str, Any]:
     found["x"] = checks.positive_vector("x_limit", x)
     if x.size != order:
         raise ValueError(f"x_limit has {x.size} entries: must be a number, or one for each state")
-    if isinstance(loop.controller, ADRC):
-        observer = loop.controller.observer
-        rates = limit * observer.omega_o ** np.arange(observer.estimates + 0.0)
-        n = observer.order
-        f = max(float(rates[n]), action.reach)
-        found |= dict.fromkeys(("f_residual", "f_learned", "error_plain", "error_learned"), f)
-        found |= {"x_hat": rates[:n], "f_derivatives": rates[n + 1 :]}
-        found |= {"authority": 1.0, "status": _FLAGS, "reason": _FLAGS}
+    controller: Any = loop.controller
+    if isinstance(controller, ADRC):
+        found |= _bounds_of(controller.observer, limit, action.reach)
+    elif isinstance(controller, Axes):
+        reaches = dict(zip(action.names, action.reach.tolist(), strict=True))
+        for name, axis in zip(controller.names, controller.axes, strict=True):
+            own = _bounds_of(axis.observer, limit, reaches.get(name, 0.0))
+            found |= {f"{name}.{channel}": most for channel, most in own.items()}
+        found["v"] = np.array([float(found[f"{name}.f_residual"]) for name in controller.names])
+        found["status"] = _FLAGS
     return found
+
+
+def _bounds_of(observer: Any, limit: float, reach: float) -> dict[str, Any]:
+    """Return the bounds of the channels of an ADRC."""
+    rates = limit * observer.omega_o ** np.arange(observer.estimates + 0.0)
+    n = observer.order
+    f = max(float(rates[n]), reach)
+    found: dict[str, Any] = dict.fromkeys(
+        ("f_residual", "f_learned", "error_plain", "error_learned"), f
+    )
+    found |= {"x_hat": rates[:n], "f_derivatives": rates[n + 1 :]}
+    return found | {"authority": 1.0, "status": _FLAGS, "reason": _FLAGS}
 
 
 # ---- Loops, spaces and the work of a step, which Env and VectorEnv share ----
@@ -180,14 +205,15 @@ class Driven:
         count: int,
         plant: Any,
         scenario: Scenario | Draw,
-        controller: ADRC | None = None,
+        controller: ADRC | Axes | None = None,
         *,
         dt: float | None = None,
-        u_min: float = -math.inf,
-        u_max: float = math.inf,
+        u_min: Any = -math.inf,
+        u_max: Any = math.inf,
         action_repeat: int = 1,
         limit: float | None = None,
         cost_of_u: float = 0.0,
+        weights: Any = None,
         observe: Sequence[str] | None = None,
         x_limit: Any = None,
         interpret: bool = False,
@@ -197,10 +223,25 @@ class Driven:
             plant = LinearPlant.of(plant)
         if not checks.is_sequence(plant):
             check_plant(plant)
-        law, self.action = loop_of(controller, dt, u_min, u_max)
-        u_most = max(abs(self.action.u_min), abs(self.action.u_max))
-        self.loops = Loops(
+        first: Any = next(iter(plant), None) if checks.is_sequence(plant) else plant
+        law: Any
+        self.action: Any
+        own: dict[str, Any] = {}
+        kind: Any = Loops
+        self.several = is_several(first) or isinstance(controller, Axes)
+        if self.several:
+            law, self.action = loop_of_axes(first, controller, dt, u_min, u_max)
+            kind, own = LoopsOfAxes, {"weights": weights}
+        else:
+            if weights is not None:
+                raise ValueError(f"weights = {weights!r}: are those of several axes; leave it out")
+            law, self.action = loop_of(controller, dt, u_min, u_max)
+        largest = np.maximum(np.abs(self.action.u_min), np.abs(self.action.u_max))
+        # Of several control signals the square is that of all together.
+        u_most = float(np.linalg.norm(largest)) if self.several else float(largest)
+        self.loops: Loops = kind(
             *(plant, scenario, law, count),
+            **own,
             repeat=action_repeat,
             limit=limit,
             cost_of_u=cost_of_u,
@@ -210,25 +251,45 @@ class Driven:
         )
         self.observed = Observed(observe, self.loops, self.action, x_limit)
         names = [name for name, width in self.loops.channels if width]
-        self._shown = [name for name in _SHOWN if name in names]
-        self._columns = [self.loops.column(name) for name in self._shown]
+        self._shown = [
+            name for name in names if name in _SHOWN or name.rpartition(".")[2] in _SHOWN[2:]
+        ]
+        self._columns = [columns_of(self.loops.channels, name) for name in self._shown]
         self.step_time = law.dt * action_repeat
         box = import_extra("gymnasium.spaces", "envs", "quell.envs").Box
         self.observation_space = box(self.observed.low, self.observed.high, dtype=np.float64)
-        self.action_space = box(-1.0, 1.0, (1,), np.float64)
+        self.actions = int(np.size(self.action.reach))
+        self.action_space = box(-1.0, 1.0, (self.actions,), np.float64)
 
     def begin(self, rngs: Sequence[np.random.Generator]) -> None:
         """Begin an episode in each loop, and write its first row."""
         count = self.loops.count
         self.loops.reset(range(count), rngs)
-        self.loops.advance(np.zeros(count), np.zeros(count, np.int64))
+        shape = (count, self.actions) if self.several else (count,)
+        self.loops.advance(np.zeros(shape), np.zeros(count, np.int64))
 
     def advance(self, actions: Vector, active: Any) -> None:
-        """Take the active loops through a step with actions from −1 to 1, which are clipped."""
+        """Take the active loops through a step with actions from −1 to 1, which are clipped.
+
+        They are (N,), of several axes (N, actions).
+        """
         if not np.all(np.isfinite(actions)):
             raise ValueError(f"action = {actions!r}: must be finite")
         middle, reach = self.action.middle, self.action.reach
         self.loops.advance(middle + reach * np.clip(actions, -1.0, 1.0), active)
+
+    def shaped(self, actions: Any) -> Vector:
+        """Return actions as ``advance`` takes them; they have the right size."""
+        count = self.loops.count
+        made: Vector = actions.reshape((count, self.actions) if self.several else count)
+        return made
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """What each number of an action is: u, f, or the axis whose f it is."""
+        if self.several:
+            return tuple(self.action.names)
+        return ("f" if isinstance(self.loops.controller, ADRC) else "u",)
 
     @property
     def observations(self) -> Any:
@@ -246,8 +307,16 @@ class Driven:
     def info(self) -> dict[str, Any]:
         """Arrays (N,) of the time, of channels and of the step's status flags."""
         step = self.loops.step
-        shown = dict(zip(self._shown, step.row[:, self._columns].T.copy(), strict=True))
+        shown = {
+            name: step.row[:, columns if self._is_wide(name) else columns.start].copy()
+            for name, columns in zip(self._shown, self._columns, strict=True)
+        }
+        if self.several:
+            shown["cost"] = step.costs.copy()
         return {"t": step.sample * self.loops.rules.dt, **shown, "status": step.status.copy()}
+
+    def _is_wide(self, name: str) -> bool:
+        return self.several and name in ("y", "u")
 
 
 # ---- VectorEnv ----
@@ -306,7 +375,7 @@ class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ig
         num_envs: int,
         plant: Any,
         scenario: Scenario | Draw,
-        controller: ADRC | None = None,
+        controller: ADRC | Axes | None = None,
         *,
         workers: int | None = None,
         **options: Any,
@@ -316,6 +385,8 @@ class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ig
         self._driven, self._ended = driven, np.zeros(self.num_envs, bool)
         self.single_observation_space = driven.observation_space
         self.single_action_space = driven.action_space
+        self.observation_names = driven.observed.labels
+        self.action_names = driven.action_names
         self.observation_space = batch_space(driven.observation_space, self.num_envs)
         self.action_space = batch_space(driven.action_space, self.num_envs)
         self.metadata = {"autoreset_mode": vector.AutoresetMode.NEXT_STEP, "render_modes": []}
@@ -353,17 +424,18 @@ class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ig
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Take a step in each loop; return observations, rewards, terminations, truncations, infos.
 
-        ``actions`` are (N, 1).
+        ``actions`` are (N, 1), of several axes (N, actions).
         """
         if not self._rngs:
             raise errors.ResetNeeded("step was called before reset: call reset first")
         given = np.asarray(actions, dtype=np.float64)
-        if given.size != self.num_envs:
-            raise ValueError(f"actions have shape {given.shape}: must have ({self.num_envs}, 1)")
+        shape = self.num_envs, self._driven.actions
+        if given.size != math.prod(shape):
+            raise ValueError(f"actions have shape {given.shape}: must have {shape}")
         begin = np.flatnonzero(self._ended).tolist()
         if begin:
             self._driven.loops.reset(begin, self._rngs)
-        self._driven.advance(given.reshape(-1), (~self._ended).astype(np.int64))
+        self._driven.advance(self._driven.shaped(given), (~self._ended).astype(np.int64))
         terminated, truncated = self._driven.ends
         self._ended = terminated | truncated
         rewards = 0.0 - self._driven.loops.step.cost
@@ -439,6 +511,13 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
     (``observe=("r", "y_measured", "u")`` is what it does). With controller, what that knows: r,
     y_measured, u, x_hat, f_residual, f_learned.
 
+    **Several axes.** ``controller`` is ``quell.Axes``, in which some axes have the learner
+    ``Policy``; the action has a number for each of these. Without controller, for a plant of
+    several signals, the action is all control signals. ``observation_names`` and ``action_names``
+    say what each number is, as ``"r[elbow]"`` and ``"elbow"``; by default r, y_measured, u and the
+    estimates of all axes are observed. ``info["cost"]`` has the integral of the squared error of
+    each axis over the step, ``weights`` make one reward of them.
+
     **Reward.** ``−∫ (r − y)² + ρ u² dt`` over the step, as a sum over its samples: the return is
     the quadratic cost of the episode, and does not depend on how it is divided into steps.
 
@@ -454,10 +533,11 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
         a ``Scenario``; each episode gets another seed of its noise. Or a function that draws the
         scenario of an episode from a ``numpy.random.Generator``; all have the same duration.
     controller
-        an ``ADRC`` with ``learner=Policy()``, best with ``guard=Guard()``, and finite limits of u;
-        None if the action is u.
+        an ``ADRC`` with ``learner=Policy()``, best with ``guard=Guard()``, and finite limits of u,
+        or ``quell.Axes`` of such; None if the action is u.
     dt, u_min, u_max
-        sample time [s] and limits of u, only without controller, and then necessary.
+        sample time [s] and limits of u, of several one for all or one for each, only without
+        controller, and then necessary.
     action_repeat
         samples of a step.
     limit
@@ -466,6 +546,9 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
         same for all seeds.
     cost_of_u
         ρ [y-unit²/u-unit²].
+    weights
+        of several axes: weights of their squared errors in the reward (n,); 1 by default. Axes of
+        other units need them.
     observe
         names of channels.
     x_limit
@@ -498,14 +581,15 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
         self,
         plant: Any,
         scenario: Scenario | Draw,
-        controller: ADRC | None = None,
+        controller: ADRC | Axes | None = None,
         *,
         dt: float | None = None,
-        u_min: float = -math.inf,
-        u_max: float = math.inf,
+        u_min: Any = -math.inf,
+        u_max: Any = math.inf,
         action_repeat: int = 1,
         limit: float | None = None,
         cost_of_u: float = 0.0,
+        weights: Any = None,
         observe: Sequence[str] | None = None,
         x_limit: Any = None,
         render_mode: str | None = None,
@@ -521,12 +605,18 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
             action_repeat=action_repeat,
             limit=limit,
             cost_of_u=cost_of_u,
+            weights=weights,
             observe=observe,
             x_limit=x_limit,
             interpret=interpret,
         )
+        if render_mode is not None and self._driven.several:
+            rule = "NOT for several axes yet; record the observations and plot them"
+            raise ValueError(f"render_mode = {render_mode!r}: {rule}")
         self.observation_space = self._driven.observation_space
         self.action_space = self._driven.action_space
+        self.observation_names = self._driven.observed.labels
+        self.action_names = self._driven.action_names
         self.render_mode = render_mode
         rate = max(1, round(1.0 / self._driven.step_time))
         self.metadata = {"render_modes": list(MODES), "render_fps": rate}
@@ -551,9 +641,12 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
         if self._ended:
             raise gymnasium.error.ResetNeeded("the episode has ended: call reset first")
         given = np.asarray(action, dtype=np.float64)
-        if given.size != 1:
-            raise ValueError(f"action = {action!r}: must be one number, in an array of shape (1,)")
-        self._driven.advance(given.reshape(1), np.ones(1, np.int64))
+        size = self._driven.actions
+        if given.size != size:
+            what = "one number" if size == 1 else f"{size} numbers"
+            rule = f"must be {what}, in an array of shape ({size},)"
+            raise ValueError(f"action = {action!r}: {rule}")
+        self._driven.advance(self._driven.shaped(given), np.ones(1, np.int64))
         (terminated,), (truncated,) = self._driven.ends
         self._ended = bool(terminated or truncated)
         cost = float(self._driven.loops.step.cost[0])
@@ -561,7 +654,10 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
         return observation, -cost, bool(terminated), bool(truncated), info
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
-        info = {name: values[0].item() for name, values in self._driven.info.items()}
+        info = {
+            name: values[0].item() if values.ndim == 1 else values[0]
+            for name, values in self._driven.info.items()
+        }
         if self.render_mode is not None:
             r = float(self._driven.loops.step.row[0, 0])
             self._past.append((info["t"], r, info["y"], info["u"]))

@@ -75,6 +75,7 @@ from quell.simulation.driver import (
     logged_channels,
     run_samples,
 )
+from quell.simulation.several import SampledAxes
 from quell.types import Channels, Matrix, Vector
 
 # ---- The quantity that a policy sets in each sample ----
@@ -270,12 +271,14 @@ class Episodes:
         check_scenario(drawn, "scenario(rng)")
         return drawn
 
-    def _sampled(self, scenario: Scenario) -> SampledScenario:
+    def _sampled(self, scenario: Scenario) -> Any:
         if len(scenario.rest_at):
             raise ValueError(
                 f"rest_at = {scenario.rest_at!r}: must be empty, each episode starts from rest"
             )
-        found = SampledScenario.of(scenario, self._plant, self._controller, None)
+        several = hasattr(self._controller, "outputs")
+        kind: Any = SampledAxes if several else SampledScenario
+        found: Any = kind.of(scenario, self._plant, self._controller, None)
         if found.samples < 2:
             raise ValueError(
                 f"duration = {scenario.duration!r} s with dt = {found.dt!r} s: must be at least "
@@ -289,7 +292,7 @@ class Episodes:
             )
         return found
 
-    def _tabulated(self, scenario: SampledScenario) -> Episode:
+    def _tabulated(self, scenario: Any) -> Episode:
         whole = scenario.segment(0, scenario.samples)
         parts: list[Any] = [whole.r, whole.noise, whole.derivatives, whole.w]
         return Episode(np.column_stack(parts), scenario.x0)
@@ -528,6 +531,10 @@ class Loops:
         threads; by default one for each core, and none for few loops.
     """
 
+    entry: Any = staticmethod(run_step)
+    weight = 1.0  # of the squared errors, all together
+    outputs = 1
+
     def __init__(
         self,
         plants: Plant | Sequence[Plant],
@@ -558,10 +565,10 @@ class Loops:
             limit=self.limit,
             cost_of_u=cost,
             # Within the limit |r − y| is less than twice the limit.
-            worst=4.0 * self.limit**2 + cost * u_most**2,
+            worst=4.0 * self.limit**2 * self.weight + cost * u_most**2,
             derivatives=len(example.derivatives),
         )
-        self.channels: Channels = logged_channels(plant, controller)
+        self.channels: Channels = self._logged(plant, controller)
         self._as_python = interpret or dispatch.interpret_all or not plant.compiled
         models = [p.sampled(controller.dt, interpret) for p in (each or [plant])]
         self._models, self._plant_stride = models, int(len(models) > 1)
@@ -580,18 +587,35 @@ class Loops:
     def _make_arrays(self) -> None:
         count, width = self.count, sum(width for _, width in self.channels)
         tables = 1 if self.episodes.are_equal else count
-        columns = 2 + self.rules.derivatives + self.plant.disturbances
+        columns = 2 * self.outputs + self.rules.derivatives + self.plant.disturbances
         self._signals = np.zeros((tables, self.rules.samples, columns))
         if self.episodes.are_equal:
             self._signals[0] = self.episodes.draw(np.random.default_rng(0)).table
-        self.step = Step(
+        repeat = min(self.rules.repeat, self.rules.samples)
+        self.step: Any = self._arrays_of_step(count, width, repeat)
+
+    def _logged(self, plant: Any, controller: Any) -> Channels:
+        """Return name and width of the channels of a row."""
+        return logged_channels(plant, controller)
+
+    def _arrays_of_step(self, count: int, width: int, repeat: int) -> Any:
+        """Return the arrays that a step writes."""
+        return Step(
             row=np.zeros((count, width)),
             cost=np.zeros(count),
             sample=np.zeros(count, np.int64),
             status=np.zeros(count, np.int64),
             diverged=np.zeros(count, np.int64),
-            log=np.zeros((count, min(self.rules.repeat, self.rules.samples), len(SIGNALS))),
+            log=np.zeros((count, repeat, len(SIGNALS))),
         )
+
+    @property
+    def _columns_of_u(self) -> slice:
+        return slice(len(SIGNALS) - 1, len(SIGNALS))
+
+    def _inputs(self, actions: Any, active: Any) -> tuple[Any, ...]:
+        """Return the arguments of the compiled loop behind those of plants and lanes."""
+        return self.controller.parameters, self.rules, actions, active, self._signals, self.step
 
     def column(self, name: str) -> int:
         """Return the first column of a channel."""
@@ -607,7 +631,7 @@ class Loops:
         self._lanes.memory[chosen] = self._rest
         for array in (self.step.sample, self.step.status, self.step.diverged, self.step.cost):
             array[chosen] = 0
-        self.step.row[chosen, len(SIGNALS) - 1] = 0.0
+        self.step.row[chosen, self._columns_of_u] = 0.0
         for i in which:
             episode = self.episodes.draw(rngs[i])
             if not self.episodes.are_equal:
@@ -623,15 +647,15 @@ class Loops:
     def advance(self, actions: Vector, active: Any) -> None:
         """Take the active loops through a step; write ``step``."""
         models, plant_stride, lanes = self._models, self._plant_stride, self._lanes
-        inputs = self.controller.parameters, self.rules, actions, active, self._signals, self.step
+        inputs = self._inputs(actions, active)
         if self._as_python:
-            run: Any = interpreted(run_step)
+            run: Any = interpreted(self.entry)
             stacks: tuple[Any, ...] = models, plant_stride, lanes.members, lanes.stride
         else:
             stacks = models[0], plant_stride, lanes.members[0], lanes.stride
             if self._run is None:
                 with explain_compile_errors(models[0], inputs[0]):
-                    self._run = specialised(run_step, *stacks, *inputs, 0, 1)
+                    self._run = specialised(self.entry, *stacks, *inputs, 0, 1)
             run = self._run
         edges = [self.count * part // self._shares for part in range(self._shares + 1)]
         jobs = []

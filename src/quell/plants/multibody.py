@@ -252,8 +252,6 @@ def _solved(M, b):  # type: ignore[no-untyped-def]
 
 def _arm_rate(t, x, u, w, a, g, friction, width, joints):  # type: ignore[no-untyped-def]
     n = g.size
-    viscous, coulomb = friction[0], friction[1]
-    motor, spring, damping = joints[_MOTOR], joints[_SPRING], joints[_DAMPING]
     dx, M, tau = np.zeros(x.size), np.zeros((n, n)), np.zeros(n)
     at = 2 * n
     for i in range(n):
@@ -261,11 +259,12 @@ def _arm_rate(t, x, u, w, a, g, friction, width, joints):  # type: ignore[no-unt
         tau[i] = u[i]
         if joints[_ELASTIC, i] != 0.0:
             twist, speed = x[at] - x[i], x[at + 1] - x[n + i]
-            tau[i] = spring[i] * twist + damping[i] * speed
+            tau[i] = joints[_SPRING, i] * twist + joints[_DAMPING, i] * speed
             dx[at] = x[at + 1]
-            dx[at + 1] = (u[i] - tau[i]) / motor[i]
+            dx[at + 1] = (u[i] - tau[i]) / joints[_MOTOR, i]
             at += 2
-        tau[i] += w[i] - viscous[i] * x[n + i] - coulomb[i] * math.tanh(x[n + i] / width)
+        viscous, coulomb = friction[0, i], friction[1, i]
+        tau[i] += w[i] - viscous * x[n + i] - coulomb * math.tanh(x[n + i] / width)
         M[i, i] += joints[_RIGID, i]
     theta = 0.0
     for i in range(n):

@@ -1,4 +1,4 @@
-"""The record of one run of several axes."""
+"""The records of one run, and of a batch of runs, of several axes."""
 
 from __future__ import annotations
 
@@ -6,25 +6,98 @@ import json
 import math
 import os
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from quell import checks
 from quell.files import MAX_SIZE
 from quell.quantities import UNKNOWN, AxesSignals, Signals
-from quell.records.metrics import SETTLING_BAND, Metrics
+from quell.records.metrics import SETTLING_BAND, BatchMetrics, Metrics
 from quell.records.netcdf import Stored, load_record
 from quell.records.record import Record, columns_of
-from quell.records.trajectory import Trajectory
+from quell.records.trajectory import BatchTrajectory, Trajectory
 from quell.types import Channels, Matrix, Status
 
 if TYPE_CHECKING:
     import xarray
 
 
+class AxesRecord(Record):
+    """What records of several axes have in common."""
+
+    axis_names: tuple[str, ...]
+    axis_features: tuple[tuple[str, ...], ...]
+
+    def labels(self, name: str, width: int) -> list[str]:
+        """Return the names of the entries of a channel; none if they have numbers."""
+        axis, _, channel = name.rpartition(".")
+        if channel == "theta" and axis in self.axis_names and self.axis_features:
+            return list(self.axis_features[self.axis_names.index(axis)])
+        if not self.axis_names:
+            return []
+        of_axes = AxesSignals(self.axis_names, (), ())
+        known = self.signals if isinstance(self.signals, AxesSignals) else of_axes
+        labels = known.labels(name, width)
+        return [] if labels == [str(i) for i in range(width)] else labels
+
+    def _part_of(self, which: int | str) -> tuple[int, list[int], Channels]:
+        """Return the number of an axis, its columns and its channels."""
+        if not self.axis_names:
+            raise ValueError(
+                "this record is of one loop with several signals, which has no axes: take columns "
+                "of run['y'] and run['u']"
+            )
+        if isinstance(which, str):
+            which = self.axis_names.index(checks.one_of("axis", which, self.axis_names))
+        i = checks.whole("axis", which, 0, len(self.axis_names) - 1)
+        for name in ("r", "y", "v"):
+            if name not in self.names:
+                raise ValueError(f"axis: channel {name!r} is not recorded; add it to record")
+        prefix = f"{self.axis_names[i]}."
+        own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
+        own = [each for each in own if each[2].startswith(prefix)]
+        apart = {"r", "y", "y_measured", "u", "u_wished", "v", "status", *(each[0] for each in own)}
+        whole = [(name, width, name) for name, width in self.channels if "." not in name]
+        whole = [each for each in whole if each[0] not in apart]
+        usual = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
+        singles = [each for each in usual if each[1] in self.names]
+        columns = [columns_of(self.channels, source).start + i for _, source in singles]
+        for _, _, source in (*whole, *own):
+            columns += range(*columns_of(self.channels, source).indices(self.log.shape[-1]))
+        channels = [(name, 1) for name, _ in singles]
+        channels += [(name, width) for name, width, _ in (*whole, *own)]
+        return i, columns, tuple(channels)
+
+    def _features_of(self, i: int) -> tuple[str, ...]:
+        return self.axis_features[i] if self.axis_features else ()
+
+    def _signals_of(self, i: int) -> Signals:
+        """Return names and units of one axis: its u is v."""
+        if not isinstance(self.signals, AxesSignals):
+            return UNKNOWN
+        return Signals(self.signals.y[i])
+
+    def _names_as_text(self) -> dict[str, str]:
+        """Return the names of axes and features as attributes of a file."""
+        return {
+            "axis_names": json.dumps(self.axis_names),
+            "axis_features": json.dumps(self.axis_features),
+        }
+
+
+def _names_from(stored: Stored) -> dict[str, Any]:
+    """Return the names of axes and features from the attributes of a file."""
+    names = json.loads(stored.attributes["axis_names"])
+    features = json.loads(stored.attributes["axis_features"])
+    return {
+        "axis_names": tuple(map(str, names)),
+        "axis_features": tuple(tuple(map(str, each)) for each in features),
+    }
+
+
 @dataclass(frozen=True, eq=False)
-class AxesTrajectory(Record):
+class AxesTrajectory(AxesRecord):
     """The record of one run of several axes.
 
     ``run["y"]`` is a channel: (samples, p); r, y_measured, u, v, w and x likewise; ``run.t`` are
@@ -69,18 +142,6 @@ class AxesTrajectory(Record):
         """Return the number of samples."""
         return int(self.log.shape[0])
 
-    def labels(self, name: str, width: int) -> list[str]:
-        """Return the names of the entries of a channel; none if they have numbers."""
-        axis, _, channel = name.rpartition(".")
-        if channel == "theta" and axis in self.axis_names and self.axis_features:
-            return list(self.axis_features[self.axis_names.index(axis)])
-        if not self.axis_names:
-            return []
-        of_axes = AxesSignals(self.axis_names, (), ())
-        known = self.signals if isinstance(self.signals, AxesSignals) else of_axes
-        labels = known.labels(name, width)
-        return [] if labels == [str(i) for i in range(width)] else labels
-
     def axis(self, which: int | str) -> Trajectory:
         """Return one axis as a record of its own: its u is v_i [y-unit/s^n].
 
@@ -91,29 +152,10 @@ class AxesTrajectory(Record):
         which
             name or number, from 0.
         """
-        if not self.axis_names:
-            raise ValueError(
-                "this record is of one loop with several signals, which has no axes: take columns "
-                "of run['y'] and run['u']"
-            )
-        if isinstance(which, str):
-            which = self.axis_names.index(checks.one_of("axis", which, self.axis_names))
-        i = checks.whole("axis", which, 0, len(self.axis_names) - 1)
-        prefix = f"{self.axis_names[i]}."
-        own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
-        own = [each for each in own if each[2].startswith(prefix)]
-        apart = {"r", "y", "y_measured", "u", "u_wished", "v", "status", *(each[0] for each in own)}
-        whole = [(name, width, name) for name, width in self.channels if "." not in name]
-        whole = [each for each in whole if each[0] not in apart]
-        singles = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
-        columns = [columns_of(self.channels, source).start + i for _, source in singles]
-        for _, _, source in (*whole, *own):
-            columns += range(*columns_of(self.channels, source).indices(self.log.shape[1]))
-        channels = [(name, 1) for name, _ in singles]
-        channels += [(name, width) for name, width, _ in (*whole, *own)]
+        i, columns, channels = self._part_of(which)
         return Trajectory(
             log=np.ascontiguousarray(self.log[:, columns]),
-            channels=tuple(channels),
+            channels=channels,
             dt=self.dt,
             every=self.every,
             status=self.status,
@@ -121,14 +163,8 @@ class AxesTrajectory(Record):
             limit=self.limit,
             plant=f"{self.plant}, {self.axis_names[i]}",
             signals=self._signals_of(i),
-            features=self.axis_features[i] if self.axis_features else (),
+            features=self._features_of(i),
         )
-
-    def _signals_of(self, i: int) -> Signals:
-        """Return names and units of one axis: its u is v."""
-        if not isinstance(self.signals, AxesSignals):
-            return UNKNOWN
-        return Signals(self.signals.y[i])
 
     def metrics(
         self,
@@ -182,8 +218,7 @@ class AxesTrajectory(Record):
             "ended": self.ended,
             "limit": self.limit,
             "message": self.message,
-            "axis_names": json.dumps(self.axis_names),
-            "axis_features": json.dumps(self.axis_features),
+            **self._names_as_text(),
         }
         return self._dataset(("time",), attributes)
 
@@ -193,17 +228,103 @@ class AxesTrajectory(Record):
 
         def made(stored: Stored, found: dict[str, Any]) -> AxesTrajectory:
             known = {each.name for each in fields(cls)}
-            names = json.loads(stored.attributes["axis_names"])
-            features = json.loads(stored.attributes["axis_features"])
             return cls(
                 **{name: value for name, value in found.items() if name in known},
                 status=Status(int(stored.attributes["status"])),
                 ended=float(stored.attributes["ended"]),
                 limit=float(stored.attributes["limit"]),
-                axis_names=tuple(map(str, names)),
-                axis_features=tuple(tuple(map(str, each)) for each in features),
+                **_names_from(stored),
             )
 
         attributes = {"dt", "every", "status", "ended", "plant", "axis_names", "axis_features"}
         writer = "AxesTrajectory.save"
         return load_record(path, writer, ("time",), attributes, set(), max_size, made)
+
+
+@dataclass(frozen=True, eq=False)
+class AxesBatch(AxesRecord, BatchTrajectory):
+    """The record of a batch of runs of several axes.
+
+    ``runs["y"]`` is a channel: (runs, samples, p); r, u, v and w likewise. ``runs.run(i)`` is the
+    i-th run as an ``AxesTrajectory``, ``runs.axis("elbow")`` one axis of all runs as a
+    ``BatchTrajectory``, whose u is v. All else is that of ``BatchTrajectory``.
+    """
+
+    axis_names: tuple[str, ...] = ()
+    axis_features: tuple[tuple[str, ...], ...] = ()  #: names of each axis' features
+    stored_attributes: ClassVar[tuple[str, ...]] = ("axis_names", "axis_features")
+
+    def run(self, i: int) -> AxesTrajectory:  # type: ignore[override]
+        """Return the i-th run, to its end, with the channels that were recorded."""
+        checks.whole("i", i, 0, len(self) - 1)
+        return AxesTrajectory(
+            log=self.log[i, : self.lengths[i]],
+            channels=self.channels,
+            dt=self.dt,
+            every=self.every,
+            status=Status(int(self.status[i])),
+            ended=float(self.ended[i]),
+            limit=float(self.limit[i]),
+            plant=self.plant,
+            axis_names=self.axis_names,
+            axis_features=self.axis_features,
+            final_state=self.final_states[i] if self.final_states else None,
+            signals=self.signals,
+        )
+
+    def axis(self, which: int | str) -> BatchTrajectory:
+        """Return one axis of all runs as a batch of its own: its u is v_i [y-unit/s^n].
+
+        Parameters
+        ----------
+        which
+            name or number, from 0. The channels r, y and v must be recorded.
+        """
+        i, columns, channels = self._part_of(which)
+        return BatchTrajectory(
+            log=np.ascontiguousarray(self.log[..., columns]),
+            channels=channels,
+            dt=self.dt,
+            every=self.every,
+            lengths=self.lengths,
+            status=self.status,
+            ended=self.ended,
+            limit=self.limit,
+            plant=f"{self.plant}, {self.axis_names[i]}",
+            parameters=self.parameters,
+            features=self._features_of(i),
+            signals=self._signals_of(i),
+        )
+
+    def metrics(  # type: ignore[override]
+        self,
+        start: float = 0.0,
+        stop: float | None = None,
+        *,
+        band: float = SETTLING_BAND,
+    ) -> dict[str, BatchMetrics]:
+        """Return the measures of each axis, by its name; see ``BatchTrajectory.metrics``."""
+        return {
+            name: self.axis(i).metrics(start, stop, band=band)
+            for i, name in enumerate(self.axis_names)
+        }
+
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
+        """Draw output and v of each axis: median, bands of the runs, and when others diverged.
+
+        Parameters
+        ----------
+        axes, ax
+            matplotlib axes, two rows with one for each axis of the machine; a new figure by
+            default.
+        """
+        from quell.records.plotting import given_axes, plot_batch_of_axes
+
+        return plot_batch_of_axes(self, given_axes(axes, ax))
+
+    def _attributes(self) -> dict[str, Any]:
+        return super()._attributes() | self._names_as_text()
+
+    @classmethod
+    def _read_attributes(cls, stored: Stored) -> dict[str, Any]:
+        return _names_from(stored)

@@ -288,6 +288,25 @@ def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: A
     return axes
 
 
+def plot_batch_of_axes(runs: Any, axes: Any = None) -> Any:
+    """Draw output and v of each axis of a batch of machines; return the axes (2 n,), y first."""
+    count = len(runs.axis_names)
+    if not count:
+        raise ValueError("the loop has several signals and no axes: plot columns of runs['y']")
+    if axes is None:
+        axes = new_figure(1.0 + 4.2 * count, 5.0).subplots(2, count, sharex=True)
+    axes = np.ravel(axes)
+    if axes.size != 2 * count:
+        raise ValueError(f"axes: must be {2 * count} matplotlib axes, got {axes.size}")
+    for i, name in enumerate(runs.axis_names):
+        plot_batch(runs.axis(i), runs.diverged, runs.ended, axes[i::count])
+        axes[i].set_title(f"{name}: {axes[i].get_title()}", fontsize="medium")
+        axes[count + i].set_ylabel("v")
+        if i < count - 1:
+            axes[i].get_legend().remove()
+    return axes
+
+
 def _new_axes(count: int, height: float) -> Any:
     """Return ``count`` axes over one time axis, each ``height`` inches high."""
     import matplotlib.pyplot as plt

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -291,7 +291,8 @@ class BatchTrajectory(Record):
     parameters: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_states: tuple[Any, ...] = ()
-    signals: Signals = UNKNOWN  #: names and units of y, u and disturbances
+    signals: Any = UNKNOWN  #: names and units of y, u and disturbances
+    stored_attributes: ClassVar[tuple[str, ...]] = ()  # attributes of its files, besides the usual
 
     @property
     def diverged(self) -> NDArray[np.bool_]:
@@ -409,7 +410,7 @@ class BatchTrajectory(Record):
         The plants' parameters are coordinates of ``run``; one that has a channel's name is the
         coordinate ``plant_<name>``.
         """
-        data = self._dataset(("run", "time"), {"plant": self.plant, "message": self.message})
+        data = self._dataset(("run", "time"), self._attributes())
         taken = {*map(str, data.variables), *map(str, data.dims), *_PER_RUN}
         values_per_run = (self.lengths, self.status, self.ended, self.limit)
         coordinates: dict[str, Any] = {"run": ("run", np.arange(len(self)))}
@@ -420,8 +421,17 @@ class BatchTrajectory(Record):
             coordinates[key] = ("run", values, {"parameter": name})
         return data.assign_coords(coordinates)
 
+    def _attributes(self) -> dict[str, Any]:
+        """Return the attributes of its dataset."""
+        return {"plant": self.plant, "message": self.message}
+
     @classmethod
-    def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> BatchTrajectory:
+    def _read_attributes(cls, stored: Stored) -> dict[str, Any]:
+        """Return fields that are stored as attributes, besides those of every record."""
+        return {}
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Self:
         """Return the record that ``save`` wrote, without ``final_states``.
 
         Parameters
@@ -435,7 +445,10 @@ class BatchTrajectory(Record):
             as ``Trajectory.load``.
         """
 
-        def made(stored: Stored, fields: dict[str, Any]) -> BatchTrajectory:
+        def made(stored: Stored, fields: dict[str, Any]) -> Any:
+            if "axis_names" in stored.attributes and not cls.stored_attributes:
+                rule = "NOT possible here, they must be of one y and one u; AxesBatch.load reads it"
+                raise ValueError(f"its runs have several signals: {rule}")
             runs, samples, _ = fields["log"].shape
             values = {name: stored.values[name] for name in (*_PER_RUN, *stored.parameters)}
             lengths = values["lengths"]
@@ -450,8 +463,11 @@ class BatchTrajectory(Record):
                 ended=values["ended"],
                 limit=values["limit"],
                 parameters={called: values[name] for name, called in stored.parameters.items()},
+                **cls._read_attributes(stored),
             )
 
-        axes, attributes, variables = ("run", "time"), {"dt", "every", "plant"}, set(_PER_RUN)
-        writer = "BatchTrajectory.save"
-        return load_record(path, writer, axes, attributes, variables, max_size, made)
+        axes, variables = ("run", "time"), set(_PER_RUN)
+        attributes = {"dt", "every", "plant", *cls.stored_attributes}
+        writer = f"{cls.__name__}.save"
+        found: Self = load_record(path, writer, axes, attributes, variables, max_size, made)
+        return found

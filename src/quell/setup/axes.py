@@ -117,7 +117,7 @@ def coupled(
         `[lowest, highest]` for each.
     saturation
         what happens at the limits: `each` cuts each actuator, `direction` scales all, and a list of
-        all axes gives them what they ask for in this order.
+        all axes is their order of priority.
     weights
         of the actuators, where there are more than axes or an axis has a safe set.
     wished

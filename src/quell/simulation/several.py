@@ -250,6 +250,12 @@ def logged_channels(plant: Any, controller: Any) -> Channels:
     return (*signals, ("w", plant.disturbances), ("x", plant.order), *controller.channels)
 
 
+def names_of_axes(controller: Any) -> dict[str, Any]:
+    """Return the names of the axes, and of the features of each, for a record."""
+    features = tuple(axis.features for axis in controller.axes)
+    return {"axis_names": controller.names, "axis_features": features}
+
+
 def check_fit(plant: Any, controller: Any) -> None:
     """Raise a ``ValueError`` unless a plant has the signals of a controller of several axes."""
     name = getattr(plant, "name", plant)
@@ -295,7 +301,6 @@ def simulate_axes(
         ended=loop.ended * dt,
         limit=sampled.limit,
         plant=plant.name,
-        axis_names=controller.names,
-        axis_features=tuple(axis.features for axis in controller.axes),
+        **names_of_axes(controller),
         final_state=loop.state,
     )

@@ -34,7 +34,7 @@ from quell.lti.models import is_linear_model
 from quell.parallel import in_parallel, one_blas_thread, part_of
 from quell.plants.base import Plant, PlantBatch, check_plant, signals_of
 from quell.plants.linear import LinearPlant
-from quell.records.axes import AxesTrajectory
+from quell.records.axes import AxesBatch, AxesTrajectory
 from quell.records.record import columns_of, readable_names, signals_of_loop
 from quell.records.trajectory import BatchTrajectory, Trajectory
 from quell.simulation.driver import (
@@ -48,12 +48,20 @@ from quell.simulation.driver import (
     logged_channels,
     segment_bounds,
 )
-from quell.simulation.several import simulate_axes
+from quell.simulation.several import (
+    LoopOfAxes,
+    SampledAxes,
+    check_fit,
+    names_of_axes,
+    simulate_axes,
+)
+from quell.simulation.several import logged_channels as channels_of_axes
 from quell.types import Channels
 
 # ---- Many runs at once, on all cores ----
 
 _RECORDED = ("r", "y", "u")
+_RECORDED_OF_AXES = (*_RECORDED, "v")
 # Runs in a job: enough that threads seldom wait for the next one, few enough that progress is
 # reported often and that all threads end at about the same time. Chosen by hand.
 _RUNS_PER_JOB = 16
@@ -78,7 +86,7 @@ def simulate_batch(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-) -> BatchTrajectory:
+) -> BatchTrajectory | AxesBatch:
     """Run every plant, controller and scenario of a batch; see ``quell.simulate``."""
     plants, controllers, scenarios = _members(plant, controller, scenario)
     every = checks.whole("record_every", record_every, 1)
@@ -86,9 +94,11 @@ def simulate_batch(
     checks.optional(checks.positive, "limit", limit)
     sampled = _sampled(scenarios, plants[0], controllers, limit)
     dt, samples, runs = sampled[0].dt, sampled[0].samples, len(sampled)
-    logged = logged_channels(plants[0], controllers[0])
+    several = is_of_several(controllers[0])
+    logged = (channels_of_axes if several else logged_channels)(plants[0], controllers[0])
     width = sum(width for _, width in logged)
-    channels = _selected(_RECORDED if record is None else record, logged)
+    usual = [name for name, _ in logged if name in _RECORDED_OF_AXES] if several else _RECORDED
+    channels = _selected(usual if record is None else record, logged)
     columns = [k for name, _ in channels for k in range(width)[columns_of(logged, name)]]
     recorded = [(name, j) for name, width in channels for j in range(width)]
     # Channel by channel, so that a channel of all runs is contiguous in memory.
@@ -96,13 +106,18 @@ def simulate_batch(
     outcome = Outcome(log, *(np.zeros(runs, dtype=np.int64) for _ in range(3)))
     loops: list[Loop] = []
     first: dict[Any, Loop] = {}
+    make = LoopOfAxes if several else Loop
     for i, model in enumerate(_models(plants, dt, interpret)):
         compiled = not interpret and plants[i].compiled
         structure = (id(controllers[i]), layout_of(model)) if compiled else i
         like = first.get(structure)
-        loops.append(Loop(plants[i], model, controllers[i], sampled[i], interpret, like))
+        loops.append(make(plants[i], model, controllers[i], sampled[i], interpret, like))
         first.setdefault(structure, loops[i])
-    if max(columns) < len(SIGNALS) and not any(loop.integration.needed for loop in loops):
+    if (
+        not several
+        and max(columns) < len(SIGNALS)
+        and not any(loop.integration.needed for loop in loops)
+    ):
         width = len(SIGNALS)  # states and estimates are not used
     _run_loops(loops, columns, width, every, outcome, progress, workers)
     for i in np.flatnonzero(outcome.lengths < log.shape[2]).tolist():
@@ -111,21 +126,28 @@ def simulate_batch(
     judge_integration(name, loops)
     for i, loop in enumerate(loops):
         outcome.status[i], outcome.ended[i] = int(loop.result_status), loop.ended
-    return BatchTrajectory(
-        log=np.moveaxis(log, 0, -1),
-        channels=channels,
-        dt=dt,
-        every=every,
-        lengths=outcome.lengths,
-        status=outcome.status,
-        ended=np.asarray(outcome.ended * dt, dtype=np.float64),
-        limit=np.array([s.limit for s in sampled]),
-        plant=name,
-        parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
-        features=controllers[0].features,
-        signals=signals_of_loop(signals_of(plants[0]), controllers[0]),
-        final_states=tuple(loop.state for loop in loops),
-    )
+    found: dict[str, Any] = {
+        "log": np.moveaxis(log, 0, -1),
+        "channels": channels,
+        "dt": dt,
+        "every": every,
+        "lengths": outcome.lengths,
+        "status": outcome.status,
+        "ended": np.asarray(outcome.ended * dt, dtype=np.float64),
+        "limit": np.array([s.limit for s in sampled]),
+        "plant": name,
+        "parameters": plants.parameters if isinstance(plants, PlantBatch) else {},
+        "final_states": tuple(loop.state for loop in loops),
+    }
+    if several:
+        return AxesBatch(**found, **names_of_axes(controllers[0]))
+    signals = signals_of_loop(signals_of(plants[0]), controllers[0])
+    return BatchTrajectory(**found, features=controllers[0].features, signals=signals)
+
+
+def is_of_several(controller: Any) -> bool:
+    """Return whether a controller has several signals, as ``Axes`` and ``StateFeedback``."""
+    return isinstance(controller, Axes | StateFeedback | SeveralInSingle)
 
 
 def _run_loops(
@@ -141,7 +163,7 @@ def _run_loops(
     log, lengths = outcome.log, outcome.lengths
 
     def run_some(
-        which: Sequence[int], first: int, last: int, shared: Mapping[SampledScenario, Segment]
+        which: Sequence[int], first: int, last: int, shared: Mapping[Any, Segment]
     ) -> None:
         """Take some runs through a segment, in a thread."""
         buffer = np.empty(((last - first) // every + 1, width))
@@ -175,7 +197,12 @@ def _members(
 ) -> tuple[Sequence[Plant], Sequence[Controller], Sequence[Scenario]]:
     """Return plants, controllers and scenarios, one for each run."""
     given = {"plant": plant, "controller": controller, "scenario": scenario}
-    check = {"plant": check_plant, "controller": check_controller, "scenario": check_scenario}
+    check_any = partial(check_controller, several=True)
+    check: dict[str, Callable[..., None]] = {
+        "plant": check_plant,
+        "controller": check_any,
+        "scenario": check_scenario,
+    }
     lengths = {name: len(value) for name, value in given.items() if checks.is_sequence(value)}
     (leader, runs), *others = lengths.items()
     for name, length in others:
@@ -200,27 +227,31 @@ def _members(
     for i, other in enumerate(controllers):
         if other is controllers[0]:
             continue
-        for what in ("dt", "channels", "features"):
-            value, first = getattr(other, what), getattr(controllers[0], what)
+        for what in ("dt", "channels", "features", "inputs", "outputs"):
+            value, first = (getattr(each, what, 1) for each in (other, controllers[0]))
             if value != first:
                 raise ValueError(
                     f"controller[{i}] has {what} = {value!r}, controller[0] {first!r}: "
                     "must be the same; run them as two batches"
                 )
+    if is_of_several(controllers[0]):
+        for parts in zip(plants, controllers, strict=True):
+            check_fit(*parts)
     return plants, controllers, scenarios
 
 
 def _sampled(
     scenarios: Sequence[Scenario], plant: Plant, controllers: Sequence[Controller], limit: Any
-) -> list[SampledScenario]:
+) -> list[Any]:
     """Return the sampled scenario of each run; runs of one scenario share theirs."""
-    found: dict[tuple[int, int], SampledScenario] = {}
-    sampled: list[SampledScenario] = []
+    kind: Any = SampledAxes if is_of_several(controllers[0]) else SampledScenario
+    found: dict[tuple[int, Any], Any] = {}
+    sampled: list[Any] = []
     for i, (scenario, controller) in enumerate(zip(scenarios, controllers, strict=True)):
         key = id(scenario), getattr(controller, "derivatives", 0)
         if key not in found:
             try:
-                found[key] = SampledScenario.of(scenario, plant, controller, limit)
+                found[key] = kind.of(scenario, plant, controller, limit)
             except ValueError as error:
                 where = "" if all(each is scenario for each in scenarios) else f"scenario[{i}]: "
                 raise ValueError(f"{where}{error}") from None
@@ -296,6 +327,20 @@ def simulate(
     record: Sequence[str] | None = None,
     workers: int | None = None,
 ) -> BatchTrajectory: ...
+@overload
+def simulate(
+    plant: Any,
+    controller: Axes | StateFeedback | SeveralInSingle | Sequence[Axes] | Sequence[StateFeedback],
+    scenario: Scenario | Sequence[Scenario],
+    *,
+    record_every: int = 1,
+    limit: float | None = None,
+    interpret: bool = False,
+    precision: str = "double",
+    progress: Callable[[float], None] | None = None,
+    record: Sequence[str] | None = None,
+    workers: int | None = None,
+) -> AxesBatch: ...
 def simulate(
     plant: Any,
     controller: Any,
@@ -308,7 +353,7 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-) -> Trajectory | BatchTrajectory | AxesTrajectory:
+) -> Trajectory | BatchTrajectory | AxesTrajectory | AxesBatch:
     """Run a controller on a plant through a scenario, or a batch of them on all cores.
 
     The controller starts with nothing learned, from a new state: neither it nor the plant is
@@ -341,14 +386,15 @@ def simulate(
     progress
         called with the share done, 0 to 1, every few thousand samples, or every few runs.
     record
-        for a batch: channels to record, ``("r", "y", "u")`` by default. A single run records all.
+        for a batch: channels to record, ``("r", "y", "u")`` by default, of several axes ``"v"``,
+        too. A single run records all.
     workers
         for a batch: number of threads; the number of cores by default.
 
     Returns
     -------
-    Trajectory, BatchTrajectory or AxesTrajectory
-        the recorded samples, up to the end of the run; ``AxesTrajectory`` for several signals.
+    Trajectory, BatchTrajectory, AxesTrajectory or AxesBatch
+        the recorded samples, up to the end of the run; the latter two for several signals.
 
     Raises
     ------
@@ -366,24 +412,9 @@ def simulate(
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
-    if single and not interpret:
-        check_compilable()
-    if isinstance(controller, Axes | StateFeedback | SeveralInSingle):
-        for name, value in (("record", record), ("workers", workers)):
-            if value is not None:
-                raise ValueError(f"{name} = {value!r}: several axes are simulated without it")
-        for name, value in (("plant", plant), ("scenario", scenario)):
-            if checks.is_sequence(value):
-                raise ValueError(
-                    f"{name} has {len(value)} entries: batches of several axes are NOT possible "
-                    "yet; simulate one after the other"
-                )
-        check_plant(plant)
-        check_scenario(scenario)
-        if single:
-            controller = in_single_precision(controller)
-        return simulate_axes(plant, controller, scenario, record_every, limit, interpret, progress)
     if single:
+        if not interpret:
+            check_compilable()
         several = checks.is_sequence(controller)
         controller = _in_single(controller) if several else in_single_precision(controller)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
@@ -394,6 +425,9 @@ def simulate(
             rule = "is for a batch; a single run records all channels, in this thread"
             raise ValueError(f"{name} = {value!r}: {rule}")
     check_plant(plant)
+    if is_of_several(controller):
+        check_scenario(scenario)
+        return simulate_axes(plant, controller, scenario, record_every, limit, interpret, progress)
     check_controller(controller)
     check_scenario(scenario)
     every = checks.whole("record_every", record_every, 1)

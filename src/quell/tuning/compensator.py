@@ -96,6 +96,7 @@ class TunedCompensator:
     tables: dict[str, dict[str, Any]]  #: ``[observer]`` and ``[compensator]`` of a setup file
     dt: float  #: sample time [s]
     loads: tuple[Vector, Vector]  #: y after the step of the load, before and after [y-unit]
+    loads_dt: float  #: time from one y of the loads to the next: ``dt``, or more of slow loops [s]
 
     @property
     def compensator(self) -> Compensator:
@@ -120,7 +121,7 @@ class TunedCompensator:
         for y, label in zip(self.loads, ("controller alone", "with compensator"), strict=True):
             size = np.abs(y)
             shown = min(int(np.flatnonzero(size > 0.02 * np.max(size))[-1]) + 2, y.size)
-            ax.plot(np.arange(shown) * self.dt, y[:shown], label=label)
+            ax.plot(np.arange(shown) * self.loads_dt, y[:shown], label=label)
         ax.set(xlabel="t [s]", ylabel="y [y-unit]", title="Step of the load")
         ax.legend()
         return ax
@@ -249,7 +250,8 @@ def tune_compensator(
         response(first, law_of(controller), inputs),
         response(first, law_of(plain), inputs),
     )
-    return TunedCompensator(both, best.name, before, best.measures, bounds, tables, dt, loads)
+    known, apart = (before, best.measures, bounds, tables, dt, loads), dt * inputs.distance
+    return TunedCompensator(both, best.name, *known, apart)
 
 
 def _with_speeds(given: Given, speeds: tuple[float, float]) -> Given:
@@ -401,7 +403,7 @@ def _measured(
 
 
 def _iae(y: Vector, dt: float, inputs: Inputs) -> float:
-    return float(np.sum(np.abs(y)) * dt / np.max(np.abs(inputs.d)))
+    return float(np.sum(np.abs(y)) * dt * inputs.distance / np.max(np.abs(inputs.d)))
 
 
 def _excess(measures: Measures, bounds: Constraints) -> float:

@@ -38,6 +38,7 @@ from quell.plants.nonlinear import NonlinearPlant, checked_point
 from quell.quantities import Signals
 from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser import loops
 from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of, load_step, response
 from quell.tuning.optimiser.requirements import (
     USUAL_DAMPING,
@@ -377,18 +378,17 @@ class ReferenceStep(NamedTuple):
 
 def reference_step(plants: PlantSet, controller: Controller) -> ReferenceStep:
     """Return the response of the first plant with a linear controller."""
-    size = load_step(plants).r.size
-    law, one, none = law_of(controller), np.ones(size), np.zeros(size)
-    y = response(plants.scaled()[0], law, Inputs(one, none))
-    overshoot, settling = _measured(y, plants.dt)
+    inputs, law = loops.reference_step(plants), law_of(controller)
+    y, dt = response(plants.scaled()[0], law, inputs), plants.dt * inputs.distance
+    overshoot, settling = _measured(y, dt)
     if not overshoot > MOST_OVERSHOOT:
         return ReferenceStep(overshoot, settling, None, math.nan)
     # With the pulse response any prefilter is a convolution.
     pulse = np.diff(y, prepend=0.0)
-    low, high, best = _SLOWEST / plants.dt, 1.0 / plants.dt, None
+    low, high, best = _SLOWEST / dt, 1.0 / dt, None
     for _ in range(_BISECTIONS):
         omega = math.sqrt(low * high)
-        after = _measured(_behind(ReferenceModel(omega, _ORDER), pulse, plants.dt), plants.dt)
+        after = _measured(_behind(ReferenceModel(omega, _ORDER), pulse, dt), dt)
         if after[0] <= MOST_OVERSHOOT:
             low, best = omega, (ReferenceModel(omega, _ORDER), after[1])
         else:
@@ -400,10 +400,12 @@ def reference_step(plants: PlantSet, controller: Controller) -> ReferenceStep:
 
 def peak_of_u(plants: PlantSet, controller: Controller) -> float:
     """Return the largest ``|u|`` after a unit step of r [u-unit/y-unit], without limits of u."""
-    size = load_step(plants).r.size
-    one, none = np.ones(size), np.zeros(size)
-    u = response(plants.scaled()[0], law_of(controller), Inputs(one, none), "u")
-    return float(np.max(np.abs(u)))
+    inputs, first, law = loops.reference_step(plants), plants.scaled()[0], law_of(controller)
+    largest = float(np.max(np.abs(response(first, law, inputs, "u"))))
+    if inputs.distance > 1:  # the law may be faster than that
+        start = inputs._replace(distance=1)
+        largest = max(largest, float(np.max(np.abs(response(first, law, start, "u")))))
+    return largest
 
 
 def _behind(model: ReferenceModel, pulse: Vector, dt: float) -> Vector:

@@ -38,7 +38,7 @@ from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import range_of_u
-from quell.tuning.optimiser.loops import area_of_step
+from quell.tuning.optimiser.loops import area_until_rest
 from quell.tuning.plants import Given, given_plants, with_known_noise
 from quell.tuning.report import toml_text
 from quell.tuning.tune import tune
@@ -49,9 +49,6 @@ _STRUCTURES = ("bandwidths", "half-gain", "half-gain-law")
 _TABLES = ("b0", "all")
 # Options of ``tune`` that are for sets of plants, or for other results.
 _NOT_HERE = ("uncertain", "scenario", "search", "compare", "feedforward")
-# Where the response to a step of the load ends, in time constants of the slowest pole: what is left
-# is a share of e⁻²⁰ of y. And the limits of that pole in the z-plane, beyond which it is rounding.
-_TIME_CONSTANTS, _FASTEST, _SLOWEST = 20.0, 1e-9, 1.0 - 1e-12
 # Bandwidths that differ by less are those of one optimum; and the ratio of the integrals of |y|
 # from which on the summary advises other tables.
 _SAME, _MUCH = 1e-6, 1.15
@@ -499,6 +496,4 @@ def load_iae(loop: LoopAnalysis) -> float:
     """Return the integral of ``|y|`` after a unit step of the load at the plant's input."""
     if not loop.stable:
         return math.inf
-    system = loop.closed_loop("d", "y")
-    pole = min(max(system.largest_pole, _FASTEST), _SLOWEST)
-    return area_of_step(system, math.ceil(_TIME_CONSTANTS / -math.log(pole)) + 1) * float(loop.dt)
+    return area_until_rest(loop.closed_loop("d", "y")) * float(loop.dt)

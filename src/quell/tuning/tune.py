@@ -28,7 +28,7 @@ from quell.tuning.designs import (
     with_noise_bound,
     without_damping,
 )
-from quell.tuning.optimiser.loops import Inputs, PlantSet, load_step
+from quell.tuning.optimiser.loops import Inputs, PlantSet, load_step, samples_of
 from quell.tuning.optimiser.requirements import OBJECTIVES
 from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set, with_known_noise
 from quell.tuning.report import (
@@ -185,6 +185,12 @@ def tune(
     u_limits = range_of_u(limits)
     if uncertain is None:
         constraints = with_known_noise(given_constraints(constraints), as_list(plant)[0], u_limits)
+    checks.whole("seed", seed, 0)
+    if compare is not None and not checks.is_sequence(compare):
+        raise ValueError(
+            f"compare = {compare!r}: must be a list of structures, as compare=['pi', 'pid'], or an "
+            "empty list for none"
+        )
     if scenario is not None or not isinstance(objective, str) or objective not in OBJECTIVES:
         how: dict[str, Any] = {"structure": structure, "order": order, "constraints": constraints}
         how |= {"compare": compare, "delay": delay, "actuator_lag": actuator_lag, "setup": setup}
@@ -329,7 +335,8 @@ def _inputs(
     step = load_step(plants, checks.finite("load", load), last)
     if reference is None:
         return step
-    t: Vector = np.arange(step.r.size, dtype=np.float64) * plants.dt
+    count = samples_of(plants.dt * step.r.size * step.distance if last is None else last, plants.dt)
+    t: Vector = np.arange(count, dtype=np.float64) * plants.dt
     if not callable(reference):
         raise ValueError(f"reference = {reference!r}: must be a signal, as quell.signals.Step()")
     r, none = np.asarray(reference(t), dtype=np.float64), np.zeros(t.size)
@@ -400,7 +407,8 @@ def _setup(
         if rest is not None:
             rest = rest._replace(x0=(*rest.x0, *[rest.u] * waiting))
     if "scenario" not in tables:
-        last = float(f"{load_step(plants).r.size * dt:.2g}")
+        step = load_step(plants)
+        last = float(f"{step.r.size * step.distance * dt:.2g}")
         rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
         assert design.solution is not None
         peak = peak_of_u(plants, design.solution.controller)

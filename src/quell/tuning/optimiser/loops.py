@@ -415,10 +415,14 @@ def _delayed(law: LinearLaw, samples: int) -> LinearLaw:
 
 # ---- Responses of linear loops over time, for objectives and limits of u that are about them ----
 
-# Controllers whose responses are kept: those of one difference quotient, and some more.
-_KEPT = 64
-# Responses last so many radians of the plant's phase crossover, and at most so many samples.
-_LASTS, _MOST_SAMPLES = 150.0, 50_000
+# Controllers whose responses are kept: those of one difference quotient, and some more; fewer of
+# long responses, so that all have at most so many numbers for each plant.
+_KEPT, _KEPT_SAMPLES = 64, 3_200_000
+# Responses to steps last so many radians of the plant's phase crossover. Of longer ones than so
+# many samples every second is calculated, or every fourth …, which leaves 650 points per radian.
+_LASTS, _ALL_SAMPLES = 150.0, 200_000
+# Samples of a response to any reference, each of which counts.
+_MOST_SAMPLES = 2_000_000
 # Beyond, a response is that of an unstable loop: it would overflow.
 _DIVERGED = 1e100
 
@@ -434,6 +438,9 @@ class Inputs(NamedTuple):
     r: Vector  # (k,) [y-unit]
     d: Vector  # (k,) [u-unit]
     u_ff: Vector | None = None  # (k,) [u-unit]
+    # Samples from one of the k to the next, a power of two; more than one for constant inputs only.
+    distance: int = 1
+    lasts: bool = False  # a load that stays: what counts lasts until y is at rest, not k samples
 
     def of_loop(self) -> tuple[tuple[str, Vector], ...]:
         """Return the inputs of the linear loop by their names in ``closed_loop``."""
@@ -443,10 +450,36 @@ class Inputs(NamedTuple):
 
 
 def load_step(plants: PlantSet, size: float = 1.0, duration: float | None = None) -> Inputs:
-    """Return a step of the load, by default for 150 radians of the plants' crossover."""
+    """Return a step of the load, by default for 150 radians of the plants' crossover.
+
+    The samples of a long one are at a distance.
+    """
     last = _LASTS / plants.crossover if duration is None else duration
-    count = max(min(round(last / plants.dt), _MOST_SAMPLES), 10)
-    return Inputs(np.zeros(count), np.full(count, size))
+    count, distance = max(round(last / plants.dt), 10), 1
+    while count > _ALL_SAMPLES * distance:
+        distance *= 2
+    count = -(-count // distance)
+    return Inputs(np.zeros(count), np.full(count, size), None, distance, duration is None)
+
+
+def reference_step(plants: PlantSet) -> Inputs:
+    """Return a unit step of the reference, as long as ``load_step``."""
+    load = load_step(plants)
+    return Inputs(np.ones(load.r.size), np.zeros(load.r.size), distance=load.distance)
+
+
+def samples_of(duration: float, dt: float) -> int:
+    """Return the number of samples of a reference.
+
+    Raises ``ValueError`` for more than can be calculated, each of which would count.
+    """
+    count = max(round(duration / dt), 10)
+    if count > _MOST_SAMPLES:
+        raise ValueError(
+            f"duration = {duration:g} s has {count} samples of dt = {dt:g} s: a response to a "
+            f"reference has at most {_MOST_SAMPLES}; give a shorter duration, or a larger dt"
+        )
+    return count
 
 
 class SetResponses:
@@ -467,14 +500,27 @@ class SetResponses:
         """Return y or u with the controller of values (p,), one array (k,) for each plant."""
         key = id(structure), values.tobytes(), target
         if key not in self._known:
-            if len(self._known) >= _KEPT:
+            law = _law_at(structure, values)
+            if len(self._known) >= min(_KEPT, max(_KEPT_SAMPLES // self.inputs.r.size, 4)):
                 self._known.clear()
-            with warnings.catch_warnings():
-                # Of controllers on the way of a search; the result's own is made with warnings.
-                warnings.simplefilter("ignore", DesignWarning)
-                law = law_of(structure.controller(values))
             self._known[key] = [response(p, law, self.inputs, target) for p in self._scaled]
         return self._known[key]
+
+    def areas(self, structure: Structure, values: Vector) -> Vector:
+        """Return the integral of ``|y|`` after the step of the load, of each plant.
+
+        It lasts until y is at rest: bounds of noise may make a loop far slower than its plant.
+        """
+        law, size = _law_at(structure, values), self.plants.dt * abs(float(self.inputs.d[0]))
+        loops = [closed_loop(plant, law, "d", "y") for plant in self._scaled]
+        return np.array([size * area_until_rest(loop) for loop in loops])
+
+
+def _law_at(structure: Structure, values: Vector) -> LinearLaw:
+    with warnings.catch_warnings():
+        # Of controllers on the way of a search; the result's own is made with warnings.
+        warnings.simplefilter("ignore", DesignWarning)
+        return law_of(structure.controller(values))
 
 
 def response(plant: SampledPlant, law: LinearLaw, inputs: Inputs, target: str = "y") -> Vector:
@@ -485,11 +531,24 @@ def response(plant: SampledPlant, law: LinearLaw, inputs: Inputs, target: str = 
         total += inputs.u_ff
     for source, given in inputs.of_loop():
         if np.any(given):
-            pulse = pulse_in_blocks(closed_loop(plant, law, source, target), size)
+            loop = at_distance(closed_loop(plant, law, source, target), inputs.distance)
+            pulse = pulse_in_blocks(loop, size)
             if not np.max(np.abs(pulse)) < _DIVERGED:
                 return np.full(size, np.inf)
             total += _convolved(pulse, given)
     return total
+
+
+def at_distance(system: System, distance: int) -> System:
+    """Return the system of each ``distance``-th sample, a power of two, of an input held so long.
+
+    Its first output is that of the first sample.
+    """
+    N, B, C, D = System.balanced(*system)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(distance.bit_length() - 1):
+            N, B = 2.0 * N + N @ N, 2.0 * B + N @ B
+    return System(N, B, C, D)
 
 
 def _convolved(one: Vector, other: Vector) -> Vector:
@@ -527,6 +586,9 @@ def pulse_in_blocks(system: System, size: int) -> Vector:
 # below 1/20 000 of the time that has passed, so that only modes are left that are far slower, or
 # whose damping is below 1e-3.
 _ONE_BY_ONE, _OF_A_DISTANCE = 50_000, 10_000
+# Where the response to a step ends, in time constants of the slowest pole: what is left is a share
+# of e⁻²⁰ of y. And the limits of that pole in the z-plane, beyond which it is rounding.
+_TIME_CONSTANTS, _FASTEST, _SLOWEST = 20.0, 1e-9, 1.0 - 1e-12
 
 
 def area_of_step(system: System, samples: int) -> float:
@@ -555,3 +617,12 @@ def area_of_step(system: System, samples: int) -> float:
         x = np.linalg.matrix_power(N + np.eye(n + 1), count) @ x
         passed += count * distance
     return total
+
+
+def area_until_rest(system: System) -> float:
+    """Return the sum of ``|y|`` of a system that comes to rest at 0 after a unit step; else inf."""
+    pole = system.largest_pole
+    if pole >= 1.0:
+        return math.inf
+    pole = min(max(pole, _FASTEST), _SLOWEST)
+    return area_of_step(system, math.ceil(_TIME_CONSTANTS / -math.log(pole)) + 1)

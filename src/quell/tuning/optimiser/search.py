@@ -223,7 +223,7 @@ def _limit_of_u(name: str, limit: float, over: SetResponses) -> Extra:
             largest = 0.0
             for u in over.of(structure, row, "u"):
                 if name == "rate_max":
-                    u = np.diff(u, prepend=0.0) / over.plants.dt
+                    u = np.diff(u, prepend=0.0) / (over.plants.dt * over.inputs.distance)
                 largest = max(largest, float(np.max(np.abs(u))))
             found[i] = min(largest / limit, 1e6)
         return found
