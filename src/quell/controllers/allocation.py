@@ -47,7 +47,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numba
@@ -713,6 +713,7 @@ def checked_gain(
     if callable(given):
         rule = f"it takes x, an array ({n}, {most}) of estimates x[axis, derivative]"
         plain, values = user_functions.separated(name, given, 1)
+        user_functions.frozen(plain)  # compiles helpers again whose globals have changed
         first = user_functions.attempt(f"{name}(zeros)", rule, partial(plain, **values), x)
         first = checks.matrix(f"{name}(zeros)", first)
     else:
@@ -748,7 +749,6 @@ def checked_gain(
         ) from None
     numbers = user_functions.as_array(values)
     design = FunctionGain(code.address, name == "M", of_actuators, numbers)
-    user_functions.set_origin(code.address, plain, numbers=(0, shapes))
     return Gain(design, code, (n, count), start, of_actuators)
 
 
@@ -786,7 +786,7 @@ def _check_condition(name: str, matrix: Matrix, names: Sequence[str]) -> None:
 _KEPT = 32
 
 
-@lru_cache(maxsize=_KEPT)
+@user_functions.kept_code(_KEPT)
 def _compiled_gain(
     function: Callable[..., Any],
     shapes: user_functions.Shapes,
@@ -806,7 +806,9 @@ def _compiled_gain(
             for j in range(outer[1]):
                 out[i, j] = matrix[i][j]
 
-    return user_functions.compile_cfunc(nb_types.void(POINTER, POINTER, POINTER), write)
+    code = user_functions.compile_cfunc(nb_types.void(POINTER, POINTER, POINTER), write)
+    user_functions.set_origin(code.address, function, numbers=(0, shapes))
+    return code
 
 
 def checked_rule(
