@@ -31,7 +31,7 @@ from quell.experiments.common import save_figures
 from quell.files import nonfinite_to_none
 from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
-from quell.plants.base import signals_of
+from quell.plants.base import one_at_a_time, signals_of
 from quell.records.metrics import MEASURES
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.setup.axes import signals_in
@@ -267,7 +267,7 @@ def over_seeds(
     for batch in (numbers[:1], numbers[1:]):
         jobs = [partial(run, controller, seed) for seed in batch for controller in made]
         share = part_of(progress, len(results), len(results) + len(jobs), total)
-        results += in_parallel(jobs, share) if jobs else []
+        results += in_parallel(jobs, share, 1 if one_at_a_time(plant) else None) if jobs else []
     shape = len(numbers), len(made), len(judged), len(axes), len(MEASURES)
     table = np.array([[found[name] for name in measures] for found, _ in results]).reshape(shape)
     diverged = np.array([lost for _, lost in results]).reshape(shape[:2])
