@@ -58,6 +58,7 @@ from quell import checks
 from quell.controllers.base import Limits, RateLimit, checked_limits
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.frozen import frozen, kept_code
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.sized import Buffer, Flag, Work
 from quell.kernels.user_functions import POINTER, call
@@ -713,7 +714,7 @@ def checked_gain(
     if callable(given):
         rule = f"it takes x, an array ({n}, {most}) of estimates x[axis, derivative]"
         plain, values = user_functions.separated(name, given, 1)
-        user_functions.frozen(plain)  # compiles helpers again whose globals have changed
+        frozen(plain)  # compiles helpers again whose globals have changed
         first = user_functions.attempt(f"{name}(zeros)", rule, partial(plain, **values), x)
         first = checks.matrix(f"{name}(zeros)", first)
     else:
@@ -786,7 +787,7 @@ def _check_condition(name: str, matrix: Matrix, names: Sequence[str]) -> None:
 _KEPT = 32
 
 
-@user_functions.kept_code(_KEPT)
+@kept_code(_KEPT)
 def _compiled_gain(
     function: Callable[..., Any],
     shapes: user_functions.Shapes,

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
+from quell.kernels.frozen import frozen, kept_code
 from quell.kernels.functions import is_single, log2
 from quell.kernels.sized import Flag, Size
 from quell.kernels.user_functions import (
@@ -49,9 +50,7 @@ from quell.kernels.user_functions import (
     NotCompilableError,
     call,
     compile_cfunc,
-    frozen,
     jit_user_function,
-    kept_code,
     set_origin,
 )
 from quell.types import Vector

@@ -20,16 +20,11 @@ Each error names the user's class and the rule. Classes of this package are not 
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import inspect
 from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import lru_cache, partial, wraps
+from functools import lru_cache, partial
 from math import prod
-from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -38,6 +33,7 @@ from numba.extending import intrinsic, overload
 
 from quell import checks
 from quell.kernels.dispatch import Generic, set_display_name
+from quell.kernels.frozen import Frozen, frozen, outdated_helper
 from quell.kernels.numba_internals import ir
 from quell.kernels.sized import Scalars
 from quell.types import Vector
@@ -157,14 +153,11 @@ def jit_user_function(function: Callable[..., Any]) -> Any:
     Bound methods and callable objects raise a ``NotCompilableError``, and functions that call one
     of ``register_jitable`` whose globals have changed: Numba compiles that only once.
     """
-    for helper in _reached(function):
-        if not hasattr(helper, "recompile") and helper is not function:
-            now = _all_taken(helper)
-            if _compiled_with.setdefault(helper, now) != now:
-                raise NotCompilableError(
-                    f"{helper.__name__} has been compiled with other values of its globals or of "
-                    "the variables around it: define it again, or pass them as arguments"
-                )
+    if (helper := outdated_helper(function)) is not None:
+        raise NotCompilableError(
+            f"{helper.__name__} has been compiled with other values of its globals or of the "
+            "variables around it: define it again, or pass them as arguments"
+        )
     try:
         # Division by zero gives inf, as in numpy: an exception can't leave compiled code from here.
         return numba.njit(getattr(function, "py_func", function), error_model="numpy")
@@ -179,157 +172,6 @@ def compile_cfunc(signature: Any, function: Callable[..., Any]) -> Any:
     except Exception as error:  # compilation can raise anything
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise NotCompilableError(" ".join(lines[:2])) from error
-
-
-# ---- What compiled code has frozen of a user's function ----
-
-# Functions whose names are kept. Chosen by hand: more than those of a study.
-_FUNCTIONS = 256
-# Packages whose functions and constants do not change.
-_LIBRARIES = frozenset({"numba", "numpy", "quell", "scipy"})
-# What helpers took from outside when they were compiled.
-_compiled_with: WeakKeyDictionary[Any, tuple[Any, ...]] = WeakKeyDictionary()
-
-
-class _Itself:
-    """A value that equals only itself."""
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Itself) and other.value is self.value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-
-@dataclass(frozen=True)
-class Frozen:
-    """A user's function; equal to another one if the code that Numba makes of both is the same."""
-
-    function: Callable[..., Any] = field(compare=False)
-    data: tuple[Any, ...]
-
-
-def frozen(function: Callable[..., Any]) -> Frozen:
-    """Return a function with all that becomes constant in its code.
-
-    That are its instructions and defaults, the variables of enclosing functions and the globals
-    that it names: numbers, texts, the contents of arrays and tuples, and what modules have under
-    the names in it; and the same of the helpers that it calls. Other objects count by identity.
-
-    Numba keeps the code of a helper under ``numba.njit``, too: it is compiled again if any of this
-    has changed, or may have changed before it was first seen here. So call this before the first
-    trial of a function as well.
-    """
-    found = _reached(function)
-    for helper in found:  # those that are called come before those that call them
-        if hasattr(helper, "recompile"):
-            now = _all_taken(helper)
-            if _compiled_with.get(helper) != now:
-                _compiled_with[helper] = now
-                if helper.overloads and any(len(taken) > 2 for taken in now):  # any from outside
-                    with suppress(Exception):  # it is raised again where the helper is called
-                        helper.recompile()
-    return Frozen(function, (_Itself(function), *found.values()))
-
-
-def kept_code(most: int | None) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that keeps the last ``most`` results of a function that compiles.
-
-    Arguments are functions of users, which count with what is ``frozen`` of them, and hashable
-    values.
-    """
-
-    def decorate(build: Callable[..., Any]) -> Callable[..., Any]:
-        @lru_cache(maxsize=most)
-        def kept(*given: Any) -> Any:
-            return build(*(each.function if isinstance(each, Frozen) else each for each in given))
-
-        @wraps(build)
-        def code(*given: Any) -> Any:
-            return kept(*(frozen(each) if callable(each) else each for each in given))
-
-        return code
-
-    return decorate
-
-
-def _reached(function: Any) -> dict[Any, tuple[Any, ...]]:
-    """Return what a function and all helpers that it calls take from outside, itself as the last.
-
-    There is nothing for what is no function.
-    """
-    found: dict[Any, tuple[Any, ...]] = {}
-    begun = set()
-
-    def reach(each: Any) -> None:
-        if each not in begun:
-            begun.add(each)
-            helpers: list[Any] = []
-            taken = _taken(getattr(each, "py_func", each), helpers)
-            for helper in helpers:
-                reach(helper)
-            found[each] = taken
-
-    if isinstance(getattr(function, "py_func", function), FunctionType):
-        reach(function)
-    return found
-
-
-def _all_taken(helper: Any) -> tuple[Any, ...]:
-    """Return what a helper and all that it calls take from outside."""
-    return tuple(_reached(helper).values())
-
-
-def _taken(function: FunctionType, helpers: list[Any]) -> tuple[Any, ...]:
-    """Return what a function takes from outside, and add the helpers that it calls to the list."""
-    code = function.__code__
-    names = _names(code)
-    taken = [(name, function.__globals__[name]) for name in names if name in function.__globals__]
-    for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
-        with suppress(ValueError):  # a variable without a value yet
-            taken.append((name, cell.cell_contents))
-    taken.append(("=", (function.__defaults__, *(function.__kwdefaults__ or {}).values())))
-    values = ((name, _comparable(value, names, helpers)) for name, value in taken)
-    return (code, *values)
-
-
-@lru_cache(maxsize=_FUNCTIONS)
-def _names(code: CodeType) -> tuple[str, ...]:
-    """Return the names of globals and attributes in a function and in those inside of it."""
-    inner = (each for each in code.co_consts if isinstance(each, CodeType))
-    return tuple(
-        dict.fromkeys([*code.co_names, *(name for each in inner for name in _names(each))])
-    )
-
-
-def _comparable(value: Any, names: tuple[str, ...], helpers: list[Any]) -> Any:
-    """Return what is equal, and has the same hash, for the same constant in compiled code."""
-    if isinstance(value, np.ndarray | np.generic):
-        flags = value.flags
-        layout = str(value.dtype), value.shape, flags.c_contiguous, flags.f_contiguous
-        return type(value), *layout, hashlib.blake2b(value.tobytes()).digest()
-    if value is None or isinstance(value, int | float | complex | str | bytes):
-        return type(value), repr(value)  # nan is equal to nan, 0.0 not to −0.0
-    if isinstance(value, tuple):
-        return type(value), *(_comparable(each, names, helpers) for each in value)
-    plain = getattr(value, "py_func", value)
-    home = value.__name__ if isinstance(value, ModuleType) else getattr(plain, "__module__", None)
-    if (home or "").partition(".")[0] in _LIBRARIES:
-        return _Itself(value)
-    if isinstance(value, ModuleType):
-        held = vars(value)
-        # Modules may lead in a circle: each name is followed once.
-        return _Itself(value), *(
-            (name, _comparable(held[name], names[:i] + names[i + 1 :], helpers))
-            for i, name in enumerate(names)
-            if name in held
-        )
-    if isinstance(plain, FunctionType):
-        helpers.append(value)
-    return _Itself(value)
 
 
 # ---- Parameters of a user's function, which are data of its compiled code ----

@@ -25,6 +25,7 @@ from quell import checks
 from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
+from quell.kernels.frozen import kept_code
 from quell.kernels.sized import Buffer, Size
 from quell.kernels.user_functions import (
     POINTER,
@@ -286,7 +287,7 @@ class _Sizes(NamedTuple):
     more: Shapes  # of those of the output
 
 
-@user_functions.kept_code(_KEPT)
+@kept_code(_KEPT)
 def _machine_code(
     rate_of: Callable[..., Any], output_of: Callable[..., Any], sizes: _Sizes
 ) -> tuple[Any, Any]:

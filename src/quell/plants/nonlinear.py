@@ -35,6 +35,7 @@ from quell import checks
 from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
+from quell.kernels.frozen import frozen, kept_code
 from quell.kernels.functions import tanh
 from quell.kernels.user_functions import (
     POINTER,
@@ -113,7 +114,7 @@ def row_output(row: tuple[float, ...]) -> Callable[[Vector], float]:
     return linear
 
 
-@user_functions.kept_code(_KEPT)
+@kept_code(_KEPT)
 def machine_code(
     rate_of: Callable[..., Any],
     output_of: Callable[..., Any],
@@ -330,13 +331,13 @@ class EquationPlant(Described):
     @cached_property
     def _rate(self) -> Callable[..., Any]:
         """The function f(t, x, u, w), with the parameters in it."""
-        user_functions.frozen(self.f)  # compiles helpers again whose globals have changed
+        frozen(self.f)  # compiles helpers again whose globals have changed
         return bound(self.f, self._numbers[0])
 
     @cached_property
     def _measured(self) -> Callable[..., Any]:
         """The function h(x), with the parameters in it."""
-        user_functions.frozen(self._output_function)
+        frozen(self._output_function)
         return bound(self._output_function, self._numbers[1])
 
     @cached_property
@@ -355,7 +356,7 @@ class EquationPlant(Described):
 
     def _code(self, interpret: bool = False) -> tuple[Any, Any] | None:
         """Return the two compiled functions; None if they run as Python."""
-        key = user_functions.frozen(self.f), user_functions.frozen(self._output_function)
+        key = frozen(self.f), frozen(self._output_function)
         if interpret:
             return None
         if key in self._codes:
