@@ -8,7 +8,7 @@ import types
 import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -17,7 +17,7 @@ from numba.extending import register_jitable
 
 import quell as ql
 from quell.kernels import user_functions
-from quell.plants.base import measure
+from quell.plants.base import advance, measure
 from quell.plants.multivariable import measure_all
 from quell.plants.nonlinear import derivatives
 
@@ -357,3 +357,44 @@ def test_a_plant_that_was_compiled_can_be_sent_to_another_process() -> None:
     sent = pickle.loads(pickle.dumps(plant))
     assert sent.f is rate
     assert sent.compiled
+
+
+class LagDesign(NamedTuple):
+    """A plant of the user's: a lag of one second."""
+
+    dt: float
+
+
+class Lag:
+    """The same, as ``simulate`` takes it."""
+
+    name, order, disturbances, compiled = "lag", 1, 1, True
+
+    def sampled(self, dt: float, interpret: bool = False) -> LagDesign:
+        """Return the plant for a sample time."""
+        return LagDesign(dt)
+
+
+@measure.register(LagDesign)
+def _measure_lag(plant: LagDesign, x: Any) -> float:
+    return x[0]
+
+
+@advance.register(LagDesign)
+def _advance_lag(plant: LagDesign, x: Any, scratch: Any, t: float, u: float, w: Any) -> None:
+    x[0] += plant.dt * (GAIN * u - x[0])
+
+
+def test_a_kernel_of_the_users_that_has_changed_is_not_run_with_old_numbers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Numba compiles it once for each type: a changed global is refused, a field works; Python runs what is there."""
+    law = ql.baselines.PID(kp=2.0, ki=2.0, dt=0.01)
+    short = ql.Scenario(1.0, 0.1)
+    first = ql.simulate(Lag(), law, short)
+    monkeypatch.setitem(globals(), "dt", 3.0)  # the name of a field only
+    np.testing.assert_array_equal(ql.simulate(Lag(), law, short)["y"], first["y"])
+    set_number()
+    with pytest.raises(ValueError, match=r"advance \(for LagDesign\) has been compiled, and it or"):
+        ql.simulate(Lag(), law, short)
+    assert ql.simulate(Lag(), law, short, interpret=True)["y"][-1] > 3.0 * first["y"][-1]
