@@ -9,8 +9,8 @@ the same. The figure is the integral gain over that of the cascade, k_i being th
 checked to be stable with the whole plant. With --free M_ks has no bound for any of them, with
 --ringing the damping of poles has none.
 
-The second table is M_s of an ADRC of order 2 with omega_o = 4 omega_c and b0 = 1/(J_m + J_l), the
-encoder at the motor.
+The first two tables are M_s of an ADRC of order 2 with omega_o = 4 omega_c, the encoder at the motor:
+b0 = 1/(J_m + J_l), and then 1/J_m.
 
 Usage: python benchmarks/flexible_axis.py [--free] [--ringing] [--quick] [--json FILE]
 """
@@ -34,6 +34,7 @@ BOUND = 1.6  # M_s and M_t
 REFERENCE = "p-pi-notch"
 OTHERS = ("bandwidths", "poles", "model-based", "model-based-poles")
 RATIOS = (0.3, 1.0, 3.0, 10.0)
+BANDWIDTHS = (20.0, 40.0, 80.0, 160.0)  # rad/s
 
 
 class Axis(NamedTuple):
@@ -115,10 +116,10 @@ def summary(results: list[tuple[Axis, dict[str, Any]]]) -> dict[str, Any]:
     }
 
 
-def model_free(ratio: float, omega_c: float) -> float | None:
-    """Return M_s of an ADRC of order 2 at the motor; None if it is not stable."""
+def model_free(ratio: float, omega_c: float, inertia: float) -> float | None:
+    """Return M_s of an ADRC of order 2 at the motor with b0 = 1/inertia; None if it is not stable."""
     plant = Axis(2, "motor", ratio, 0.02).plant()
-    b0 = 1.0 / (MOTOR * (1.0 + ratio))
+    b0 = 1.0 / inertia
     observer = ql.ESO.model_free(2, b0, 4.0 * omega_c, DT)
     loop = ql.analysis.analyse(plant, ql.ADRC(observer, omega_c), delay=LATE)
     return 1.0 / loop.margins.modulus if loop.stable else None
@@ -133,12 +134,14 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for all numbers")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    print("ADRC of order 2 at the motor, omega_o = 4 omega_c: M_s")
-    print("J_l/J_m  " + "".join(f"omega_c = {w:<6g}" for w in (20.0, 40.0, 80.0, 160.0)))
-    for ratio in RATIOS:
-        cells = (model_free(ratio, w) for w in (20.0, 40.0, 80.0, 160.0))
-        text = "".join(f"{'unstable' if m is None else f'{m:.2f}':16s}" for m in cells)
-        print(f"{ratio:<9g}{text}")
+    for of in ("both inertias", "the motor alone"):
+        print(f"ADRC of order 2 at the motor, omega_o = 4 omega_c, b0 of {of}: M_s")
+        print("J_l/J_m  " + "".join(f"omega_c = {w:<6g}" for w in BANDWIDTHS))
+        for ratio in RATIOS:
+            inertia = MOTOR * (1.0 + ratio) if of == "both inertias" else MOTOR
+            cells = (model_free(ratio, w, inertia) for w in BANDWIDTHS)
+            text = "".join(f"{'unstable' if m is None else f'{m:.2f}':16s}" for m in cells)
+            print(f"{ratio:<9g}{text}")
     results = []
     print(f"\nk_i over that of the tuned {REFERENCE}, M_s and M_t <= {BOUND:g}", end="")
     print(", no bound of M_ks" if options.free else ", its M_ks")

@@ -3,9 +3,9 @@
 A block that needs a machine, a cluster or a large library is named in ``NOT_HERE`` with the reason.
 """
 
-import math
 import os
 import re
+import sys
 import tempfile
 import tomllib
 import warnings
@@ -27,7 +27,7 @@ NOT_HERE = {
     "SLURMCluster": "a cluster",
     '"drive.fmu"': "a unit of somebody's",
     '"robot.fmu"': "a unit of somebody's",
-    "controller.set(r=": "the interface of a unit, in words",
+    "controller_fmu.set(": "the interface of a unit, in words",
     "Relay(": "a rig",
 }
 DT = 1e-3
@@ -51,7 +51,7 @@ def known() -> dict[str, object]:
         state += 0.05 * np.array([u[k] - state[0], state[0] - state[1]])
         y[k + 1] = state[1] + 1e-3 * np.sin(3.1 * k)
     names = {"plant": plant, "observer": observer, "controller": controller, "scenario": scenario}
-    return {"ql": ql, "math": math, "u": u, "y": y, "dt": 0.05, **names}
+    return {"ql": ql, "u": u, "y": y, "dt": 0.05, **names}
 
 
 def run_block(code: str, before: dict[str, object]) -> str:
@@ -81,6 +81,7 @@ def run_setup(code: str) -> str:
 
 
 warnings.simplefilter("ignore")
+failed: list[str] = []
 for page in sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]):
     shared: dict[str, object] = {}
     for language, how in (("python", partial(run_block, before=shared)), ("toml", run_setup)):
@@ -88,6 +89,11 @@ for page in sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]):
             with tempfile.TemporaryDirectory() as folder:
                 os.chdir(folder)
                 try:
-                    print(f"{page.name}, {language} {number}: {how(code)}", flush=True)
+                    found = how(code)
+                except Exception as error:  # one block must not hide the others
+                    found = f"NOT: {type(error).__name__}: {error}"
+                    failed.append(f"{page.name}, {language} {number}: {found}")
                 finally:
                     os.chdir(ROOT)
+                print(f"{page.name}, {language} {number}: {found}", flush=True)
+sys.exit("\n".join(failed))

@@ -62,8 +62,10 @@ _MEANINGS = {
     ExitCode.BROKEN: (
         "quell doctor: something that quell needs does not work here; a line with NOT says what"
     ),
-    ExitCode.INTERRUPTED: "stopped by Ctrl-C; quell run-rig ramps u to zero before",
-    ExitCode.TERMINATED: "stopped by SIGTERM",
+    ExitCode.INTERRUPTED: (
+        "stopped by Ctrl-C, quell run-rig in its loop also by SIGTERM or SIGHUP; it ramps u to zero"
+    ),
+    ExitCode.TERMINATED: "stopped by SIGTERM, quell run-rig before its loop",
 }
 HELP = "Exit codes: " + "; ".join(f"{code.value} {code.about}" for code in ExitCode) + "."
 """The table, for the help text of the command."""
