@@ -9,8 +9,8 @@ the same. The figure is the integral gain over that of the cascade, k_i being th
 checked to be stable with the whole plant. With --free M_ks has no bound for any of them, with
 --ringing the damping of poles has none.
 
-The first two tables are M_s of an ADRC of order 2 with omega_o = 4 omega_c, the encoder at the motor:
-b0 = 1/(J_m + J_l), and then 1/J_m.
+The first two tables are M_s of an ADRC of order 2 with omega_o = 4 omega_c, the encoder at the
+motor: b0 = 1/(J_m + J_l), and then 1/J_m.
 
 Usage: python benchmarks/flexible_axis.py [--free] [--ringing] [--quick] [--json FILE]
 """
@@ -117,7 +117,7 @@ def summary(results: list[tuple[Axis, dict[str, Any]]]) -> dict[str, Any]:
 
 
 def model_free(ratio: float, omega_c: float, inertia: float) -> float | None:
-    """Return M_s of an ADRC of order 2 at the motor with b0 = 1/inertia; None if it is not stable."""
+    """Return M_s of an ADRC of order 2 at the motor, b0 = 1/inertia; None if it is not stable."""
     plant = Axis(2, "motor", ratio, 0.02).plant()
     b0 = 1.0 / inertia
     observer = ql.ESO.model_free(2, b0, 4.0 * omega_c, DT)
