@@ -37,9 +37,9 @@ axes in order of priority
     earlier one, unless it gives that less than about 1/√ρ = 0.1 of what its own actuators do. In
     the trial of a quadrotor ρ from 10 to 1000 gives one result to 2 % (docs/axes).
 
-The sum of squares is not formed, it would need twice the digits: the rows of all axes are turned into
-a triangle. In single precision u then differs from double by less than 10⁻⁵ of its range in 99.9 %
-of drawn cases (``benchmarks/axes.py --part single``).
+The sum of squares is not formed, it would need twice the digits: the rows of all axes are turned
+into a triangle. In single precision u then differs from double by less than 10⁻⁵ of its range in
+99.9 % of drawn cases (``benchmarks/axes.py --part single``).
 
 *B0 as a function* of the estimates, or its inverse M, is evaluated in each sample. One that is not
 finite or has no inverse is not used: the last good one stays, and the status has ``GAIN_HELD``.
@@ -501,8 +501,7 @@ def _solve_rows(
             before = step[k]
             step[k] = c * before + s * missed
             missed = c * missed - s * before
-    for back in range(m):
-        k = m - 1 - back
+    for k in range(m - 1, -1, -1):
         if free[k] != 0.0:
             for j in range(k + 1, m):
                 step[k] -= R[k, j] * step[j]
