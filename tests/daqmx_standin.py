@@ -160,15 +160,18 @@ class Rack:
         return self.cards[task.device]
 
     def _claim(self, task, physical, kind):
-        device, _, channel = physical.partition("/")
-        if device not in self.cards:
-            raise DriverError(INVALID_DEVICE)
-        if channel not in self.cards[device].channels():
-            raise DriverError(NO_CHANNEL)
-        if task.channels and (kind == "counter" or task.device != device):
-            raise DriverError(INVALID_VALUE)
-        task.kind, task.device = kind, device
-        task.channels[channel] = (-10.0, 10.0)
+        for each in unflatten_channel_string(physical):  # a range is several channels
+            device, _, channel = each.partition("/")
+            if device not in self.cards:
+                raise DriverError(INVALID_DEVICE)
+            lines = [f"port0/line{i}" for i in range(self.cards[device].lines)]
+            channels = lines if (kind, channel) == ("line", "port0") else [channel]
+            if not self.cards[device].channels().issuperset(channels):
+                raise DriverError(NO_CHANNEL)
+            if task.channels and (kind == "counter" or task.device != device):
+                raise DriverError(INVALID_VALUE)
+            task.kind, task.device = kind, device
+            task.channels |= dict.fromkeys(channels, (-10.0, 10.0))
         self.last_channel = physical
 
     def _is_taken(self, task):
@@ -212,8 +215,11 @@ class Rack:
             size,
         )
 
-    def DAQmxGetTaskAttribute(self, handle, attribute, out, size):
-        assert attribute == 0x1276, "only the task's name is asked for"
+    def DAQmxGetTaskAttribute(self, handle, attribute, out, size=0):
+        if attribute == 0x2181:
+            out._obj.value = len(self._task(handle).channels)
+            return 0
+        assert attribute == 0x1276, "only its name and number of channels are asked for"
         return self._say(f"_unnamedTask<{handle.value}>", out, size)
 
     def DAQmxInternalGetLastCreatedChan(self, out, size):
@@ -244,10 +250,15 @@ class Rack:
     def _limit(self, task, physical, low, high):
         if not -10.0 <= low < high <= 10.0:
             raise DriverError(INVALID_VALUE)
-        task.channels[physical.partition("/")[2]] = (low, high)
+        for each in unflatten_channel_string(physical):
+            task.channels[each.partition("/")[2]] = (low, high)
 
     def DAQmxCreateDOChan(self, handle, lines, name, grouping):
         self._claim(self._task(handle), lines, "line")
+
+    def DAQmxGetChanAttribute(self, handle, channel, attribute, out):
+        assert attribute == 0x2179, "only the number of lines is asked for"
+        out._obj.value = len(self._task(handle).channels)
 
     def DAQmxSetChanAttribute(self, handle, channel, attribute, value):
         self._task(handle).attributes[attribute] = value.value

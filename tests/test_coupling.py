@@ -94,8 +94,8 @@ def test_axes_that_hardly_notice_each_other_need_no_b0() -> None:
     """A gain of 1.04 is no reason for a matrix."""
     found = coupling(chains([[1.0, 0.2], [0.2, 1.0]]), DT, axes=("x", "y"))
     assert found.advice == (
-        "the axes hardly notice each other in B0 (gains change by 1.04 at most): a controller for "
-        "each axis, with its own b0, is enough"
+        "the axes hardly notice each other in B0 (with the other loops closed a gain changes by a "
+        "factor of 1.04 at most): a controller for each axis, with its own b0, is enough"
     )
 
 

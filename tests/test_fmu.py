@@ -18,6 +18,8 @@ import pytest
 
 import quell as ql
 from quell import setup
+from quell.experiments.compare import compare
+from quell.experiments.over_seeds import over_seeds
 from quell.files import TooLargeError
 from quell.plants.fmu import INSTANCES
 from quell.realtime.devices import TwinDevice
@@ -349,3 +351,46 @@ def test_capabilities_that_an_fmu_lacks_are_respected(tmp_path: Path) -> None:
         ql.simulate(slow, law, SHORT)
     with pytest.raises(ValueError, match="can be instantiated only once in a process"):
         ql.simulate(slow, law, [SHORT, SHORT])
+
+
+def test_controllers_are_compared_on_an_fmu_that_has_one_instance_in_a_process(
+    files: dict[int, Path], tmp_path: Path
+) -> None:
+    """One run after the other, also behind an encoder; the results are those of runs side by side."""
+    content = fmus.contents(3)
+    replaced(
+        'modelIdentifier="mass" ',
+        'modelIdentifier="mass" canBeInstantiatedOnlyOncePerProcess="true" ',
+    )(content)
+    laws = {"one": controller(), "two": controller(), "three": controller()}
+    laws["two"].retune(omega_c=5.0)
+    noisy = ql.Scenario(1.0, 0.3, noise=ql.signals.BandLimitedNoise(1e-8, DT))
+    path = fmus.packed(tmp_path / "shy.fmu", content)
+    shy, other = (
+        ql.plants.encoded(ql.plants.FMU(each, **LOOP), 20_000, 1.0) for each in (path, files[3])
+    )
+    found, wanted = (over_seeds(plant, laws, noisy, seeds=3).values for plant in (shy, other))
+    np.testing.assert_array_equal(found["rms"], wanted["rms"])
+    assert np.unique(found["rms"]).size > 3
+    runs, others = (compare(plant, laws, noisy).runs for plant in (shy, other))
+    for name in laws:
+        np.testing.assert_array_equal(runs[name]["y"], others[name]["y"])
+
+
+def test_variables_of_two_types_may_have_one_reference(tmp_path: Path) -> None:
+    """In FMI 2.0 a reference counts among variables of its type only; two of one type are one variable."""
+    content = fmus.contents(2)
+    y = fmus._NAMES["mass"].index("y")
+    replaced(
+        f'name="count" valueReference="{fmus._NAMES["mass"].index("count")}"',
+        f'name="count" valueReference="{y}"',
+    )(content)
+    path = fmus.packed(tmp_path / "shared.fmu", content)
+    plant = ql.plants.MultivariableFMU(path, u=["u"], y=["y", "count"], w=["w"])
+    instance = plant.instance(1.0, np.zeros(2))
+    assert instance.advance([5.0, 0.0]).tolist() == [2.5, 2.0]  # y, and as a whole number
+    instance.free()
+    replaced('name="v" valueReference="4"', f'name="v" valueReference="{y}"')(content)
+    path = fmus.packed(tmp_path / "alias.fmu", content)
+    with pytest.raises(ValueError, match="y names one variable twice: 'y' and 'v'"):
+        ql.plants.MultivariableFMU(path, u=["u"], y=["y", "v"], w=["w"])

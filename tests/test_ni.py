@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.realtime.devices import TwinDevice, handle_of, read_measurement, write_command
-from quell.realtime.ni import NiDevice, ni_device
+from quell.realtime.ni import NiDevice, Tasks, Voltage, ni_device
 from quell.realtime.registry import open_device
 from quell.realtime.system import virtual_clock
 
@@ -231,6 +231,12 @@ def test_a_card_without_watchdog_is_refused_in_words_that_help(rack):
         ({"bits": 64}, "bits = 64: must be a whole number from 8 to 32"),
         ({"watchdog": 0.0}, "watchdog = 0.0: must be finite and greater than zero"),
         ({"pulse_filter": -1.0}, "pulse_filter = -1.0: must be finite and not negative"),
+        ({"output": "Dev2/ao0:1"}, "output = 'Dev2/ao0:1': is several channels; name each one"),
+        ({"output": "Dev2/ao0,Dev2/ao1"}, "output = .*in a URL Dev2/ao0,Dev2/ao1"),
+        ({"counter": "Dev1/ctr0:1"}, "counter = 'Dev1/ctr0:1': is several channels"),
+        ({"enable": ["Dev2/port0/line0"]}, r"enable = \['Dev2/port0/line0'\]: must be one digital"),
+        ({"heartbeat": "Dev2/port0/line0:1"}, "heartbeat = .*must be one digital line, a text"),
+        ({"heartbeat": "Dev2/port0"}, "heartbeat = 'Dev2/port0': is 24 lines; must be one line"),
     ],
 )
 def test_bad_arguments_are_named_in_one_line(rack, arguments, says):
@@ -454,6 +460,50 @@ def test_each_card_has_its_watchdog(wide):
         device.write([0.0, 0.0, 0.0])
     with pytest.warns(RuntimeWarning, match="Dev4/ao0, Dev4/ao1 can't be set to zero"):
         device.close()
+
+
+def test_a_card_that_is_lost_does_not_hold_up_the_voltage_of_another(wide):
+    """Whichever is written first; the error is raised, and the heartbeat stands still."""
+    for lost, left, name in (("Dev3", "Dev4", "ao1"), ("Dev4", "Dev3", "ao0")):
+        device = several(heartbeat="Dev1/port0/line0")
+        history = wide.cards["Dev1"].history
+        device.write([1.0, 2.0, 3.0])
+        assert wide.cards[left].volts[name] > 1.0
+        beats = len(history)
+        wide.cards[lost].present = False
+        with pytest.raises(OSError, match="can't be written.*-200324: the card is gone"):
+            device.write([0.0, 0.0, 0.0])
+        assert wide.cards[left].volts[name] == 0.0
+        wide.cards[left].volts[name] = 1.0
+        with pytest.raises(OSError, match="-200324: the card is gone"):
+            device.write([0.0, math.nan, 0.0])
+        assert wide.cards[left].volts[name] == 0.0
+        assert len(history) == beats
+        with pytest.warns(RuntimeWarning, match=f"{lost}/ao0.*switch the amplifier off"):
+            device.close()
+        wide.cards[lost].present = True
+
+
+def test_a_name_of_several_channels_is_refused_when_the_task_knows_them(wide):
+    """However it is written: the driver would read and write beyond the array of values."""
+    tasks = Tasks()
+    with pytest.raises(ValueError, match="output = 'Dev4/ao0:1': is 2 channels, must be 1 channel"):
+        tasks.open_outputs([Voltage("Dev4/ao0:1", -1.0, 1.0)])
+    with pytest.raises(ValueError, match="input = 'Dev3/ai0:1': is 2 channels, must be 1 channel"):
+        tasks.open_inputs([Voltage("Dev3/ai0:1", -1.0, 1.0)])
+    assert tasks.close() == []
+
+
+def test_arrays_are_lists(wide):
+    """Of channels and of numbers."""
+    channels = np.array(["Dev4/ao0", "Dev4/ao1"])
+    with closing(
+        NiDevice(
+            ["Dev1/ctr0"], channels, volts=np.array([1.0, 2.0]), u_max=np.array([5, 4]), u_min=-1.0
+        )
+    ) as device:
+        device.write([1.0, 1.0])
+        assert wide.cards["Dev4"].history[-2:] == [("ao0", 1.0), ("ao1", 2.0)]
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,68 @@ def test_what_the_seeds_do_not_decide_begins_with_not() -> None:
     assert same.describe().count("alike, as far as 3 seeds show") == 3
 
 
+@pytest.mark.parametrize("coupled", [True, False])
+@pytest.mark.parametrize(("noise", "seeds"), [(NOISY, 3), (0.0, 1)])
+def test_an_axis_at_rest_is_alike_and_left_out_of_all_axes(
+    coupled: bool, noise: Any, seeds: int
+) -> None:
+    """Its criterion is zero or the rounding of the other axis, 1e-20 here; a line with NOT says that it has no ratio."""
+    given = {}
+    for omega in (8.0, 12.0):
+        data = gantry(omega)
+        data["scenario"]["disturbances"] = [0.0, 0.0]
+        data["axis"][0]["noise"], data["axis"][1]["noise"] = noise, 0.0
+        if not coupled:
+            data["plant"]["B"] = [[0, 0], [5, 0], [0, 0], [0, 6]]
+        given[f"c{omega:g}"] = made_axes("gantry", data)
+    found = over_seeds.of_setups(given, seeds=seeds)
+    still = found.values["rms"][:, 0, 1]
+    assert np.all(still < 1e-17)
+    assert np.all(still > 0.0) if coupled else np.all(still == 0.0)
+    x, y, together = found.verdicts
+    assert (x.best, y.best, together.best) == ("c12", None, "c12")
+    assert y.pairs[0].lower == 0.0
+    assert together.left_out == ("y",)
+    assert together.pairs[0].lower == pytest.approx(x.pairs[0].lower, abs=1e-12)
+    assert found.ratio("c12", 0)[0] == pytest.approx(found.values["rms"][1, 0, 0].mean() / found.values["rms"][0, 0, 0].mean(), rel=1e-3)  # fmt: skip
+    line = "NOT in all axes, 0.1 to 0.3 s: y: RMS error is zero or rounding there, and has no ratio"
+    assert line in found.describe().splitlines()
+
+
+def test_a_criterion_of_zero_beside_one_that_is_not_decides_its_own_axis_only() -> None:
+    """Without any axis that has a ratio there is no verdict on all axes, and none is called best."""
+    values = np.array([[[[0.0, 1e-13], [1.1, 1.1]]], [[[0.5, 0.6], [1.0, 1.0]]]])
+    lost = np.zeros((2, 2), bool)
+    given = ("a", "b"), ("x", "y"), [(0.0, 1.0)]
+    x, y, together = _verdicts(*given, values, lost, 0.05, np.full((1, 2), 1e-9))
+    assert (x.best, y.best, together.best, together.left_out) == ("a", "b", "b", ("x",))
+    values[0, 0, 1] = 0.0
+    *_, together = _verdicts(*given, values, lost, 0.05, np.full((1, 2), 1e-9))
+    assert (together.best, together.left_out) == (None, ("x", "y"))
+    line = "NOT in all axes, 0 to 1 s: x, y: RMS error is zero or rounding there, and has no ratio"
+    assert together.describe("rms", 2) == [line]
+
+
+def test_small_real_errors_are_no_rounding() -> None:
+    """Of 1e-10 m with r = 0 beside an axis of 100 degrees, and where one controller is far off."""
+    largest = np.array([[[[3e-10], [100.0]]], [[[5e-10], [1e8]]]])
+    no = np.zeros((2, 1), bool)
+    found = over_seeds._rounding(largest, no, [(0.0, 2.0)], "rms")
+    assert found[0] == pytest.approx([1e-12, 1e-10])
+    assert over_seeds._rounding(largest, no, [(0.0, 2.0)], "iae") == pytest.approx(2.0 * found)
+
+
+def test_differences_of_rounding_are_alike_in_all_seeds() -> None:
+    """An omega_c of 8 and one of 8.0000000001 differ by 1e-9 % in each seed, which no model has."""
+    given = {"a": made_axes("a", gantry(8.0)), "b": made_axes("b", gantry(8.0000000001))}
+    found = over_seeds.of_setups(given, seeds=3)
+    pair = found.verdicts[0].pairs[0]
+    assert 0.0 < pair.least < pair.most < 1e-9
+    assert (pair.decided, pair.needed) == (False, 0)
+    assert [verdict.best for verdict in found.verdicts] == [None] * 3
+    assert found.describe().count("alike, as far as 3 seeds show") == 3
+
+
 def test_in_95_of_100_cases_no_controller_is_called_better_that_is_not() -> None:
     """Of three that are alike, in skewed and correlated criteria of two axes: at most 5 % of draws have a verdict."""
     rng = np.random.default_rng(2)
@@ -98,7 +160,8 @@ def test_in_95_of_100_cases_no_controller_is_called_better_that_is_not() -> None
         shared = rng.normal(size=(1, 1, 2, 10))
         values = np.exp(0.3 * shared + 0.2 * rng.gamma(2.0, size=(3, 1, 2, 10)))
         lost = np.zeros((3, 10), bool)
-        found = _verdicts(("a", "b", "c"), ("x", "y"), [(0.0, 1.0)], values, lost, 0.05 / 9)
+        given = values, lost, 0.05 / 9, np.zeros((1, 2))
+        found = _verdicts(("a", "b", "c"), ("x", "y"), [(0.0, 1.0)], *given)
         wrong += any(pair.decided for verdict in found for pair in verdict.pairs)
     assert wrong / count < 0.06
     assert wrong > 0
@@ -146,6 +209,13 @@ def test_one_axis_is_compared_in_the_same_way() -> None:
     assert found.describe().startswith("0 to 2 s: best is k6: ∫|error| ")
 
 
+def in_windows(*windows: Any) -> Any:
+    """Compare two controllers in these windows."""
+    lag = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
+    some = {name: ql.baselines.PID(kp=2.0, dt=0.01) for name in "ab"}
+    return over_seeds.over_seeds(lag, some, ql.Scenario(1.0, 2.0), windows=windows)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -170,6 +240,11 @@ def test_one_axis_is_compared_in_the_same_way() -> None:
             lambda: over_seeds.of_setups(setups(8.0, 9.0, duration=0.1)),
             r"windows\[0\].start = 0.1: must be less than the scenario's duration",
         ),
+        (lambda: in_windows({"start": None}), r"windows\[0\]: start = None: must be a number"),
+        (lambda: in_windows({}, {"begin": 1.0}), r"windows\[1\]: 'begin' is unknown; .*start"),
+        (lambda: in_windows({"start": -1.0}), r"windows\[0\]: start = -1.0: must be .*not negative"),
+        (lambda: in_windows({"start": 0.5, "stop": 0.2}), r"windows\[0\]: start = 0.5, stop = 0.2"),
+        (lambda: in_windows(1.0), r"windows\[0\] = 1.0: must be a table, such as"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_compared_is_refused(call: Callable[[], Any], message: str) -> None:

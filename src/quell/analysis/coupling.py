@@ -173,8 +173,9 @@ class Coupling:
                 "stay stable without B0, and with it this motion is not left to the observer"
             )
         return (
-            f"the axes hardly notice each other {where} (gains change by {change:.3g} at most): a "
-            "controller for each axis, with its own b0, is enough"
+            f"the axes hardly notice each other {where} (with the other loops closed a gain "
+            f"changes by a factor of {change:.3g} at most): a controller for each axis, with its "
+            "own b0, is enough"
         )
 
     def _undecided(self, gains: GainsAt, where: str) -> str:

@@ -49,7 +49,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numba
@@ -60,6 +60,7 @@ from quell import checks
 from quell.controllers.base import Limits, RateLimit, checked_limits
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.frozen import frozen, kept_code
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.sized import Buffer, Flag, Work
 from quell.kernels.user_functions import POINTER, call
@@ -743,6 +744,7 @@ def checked_gain(
     if callable(given):
         rule = f"it takes x, an array ({n}, {most}) of estimates x[axis, derivative]"
         plain, values = user_functions.separated(name, given, 1)
+        frozen(plain)  # compiles helpers again whose globals have changed
         first = user_functions.attempt(f"{name}(zeros)", rule, partial(plain, **values), x)
         first = checks.matrix(f"{name}(zeros)", first)
     else:
@@ -778,7 +780,6 @@ def checked_gain(
         ) from None
     numbers = user_functions.as_array(values)
     design = FunctionGain(code.address, name == "M", of_actuators, numbers)
-    user_functions.set_origin(code.address, plain, numbers=(0, shapes))
     return Gain(design, code, (n, count), start, of_actuators)
 
 
@@ -816,7 +817,7 @@ def _check_condition(name: str, matrix: Matrix, names: Sequence[str]) -> None:
 _KEPT = 32
 
 
-@lru_cache(maxsize=_KEPT)
+@kept_code(_KEPT)
 def _compiled_gain(
     function: Callable[..., Any],
     shapes: user_functions.Shapes,
@@ -836,7 +837,9 @@ def _compiled_gain(
             for j in range(outer[1]):
                 out[i, j] = matrix[i][j]
 
-    return user_functions.compile_cfunc(nb_types.void(POINTER, POINTER, POINTER), write)
+    code = user_functions.compile_cfunc(nb_types.void(POINTER, POINTER, POINTER), write)
+    user_functions.set_origin(code.address, function, numbers=(0, shapes))
+    return code
 
 
 def checked_rule(

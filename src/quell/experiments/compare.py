@@ -57,6 +57,7 @@ from quell.learners import Kalman
 from quell.observers import ESO
 from quell.parallel import in_parallel, one_blas_thread
 from quell.plants import Plant, two_mass_spring
+from quell.plants.base import one_at_a_time
 from quell.plants.linear import delayed
 from quell.plants.linearise import linear_model, linear_part
 from quell.records import metrics
@@ -372,7 +373,8 @@ def compare(
         partial(simulate, plant, controller, scenario, record_every=record_every)
         for controller in controllers.values()
     ]
-    runs = dict(zip(controllers, in_parallel(jobs, progress), strict=True))
+    workers = 1 if one_at_a_time(plant) else None
+    runs = dict(zip(controllers, in_parallel(jobs, progress, workers), strict=True))
     duration = scenario.duration
     scores = {name: score(run, duration, load_at, band) for name, run in runs.items()}
     return Comparison(runs, scores)

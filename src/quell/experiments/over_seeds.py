@@ -4,15 +4,18 @@ Each controller runs through the scenario once for each seed, so all meet the sa
 disturbances. A criterion c of an axis then is compared in pairs: with ``d_s = ln c_B − ln c_A`` for
 seed s, its mean and Student's t for the mean of the d_s give the share by which A is lower, with an
 interval (``monitoring.rank.decide``). The level is shared by all pairs of controllers, axes and
-windows (Bonferroni), so that in 95 % of all cases no controller is called better that is not.
+windows (Bonferroni), so that in 95 % of all cases no controller is called better that is not. What
+differs by less than 0.1 % is alike: no model is as exact.
 
 *All axes together* are the geometric mean of the axes' ratios, as their criteria have different
-units: d_s is the mean over the axes. Without anything random in the scenario there is one run of
-each controller, and differences are what they are in this scenario.
+units: d_s is the mean over the axes. An axis where a criterion is zero, or rounding, has no ratio:
+it is left out, and a line with NOT says so. Without anything random in the scenario there is one
+run of each controller, and differences are what they are in this scenario.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -31,12 +34,12 @@ from quell.experiments.common import save_figures
 from quell.files import nonfinite_to_none
 from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
-from quell.plants.base import signals_of
+from quell.plants.base import one_at_a_time, signals_of
 from quell.records.metrics import MEASURES
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.setup.axes import signals_in
 from quell.setup.description import is_of_axes
-from quell.setup.loading import Setup
+from quell.setup.loading import Setup, check_window
 from quell.simulation import Scenario, simulate
 from quell.simulation.driver import is_random
 from quell.sweeping.measures import Measure, measure_run
@@ -50,8 +53,14 @@ ALL_AXES = "all axes"
 """Name of the verdict on all axes together."""
 # Seeds by default: with ten, differences of a third of their spread are decided for two axes.
 SEEDS = 10
-# Without seeds a smaller difference is called alike: no model is as exact. Chosen by hand.
+# A smaller difference is called alike: no model is as exact. Chosen by hand.
 _ALIKE = 1e-3
+# A criterion is rounding up to this part of the largest |r| or |y| of its axis: loops at rest with
+# r = 0.1 to 1000 have 3e-16 to 3e-14, a spindle at 1e4 rad with a 20-bit encoder 1e-10.
+_ROUNDING = 1e-12
+# Also up to this part of that of any axis, as the rounding of one moves the others: 1e-19 to 1e-16
+# was seen. Chosen by hand, low, as the axes have different units.
+_COUPLED = 1e-14
 
 # ---- Verdicts ----
 
@@ -64,7 +73,7 @@ class Pair(NamedTuple):
     lower: float  #: share by which ``better`` is lower than ``other``
     least: float  #: lower end of the interval of ``lower``; negative if it may be higher
     most: float  #: upper end
-    decided: bool  #: whether ``better`` is better
+    decided: bool  #: whether ``better`` is better, by more than 0.1 %
     needed: int  #: seeds that would decide a difference like this; 0 if far too many, or decided
 
 
@@ -74,8 +83,10 @@ class Verdict(NamedTuple):
     axis: str  #: its name; ``ALL_AXES``; "" if there is one axis only
     start: float  #: begin of the window [s]
     stop: float  #: its end [s]
-    first: str | None  #: the lowest criterion; None if all diverged
+    first: str | None  #: the lowest criterion; None if all diverged, or all axes are left out
     pairs: tuple[Pair, ...]  #: all pairs of those that never diverged, those with ``first`` first
+    #: axes that all axes together are without: there a criterion is zero, or rounding
+    left_out: tuple[str, ...] = ()
 
     @property
     def best(self) -> str | None:
@@ -87,9 +98,13 @@ class Verdict(NamedTuple):
         """Return lines, of which those that begin with NOT decide nothing."""
         where = f"{self.axis}, " if self.axis else ""
         where += f"{self.start:g} to {self.stop:g} s"
-        if self.first is None:
-            return [f"NOT decided: {where}: all diverged"]
         what, exact = CRITERIA[criterion], seeds == 1
+        without = []
+        if self.left_out:
+            its = ", ".join(self.left_out)
+            without = [f"NOT in {where}: {its}: {what} is zero or rounding there, and has no ratio"]
+        if self.first is None:
+            return without or [f"NOT decided: {where}: all diverged"]
         lower: dict[str, list[str]] = {}
         undecided = []
         for pair in self.pairs:
@@ -108,7 +123,7 @@ class Verdict(NamedTuple):
         for better, shown in lower.items():
             word = "best is " if better == self.best else ""
             lines.append(f"{where}: {word}{better}: {what} {', '.join(shown)}")
-        return lines + undecided
+        return lines + undecided + without
 
 
 @dataclass(frozen=True)
@@ -124,6 +139,7 @@ class SeedComparison:
     #: none
     values: Mapping[str, NDArray[np.float64]]
     diverged: NDArray[np.bool_]  #: which runs diverged (controllers, seeds)
+    rounding: NDArray[np.float64]  #: the criterion up to which it is rounding (windows, axes)
     verdicts: tuple[Verdict, ...]  #: for each window the axes and, of several, all together
     units: tuple[str, ...] = ()  #: unit of the y of each axis, empty if it is not known
     notes: tuple[str, ...] = field(default=())
@@ -138,9 +154,13 @@ class SeedComparison:
     def ratio(self, name: str, window: int) -> tuple[float, float]:
         """Return the geometric mean of the axes' ratios to the first controller.
 
-        With half of its 95 % interval; NaN for one that diverged.
+        With half of its 95 % interval; NaN for one that diverged, or if no axis has a ratio.
         """
-        d = _logarithms(self.values[self.criterion])[:, window].mean(axis=1)
+        values, rounding = self.values[self.criterion][:, window], self.rounding[window]
+        kept = _has_ratio(values, rounding)
+        if not kept.any():
+            return math.nan, math.nan
+        d = _logarithms(values, rounding)[:, kept].mean(axis=1)
         d = d[self.names.index(name)] - d[0]
         ratio = math.exp(float(np.mean(d)))
         half = half_width_of_mean(d) if d.size > 1 and np.all(np.isfinite(d)) else math.nan
@@ -171,6 +191,7 @@ class SeedComparison:
             "windows": [list(window) for window in self.windows],
             "seeds": list(self.seeds),
             "diverged": self.diverged.tolist(),
+            "rounding": self.rounding.tolist(),
             "values": {name: array.tolist() for name, array in self.values.items()},
             "verdicts": [
                 verdict._asdict()
@@ -227,8 +248,9 @@ def over_seeds(
     Raises
     ------
     ValueError
-        for fewer than two controllers, controllers of different axes, a window without samples,
-        several seeds where nothing is random, one where something is, and what ``simulate`` raises.
+        for fewer than two controllers, controllers of different axes, a window with other keys,
+        before 0 s or without samples, several seeds where nothing is random, one where something
+        is, and what ``simulate`` raises.
 
     Examples
     --------
@@ -249,16 +271,22 @@ def over_seeds(
     axes = _axes_of(controllers)
     numbers = _seeds(scenario, seeds)
     judged = _windows(scenario, windows)
+    spans = tuple(_span(window, scenario.duration) for window in judged)
     measures = {
         f"{i}.{axis}.{name}": Measure(name, **window, axis=axis)
         for i, window in enumerate(judged)
         for axis in axes
         for name in MEASURES
     }
+    own: dict[str, Callable[[Any], float]] = {
+        f"{i}.{axis}": partial(_largest, start=start, stop=stop, axis=axis)
+        for i, (start, stop) in enumerate(spans)
+        for axis in axes
+    }
 
     def run(controller: Any, seed: int) -> tuple[dict[str, float], bool]:
         found = simulate(plant, controller, replace(scenario, seed=seed))
-        return measure_run(found, measures), bool(found.diverged)
+        return measure_run(found, {**measures, **own}), bool(found.diverged)
 
     made = [*controllers.values()]
     # The first seed of each compiles what is not compiled yet; the others then only run.
@@ -267,18 +295,20 @@ def over_seeds(
     for batch in (numbers[:1], numbers[1:]):
         jobs = [partial(run, controller, seed) for seed in batch for controller in made]
         share = part_of(progress, len(results), len(results) + len(jobs), total)
-        results += in_parallel(jobs, share) if jobs else []
+        results += in_parallel(jobs, share, 1 if one_at_a_time(plant) else None) if jobs else []
     shape = len(numbers), len(made), len(judged), len(axes), len(MEASURES)
     table = np.array([[found[name] for name in measures] for found, _ in results]).reshape(shape)
     diverged = np.array([lost for _, lost in results]).reshape(shape[:2])
     table[diverged] = np.nan
+    largest = np.array([[found[name] for name in own] for found, _ in results])
+    largest = np.moveaxis(largest.reshape(shape[:4]), 0, -1)
     values = {name: np.moveaxis(table[..., k], 0, -1) for k, name in enumerate(MEASURES)}
-    spans = tuple(_span(window, scenario.duration) for window in judged)
     names = tuple(controllers)
-    verdicts = _verdicts(
-        names, axes, spans, values[criterion], diverged.T, _level(confidence, names, axes, spans)
-    )
-    return SeedComparison(names, axes, spans, numbers, criterion, values, diverged.T, verdicts)
+    rounding = _rounding(largest, diverged.T, spans, criterion)
+    level = _level(confidence, names, axes, spans)
+    verdicts = _verdicts(names, axes, spans, values[criterion], diverged.T, level, rounding)
+    found = names, axes, spans, numbers, criterion, values, diverged.T
+    return SeedComparison(*found, rounding, verdicts)
 
 
 def _axes_of(controllers: Mapping[str, Any]) -> tuple[str, ...]:
@@ -319,17 +349,29 @@ def _seeds(scenario: Scenario, seeds: int | None) -> tuple[int, ...]:
     return tuple(range(scenario.seed, scenario.seed + count))
 
 
-def _windows(
-    scenario: Scenario, windows: Sequence[Mapping[str, Any]]
-) -> tuple[dict[str, Any], ...]:
-    """Return the windows, each with a begin within the scenario."""
+def _windows(scenario: Scenario, windows: Sequence[Any]) -> tuple[dict[str, Any], ...]:
+    """Return the windows, checked, each with a begin within the scenario."""
+    known = tuple(inspect.signature(check_window).parameters)
     rests = [float(time) for time in scenario.rest_at]
-    found = tuple(dict(window) for window in windows) or ({"start": rests[-1] if rests else 0.0},)
+    found = tuple(windows) or ({"start": rests[-1] if rests else 0.0},)
     for i, window in enumerate(found):
-        if window.get("start", 0.0) >= scenario.duration:
+        where = f"windows[{i}]"
+        if not isinstance(window, Mapping):
+            rule = 'must be a table, such as {"start": 4.0, "stop": 9.0}'
+            raise ValueError(f"{where} = {window!r:.60}: {rule}")
+        for key in window:
+            if key not in known:
+                hint = checks.nearest(str(key), known)
+                raise ValueError(f"{where}: {key!r:.60} is unknown; {hint}")
+        try:
+            check_window(**window)
+            start = checks.non_negative("start", window.get("start", 0.0), "s")
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        if start >= scenario.duration:
             rule = f"must be less than the scenario's duration, {scenario.duration:g} s"
-            raise ValueError(f"windows[{i}].start = {window['start']:g}: {rule}")
-    return found
+            raise ValueError(f"{where}.start = {start:g}: {rule}")
+    return tuple(map(dict, found))
 
 
 def _span(window: Mapping[str, Any], duration: float) -> tuple[float, float]:
@@ -343,9 +385,43 @@ def _level(confidence: float, names: Sequence[Any], axes: Sequence[Any], spans: 
     return (1.0 - confidence) / (len(list(combinations(names, 2))) * each * len(spans))
 
 
-def _logarithms(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the logarithms of a criterion, of zero that of the smallest number."""
-    logarithms: NDArray[np.float64] = np.log(np.maximum(values, np.finfo(np.float64).tiny))
+def _largest(run: Any, start: float, stop: float, axis: str) -> float:
+    """Return the largest |r| or |y| of an axis in a window; NaN if the run ended before it."""
+    one = run.axis(axis) if axis else run
+    part = one.window(start, stop)
+    seen = np.abs([one["r"][part], one["y"][part]])
+    return float(np.max(seen)) if seen.size else math.nan
+
+
+def _rounding(
+    largest: NDArray[np.float64],
+    diverged: NDArray[np.bool_],
+    spans: Sequence[tuple[float, float]],
+    criterion: str,
+) -> NDArray[np.float64]:
+    """Return the criterion up to which it is rounding (windows, axes).
+
+    ``largest`` is the largest |r| or |y| (controllers, windows, axes, seeds). The least of all runs
+    counts, or a controller that is far off would make the errors of all others rounding.
+    """
+    lost = np.isnan(largest) | diverged[:, None, None]
+    least = np.min(np.where(lost, np.inf, largest), axis=(0, 3))
+    least[np.isinf(least)] = 0.0  # all runs diverged
+    found = np.maximum(_ROUNDING * least, _COUPLED * np.max(least, axis=1, keepdims=True))
+    if criterion == "iae":
+        found *= [[stop - start] for start, stop in spans]
+    return np.maximum(found, np.finfo(np.float64).tiny)
+
+
+def _has_ratio(values: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return in which axes no criterion of ``values`` (controllers, axes, seeds) is rounding."""
+    found: NDArray[np.bool_] = ~np.any(values <= rounding[:, None], axis=(0, 2))
+    return found
+
+
+def _logarithms(values: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the logarithms of a criterion; what is rounding is all the same."""
+    logarithms: NDArray[np.float64] = np.log(np.maximum(values, rounding[:, None]))
     return logarithms
 
 
@@ -356,22 +432,28 @@ def _verdicts(
     values: NDArray[np.float64],
     diverged: NDArray[np.bool_],
     level: float,
+    rounding: NDArray[np.float64],
 ) -> tuple[Verdict, ...]:
     """Return the verdicts of ``values`` (controllers, windows, axes, seeds) of the criterion."""
     stable = [i for i in range(len(names)) if not np.any(diverged[i])]
-    logarithms = _logarithms(values)
     found = []
     for k, span in enumerate(spans):
-        rows = {name: logarithms[:, k, i] for i, name in enumerate(axes)}
-        if len(axes) > 1:
-            rows[ALL_AXES] = logarithms[:, k].mean(axis=1)
+        logarithms = _logarithms(values[:, k], rounding[k])
+        rows = {name: logarithms[:, i] for i, name in enumerate(axes)}
+        kept = _has_ratio(values[:, k], rounding[k])
+        left_out = tuple(name for name, has in zip(axes, kept, strict=True) if not has)
+        if len(axes) > 1 and kept.any():
+            rows[ALL_AXES] = logarithms[:, kept].mean(axis=1)
         for axis, row in rows.items():
             order = sorted(stable, key=lambda i: float(np.mean(row[i])))
             pairs = tuple(
                 _pair(names[i], names[j], row[j] - row[i], level) for i, j in combinations(order, 2)
             )
             first = names[order[0]] if order else None
-            found.append(Verdict(axis, *span, first, pairs))
+            without = left_out if axis == ALL_AXES else ()
+            found.append(Verdict(axis, *span, first, pairs, without))
+        if len(axes) > 1 and not kept.any():
+            found.append(Verdict(ALL_AXES, *span, None, (), left_out))
     return tuple(found)
 
 
@@ -382,8 +464,9 @@ def _pair(better: str, other: str, d: Vector, level: float) -> Pair:
         lower = -math.expm1(-middle)
         return Pair(better, other, lower, lower, lower, lower > _ALIKE, 0)
     spread = float(np.std(d, ddof=1)) / math.sqrt(d.size)
-    found = decide(middle, spread, d.size - 1.0, level)
-    lower, least, most = (-math.expm1(-each) for each in found.ends)
+    alike = -math.log1p(-_ALIKE)
+    found = decide(middle - alike, spread, d.size - 1.0, level)
+    lower, least, most = (-math.expm1(-(each + alike)) for each in found.ends)
     open_ = not found.decided and not math.isnan(found.enough)
     needed = math.ceil(max(found.enough, 1.1) * d.size) if open_ else 0
     return Pair(better, other, lower, least, most, found.decided, needed)

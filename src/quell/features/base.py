@@ -30,7 +30,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, singledispatch
+from functools import singledispatch
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
+from quell.kernels.frozen import frozen, kept_code
 from quell.kernels.functions import is_single, log2
 from quell.kernels.sized import Flag, Size
 from quell.kernels.user_functions import (
@@ -643,6 +644,7 @@ class Custom(Features):
     def design(self, order: int) -> CustomDesign:
         """Compile the function, for a plant of order ``order``."""
         count = len(self.labels)
+        frozen(self.function)  # compiles helpers again whose globals have changed
         try:
             returned = np.shape(self.function(np.zeros(order), 0.0))
         except ArithmeticError:  # not defined at the origin, for example 1/x
@@ -669,7 +671,7 @@ class Custom(Features):
         return (True,) * len(self.labels)
 
 
-@cache  # keeps the code for ever, because designs hold its address
+@kept_code(None)  # keeps the code for ever, because designs hold its address
 def _machine_code(function: Callable[..., Any], order: int, count: int) -> Any:
     def features(px, u, pout):  # type: ignore[no-untyped-def]
         out = numba.carray(pout, (count,))

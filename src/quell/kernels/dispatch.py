@@ -31,6 +31,7 @@ from numba import types as nb_types
 from numba.extending import overload, register_jitable
 
 from quell.kernels.cache import code_cache
+from quell.kernels.frozen import Frozen, frozen
 from quell.kernels.functions import is_single
 from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS, EntryCompiler, WithoutOverlaps
 from quell.kernels.numba_internals import NumbaError
@@ -70,6 +71,10 @@ def _owner(array: Any) -> int | None:
 # Types with implementations from outside of this package, and their names in messages.
 _USER_TYPES: dict[type, str] = {}
 
+# Their implementations, by the name of the generic function, and those that were compiled.
+_IMPLEMENTED: dict[type, dict[str, Callable[..., Any]]] = {}
+_COMPILED: dict[tuple[type, str], Frozen] = {}
+
 # Lines of Numba's error text that carry no reason.
 _NO_REASON = re.compile(
     r"\W*$|There are \d|- Of which|Overload in|With argument|Rejected as|- Resolution|"
@@ -77,9 +82,10 @@ _NO_REASON = re.compile(
 )
 
 
-def add_user_type(cls: type) -> None:
-    """Add a type for which the user has registered an implementation."""
+def add_user_type(cls: type, name: str, implementation: Callable[..., Any]) -> None:
+    """Add a type for which the user has registered an implementation of the function ``name``."""
     _USER_TYPES.setdefault(cls, cls.__name__)
+    _IMPLEMENTED.setdefault(cls, {})[name] = implementation
 
 
 def set_display_name(cls: type, name: str) -> None:
@@ -95,6 +101,26 @@ def uses_user_types(value: Any) -> bool:
     return type(value) in _USER_TYPES or (
         isinstance(value, tuple) and any(map(uses_user_types, value))
     )
+
+
+def check_implementations(value: Any) -> None:
+    """Raise a ``ValueError`` if implementations for user's types in ``value`` have changed.
+
+    Numba compiles them only once for each type, so compiled code would be that of the first ones.
+    """
+    cls = type(value)
+    for name, implementation in _IMPLEMENTED.get(cls, {}).items():
+        now = frozen(implementation)
+        if _COMPILED.setdefault((cls, name), now) != now:
+            raise ValueError(
+                f"{_USER_TYPES[cls]}.{name} (for {cls.__name__}) has been compiled, and it or a "
+                "global that it uses has changed since: make such numbers fields of "
+                f"{cls.__name__}, or define {cls.__name__} and its functions again. "
+                "simulate(..., interpret=True) runs it as it is now"
+            )
+    if isinstance(value, tuple):
+        for each in value:
+            check_implementations(each)
 
 
 @contextmanager
@@ -196,7 +222,7 @@ def generic(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
         def add(implementation: F) -> F:
             table[cls] = implementation
             if not implementation.__module__.startswith("quell."):
-                add_user_type(cls)
+                add_user_type(cls, name, implementation)
             return implementation
 
         return add
@@ -346,8 +372,16 @@ def dispatcher_for(entry: Any, *arguments: Any) -> Any:
 
     If the user has registered implementations for one of their types, at any depth, it has no disk
     cache: the cache would not notice an edit of those implementations.
+
+    Raises
+    ------
+    ValueError
+        if such an implementation has changed since it was compiled.
     """
-    return entry.uncached if any(map(uses_user_types, arguments)) else entry
+    if not any(map(uses_user_types, arguments)):
+        return entry
+    check_implementations(arguments)
+    return entry.uncached
 
 
 def compilations(entry: Any) -> int:

@@ -8,6 +8,10 @@ long as its address is in use; addresses are not valid in another process.
 Numbers and arrays that a user's function takes by name are data, not code: one array holds all of
 them, and compiled code reads it by a pointer. Other numbers of the same shapes compile nothing.
 
+What it takes from outside without a name, globals and variables of enclosing functions, becomes a
+constant of its code. Code is kept for a function together with these values (``frozen``), so that
+changed values make other code.
+
 Trial of user-defined functions, interpreted, so that mistakes are reported before compilation.
 
 Each error names the user's class and the rule. Classes of this package are not tried.
@@ -29,6 +33,7 @@ from numba.extending import intrinsic, overload
 
 from quell import checks
 from quell.kernels.dispatch import Generic, set_display_name
+from quell.kernels.frozen import Frozen, frozen, outdated_helper
 from quell.kernels.numba_internals import ir
 from quell.kernels.sized import Scalars
 from quell.types import Vector
@@ -46,6 +51,15 @@ class Origin(NamedTuple):
     # Where its own parameters begin in the array of numbers that is passed, and their shapes; None
     # if no such array is passed.
     numbers: tuple[int, Shapes] | None = None
+    frozen: Frozen | None = None  # what its code has from outside
+
+    def check_unchanged(self) -> None:
+        """Raise a ``ValueError`` if the function is not any more what its code was made of."""
+        if self.frozen is not None and frozen(self.function) != self.frozen:
+            raise ValueError(
+                f"{self.function.__name__}: its globals or the variables around it have changed "
+                "since it was compiled: make the parts that use it again, or pass them as arguments"
+            )
 
 
 _origins: dict[int, Origin] = {}
@@ -58,7 +72,7 @@ def set_origin(
     numbers: tuple[int, Shapes] | None = None,
 ) -> None:
     """Note what the function at an address was made of, for its translation to C."""
-    _origins[address] = Origin(function, c_function, numbers)
+    _origins[address] = Origin(function, c_function, numbers, frozen(function))
 
 
 def origin_of(address: Any) -> Origin | None:
@@ -136,8 +150,14 @@ class NotCompilableError(Exception):
 def jit_user_function(function: Callable[..., Any]) -> Any:
     """Return a user's function for calls from a function that is passed to ``compile_cfunc``.
 
-    Bound methods and callable objects raise a ``NotCompilableError``.
+    Bound methods and callable objects raise a ``NotCompilableError``, and functions that call one
+    of ``register_jitable`` whose globals have changed: Numba compiles that only once.
     """
+    if (helper := outdated_helper(function)) is not None:
+        raise NotCompilableError(
+            f"{helper.__name__} has been compiled with other values of its globals or of the "
+            "variables around it: define it again, or pass them as arguments"
+        )
     try:
         # Division by zero gives inf, as in numpy: an exception can't leave compiled code from here.
         return numba.njit(getattr(function, "py_func", function), error_model="numpy")

@@ -73,6 +73,13 @@ class PlantWrapper(Described):
         return self.plant.compiled
 
 
+def one_at_a_time(plant: Any) -> bool:
+    """Return whether only one run of a plant can be under way in a process, as of some FMUs."""
+    while isinstance(plant, PlantWrapper):
+        plant = plant.plant
+    return bool(getattr(plant, "one_at_a_time", False))
+
+
 def check_plant(value: Any, name: str = "plant") -> None:
     """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a plant."""
     if isinstance(value, type) or not hasattr(value, "sampled"):

@@ -346,6 +346,11 @@ class FMUPlant(Described):
         """Number of disturbance inputs."""
         return len(self._ports.inputs) - self._ports.controls
 
+    @property
+    def one_at_a_time(self) -> bool:
+        """Whether the FMU permits only one instance, so one run at a time, in a process."""
+        return self._library.only_one
+
     def _check_step(self, dt: float) -> None:
         """Refuse a sample time that is none, and warn of one that does not fit the FMU."""
         checks.positive("dt", dt, "s")

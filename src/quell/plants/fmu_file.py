@@ -158,7 +158,7 @@ class Library:
             remove()
             raise
         self.has_state = bool(slave.canGetAndSetFMUstate)
-        self._only_one = bool(slave.canBeInstantiatedOnlyOncePerProcess)
+        self.only_one = bool(slave.canBeInstantiatedOnlyOncePerProcess)
 
     def _check_binary(self, names: list[str], identifier: str, place: str) -> None:
         """Raise a ``ValueError`` if there is no binary for this machine."""
@@ -201,7 +201,7 @@ class Library:
 
     def instance(self) -> Any:
         """Return FMPy's object for a new instance."""
-        if self._only_one and self._live:
+        if self.only_one and self._live:
             raise ValueError(
                 f"{self.name}: can be instantiated only once in a process, and another run of it "
                 "is not over: run one after the other"
@@ -371,12 +371,14 @@ class Variables:
 
     def _check_once(self, who: str, ports: tuple[Port, ...]) -> None:
         """Raise a ``ValueError`` if two ports are one variable."""
-        seen: dict[int, str] = {}
+        # In FMI 2.0 each type has references of its own (section 2.2.7, valueReference).
+        seen: dict[tuple[str, int], str] = {}
         for port in ports:
-            if port.reference in seen:
-                both = f"{seen[port.reference]!r} and {port.name!r}"
+            key = port.type, port.reference
+            if key in seen:
+                both = f"{seen[key]!r} and {port.name!r}"
                 raise ValueError(f"{self._where}: {who} one variable twice: {both}")
-            seen[port.reference] = port.name
+            seen[key] = port.name
 
     def _every(
         self, argument: str, names: Sequence[str] | None, candidates: list[str]

@@ -25,6 +25,7 @@ from quell import checks
 from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
+from quell.kernels.frozen import kept_code
 from quell.kernels.sized import Buffer, Size
 from quell.kernels.user_functions import (
     POINTER,
@@ -286,7 +287,7 @@ class _Sizes(NamedTuple):
     more: Shapes  # of those of the output
 
 
-@lru_cache(maxsize=_KEPT)
+@kept_code(_KEPT)
 def _machine_code(
     rate_of: Callable[..., Any], output_of: Callable[..., Any], sizes: _Sizes
 ) -> tuple[Any, Any]:
@@ -447,9 +448,10 @@ class MultivariableNonlinearPlant(EquationPlant):
     def sampled(self, dt: float, interpret: bool = False) -> Any:
         """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
         step, substeps = self._step(dt)
-        if interpret or self._machine_code is None:
+        code = self._code(interpret)
+        if code is None:
             return PythonMultivariable(self._rate, self._measured, step, substeps)
-        rate, output = self._machine_code
+        rate, output = code
         numbers = as_array(*self._numbers)
         return CompiledMultivariable(rate.address, output.address, step, substeps, numbers)
 

@@ -35,6 +35,7 @@ from quell import checks
 from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
+from quell.kernels.frozen import frozen, kept_code
 from quell.kernels.functions import tanh
 from quell.kernels.user_functions import (
     POINTER,
@@ -46,6 +47,7 @@ from quell.kernels.user_functions import (
     evaluate,
     named_parameters,
     reader,
+    set_origin,
     shapes_of,
 )
 from quell.plants.base import Plant, advance, labelled, measure, signals_of
@@ -112,7 +114,7 @@ def row_output(row: tuple[float, ...]) -> Callable[[Vector], float]:
     return linear
 
 
-@lru_cache(maxsize=_KEPT)
+@kept_code(_KEPT)
 def machine_code(
     rate_of: Callable[..., Any],
     output_of: Callable[..., Any],
@@ -150,7 +152,10 @@ def machine_code(
         return h(numba.carray(px, (n,)), *more(pp))
 
     compile_cfunc = user_functions.compile_cfunc
-    return compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
+    code = compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
+    set_origin(code[0].address, rate_of, numbers=(0, shapes[0]))
+    set_origin(code[1].address, output_of, numbers=(count_of(shapes[0]), shapes[1]))
+    return code
 
 
 # ---- The equation of a nonlinear plant in a sample ----
@@ -326,30 +331,51 @@ class EquationPlant(Described):
     @cached_property
     def _rate(self) -> Callable[..., Any]:
         """The function f(t, x, u, w), with the parameters in it."""
+        frozen(self.f)  # compiles helpers again whose globals have changed
         return bound(self.f, self._numbers[0])
 
     @cached_property
     def _measured(self) -> Callable[..., Any]:
         """The function h(x), with the parameters in it."""
+        frozen(self._output_function)
         return bound(self._output_function, self._numbers[1])
 
     @cached_property
-    def _machine_code(self) -> tuple[Any, Any] | None:
-        """The two compiled functions, kept as long as their addresses; None if Numba can't."""
+    def _codes(self) -> dict[Any, tuple[Any, Any] | None]:
+        """Compiled functions by what is frozen in them, kept as long as their addresses."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is computed when it is needed: the code is of this process only."""
+        of_class = partial(getattr, type(self))
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(of_class(name, None), cached_property)
+        }
+
+    def _code(self, interpret: bool = False) -> tuple[Any, Any] | None:
+        """Return the two compiled functions; None if they run as Python."""
+        key = frozen(self.f), frozen(self._output_function)
+        if interpret:
+            return None
+        if key in self._codes:
+            return self._codes[key]
         try:
-            return self._machine_code_of_both()
+            made = self._machine_code_of_both()
         except user_functions.NotCompilableError as error:
             warn(
                 f"{self.name}: f or output can't be compiled and runs as Python, which is slow "
                 f"({error})",
                 UserWarning,
             )
-            return None
+            made = None
+        return self._codes.setdefault(key, made)  # of two threads both use the first one's
 
     @property
     def compiled(self) -> bool:
         """Whether Numba could compile the functions."""
-        return self._machine_code is not None
+        return self._code() is not None
 
     def _step(self, dt: float) -> tuple[float, int]:
         """Return length and number of the sub-steps in a sample."""
@@ -516,24 +542,23 @@ class NonlinearPlant(EquationPlant):
         f = user_functions.jit_user_function(self.f)
         h = user_functions.jit_user_function(self._output_function)
         compile_cfunc = user_functions.compile_cfunc
-        return compile_cfunc(_RATE_SIGNATURE_PLANT, rate), compile_cfunc(
-            _OUTPUT_SIGNATURE_PLANT, output
+        code = (
+            compile_cfunc(_RATE_SIGNATURE_PLANT, rate),
+            compile_cfunc(_OUTPUT_SIGNATURE_PLANT, output),
         )
+        set_origin(code[0].address, self.f)
+        set_origin(code[1].address, self._output_function)
+        return code
 
     def sampled(self, dt: float, interpret: bool = False) -> Any:
         """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
         step, substeps = self._step(dt)
-        if interpret or self._machine_code is None:
+        code = self._code(interpret)
+        if code is None:
             return PythonNonlinear(self._rate, self._measured, step, substeps)
-        rate, output = self._machine_code
-        set_origin = user_functions.set_origin
+        rate, output = code
         if self.parameters is None:
-            set_origin(rate.address, self.f)
-            set_origin(output.address, self._output_function)
             return CompiledNonlinear(rate.address, output.address, step, substeps)
-        own, more = map(shapes_of, self._numbers)
-        set_origin(rate.address, self.f, numbers=(0, own))
-        set_origin(output.address, self._output_function, numbers=(count_of(own), more))
         numbers = as_array(*self._numbers)
         return CompiledParametric(rate.address, output.address, step, substeps, numbers)
 

@@ -193,6 +193,7 @@ class Tasks:
         for each in inputs:
             with translated_errors(f"input = {each.name!r} from {each.low:g} to {each.high:g} V"):
                 task.ai_channels.add_ai_voltage_chan(each.name, min_val=each.low, max_val=each.high)
+        _check_count("input", inputs, task)
         values = np.zeros(len(inputs))
         with translated_errors(f"input = {inputs[0].name!r}"):
             self._begin(task)  # before that each read starts and stops it
@@ -211,6 +212,7 @@ class Tasks:
         for each in outputs:
             with translated_errors(f"output = {each.name!r} from {each.low:g} to {each.high:g} V"):
                 task.ao_channels.add_ao_voltage_chan(each.name, min_val=each.low, max_val=each.high)
+        _check_count("output", outputs, task)
         writer = self._ni.stream_writers.AnalogMultiChannelWriter(task.out_stream, auto_start=True)
         writer.verify_array_shape = False
         names = ", ".join(each.name for each in outputs)
@@ -224,7 +226,9 @@ class Tasks:
             return lambda level: None
         task = self._new(f"the task of {name}")
         with translated_errors(f"{name} = {line!r}"):
-            task.do_channels.add_do_chan(line)
+            if (lines := task.do_channels.add_do_chan(line).do_num_lines) != 1:
+                rule = "must be one line, such as Dev2/port0/line0"
+                raise ValueError(f"{name} = {line!r}: is {lines} lines; {rule}")
             writer = self._ni.stream_writers.DigitalSingleChannelWriter
             write = writer(task.out_stream, auto_start=True).write_one_sample_one_line
             return self._start(task, write, False, f"{line} can't be set low")
@@ -261,6 +265,20 @@ class Tasks:
         self._begin(task)  # or each write would start and stop it
         self._closing.append((failure, lambda: write(zero, _TIMEOUT)))
         return lambda value: write(value, _TIMEOUT)
+
+
+# The remedy for a name that is several channels.
+_ONE_EACH = "name each one, ['Dev2/ao0', 'Dev2/ao1'], in a URL Dev2/ao0,Dev2/ao1"
+
+
+def _check_count(what: str, channels: list[Voltage], task: Any) -> None:
+    """Refuse names that are several channels: the driver would go beyond the array of values."""
+    with translated_errors(f"{what} = {channels[0].name!r}"):
+        count = task.number_of_channels
+    if count != len(channels):
+        names = ", ".join(each.name for each in channels)
+        rule = f"must be {checks.counted(len(channels), 'channel')}; {_ONE_EACH}"
+        raise ValueError(f"{what} = {names!r}: is {checks.counted(count, 'channel')}, {rule}")
 
 
 # ---- Cards of National Instruments as a device ----
@@ -355,6 +373,7 @@ class NiDevice:
         heartbeat: str | None = None,
         watchdog: float | None = None,
     ) -> None:
+        counter, output = _as_list(counter), _as_list(output)
         several = checks.is_sequence(counter) or checks.is_sequence(output)
         inputs, outputs = _channels("counter", counter), _channels("output", output)
         self.signal_counts = SignalCounts(len(inputs), len(outputs)) if several else None
@@ -395,6 +414,8 @@ class NiDevice:
         ]
         self._low, self._high = np.array(limits).T
         timeout = None if watchdog is None else checks.positive("watchdog", watchdog, "s")
+        _check_line("enable", enable)
+        _check_line("heartbeat", heartbeat)
 
         self.name = f"NI {', '.join(inputs)} and {', '.join(outputs)}"
         self._armed = self._level = False
@@ -444,7 +465,9 @@ class NiDevice:
     def write(self, u: Any) -> None:
         """Set the outputs to ``u`` [u-unit], a number or an array (m,), cut to its limits.
 
-        If one is not finite all outputs are set to zero, and a ``ValueError`` is raised.
+        If one is not finite all outputs are set to zero, and a ``ValueError`` is raised. If a card
+        fails the others get their u nevertheless. Then its ``OSError`` is raised; the heartbeat
+        does not change, and watchdogs are not reset.
         """
         self._check_open()
         given = np.asarray(u, dtype=float).reshape(-1)
@@ -457,8 +480,14 @@ class NiDevice:
                 self._tasks.arm()
                 self._write_enable(True)
                 self._armed = True
+            failure: Exception | None = None
             for places, write in self._writers:
-                write(volts[places] if finite else np.zeros(len(places)))
+                try:
+                    write(volts[places] if finite else np.zeros(len(places)))
+                except Exception as error:  # the other cards would hold their last voltages
+                    failure = failure or error
+            if failure is not None:
+                raise failure
             self._level = not self._level
             self._write_heartbeat(self._level)
             self._tasks.reset_watchdog()
@@ -490,15 +519,33 @@ def _channels(name: str, given: Any) -> list[str]:
     if not found or not all(isinstance(each, str) and each for each in found):
         rule = "must be a physical channel, or of several axes a list of them"
         raise ValueError(f"{name} = {given!r:.60}: {rule}")
+    for each in found:
+        if ":" in each or "," in each:
+            raise ValueError(f"{name} = {each!r:.60}: is several channels; {_ONE_EACH}")
     if len(set(found)) < len(found):
         raise ValueError(f"{name} = {given!r:.60}: must be different channels")
     return found
+
+
+def _check_line(name: str, given: Any) -> None:
+    """Refuse what is not one digital line; None is none."""
+    if given is None:
+        return
+    if not isinstance(given, str) or not given or ":" in given or "," in given:
+        rule = "must be one digital line, a text such as 'Dev2/port0/line0'"
+        raise ValueError(f"{name} = {given!r:.60}: {rule}; one serves all amplifiers")
+
+
+def _as_list(given: Any) -> Any:
+    """Return an array as a list, all else as it is."""
+    return given.tolist() if isinstance(given, np.ndarray) else given
 
 
 def _for_each(
     name: str, given: Any, used: list[bool], default: Any = None, kind: str = ""
 ) -> list[Any]:
     """Return a number for each channel, that of all or one of a list; None is the default."""
+    given = _as_list(given)
     if given is None:
         return [default] * len(used)
     if not any(used):

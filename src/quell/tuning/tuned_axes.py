@@ -253,12 +253,13 @@ class TunedAxes:
                 lines.append(f"behind B0: {left.advice.splitlines()[0]}")
             elif left.factor > _INDEPENDENT:
                 lines.append(
-                    f"NOT decoupled by this B0: behind it a gain changes by {left.factor:.3g} with "
-                    "the other loops closed; give the B0 of the machine"
+                    f"NOT decoupled by this B0: behind it a gain changes by a factor of "
+                    f"{left.factor:.3g} with the other loops closed; give the B0 of the machine"
                 )
             else:
                 lines.append(
-                    f"decoupled by this B0: behind it gains change by {left.factor:.3g} at most"
+                    "decoupled by this B0: behind it a gain changes by a factor of "
+                    f"{left.factor:.3g} at most with the other loops closed"
                 )
         return lines
 

@@ -674,6 +674,7 @@ class Calls:
             given = _with_numbers(given, origin.numbers, returns, self.program.literals.real)
         if origin.c_function is not None:
             return self._c_function(body, origin.c_function, given)
+        origin.check_unchanged()
         if returns:
             found = self.program.function(origin.function, given)
         else:
