@@ -548,6 +548,17 @@ def test_contradicting_constraints_are_named_with_their_excess() -> None:
         ql.tune(unstable, DT, structure="pi-unfiltered", constraints=bounds, compare=())
 
 
+@pytest.mark.slow
+def test_a_bound_of_u_near_that_at_rest_is_named_with_the_least_that_was_found() -> None:
+    """With a PI controller the speed of an inertia makes u overshoot the load, for any gains."""
+    speed = ([1.0], [2e-4, 0.0])  # rad/s for N m
+    bounds = Constraints(u_max=1.01)
+    with pytest.raises(
+        ValueError, match=r"contradict .*u_max 1.01.*least that was found is 1\.\d+"
+    ):
+        ql.tune(speed, 2.5e-4, structure="pi-unfiltered", constraints=bounds, compare=())
+
+
 def test_a_plant_that_no_controller_of_the_structure_stabilises_is_said() -> None:
     """A PI controller and a double integrator."""
     with pytest.raises(ValueError, match="no controller of this structure was found that stab"):
