@@ -1,7 +1,7 @@
 """Several axes: an arm with and without its mass matrix, arms of MuJoCo, a quadrotor, and the cost.
 
-    python benchmarks/axes.py [--part arm|draws|learners|mujoco|quadrotor|yaw|cost] [--draws 100]
-                              [--seed 7]
+    python benchmarks/axes.py [--part arm|draws|learners|mujoco|quadrotor|yaw|single|cost]
+                              [--draws 100] [--seed 7]
 
 *arm*: random rigid two-link arms (those of ``quell stress --loops axes``) that follow sines,
 ω_c/ω_o = 8/60: RMS error against the response that the design asks for, from 5 s on, with M(q),
@@ -26,6 +26,11 @@ of the error against the response that the design asks for, all angles.
 inertia and the lag of its rotors known: at each step of the reference, not before, u is planned
 for what is left of the response that the design asks for, with all of the torque for yaw.
 
+*single*: u of single precision against that of double at the limits, with ``saturation="each"``
+and by priority: gantries with two motors on one axis, quadrotors, and random B0 of the given
+numbers of axes and actuators whose rows differ in size by up to 10⁴. Of each the median, the 99.9th
+percentile and the largest difference of one actuator, in parts of its range.
+
 *draws*: processor time to make each of some drawn arms and its ``Axes`` with M(q) and to take the
 first samples, and that of a sample in the loop.
 
@@ -48,7 +53,15 @@ from scipy.optimize import lsq_linear
 from scipy.signal import lsim
 
 import quell as ql
+from quell.controllers.allocation import (
+    allocate,
+    checked_actuator_limits,
+    checked_gain,
+    checked_rule,
+    range_memory,
+)
 from quell.experiments.stress.axes import draw_arm
+from quell.kernels.single import in_single
 from quell.plants.multibody import rotor_levers
 
 DT = 1e-3
@@ -481,6 +494,78 @@ def part_cost(draws: int, seed: int) -> None:
               f"ratio to three {b / (3 * a):.2f}")  # fmt: skip
 
 
+# ---- Single precision at the limits ----
+
+
+def drawn_gain(kind: str, rng: Any) -> tuple[Any, float, float, list[float] | None]:
+    """Return B0, the limits of u, and the u that is wished."""
+    if kind == "quadrotor":
+        return rotor_levers(0.17, 0.015) / drawn_inertia(rng)[:, None], LEAST, MOST, [HOVER] * 4
+    if kind == "gantry":  # x and the angle of the beam by two motors, y by the third one
+        m, J, half, at, y = (rng.uniform(*each) for each in (
+            (20, 60), (5, 20), (0.5, 1.0), (-0.4, 0.4), (5, 15),
+        ))  # fmt: skip
+        more = rng.normal(0.0, (0.02 / m, 0.05 / J, 0.01, 0.01))
+        B0 = [[1 / m, 1 / m, more[0]], [(half - at) / J, -(half + at) / J, more[1]],
+              [more[2], more[3], 1 / y]]  # fmt: skip
+        return np.array(B0), -300.0, 300.0, None
+    n, m = map(int, kind.split(" by "))
+    while True:
+        B0 = rng.standard_normal((n, m))
+        if np.linalg.cond(B0 / np.linalg.norm(B0, axis=1)[:, None]) < 10.0:
+            return B0 * 10.0 ** rng.uniform(-2.0, 2.0, n)[:, None], -1.0, 1.0, None
+
+
+def drawn_inertia(rng: Any) -> Any:
+    """Return inertias of a quadrotor up to 30 % off [kg m²]."""
+    return INERTIA * rng.uniform(0.7, 1.3, 3)
+
+
+def difference_in_single(kind: str, by_priority: bool, rng: Any) -> float:
+    """Return how much u differs, in parts of its range; 0 if no limit is met."""
+    B0, low, high, wished = drawn_gain(kind, rng)
+    n, m = B0.shape
+    names = [f"axis{i + 1}" for i in range(n)]
+    order = [names[i] for i in rng.permutation(n)] if by_priority else "each"
+    gain = checked_gain(B0, None, None, names, 2)
+    rule = checked_rule(order, wished if m > n else None, gain, names)
+    rate = rng.choice([np.inf, 50.0 * (high - low)])
+    limits = checked_actuator_limits(low, high, rate, m, DT)
+    middle = B0 @ np.full(m, 0.5 * (low + high)) if wished is None else B0 @ wished
+    reach = 0.5 * (high - low) * np.sum(np.abs(B0), axis=1)
+    v = middle + reach * rng.choice([0.5, 1.5]) * rng.standard_normal(n)
+    room, before = range_memory(n, m, rule), rng.uniform(low, high, m)
+    double = rule, limits, gain.memory(), room, v, before, np.zeros(m)
+    single = in_single(double)
+    if allocate(*double) | allocate(*single) == 0:
+        return 0.0
+    return float(np.max(np.abs(double[-1] - single[-1])) / (high - low))
+
+
+def part_single(draws: int, seed: int) -> None:
+    """Print the differences of each kind of B0."""
+    kinds = (
+        "gantry",
+        "quadrotor",
+        "2 by 2",
+        "3 by 3",
+        "4 by 4",
+        "2 by 3",
+        "3 by 4",
+        "3 by 6",
+        "4 by 6",
+    )
+    for name, by_priority in (("each", False), ("priority", True)):
+        for kind in kinds:
+            rng = np.random.default_rng(seed)
+            drawn = np.array([difference_in_single(kind, by_priority, rng) for _ in range(draws)])
+            found = drawn[drawn > 0.0]
+            print(f"single precision, {name}, {kind}: u differs by {np.median(found):.1e}, "
+                  f"{np.quantile(found, 0.999):.1e}, {np.max(found):.1e} of its range "
+                  f"in {found.size} draws at the limits; {np.sum(found > 1e-4)} above 1e-4",
+                  flush=True)  # fmt: skip
+
+
 PARTS: dict[str, Any] = {
     "arm": part_arm,
     "draws": part_draws,
@@ -488,6 +573,7 @@ PARTS: dict[str, Any] = {
     "mujoco": part_mujoco,
     "quadrotor": part_quadrotor,
     "yaw": part_yaw,
+    "single": part_single,
     "cost": part_cost,
 }
 

@@ -52,6 +52,7 @@ int main(void)
     const double known = TICKS_OF(".rept 1000\n\tnop\n\t.endr\n\t") - empty;
 
     axes_init(&axes);
+    int limited = 0;
     one_init(&one);
     two_init(&two);
     three_init(&three);
@@ -64,6 +65,7 @@ int main(void)
         together += count;
         most = fmax(most, count);
         kept = u[0];
+        limited += (axes_status(&axes) & (AXES_SATURATED | AXES_RATE_LIMITED)) != 0;
         REAL r1 = r[0], r2 = r[1], r3 = r[2], y1 = y[0], y2 = y[1], y3 = y[2];
         __asm volatile("" : "+t"(r1), "+t"(r2), "+t"(r3), "+t"(y1), "+t"(y2), "+t"(y3));
         before = TIMER[2];
@@ -78,6 +80,7 @@ int main(void)
     }
     printf("known %.9g\n", known / TICKS_PER_INSTRUCTION);
     printf("together %.9g\nmost %.9g\nalone %.9g\n", together / SAMPLES, most, alone / SAMPLES);
+    printf("limited %.9g\n", (double)limited / SAMPLES);
     printf("state %lu\nstates %lu\n", (unsigned long)sizeof axes,
         (unsigned long)(sizeof one + sizeof two + sizeof three));
     exit(0);

@@ -138,6 +138,7 @@ SINGLE = (
     "each, with rates",
     "safe sets, rates",
     "drives, direction",
+    "more actuators, least squares",
     "more actuators, direction",
     "more actuators, priority",
     "priority",

@@ -366,17 +366,19 @@ def export(
     if precision == "single" and not accept:
         given.needed("plant")
         given.needed("scenario")
+    loop: dict[str, Any] = {"plant": given.plant, "scenario": given.scenario}
+    if precision == "double" or None in loop.values():
+        loop = {}
     exported = c(
         _learned(given.controller, memory, precision),
         out,
         name=name or "controller",
         precision=precision,
-        plant=given.plant,
-        scenario=given.scenario,
         resolution=resolution,
         accept=accept,
         proof=prove,
         overwrite=overwrite,
+        **loop,
     )
     _print(given.title, exported)
     if exported.proof is not None and not exported.proof.proved:
@@ -475,6 +477,11 @@ def _differences(found: Comparison) -> list[str]:
     rows = [("u", found.u, found.u_noise), ("y", found.y, found.y_noise)]
     lines = []
     for signal, difference, noise in found.each or rows:
+        if difference is None:
+            lines.append(
+                f"NOT compared: {signal}, which rests in this scenario; let its reference move"
+            )
+            continue
         text = f"Single precision changes {signal} by {100 * difference:.2g} % RMS"
         if noise is not None:
             text += f"; the measurement noise changes it by {100 * noise:.2g} %"

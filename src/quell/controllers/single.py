@@ -20,7 +20,7 @@ import numba
 import numpy as np
 
 from quell import checks
-from quell.controllers.allocation import CutEach, FunctionGain
+from quell.controllers.allocation import FunctionGain
 from quell.controllers.axes import Axes, AxesDesign
 from quell.controllers.axes_chain import AxisDesigns
 from quell.controllers.base import (
@@ -273,7 +273,7 @@ def in_single_precision(controller: Controller) -> SinglePrecision | SeveralInSi
     ValueError
         for what is no controller; for a parameter out of the range of single precision; for
         models in Python and ``features.Custom``, which work in double precision only; and for axes
-        whose B0 is a function, or with more actuators than axes and ``saturation = "each"``.
+        whose B0 is a function.
 
     Examples
     --------
@@ -384,17 +384,6 @@ def _check_axes(controller: Any) -> None:
         raise ValueError(
             "precision = 'single': B0 or M is a function, which is compiled in double precision; "
             "stay in double, or take a constant matrix"
-        )
-    if (
-        isinstance(controller, Axes)
-        and isinstance(design.rule, CutEach)
-        and controller.inputs > controller.outputs
-    ):
-        raise ValueError(
-            f"precision = 'single': {controller.inputs} actuators for {controller.outputs} axes "
-            "with saturation = 'each' need least squares with a weight of 1e8, for which single "
-            "precision has too few digits; take saturation = 'direction' or the axes in the order "
-            "of their priority, or stay in double"
         )
 
 

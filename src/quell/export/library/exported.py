@@ -505,6 +505,8 @@ def _edges(calls: str) -> dict[str, set[str]]:
 # (a torsional axis: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
 # unless the rounding of y itself, times omega_o^(n+1), is too much for u.
 LIMIT = 0.01
+# A signal of several axes rests if its RMS is below a unit of the last digit of the largest one.
+_REST = float(np.finfo(np.float32).eps)
 
 
 class Difference(NamedTuple):
@@ -515,13 +517,14 @@ class Difference(NamedTuple):
     name
         ``u of actuator 1``, ``v of elbow``, ``y of elbow``; of state feedback ``y 1``.
     single
-        of a run in single precision.
+        of a run in single precision; None if the signal rests in both runs, so that there is
+        nothing to compare.
     noise
         of a run in double precision without measurement noise; None if the scenario has none.
     """
 
     name: str
-    single: float
+    single: float | None
     noise: float | None
 
 
@@ -576,7 +579,7 @@ class Comparison(NamedTuple):
                 "resolution=, --resolution)"
             )
         asked = [own for own in self.each if own.name.startswith("v of ")]
-        worst = max(asked, key=lambda own: own.single, default=None)
+        worst = max(asked, key=lambda own: own.single or 0.0, default=None)
         of = "" if worst is None or self.diverged else f"{worst.name.removeprefix('v')} "
         return f"a lower omega_o{of.rstrip()}, y as a difference from a position near the work"
 
@@ -584,28 +587,34 @@ class Comparison(NamedTuple):
 def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
     """Return what single precision changes in a scenario, and what the measurement noise does.
 
-    A signal of several axes is compared with its own RMS.
+    A signal of several axes is compared with its own RMS, or, if it rests, with the largest that
+    it could be compared with: u and y of all, and the largest share of v = B0 u.
     """
     controller = in_double_precision(controller)
     double = simulate(plant, controller, scenario)
     single = simulate(plant, controller, scenario, precision="single")
     diverged, quiet = single.diverged and not double.diverged, None
-    if not (isinstance(scenario.noise, int | float) and scenario.noise == 0.0):
+    noise: Any = scenario.noise
+    noises = noise if checks.is_sequence(noise) else (noise,)
+    if not all(isinstance(each, int | float) and each == 0.0 for each in noises):
         quiet = simulate(plant, controller, replace(scenario, noise=0.0))
-    each = [
-        Difference(
-            name,
-            _difference(double, single, *place),
-            None if quiet is None else _difference(double, quiet, *place),
+    each = []
+    for name, place in _signals_of(controller):
+        largest = _largest(double, controller, *place)
+        each.append(
+            Difference(
+                name,
+                _difference(double, single, *place, largest),
+                None if quiet is None else _difference(double, quiet, *place, largest),
+            )
         )
-        for name, place in _signals_of(controller)
-    ]
-    u, y = (
-        max((own for own in each if own.name.startswith(kind)), key=lambda own: own.single)
+    worst = [
+        max((own for own in each if own.name.startswith(kind)), key=lambda own: own.single or 0.0)
         for kind in "uy"
-    )
+    ]
+    u, y = (own.single or 0.0 for own in worst)
     several = tuple(each) if hasattr(controller, "inputs") else ()
-    return Comparison(u.single, y.single, u.noise, y.noise, diverged, several)
+    return Comparison(u, y, worst[0].noise, worst[1].noise, diverged, several)
 
 
 def _signals_of(controller: Any) -> list[tuple[str, tuple[str, int]]]:
@@ -619,13 +628,33 @@ def _signals_of(controller: Any) -> list[tuple[str, tuple[str, int]]]:
     return found + [(name, ("y", i)) for i, name in enumerate(measured)]
 
 
-def _difference(reference: Any, other: Any, name: str, column: int) -> float:
-    """Return the RMS difference of a signal, relative to the RMS of the reference."""
+def _rms(values: Any) -> Any:
+    """Return the RMS of each column."""
+    return np.sqrt(np.mean(np.square(values), axis=0))
+
+
+def _largest(run: Any, controller: Any, name: str, column: int) -> float:
+    """Return the RMS with which a signal that rests is compared; 0 for a single one."""
+    if not hasattr(controller, "inputs"):
+        return 0.0
+    if name == "v":
+        return float(np.max(np.abs(controller.first_gain[column]) * _rms(run["u"])))
+    return max(float(np.max(_rms(run[each]))) for each in (("u",) if name == "u" else ("y", "r")))
+
+
+def _difference(reference: Any, other: Any, name: str, column: int, largest: float) -> float | None:
+    """Return the RMS difference of a signal, relative to the RMS of the reference.
+
+    None for a signal that rests in both: below rounding in the one, and within ``LIMIT`` of
+    ``largest`` in the other.
+    """
     count = min(len(reference), len(other))
     one, two = (each[name][:count].reshape(count, -1)[:, column] for each in (reference, other))
-    size, change = (float(np.sqrt(np.mean(np.square(each)))) for each in (one, two - one))
-    if change == 0.0:
-        return 0.0
+    size, change = float(_rms(one)), float(_rms(two - one))
+    if size <= _REST * largest:
+        size = largest
+        if change <= LIMIT * largest:
+            return None
     return change / size if size > 0.0 else math.inf
 
 
@@ -692,8 +721,8 @@ def c(
     precision
         ``"double"`` or ``"single"``.
     plant, scenario
-        for single precision: the loop in which it is compared with double; of several axes with
-        a plant of as many signals.
+        for single precision, both: the loop in which it is compared with double; of several axes
+        with a plant of as many signals.
     resolution
         of an encoder [y-unit per count]: adds ``NAME_step_counts``, which takes r and y as integers
         and computes with differences to the last count. For an ADRC without model of the position.
@@ -712,8 +741,9 @@ def c(
     ValueError
         for a name that C, C++, their headers or CMake use; a folder with files; a controller with
         parts in Python (``TranslationError``); parameters out of the range of single precision;
-        single precision that differs too much, or is not compared, without ``accept``; and a proof
-        of a controller that calls functions in C. Nothing is written then.
+        a plant or a scenario alone, or for double precision; single precision that differs too
+        much, or is not compared, without ``accept``; and a proof of a controller that calls
+        functions in C. Nothing is written then.
 
     Examples
     --------
@@ -737,6 +767,9 @@ def c(
     single = single or is_in_single(controller)
     source = c_source(controller, name, precision=precision, resolution=resolution)
     comparison = None
+    if (plant is None) != (scenario is None) or not (single or plant is None):
+        what = "a comparison needs both" if single else "are compared in single precision only"
+        raise ValueError(f"plant, scenario: {what}; leave them out, or give both and 'single'")
     if single and plant is not None and scenario is not None:
         comparison = compared(plant, controller, scenario)
     if single and not accept:
