@@ -70,6 +70,16 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
             "observer.kind = 'model-fre': unknown; did you mean model-free?",
         ),
         ("learner = 'kallman'", "learner.kind = 'kallman': unknown; did you mean kalman?"),
+        (
+            "[tune]\nu_min = -0.64",
+            "tune.u_min: unknown; limits of u are u_min, u_max and rate_limit in [controller]; "
+            "tune.u_max bounds |u| in the response to the load or the reference",
+        ),
+        (
+            "[tune]\nrate_limit = 3.0",
+            "tune.rate_limit: unknown; limits of u are u_min, u_max and rate_limit in "
+            "[controller]; tune.rate_max bounds |u'| in the response to the load or the reference",
+        ),
         ("learner = 3", "learner = 3: must be a table"),
         (
             "[observer]\nomega_o = -1.0",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ import quell as ql
 from quell.analysis import analyse
 from quell.quantities import Signals
 from quell.setup import load
-from quell.tuning import Constraints, designs
-from quell.tuning.optimiser import loops
+from quell.tuning import Constraints, designs, report
+from quell.tuning.optimiser import loops, requirements
 from quell.tuning.optimiser.requirements import sizes
 from quell.tuning.plants import given_plants, model_of, plant_set
 from quell.tuning.structures.adrc import equivalents
@@ -162,7 +163,44 @@ def test_freed_poles_are_better_than_bandwidths_and_pid(tuned: ql.Tuned) -> None
     k_i = {name: design.k_i for name, design in tuned.designs.items()}
     assert k_i["poles"] > 1.0 * k_i["pid"] > k_i["bandwidths"] > 2.0 * k_i["pi"]
     assert any("PID" in line for line in tuned.costs)
-    assert "best" in tuned.costs[-1]
+    assert "best of those tried" in tuned.costs[-1]
+
+
+@pytest.mark.parametrize(("objective", "better"), [("load", "more"), ("load-iae", "less")])
+def test_costs_are_one_ratio_of_values(objective: str, better: str, tuned: ql.Tuned) -> None:
+    """The value of a structure over that of the other one, whether it is the best or not."""
+    pair = [replace(tuned.design, name=name, objective=x) for name, x in (("a", 2.0), ("b", 3.0))]
+    named, what = {each.name: each for each in pair}, f"{report.quantity(objective)} ({better}"
+    lines = [report.costs(each, named, objective)[-1] for each in pair]
+    best = 1 if objective == "load" else 0
+    ratio = {0: "0.667", 1: "1.5"}[1 - best]
+    first, last = pair[best].name, pair[1 - best].name
+    start = f"{last} has {ratio} times the {what} is better) of"
+    assert lines[1 - best] == f"{start} {first}, the best of those tried"
+    assert lines[best] == f"{first} is the best of those tried; next: {start} it"
+
+
+def test_unstable_loops_have_the_worst_cost_without_a_warning() -> None:
+    """Of an inertia whose gain varies by 30 %, with gains that are far too high, and with low ones."""
+    one = [([gain], [2e-4, 2e-3, 0.0]) for gain in (1.0, 1.1, 1.2, 1.3)]
+    plants = plant_set(given_plants(one, 1e-3), 1e-3)
+    cost = requirements.cost_of(
+        "load-iae", loops.SetResponses(plants, loops.load_step(plants)), 1.0
+    )
+    structure = make_structure("bandwidths", loop_of(one[0], 1e-3)[1], 2)
+    stable, unstable = structure.shapes()[:1].copy(), structure.shapes()[:1].copy()
+    stable[0], unstable[0] = (5e3, 10.0, 60.0), (50.0, 60.0, 400.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cost(structure, unstable)[0] == 200.0
+        assert cost(structure, stable)[0] < 2.0
+
+
+def test_a_structure_for_resonances_that_is_not_tried_is_named(tuned: ql.Tuned) -> None:
+    """For a plant with a resonance, until it is among the designs."""
+    assert "NOT tried: model-based-poles" in report.not_tried(tuned.designs, True)[0]
+    assert report.not_tried(tuned.designs, False) == []
+    assert report.not_tried({**tuned.designs, "model-based-poles": tuned.design}, True) == []
 
 
 @pytest.mark.slow
@@ -392,6 +430,32 @@ def test_a_profile_is_tracked_within_limits_of_u() -> None:
     assert error == pytest.approx(tuned.design.objective, rel=0.01)
 
 
+SERVO = {"inertias": [2e-4, 3e-4], "stiffnesses": [23.2], "dampings": [0.002]}  # kg m², N m/rad
+
+
+@pytest.mark.parametrize(
+    ("plant", "dt", "how", "rule"),
+    [
+        (ql.plants.n_mass(**SERVO), 2.5e-4, {}, "load = 1, and at rest |u| must be 1 there"),
+        (ql.plants.n_mass(**SERVO), 2.5e-4, {"load": -0.7}, "at rest |u| must be 0.7 there"),
+        (
+            ([0.8], [90.0, 1.0]),  # °C/%, a lag of 90 s
+            1.0,
+            {"objective": "tracking", "reference": ql.signals.Step(20.0), "duration": 900.0},
+            "the reference, which ends at 20, and at rest |u| must be 25 there",
+        ),
+    ],
+)
+def test_a_bound_of_u_below_that_at_rest_is_refused_at_once(
+    plant: Any, dt: float, how: dict[str, Any], rule: str
+) -> None:
+    """Where u holds the load, and the reference against the plant's gain, for any controller."""
+    bounds = Constraints(u_max=0.64)
+    with pytest.raises(ValueError, match=r"u_max = 0.64: NOT possible") as caught:
+        ql.tune(plant, dt, constraints=bounds, **how)
+    assert rule in str(caught.value)
+
+
 # ---- sets of plants
 
 
@@ -482,6 +546,17 @@ def test_contradicting_constraints_are_named_with_their_excess() -> None:
     bounds = Constraints(m_s=1.05, m_t=1.05, m_ks=3.0)
     with pytest.raises(ValueError, match=r"contradict .*M_t 1.05.*excess that was found is \d"):
         ql.tune(unstable, DT, structure="pi-unfiltered", constraints=bounds, compare=())
+
+
+@pytest.mark.slow
+def test_a_bound_of_u_near_that_at_rest_is_named_with_the_least_that_was_found() -> None:
+    """With a PI controller the speed of an inertia makes u overshoot the load, for any gains."""
+    speed = ([1.0], [2e-4, 0.0])  # rad/s for N m
+    bounds = Constraints(u_max=1.01)
+    with pytest.raises(
+        ValueError, match=r"contradict .*u_max 1.01.*least that was found is 1\.\d+"
+    ):
+        ql.tune(speed, 2.5e-4, structure="pi-unfiltered", constraints=bounds, compare=())
 
 
 def test_a_plant_that_no_controller_of_the_structure_stabilises_is_said() -> None:

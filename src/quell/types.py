@@ -65,10 +65,11 @@ _MESSAGES = {
         "The reference was not finite; the last good one was used instead: check its source."
     ),
     Status.SATURATED: (
-        "The control signal is at u_min or u_max; the observer got the applied value."
+        "The control signal is at u_min or u_max; the controller got the applied value."
     ),
     Status.RATE_LIMITED: (
-        "The control signal moves as fast as rate_limit allows; the observer got the applied value."
+        "The control signal moves as fast as rate_limit allows; the controller got the applied "
+        "value."
     ),
     Status.OVERFLOWED: (
         "The observer or the learner overflowed and was reset: lower the learning rate, omega_o or "

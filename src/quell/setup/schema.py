@@ -317,7 +317,9 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
             types.append(f"[[{path}]]" if one_of_many else _TYPES[kind])
         elif kind == "unknown":
             start, known = f"{path}." if path else "", context["known"]
-            lines += [f"{start}{key}: unknown; {_hint(key, known)}" for key in context["keys"]]
+            lines += [
+                f"{start}{key}: unknown; {_hint(path, key, known)}" for key in context["keys"]
+            ]
         elif kind == "missing":
             remedy = f"; {_REMEDIES[path].format(name)}" if path in _REMEDIES else ""
             lines.append(f"{path}: missing{remedy}")
@@ -338,7 +340,17 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
     return SetupError([f"{name}: {line}" for line in lines])
 
 
-def _hint(key: str, known: Sequence[str]) -> str:
+# Limits of u, which a tuning keeps, and the bounds of [tune] that are named like them.
+_LIMITS_OF_U = {"u_min": ("u_max", "|u|"), "rate_limit": ("rate_max", "|u'|")}
+
+
+def _hint(path: str, key: str, known: Sequence[str]) -> str:
+    bound, of = _LIMITS_OF_U.get(key, ("", ""))
+    if path == "tune" and bound in known:
+        return (
+            "limits of u are u_min, u_max and rate_limit in [controller]; "
+            f"tune.{bound} bounds {of} in the response to the load or the reference"
+        )
     if key in CONTEXT:
         top = f"{key} belongs at the top of the file"
         if key == "trust":

@@ -57,6 +57,8 @@ _TIGHTER, _LEAST_PEAK, _REACHED = (0.4, 0.15), 0.1, 0.995
 _MEMBERS, _WORSE, _EXCHANGES = 2, 1.005, 4
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
 _RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0, 100.0, 1e3, 1e4, 1e5), 6
+# With limits of responses over time, which are slow, to some 2 %.
+_FEW_BISECTIONS = 3
 # Starts of a search over time with several integrators: the ISE, which leads to them, has other
 # valleys than the IAE. Chosen by hand.
 _VALLEYS = 4
@@ -423,7 +425,8 @@ def contradiction(problem: Problem, solution: Solution, constraints: Constraints
             "the constraints contradict each other for this structure: no controller was found "
             f"even with all limits relaxed by a factor of {_RELAXED[-1]:g}"
         )
-    for _ in range(_BISECTIONS):
+    over_time = [extra for extra in problem.extras if extra.over_time]
+    for _ in range(_FEW_BISECTIONS if over_time else _BISECTIONS):
         middle = (low * high) ** 0.5
         nearer = search(relaxed(problem, middle), structure, found.values, _NEARBY_ROUNDS)
         if nearer is not None and nearer.feasible:
@@ -437,9 +440,16 @@ def contradiction(problem: Problem, solution: Solution, constraints: Constraints
     # Bounds of parameters, as |p| dt, are not relaxed.
     limits = {each.name: given.get(each.name, each.limit) for each in active}
     reached = ", ".join(f"{name} {limit:.4g}" for name, limit in limits.items())
+    about = [
+        f"; {each.name} bounds the response to the load or the reference, and the least that was "
+        f"found is {high * each.limit:.3g}, with the other bounds relaxed as much: raise it, or "
+        "give a smaller load or reference"
+        for each in over_time
+        if each.name in limits
+    ]
     return (
         f"the constraints contradict each other for this structure: {reached or 'all'}; the least "
-        f"excess that was found is {100.0 * (high - 1.0):.3g} % for each"
+        f"excess that was found is {100.0 * (high - 1.0):.3g} % for each{''.join(about)}"
     )
 
 

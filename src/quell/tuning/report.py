@@ -272,35 +272,45 @@ def rows(designs: Mapping[str, Design], objective: str) -> list[tuple[str, ...]]
 
 
 def costs(chosen: Design, designs: Mapping[str, Design], objective: str) -> list[str]:
-    """Return sentences: what the chosen structure costs against the best one, PI and PID."""
+    """Return sentences: how many times the objective of PI, PID and the best one it has."""
     usable = {
         name: design
         for name, design in designs.items()
         if design.controller is not None and design is not chosen
     }
-    what = quantity(objective)
-    lines = []
-    for name in ("pi", "pid"):
-        if name in usable:
-            share = relative(chosen, usable[name], objective)
-            lines.append(
-                f"{chosen.name} against the optimal {name.upper()} controller under the same "
-                f"constraints: {share:.3g} times as good in {what}"
-            )
+    lines = [
+        f"{_times(chosen, usable[name], objective)} the optimal {name.upper()} controller under "
+        "the same constraints"
+        for name in ("pi", "pid")
+        if name in usable
+    ]
     if usable:
         best = max(usable.values(), key=lambda design: relative(design, chosen, objective))
-        share = relative(best, chosen, objective)
-        if share > 1.0:
-            lines.append(
-                f"{chosen.name} costs {100.0 * (1.0 - 1.0 / share):.3g} % of {what} against the "
-                f"best structure, {best.name}"
-            )
+        if relative(best, chosen, objective) > 1.0:
+            lines.append(f"{_times(chosen, best, objective)} {best.name}, the best of those tried")
         else:
-            lines.append(
-                f"{chosen.name} is the best of these structures; the next one, {best.name}, costs "
-                f"{100.0 * (1.0 - share):.3g} %"
-            )
+            of_next = _times(best, chosen, objective)
+            lines.append(f"{chosen.name} is the best of those tried; next: {of_next} it")
     return lines + _integrators_line(chosen, usable, objective)
+
+
+def _times(design: Design, other: Design, objective: str) -> str:
+    """Return how many times the other's objective a design has, up to the other's name."""
+    share, better = relative(other, design, objective), "less"
+    if objective == "load":
+        share, better = relative(design, other, objective), "more"
+    return f"{design.name} has {share:.3g} times the {quantity(objective)} ({better} is better) of"
+
+
+def not_tried(designs: Mapping[str, Design], resonant: bool) -> list[str]:
+    """Return a line where the plant has a resonance and no observer with free poles knows it."""
+    name = "model-based-poles"
+    if not resonant or name in designs:
+        return []
+    return [
+        f"NOT tried: {name}, which often rejects the load better on a plant with a resonance but "
+        f"damps it little: give --structure {name}, and look at the damping"
+    ]
 
 
 def _integrators_line(chosen: Design, others: Mapping[str, Design], objective: str) -> list[str]:

@@ -242,6 +242,7 @@ def tune(
     if forward is not None:
         _check_feedforward(names if structure == SIMPLEST else [structure], feedforward)
     inputs = _inputs(objective, reference, duration, load, plants, forward)
+    _check_u_max(bounds.u_max, inputs, plants)
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task)
@@ -348,6 +349,37 @@ def _inputs(
             "feedforward uses"
         )
     return Inputs(r, none, feedforward.linear_part(reference, t, plants.dt))
+
+
+# Rounding, and the plant's gain at the lowest frequency of the grid in the place of that at zero.
+_AT_REST = 1e-3
+
+
+def _check_u_max(u_max: float | None, inputs: Inputs, plants: PlantSet) -> None:
+    """Raise an error for a bound of ``|u|`` below what u must be where the loop is at rest.
+
+    With integral action u is there ``r/P(0) − d``, for any controller. A search would end at loops
+    that are too slow to come to rest.
+    """
+    if u_max is None:
+        return
+    d, last = float(inputs.d[-1]), inputs.r[inputs.r.size // 2 :]
+    if np.ptp(last) > 0.0:  # not at rest at the end
+        return
+    gain = float(np.min(np.abs(plants.P[:, 0])))
+    held = abs(float(last[-1])) / gain if gain > 0.0 else 0.0
+    if max(abs(d), held) <= (1.0 + _AT_REST) * u_max:
+        return
+    what = f"the step load = {d:g}"
+    remedy = f"give load, the largest step of it, below {u_max:g}"
+    if held > abs(d):
+        what = f"the reference, which ends at {last[-1]:g}"
+        remedy = f"give a reference that ends below {u_max * gain:.3g}"
+    raise ValueError(
+        f"constraints.u_max = {u_max:g}: NOT possible for any controller: it bounds |u| in the "
+        f"response to {what}, and at rest |u| must be {max(abs(d), held):.4g} there; {remedy}, or "
+        "leave this bound out; limits of u are others: u_min, u_max of the controller"
+    )
 
 
 def _analysis(given: Given, plants: PlantSet, design: Design) -> LoopAnalysis:

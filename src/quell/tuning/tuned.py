@@ -31,6 +31,7 @@ from quell.tuning.optimiser.requirements import all_peaks, beside_poles, closed_
 from quell.tuning.optimiser.search import Problem, Solution
 from quell.tuning.report import Design, ReferenceStep, draw, reference_step, toml_text
 from quell.tuning.simulated import Checked, Search
+from quell.tuning.structures.base import resonances
 from quell.types import Matrix, Vector
 
 # With more parameters, the corners of their box are not all in the set.
@@ -279,8 +280,14 @@ class Tuned:
 
     @property
     def costs(self) -> list[str]:
-        """Costs of the chosen structure against the best one, PI and PID, as sentences."""
-        return report.costs(self.design, self.designs, self.objective)
+        """The chosen structure against the best one tried, PI and PID, as sentences.
+
+        And one that was not tried, for a plant with a resonance.
+        """
+        lines = report.costs(self.design, self.designs, self.objective)
+        single = len(self.designs) == 1  # compares nothing
+        resonant = not single and bool(resonances(self.task.model))
+        return lines + report.not_tried(self.designs, resonant)
 
     def __repr__(self) -> str:
         return f"Tuned {self.design.name}:\n{self.summary()}"

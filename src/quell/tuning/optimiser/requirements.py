@@ -444,7 +444,8 @@ def cost_of(objective: str, over: SetResponses, quantile: float) -> Cost:
         found = np.empty(values.shape[0])
         for i, row in enumerate(values):
             each = scores(objective, structure, row, over)
-            value = float(np.quantile(each, quantile))
+            with np.errstate(invalid="ignore"):  # between two infinite ones, of unstable loops
+                value = float(np.quantile(each, quantile))
             found[i] = np.log(value) if 0.0 < value < np.inf else _WORST
         return found
 

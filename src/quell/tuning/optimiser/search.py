@@ -530,6 +530,9 @@ _EXCESS_SEARCH = 20.0
 # are flat: a share of 1e-4 of the objective is 1 to 2 % of the parameters. With few parameters,
 # which are worth to be known, the search goes on.
 _SETTLED, _TOLERANCE = 1e-4, 1e-7
+# With limits of responses over time, which are slow, a search that exceeds a limit by more than
+# this share, and whose merit changes by less, ends, too: no step leads to what keeps it.
+_FAR, _STALLED = 1e-2, 1e-2
 FEW, _SETTLED_OF_FEW, _TOLERANCE_OF_FEW = 3, 1e-7, 1e-12
 
 
@@ -636,7 +639,9 @@ def search(
     now, box = Iterate(problem, structure, np.clip(np.log(start), low, high)), _BOX
     best: Iterate | None = None
     extra_points: list[tuple[int, Peak]] = []
-    last, few = math.inf, not roughly and _is_precise(problem, structure)
+    slow = any(extra.over_time for extra in problem.extras)
+    last = last_merit = math.inf
+    few = not roughly and _is_precise(problem, structure)
     settled = _SETTLED_OF_FEW if few else _SETTLED
     allowed = _SETTLED_OF_FEW if few else _VIOLATION
     for i in range(rounds):
@@ -644,7 +649,9 @@ def search(
             best = now
         if i == rounds - 1 or (now.violation <= allowed and abs(last - now.cost) < settled):
             break
-        last = now.cost
+        if slow and now.violation > _FAR and abs(last_merit - merit(now)) < _STALLED:
+            break
+        last, last_merit = now.cost, merit(now)
         extra_points = (extra_points + now.peaks)[-400:]
         points = now.points(_NEAR if i < _EARLY_ROUNDS else _NEARER, extra_points)
         bounds = list(zip(np.maximum(low, now.x - box), np.minimum(high, now.x + box), strict=True))
@@ -654,6 +661,7 @@ def search(
         after = None if x is None else Iterate(problem, structure, x)
         if after is None or not after.stable:
             box *= _SHRINK
+            last_merit = math.inf  # the same point again, in a smaller box
             if box < 1e-3:
                 break
             continue
