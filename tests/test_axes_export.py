@@ -438,7 +438,6 @@ def test_what_is_for_one_u_is_refused(tmp_path: Path, options: Any, message: str
         (lambda: ql.Axes(two(), gain_functions.made_by_a_library), "double",
          "made_by_a_library: must return a matrix written as nested tuples"),
         (lambda: ql.Axes(two(), gain_functions.nested_tuples), "single", "B0 or M is a function"),
-        (lambda: ql.Axes(three(), WIDE), "single", "4 actuators for 3 axes"),
     ],
 )  # fmt: skip
 def test_what_has_no_counterpart_is_named(
