@@ -335,6 +335,14 @@ def test_without_a_pi_controller_of_use_the_bound_of_noise_is_that_of_a_pid_cont
         assert found.design.k_i > least
 
 
+def test_without_any_pid_controller_of_use_noise_is_not_bounded_and_the_report_says_so() -> None:
+    """Three integrators have none, so nothing tells how much of u noise may use."""
+    found = ql.tune(([1.0], [1.0, 0, 0, 0]), 0.01, structure="bandwidths", order=3, compare=())
+    assert found.noise_bound.startswith("NOT bounded: M_ks: neither a PI controller nor a PID")
+    assert "give the limits of u" in found.noise_bound
+    assert found.noise_bound in found.summary()
+
+
 def test_the_law_of_a_freed_adrc_is_well_damped(tuned: ql.Tuned) -> None:
     """Its poles are those of the ideal response to the reference."""
     poles = tuned.design.solution.structure.poles(tuned.design.solution.values[None, :])[0][0]

@@ -156,9 +156,9 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
     if given.m_ks is not None or given.noise_over_pi is None:
         return task, ""
     ratio, by_gain = given.noise_over_pi, replace(task, objective="load")
-    remedy = (
-        "; a guess: give the limits of u, and noise_std or resolution of y (--u-min, --u-max, "
-        "--noise, --resolution), to have what noise may do to u"
+    give = (
+        "give the limits of u, and noise_std or resolution of y (--u-min, --u-max, --noise, "
+        "--resolution), to have what noise may do to u"
     )
     pi = _reference(by_gain, FilteredPID(task.model, derivative=False, filtered=False))
     found = []
@@ -173,9 +173,10 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
             how = f"M_ks: that of the optimal PID controller with T_f = T_d/{ratio:g}"
             found.append((_m_ks(task, pid), how))
     if not found:
-        return task, f"no bound of M_ks: no PI or PID controller meets the constraints{remedy}"
+        source = f"neither a PI controller nor a PID controller with T_f = T_d/{ratio:g}"
+        return task, f"NOT bounded: M_ks: {source} meets the constraints, to guess it from; {give}"
     m_ks, how = max(found)
-    return _with(task, m_ks=m_ks), how + remedy
+    return _with(task, m_ks=m_ks), f"{how}; a guess: {give}"
 
 
 def _with(task: Task, **bounds: Any) -> Task:
