@@ -419,7 +419,7 @@ def test_tune_goes_on_by_simulation_within_the_bounds_of_the_linear_loop() -> No
     assert check.samples == 20
     assert check.value == pytest.approx(best.values["effort"], rel=0.05)
     assert "effort on 20 fresh samples" in tuned.summary()
-    assert "against the optimal PI controller" in tuned.summary()
+    assert "of the optimal PI controller under the same constraints" in tuned.summary()
     assert tuned.to_json()["search"]["front"] == [best.number]
     assert "u_max = 1.0" in tuned.toml()
 

@@ -105,7 +105,7 @@ def flat(parameters: Any) -> list[Any]:
 def test_every_plant_has_an_example() -> None:
     """Public functions of plants are registered, and each public class has an instance.
 
-    Plants from files are tested in tests/test_fmu.py and tests/test_any_plant.py.
+    Plants from files are tested in test_fmu.py, test_fmu_axes.py and test_any_plant.py.
     """
     no_plants = {
         *("Plant", "PlantBatch", "batch", "labelled", "linearised", "signals_of", "rotor_levers")
@@ -118,7 +118,10 @@ def test_every_plant_has_an_example() -> None:
     made = {make for name, make in registered if name not in FROM_FILES}
     assert public - classes == made - {registry.linear, registry.multivariable_linear}
     examples = [*PLANTS.values(), *PLANTS_OF_AXES.values()]
-    assert classes <= {type(plant) for plant in examples} | {plant_room.FMU}
+    assert classes <= {type(plant) for plant in examples} | {
+        plant_room.FMU,
+        plant_room.MultivariableFMU,
+    }
 
 
 # Plants with several control signals.
