@@ -397,10 +397,11 @@ def test_an_axis_does_not_run_alone() -> None:
             lambda axis=axis: ql.Axes([axis, joint()]),
             lambda axis=axis: axis.step(0.1, 0.0),
             lambda axis=axis: axis.track(0.1, 0.0, 0.0),
-            lambda axis=axis: axis.prepare_retune(omega_c=6.0),
         ):
             with pytest.raises(ValueError, match="needs the signals of all axes"):
                 use()
+        with pytest.raises(ValueError, match="call axes.retune"):
+            axis.prepare_retune(omega_c=6.0)
 
 
 def test_a_dictionary_gives_learners_and_guards_by_name() -> None:

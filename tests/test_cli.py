@@ -288,7 +288,7 @@ def test_an_experiment_does_not_wait_for_the_others() -> None:
         "print(*(getattr(ql.experiments, name).__name__ for name in ql.experiments.__all__))\n"
     )
     ended = run_python(code)
-    names = ("acc", "compare", "stress", "torsional", "two_mass_spring")
+    names = ("acc", "compare", "over_seeds", "stress", "torsional", "two_mass_spring")
     assert ended.stdout.split() == ["[]", *(f"quell.experiments.{name}" for name in names)]
     with pytest.raises(AttributeError, match="has no attribute 'three_masses'"):
         experiments.three_masses  # noqa: B018

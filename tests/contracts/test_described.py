@@ -59,7 +59,9 @@ EXAMPLES: dict[str, Any] = {
 ROOMS = (controller_room, baseline_room, observer_room, plant_room, learner_room)
 # Interfaces; an estimate and a regulator's matrices belong to a running loop, and an FMU and models of other libraries to
 # files and packages that are not here.
-_WITHOUT = {"Estimate", "FMU", "GainEstimate", "JaxModel", "Regulator", "TorchModel"}
+_WITHOUT = {
+    *("Estimate", "FMU", "GainEstimate", "JaxModel", "MultivariableFMU", "Regulator", "TorchModel")
+}
 
 
 def public_classes() -> set[str]:
