@@ -284,10 +284,10 @@ def _fmu(setup: Setup, folder: Path) -> tuple[str, bytes]:
 def _c(setup: Setup, folder: Path, precision: str) -> tuple[str, bytes]:
     from quell.export import c
 
-    # The run in which single precision is compared with double is one of one axis.
-    run: dict[str, Any] = {"plant": setup.plant, "scenario": setup.scenario}
-    if isinstance(setup.controller, Axes):
-        run = {}
+    # Single precision is compared with double in a run.
+    run: dict[str, Any] = {}
+    if precision == "single":
+        run = {"plant": setup.plant, "scenario": setup.scenario}
     found = c(setup.controller, folder, name=C_NAME, precision=precision, **run)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
