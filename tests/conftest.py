@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import os
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -135,3 +136,34 @@ def quell(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     return lambda *arguments: in_this_process(arguments, monkeypatch, capsys)
+
+
+@pytest.fixture
+def no_fmu_left(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[None]:
+    """Check that the test leaves no instance of an FMU and no unpacked folder behind."""
+    from quell.plants.fmu import INSTANCES
+
+    folder = tmp_path_factory.mktemp("unpacked")
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    yield
+    gc.collect()
+    assert not INSTANCES
+    assert not [*folder.glob("quell-fmu-*")]
+
+
+@pytest.fixture
+def compiled_functions(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return the list of what is compiled from users' functions while the test runs."""
+    from quell.kernels import user_functions
+
+    compiled: list[Any] = []
+    compile_cfunc = user_functions.compile_cfunc
+
+    def counted(*arguments: Any) -> Any:
+        compiled.append(arguments)
+        return compile_cfunc(*arguments)
+
+    monkeypatch.setattr(user_functions, "compile_cfunc", counted)
+    return compiled

@@ -182,17 +182,8 @@ def test_b0_follows_its_defaults_and_its_instructions() -> None:
     assert gain_of(bound)[1][0].tolist() == [3.0, 7.0 * 0.2]
 
 
-def test_twenty_axes_of_one_function_compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_twenty_axes_of_one_function_compile_once(compiled_functions: list[Any]) -> None:
     """As long as nothing changes, and for other numbers that are bound by name."""
-    compiled: list[Any] = []
-    compile_cfunc = user_functions.compile_cfunc
-
-    def counted(*arguments: Any) -> Any:
-        compiled.append(arguments)
-        return compile_cfunc(*arguments)
-
-    monkeypatch.setattr(user_functions, "compile_cfunc", counted)
-
     helper(1.0)  # compiled by its user, for other globals than now
 
     def own_gain(x: Any, inertia: float) -> Any:
@@ -200,10 +191,10 @@ def test_twenty_axes_of_one_function_compile_once(monkeypatch: pytest.MonkeyPatc
 
     for inertia in np.linspace(1.0, 2.0, 20):
         gain_of(partial(own_gain, inertia=inertia))
-    assert len(compiled) == 1
+    assert len(compiled_functions) == 1
     set_array()
     gain_of(partial(own_gain, inertia=1.0))
-    assert len(compiled) == 2
+    assert len(compiled_functions) == 2
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import copy
-import gc
 import pickle
 import random
 import struct
-import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +19,6 @@ from quell import setup
 from quell.experiments.compare import compare
 from quell.experiments.over_seeds import over_seeds
 from quell.files import TooLargeError
-from quell.plants.fmu import INSTANCES
 from quell.realtime.devices import TwinDevice
 
 from . import fmus
@@ -29,7 +26,7 @@ from .in_c import needs_gcc
 from .mutations import mutated
 
 pytest.importorskip("fmpy", reason="FMPy, which reads and calls FMUs, is missing")
-pytestmark = needs_gcc
+pytestmark = [needs_gcc, pytest.mark.usefixtures("no_fmu_left")]
 
 VERSIONS = (2, 3)
 DT = 0.01
@@ -55,17 +52,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """An FMU of each version."""
     folder = tmp_path_factory.mktemp("fmus")
     return {n: fmus.packed(folder / f"mass{n}.fmu", fmus.contents(n)) for n in VERSIONS}
-
-
-@pytest.fixture(autouse=True)
-def _nothing_left(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """No test leaves an instance or a folder behind."""
-    folder = tmp_path_factory.mktemp("unpacked")
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    gc.collect()
-    assert not INSTANCES
-    assert not [*folder.glob("quell-fmu-*")]
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import gc
 import pickle
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +12,13 @@ import pytest
 
 import quell as ql
 from quell import setup
-from quell.plants.fmu import INSTANCES
 from quell.realtime.devices import TwinDevice
 
 from . import fmus
 from .in_c import needs_gcc
 
 pytest.importorskip("fmpy", reason="FMPy, which reads and calls FMUs, is missing")
-pytestmark = needs_gcc
+pytestmark = [needs_gcc, pytest.mark.usefixtures("no_fmu_left")]
 
 VERSIONS = (2, 3)
 DT = 1e-3
@@ -52,17 +49,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """An FMU of the arm of each version."""
     folder = tmp_path_factory.mktemp("fmus")
     return {n: fmus.packed(folder / f"arm{n}.fmu", fmus.contents(n, "arm")) for n in VERSIONS}
-
-
-@pytest.fixture(autouse=True)
-def _nothing_left(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """No test leaves an instance or a folder behind."""
-    folder = tmp_path_factory.mktemp("unpacked")
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    gc.collect()
-    assert not INSTANCES
-    assert not [*folder.glob("quell-fmu-*")]
 
 
 @pytest.mark.parametrize("version", VERSIONS)

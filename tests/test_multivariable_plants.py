@@ -272,16 +272,8 @@ def joint() -> ql.ADRC:
 
 
 @pytest.mark.compiled
-def test_a_hundred_drawn_arms_compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hundred_drawn_arms_compile_once(compiled_functions: list[Any]) -> None:
     """Their equation and their M(q) are the same code with other numbers; each computes its own values."""
-    compiled: list[Any] = []
-    compile_cfunc = user_functions.compile_cfunc
-
-    def counted(*arguments: Any) -> Any:
-        compiled.append(arguments)
-        return compile_cfunc(*arguments)
-
-    monkeypatch.setattr(user_functions, "compile_cfunc", counted)
     rng, addresses = np.random.default_rng(3), set()
     for i in range(100):
         arm = drawn_arm(rng)
@@ -296,7 +288,7 @@ def test_a_hundred_drawn_arms_compile_once(monkeypatch: pytest.MonkeyPatch) -> N
         user_functions.call(gain.address, x.reshape(2, 2), gain.numbers, fresh)
         np.testing.assert_array_equal(fresh, arm.inertia(x.reshape(2, 2)))
     assert len(addresses) == 1
-    assert len(compiled) <= 3
+    assert len(compiled_functions) <= 3
 
 
 def rates(t, x, u, w, gain, K, offsets=(0.5, 0.25)):  # type: ignore[no-untyped-def]

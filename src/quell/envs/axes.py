@@ -8,7 +8,6 @@ vectors in the place of r, y and u.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,7 +18,15 @@ from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import reset_loop, status_flags, write_row
 from quell.controllers.several import control_all
-from quell.envs.loops import Integers, Loops, Policy, Rules, member
+from quell.envs.loops import (
+    Integers,
+    Loops,
+    Policy,
+    Rules,
+    check_given_once,
+    member,
+    sample_time,
+)
 from quell.kernels.dispatch import compiled_loop, interpreted, is_finite, kernel
 from quell.plants.multivariable import measure_all
 from quell.simulation.several import check_fit, logged_channels, run_axes
@@ -113,9 +120,7 @@ def loop_of_axes(
         for a controller without ``Policy``, without finite limits, or for missing arguments.
     """
     if controller is None:
-        if dt is None:
-            raise ValueError("dt = None: must be the sample time [s] if there is no controller")
-        dt = checks.positive("dt", dt, "s")
+        dt = sample_time(dt)
         low, high = _limits("u_min and u_max", u_min, u_max, plant.inputs)
         actions = Actions(0.5 * (low + high), 0.5 * (high - low), low, high, _places("u", low.size))
         return GivenControls(dt, GivenDesigns(low, high), plant.outputs), actions
@@ -134,11 +139,7 @@ def loop_of_axes(
         raise ValueError(
             "controller: no axis has learner=quell.envs.Policy(), whose output the actions are"
         )
-    for name, given, usual in (
-        ("dt", dt, None), ("u_min", u_min, -math.inf), ("u_max", u_max, math.inf)
-    ):  # fmt: skip
-        if np.any(given != usual):
-            raise ValueError(f"{name}: the controller has it; give it there only")
+    check_given_once(dt, u_min, u_max)
     limits = controller.limits
     what = "u_min and u_max of the controller"
     low, high = _limits(what, limits.low, limits.high, controller.inputs)

@@ -31,7 +31,15 @@ from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, checked_limits
 from quell.envs.axes import Actions, LoopsOfAxes, labels_of, loop_of_axes, observed_by_default
-from quell.envs.loops import Draw, GivenControl, GivenDesign, Loops, Policy
+from quell.envs.loops import (
+    Draw,
+    GivenControl,
+    GivenDesign,
+    Loops,
+    Policy,
+    check_given_once,
+    sample_time,
+)
 from quell.guard import Guard
 from quell.lti.models import is_linear_model
 from quell.observers.eso import ESO
@@ -72,9 +80,7 @@ def loop_of(
         for a controller without ``Policy``, without finite limits, or for missing arguments.
     """
     if controller is None:
-        if dt is None:
-            raise ValueError("dt = None: must be the sample time [s] if there is no controller")
-        dt = checks.positive("dt", dt, "s")
+        dt = sample_time(dt)
         low, high = _limits(u_min, u_max, "u_min and u_max")
         middle, reach = 0.5 * (low + high), 0.5 * (high - low)
         given = GivenDesign(checked_limits(low, high, math.inf, dt))
@@ -84,10 +90,7 @@ def loop_of(
             f"controller = {controller!r}: must be a quell.ADRC with learner=quell.envs.Policy(), "
             "whose output the actions are, or None for actions that are u"
         )
-    twice = {"dt": dt is not None, "u_min": u_min != -math.inf, "u_max": u_max != math.inf}
-    for name, is_given in twice.items():
-        if is_given:
-            raise ValueError(f"{name}: the controller has it; give it there only")
+    check_given_once(dt, u_min, u_max)
     limits = controller.limits
     low, high = _limits(limits.low, limits.high, "u_min and u_max of the controller")
     most = controller.learner.most

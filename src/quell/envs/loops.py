@@ -19,6 +19,7 @@ stay constants (``kernels/sized.py``).
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -216,6 +217,31 @@ def _status_flags(design: GivenDesign, state: GivenState) -> int:
 @reset_loop.register(GivenDesign)
 def _reset_loop(design: GivenDesign, state: GivenState) -> None:
     state.u[0] = 0.0
+
+
+# ---- What a loop with and without controller is given ----
+
+
+def sample_time(dt: float | None) -> float:
+    """Return the sample time [s] of a loop without controller.
+
+    Raises
+    ------
+    ValueError
+        if it is missing, or not above zero.
+    """
+    if dt is None:
+        raise ValueError("dt = None: must be the sample time [s] if there is no controller")
+    return positive("dt", dt, "s")
+
+
+def check_given_once(dt: float | None, u_min: Any, u_max: Any) -> None:
+    """Raise a ``ValueError`` for what the controller of a loop has already."""
+    for name, given, usual in (
+        ("dt", dt, None), ("u_min", u_min, -math.inf), ("u_max", u_max, math.inf)
+    ):  # fmt: skip
+        if np.any(given != usual):
+            raise ValueError(f"{name}: the controller has it; give it there only")
 
 
 # ---- Scenarios of episodes ----

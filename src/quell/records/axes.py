@@ -256,20 +256,8 @@ class AxesBatch(AxesRecord, BatchTrajectory):
 
     def run(self, i: int) -> AxesTrajectory:  # type: ignore[override]
         """Return the i-th run, to its end, with the channels that were recorded."""
-        checks.whole("i", i, 0, len(self) - 1)
         return AxesTrajectory(
-            log=self.log[i, : self.lengths[i]],
-            channels=self.channels,
-            dt=self.dt,
-            every=self.every,
-            status=Status(int(self.status[i])),
-            ended=float(self.ended[i]),
-            limit=float(self.limit[i]),
-            plant=self.plant,
-            axis_names=self.axis_names,
-            axis_features=self.axis_features,
-            final_state=self.final_states[i] if self.final_states else None,
-            signals=self.signals,
+            **self._of_run(i), axis_names=self.axis_names, axis_features=self.axis_features
         )
 
     def axis(self, which: int | str) -> BatchTrajectory:

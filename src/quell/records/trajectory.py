@@ -328,20 +328,23 @@ class BatchTrajectory(Record):
 
     def run(self, i: int) -> Trajectory:
         """Return the i-th run, to its end, with the channels that were recorded."""
+        return Trajectory(**self._of_run(i), features=self.features)
+
+    def _of_run(self, i: int) -> dict[str, Any]:
+        """Return what a record of the i-th run has, without its features."""
         checks.whole("i", i, 0, len(self) - 1)
-        return Trajectory(
-            log=self.log[i, : self.lengths[i]],
-            channels=self.channels,
-            dt=self.dt,
-            every=self.every,
-            status=Status(int(self.status[i])),
-            ended=float(self.ended[i]),
-            limit=float(self.limit[i]),
-            plant=self.plant,
-            features=self.features,
-            signals=self.signals,
-            final_state=self.final_states[i] if self.final_states else None,
-        )
+        return {
+            "log": self.log[i, : self.lengths[i]],
+            "channels": self.channels,
+            "dt": self.dt,
+            "every": self.every,
+            "status": Status(int(self.status[i])),
+            "ended": float(self.ended[i]),
+            "limit": float(self.limit[i]),
+            "plant": self.plant,
+            "signals": self.signals,
+            "final_state": self.final_states[i] if self.final_states else None,
+        }
 
     def metrics(
         self,
