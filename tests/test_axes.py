@@ -456,7 +456,7 @@ BAD: tuple[tuple[object, str], ...] = (
     (lambda: ql.Axes(joint()), "axes = ADRC.*: must be an ADRC for each axis, in a list"),  # type: ignore[arg-type]
     (lambda: ql.Axes(GOOD).step(0.1, 0.2), "r = 0.1, y = 0.2: each must have 2 numbers"),  # type: ignore[arg-type]
     (lambda: ql.Axes(GOOD).step([0.1], [0.2]), "each must have 2 numbers"),
-    (lambda: ql.Axes(GOOD, u_min=3.0, u_max=2), "actuator 1: u_min = 3.0, u_max = 2: u_min must"),
+    (lambda: ql.Axes(GOOD, u_min=3.0, u_max=2), r"u\[0\]: u_min = 3.0, u_max = 2: u_min must"),
     (lambda: ql.Axes([joint(), 3.0]), "axis2 = 3.0: must be an ADRC"),  # type: ignore[list-item]
     (lambda: ql.Axes([joint(u_max=1.0), joint()]), "axis1 has limits of u: must have none"),
     (lambda: ql.Axes(GOOD, np.eye(3)), r"B0 has shape \(3, 3\), there are 2 axes \(axis1, axis2\)"),
@@ -464,7 +464,7 @@ BAD: tuple[tuple[object, str], ...] = (
     (lambda: ql.Axes(GOOD, [[1, 2], [0, 0]]), "no actuator moves axis 'axis2'"),
     (lambda: ql.Axes(GOOD, np.eye(2), M=np.eye(2)), "B0 and M are both given"),
     (lambda: ql.Axes(GOOD, u_max=[1.0]), "u_max has 1 values, there are 2 actuators"),
-    (lambda: ql.Axes(GOOD, u_min=[-1, 3], u_max=2), "actuator 2: u_min"),
+    (lambda: ql.Axes(GOOD, u_min=[-1, 3], u_max=2), r"u\[1\]: u_min"),
     (lambda: ql.Axes(GOOD, saturation="scale"), "saturation = 'scale'"),
     (lambda: ql.Axes(GOOD, saturation=["axis1"]), "all axes in the order of their priority"),
     (lambda: ql.Axes(GOOD, weights=[1, 2]), "leave them out"),

@@ -159,8 +159,8 @@ def test_the_comparison_has_figures_of_each_axis_and_actuator(tmp_path: Path) ->
     found = compared(*given)
     names = ("shoulder", "elbow", "wrist")
     assert [each.name for each in found.each] == [
-        *(f"u of actuator {k}" for k in (1, 2, 3)),
-        *(f"{signal} of {name}" for signal in "vy" for name in names),
+        *(f"u[{k}]" for k in range(3)),
+        *(f"{signal}[{name}]" for signal in "vy" for name in names),
     ]
     assert found.u == max(each.single for each in found.each[:3])
     assert found.y == max(each.single for each in found.each[6:])
@@ -183,11 +183,11 @@ def test_an_axis_at_rest_is_not_compared() -> None:
     given = ql.Scenario((ql.signals.Sinusoid(0.3, 3.0), 0.0), duration=0.3, noise=(0.0, 0.0))
     found = {each.name: each for each in compared(plant_of_two(gain), axes, given).each}
     assert [name for name, each in found.items() if each.single is None] == [
-        "v of beam",
-        "y of beam",
+        "v[beam]",
+        "y[beam]",
     ]
     assert all(each.noise is None for each in found.values())
-    for name in ("u of actuator 1", "u of actuator 2", "v of x", "y of x"):
+    for name in ("u[0]", "u[1]", "v[x]", "y[x]"):
         assert found[name].single < 1e-4  # type: ignore[operator]
 
 
@@ -247,7 +247,7 @@ def test_single_precision_that_changes_u_of_one_actuator_too_much_is_refused(
     axes = ql.Axes({"slow": joint(), "fast": fast})
     run = ql.Scenario(tuple(ql.signals.Sinusoid(1.0, 3.0) for _ in range(2)), duration=0.5)
     options: dict[str, Any] = {"precision": "single", "plant": machine, "scenario": run}
-    with pytest.raises(ValueError, match=r"changes u of actuator 2 by .* a lower omega_o of fast"):
+    with pytest.raises(ValueError, match=r"changes u\[1\] by .* a lower omega_o of fast"):
         ql.export.c(axes, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
     done = ql.export.c(axes, tmp_path / "out", accept=True, **options)

@@ -128,6 +128,10 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
             "scenario.duration = 0.0: must be finite and greater than zero [s]",
         ),
         ("metrics = {start = 1.0}", "metrics = {'start': 1.0}: must be [[metrics]]"),
+        (
+            "[[metrics]]\nstart = -1.0",
+            "metrics[0].start = -1.0: must be finite and not negative [s]",
+        ),
         ("[[metrics]]\nband = 0.0", "metrics[0].band = 0.0: must be finite and greater than zero"),
         (
             "[[metrics]]\n[[metrics]]\nstart = 3.0\nstop = 1.0",

@@ -230,7 +230,7 @@ def test_the_controller_of_several_axes_is_exported_to_c(
     assert "gantry_step" in header
     single = quell("export", "gantry.toml", "--out", "d", "--precision", "single")
     assert single.code == 0, single.err
-    for signal in ("u of actuator 1", "u of actuator 2", "v of x", "v of y", "y of x", "y of y"):
+    for signal in ("u[0]", "u[1]", "v[x]", "v[y]", "y[x]", "y[y]"):
         assert f"Single precision changes {signal} by " in single.out
     assert "the measurement noise changes it by" in single.out
 

@@ -199,7 +199,7 @@ class TestC:
         (lambda: controller().step([1.0, 2.0], [0.0, 0.0]), "must have 1 and 2 numbers"),
         (lambda: controller().step(0.1, [0.0, 0.0]), "must have 1 and 2 numbers"),
         (lambda: StateFeedback(controller().observer, "k"), "gain"),
-        (lambda: controller(u_min=1.0, u_max=-1.0), "actuator 1: u_min"),
+        (lambda: controller(u_min=1.0, u_max=-1.0), r"u\[0\]: u_min"),
         (lambda: ql.simulate(drive(), controller(), ql.Scenario((1.0, 2.0))),
          "reference has 2 signals"),
         (lambda: ql.export.c_source(controller(), resolution=1e-6), "StateFeedback takes y in its"),

@@ -660,7 +660,7 @@ def checked_actuator_limits(
         try:
             found.append(checked_limits(lows[i], highs[i], rates[i], dt))
         except ValueError as error:
-            raise ValueError(f"actuator {i + 1}: {error}") from None
+            raise ValueError(f"u[{i}]: {error}") from None
     return ActuatorLimits(*(np.array(part, dtype=float) for part in zip(*found, strict=True)))
 
 

@@ -266,7 +266,7 @@ def check_window(
     band: float = SETTLING_BAND,
 ) -> None:
     """Check the arguments of ``Trajectory.metrics`` before the run."""
-    checks.finite("start", start)
+    checks.non_negative("start", start, "s")
     if stop is not None:
         checks.interval("start", start, "stop", stop)
     if target is not None:

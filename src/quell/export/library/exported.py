@@ -515,7 +515,7 @@ class Difference(NamedTuple):
     Attributes
     ----------
     name
-        ``u of actuator 1``, ``v of elbow``, ``y of elbow``; of state feedback ``y 1``.
+        as in a record: ``u[0]``, ``v[elbow]``, ``y[elbow]``; of state feedback ``y[0]``.
     single
         of a run in single precision; None if the signal rests in both runs, so that there is
         nothing to compare.
@@ -578,10 +578,10 @@ class Comparison(NamedTuple):
                 "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
                 "resolution=, --resolution)"
             )
-        asked = [own for own in self.each if own.name.startswith("v of ")]
+        asked = [own for own in self.each if own.name.startswith("v[")]
         worst = max(asked, key=lambda own: own.single or 0.0, default=None)
-        of = "" if worst is None or self.diverged else f"{worst.name.removeprefix('v')} "
-        return f"a lower omega_o{of.rstrip()}, y as a difference from a position near the work"
+        of = "" if worst is None or self.diverged else f" of {worst.name[2:-1]}"
+        return f"a lower omega_o{of}, y as a difference from a position near the work"
 
 
 def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
@@ -622,10 +622,9 @@ def _signals_of(controller: Any) -> list[tuple[str, tuple[str, int]]]:
     if not hasattr(controller, "inputs"):
         return [("u", ("u", 0)), ("y", ("y", 0))]
     inputs, outputs, names = controller.inputs, controller.outputs, controller.names
-    found = [(f"u of actuator {k + 1}", ("u", k)) for k in range(inputs)]
-    found += [(f"v of {name}", ("v", i)) for i, name in enumerate(names)]
-    measured = [f"y of {name}" for name in names] or [f"y {i + 1}" for i in range(outputs)]
-    return found + [(name, ("y", i)) for i, name in enumerate(measured)]
+    found = [(f"u[{k}]", ("u", k)) for k in range(inputs)]
+    found += [(f"v[{name}]", ("v", i)) for i, name in enumerate(names)]
+    return found + [(f"y[{name}]", ("y", i)) for i, name in enumerate(names or range(outputs))]
 
 
 def _rms(values: Any) -> Any:
