@@ -309,7 +309,8 @@ def run_rig(
     signals.
 
     The exit code is 0 where the scenario was run to its end, 3 where a limit or a fault ended it,
-    130 after Ctrl-C, SIGTERM or SIGHUP; u was ramped to zero in each case. It is 2 for an error in the arguments.
+    130 after Ctrl-C, SIGTERM or SIGHUP; u was ramped to zero in each case. It is 2 for an error in
+    the arguments.
 
     Parameters
     ----------
