@@ -37,7 +37,7 @@ from scipy.signal import lsim
 
 import quell as ql
 from quell.envs import Policy
-from quell.envs.env import arguments, torsional_scenario
+from quell.envs.library import arguments, torsional_scenario
 from quell.types import Vector
 
 NAME, OBSERVED = "torsional-residual", ("r", "y_measured", "x_hat", "f_residual")

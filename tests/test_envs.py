@@ -20,8 +20,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="gymnasium (extra envs) is n
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from quell.envs import Env, Policy, VectorEnv  # noqa: E402
-from quell.envs.env import NAMES  # noqa: E402
+from quell.envs import NAMES, Env, Policy, VectorEnv  # noqa: E402
 
 from .commands import run_python  # noqa: E402
 
@@ -186,14 +185,18 @@ def test_a_lost_loop_is_terminated_and_costs_more_than_any_other() -> None:
         env.step(np.ones(1))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * name.startswith("arm")) for name in NAMES],
+)
 def test_gymnasium_finds_nothing_wrong_with_the_librarys_environments(name: str) -> None:
     """Its checker raises no error and gives no warning; seeds decide all."""
     env = gymnasium.make(f"quell/{name}-v0")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=True)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 1))
+    size = env.action_space.shape
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (5, *size))  # type: ignore[misc]
     first, again, other = (
         episode(env.unwrapped, actions, seed)["observations"] for seed in (7, 7, 8)
     )
@@ -364,6 +367,12 @@ def test_without_gymnasium_the_error_names_the_extra() -> None:
     )
     shown = run_python(code)
     assert "pip install 'quell-control[envs]'" in shown.stdout
+
+
+def test_the_import_that_registers_the_environments_does_not_load_the_compiler() -> None:
+    """It takes time where all that is wanted may be another library's environment."""
+    shown = run_python("import sys, quell.envs; print('numba' in sys.modules)")
+    assert shown.stdout == "False\n"
 
 
 def test_gymnasium_finds_the_environments_by_their_module() -> None:

@@ -21,7 +21,7 @@ In a sample each axis runs as ``controllers/law.py`` does it, then u is found fo
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -343,7 +343,7 @@ class Axes(StatefulController):
 
     def __init__(
         self,
-        axes: Sequence[Compensator] | dict[str, Compensator],
+        axes: Sequence[Compensator] | Mapping[str, Compensator],
         B0: Any = None,
         *,
         M: Any = None,
@@ -357,9 +357,9 @@ class Axes(StatefulController):
         learner: Any = None,
         guard: Any = None,
     ) -> None:
-        if not isinstance(axes, dict) and not checks.is_sequence(axes):
+        if not isinstance(axes, Mapping) and not checks.is_sequence(axes):
             raise ValueError(f"axes = {axes!r:.60}: must be an ADRC for each axis, in a list")
-        given = axes if isinstance(axes, dict) else {}
+        given = axes if isinstance(axes, Mapping) else {}
         parts: list[Any] = list(given.values()) if given else list(axes)
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
         check_axes(parts, self.names)

@@ -7,7 +7,7 @@ computes its gain when all have run.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -309,7 +309,7 @@ def _restart_of_all(learning: LearningDesign, memory: LearningMemory) -> None:
 
 def for_each(what: str, given: Any, names: Sequence[str]) -> list[Any]:
     """Return what is given for each axis: a list, or a dictionary by name; None where it is not."""
-    if isinstance(given, dict):
+    if isinstance(given, Mapping):
         for name in given:
             checks.one_of(f"{what} of axis", name, names)
         return [given.get(name) for name in names]
@@ -345,7 +345,7 @@ class LearningOfAxes:
         self, learner: Any, guard: Any, axes: Sequence[ADRC], names: Sequence[str]
     ) -> None:
         self.learner, self.guard = learner, guard
-        self.is_shared = not (isinstance(learner, dict) or checks.is_sequence(learner))
+        self.is_shared = not (isinstance(learner, Mapping) or checks.is_sequence(learner))
         count = len(axes)
         if learner is None and guard is not None:
             raise ValueError(
@@ -356,7 +356,7 @@ class LearningOfAxes:
         if not self.is_shared:
             self._learners = for_each("learner", learner, names)
         self._guards = [None if own is None else guard for own in self._learners]
-        if isinstance(guard, dict) or checks.is_sequence(guard):
+        if isinstance(guard, Mapping) or checks.is_sequence(guard):
             self._guards = for_each("guard", guard, names)
         for name, axis, own, watch in zip(names, axes, self._learners, self._guards, strict=True):
             _check_parts(name, axis, own, watch, self.is_shared)

@@ -8,10 +8,10 @@ May import ``simulation`` and what it imports.
 
 from __future__ import annotations
 
-from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+from quell.checks import import_extra
 from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
@@ -21,6 +21,18 @@ if TYPE_CHECKING:
 __all__ = ["Env", "Policy", "VectorEnv", "register"]
 
 __getattr__ = imported_on_use(__name__, {"Env": "env", "Policy": "loops", "VectorEnv": "env"})
+
+NAMES = (
+    "two-mass",
+    "two-mass-residual",
+    "dc-motor",
+    "dc-motor-residual",
+    "torsional",
+    "torsional-residual",
+    "arm",
+    "arm-residual",
+)
+"""The environments of the library, by their names without namespace and version."""
 
 
 def register() -> None:
@@ -34,7 +46,17 @@ def register() -> None:
     ImportError
         without Gymnasium.
     """
-    import_module("quell.envs.env").register_all()
+    registration = import_extra("gymnasium.envs.registration", "envs", "quell.envs")
+    for name in NAMES:
+        full_name = f"quell/{name}-v0"
+        if full_name in registration.registry:
+            continue
+        registration.register(
+            id=full_name,
+            entry_point="quell.envs.library:make",
+            vector_entry_point="quell.envs.library:make_vector",
+            kwargs={"name": name},
+        )
 
 
 if find_spec("gymnasium") is not None:
