@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from quell.envs.env import Env, VectorEnv
     from quell.envs.loops import Policy
 
-__all__ = ["Env", "Policy", "VectorEnv", "register"]
+__all__ = ["NAMES", "Env", "Policy", "VectorEnv", "register"]
 
 __getattr__ = imported_on_use(__name__, {"Env": "env", "Policy": "loops", "VectorEnv": "env"})
 
