@@ -39,6 +39,7 @@ import numpy as np
 
 from quell import checks
 from quell.identification.input_gain import (
+    UNSEEN,
     check_motion,
     fits,
     gains,
@@ -64,9 +65,6 @@ _WITHIN_95, _POOR = 1.96, 0.3
 # Condition number of the excitation from which on the actuators that moved together are named
 # (Belsley et al. 1980), and the share of the weakest direction that counts as taking part.
 _COLLINEAR, _TAKES_PART = 30.0, 0.3
-# Deviations by which an actuator must move some axis to count as recorded: noise is beyond them in
-# one of 16 000 entries.
-_UNSEEN = 4.0
 # Least ratio of eigenvalues that is more than rounding.
 _LEAST_SHARE = 1e-24
 # Factor of the deviations from which on they are said to be open: chosen by hand.
@@ -137,7 +135,7 @@ class InputGainMatrix:
         Actuators that moved together are not among them.
         """
         with np.errstate(invalid="ignore"):
-            seen = np.any(np.abs(self.B0) > _UNSEEN * self.std, axis=0)
+            seen = np.any(np.abs(self.B0) > UNSEEN * self.std, axis=0)
         together = {name for names in self.together for name in names}
         pairs = zip(self.actuators, seen, strict=True)
         return tuple(name for name, moves in pairs if not moves and name not in together)
@@ -152,13 +150,12 @@ class InputGainMatrix:
         """Reasons not to rely on the result; empty for a good one."""
         found, poor, unseen = [], self.poor, self.unseen
         if unseen:
-            names, one = " and ".join(unseen), len(unseen) == 1
+            names, are = " and ".join(unseen), "is" if len(unseen) == 1 else "are"
             found.append(
-                f"{names} {'moves' if one else 'move'} no axis in this record: "
-                f"{'is' if one else 'are'} {names} recorded, in the right column, as applied? What "
-                "moves the machine and is not in the record makes the entries of the other "
-                f"actuators wrong, so no entry of B0 is known; if {names} rested, move "
-                f"{'it' if one else 'them'}"
+                f"{names} {are} not seen to move an axis in this record: {are} {names} recorded, "
+                "in the right column, as applied? What moves the machine and is not in the record "
+                "makes the entries of the other actuators wrong, so no entry of B0 is known; "
+                "actuators that rested have to be moved"
             )
         for i, axis in enumerate(self.axes) if not unseen else ():
             mixed = np.array([name in self.together[i] for name in self.actuators]) & poor[i]
