@@ -4,10 +4,10 @@ For each axis ``y_i^(n_i) = f_i + Σ_j B0_ij u_j`` the prediction-error fits of 
 made with all u, and with the y of the other axes as known inputs (``running_loop`` has the
 equations). So friction, stiffness and gravity that couple the axes are no load, and need no model.
 
-What the u have in common is in the covariance C of the entries of a row for given lag, delay,
-dynamics and noise (these make the errors of all entries alike, which is no matter of the u)::
+What the u have in common is in the covariance C of the entries of a row for a given lag and delay,
+τ, (these make the errors of all entries alike, which is no matter of the u)::
 
-    C = C_bb − C_bφ C_φφ⁻¹ C_φb
+    C = C_bb − C_bτ C_ττ⁻¹ C_τb
 
 The information is C⁻¹; its rows and columns are divided by the roots of its diagonal, so that the
 units of the u do not count, and the root of the ratio of its eigenvalues is the condition number of
@@ -410,14 +410,14 @@ def _row(
 
 
 def _of_u(one: LoopFit) -> Matrix:
-    """Return the covariance (m, m) of the gains of u for given nonlinear parameters."""
-    of_phi, of_b = slice(0, one.form.size), one.form.gains_of_u
+    """Return the covariance (m, m) of the gains of u for a given lag and delay."""
+    of_times, of_b = one.form.times, one.form.gains_of_u
     sizes = np.sqrt(np.maximum(np.diag(one.covariance), 0.0))
     scaled = one.covariance / np.outer(*2 * [np.where(sizes > 0.0, sizes, 1.0)])
-    mixed = scaled[of_b, of_phi]
-    left = scaled[of_b, of_b] - mixed @ np.linalg.pinv(scaled[of_phi, of_phi], hermitian=True) @ (
-        mixed.T
-    )
+    mixed = scaled[of_b, of_times]
+    left = scaled[of_b, of_b] - mixed @ np.linalg.pinv(
+        scaled[of_times, of_times], hermitian=True
+    ) @ (mixed.T)
     return np.asarray(left * np.outer(sizes[of_b], sizes[of_b]), dtype=np.float64)
 
 
