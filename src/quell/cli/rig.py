@@ -226,6 +226,9 @@ def proxy(
     setup with [[axis]] stands between a host and a drive of as many measurements and control
     signals.
 
+    Where the drive falls silent the host gets no measurement either. After a second of that, or
+    where the drive has set u to zero or ended the session, the proxy ends, with exit code 3.
+
     Parameters
     ----------
     setup
@@ -275,8 +278,19 @@ def proxy(
             of_axis, of = (f"{axis}: ", "v") if several else ("", "u")
             text = f"{of} = {each.u:.6g}, f = {each.f:.6g}, {each.status!r}"
             print(f"last tick: {of_axis}{text}")
+        count = drive.counters
+        missing = f"ticks without a measurement of it: {count['missing']}"
+        print(f"drive: {missing}, commands that could not be sent to it: {count['unsent']}")
+        fault = drive.fault
     for note in notes:
         print(note)
+    if fault:
+        ended = "the host's session was ended, and the drive told to set u to zero, if it hears"
+        print(
+            f"NOT connected to the drive at {url}: {fault}; {ended}. Look at the drive, its power "
+            "and its wire, then start the proxy again"
+        )
+        sys.exit(ExitCode.ENDED_BY_SAFETY)
 
 
 # ---- quell run-rig ----
