@@ -647,7 +647,7 @@ def replay(
 ) -> None:
     """Run a setup's observer and learner on a recorded run, and compare the estimates.
 
-    A record of several axes needs a setup with as many [[axis]].
+    A record of several axes needs a setup with the same [[axis]] and actuators, in their order.
 
     Parameters
     ----------
@@ -673,6 +673,8 @@ def replay(
     recorded = load_record(record, max_size)
     try:  # replay refuses a controller that is no ADRC
         names = (given.rig or {}).get("channels", ())
+        if several:
+            _check_actuators(recorded, given)
         replayed = replay_record(recorded, given.controller, channels=names)
     except ValueError as error:
         raise with_path(given.file, "", error, ()) from None
@@ -714,6 +716,18 @@ def replay(
         "setup": given.as_json(),
     }
     write_results(console, results, outputs, paths)
+
+
+def _check_actuators(recorded: Any, given: Setup) -> None:
+    """Check that the actuators of a recorded run are those of a setup, as far as both name them."""
+    from quell.quantities import AxesSignals
+    from quell.realtime.replaying import check_same_names
+    from quell.setup.axes import signals_in
+
+    if isinstance(recorded.signals, AxesSignals):
+        ours: Any = signals_in(given.description, given.controller)
+        both = ([each.name for each in one.u] for one in (recorded.signals, ours))
+        check_same_names("actuators", *both)
 
 
 def _print_scores(
