@@ -680,10 +680,20 @@ def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None
     shown = quell("replay", "run.csv", "gantry.toml", "--no-figures", "--json", "replay.json")
     assert shown.code == 0, shown.err
     assert "run.csv through gantry: y" in shown.out
-    for command in (("identify", "run.csv", "--order", "2"), ("b0", "run.csv", "--order", "2")):
-        shown = quell(*command)
-        assert shown.code == 2
-        assert "has several axes (x, y): NOT possible here" in shown.err
+    Path("alone.csv").write_bytes(Path("run.csv").read_bytes())  # without run.csv.json
+    names = ("run.csv", "alone.csv")
+    for name in names:
+        for command in (("identify", name, "--order", "2"), ("b0", name, "--order", "2")):
+            shown = quell(*command)
+            assert shown.code == 2
+            assert "has several axes (x, y): NOT possible here" in shown.err
+    shown = quell("rank", "A=run.csv", "B=alone.csv")
+    assert shown.code == 0, shown.err
+    assert "NOT decided for x, y" in shown.out
+    read = {name: quell("b0", name, "--axes", "x,y", "--order", "2") for name in names}
+    said = [(each.out + each.err).replace(name, "") for name, each in read.items()]
+    assert said[0] == said[1]
+    assert "u has 26 samples: must have at least 150" in said[0]
     shown = quell("run-rig", "gantry.toml", "--watch", "watch.json", "--no-figures")
     assert shown.code == 0, shown.err
     assert "NOT watched: no whole window of 60 s; run longer" in shown.out
