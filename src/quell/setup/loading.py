@@ -484,7 +484,8 @@ def tuning_task(
     Raises
     ------
     SetupError
-        as ``load``; for a file without plant, and for ranges that are none of the plant's keys.
+        as ``load``; for a file without plant, for ranges that are none of the plant's keys, and for
+        ``storage`` without ``trials``.
     """
     name, data = read(path)
     given = data.get("controller", {})
@@ -493,6 +494,9 @@ def tuning_task(
     table = data.get("tune", {})
     if isinstance(table, Mapping):
         asked = {**table, **(changes or {})}
+        if "storage" in asked and "trials" not in asked:
+            rule = "has no effect without trials; give them (--trials), or leave it out"
+            raise SetupError([f"{name}: tune.storage = {asked['storage']!r}: {rule}"])
         structure = asked.get("structure", SIMPLEST)
         if isinstance(given, Mapping) and structure in (SIMPLEST, *FEEDING_FORWARD):
             asked = _feedforward(given) | asked
