@@ -402,7 +402,11 @@ def run_rig(
     if several:
         rule = "is for one axis; change the bandwidths of each [[axis]] in the file"
         refuse({"omega_c": (omega_c, None), "omega_o": (omega_o, None)}, rule)
-    given = _loaded(name, _changed(data, changes), trust)
+    tables = _changed(data, changes)
+    if seconds is not None and isinstance(windows := tables.get("metrics"), list):
+        # A shorter run is not judged after its end.
+        tables["metrics"] = [each for each in windows if not _begins_after(each, seconds)]
+    given = _loaded(name, tables, trust)
     if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
 
@@ -555,6 +559,11 @@ def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) ->
         if value is not None and isinstance(tables.setdefault(table_name, {}), dict):
             tables[table_name][key] = value
     return tables
+
+
+def _begins_after(window: Any, seconds: float) -> bool:
+    start = window.get("start") if isinstance(window, Mapping) else None
+    return isinstance(start, int | float) and start >= seconds
 
 
 def check_recordings(files: Iterable[Path], overwrite: bool) -> None:

@@ -87,14 +87,6 @@ def run(
     several = is_of_axes(data)
     given = (made_axes if several else made)(name, data, trust)
     plant, scenario = given.needed("plant"), given.needed("scenario")
-    late = [
-        f"{given.file}: metrics[{i}].start = {window['start']:g}: "
-        f"must be less than the scenario's duration, {scenario.duration:g} s"
-        for i, window in enumerate(given.windows)
-        if window.get("start", 0.0) >= scenario.duration
-    ]
-    if late:
-        raise SetupError(late)
     outputs = check_outputs(outputs, [setup.stem])
     console = Console()
     with progress_bar(console, COMPILING) as report:
