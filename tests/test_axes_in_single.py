@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import quell as ql
 from quell.controllers import in_single_precision
 from quell.controllers.stateful import named_arrays
 from quell.export import c_source
-from quell.export.library.exported import _difference, compared
+from quell.export.library.precision import _difference, compared
 from quell.plants.multibody import rotor_levers
 
 from . import gain_functions
@@ -189,6 +190,25 @@ def test_an_axis_at_rest_is_not_compared() -> None:
     assert all(each.noise is None for each in found.values())
     for name in ("u[0]", "u[1]", "v[x]", "y[x]"):
         assert found[name].single < 1e-4  # type: ignore[operator]
+
+
+def test_an_actuator_at_its_limits_is_not_compared_and_the_others_are() -> None:
+    """Two motors push one mass each: the one that is asked for too much is named, and counts not."""
+    gain = [[1.0, 0.0], [0.0, 1.0]]
+    pair = ql.Axes({"far": joint(), "near": joint()}, gain, u_min=-3.0, u_max=3.0)
+    given = ql.Scenario((1e3, ql.signals.Sinusoid(0.01, 3.0)), duration=0.3)
+    found = compared(plant_of_two(gain), pair, given)
+    each = {one.name: one for one in found.each}
+    assert each["u[0]"].single is None
+    assert each["u[0]"].limited > 0.9
+    assert "as u lies at its limits in" in each["u[0]"].reason
+    assert found.limited == each["u[1]"].limited < 0.1
+    assert found.u == each["u[1]"].single < 1e-4  # type: ignore[operator]
+    found.check(pair)
+    both = compared(plant_of_two(gain), pair, replace(given, reference=(1e3, -1e3)))
+    assert all(one.single is None for one in both.each)
+    with pytest.raises(ValueError, match="NOT compared with double, as u lies at its limits"):
+        both.check(pair)
 
 
 def plant_of_two(gain: Any) -> Any:

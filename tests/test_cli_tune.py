@@ -99,6 +99,16 @@ def test_a_wrong_call_is_one_clear_error(
     assert message in shown.err
 
 
+def test_a_journal_without_trials_is_refused(quell: object, tmp_path: Path) -> None:
+    """It is the journal of a tuning by simulation, which ``trials`` or --trials make."""
+    file = tmp_path / "lag.toml"
+    plant = 'plant = { kind = "linear", num = [1.0], den = [1.0, 1.0] }'
+    file.write_text(f'dt = 0.1\n{plant}\n[tune]\nstorage = "x.log"\n', encoding="utf-8")
+    shown: Shown = quell("tune", str(file), "--no-figures")  # type: ignore[operator]
+    assert shown.code == 2
+    assert "tune.storage = 'x.log': has no effect without trials; give them" in shown.err
+
+
 POINTS = """
 dt = 0.01
 plant = {{ kind = "linear", num = [4.0], den = [1.0, 1.0] }}

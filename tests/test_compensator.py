@@ -190,6 +190,17 @@ def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
         assert 1.0 / elsewhere.margins.modulus <= 1.01 * tuned.after.m_s_elsewhere
 
 
+def test_the_integral_of_the_error_beside_a_gentle_controller_has_its_end() -> None:
+    """A loop far slower than its plant: the report has what the simulation has, until y is at rest."""
+    lags = ([1.0], [1.0, 3.0, 3.0, 1.0])
+    gentle = ql.baselines.PID(kp=0.05, ki=0.05 / 3.0, kd=0.0, tf=0.2, dt=0.1)
+    tuned = ql.tuning.tune_compensator(lags, gentle, speeds=(1.0, 1.0))
+    scenario = ql.Scenario(disturbances=(1.0,), duration=1000.0)
+    for law, iae in ((gentle, tuned.before.iae), (tuned.controller, tuned.after.iae)):
+        run = ql.simulate(ql.plants.LinearPlant.of(lags), law, scenario)
+        assert iae == pytest.approx(0.1 * np.sum(np.abs(run["y"])), rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("controller", "options", "message"),
     [

@@ -16,7 +16,8 @@ import pytest
 import quell as ql
 from quell.controllers.base import control, status_flags
 from quell.export import c_files
-from quell.export.library.exported import Comparison, stack_of
+from quell.export.library.exported import stack_of
+from quell.export.library.precision import Comparison, compared
 from quell.export.library.vectors import filled, golden_vectors
 from quell.features import Periodic, State
 from quell.kernels import dispatch
@@ -354,6 +355,53 @@ def test_single_precision_is_compared_and_refused_where_it_differs(
     assert not any(tmp_path.iterdir())
     accepted = exported(tmp_path, hasty, "single", **loop | {"accept": True})
     assert accepted.comparison.u > 0.01
+
+
+def saturated(reference: Any, duration: float, **limits: Any) -> tuple[Any, Any, ql.Scenario]:
+    """Return a servo whose observer multiplies the rounding of far positions, and a scenario."""
+    controller = ql.ADRC(ql.ESO.model_free(2, 5000.0, 300.0, 2.5e-4), 60.0, **limits)
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 5000.0], [1.0, 0.0])  # 2e-4 kg m²
+    return plant, controller, ql.Scenario(reference=reference, duration=duration)
+
+
+def test_single_precision_is_not_compared_where_u_lies_at_its_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There u is the limit in both. Nothing is written, but when accepted, and the figures are NaN."""
+    monkeypatch.setattr(dispatch, "interpret_all", True)
+    plant, controller, far = saturated(62_800.0, 0.1, u_min=-1.0, u_max=1.0)
+    loop = {"plant": plant, "scenario": far, "accept": False}
+    rule = r"NOT compared with double, as u lies at its limits in 100 % .*give a scen.*--accept"
+    with pytest.raises(ValueError, match=rule):
+        exported(tmp_path, controller, "single", **loop)
+    assert not any(tmp_path.iterdir())
+    accepted = exported(tmp_path, controller, "single", **loop | {"accept": True}).comparison
+    assert math.isnan(accepted.u)
+    assert math.isnan(accepted.y)
+    assert [each.name for each in accepted.signals if each.single is None] == ["u", "y"]
+
+
+@pytest.mark.parametrize(
+    ("reference", "duration", "limits"),
+    [(20.0, 0.3, {"u_min": -1.0, "u_max": 1.0}), (5.0, 0.2, {"rate_limit": 300.0})],
+)
+def test_u_is_compared_in_the_samples_off_its_limits(
+    reference: float, duration: float, limits: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At limits of u and of its rate it is the same in both, and would make the difference smaller."""
+    monkeypatch.setattr(dispatch, "interpret_all", True)
+    plant, controller, scenario = saturated(reference, duration, **limits)
+    found = compared(plant, controller, scenario)
+    assert 0.04 < found.limited < 0.5
+    double, single = (ql.simulate(plant, controller, scenario, precision=precision)
+                      for precision in ("double", "single"))  # fmt: skip
+    cut = int(Status.SATURATED | Status.RATE_LIMITED)
+    flags = double["status"].astype(int) | single["status"].astype(int)
+    off = (flags & cut) == 0
+    change = np.linalg.norm((single["u"] - double["u"])[off]) / np.linalg.norm(double["u"][off])
+    assert found.u == pytest.approx(change)
+    assert found.u > 1.1 * np.linalg.norm(single["u"] - double["u"]) / np.linalg.norm(double["u"])
+    assert found.limited == pytest.approx(1.0 - np.mean(off))
 
 
 def test_the_refusal_names_what_would_help() -> None:

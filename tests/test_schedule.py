@@ -356,6 +356,15 @@ def test_the_exported_library_hands_its_signals_over(tmp_path: Any) -> None:
 # ---- Tuning ----
 
 
+def test_a_quantile_is_that_of_all_points_together() -> None:
+    """Of one table of b0; three tables have a tuning for each point, where it has no effect."""
+    how = {"points": (1e-3, 2e-3), "between": 0, "quantile": 0.5}
+    one = ql.tune_schedule(axis, DT, **how)
+    assert one.joint.task.quantile == 0.5
+    with pytest.raises(ValueError, match="quantile = 0.5: has no effect: there is one plant"):
+        ql.tune_schedule(axis, DT, tables="all", **how)
+
+
 def test_a_tuned_schedule_keeps_the_constraints_at_and_between_its_points(tmp_path: Any) -> None:
     """On an axis with friction whose inertia changes by 5; the file that it writes runs."""
     bounds = ql.tuning.Constraints(resolution=6e-6)

@@ -452,17 +452,14 @@ def _differences(found: Comparison) -> list[str]:
     """Return lines about single precision, next to the effect of the noise."""
     if found.diverged:
         return ["Single precision: the run diverges; in double precision it does not"]
-    rows = [("u", found.u, found.u_noise), ("y", found.y, found.y_noise)]
     lines = []
-    for signal, difference, noise in found.each or rows:
-        if difference is None:
-            lines.append(
-                f"NOT compared: {signal}, which rests in this scenario; let its reference move"
-            )
+    for each in found.signals:
+        if each.single is None:
+            lines.append(f"NOT compared: {each.name}, {each.reason}")
             continue
-        text = f"Single precision changes {signal} by {100 * difference:.2g} % RMS"
-        if noise is not None:
-            text += f"; the measurement noise changes it by {100 * noise:.2g} %"
+        text = f"Single precision changes {each.name} by {100 * each.single:.2g} % RMS"
+        if each.noise is not None:
+            text += f"; the measurement noise changes it by {100 * each.noise:.2g} %"
         lines.append(text)
     return lines
 

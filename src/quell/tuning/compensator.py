@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import LoopAnalysis, subsystem
+from quell.analysis.loop import LoopAnalysis, closed_loop, subsystem
 from quell.analysis.margins import Response
 from quell.controllers.base import Controller
 from quell.controllers.compensated import Compensated, check_takes_compensator
@@ -38,7 +38,13 @@ from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints, given_constraints
-from quell.tuning.optimiser.loops import Inputs, PlantSet, law_of, load_step, response
+from quell.tuning.optimiser.loops import (
+    PlantSet,
+    area_until_rest,
+    law_of,
+    load_step,
+    response,
+)
 from quell.tuning.plants import Given, given_plants, model_of, plant_set
 from quell.tuning.report import toml_text
 from quell.tuning.structures.adrc import matrices
@@ -212,7 +218,7 @@ def tune_compensator(
     given = _with_speeds(given, speeds)
     plants = _Plants(plant_set(given, dt), count, len(given.linear))
     inputs = load_step(plants.all, checks.nonzero("load", load, "or nothing is rejected"))
-    before = _measured(controller, plants, inputs)
+    before = _measured(controller, plants)
     if not math.isfinite(before.m_s):
         raise ValueError(
             f"controller = {controller!r}: its loop with the plant is unstable; a compensator "
@@ -232,7 +238,7 @@ def tune_compensator(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DesignWarning)  # of candidates on the way
         for family in _families(model, dt):
-            found = _searched(family, controller, plants, inputs, bounds, model)
+            found = _searched(family, controller, plants, bounds, model)
             if found is not None and (best is None or found.measures.iae < best.measures.iae):
                 best = found
     if best is None:
@@ -321,7 +327,6 @@ def _searched(
     family: _Family,
     controller: Controller,
     plants: _Plants,
-    inputs: Inputs,
     bounds: Constraints,
     model: Any,
 ) -> _Candidate | None:
@@ -333,7 +338,7 @@ def _searched(
     def at(omega_o: float, factor: float) -> tuple[float, _Candidate] | None:
         key = (omega_o, factor)
         if key not in tried:
-            tried[key] = _tried(family, key, controller, plants, inputs, bounds)
+            tried[key] = _tried(family, key, controller, plants, bounds)
         return tried[key]
 
     for omega_o, factor in itertools.product(grid.tolist(), family.factors):
@@ -358,7 +363,6 @@ def _tried(
     key: tuple[float, float],
     controller: Controller,
     plants: _Plants,
-    inputs: Inputs,
     bounds: Constraints,
 ) -> tuple[float, _Candidate] | None:
     """Return the cost of a candidate and itself; None if it breaks a bound."""
@@ -367,14 +371,14 @@ def _tried(
         both = Compensated(controller, Compensator(observer))
     except ValueError:  # this plant has no such observer
         return None
-    measures = _measured(both, plants, inputs, bounds)
+    measures = _measured(both, plants, bounds)
     if _excess(measures, bounds) > 0.0:
         return None
     return measures.iae, _Candidate(observer, family.name, family.table(observer), measures)
 
 
 def _measured(
-    controller: Controller, plants: _Plants, inputs: Inputs, bounds: Constraints | None = None
+    controller: Controller, plants: _Plants, bounds: Constraints | None = None
 ) -> Measures:
     """Return the largest figures over all plants; infinite for an unstable loop."""
     law, of = law_of(controller), plants.all
@@ -397,13 +401,10 @@ def _measured(
         worst = Measures(*map(max, worst, found))
     if bounds is None or _excess(worst, bounds) <= 0.0:  # responses over time are slow
         known = [plant for j, plant in enumerate(of.scaled()) if not plants.elsewhere(j)]
-        iae = max(_iae(response(plant, law, inputs), of.dt, inputs) for plant in known)
+        # Until y is at rest: the loop of a gentle controller is far slower than its plant.
+        iae = max(area_until_rest(closed_loop(plant, law, "d", "y")) * of.dt for plant in known)
         worst = worst._replace(iae=iae)
     return worst
-
-
-def _iae(y: Vector, dt: float, inputs: Inputs) -> float:
-    return float(np.sum(np.abs(y)) * dt * inputs.distance / np.max(np.abs(inputs.d)))
 
 
 def _excess(measures: Measures, bounds: Constraints) -> float:

@@ -3,13 +3,7 @@
 May import everything in ``export`` but ``fmi``.
 """
 
-from quell.export.library.exported import (
-    Comparison,
-    Difference,
-    Exported,
-    NoCompilerError,
-    Sizes,
-    c,
-)
+from quell.export.library.exported import Exported, NoCompilerError, Sizes, c
+from quell.export.library.precision import Comparison, Difference
 
 __all__ = ["Comparison", "Difference", "Exported", "NoCompilerError", "Sizes", "c"]

@@ -7,7 +7,6 @@ Code, constants, state and stack of an exported controller and its functions, as
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import re
@@ -15,15 +14,12 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from quell import checks
 from quell.controllers.base import check_controller
-from quell.controllers.prefilters import without_prefilters
 from quell.export.c_files import CSource
 from quell.export.controller_source import (
     c_source,
@@ -32,6 +28,7 @@ from quell.export.controller_source import (
     limits_path,
 )
 from quell.export.library.packages import package_files, package_note
+from quell.export.library.precision import Comparison, compared
 from quell.export.library.vectors import (
     TOLERANCE_REASON,
     Vectors,
@@ -42,9 +39,7 @@ from quell.export.library.vectors import (
 from quell.export.proof import Proof, proof_files, prove
 from quell.export.translate.text import checked_name
 from quell.files import check_folder, write_folder
-from quell.learners.gaussian_process import SINGLE_NOVELTY, GaussianProcess
 from quell.simulation.driver import Scenario
-from quell.simulation.simulate import simulate
 
 # ---- The files around an exported controller ----
 
@@ -496,165 +491,6 @@ def _edges(calls: str) -> dict[str, set[str]]:
         caller, called = (found[i].rpartition(":")[2] for i in (1, 2))
         edges.setdefault(caller, set()).add(called)
     return edges
-
-
-# ---- Single precision compared with double, in a scenario ----
-
-# Largest RMS difference of u that is accepted, relative to the RMS of u. Rounding acts on
-# u as noise does. One per cent of it is what a 6-bit converter adds, and does not show in y
-# (a torsional axis: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
-# unless the rounding of y itself, times omega_o^(n+1), is too much for u.
-LIMIT = 0.01
-# A signal of several axes rests if its RMS is below a unit of the last digit of the largest one.
-_REST = float(np.finfo(np.float32).eps)
-
-
-class Difference(NamedTuple):
-    """RMS differences of a signal of several axes, relative to its RMS in double precision.
-
-    Attributes
-    ----------
-    name
-        as in a record: ``u[0]``, ``v[elbow]``, ``y[elbow]``; of state feedback ``y[0]``.
-    single
-        of a run in single precision; None if the signal rests in both runs, so that there is
-        nothing to compare.
-    noise
-        of a run in double precision without measurement noise; None if the scenario has none.
-    """
-
-    name: str
-    single: float | None
-    noise: float | None
-
-
-class Comparison(NamedTuple):
-    """RMS differences in a scenario, relative to the RMS of the signal in double precision.
-
-    Attributes
-    ----------
-    u, y
-        of a run in single precision; of several signals the largest.
-    u_noise, y_noise
-        of a run in double precision without measurement noise, of the same signals; None if the
-        scenario has none.
-    diverged
-        whether the run in single precision diverged, and that in double did not.
-    each
-        of controllers of several signals, each u, v and y; else empty.
-    """
-
-    u: float
-    y: float
-    u_noise: float | None
-    y_noise: float | None
-    diverged: bool
-    each: tuple[Difference, ...] = ()
-
-    def check(self, controller: Any) -> None:
-        """Raise a ``ValueError`` if single precision differs too much for ``controller``."""
-        if not self.diverged and self.u <= LIMIT:
-            return
-        signal = next((own.name for own in self.each if own.single == self.u), "u")
-        what = "diverges" if self.diverged else f"changes {signal} by {100 * self.u:.2g} % RMS"
-        raise ValueError(
-            f"precision = 'single': {what} in this scenario, and {100 * LIMIT:g} % is the limit; "
-            f"{self._remedy(in_double_precision(controller))}, or double precision would help; "
-            "accept=True (--accept) writes it all the same"
-        )
-
-    def _remedy(self, controller: Any) -> str:
-        """Return what makes rounding smaller: of a learner's points, or else of y."""
-        several = hasattr(controller, "inputs")
-        for each in controller.axes if several else (without_prefilters(controller),):
-            learner = getattr(each, "learner", None)
-            if isinstance(learner, GaussianProcess) and learner.model.novelty < SINGLE_NOVELTY:
-                return (
-                    f"novelty={SINGLE_NOVELTY:g} of GaussianProcess (points so close that the "
-                    "inverse of their covariance loses its digits are then not stored)"
-                )
-        if not several:
-            return (
-                "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
-                "resolution=, --resolution)"
-            )
-        asked = [own for own in self.each if own.name.startswith("v[")]
-        worst = max(asked, key=lambda own: own.single or 0.0, default=None)
-        of = "" if worst is None or self.diverged else f" of {worst.name[2:-1]}"
-        return f"a lower omega_o{of}, y as a difference from a position near the work"
-
-
-def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
-    """Return what single precision changes in a scenario, and what the measurement noise does.
-
-    A signal of several axes is compared with its own RMS, or, if it rests, with the largest that
-    it could be compared with: u and y of all, and the largest share of v = B0 u.
-    """
-    controller = in_double_precision(controller)
-    double = simulate(plant, controller, scenario)
-    single = simulate(plant, controller, scenario, precision="single")
-    diverged, quiet = single.diverged and not double.diverged, None
-    noise: Any = scenario.noise
-    noises = noise if checks.is_sequence(noise) else (noise,)
-    if not all(isinstance(each, int | float) and each == 0.0 for each in noises):
-        quiet = simulate(plant, controller, replace(scenario, noise=0.0))
-    each = []
-    for name, place in _signals_of(controller):
-        largest = _largest(double, controller, *place)
-        each.append(
-            Difference(
-                name,
-                _difference(double, single, *place, largest),
-                None if quiet is None else _difference(double, quiet, *place, largest),
-            )
-        )
-    worst = [
-        max((own for own in each if own.name.startswith(kind)), key=lambda own: own.single or 0.0)
-        for kind in "uy"
-    ]
-    u, y = (own.single or 0.0 for own in worst)
-    several = tuple(each) if hasattr(controller, "inputs") else ()
-    return Comparison(u, y, worst[0].noise, worst[1].noise, diverged, several)
-
-
-def _signals_of(controller: Any) -> list[tuple[str, tuple[str, int]]]:
-    """Return names of the signals that are compared, with channel and column of a record."""
-    if not hasattr(controller, "inputs"):
-        return [("u", ("u", 0)), ("y", ("y", 0))]
-    inputs, outputs, names = controller.inputs, controller.outputs, controller.names
-    found = [(f"u[{k}]", ("u", k)) for k in range(inputs)]
-    found += [(f"v[{name}]", ("v", i)) for i, name in enumerate(names)]
-    return found + [(f"y[{name}]", ("y", i)) for i, name in enumerate(names or range(outputs))]
-
-
-def _rms(values: Any) -> Any:
-    """Return the RMS of each column."""
-    return np.sqrt(np.mean(np.square(values), axis=0))
-
-
-def _largest(run: Any, controller: Any, name: str, column: int) -> float:
-    """Return the RMS with which a signal that rests is compared; 0 for a single one."""
-    if not hasattr(controller, "inputs"):
-        return 0.0
-    if name == "v":
-        return float(np.max(np.abs(controller.first_gain[column]) * _rms(run["u"])))
-    return max(float(np.max(_rms(run[each]))) for each in (("u",) if name == "u" else ("y", "r")))
-
-
-def _difference(reference: Any, other: Any, name: str, column: int, largest: float) -> float | None:
-    """Return the RMS difference of a signal, relative to the RMS of the reference.
-
-    None for a signal that rests in both: below rounding in the one, and within ``LIMIT`` of
-    ``largest`` in the other.
-    """
-    count = min(len(reference), len(other))
-    one, two = (each[name][:count].reshape(count, -1)[:, column] for each in (reference, other))
-    size, change = float(_rms(one)), float(_rms(two - one))
-    if size <= _REST * largest:
-        size = largest
-        if change <= LIMIT * largest:
-            return None
-    return change / size if size > 0.0 else math.inf
 
 
 # ---- c ----
