@@ -366,6 +366,11 @@ def identified(
     least = max(_SAMPLES_PER_PARAMETER * (3 * order + zeros + 2), least_held)
     shortest = min(records.samples or (u.size,))
     delays = delay_range(delay, dt, shortest)
+    if delays[1] >= shortest:
+        raise ValueError(
+            f"delay = {delay!r} s: the longest delay to search (--max-delay) is longer than the "
+            f"record, which has {shortest * dt:.4g} s; give a quarter of it at most"
+        )
     least = max(least, 4 * delays[1])
     held_from = first_held_out(records, order, held_out, least, least_held)
     other = None if validation is None else other_record(*validation, least_held)

@@ -229,9 +229,7 @@ class Tuned:
     @property
     def nots(self) -> tuple[str, ...]:
         """The ``doubts`` as lines that begin with NOT."""
-        return tuple(
-            f"NOT: the margins are those of the model only: {text}" for text in self.doubts
-        )
+        return tuple(f"NOT: the margins hold for the model only: {text}" for text in self.doubts)
 
     @property
     def controller(self) -> Controller:
