@@ -432,8 +432,8 @@ def tune(
         plant, dt, more, model = from_record(console, setup, asked)
         more |= given_rest or rest_of_model(model)
     options["constraints"] = with_known_noise(options["constraints"], model, range_of_u(options))
-    known = {"signals": model.signals, "doubts": doubts(model)}
-    tuned = replace(_tuned(console, plant, dt, options | more), **known)
+    tuned = _tuned(console, plant, dt, options | more)
+    tuned = replace(tuned, signals=model.signals, doubts=doubts(model))
     _print(console, tuned, rig.device or str(setup))
     step = None
     if place is not None:
