@@ -257,6 +257,26 @@ def test_what_is_not_covered_is_said() -> None:
     assert whole.certificate == found
 
 
+def test_the_verdict_says_first_that_the_controller_is_not_guarded() -> None:
+    """For an oven with a free learner, and without one, the bounds are those of Guard()."""
+    oven = ql.plants.LinearPlant.of(([2.2], [300.0, 1.0]))
+    chain = ql.ESO.model_free(order=1, b0=0.0095, omega_o=0.1, dt=1.0)
+
+    def found(**parts: Any) -> Any:
+        return certify(oven, ql.ADRC(chain, omega_c=0.025, **parts))
+
+    learner = ql.learners.Kalman()
+    free, plain = found(learner=learner), found()
+    guarded = found(learner=learner, guard=ql.Guard())
+    first, second = str(free).splitlines()[:2]
+    assert first == "NOT guarded: holds with guard=Guard()"
+    assert second.startswith("certified: κΓ = 3")
+    assert str(plain).startswith("no learner: nothing to certify; this holds with a learner and")
+    assert str(guarded).startswith("certified: κΓ = 3")
+    assert free.to_json()["condition"] == first
+    assert guarded.to_json()["condition"] == ""
+
+
 def test_an_analysis_has_a_certificate_where_a_guarded_learner_is() -> None:
     """Not without learner or guard; where there is none, the summary says why."""
     plant, learner = ([1.3], [1.0, 0.0, 0.0]), ql.learners.Kalman()

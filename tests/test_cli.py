@@ -220,9 +220,23 @@ def test_two_outputs_have_two_files(quell: Callable[..., Shown], tmp_path: Path)
     from quell.setup import EXAMPLES
 
     (tmp_path / "setup.toml").write_text((EXAMPLES / "two_mass.toml").read_text())
-    shown = quell("run", "setup.toml", "--json", "out", "--save", "out")
+    shown = quell("run", "setup.toml", "--json", "out.nc", "--save", "out.nc")
     assert shown.code == 2
-    assert "out': must be a file for one output, is for two" in shown.err
+    assert "out.nc': must be a file for one output, is for two" in shown.err
+
+
+@pytest.mark.parametrize("name", ["x.mat", "x.xyz", "x"])
+def test_a_record_is_saved_as_what_its_name_says(
+    name: str, quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Only NetCDF and CSV are written; another ending is refused before the run."""
+    from quell.setup import EXAMPLES
+
+    (tmp_path / "setup.toml").write_text((EXAMPLES / "two_mass.toml").read_text())
+    shown = quell("run", "setup.toml", "--no-figures", "--save", name)
+    assert shown.code == 2
+    assert f"--save = '{name}': must end in .nc, for NetCDF, or in .csv" in shown.err
+    assert not (tmp_path / name).exists()
 
 
 def test_a_figure_is_written_as_png_svg_and_pdf(tmp_path: Path) -> None:

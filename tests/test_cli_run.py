@@ -311,6 +311,22 @@ def test_a_full_disk_is_told_once_and_ends_neither_run_nor_exit_code(
     assert shown.err.count("No space left on device") == 1
 
 
+def test_a_shorter_run_at_a_rig_has_no_window_after_its_end(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """And a longer one has those that the duration of the file leaves out."""
+    text = RIG + "[[metrics]]\nstart = 0.3\n"
+    (tmp_path / "rig.toml").write_text(text)
+    shown = quell("run-rig", "rig.toml", "--seconds", "0.1", "--no-figures")
+    assert shown.code == 0, shown.err
+    (tmp_path / "late.toml").write_text(text.replace("duration = 0.5", "duration = 0.2"))
+    shown = quell("run-rig", "late.toml", "--seconds", "0.5", "--no-figures")
+    assert shown.code == 0, shown.err
+    shown = quell("run-rig", "late.toml", "--no-figures")
+    assert shown.code == 2
+    assert "metrics[0].start = 0.3: must be less than the scenario's duration" in shown.err
+
+
 def test_a_trip_is_told_by_exit_code_three(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """What tripped is in the record; the metrics are of as far as it came."""
     (tmp_path / "rig.toml").write_text(RIG.replace("settle = 10", "most_error = 0.05, settle = 10"))

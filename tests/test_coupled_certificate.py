@@ -196,6 +196,20 @@ def test_what_the_bounds_do_not_cover_is_said() -> None:
     assert "not covered" not in str(plain)
 
 
+def test_the_verdict_of_axes_names_those_that_learn_without_guard() -> None:
+    """Axes without learner need no guard; without any learner there is nothing to certify."""
+
+    def line(**axes: ql.ADRC) -> str:
+        return str(certify_axes(inertias(np.eye(2)), ql.Axes(axes))).splitlines()[0]
+
+    guarded = axis()
+    free = ql.ADRC(guarded.observer, omega_c=1.0, learner=ql.learners.Kalman())
+    plain = ql.ADRC(guarded.observer, omega_c=1.0)
+    assert line(x=guarded, y=free) == "NOT guarded: y: holds with guard=Guard()"
+    assert line(x=plain, y=guarded).startswith("certified: ")
+    assert line(x=plain, y=plain).startswith("no learner: nothing to certify")
+
+
 def test_what_cannot_be_certified_is_refused() -> None:
     """Unstable loops, matrices that do not fit, bounds that are none."""
     row = System(np.array([[-0.5]]), np.array([1.0]), np.array([1.0]), 0.0)

@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.analysis import coupling, relative_gains
+import quell as ql
+from quell.analysis import analyse_axes, coupling, invariant_zeros, relative_gains
+from quell.analysis.coupling import is_turned
+from quell.analysis.matrices import sampled_matrices
 from quell.lti.models import zero_order_hold
 from quell.plants.multivariable import MultivariableLinear
 from quell.types import Matrix
@@ -149,3 +152,66 @@ def test_what_cannot_be_judged_is_refused() -> None:
         relative_gains([[1.0, 2.0], [2.0, 4.0]])
     with pytest.raises(ValueError, match="axes = .*: must be 2 different names"):
         coupling(sampled(A, B, C), DT, axes=("x", "x"))
+
+
+def tanks(shares: tuple[float, float]) -> ql.plants.MultivariableLinearPlant:
+    """Return the quadruple tank (Johansson, IEEE Trans. Control Syst. Technol. 8, 2000), [cm], [V].
+
+    Two pumps fill the lower tanks, which are measured, with these shares, and cross over the upper
+    ones with the rest. Shares with a sum below one give a zero in the right half plane.
+    """
+    a, b = shares
+    A = [
+        [-1 / 62, 0.0, 0.041, 0.0],
+        [0.0, -1 / 90, 0.0, 0.033],
+        [0.0, 0.0, -1 / 23, 0.0],
+        [0.0, 0.0, 0.0, -1 / 30],
+    ]
+    B = [
+        [a * 3.33 / 28, 0.0],
+        [0.0, b * 3.35 / 32],
+        [0.0, (1 - b) * 3.35 / 28],
+        [(1 - a) * 3.33 / 32, 0.0],
+    ]
+    return ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[:2])
+
+
+def test_a_zero_in_the_right_half_plane_is_named_and_b0_is_no_remedy() -> None:
+    """The zero of a quadruple tank, of its model in continuous time; with more share below there is none, and B0 is proposed."""
+    found = coupling(tanks((0.43, 0.34)), 1.0, bandwidth=0.01, axes=("h1", "h2"))
+    assert found.pairs == (1, 0)
+    (zero,) = found.zeros
+    plant = tanks((0.43, 0.34))
+    exact = max(invariant_zeros(plant.A, plant.B, plant.C).values.real)
+    assert zero == pytest.approx(exact, rel=1e-3)
+    assert found.advice.splitlines()[0] == (
+        "the axes are paired with the wrong inputs at rest: move h1 by input 2, h2 by input 1"
+    )
+    assert "a zero in the right half plane, at 0.0208" in found.advice.splitlines()[-1]
+    assert "use B0" not in found.advice
+    sound = coupling(tanks((0.7, 0.6)), 1.0, bandwidth=0.01)
+    assert sound.zeros == ()
+    assert "use B0" in sound.advice
+    # A zero far above the bandwidth, and those of sampling, are no matter.
+    assert coupling(tanks((0.43, 0.34)), 1.0, bandwidth=1e-3).zeros == ()
+    assert coupling(chains(np.eye(2), 4), DT).zeros == ()
+
+
+@pytest.mark.parametrize("shares", [(0.43, 0.34), (0.7, 0.6)])
+def test_where_gains_at_rest_are_turned_no_bandwidths_are_stable(
+    shares: tuple[float, float],
+) -> None:
+    """Axes with the exact B0 of two tanks, from slow to fast, each with its own bandwidth."""
+    plant, rng = tanks(shares), np.random.default_rng(3)
+    A, B, C = sampled_matrices(plant, 1.0)
+    B0 = plant.C @ plant.B
+    turned = is_turned(A - np.eye(4), B @ np.linalg.inv(B0), C)
+    stable = []
+    for _ in range(30):
+        own = [
+            ql.ADRC(ql.ESO.model_free(1, 1.0, omega_o=float(o), dt=1.0), float(c))
+            for c, o in 10.0 ** rng.uniform([-4.0, -4.0], [-1.0, -0.5], (2, 2))
+        ]
+        stable.append(analyse_axes(plant, ql.Axes(own, B0=B0)).stable)
+    assert turned == (sum(shares) < 1.0)
+    assert any(stable) != turned

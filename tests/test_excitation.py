@@ -188,5 +188,7 @@ def test_wrong_signals_are_named() -> None:
         s.PRBS(bits=40)
     with pytest.raises(ValueError, match="omegas = .*must be positive"):
         s.Multisine([0.0, 1.0])
+    with pytest.raises(ValueError, match="^omegas is empty: must have at least one frequency"):
+        s.Multisine([])
     with pytest.raises(ValueError, match="omega_start = 0.0: must be finite and greater than zero"):
         s.Chirp(omega_start=0.0, logarithmic=True)

@@ -228,6 +228,11 @@ def test_shapes_and_attributes_of_a_netcdf_file_are_checked_before_its_data(
         (lambda file: file.attrs.create("dt", np.zeros(10**4)), "no number and no text"),
         (lambda file: file.attrs.create("dt", 1e308), "its times are beyond all numbers"),
         (lambda file: file.attrs.create("every", 0), "every = 0: must be a whole number"),
+        (
+            lambda file: file.attrs.create("every", 10),
+            "k = 0 to k = 2 the column time goes on by 0.02 s, by its attributes, dt = 0.01 s and "
+            "every = 10, it is 0.2 s",
+        ),
         (lambda file: file.attrs.__delitem__("dt"), "has no dt: it was not written by Traj"),
     ):
         path = changed(saved, tmp_path / "run.nc", change)

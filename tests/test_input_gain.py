@@ -178,6 +178,15 @@ def test_poor_excitation_is_said() -> None:
     assert "the excitation is too poor" in str(found)
 
 
+def test_a_u_that_is_not_recorded_is_asked_for() -> None:
+    """Noise in the place of u says nothing of b0."""
+    u, y = record([1.0, 2.0, 0.0], adrc(), 1e-4)
+    rng = np.random.default_rng(4)
+    found = identify_b0(1e-9 * rng.standard_normal(u.size), y, DT, order=2)
+    assert found.is_poor
+    assert "is it u that was recorded?" in found.shortcomings[0]
+
+
 @pytest.mark.parametrize("seed", [1, 5])
 def test_the_interval_holds_the_gain_in_draws_of_the_trial(
     seed: int, monkeypatch: pytest.MonkeyPatch

@@ -17,6 +17,7 @@ from quell.identification import (
     interleaved_excitations,
     save_excitations,
 )
+from quell.identification.gain_matrix import _excitation
 
 from .benchmark_module import benchmark
 from .commands import Shown
@@ -105,6 +106,61 @@ def test_actuators_that_moved_together_are_named() -> None:
     assert "excite each actuator at frequencies of its own" in first
     assert found.poor.tolist() == [[True, True, False]]
     assert found.may_be_singular
+
+
+def test_an_actuator_that_is_not_recorded_leaves_no_entry_known() -> None:
+    """The other actuator's entries, too, are not known: what moved the axes is not in the record."""
+    u, y = record(300)
+    u[:, 1] = 1e-9 * np.random.default_rng(8).standard_normal(len(u))
+    found = identify_b0_matrix(u, y, DT, 1)
+    assert "u2" in found.unseen
+    assert np.all(found.poor)
+    (first, *_) = found.shortcomings
+    assert "u2 recorded, in the right column, as applied?" in first
+
+
+def test_an_actuator_that_moves_one_axis_only_is_recorded() -> None:
+    """Its entry of the other axis is zero within its deviation, and known."""
+    u, y = record(500, noise=1e-3)
+    y[:, 0] = 0.0
+    for k in range(len(u) - 1):
+        y[k + 1, 0] = 0.98 * y[k, 0] + 0.4 * u[k, 0]
+    y[:, 0] += 1e-3 * np.random.default_rng(4).standard_normal(len(y))
+    found = identify_b0_matrix(u, y, DT, 1)
+    assert abs(found.B0[0, 1]) < 4.0 * found.std[0, 1]
+    assert found.unseen == ()
+    assert not found.is_poor
+
+
+@pytest.mark.parametrize("actuators", range(2, 7))
+def test_never_a_single_actuator_moved_together(actuators: int) -> None:
+    """At least two are named, of covariances of u that hardly can be told apart, in any units."""
+    rng = np.random.default_rng(actuators)
+    names = [f"u{j}" for j in range(actuators)]
+    for _ in range(50):
+        u = rng.standard_normal((40, actuators)) * 10.0 ** rng.uniform(-6, 6, actuators)
+        first = int(rng.integers(actuators))
+        u[:, first] = np.delete(u, first, axis=1) @ rng.standard_normal(actuators - 1)
+        u *= 1.0 + 1e-3 * rng.standard_normal(u.shape)
+        size = np.linalg.norm(u, axis=0)
+        inverse = np.linalg.inv((u / size).T @ (u / size))
+        condition, together = _excitation(inverse / np.outer(size, size), names)
+        assert (condition > 30.0) == (len(together) > 0)
+        assert len(together) != 1
+
+
+def test_a_lag_that_is_not_known_is_not_a_matter_of_the_actuators() -> None:
+    """A machine of order 2 that is taken for order 1: the gains and the lag are not told apart, the actuators are."""
+    u, _ = record(300)
+    y = np.zeros(u.shape)
+    speed = np.zeros(2)
+    for k in range(len(u) - 1):
+        speed = speed + DT * B0 @ u[k]
+        y[k + 1] = y[k] + DT * speed
+    y += 1e-6 * np.random.default_rng(5).standard_normal(y.shape)
+    found = identify_b0_matrix(u, y, DT, 1)
+    assert np.all(found.condition < 5.0)
+    assert "moved together" not in str(found)
 
 
 @pytest.mark.slow

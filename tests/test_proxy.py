@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from threading import Event, Thread
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import quell as ql
 from quell.realtime import CompensatedDrive, TwinDevice, wire
+from quell.realtime.devices import read_channels, read_measurement, write_command
+from quell.realtime.rig import Rig
+from quell.types import Vector
 
 from .commands import Shown
-from .rig_bench import TIME, Bench
+from .rig_bench import TIME, Bench, PlainRig
 
 DT = 0.01
 DRIVE = ([12.0], [1.0, 12.0, 0.0])
@@ -165,6 +170,140 @@ def test_one_missing_measurement_is_missing_for_its_axis() -> None:
         assert ql.Status.MEASUREMENT_HELD not in proxy.estimate["y"].status
 
 
+class ScriptedHandle(NamedTuple):
+    """A drive that gives the next y of a list in each tick, and takes commands or does not."""
+
+    y: Vector
+    place: NDArray[np.int64]
+    fault: int
+
+
+@read_measurement.register(ScriptedHandle)
+def _read_scripted(handle: ScriptedHandle, clock: Any, until: int) -> tuple[float, int]:
+    handle.place[0] += 1
+    return handle.y[min(handle.place[0], handle.y.size) - 1], 0
+
+
+@read_channels.register(ScriptedHandle)
+def _read_scripted_channels(handle: ScriptedHandle, values: Vector) -> None:
+    values[:] = 0.25
+
+
+@write_command.register(ScriptedHandle)
+def _write_scripted(handle: ScriptedHandle, u: float) -> int:
+    return handle.fault
+
+
+class Scripted(TwinDevice):
+    """A drive with that handle."""
+
+    def __init__(self, y: list[float], fault: int = 0) -> None:
+        super().__init__(loaded_drive(), DT)
+        self.handle: Any = ScriptedHandle(np.array(y), np.zeros(1, dtype=np.int64), fault)
+
+    def read(self) -> float:
+        """Take none of the list: it is for the ticks."""
+        return 0.0
+
+
+def proxy_of(bench: Callable[..., Bench], drive: Any, **settings: Any) -> tuple[Any, Rig]:
+    """Return the proxy of a drive, and its rig, which ticks as plain Python."""
+    proxy = CompensatedDrive(drive, ql.Compensator(OBSERVER, **LIMITS), **settings)
+    return proxy, bench("udp", kind=PlainRig, plant=proxy).rig
+
+
+def test_one_missing_measurement_is_bridged_and_no_second_one(bench: Callable[..., Bench]) -> None:
+    """Nor one before the first; and the channels of a silent drive are missing as well."""
+    y = [np.nan, np.nan, 1.0, np.nan, np.nan, np.nan, 2.0]
+    proxy, rig = proxy_of(bench, Scripted(y), channels=["temperature"])
+    seen, channels = [], []
+    for _ in y:
+        rig.tick()
+        seen.append(float(rig.model.y[0]))
+        channels.append(float(rig.channels[0]))
+    np.testing.assert_array_equal(seen, [np.nan, np.nan, 1.0, 1.0, np.nan, np.nan, 2.0])
+    np.testing.assert_array_equal(channels, [0.25, np.nan, 0.25, 0.25, np.nan, np.nan, 0.25])
+    assert proxy.counters == {"missing": 5, "unsent": 0}
+    assert not proxy.fault
+
+
+def test_a_drive_that_takes_no_command_is_lost(bench: Callable[..., Bench]) -> None:
+    """More than ``Safety.hold`` in a row can't be sent: the rig ends, however many ticks it has."""
+    proxy, rig = proxy_of(bench, Scripted([0.0], wire.COMMAND_NOT_SENT))
+    rig.tick(5)
+    assert (proxy.fault, proxy.counters["unsent"]) == ("", 5)
+    rig.tick(100)
+    assert (proxy.fault, proxy.counters["unsent"]) == ("commands could not be sent any more", 6)
+
+
+def tried(stack: ExitStack, several: bool) -> tuple[Bench, Any, Bench, Any, Any]:
+    """Return a drive, its proxy, the rig of that, a host and its u after five good ticks."""
+    signals, u = ((2, 2), [0.3, 0.2]) if several else (None, 0.3)
+    drive = Bench(stack, plant=ARM if several else loaded_drive())
+    compensator = compensators() if several else ql.Compensator(OBSERVER, **LIMITS)
+    proxy = CompensatedDrive(drive.open(signals=signals), compensator)
+    outer = Bench(stack, plant=proxy)
+    host = outer.open(meanwhile=drive.rig.tick, signals=signals)
+    for _ in range(5):
+        drive.rig.tick()
+        outer.rig.tick()
+        assert np.isfinite(outer.catch_up(host)).all()
+        host.write(u)
+    return drive, proxy, outer, host, u
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_the_host_sees_that_a_drive_has_died(several: bool) -> None:
+    """One sample is bridged; then there is no measurement, and after a second no session."""
+    with ExitStack() as stack:
+        _, proxy, outer, host, u = tried(stack, several)
+        seen = []
+        for _ in range(12):
+            outer.rig.tick()
+            seen.append(host.read())
+            host.write(u)
+        assert np.isfinite(seen[0]).all()
+        assert np.isnan(seen[1:]).all()
+        assert proxy.fault == "no measurement has come for 12 ticks, 0.12 s"
+        assert outer.rig.state == "live"
+        for _ in range(89):
+            assert not host.lost
+            outer.rig.tick()
+            host.read()
+            if outer.rig.state == "live":
+                host.write(u)
+        assert (outer.rig.state, host.lost) == ("idle", True)
+        assert proxy.fault == "no measurement has come for 101 ticks, 1.01 s"
+
+
+def test_one_dead_sensor_is_named_and_missing_for_the_host() -> None:
+    """The other axis is measured on."""
+    with ExitStack() as stack:
+        drive, proxy, outer, host, u = tried(stack, True)
+        model, values, seen = drive.rig.model, np.array([np.nan, 0.15]), []
+        for _ in range(40):
+            wire.write_next_numbers(model.outbox, model.endpoint, wire.MEASUREMENT, TIME, values, 0)
+            wire.send(model.transport, model.outbox)
+            outer.rig.tick()
+            seen.append(host.read())
+            host.write(u)
+        assert np.isnan(np.array(seen)[1:, 0]).all()
+        np.testing.assert_array_equal(np.array(seen)[:, 1], 0.15)
+        assert proxy.fault == "no measurement of x has come for 40 ticks, 0.4 s"
+
+
+def test_a_drive_that_has_tripped_ends_the_session_of_the_host() -> None:
+    """It sends measurements on, but its u is zero: the host must not go on."""
+    with ExitStack() as stack:
+        drive, proxy, outer, host, _ = tried(stack, False)
+        drive.rig.tick(30)
+        assert drive.rig.state == "tripped"
+        outer.rig.tick(5)
+        host.read()
+        assert (outer.rig.state, host.lost) == ("idle", True)
+        assert proxy.fault.startswith("its watchdog has set u to zero")
+
+
 def test_what_does_not_fit_is_refused() -> None:
     """Another controller, no limits, another sample time, a device in Python, other signals."""
     twin, compensator = TwinDevice(loaded_drive(), DT), ql.Compensator(OBSERVER, **LIMITS)
@@ -235,3 +374,48 @@ def test_the_command_takes_a_setup_of_several_axes(quell: Callable[..., Shown]) 
     Path("adrc.toml").write_text(text, encoding="utf-8")
     shown = quell("proxy", "adrc.toml", *arguments)
     assert (shown.code, "the host has the controller" in shown.err) == (2, True)
+
+
+PROXY = """
+dt = 0.01
+[observer]
+kind = "model-based"
+omega_o = 30.0
+plant = {kind = "linear", num = [12.0], den = [1.0, 12.0, 0.0]}
+[controller]
+kind = "compensator"
+u_min = -3.0
+u_max = 3.0
+[rig]
+device = "URL"
+"""
+
+
+def test_the_command_says_that_the_drive_is_lost_and_ends_with_code_3(
+    quell: Callable[..., Shown],
+) -> None:
+    """The drive says goodbye after a while: one line, which begins with NOT, says how it ended."""
+    with ExitStack() as stack:
+        drive, over = Bench(stack, plant=loaded_drive(), kind=PlainRig), Event()
+        file = Path("drive.toml")
+        file.write_text(PROXY.replace("URL", drive.url), encoding="utf-8")
+
+        def work() -> None:
+            while drive.rig.state != "live" and not over.wait(DT):
+                drive.rig.tick()
+            while not over.wait(DT) and drive.rig.counters["accepted"] < 20:
+                drive.rig.tick()
+            drive.rig._end_session()
+
+        thread = Thread(target=work)
+        thread.start()
+        shown = quell(
+            *("proxy", str(file), "--host", "udp://127.0.0.1:0", "--priority", "0"),
+            *("--seconds", "60"),
+        )
+        over.set()
+        thread.join()
+        drive.rig.tick()
+    last = shown.out.splitlines()[-1]
+    assert last.startswith(f"NOT connected to the drive at {drive.url}: it has ended the session")
+    assert (shown.code, shown.err) == (3, "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -201,11 +202,11 @@ def test_a_change_is_judged_by_mean_squares_over_two_times() -> None:
     assert state.covariance[0, 0] == pytest.approx(1.0 / (1.0 / 9.0 + 1.0))
 
 
-def test_a_selection_of_all_features_is_plain_least_squares() -> None:
-    """``strongest`` that is not below the number of features changes nothing."""
-    assert ql.learners.RLS(strongest=3).rule(OBSERVER, 4.0, 3) == ql.learners.RLS().rule(
-        OBSERVER, 4.0, 3
-    )
+def test_a_selection_of_all_features_is_refused() -> None:
+    """``strongest`` that is not below the number of features would change nothing."""
+    for strongest in (3, 50):
+        with pytest.raises(ValueError, match=f"strongest = {strongest}: has no effect, as there"):
+            ql.learners.RLS(strongest=strongest).rule(OBSERVER, 4.0, 3)
     assert isinstance(ql.learners.RLS(strongest=2).rule(OBSERVER, 4.0, 3), SelectionRule)
     with pytest.raises(ValueError, match="strongest = 0: must be a whole number of at least 1"):
         ql.learners.RLS(strongest=0)
@@ -454,3 +455,30 @@ def test_a_mistake_is_named(make: Any, message: str) -> None:
     """With the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ql.learners.Kalman(bias=False, bias_bandwidth=1.0), "bias_bandwidth = 1.0: has"),
+        (
+            lambda: ql.learners.Kalman(state=False, state_bandwidth=0.5),
+            "state_bandwidth = 0.5: has",
+        ),
+        (lambda: ql.learners.Kalman(state=False, prior=3.0), "prior = 3.0: has no effect"),
+        (lambda: ql.learners.Kalman(state=False, frequency=3.0), "frequency = 3.0: has no effect"),
+        (lambda: ql.learners.Kalman(gain_interval=(0.9, 1.1)), "with u = False; leave it out, or"),
+        (
+            lambda: ql.learners.Harmonic(bias=False, bias_bandwidth=1.0, pair_bandwidth=2.0),
+            "bias_bandwidth = 1.0: has no effect",
+        ),
+        (lambda: ql.learners.RLS(gain_interval=(0.9, 1.1)), "or add Input() to features"),
+        (lambda: ql.learners.NLMS(gain_interval=(0.9, 1.1)), "or add Input() to features"),
+    ],
+)
+def test_options_of_features_that_are_not_there_are_refused(make: Any, message: str) -> None:
+    """With what to do; the sinusoids of Harmonic take their bandwidth from that of the bias."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()
+    ql.learners.Harmonic(bias=False, bias_bandwidth=1.0)
+    ql.learners.Kalman(u=True, gain_interval=(0.9, 1.1))

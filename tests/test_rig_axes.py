@@ -484,6 +484,28 @@ def test_a_replay_needs_as_many_axes(run: str, controller: Any, message: str) ->
         replay(Outcome(duration=0.2).run, controller)
 
 
+@pytest.mark.parametrize("names", [("y", "x"), ("x", "z")])
+@pytest.mark.parametrize("kind", [".csv", ".mcap", "a table alone"])
+def test_a_replay_refuses_axes_of_other_names_or_order(
+    tmp_path: Path, kind: str, names: tuple[str, str]
+) -> None:
+    """As a state of ``quell watch`` does: the record of one axis is not that of another."""
+    if kind == ".mcap":
+        pytest.importorskip("foxglove")
+    found, path = Outcome(duration=0.2), tmp_path / ("run.mcap" if kind == ".mcap" else "run.csv")
+    sink = {".csv": CsvSink, ".mcap": McapSink}[path.suffix](path)
+    sink.open(found.header)
+    sink.write(found.rows)
+    sink.close()
+    if kind == "a table alone":
+        header_path(path).unlink()
+    other = ql.Axes(dict(zip(names, gantry().axes, strict=True)), B0, u_min=-3.0, u_max=3.0)
+    rule = f"run has x, y, the controller {', '.join(names)}: must be the same axes in the same"
+    with pytest.raises(ValueError, match=rule):
+        replay(load(path), other)
+    assert replay(load(path), gantry()).axis_names == ("x", "y")
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".mcap"])
 def test_a_recording_comes_back_bit_by_bit(tmp_path: Path, suffix: str) -> None:
     """With the names of the axes in its columns; a command of one axis refuses it."""
@@ -658,10 +680,20 @@ def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None
     shown = quell("replay", "run.csv", "gantry.toml", "--no-figures", "--json", "replay.json")
     assert shown.code == 0, shown.err
     assert "run.csv through gantry: y" in shown.out
-    for command in (("identify", "run.csv", "--order", "2"), ("b0", "run.csv", "--order", "2")):
-        shown = quell(*command)
-        assert shown.code == 2
-        assert "has several axes (x, y): NOT possible here" in shown.err
+    Path("alone.csv").write_bytes(Path("run.csv").read_bytes())  # without run.csv.json
+    names = ("run.csv", "alone.csv")
+    for name in names:
+        for command in (("identify", name, "--order", "2"), ("b0", name, "--order", "2")):
+            shown = quell(*command)
+            assert shown.code == 2
+            assert "has several axes (x, y): NOT possible here" in shown.err
+    shown = quell("rank", "A=run.csv", "B=alone.csv")
+    assert shown.code == 0, shown.err
+    assert "NOT decided for x, y" in shown.out
+    read = {name: quell("b0", name, "--axes", "x,y", "--order", "2") for name in names}
+    said = [(each.out + each.err).replace(name, "") for name, each in read.items()]
+    assert said[0] == said[1]
+    assert "u has 26 samples: must have at least 150" in said[0]
     shown = quell("run-rig", "gantry.toml", "--watch", "watch.json", "--no-figures")
     assert shown.code == 0, shown.err
     assert "NOT watched: no whole window of 60 s; run longer" in shown.out
@@ -682,6 +714,24 @@ def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None
         ).rig
         is None
     )
+
+
+def test_a_replay_refuses_actuators_in_another_order(quell: Callable[..., Shown]) -> None:
+    """Where the setup and the record name them: each u acts on other axes."""
+    text = slow_gantry().replace("axes = {", 'axes = { actuators = ["left [N]", "right [N]"],')
+    Path("gantry.toml").write_text(text, encoding="utf-8")
+    Path("turned.toml").write_text(
+        text.replace('"left [N]", "right [N]"', '"right [N]", "left [N]"'), encoding="utf-8"
+    )
+    arguments = ("--csv", "run.csv", "--seconds", "0.5", "--no-figures")
+    assert quell("run-rig", "gantry.toml", *arguments).code == 0
+    shown = quell("replay", "run.csv", "turned.toml", "--no-figures")
+    rule = "run has left, right, the controller right, left: must be the same actuators"
+    assert (shown.code, rule in shown.err) == (2, True), shown.err
+    header_path(Path("run.csv")).unlink()
+    shown = quell("replay", "run.csv", "turned.toml", "--no-figures")
+    assert (shown.code, rule in shown.err) == (2, True), shown.err
+    assert quell("replay", "run.csv", "gantry.toml", "--no-figures").code == 0
 
 
 def test_a_served_rig_of_axes_is_run_over_udp(quell: Callable[..., Shown]) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import quell as ql
 from quell.setup import EXAMPLES, SetupError, load, made, varied
-from quell.setup.loading import keys, markdown
+from quell.setup.loading import changed, keys, markdown
 from quell.setup.registry import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 
 from .setups import TWO_MASS
@@ -172,6 +172,42 @@ def test_a_mistake_gives_a_line_with_file_key_and_rule(text: str, message: str) 
         setup(text)
     assert len(caught.value.mistakes) == 1
     assert caught.value.mistakes[0].startswith(f"rig.toml: {message}")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"metrics": [{"start": 50.0}]},
+            r"metrics\[0\].start = 50: must be less than the scenario's duration, 5 s",
+        ),
+        ({"scenario.x0": [1.0, 2.0]}, r"scenario.x0 has shape \(2,\): must be a vector of 4"),
+        ({"scenario.schedule": [1.0]}, "scenario.schedule has 1 signal, and the schedule of the"),
+        ({"plant.uncertain": {"m1": [2.0, 1.0]}}, "plant.uncertain.m1 = .*: must be .low, high"),
+        ({"sweep": {"draws": 30}}, "sweep.draws = 30: nothing in the scenario is random"),
+        (
+            {"sweep": {"parameters": {"observer.b1": [1.0]}}},
+            "sweep.parameters: observer.b1: unknown; must be one of",
+        ),
+        (
+            {"sweep": {"parameters": {"plant.m1": [1.0]}, "limits": {"foo": 2.0}}},
+            "sweep.limits.foo: is none of the metrics",
+        ),
+        ({"sweep": {"parameters": {"plant.m1": [1.0]}, "metrics": []}}, "sweep.metrics is empty"),
+    ],
+)
+def test_loading_refuses_what_no_command_can_use(changes: Any, message: str) -> None:
+    """With the key, its value and the rule; each part alone is right."""
+    base = {
+        "dt": 0.01,
+        "plant": {"kind": "two-mass"},
+        "observer": {"kind": "model-free", "order": 4, "b0": 1.0, "omega_o": 10.0},
+        "controller": {"omega_c": 1.0},
+        "scenario": {"duration": 5.0, "reference": 1.0},
+    }
+    made("drive.toml", base)
+    with pytest.raises(SetupError, match=f"^drive.toml: {message}"):
+        made("drive.toml", changed("drive.toml", base, changes))
 
 
 def test_several_mistakes_are_told_at_once() -> None:

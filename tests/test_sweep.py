@@ -422,6 +422,17 @@ def test_a_setup_in_a_sweep_is_the_one_with_these_values(tmp_path: Path) -> None
         ("kp = 0.1", "kq = 0.1", "sweep.cases.pid: controller.kq: unknown"),
         ('"rms"', '"rmse"', "sweep.metrics: 'rmse' is unknown, did you mean rms?"),
         ("seed = 3", "limits = { ise = 1.0 }", "sweep.limits.ise: is none of the metrics"),
+        (
+            "plant.m1 = { low = 0.6, high = 1.4 }",
+            '"tune.m_s" = { low = 1.0, high = 2.0 }',
+            "sweep.parameters: tune.m_s: no run uses it; sweep keys of dt, plant, observer",
+        ),
+        (
+            "plant.m1 = { low = 0.6, high = 1.4 }",
+            '"scenario.seed" = [1, 2]',
+            "sweep.parameters: scenario.seed: no run uses it; seed and draws of .sweep. are",
+        ),
+        ("mine = {}", 'mine = { title = "a" }', "sweep.cases.mine: title: no run uses it"),
         ("draws = 4", "drows = 4", "sweep.drows: unknown; did you mean draws?"),
     ],
 )
@@ -432,6 +443,25 @@ def test_what_a_sweep_varies_and_the_setup_does_not_have_is_named(
     assert old in SETUP
     with pytest.raises(SetupError, match=f"^drive.toml: {message}"):
         sweep_of(made(*read(setup_of(tmp_path, SETUP.replace(old, new)))))
+
+
+def test_draws_need_something_that_is_drawn_or_random(tmp_path: Path) -> None:
+    """Noise in one of the scenarios, a distribution, or a seed that the function takes."""
+    still = ql.Scenario(1.0, duration=0.1)
+    plant, law = two_mass_spring(), LAWS["adrc"]
+
+    def noisy(scenario: Any) -> Any:
+        return plant, law, scenario
+
+    def seeded(seed: int) -> Any:
+        return plant, law, still
+
+    options: dict[str, Any] = {"draws": 3, "executor": None}
+    with pytest.raises(ValueError, match=r"^draws = 3: nothing in the scenario is random and no"):
+        sweep(noisy, {"scenario": [still, still]}, folder=tmp_path / "a", **options)
+    assert not (tmp_path / "a").exists()
+    sweep(noisy, {"scenario": [still, SCENARIO]}, folder=tmp_path / "b", **options)
+    sweep(seeded, {}, folder=tmp_path / "c", **options)
 
 
 def test_the_command_does_a_sweep_and_repeats_a_run(

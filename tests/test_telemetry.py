@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event as ThreadEvent
@@ -27,6 +28,7 @@ from quell.realtime.recordings import (
     MemorySink,
     file_sink,
     header_path,
+    is_recording,
     load,
     row_channels,
     trajectory_of,
@@ -169,6 +171,87 @@ def test_a_csv_file_without_its_header_still_knows_its_sample_time(
     np.testing.assert_array_equal(run.log, rows)
     np.testing.assert_array_equal(run["k"] * run.dt, rows[:, K] * dt)
     assert run.dt == pytest.approx(dt, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        (
+            lambda time: 10.0 * time,
+            "column time goes on by 0.1 s, by dt = 0.01 s in run.csv.json it is 0.01 s",
+        ),
+        (
+            lambda time: 0.1 * time,
+            "column time goes on by 0.002 s, by dt = 0.01 s in run.csv.json it is 0.02 s",
+        ),
+        (lambda time: np.nan if time else 0.0, "k = 0 to k = 1 the column time goes on by nan s"),
+        (lambda time: 1.01 * time, "k = 0 to k = 112 the column time goes on by 1.1312 s"),
+    ],
+)
+def test_times_that_contradict_the_header_are_refused(
+    change: Callable[[float], float], rule: str, tmp_path: Path
+) -> None:
+    """Nobody can tell which of both is right; both are named."""
+    path = tmp_path / "run.csv"
+    recorded(NARROW, counted(200), CsvSink(path))
+    with_times(path, lambda time: repr(change(time)))
+    with pytest.raises(ValueError, match="its times contradict each other: .*" + rule):
+        load(path)
+
+
+def test_rounded_times_and_those_of_a_part_agree_with_the_header(tmp_path: Path) -> None:
+    """A spreadsheet writes six digits; k counts on from the first row of a part."""
+    path, rows = tmp_path / "run.csv", counted(200)
+    recorded(NARROW, rows, CsvSink(path))
+    with_times(path, lambda time: f"{time + 1000.0:.6g}")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], *lines[50:]]) + "\n")
+    np.testing.assert_array_equal(load(path).log, rows[49:])
+
+
+def test_times_of_a_table_alone_that_jump_are_refused(tmp_path: Path) -> None:
+    """Its dt is that of the last row; it has no other."""
+    path = tmp_path / "run.csv"
+    recorded(NARROW, counted(200), CsvSink(path))
+    header_path(path).unlink()
+    with_times(path, lambda time: repr(time if time < 1.0 else time + 1.0))
+    with pytest.raises(ValueError, match="by dt = 0.01502.* s of its last row it is 0.04"):
+        load(path)
+
+
+def with_times(path: Path, change: Callable[[float], str]) -> None:
+    """Change the first column of a CSV file."""
+    first, *lines = path.read_text().splitlines()
+    cells = [line.partition(",") for line in lines]
+    changed = [f"{change(float(time))},{rest}" for time, _, rest in cells]
+    path.write_text("\n".join([first, *changed]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda text: text, True),
+        (lambda text: text.replace(b"\n", b"\r\n"), True),
+        (lambda text: b"\xef\xbb\xbf" + text, True),
+        (lambda text: text.replace(b"time,k,lateness", b"time,k,late"), False),
+        (lambda text: b"t,u,y\n0,1,2\n", False),
+        (lambda text: bytes(100), False),
+        (lambda text: b"", False),
+    ],
+)
+def test_a_table_is_a_recording_by_its_first_line(
+    change: Callable[[bytes], bytes], expected: bool, tmp_path: Path
+) -> None:
+    """Also with the ends of lines and the mark of another system; no header is beside it."""
+    path, rows = tmp_path / "run.txt", counted(200)
+    recorded(NARROW, rows, CsvSink(tmp_path / "run.csv"))
+    path.write_bytes(change((tmp_path / "run.csv").read_bytes()))
+    assert is_recording(path) is expected
+    if expected:
+        np.testing.assert_array_equal(load(path).log, rows)
+    assert is_recording(tmp_path / "run.csv")
+    assert not is_recording(tmp_path)
+    assert not is_recording(tmp_path / "nothing.csv")
 
 
 def test_a_csv_file_without_its_header_is_of_one_axis_if_no_axis_has_an_estimate(

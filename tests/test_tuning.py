@@ -371,7 +371,7 @@ def test_limits_of_noise_and_delay_are_kept() -> None:
 
 def test_the_integral_of_the_error_is_that_of_a_simulation() -> None:
     """``load-iae``; and it is less than that of the loop with the largest integral gain."""
-    how: dict[str, Any] = {"structure": "pi", "compare": (), "duration": 30.0}
+    how: dict[str, Any] = {"structure": "pi", "compare": ()}
     integral = {}
     for objective in ("load", "load-iae"):
         tuned = ql.tune(LAGS, DT, objective=objective, **how)
@@ -412,6 +412,27 @@ def test_the_integral_of_the_error_has_the_end_of_a_slow_response(
     assert tuned.design.measures["iae"] >= (1.0 - 1e-3) / tuned.design.k_i
 
 
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"duration": 3.0},
+        {"duration": 3.0, "reference": 2.0},
+        {"reference": ql.signals.Step(2.0)},
+        {"duration": 3.0, "load": -2.5},
+    ],
+    ids=str,
+)
+def test_the_integral_of_the_error_is_never_cut(how: dict[str, Any]) -> None:
+    """A duration and a reference bound u; ∫|y| after the load is that of the simulation, to its end."""
+    bounds = Constraints(u_max=100.0)
+    tuned = ql.tune(LAGS, DT, structure="pi", compare=(), constraints=bounds, **how)
+    load = how.get("load", 1.0)
+    scenario = ql.Scenario(disturbances=(load,), duration=60.0)
+    run = ql.simulate(ql.plants.LinearPlant.of(LAGS), tuned.controller, scenario)
+    assert tuned.design.objective == pytest.approx(DT * np.sum(np.abs(run["y"])), rel=1e-6)
+    assert tuned.design.objective == pytest.approx(abs(load) * tuned.design.measures["iae"])
+
+
 def test_a_slow_response_at_a_distance_is_that_of_all_samples() -> None:
     """Every fourth sample of y and u of a loop is the same."""
     plant = ([50.0], np.poly([-1 / 3600] * 3) * 3600.0**3)
@@ -436,6 +457,20 @@ def test_a_profile_is_tracked_within_limits_of_u() -> None:
     assert np.max(np.abs(run["u"])) <= 1.1 * 1.002
     error = math.sqrt(float(np.mean((run["r"] - run["y"]) ** 2)))
     assert error == pytest.approx(tuned.design.objective, rel=0.01)
+
+
+def test_a_number_is_a_reference_that_is_followed_from_rest() -> None:
+    """As in a scenario: 2.0 is what a step of 2 from the start on is, with and without feedforward."""
+    how: dict[str, Any] = {"objective": "tracking", "structure": "bandwidths", "order": 1}
+    how |= {"compare": (), "duration": 20.0}
+    first = ([1.0], [1.0, 1.0])
+    for forward in (False, True):
+        step, number = (
+            ql.tune(first, DT, reference=given, feedforward=forward, **how).design
+            for given in (ql.signals.Step(2.0), 2.0)
+        )
+        assert number.objective == step.objective > 0.0
+        assert number.values == step.values
 
 
 SERVO = {"inertias": [2e-4, 3e-4], "stiffnesses": [23.2], "dampings": [0.002]}  # kg m², N m/rad
@@ -621,6 +656,90 @@ def test_arguments_that_do_not_fit_are_named(arguments: dict[str, Any], message:
     """Before anything is searched, whatever would have failed later."""
     with pytest.raises(ValueError, match=message):
         ql.tune(arguments.pop("plant", ([1.0], [1.0, 1.0])), 0.01, **{"compare": (), **arguments})
+
+
+SEVERAL = [([1.0], [1.0, 1.0]), ([1.0], [1.1, 1.0])]
+STEP = ql.signals.Step()
+U_MAX = Constraints(u_max=9.0)
+RUN = ql.Scenario(duration=1.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"duration": 3.0},
+            r"duration = 3.0: .*∫\|y\| and k_i are those until y is at rest; give obj",
+        ),
+        ({"reference": 1.0}, "reference = 1.0: .*is about the load; give objective = 'tracking'"),
+        (
+            {"objective": "tracking", "reference": STEP, "load": 2.0},
+            "load = 2.0: .*follows the ref",
+        ),
+        ({"objective": "load", "load": 2.0}, "load = 2.0: .*k_i is the same for all loads"),
+        (
+            {"objective": "load", "load": 2.0, "reference": 1.0, "constraints": U_MAX},
+            "load = 2.0: .*k_i is the same for all loads",
+        ),
+        ({"quantile": 0.5}, "quantile = 0.5: .*there is one plant; give several, b_range, or"),
+        (
+            {"plant": SEVERAL, "quantile": 0.5, "objective": "load"},
+            "quantile = 0.5: .*the same for",
+        ),
+        ({"samples": 3}, "samples = 3: .*no plant is drawn; give ranges"),
+        ({"samples": 3, "b_range": (0.8, 1.2)}, "samples = 3: .*no plant is drawn; give ranges"),
+        (
+            {"check_samples": 10},
+            r"check_samples = 10: .*\(\[plant.uncertain\]\), or b_range, or leave",
+        ),
+        ({"plant": SEVERAL, "seed": 3}, "seed = 3: .*no plant is drawn; give ranges"),
+        (
+            {"constraints": Constraints(noise_share=0.5)},
+            "noise_share = 0.5: .*is not known; give noi",
+        ),
+        (
+            {"constraints": Constraints(noise_share=0.5, u_std=0.1, noise_std=0.01)},
+            "noise_share = 0.5: .*u_std bounds what noise does to u",
+        ),
+        (
+            {"constraints": Constraints(noise_over_pi=3.0, m_ks=5.0)},
+            "noise_over_pi = 3.0: .*m_ks bounds what noise does to u",
+        ),
+        (
+            {"constraints": Constraints(noise_over_pi=3.0, noise_std=0.01), "u_min": 0, "u_max": 1},
+            "noise_over_pi = 3.0: .*the noise of y is known",
+        ),
+        (
+            {"scenario": RUN, "objective": "iae", "duration": 3.0},
+            "duration = 3.0: .*the scenario says",
+        ),
+        (
+            {"scenario": RUN, "objective": "iae", "reference": 1.0},
+            "reference = 1.0: .*the scenario",
+        ),
+        ({"scenario": RUN, "objective": "iae", "load": 2.0}, "load = 2.0: .*the scenario says"),
+        (
+            {"scenario": RUN, "objective": "iae", "quantile": 0.5},
+            "quantile = 0.5: .*give an Objectiv",
+        ),
+        ({"scenario": RUN, "objective": "iae", "samples": 3}, "samples = 3: .*no plant is drawn"),
+    ],
+)
+def test_options_without_effect_are_refused(arguments: dict[str, Any], message: str) -> None:
+    """With their value, why, and what to do, before anything is searched."""
+    with pytest.raises(ValueError, match=message):
+        ql.tune(arguments.pop("plant", ([1.0], [1.0, 1.0])), 0.01, **{"compare": (), **arguments})
+
+
+def test_the_constraints_of_a_result_can_be_given_again() -> None:
+    """The bound of noise that a share or a ratio made takes their place, and is the same again."""
+    how: dict[str, Any] = {"structure": "pi", "compare": (), "u_min": -1.0, "u_max": 1.0}
+    given = (Constraints(noise_std=1e-3, noise_share=0.1), Constraints(noise_over_pi=3.0))
+    for constraints, name in zip(given, ("u_std", "m_ks"), strict=True):
+        found = ql.tune(LAGS, DT, constraints=constraints, **how)
+        again = ql.tune(LAGS, DT, constraints=found.constraints, **how)
+        assert getattr(again.constraints, name) == getattr(found.constraints, name) is not None
+        assert again.design.objective == pytest.approx(found.design.objective, rel=1e-3)
 
 
 @pytest.mark.parametrize(

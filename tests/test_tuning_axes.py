@@ -20,13 +20,14 @@ from quell.analysis import MultivariableLoop, analyse_axes
 from quell.lti.models import System, zero_order_hold
 from quell.setup import SetupError, load_axes, made_axes
 from quell.tuning import Constraints, TunedAxes, tune_axes
-from quell.tuning.axes import _exact, _made, _nominal, diagonal_entry
+from quell.tuning.axes import _exact, _given_gain, _made, _nominal, diagonal_entry
 from quell.tuning.optimiser.coupled import CoupledLoops, Law, Limits, Plant, integral_gain
 from quell.tuning.optimiser.loops import area_of_step, pulse_in_blocks
 
 from .benchmark_module import benchmark
 from .commands import Shown
 from .setups import GANTRY
+from .test_coupling import tanks
 
 M = np.array([[1.2e-3, 3.5e-4], [3.5e-4, 2e-4]])  # [kg m²]
 DT = 1e-3
@@ -161,6 +162,69 @@ def test_what_cannot_be_met_is_told_with_what_to_do() -> None:
     assert found.excess > 1e-3
     line = next(each for each in found.verdicts() if each.startswith("NOT met"))
     assert "give the B0 of the machine" in line
+
+
+def of_tanks(B0: Any) -> ql.Axes:
+    """Return axes of two tanks that are not tuned."""
+    level = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=0.1, dt=1.0), omega_c=0.02)
+    return ql.Axes({"h1": level, "h2": level}, B0=B0)
+
+
+def test_a_zero_in_the_right_half_plane_is_named_and_the_given_b0_not_asked_for_again() -> None:
+    """Tanks with their exact B0: no bandwidths are stable, and the inputs to pair are told."""
+    plant = tanks((0.43, 0.34))
+    found = tune_axes(plant, of_tanks(plant.C @ plant.B))
+    assert not found.met
+    assert found.given.is_of_plant
+    assert found.given.is_turned
+    told = found.summary()
+    assert "no bandwidths are stable with this B0" in told
+    assert "a zero in the right half plane, at 0.0208" in told
+    assert "pair by the gains at rest, h1 with input 2, h2 with input 1" in told
+    assert "NOT decoupled by this B0, which is that of the plant" in told
+    for done in ("give the B0", "use B0"):
+        assert done not in told
+    zeros = found.to_json()["coupled"]["given_B0"]["zeros"]
+    assert zeros == [[pytest.approx(0.0208, abs=1e-4), 0.0]]
+
+
+@pytest.mark.slow
+def test_the_pairs_that_are_proposed_meet_the_bounds() -> None:
+    """The same tanks with the other inputs; the B0 of the plant, which is worse, is not asked for."""
+    plant = tanks((0.43, 0.34))
+    rest = -plant.C @ np.linalg.solve(plant.A, plant.B) / np.array([[62.0], [90.0]])
+    found = tune_axes(plant, of_tanks(rest * [[0.0, 1.0], [1.0, 0.0]]))
+    assert found.met
+    assert found.given.pairs is None
+    assert "give the B0" not in found.summary()
+    assert "a zero in the right half plane" in found.summary()
+
+
+def test_a_b0_is_compared_with_that_of_the_plant() -> None:
+    """To about 1 %, each row to a factor, also below the lags of actuators; another one is asked for only where it helps."""
+
+    def judged(plant: Any, given: ql.Axes) -> tuple[bool, bool | None]:
+        nominal = _nominal(plant, given, [None])[0]
+        found = _given_gain(plant, given, None, nominal, 20.0, 20.0)
+        assert not found.is_turned
+        assert found.zeros == ()
+        return found.is_of_plant, found.is_other_better
+
+    B0 = np.linalg.inv(M)
+    assert judged(machine(), axes()) == (True, False)
+    for scale in (B0 * [[3.0], [1.0]], B0 * [[1.0, 1.01], [1.0, 1.0]]):
+        assert judged(machine(), axes(np.linalg.inv(scale))) == (True, False)
+    for wrong in (np.diag(np.diag(M)), np.linalg.inv(B0 * [[1.0, 1.05], [1.0, 1.0]])):
+        assert judged(machine(), axes(wrong)) == (False, True)
+    # Lags of 0.3 and 1 ms: the gains far above them are not B0, those below are.
+    A, B = np.zeros((6, 6)), np.zeros((6, 2))
+    A[0, 1] = A[2, 3] = 1.0
+    A[[1, 3], 4:] = B0
+    A[4, 4], A[5, 5] = -1 / 3e-4, -1 / 1e-3
+    B[4, 0], B[5, 1] = 1 / 3e-4, 1 / 1e-3
+    lagging = ql.plants.MultivariableLinearPlant(A, B, np.eye(6)[[0, 2]])
+    assert judged(lagging, axes()) == (True, False)
+    assert judged(lagging, axes(np.diag(np.diag(M)))) == (False, None)
 
 
 @pytest.mark.slow

@@ -478,7 +478,7 @@ def test_a_window_that_lacks_too_much_of_one_axis_is_left_out() -> None:
 def test_a_recording_of_axes_is_watched_as_the_running_loop_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In blocks of any size; by the command, from a recording and from a saved run."""
+    """In blocks of any size; by the command, from a recording, also without its header, and from a saved run."""
     move = ql.signals.Sinusoid(1.0, 3.0)
     found = Outcome(None, gantry(learning=True), (move, move), duration=5.0)
     sink = WatchSink(tmp_path / "watch.json", Machine(window=2.0))
@@ -497,7 +497,8 @@ def test_a_recording_of_axes_is_watched_as_the_running_loop_was(
     for name in kept.watch.features:
         np.testing.assert_allclose(kept.watch.values(name), again.watch.values(name), rtol=1e-6)
     found.run.save(tmp_path / "run.nc")
-    for name in ("run.csv", "run.nc"):
+    (tmp_path / "alone.csv").write_bytes((tmp_path / "run.csv").read_bytes())
+    for name in ("run.csv", "run.nc", "alone.csv"):
         shown = in_this_process(
             ["watch", str(tmp_path / name), "--window", "2"], monkeypatch, capsys
         )

@@ -40,7 +40,7 @@ from quell.files import MAX_SIZE, nonfinite_to_none
 from quell.identification import Measured, excitation
 from quell.identification.result import Identified, nrmse, simulated_plant
 from quell.realtime.devices import Device, TwinDevice
-from quell.realtime.recordings import Event, header_path, load, load_one
+from quell.realtime.recordings import Event, is_recording, load, load_one
 from quell.realtime.run import RigRun, run_rig
 from quell.realtime.safety import Safety
 from quell.realtime.supervisor import Cause
@@ -145,9 +145,9 @@ def measured(
     """Read input and output from a file of any kind that quell knows.
 
     A NetCDF file is a run that ``Trajectory.save`` wrote; a MCAP file, or a CSV file with the
-    header of a recording beside it, is a recording of ``quell run-rig``; another file is a table
-    in text, for which ``columns``, ``dt`` and ``time_unit`` are those of ``read_record``; with
-    ``reference`` a column r belongs to the usual ones.
+    first line of a recording or its header beside it, is a recording of ``quell run-rig``; another
+    file is a table in text, for which ``columns``, ``dt`` and ``time_unit`` are those of
+    ``read_record``; with ``reference`` a column r belongs to the usual ones.
 
     Raises
     ------
@@ -204,8 +204,7 @@ def measured_axes(
         as ``measured``; and for a table without names of both.
     """
     given = actuators or columns or dt or time_unit
-    is_recording = path.suffix.lower() == ".mcap" or header_path(path).is_file()
-    if path.suffix.lower() == ".nc" or (is_recording and not given):
+    if path.suffix.lower() == ".nc" or (not given and is_recording(path)):
         return _of_run(path, axes, given, max_size)
     for name, value in (("axes", axes), ("actuators", actuators)):
         if not value:
@@ -267,10 +266,7 @@ def recorded_run(
         return None
     if path.suffix.lower() == ".nc":
         return Trajectory.load(path, max_size)
-    header = path.with_name(path.name + ".json")
-    if path.suffix.lower() == ".mcap" or header.is_file():
-        return load_one(path, max_size)
-    return None
+    return load_one(path, max_size) if is_recording(path) else None
 
 
 def runs_in(
@@ -284,7 +280,7 @@ def runs_in(
         return {}
     if path.suffix.lower() == ".nc":
         run = _saved_run(path, max_size)
-    elif path.suffix.lower() == ".mcap" or header_path(path).is_file():
+    elif is_recording(path):
         run = load(path, max_size)
     else:
         return {}

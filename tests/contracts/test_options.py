@@ -164,9 +164,9 @@ CASES: dict[str, dict[str, Case]] = {
     "run-rig": {
         "SETUP": (_OF_SETUP, ("other.toml", *_FIGURES)), "--example": ("--example",), "--device": ("--device", "twin:torsional"), "--seconds": ("--seconds", "2"), "--omega-c": ("--omega-c", "3"),
         "--omega-o": ("--omega-o", "9"), "--spin": ("--spin", "0.001"), "--priority": ("--priority", "0"), "--mcap": ("--mcap", "new.mcap"), "--csv": ("--csv", "new.csv"), "--memory": ("--memory", "servo.qllm"),
-        "--live": ("--live", "0"), "--live-origin": ("--live-origin", "https://a.org"), "--watch": ("--watch", "new.json"), "--save": ("--save", "taken.json"),
+        "--live": ("--live", "0"), "--live-origin": ("--live-origin", "https://a.org"), "--watch": ("--watch", "new.json"), "--save": ("--save", "taken.nc"),
     },
-    "replay": {"RECORD": ("other.csv",), "--setup": ("--setup", "other.toml"), "--save": ("--save", "taken.json")},
+    "replay": {"RECORD": ("other.csv",), "--setup": ("--setup", "other.toml"), "--save": ("--save", "taken.nc")},
     "sweep": {
         "SETUP": (_OF_SETUP, ("other.toml", *_FIGURES)), "--folder": ("--folder", "elsewhere"), "--dask": ("--dask", "tcp://127.0.0.1:1"), "--workers": ("--workers", "1"),
         "--repeat": ("--repeat", "0"), "--worst": (("real",), ("--worst", "1", "--repeat", "0")), "--save": ("--save", "run.nc"),
@@ -258,7 +258,8 @@ def _write_inputs() -> None:
         np.savetxt(log, table, delimiter=",", header="t,u,y,r", comments="")
     two = np.column_stack([t, u, y, rng.normal(size=600), rng.normal(size=600)])
     np.savetxt("two.csv", two, delimiter=",", header="t,u,y,v,q", comments="")
-    Path("taken.json").write_text("{}", encoding="utf-8")
+    for name in ("taken.json", "taken.nc"):
+        Path(name).write_text("{}", encoding="utf-8")
     Path("plants.csv").write_text("m1,m2,k_lin,k_nonlin,lambda,tau\n1,1,1,0,0,0.01\n")
 
 
@@ -341,6 +342,7 @@ def test_no_output_replaces_a_file(
     """Named files are looked at before the work; so the option has an effect."""
     base = [each for each in BASES[command] if each != "--no-figures"]
     more = () if option == "--figures" or command in ("b0", "rank", "watch", "doctor") else _FIGURES
-    code, told = outcome(command, *base, *more, option, "taken.json")
+    taken = "taken.nc" if option == "--save" else "taken.json"
+    code, told = outcome(command, *base, *more, option, taken)
     assert code != 0
-    assert "taken.json" in told
+    assert taken in told

@@ -15,6 +15,7 @@ The error q of the plain observer in a record: what certificates are about.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ from quell.controllers.prefilters import without_prefilters
 from quell.files import nonfinite_to_none
 from quell.guard import Guard, UnguardedDesign
 from quell.guard.guard import CorrectionGains, gains_of, named_plants
+from quell.learners.base import NoLearner
 from quell.observers.design import f_learned_response, response
 from quell.observers.forms import state_for, without_delay
 from quell.plants.flexible import CubicSpringPlant
@@ -45,6 +47,7 @@ class Certificate:
     kappa: float  #: κ of the guard
     gains: dict[str, CorrectionGains]  #: Γ and Γ_y [s^n], by name of the plant
     excluded: tuple[str, ...] = ()  #: what the bounds do not cover
+    condition: str = ""  #: why they do not hold for the controller as it is; empty if they do
 
     @property
     def worst(self) -> str:
@@ -107,6 +110,8 @@ class Certificate:
                 f"with any learner |q| stays below {self.error_factor:.3g} max |q_0|, "
                 f"and |y − y_0| below {self.output_factor:.3g} max |q_0|",
             ]
+        if self.condition:
+            lines.insert(0, self.condition)
         if self.excluded:
             lines.append(f"not covered: {'; '.join(self.excluded)}")
         return "\n".join(lines)
@@ -124,6 +129,7 @@ class Certificate:
             "worst": self.worst,
             "plants": {name: gains._asdict() for name, gains in self.gains.items()},
             "excluded": list(self.excluded),
+            "condition": self.condition,
         }
         return dict(nonfinite_to_none(found))
 
@@ -148,7 +154,8 @@ def certify(
         a plant as for ``analyse``, or a list of plants, or ``{name: plant}``. The bounds hold for
         these plants, not for those between them.
     controller
-        an ``ADRC``; κ is that of its guard, or of ``Guard()`` if it has none.
+        an ``ADRC``; κ is that of its guard. Without guard or learner κ is that of ``Guard()``, and
+        ``condition``, the first line of the text, says that the bounds are not those of this loop.
     delay
         additional dead time of the loops [s].
     actuator_lag
@@ -175,7 +182,8 @@ def certify(
         sampled = sampled_plant(linear, adrc.dt, own_delay + delay, actuator_lag)
         gains[name] = gains_of(name, sampled, adrc.observer, adrc.parameters.law)
         excluded += _not_covered(plant, adrc.parameters.limits)
-    return Certificate(guard_bound(adrc), gains, tuple(dict.fromkeys(excluded)))
+    not_covered = tuple(dict.fromkeys(excluded))
+    return Certificate(guard_bound(adrc), gains, not_covered, condition_of({"": adrc}))
 
 
 def linear_adrc(controller: Controller) -> ADRC:
@@ -195,6 +203,19 @@ def guard_bound(controller: ADRC) -> float:
     """Return κ of a controller's guard, or that of ``Guard()``."""
     design = controller.parameters.guard
     return Guard().bound if isinstance(design, UnguardedDesign) else float(design.bound)
+
+
+def condition_of(axes: Mapping[str, ADRC]) -> str:
+    """Return why bounds with ``guard_bound`` are not those of these axes; empty if they are."""
+    learning = {
+        name: axis for name, axis in axes.items() if not isinstance(axis.learner, NoLearner)
+    }
+    if not learning:
+        return "no learner: nothing to certify; this holds with a learner and guard=Guard()"
+    free = [name for name, axis in learning.items() if axis.guard is None]
+    if not free:
+        return ""
+    return f"NOT guarded{': ' * any(free)}{', '.join(free)}: holds with guard=Guard()"
 
 
 def _not_covered(plant: Any, limits: Limits) -> list[str]:

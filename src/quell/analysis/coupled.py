@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.certificate import guard_bound, linear_adrc
+from quell.analysis.certificate import condition_of, guard_bound, linear_adrc
 from quell.analysis.matrices import estimates_at, gain_at, sampled_matrices
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
@@ -58,6 +58,8 @@ class CoupledCertificate:
     axes: tuple[str, ...]
     excluded: tuple[str, ...] = ()
     """What the bounds do not cover."""
+    condition: str = ""
+    """Why the bounds do not hold for the axes as they are; empty if they do."""
 
     @property
     def spectral_radius(self) -> float:
@@ -120,9 +122,10 @@ class CoupledCertificate:
     def __str__(self) -> str:
         rho = f"ρ(ΓK) = {self.spectral_radius:.3g}"
         rest = f"\nnot covered: {'; '.join(self.excluded)}" if self.excluded else ""
+        begin = f"{self.condition}\n" if self.condition else ""
         if not self.certified:
             return (
-                f"not certified: {rho} must be below 1: multiply all κ by less than "
+                f"{begin}not certified: {rho} must be below 1: multiply all κ by less than "
                 f"{self.largest_factor:.3g}, or lower that of {self.weakest} most{rest}"
             )
         largest = self.error_factors.sum(axis=1)
@@ -130,7 +133,8 @@ class CoupledCertificate:
             f"{x:.3g} for {name}" for name, x in zip(self.axes, largest, strict=True)
         )
         return (
-            f"certified: {rho}; all κ may be multiplied by up to {self.largest_factor:.3g}\n"
+            f"{begin}certified: {rho}; all κ may be multiplied by up to "
+            f"{self.largest_factor:.3g}\n"
             f"with any learners |q| stays below these multiples of the largest |q_0|: {bounds}"
             f"{rest}"
         )
@@ -148,6 +152,7 @@ class CoupledCertificate:
             "uncertain": self.uncertain.tolist(),
             "error_factors": self.error_factors.tolist(),
             "excluded": list(self.excluded),
+            "condition": self.condition,
         }
         return dict(nonfinite_to_none(found))
 
@@ -252,7 +257,8 @@ def certify_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Coupled
     plant
         a plant with an output for each axis, as for ``analyse_axes``.
     axes
-        the controller; κ of each axis is that of its guard, or of ``Guard()`` if it has none.
+        the controller; κ of each axis is that of its guard, or of ``Guard()`` if it has none;
+        ``condition`` names the axes that learn without guard, for which the bounds do not hold.
     operating_point
         (x, u) at which a nonlinear plant is linearised, and y of which B0 is evaluated at.
 
@@ -281,7 +287,8 @@ def certify_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Coupled
     to_error, to_output = coupled_loop(matrices, adrcs, inverse)
     kappa = [guard_bound(adrc) for adrc in adrcs]
     found = certify_coupled(to_error, kappa, to_output, axes.names)
-    return replace(found, excluded=_not_covered(plant, axes))
+    condition = condition_of(dict(zip(axes.names, adrcs, strict=True)))
+    return replace(found, excluded=_not_covered(plant, axes), condition=condition)
 
 
 def _not_covered(plant: Any, axes: Axes) -> tuple[str, ...]:

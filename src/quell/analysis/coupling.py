@@ -17,11 +17,21 @@ G is taken at rest and at the bandwidth of the loops. A plant that integrates ha
 what counts then is *B0*, the gains from u to the first derivative of each y that u reaches, with
 ``y_i^(n_i) = f_i + (B0 u)_i``. Sampled, these are the first pulses: of row i the first sample in
 which any input moves y_i, dead times of the inputs apart.
+
+B0 are the gains far above the dynamics of the plant. With a zero in the right half plane they say
+nothing of the gains at rest, and loops that ``u = B0⁻¹ v`` takes apart may be unstable with any
+bandwidths: with a plant that is stable and a controller that integrates, all loops together can
+only be stable if ``det(G(0) B0⁻¹) > 0`` (the last coefficient of the closed loop's polynomial;
+Grosdidier, Morari & Holt, *Ind. Eng. Chem. Fundam.* 24, 1985), and each real zero in the right half
+plane turns this sign. No feedback moves such a zero z, and in its direction no loop is faster than
+about z/2 (Skogestad & Postlethwaite, sections 5.7 and 6.5). Zeros faster than the samples are those
+of sampling, and zeros ten times above the bandwidth do not matter to it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -32,7 +42,9 @@ from quell import checks
 from quell.analysis.margins import Complex
 from quell.analysis.matrices import MatrixResponse, sampled_matrices
 from quell.analysis.multivariable import grouped_poles
+from quell.lti.canonical import format_roots
 from quell.lti.models import ZERO_TOLERANCE, MatrixSystem
+from quell.lti.zeros import invariant_zeros
 from quell.types import Matrix, Vector
 
 # A gain that changes by less than this factor leaves two loops as they are. Chosen by hand: it is
@@ -46,6 +58,10 @@ _SINGULAR = 100.0
 _RANK_TOLERANCE = 1e-9
 # Rounds of balancing rows and columns.
 _BALANCING = 30
+# Zeros in the right half plane that count: faster than this share of the sampling rate they are
+# those of sampling, ten times above the bandwidth they do not matter, and with a damping between
+# ±1e-6 they are on the axis, as in ``canonical``.
+_OF_SAMPLES, ABOVE_BANDWIDTH, _LEAST_DAMPING = 1.0, 10.0, 1e-6
 # An entry below this share of its row and its column, balanced, is no path between two axes.
 _NO_PATH = 1e-6
 
@@ -97,6 +113,8 @@ class Coupling:
 
     at: tuple[GainsAt, ...]
     axes: tuple[str, ...]
+    zeros: tuple[complex, ...] = ()
+    """Invariant zeros in the right half plane, up to ten times the bandwidth [rad/s]."""
 
     @property
     def decided(self) -> bool:
@@ -115,8 +133,30 @@ class Coupling:
 
     @property
     def advice(self) -> str:
-        """One sentence a regime, and what to do; the first word is NOT if nothing is decided."""
-        return "\n".join(self._sentence(gains) for gains in self.at)
+        """One sentence a regime, and what to do; the first word is NOT if nothing is decided.
+
+        A last sentence names the zeros in the right half plane, if there are any.
+        """
+        lines = [": ".join(filter(None, self._sentence(gains))) for gains in self.at]
+        return "\n".join([*lines, *([about_zeros(self.zeros)] if self.zeros else ())])
+
+    @property
+    def facts(self) -> str:
+        """One sentence a regime, without what to do."""
+        return "\n".join(self._sentence(gains)[0] for gains in self.at)
+
+    @property
+    def pairs(self) -> tuple[int, ...] | None:
+        """The input of each axis by the gains at rest; None for a plant that has none.
+
+        It is also None if no pairs have positive relative gains.
+        """
+        first = self.at[0]
+        if first.where != "at rest" or _is_singular(first):
+            return None
+        found = _pairing(first.relative)
+        sound = np.all(first.relative[np.arange(len(found)), found].real > 0.0)
+        return tuple(found) if sound else None
 
     def __str__(self) -> str:
         lines = []
@@ -129,18 +169,17 @@ class Coupling:
             lines.append(f"{kind} {_of(gains.where)}: [{table}]")
         return "\n".join([*lines, self.advice])
 
-    def _sentence(self, gains: GainsAt) -> str:
+    def _sentence(self, gains: GainsAt) -> tuple[str, str]:
+        """Return what the gains are like, and what to do."""
         where = _of(gains.where)
         if _is_singular(gains):
-            return self._undecided(gains, where)
+            return self._undecided(gains, where), ""
         relative, axes = gains.relative, self.axes
         pairs = _pairing(relative)
         if any(i != j for i, j in enumerate(pairs)):
             text = ", ".join(f"{axes[i]} by input {j + 1}" for i, j in enumerate(pairs) if i != j)
-            return (
-                f"the axes are paired with the wrong inputs {where}: move {text}, or use B0 "
-                "(u = B0⁻¹ v)"
-            )
+            rest = "" if self.zeros else ", or use B0 (u = B0⁻¹ v)"
+            return f"the axes are paired with the wrong inputs {where}", f"move {text}{rest}"
         changes = _changes(relative)
         first = int(np.argmax(changes))
         if changes[first] <= _INDEPENDENT:
@@ -161,21 +200,23 @@ class Coupling:
             )
         elif largest > 1.0:
             known = f" (an error of {100.0 / largest:.2g} % in one entry would make it singular)"
-        return f"{axes[pair[0]]} and {axes[pair[1]]} are coupled {how} {where}: use B0{known}"
+        fact = f"{axes[pair[0]]} and {axes[pair[1]]} are coupled {how} {where}"
+        return fact, "choose other inputs or outputs" if self.zeros else f"use B0{known}"
 
-    def _independent(self, gains: GainsAt, where: str, change: float) -> str:
-        """Return the sentence for axes that do not notice each other's loops."""
+    def _independent(self, gains: GainsAt, where: str, change: float) -> tuple[str, str]:
+        """Return what axes are like that do not notice each other's loops, and what to do."""
         size = np.abs(_balanced(gains.G))
         path = size > _NO_PATH * np.minimum(size.max(axis=0), size.max(axis=1)[:, None])
         for i, j in np.argwhere(path & ~path.T):
             return (
-                f"{self.axes[j]} moves {self.axes[i]} {where}, but not the other way: the loops "
-                "stay stable without B0, and with it this motion is not left to the observer"
+                f"{self.axes[j]} moves {self.axes[i]} {where}, but not the other way",
+                "the loops stay stable without B0, and with it this motion is not left to the "
+                "observer",
             )
         return (
             f"the axes hardly notice each other {where} (with the other loops closed a gain "
-            f"changes by a factor of {change:.3g} at most): a controller for each axis, with its "
-            "own b0, is enough"
+            f"changes by a factor of {change:.3g} at most)",
+            "a controller for each axis, with its own b0, is enough",
         )
 
     def _undecided(self, gains: GainsAt, where: str) -> str:
@@ -260,7 +301,46 @@ def coupling(
             )
         response = MatrixResponse(MatrixSystem(N, B, C, np.zeros((p, m))))
         found.append(_gains_at(f"at {bandwidth:.4g} rad/s", response([bandwidth], dt)[0]))
-    return Coupling(tuple(found), names)
+    limit = _OF_SAMPLES / dt if bandwidth is None else ABOVE_BANDWIDTH * bandwidth
+    return Coupling(tuple(found), names, unstable_zeros(N, B, C, dt, limit))
+
+
+def about_zeros(zeros: Sequence[complex]) -> str:
+    """Return what zeros in the right half plane [rad/s] mean for the loops."""
+    what = "a zero" if len(zeros) == 1 else "zeros"
+    return (
+        f"the plant has {what} in the right half plane, at {format_roots(np.array(zeros))} rad/s, "
+        "which no B0 moves: at least one loop has to stay slower than about half of it"
+    )
+
+
+def is_turned(N: Matrix, B: Matrix, C: Matrix) -> bool:
+    """Return whether no controllers that integrate, one for each input, are stable together.
+
+    ``N`` is Φ − I of a sampled plant. With loops of positive gains the closed loop's polynomial
+    has at z = 1 the sign of ``det(−N) det(C (−N)⁻¹ B)``, which must be that of all other z beyond
+    its zeros. It is that of one matrix, whether the plant integrates or not.
+    """
+    whole = np.block([[-N, B], [-C, np.zeros((C.shape[0], B.shape[1]))]])
+    rows, columns = balancing(whole)
+    whole = whole * rows * columns
+    sizes = np.linalg.svd(whole, compute_uv=False)
+    return bool(sizes[-1] > _RANK_TOLERANCE * sizes[0] and np.linalg.slogdet(whole)[0] < 0.0)
+
+
+def unstable_zeros(N: Matrix, B: Matrix, C: Matrix, dt: float, limit: float) -> tuple[complex, ...]:
+    """Return the zeros in the right half plane of a sampled plant, up to a limit [rad/s].
+
+    ``N`` is Φ − I, so that zeros near z = 1 are exact. Zeros at rest, and those that are faster
+    than the samples, are left out.
+    """
+    found = invariant_zeros(N, B, C)
+    if not found.full_rank:
+        return ()
+    zeros = np.log1p(found.values.astype(complex)) / dt
+    size = np.abs(zeros)
+    kept = (zeros.real > _LEAST_DAMPING * size) & (size <= min(limit, _OF_SAMPLES / dt))
+    return tuple(zeros[kept][np.argsort(size[kept])].tolist())
 
 
 def _gains_at(where: str, G: Complex) -> GainsAt:
@@ -280,12 +360,19 @@ def _relative(G: Complex) -> tuple[Complex | None, float]:
 
 def _balanced(G: Complex) -> Complex:
     """Return G with rows and columns scaled to sizes of one, which leaves Λ as it is."""
-    G = G.copy()
+    rows, columns = balancing(G)
+    return G * rows * columns
+
+
+def balancing(G: Any) -> tuple[Matrix, Matrix]:
+    """Return factors of the rows (p, 1) and of the columns (1, m) that scale their sizes to one."""
+    factors = [np.ones((G.shape[0], 1)), np.ones((1, G.shape[1]))]
     for _ in range(_BALANCING):
         for axis in (1, 0):
-            size: NDArray[np.float64] = np.linalg.norm(G, axis=axis, keepdims=True)
-            G = G / np.where(size > 0.0, size, 1.0)
-    return G
+            scaled = G * factors[0] * factors[1]
+            size: NDArray[np.float64] = np.linalg.norm(scaled, axis=axis, keepdims=True)
+            factors[1 - axis] = factors[1 - axis] / np.where(size > 0.0, size, 1.0)
+    return factors[0], factors[1]
 
 
 def _first_pulses(A: Matrix, B: Matrix, C: Matrix) -> Matrix:

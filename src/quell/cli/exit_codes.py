@@ -46,7 +46,7 @@ _MEANINGS = {
     ),
     ExitCode.ENDED_BY_SAFETY: (
         "quell run-rig, quell tune --device: a limit of safety or a fault ended the run; u was "
-        "ramped to zero"
+        "ramped to zero; quell proxy: the drive was lost, a line with NOT says how"
     ),
     ExitCode.DIVERGED: (
         "quell run, compare, reproduce two-mass and torsional: a simulated run diverged; all "

@@ -105,8 +105,8 @@ class RunOutputs(Outputs):
         Put the figures into this folder, as PNG, SVG and PDF; by default into quell-figures, or
         quell-figures-2 and so on if that exists.
     save
-        Write the whole record to this file: as NetCDF, which `Trajectory.load` reads (of several
-        axes `AxesTrajectory.load`), or as CSV with names and units if it ends in .csv.
+        Write the whole record to this file. One that ends in .nc is NetCDF, which `Trajectory.load`
+        reads (of several axes `AxesTrajectory.load`); one in .csv is text with names and units.
     """
 
     save: Path | None = None

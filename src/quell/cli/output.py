@@ -95,12 +95,15 @@ def check_outputs(outputs: T, figures: Sequence[str] = (), recordings: Sequence[
     Raises
     ------
     ValueError
-        for a file that exists, unless ``outputs.overwrite``; that cannot be written; or that two
-        outputs have in common; or a folder that cannot be created.
+        for a record whose name ends neither in .nc nor in .csv; for a file that exists, unless
+        ``outputs.overwrite``; that cannot be written; or that two outputs have in common; or a
+        folder that cannot be created.
     """
     from quell.experiments.common import figure_files, make_folder
     from quell.files import check_writable, new_folder
 
+    if isinstance(outputs, RunOutputs):
+        _check_record(outputs.save)
     named = (outputs.json, outputs.save if isinstance(outputs, RunOutputs) else None)
     files = [file for file in named if file is not None]
     folder = outputs.figures if isinstance(outputs, Outputs) else None
@@ -115,6 +118,16 @@ def check_outputs(outputs: T, figures: Sequence[str] = (), recordings: Sequence[
     if isinstance(outputs, Outputs) and folder is FIGURES:
         return replace(outputs, figures=new_folder(FIGURES))
     return outputs
+
+
+# Endings of a record's file, and what writes each.
+_RECORDS = (".nc", ".csv")
+
+
+def _check_record(path: Path | None) -> None:
+    if path is not None and path.suffix.lower() not in _RECORDS:
+        rule = "must end in .nc, for NetCDF, or in .csv, for text with names and units"
+        raise ValueError(f"--save = {str(path)!r}: {rule}")
 
 
 def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:

@@ -226,6 +226,9 @@ def proxy(
     setup with [[axis]] stands between a host and a drive of as many measurements and control
     signals.
 
+    Where the drive falls silent the host gets no measurement either. After a second of that, or
+    where the drive has set u to zero or ended the session, the proxy ends, with exit code 3.
+
     Parameters
     ----------
     setup
@@ -275,8 +278,19 @@ def proxy(
             of_axis, of = (f"{axis}: ", "v") if several else ("", "u")
             text = f"{of} = {each.u:.6g}, f = {each.f:.6g}, {each.status!r}"
             print(f"last tick: {of_axis}{text}")
+        count = drive.counters
+        missing = f"ticks without a measurement of it: {count['missing']}"
+        print(f"drive: {missing}, commands that could not be sent to it: {count['unsent']}")
+        fault = drive.fault
     for note in notes:
         print(note)
+    if fault:
+        ended = "the host's session was ended, and the drive told to set u to zero, if it hears"
+        print(
+            f"NOT connected to the drive at {url}: {fault}; {ended}. Look at the drive, its power "
+            "and its wire, then start the proxy again"
+        )
+        sys.exit(ExitCode.ENDED_BY_SAFETY)
 
 
 # ---- quell run-rig ----
@@ -388,7 +402,11 @@ def run_rig(
     if several:
         rule = "is for one axis; change the bandwidths of each [[axis]] in the file"
         refuse({"omega_c": (omega_c, None), "omega_o": (omega_o, None)}, rule)
-    given = _loaded(name, _changed(data, changes), trust)
+    tables = _changed(data, changes)
+    if seconds is not None and isinstance(windows := tables.get("metrics"), list):
+        # A shorter run is not judged after its end.
+        tables["metrics"] = [each for each in windows if not _begins_after(each, seconds)]
+    given = _loaded(name, tables, trust)
     if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
 
@@ -543,6 +561,11 @@ def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) ->
     return tables
 
 
+def _begins_after(window: Any, seconds: float) -> bool:
+    start = window.get("start") if isinstance(window, Mapping) else None
+    return isinstance(start, int | float) and start >= seconds
+
+
 def check_recordings(files: Iterable[Path], overwrite: bool) -> None:
     """Check suffixes and places of recordings, before the device is opened."""
     from quell.realtime.recordings import file_sink
@@ -633,7 +656,7 @@ def replay(
 ) -> None:
     """Run a setup's observer and learner on a recorded run, and compare the estimates.
 
-    A record of several axes needs a setup with as many [[axis]].
+    A record of several axes needs a setup with the same [[axis]] and actuators, in their order.
 
     Parameters
     ----------
@@ -659,6 +682,8 @@ def replay(
     recorded = load_record(record, max_size)
     try:  # replay refuses a controller that is no ADRC
         names = (given.rig or {}).get("channels", ())
+        if several:
+            _check_actuators(recorded, given)
         replayed = replay_record(recorded, given.controller, channels=names)
     except ValueError as error:
         raise with_path(given.file, "", error, ()) from None
@@ -700,6 +725,18 @@ def replay(
         "setup": given.as_json(),
     }
     write_results(console, results, outputs, paths)
+
+
+def _check_actuators(recorded: Any, given: Setup) -> None:
+    """Check that the actuators of a recorded run are those of a setup, as far as both name them."""
+    from quell.quantities import AxesSignals
+    from quell.realtime.replaying import check_same_names
+    from quell.setup.axes import signals_in
+
+    if isinstance(recorded.signals, AxesSignals):
+        ours: Any = signals_in(given.description, given.controller)
+        both = ([each.name for each in one.u] for one in (recorded.signals, ours))
+        check_same_names("actuators", *both)
 
 
 def _print_scores(

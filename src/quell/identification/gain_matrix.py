@@ -4,12 +4,22 @@ For each axis ``y_i^(n_i) = f_i + Σ_j B0_ij u_j`` the prediction-error fits of 
 made with all u, and with the y of the other axes as known inputs (``running_loop`` has the
 equations). So friction, stiffness and gravity that couple the axes are no load, and need no model.
 
-What a record tells of a row of B0 is in the covariance C of its entries. With the scales of the u,
-``s_j``, the information is ``(S⁻¹ C S⁻¹)⁻¹``; its rows and columns are divided by the roots of its
-diagonal, and the root of the ratio of its eigenvalues is the condition number of the excitation
-(Belsley, Kuh & Welsch, *Regression Diagnostics*, 1980, sec. 3.2): 1 for u that have nothing in
-common, above 30 for u that hardly can be told apart. The eigenvector of the largest eigenvalue of
-``S⁻¹ C S⁻¹``, the combination that is known least, names the actuators that moved together.
+What the u have in common is in the covariance C of the entries of a row for given lag, delay,
+dynamics and noise (these make the errors of all entries alike, which is no matter of the u)::
+
+    C = C_bb − C_bφ C_φφ⁻¹ C_φb
+
+The information is C⁻¹; its rows and columns are divided by the roots of its diagonal, so that the
+units of the u do not count, and the root of the ratio of its eigenvalues is the condition number of
+the excitation (Belsley, Kuh & Welsch, *Regression Diagnostics*, 1980, sec. 3.2): 1 for u that have
+nothing in common, above 30 for u that hardly can be told apart. The eigenvector of the least
+eigenvalue, the combination that is known least, names the actuators that moved together.
+
+A u that moves no axis by four of its deviations says nothing of its actuator: it rested, or what is
+recorded as u is not what reached the machine. In the second case the actuator is a load that no
+model of the noise describes, and that is correlated with the y and u of the other axes: the entries
+of the others are wrong by far more than their deviations. To leave the column out does not help, as
+what is missing is then missing as well. So no entry is taken as known.
 
 Where the error is not white, or depends on past u, the model of the noise is not true, and in a
 loop the gains are biased. The deviations are then multiplied by the root of ζ over its limit, or by
@@ -29,6 +39,7 @@ import numpy as np
 
 from quell import checks
 from quell.identification.input_gain import (
+    UNSEEN,
     check_motion,
     fits,
     gains,
@@ -91,7 +102,8 @@ class InputGainMatrix:
     white: tuple[bool, ...]  #: whether the error of each axis is white, at 99 %
     independent: tuple[bool, ...]  #: whether it is independent of the u before, at 99 %
     converged: tuple[bool, ...]  #: whether the search of each axis ended at a minimum
-    together: tuple[tuple[str, ...], ...]  #: for each axis the actuators that moved together
+    together: tuple[tuple[str, ...], ...]
+    """For each axis the actuators that moved together; none up to a condition number of 30."""
     dt: float  #: sample time of the record [s]
     samples: int  #: number of samples of the record
 
@@ -107,11 +119,26 @@ class InputGainMatrix:
 
         It is known if its interval is within ±30 % of it, or, for a small one, within ±30 % of the
         largest entries of its row and column, where these are scaled to have 1 for the largest.
+        Where there are actuators that are ``unseen``, none is known: they may have moved the axes.
         """
+        if self.unseen:
+            return np.ones(self.B0.shape, dtype=bool)
         half = _WITHIN_95 * self.std
         small = np.abs(_balanced(np.abs(self.B0), half)) > _POOR
         with np.errstate(invalid="ignore"):
             return ~(half < _POOR * np.abs(self.B0)) & ~(np.isfinite(half) & ~small)
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Actuators whose u moves no axis, by four deviations: they rested, or are not recorded.
+
+        Actuators that moved together are not among them.
+        """
+        with np.errstate(invalid="ignore"):
+            seen = np.any(np.abs(self.B0) > UNSEEN * self.std, axis=0)
+        together = {name for names in self.together for name in names}
+        pairs = zip(self.actuators, seen, strict=True)
+        return tuple(name for name, moves in pairs if not moves and name not in together)
 
     @property
     def is_poor(self) -> bool:
@@ -121,27 +148,34 @@ class InputGainMatrix:
     @property
     def shortcomings(self) -> tuple[str, ...]:
         """Reasons not to rely on the result; empty for a good one."""
-        found, poor = [], self.poor
-        for i, axis in enumerate(self.axes):
-            if not np.any(poor[i]):
-                continue
-            if self.condition[i] > _COLLINEAR:
+        found, poor, unseen = [], self.poor, self.unseen
+        if unseen:
+            names, are = " and ".join(unseen), "is" if len(unseen) == 1 else "are"
+            found.append(
+                f"{names} {are} not seen to move an axis in this record: {are} {names} recorded, "
+                "in the right column, as applied? What moves the machine and is not in the record "
+                "makes the entries of the other actuators wrong, so no entry of B0 is known; "
+                "actuators that rested have to be moved"
+            )
+        for i, axis in enumerate(self.axes) if not unseen else ():
+            mixed = np.array([name in self.together[i] for name in self.actuators]) & poor[i]
+            if np.any(mixed):
                 found.append(
                     f"axis {axis}: {' and '.join(self.together[i])} moved together (condition "
                     f"number {self.condition[i]:.3g}), so their entries of B0 cannot be told "
                     "apart; excite each actuator at frequencies of its own (quell excite "
                     f"--actuators {len(self.actuators)}), added behind any mixer"
                 )
-                continue
-            low, high = np.moveaxis(self.intervals[i], 1, 0)
-            which = "; ".join(
-                f"of {self.actuators[j]} from {low[j]:.4g} to {high[j]:.4g}"
-                for j in np.flatnonzero(poor[i])
-            )
-            found.append(
-                f"axis {axis}: the excitation is too poor: the entry {which}; move the actuator "
-                "faster and farther, or for a longer time"
-            )
+            alone = np.flatnonzero(poor[i] & ~mixed)
+            if alone.size:
+                low, high = np.moveaxis(self.intervals[i], 1, 0)
+                which = "; ".join(
+                    f"of {self.actuators[j]} from {low[j]:.4g} to {high[j]:.4g}" for j in alone
+                )
+                found.append(
+                    f"axis {axis}: the record is too poor for the entry {which}; move the actuator "
+                    "faster and farther, or for a longer time, and check the order"
+                )
         if not found and self.may_be_singular:
             found.append(
                 "B0 may be singular within its deviations: there may be a motion that no u "
@@ -344,7 +378,7 @@ def _row(
     # In a loop u depends on the error of its own sample: only u before it counts.
     late = u[u.shape[0] - size : -1]
     tests = [residuals(best.error[1:], column, lags) for column in late.T]
-    condition, together = _excitation(covariance, names)
+    condition, together = _excitation(_of_u(best), names)
     # Where the model of the noise is not true, its parameters are not either: quantization of slow
     # motions is not white, for instance.
     misfit = max(each.whiteness / each.whiteness_limit for each in tests)
@@ -375,21 +409,34 @@ def _row(
     }
 
 
-def _excitation(covariance: Matrix, names: Sequence[str]) -> tuple[float, tuple[str, ...]]:
-    """Return the condition number of the excitation, and the actuators that moved together.
+def _of_u(one: LoopFit) -> Matrix:
+    """Return the covariance (m, m) of the gains of u for given nonlinear parameters."""
+    of_phi, of_b = slice(0, one.form.size), one.form.gains_of_u
+    sizes = np.sqrt(np.maximum(np.diag(one.covariance), 0.0))
+    scaled = one.covariance / np.outer(*2 * [np.where(sizes > 0.0, sizes, 1.0)])
+    mixed = scaled[of_b, of_phi]
+    left = scaled[of_b, of_b] - mixed @ np.linalg.pinv(scaled[of_phi, of_phi], hermitian=True) @ (
+        mixed.T
+    )
+    return np.asarray(left * np.outer(sizes[of_b], sizes[of_b]), dtype=np.float64)
 
-    ``covariance`` is that of the gains of u that are scaled to a deviation of 1.
-    """
+
+def _excitation(covariance: Matrix, names: Sequence[str]) -> tuple[float, tuple[str, ...]]:
+    """Return the condition number of the excitation, and the actuators that moved together."""
     sizes = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if len(names) == 1 or not np.all(np.isfinite(covariance)) or not np.all(sizes > 0.0):
         return 1.0, ()
     # The diagonal of the inverse is the information of each u beside the others.
     inverse = np.linalg.pinv(covariance / np.outer(sizes, sizes), hermitian=True)
     own = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
-    values = np.linalg.eigvalsh(inverse / np.outer(own, own))
+    values, vectors = np.linalg.eigh(inverse / np.outer(own, own))
     condition = math.sqrt(values[-1] / max(float(values[0]), values[-1] * _LEAST_SHARE))
-    weakest = np.abs(np.linalg.eigh(covariance)[1][:, -1])
-    taking = weakest > _TAKES_PART * float(np.max(weakest))
+    if condition <= _COLLINEAR:
+        return condition, ()
+    # With ones on the diagonal, an entry of the weakest direction is not above the sum of the
+    # others: at least two take part.
+    weakest = np.abs(vectors[:, 0])
+    taking = weakest > min(_TAKES_PART, 0.9 / (len(names) - 1)) * float(np.max(weakest))
     return condition, tuple(name for name, part in zip(names, taking, strict=True) if part)
 
 

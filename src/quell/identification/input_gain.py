@@ -296,6 +296,9 @@ _POOR = 0.15
 # Deviations within which the interval of 95 % lies, and within which a lag or delay may be zero
 # (99.7 %).
 _WITHIN_95, _WITHIN_99 = 1.96, 3.0
+# Deviations by which a gain must differ from zero for its u to count as recorded: noise is beyond
+# them in one of 16 000 cases.
+UNSEEN = 4.0
 # Longest delay of a loop that is analysed [samples], as in ``quell.plants.linear``.
 _MOST_SAMPLES = 200
 # Least motion of u and y, and the inverse of their largest size: their squares are numbers then.
@@ -415,9 +418,12 @@ class InputGain:
         found = []
         if self.is_poor:
             low, high = self.interval
+            asked = ""
+            if not abs(self.b0) > UNSEEN * self.b0_std:
+                asked = "; this u moves y by no more than noise does: is it u that was recorded?"
             found.append(
                 f"the excitation is too poor: b0 may be anything from {low:.4g} to {high:.4g}; "
-                f"{_EXCITE}"
+                f"{_EXCITE}{asked}"
             )
         if not self.converged:
             found.append("the search did not converge; record longer, or check the order")

@@ -462,6 +462,28 @@ class Kalman:
             checks.positive("frequency", self.frequency, "rad/s")
         checks.positive("prior", self.prior)
         checks.around_one("gain_interval", self.gain_interval)
+        self._check_used()
+
+    def _check_used(self) -> None:
+        """Raise a ``ValueError`` for options of features that there are not."""
+        slow = np.any(checks.vector("state_bandwidth", self.state_bandwidth))
+        unused = {
+            "bias_bandwidth": ("bias", self.bias_bandwidth is not None),
+            "state_bandwidth": ("state", bool(slow)),
+            "prior": ("state", self.prior != Kalman.prior),
+            "frequency": ("state", self.frequency is not None),
+            "gain_interval": ("u", tuple(self.gain_interval) != Kalman.gain_interval),
+        }
+        for option, (feature, is_given) in unused.items():
+            if is_given and not getattr(self, feature) and not self._uses(option):
+                raise ValueError(
+                    f"{option} = {getattr(self, option)!r}: has no effect with {feature} = False; "
+                    f"leave it out, or take {feature} = True"
+                )
+
+    def _uses(self, option: str) -> bool:
+        """Return whether an option has an effect without its feature."""
+        return False
 
     def design(self, observer: ESO, omega_c: float) -> KalmanDesign:
         """Return the parameters for an observer and the controller's bandwidth [rad/s].
@@ -617,6 +639,9 @@ class Harmonic(Kalman):
                 raise ValueError(f"limits = {self.limits!r}: {rule}")
         if self.pair_bandwidth is not None:
             checks.positive("pair_bandwidth", self.pair_bandwidth, "rad/s")
+
+    def _uses(self, option: str) -> bool:
+        return option == "bias_bandwidth" and self.pair_bandwidth is None  # which follows from it
 
     def _check_orders(self) -> None:
         if not checks.is_sequence(self.orders) or len(self.orders) == 0:

@@ -349,6 +349,10 @@ def _meaning(learner: LinearDesign) -> Any:
 # ---- The base class of the learners that are linear in θ ----
 
 
+GAIN_INTERVAL = (0.5, 2.0)
+"""Limits of the effective gain over b0 by default."""
+
+
 class Linear(FeatureLearner):
     """Base class of linear learners; a subclass defines the rule that finds θ.
 
@@ -370,6 +374,11 @@ class Linear(FeatureLearner):
     ) -> None:
         super().__init__(features, frequency, scale, bias_bandwidth)
         self.gain_interval = checks.around_one("gain_interval", gain_interval)
+        if not self.features.has_input and self.gain_interval != GAIN_INTERVAL:
+            raise ValueError(
+                f"gain_interval = {gain_interval!r}: has no effect without u among the features; "
+                "leave it out, or add Input() to features"
+            )
 
     def rule(self, observer: ESO, omega_c: float, features: int) -> Any:
         """Return the parameters of the rule (a NamedTuple)."""
@@ -497,7 +506,7 @@ class NLMS(Linear):
         regularisation: float = 1e-2,
         frequency: float | None = None,
         scale: Any = None,
-        gain_interval: tuple[float, float] = (0.5, 2.0),
+        gain_interval: tuple[float, float] = GAIN_INTERVAL,
         bias_bandwidth: float | None = None,
     ) -> None:
         features, rate = features_first(features, rate, None, "rate")

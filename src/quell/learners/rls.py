@@ -57,7 +57,13 @@ from quell.kernels.functions import is_single
 from quell.kernels.single import add_symmetrically
 from quell.kernels.sized import Scalars, Work, clear
 from quell.learners.recall import RecallMemory, RecallRule, recall_memory, recall_rule
-from quell.learners.regression import Linear, reset_uncertainty, share_excess, update_theta
+from quell.learners.regression import (
+    GAIN_INTERVAL,
+    Linear,
+    reset_uncertainty,
+    share_excess,
+    update_theta,
+)
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -469,7 +475,7 @@ class RLS(Linear):
         recall: bool = False,
         frequency: float | None = None,
         scale: Any = None,
-        gain_interval: tuple[float, float] = (0.5, 2.0),
+        gain_interval: tuple[float, float] = GAIN_INTERVAL,
         bias_bandwidth: float | None = None,
     ) -> None:
         super().__init__(features, frequency, scale, gain_interval, bias_bandwidth)
@@ -496,7 +502,12 @@ class RLS(Linear):
         dt, lag_time = observer.dt, observer.lag_time
         forget = -math.expm1(-dt / (self.memory_time or _MEMORY / omega_c))
         rule: Any = RlsRule(lag_time / dt, forget, self.prior**2)
-        if self.strongest is not None and self.strongest < features:
+        if self.strongest is not None and self.strongest >= features:
+            raise ValueError(
+                f"strongest = {self.strongest}: has no effect, as there are {features} features; "
+                "leave it out, or give fewer"
+            )
+        if self.strongest is not None:
             interval = round(EXCHANGE_LAGS * lag_time / dt)
             rule = SelectionRule(rule, min(omega_c * dt, 1.0), max(interval, 1))
         if self.relearn is not None:

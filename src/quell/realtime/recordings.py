@@ -56,7 +56,7 @@ from quell.files import (
 from quell.quantities import OF_AXES, AxesSignals, signals_from
 from quell.realtime.mcap_reader import MAGIC, MARK, RECORD, SCHEMA, TOPIC, read_mcap
 from quell.records.axes import AxesTrajectory
-from quell.records.record import check_times, columns_of, describe, is_vector, units_of
+from quell.records.record import check_steps, check_times, columns_of, describe, is_vector, units_of
 from quell.records.trajectory import Trajectory
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -305,14 +305,38 @@ def header_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
+def is_recording(path: Path) -> bool:
+    """Return whether a file is a recording: MCAP, or CSV by its first line or the header beside it.
+
+    A table that begins with the columns of a loop is one, as a copy without its header is.
+    """
+    if path.suffix.lower() == ".mcap" or header_path(path).is_file():
+        return True
+    if not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                return True
+        names = _names_in(next(byte_lines(path), b""))
+    except (OSError, ValueError):  # whatever reads the file tells why it can't be read
+        return False
+    return names[: R + 1] == ["time", *(name for name, _ in LOOP_CHANNELS[:R])]
+
+
+def _names_in(line: bytes) -> list[str]:
+    """Return the names of columns in a first line, also behind the mark that Excel puts there."""
+    return line.decode("utf-8-sig", errors="replace").strip().split(",")
+
+
 def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
     """Return header and rows of a ``CsvSink``'s file, without a last line that was cut short.
 
     Without the header beside it, dt comes from the column ``time``; ``features`` are unknown. The
-    rows may take ``most`` bytes.
+    rows may take ``most`` bytes. Times that contradict the header are refused.
     """
     lines = byte_lines(path)
-    names = next(lines, b"").decode("utf-8", errors="replace").strip().split(",")
+    names = _names_in(next(lines, b""))
     if names[:2] != ["time", "k"]:
         raise ValueError("its first line is not the names of a recording's columns: time, k, …")
     beside = header_path(path)
@@ -326,6 +350,8 @@ def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
     if header.columns != tuple(names[1:]):
         others = f"those in {beside.name}" if beside.is_file() else "those of a recording"
         raise ValueError(f"its columns differ from {others}")
+    place = f"in {beside.name}" if beside.is_file() else "of its last row"
+    check_steps(time, rows[:, K], header.dt, f"dt = {header.dt:g} s {place}")
     return header, rows
 
 

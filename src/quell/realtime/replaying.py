@@ -31,7 +31,7 @@ from quell.kernels.dispatch import call_specialised, compiled, explain_compile_e
 from quell.realtime.axes_supervisor import set_applied_controls
 from quell.realtime.channels import ChannelInputs, channel_inputs, checked_channels, pass_channels
 from quell.realtime.devices import SignalCounts, counts_text
-from quell.realtime.recordings import check_one
+from quell.realtime.recordings import check_one, in_column
 from quell.realtime.safety import check_takes_reference, default_hold
 from quell.realtime.supervisor import Mode
 from quell.records.axes import AxesTrajectory
@@ -85,8 +85,9 @@ def replay(
     ValueError
         for a controller that takes u_0 in the place of a reference; for a run without r, y,
         y_measured or u, with samples left out, without measurements, with another sample time or
-        other numbers of signals; for ``u_before`` with a controller that can't start under load;
-        for a schedule without its signals, and channels that the run does not have.
+        other numbers of signals, with axes of other names or in another order; for ``u_before``
+        with a controller that can't start under load; for a schedule without its signals, and
+        channels that the run does not have.
     """
     axes = controller if isinstance(controller, Axes) else None
     check_controller(controller, several=axes is not None)
@@ -178,11 +179,26 @@ def _check_axes_of(run: Any, axes: Axes | None) -> None:
             f"run has {counts_text(theirs)}, the controller {counts_text(ours)}: must be as many; "
             "take the setup with which it was recorded, or one with as many [[axis]]"
         )
+    if axes is not None:
+        check_same_names("axes", run.axis_names, axes.names)
     for name in ("r", "y_measured"):
         if found[name] != outputs:
             raise ValueError(
                 f"run has {found[name]} columns of {name} and {outputs} of y: must be as many"
             )
+
+
+def check_same_names(what: str, theirs: Sequence[str], ours: Sequence[str]) -> None:
+    """Raise a ``ValueError`` unless names of a run are the controller's; unknown ones are.
+
+    A name is compared as it stands in a column of a CSV file, which may be all that is known of it.
+    """
+    known = all(theirs) and all(ours) and len(theirs) > 0 and len(ours) > 0
+    if known and [*map(in_column, theirs)] != [*map(in_column, ours)]:
+        raise ValueError(
+            f"run has {', '.join(theirs)}, the controller {', '.join(ours)}: must be the same "
+            f"{what} in the same order; take the setup with which it was recorded"
+        )
 
 
 def _started(controller: Any, y: Any, u: Any, r: Any) -> tuple[Any, Any]:

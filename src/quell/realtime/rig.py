@@ -141,6 +141,12 @@ def measure_channels(plant: Any, x: Vector, values: Vector) -> None:
     """Write what a plant gives beside y into ``values``; by default they stay as they are."""
 
 
+@generic_with_default
+def is_lost(plant: Any) -> bool:
+    """Return whether a plant that is a machine can't go on; the rig then ends. By default not."""
+    return False
+
+
 class OneSignal(NamedTuple):
     """A plant with one y and one u."""
 
@@ -414,10 +420,11 @@ def _log(rig: RigModel) -> None:
 
 
 @compiled
-def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
+def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> bool:
     """Tick until ``rig.stop`` is set, or ``most`` times if it is not negative.
 
-    If ``paced``, there is one tick each dt; otherwise they follow each other at once.
+    Return whether the plant is lost; then there is no further tick. If ``paced``, there is one tick
+    each dt; otherwise they follow each other at once.
     """
     begin = now(clock)
     period = 1e9 * rig.dt
@@ -442,6 +449,9 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
             begin += waited
         tick(rig, time, fresh)
         k += 1
+        if is_lost(rig.plant.plant):
+            return True
+    return False
 
 
 @kernel
@@ -642,7 +652,8 @@ class Rig:
     ) -> list[str]:
         """Tick in real time for ``seconds``, or until a signal or another thread calls ``stop``.
 
-        The ticks run on their own thread, which needs no Python; the calling thread writes the log.
+        It ends at once, and the session with it, where the plant is a drive that is lost. The ticks
+        run on their own thread, which needs no Python; the calling thread writes the log.
         Return sentences about which requests the system has granted.
 
         Parameters
@@ -723,7 +734,8 @@ class Rig:
         model.counts[STATE] = IDLE
 
     def _serve(self, most: int, paced: bool) -> None:
-        call_specialised(serve, self.model, self._clock, most, paced)
+        if call_specialised(serve, self.model, self._clock, most, paced):
+            self._end_session()
 
     def _write_log(self) -> None:
         if self._file is None or self._file.closed:

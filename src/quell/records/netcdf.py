@@ -19,7 +19,7 @@ from quell import checks
 from quell.files import TooLargeError, bytes_of, check_regular, check_size
 from quell.quantities import UNKNOWN, Signals, signals_from
 from quell.records import netcdf_reader
-from quell.records.record import check_times
+from quell.records.record import check_steps, check_times
 
 R = TypeVar("R")
 # Samples from one recorded sample to the next: as many as a scenario may have.
@@ -167,7 +167,12 @@ def _record_fields(stored: Stored, axes: tuple[str, ...], besides: set[str]) -> 
     every = checks.whole("every", stored.attributes["every"], 1)
     if every > _MOST_EVERY:
         raise ValueError(f"every = {every}: must be at most {_MOST_EVERY}")
-    check_times(log.shape[-2], every * dt)
+    samples, step = log.shape[-2], every * dt
+    check_times(samples, step)
+    time = stored.values.get("time")
+    if time is not None and time.shape == (samples,) and time.dtype.kind in "fiu":
+        known = f"its attributes, dt = {dt:g} s and every = {every},"
+        check_steps(time.astype(np.float64), np.arange(float(samples)), step, known)
     return {
         "log": log,
         "channels": tuple(zip(channels, widths, strict=True)),

@@ -137,9 +137,10 @@ def _checked(file: Any, found: dict[str, Any], axes: list[str], most: int) -> di
         if size > most:
             raise TooLarge
         variables.append(_variable(name, dataset))
-    # Times and other coordinates follow from dt and the shapes, f_hat from its two shares.
+    # Coordinates follow from dt and the shapes, f_hat from its two shares; times may contradict dt.
     named = {"f_hat"}.union(*(variable["dims"] for variable in variables))
-    wanted = [each for each in variables if each["name"] not in named or "labels" in each]
+    left = named - {"time"}
+    wanted = [each for each in variables if each["name"] not in left or "labels" in each]
     if not {*axes} <= named:
         raise Fault(f"has channels that are not over {' and '.join(axes)}")
     return {"attributes": attributes, "variables": wanted}

@@ -152,6 +152,32 @@ def check_times(samples: int, step: float) -> None:
         raise ValueError(f"its samples are {step:g} s apart: its times are beyond all numbers")
 
 
+# Share by which times may differ from the sample time: clocks drift by less. Chosen by hand.
+_DRIFT = 1e-3
+
+
+def check_steps(time: Vector, index: Vector, step: float, known: str) -> None:
+    """Raise a ``ValueError`` unless times [s] go on by ``step`` from one index to the next.
+
+    They may be rounded, by a step, and drift, as clocks do. ``known`` says what the step is, and
+    where that stands. An index that is no number is not judged here.
+    """
+    if time.size < 2 or not np.all(np.isfinite(index)):
+        return
+    with np.errstate(all="ignore"):  # a damaged file may hold any numbers
+        passed, meant = time - time[0], (index - index[0]) * step
+        wrong = ~(np.abs(passed - meant) <= step + _DRIFT * np.abs(meant))
+    if np.any(wrong):
+        k = int(np.argmax(wrong))
+        if not np.isfinite(time[0]):
+            raise ValueError("its first time is not finite; must be a number, in seconds")
+        raise ValueError(
+            f"its times contradict each other: from k = {index[0]:.0f} to k = {index[k]:.0f} the "
+            f"column time goes on by {passed[k]:g} s, by {known} it is {meant[k]:g} s; correct "
+            "the one that is wrong"
+        )
+
+
 def first_sample_at(time: float, step: float, samples: int) -> int:
     """Return the first of ``samples`` samples, ``step`` apart, that is not before ``time``.
 

@@ -42,6 +42,7 @@ from quell.setup.loading import (
     made_once,
     sweep_of,
     title_of,
+    usable,
     windows_of,
 )
 from quell.setup.registry import CASE
@@ -454,7 +455,7 @@ def made_axes(
     if rig is not None and signals.known:
         rig = {"signals": signals, **rig}
     parts = (controller, plant, scenario, rig, sweep, windows)
-    return Setup(name, title, *parts, tables, tune, trust)
+    return usable(Setup(name, title, *parts, tables, tune, trust), AxesVariation)
 
 
 def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:

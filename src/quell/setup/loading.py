@@ -37,7 +37,7 @@ from quell.plants.base import Plant, signals_of
 from quell.plants.linear import delayed
 from quell.plants.linearise import linear_model
 from quell.records.metrics import SETTLING_BAND
-from quell.setup.description import Description, describe
+from quell.setup.description import Description, describe, is_of_axes
 from quell.setup.registry import CASE
 from quell.setup.schema import (
     Builder,
@@ -50,14 +50,16 @@ from quell.setup.schema import (
     parameters_of,
     read,
 )
-from quell.simulation.driver import Scenario
-from quell.sweeping.measures import Measure
-from quell.sweeping.runs import as_values, hash_of
+from quell.signals import as_signal
+from quell.simulation.driver import Scenario, check_schedule, checked_start
+from quell.sweeping.measures import Measure, as_measures
+from quell.sweeping.runs import Job, Plan, as_values, check_draws, hash_of
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import SIMPLEST, range_of_u
 from quell.tuning.plants import with_known_noise
 from quell.tuning.report import late_tables, rest_of_plant
 from quell.tuning.structures.registry import FEEDING_FORWARD
+from quell.tuning.tuned import checked_range
 
 # ---- A setup ----
 
@@ -69,6 +71,11 @@ _EXAMPLES = {
     "scenario": "scenario = {duration = 10.0, reference = {kind = 'step'}}",
     "plant": "plant = {kind = 'linear', num = [1.0], den = [1.0, 1.0]}",
     "rig": "rig = {device = 'twin:'}",
+}
+_EXAMPLES_OF_AXES = {
+    "scenario": "scenario = {duration = 10.0}, and reference = {kind = 'step'} in each [[axis]]",
+    "plant": "plant = {kind = 'multivariable-linear', A = …, B = …, C = …}, or {kind = 'arm'}",
+    "rig": "rig = {device = 'udp://127.0.0.1:5005'}",
 }
 
 EXAMPLES = Path(__file__).parent / "examples"
@@ -106,7 +113,8 @@ class Setup:
     def needed(self, table: str) -> Any:
         """Return the object of an optional table; raise a ``SetupError`` if it is missing."""
         if getattr(self, table) is None:
-            example = f", {_EXAMPLES[table]}" if table in _EXAMPLES else ""
+            examples = _EXAMPLES_OF_AXES if is_of_axes(self.tables()) else _EXAMPLES
+            example = f", {examples[table]}" if table in examples else ""
             raise SetupError([f"{self.file}: {table}: missing; give a table [{table}]{example}"])
         return getattr(self, table)
 
@@ -143,13 +151,13 @@ def made(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     SetupError
         as ``load``.
     """
-    return assembled(name, describe(name, data), trust=trust)
+    return usable(assembled(name, describe(name, data), trust=trust))
 
 
 def assembled(
     name: str, tables: Description, known: Known | None = None, trust: bool = False
 ) -> Setup:
-    """Build the objects of the tables of a file.
+    """Build the objects of the tables of a file; ``usable`` checks what they do together.
 
     ``known`` has inputs and objects of an earlier call: what is the same is not built again.
     """
@@ -201,11 +209,50 @@ def assembled(
         check = partial(scenario.seeded_signals, count)
         attempt = partial(builder.attempt, "scenario", ("disturbances",), check)
         build_once("signals", (scenario, count), attempt)
+        start = partial(checked_start, scenario, plant, dt)
+        builder.attempt("scenario", ("x0", "duration"), start)
     windows = windows_of(builder, tables.metrics)
     title = tables.title or title_of(name)
     tune = build("tune")
     built = controller, plant, scenario, rig, sweep, windows
     return Setup(name, title, *built, tables, tune, trust)
+
+
+def usable(setup: Setup, variation: type[Variation] | None = None) -> Setup:
+    """Return a setup whose windows, signals and sweep can be used; ``SetupError`` for another one.
+
+    A part alone cannot know these rules. ``assembled`` does not check them: tuning and sweeps build
+    setups with another controller, in which only the parts matter.
+    """
+    check_windows(setup)
+    scenario, tables = setup.scenario, setup.description
+    if scenario is not None and setup.plant is not None and variation is None:
+        builder = Builder(setup.file, setup.trust)
+        derivative: Any = scenario.reference
+        for _ in range(int(getattr(setup.controller, "derivatives", 0))):
+            next_one = as_signal(derivative).derivative
+            derivative = builder.attempt("scenario", ("reference",), next_one)
+        # A device gives the signals that a schedule follows, too; a tuning has yet to make it.
+        if "schedule" not in (setup.tune or {}) and not (setup.rig or {}).get("channels"):
+            builder.attempt("", (), check_schedule, scenario, setup.controller)
+    if tables.sweep is not None:
+        sweep_of(setup, variation)
+    return setup
+
+
+def check_windows(setup: Setup) -> None:
+    """Raise a ``SetupError`` for windows of [[metrics]] that begin after the scenario's end."""
+    if setup.scenario is None:
+        return
+    end = setup.scenario.duration
+    late = [
+        f"{setup.file}: metrics[{i}].start = {window['start']:g}: "
+        f"must be less than the scenario's duration, {end:g} s"
+        for i, window in enumerate(setup.windows)
+        if window.get("start", 0.0) >= end
+    ]
+    if late:
+        raise SetupError(late)
 
 
 def windows_of(builder: Builder, tables: Sequence[Table]) -> tuple[dict[str, Any], ...]:
@@ -225,8 +272,13 @@ def title_of(name: str) -> str:
 
 
 def _check_ranges(name: str, plant: CallTable | None) -> None:
-    """Check that the ranges of a plant are those of its keys."""
-    for path in getattr(plant, "uncertain", None) or ():
+    """Check that the ranges of a plant are those of its keys, and have a low and a high end."""
+    ranges: Mapping[str, Any] = getattr(plant, "uncertain", None) or {}
+    for path, ends in ranges.items():
+        try:
+            checked_range(path, ends)
+        except ValueError as error:
+            raise SetupError([f"{name}: plant.{error}"]) from None
         table: Any = plant
         for step in path.split("."):
             if isinstance(table, Mapping):  # parameters of a function or an FMU, which know them
@@ -371,7 +423,7 @@ def varied(setup: Setup, changes: Mapping[str, Any]) -> Setup:
     """
     if not isinstance(setup, Setup):
         raise ValueError(f"setup = {setup!r:.80}: must be a Setup, as quell.setup.load returns it")
-    return made(setup.file, changed(setup.file, setup.tables(), changes), setup.trust)
+    return _unchecked(setup.file, changed(setup.file, setup.tables(), changes), setup.trust)
 
 
 def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
@@ -398,7 +450,11 @@ def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
 def _controller(
     name: str, tables: Mapping[str, Any], values: Mapping[str, float], trust: bool
 ) -> Controller:
-    return made(name, changed(name, tables, values), trust).controller
+    return _unchecked(name, changed(name, tables, values), trust).controller
+
+
+def _unchecked(name: str, data: Mapping[str, Any], trust: bool) -> Setup:
+    return assembled(name, describe(name, data), trust=trust)
 
 
 def changed(name: str, data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -478,7 +534,8 @@ def tuning_task(
     Raises
     ------
     SetupError
-        as ``load``; for a file without plant, and for ranges that are none of the plant's keys.
+        as ``load``; for a file without plant, for ranges that are none of the plant's keys, and for
+        ``storage`` without ``trials``.
     """
     name, data = read(path)
     given = data.get("controller", {})
@@ -487,12 +544,16 @@ def tuning_task(
     table = data.get("tune", {})
     if isinstance(table, Mapping):
         asked = {**table, **(changes or {})}
+        if "storage" in asked and "trials" not in asked:
+            rule = "has no effect without trials; give them (--trials), or leave it out"
+            raise SetupError([f"{name}: tune.storage = {asked['storage']!r}: {rule}"])
         structure = asked.get("structure", SIMPLEST)
         if isinstance(given, Mapping) and structure in (SIMPLEST, *FEEDING_FORWARD):
             asked = _feedforward(given) | asked
         if asked:
             kept["tune"] = asked
-    setup = made(name, kept, trust)
+    setup = _unchecked(name, kept, trust)
+    check_windows(setup)
     plant, ranges = setup.needed("plant"), _ranges(setup)
     options = tuning_options(setup, given, plant, limits or {})
     options["setup"] = tuned_tables(setup, data, plant, options)
@@ -571,7 +632,7 @@ def _with_tuning_task(
     name: str, data: Mapping[str, Any], values: Mapping[str, float], trust: bool
 ) -> Setup:
     changes = {f"plant.{key}": value for key, value in values.items()}
-    return made(name, changed(name, data, changes), trust)
+    return _unchecked(name, changed(name, data, changes), trust)
 
 
 def _ranges(setup: Setup) -> dict[str, tuple[float, float]]:
@@ -587,6 +648,14 @@ def _ranges(setup: Setup) -> dict[str, tuple[float, float]]:
 
 # Tables that a simulated run does not use.
 _NOT_USED = ("sweep", "rig", "metrics", "title")
+# The same, and other keys that change no run, with what to do where that is not plain.
+_NOT_SWEPT: Mapping[str, str] = {
+    r"(sweep|rig|metrics|title|tune)\b": "",
+    r"plant\.(.+\.)?(uncertain|signals)\b": "",
+    r"axis\[\d+\]\.(name|signal)$": "",
+    r"axes\.actuators\b": "",
+    r"scenario\.seed$": "seed and draws of [sweep] are what seeds the runs; ",
+}
 
 
 def sweep_of(setup: Setup, variation: type[Variation] | None = None) -> dict[str, Any]:
@@ -605,6 +674,10 @@ def sweep_of(setup: Setup, variation: type[Variation] | None = None) -> dict[str
     table: dict[str, Any] = dict(setup.sweep or {})
     make = variation or Variation
     build = make(setup.file, setup.tables(), table.pop("cases"), setup.trust)
+    swept = {f"cases.{name}": each for name, each in build.cases.items()}
+    for where, paths in {**swept, "parameters": table["parameters"]}.items():
+        for path in paths:
+            _check_used(build, f"sweep.{where}", path)
     for name in build.cases:
         _attempt(build, f"sweep.cases.{name}", {CASE: name})
     for path, given in table["parameters"].items():
@@ -612,7 +685,22 @@ def sweep_of(setup: Setup, variation: type[Variation] | None = None) -> dict[str
             _check_parameter(build, path, given)
     measures = _measures(setup, table.pop("metrics"))
     table["limits"] = _limits(setup.file, table["limits"], measures)
+    try:
+        as_measures(measures)
+        plan = Plan(**{key: table[key] for key in ("parameters", "draws", "sampling", "seed")})
+        check_draws(plan, Job(build, measures, (), takes_seed=False))
+    except ValueError as error:
+        raise SetupError([f"{setup.file}: sweep.{error}"]) from None
     return {"build": build, **table, "metrics": measures}
+
+
+def _check_used(build: Variation, where: str, path: str) -> None:
+    """Raise a ``SetupError`` for a path that changes no run."""
+    for pattern, hint in _NOT_SWEPT.items():
+        if re.match(pattern, path):
+            swept = ", ".join(key for key in build.data if not re.match(r"tune\b", key))
+            rule = f"no run uses it; {hint}sweep keys of {swept}, as plant.m1 or learner.prior"
+            raise SetupError([f"{build.name}: {where}: {path}: {rule}"])
 
 
 def _check_parameter(build: Variation, path: str, given: Any) -> None:

@@ -14,12 +14,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 from quell import checks
 from quell.plants.linearise import linear_model
+from quell.setup.description import describe
 from quell.setup.loading import (
     NO_CONTROLLER,
     REPLACED,
     Setup,
+    assembled,
     changed,
-    made,
+    check_windows,
     tuned_tables,
     tuning_options,
 )
@@ -81,7 +83,8 @@ def schedule_task(
     asked = {**data["tune"], **(changes or {})}
     _check(name, data, asked)
     first = {"dt": data["dt"]} if "dt" in data else {}
-    alone = made(name, first | {"controller": NO_CONTROLLER, "tune": asked})
+    tables = first | {"controller": NO_CONTROLLER, "tune": asked}
+    alone = assembled(name, describe(name, tables))
     given = (alone.tune or {})["schedule"]
     how: dict[str, Any] = dict(given["options"])
     at = _Points(name, data, given, asked["schedule"], trust)
@@ -93,7 +96,9 @@ def schedule_task(
     table = data["plant"] if "plant" in data and has_signals else at.table(middle)
     whole = {key: value for key, value in data.items() if key not in REPLACED}
     whole |= {"plant": table, "tune": asked}
-    setup = made(name, {**whole, "controller": NO_CONTROLLER}, trust)
+    without = describe(name, {**whole, "controller": NO_CONTROLLER})
+    setup = assembled(name, without, trust=trust)
+    check_windows(setup)
     options = tuning_options(setup, data.get("controller"), setup.plant, limits or {})
     del options["schedule"]
     options |= how
@@ -177,7 +182,7 @@ class _Points:
         if at in self.changes:
             where = f"tune.schedule.points[{self.changes[at][0]}]"
         try:
-            setup = made(self.name, tables, self.trust)
+            setup = assembled(self.name, describe(self.name, tables), trust=self.trust)
             if getattr(setup.description.plant, "uncertain", None) is not None:
                 raise SetupError([f"plant.uncertain: {_RANGES}; b_range of [tune] is a range of b"])
         except SetupError as error:

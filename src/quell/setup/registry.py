@@ -225,7 +225,7 @@ def tuning(
         plant; ``objective`` is then the name of a metric, ``"iae"`` by default.
     storage
         Optuna's journal file for these candidates, from which an interrupted tuning continues;
-        not used without them.
+        a tuning needs ``trials`` then, here or as ``--trials``.
     schedule
         operating points, for a controller whose gains follow a signal.
     """

@@ -195,6 +195,8 @@ class Multisine(Signal):
 
     def __post_init__(self) -> None:
         omegas = checks.positive_vector("omegas", self.omegas)
+        if not omegas.size:
+            raise ValueError("omegas is empty: must have at least one frequency [rad/s]")
         amplitudes, phases = np.ones(omegas.size), self.phases
         if self.amplitudes is not None:
             amplitudes = checks.vector("amplitudes", self.amplitudes, omegas.size)

@@ -265,18 +265,22 @@ def check_one_signal(plant: Any) -> None:
 
 def samples_and_start(scenario: Scenario, plant: Any, dt: float) -> tuple[int, Vector]:
     """Return the number of samples of a run, and the plant's state at its start."""
+    samples, x0 = checked_start(scenario, plant, dt)
+    _warn_of_times(scenario, dt, samples)
+    return samples, x0
+
+
+def checked_start(scenario: Scenario, plant: Any, dt: float) -> tuple[int, Vector]:
+    """Do what ``samples_and_start`` does, without warnings about the times."""
     duration = scenario.duration
     if duration / dt > _MOST_SAMPLES:
         raise ValueError(
             f"duration = {duration!r} s with dt = {dt!r} s: must be at most "
             f"{_MOST_SAMPLES:.0e} samples"
         )
-    samples = math.floor(in_steps(duration, dt)) + 1
-    _warn_of_times(scenario, dt, samples)
     given = scenario.x0
-    return samples, np.zeros(plant.order) if given is None else checks.vector(
-        "x0", given, plant.order
-    )
+    x0 = np.zeros(plant.order) if given is None else checks.vector("x0", given, plant.order)
+    return math.floor(in_steps(duration, dt)) + 1, x0
 
 
 def rest_samples(scenario: Scenario, dt: float, samples: int) -> frozenset[int]:
@@ -284,15 +288,20 @@ def rest_samples(scenario: Scenario, dt: float, samples: int) -> frozenset[int]:
     return frozenset(first_sample_at(time, dt, samples) for time in scenario.rest_at)
 
 
-def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal]:
-    """Return the external signals of a controller's schedule, seeded."""
+def check_schedule(scenario: Scenario, controller: Controller) -> None:
+    """Raise a ``ValueError`` unless a scenario has as many signals as the schedule follows."""
     given, used = len(scenario.schedule), int(getattr(controller, "external_signals", 0))
     if given != used:
         raise ValueError(
             f"scenario.schedule has {checks.counted(given, 'signal')}, and the schedule of the "
             f"controller follows {used} external ones: must be as many"
         )
-    if not given:
+
+
+def _schedule_signals(scenario: Scenario, controller: Controller) -> list[Signal]:
+    """Return the external signals of a controller's schedule, seeded."""
+    check_schedule(scenario, controller)
+    if not scenario.schedule:
         return []
     reference: Any = scenario.reference
     before = (reference, *scenario.disturbances)  # which have the first seeds

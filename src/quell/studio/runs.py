@@ -27,7 +27,7 @@ from quell.records.trajectory import Trajectory
 from quell.setup.axes import made_axes
 from quell.setup.description import describe as tables_of
 from quell.setup.description import is_of_axes, parsed
-from quell.setup.loading import Known, Setup, assembled
+from quell.setup.loading import Known, Setup, assembled, usable
 from quell.simulation import simulate
 from quell.studio.messages import (
     MOST_BYTES,
@@ -102,7 +102,7 @@ class Maker:
                 setup = made_axes(self.name, tables, self.trust, self._known)
             else:
                 described = tables_of(self.name, tables)
-                setup = assembled(self.name, described, self._known, self.trust)
+                setup = usable(assembled(self.name, described, self._known, self.trust))
         if self.warnings:
             self._known = {}  # what is not built again would not warn again
         for table in ("plant", "scenario"):

@@ -37,8 +37,7 @@ from quell.parallel import one_blas_thread
 from quell.plants.base import Plant, check_plant
 from quell.plants.linear import LinearPlant
 from quell.records.record import netcdf_of
-from quell.signals import Signal
-from quell.simulation.driver import Scenario, check_scenario
+from quell.simulation.driver import Scenario, check_scenario, is_random
 from quell.simulation.simulate import simulate
 from quell.sweeping.measures import (
     Measure,
@@ -316,6 +315,11 @@ class Plan:
         return int(self.draws) * math.prod(map(len, self._lists.values()))
 
     @property
+    def is_drawn(self) -> bool:
+        """Whether a parameter is drawn from a distribution."""
+        return bool(self._distributions)
+
+    @property
     def lists(self) -> Mapping[str, tuple[Any, ...]]:
         """All values of the parameters that are not drawn."""
         return self._lists
@@ -482,12 +486,29 @@ def built(job: Job, part: Part, run: int) -> Parts:
     return Parts(plant, controller, scenario)
 
 
-def is_random(scenario: Scenario) -> bool:
-    """Return whether the signals of a scenario depend on its seed."""
-    given: list[Any] = [*scenario.disturbances]
-    for each in (scenario.reference, scenario.noise):  # of several axes one for each
-        given += each if isinstance(each, Sequence) else [each]
-    return any(each.seeded(0) != each.seeded(1) for each in given if isinstance(each, Signal))
+def check_draws(plan: Plan, job: Job) -> None:
+    """Raise a ``ValueError`` for several draws of runs that do not differ.
+
+    They differ by what is drawn from a distribution, by a seed that ``build`` takes, or by random
+    signals in one of the scenarios. Runs that cannot be built are left to the sweep, which says so.
+    """
+    if plan.draws == 1 or plan.is_drawn or job.takes_seed:
+        return
+    any_built = False
+    for run in range(plan.runs // plan.draws):
+        try:
+            scenario = built(job, plan.part(run, run + 1), run).scenario
+        except Exception:  # a function of the user's may raise anything
+            continue
+        if is_random(scenario):
+            return
+        any_built = True
+    if any_built:
+        raise ValueError(
+            f"draws = {plan.draws}: nothing in the scenario is random and no parameter is drawn "
+            "from a range, so each run would be repeated as it is; add noise or random "
+            "disturbances, give a range without steps, or leave draws out"
+        )
 
 
 def _three(made: Any) -> tuple[Any, Any, Any]:

@@ -37,6 +37,7 @@ from quell.sweeping.runs import (
     Plan,
     Store,
     built,
+    check_draws,
     existing_store,
     hash_of,
     name_of,
@@ -555,7 +556,8 @@ def sweep(
     Raises
     ------
     ValueError
-        for arguments out of range, a parameter that ``build`` does not have, the folder of another
+        for arguments out of range, a parameter that ``build`` does not have, several draws of runs
+        in which nothing is drawn or random, the folder of another
         sweep, a scheduler that does not answer, or if none of the runs that are tried first can be
         done; nothing is written then.
     ChildProcessError
@@ -566,6 +568,7 @@ def sweep(
     checked = _checked_limits(limits or {}, list(measures))
     takes_seed = _takes_seed(build, plan)
     job = Job(build, measures, tuple(record), takes_seed)
+    check_draws(plan, job)
     checks.optional(checks.whole, "runs_per_file", runs_per_file, 1)
     if executor == "processes":
         check_sendable("build and functions in metrics", job)

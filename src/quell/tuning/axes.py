@@ -41,7 +41,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.analysis.coupling import Coupling, coupling
+from quell.analysis.coupling import (
+    ABOVE_BANDWIDTH,
+    Coupling,
+    balancing,
+    coupling,
+    is_turned,
+    unstable_zeros,
+)
 from quell.analysis.matrices import (
     estimates_at,
     gain_at,
@@ -73,11 +80,13 @@ from quell.tuning.optimiser.coupled import (
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 from quell.tuning.tuned_axes import (
+    INDEPENDENT,
     PLACES,
     TOLERANCE,
     AxesBound,
     AxesCheck,
     AxisResult,
+    GivenB0,
     TunedAxes,
 )
 from quell.types import Matrix, Progress, Vector
@@ -98,6 +107,11 @@ _WORST, _SLOWEST = 2, 1e-4
 # A pole and a zero of the diagonal entry cancel within this share of their size, and of the
 # fastest pole; it is far above rounding, and far below what a controller notices.
 _CANCEL, _CANCEL_OF_FASTEST = 1e-6, 1e-10
+# Difference to the gains of the plant, as a share of the largest entries of its row and column,
+# below which B0 counts as that of the plant; and the frequencies that are looked at.
+_SAME_B0, _FREQUENCIES = 0.01, 40
+# Least sum of squares that is divided by.
+_TINY = float(np.finfo(np.float64).tiny)
 # Bounds of ``Constraints`` that are not for axes.
 _NOT_HERE = ("u_std", "noise_std", "resolution", "delay_margin", "u_max", "rate_max")
 OBJECTIVES = ("load-iae", "load")
@@ -220,7 +234,9 @@ def tune_axes(
             checked = _check(nominal, B0_off, drawn, found, check_samples, seed)
         made = _made(axes, found.values)
         A, B, C, R = nominal[0]
-        bandwidth = float(np.max(np.sqrt(found.values[:, 0] * found.values[:, 1])))
+        bandwidth, fastest = (
+            float(np.max(np.sqrt(values[:, 0] * values[:, 1]))) for values in (found.values, start)
+        )
         shown = tuple(_loop(each, made, found.values) for each in judged)
         return TunedAxes(
             controller=made,
@@ -238,6 +254,7 @@ def tune_axes(
             objective=objective,
             left=_relative_gains(A, B @ R, C, axes, bandwidth),
             of_plant=_relative_gains(A, B, C, axes, bandwidth),
+            given=_given_gain(plant, axes, points[0], nominal[0], bandwidth, fastest),
             check=checked,
             with_learners=_with_learners(plant, made, points[0]),
             setup=dict(setup or {}),
@@ -636,14 +653,79 @@ def _check(
 
 def _relative_gains(A: Matrix, B: Matrix, C: Matrix, axes: Axes, at: float) -> Coupling | None:
     """Return the relative gains at a frequency; None where there are none."""
+    found = _coupling(A, B, C, axes, at)
+    return None if found is None else replace(found, at=found.at[-1:])
+
+
+def _coupling(A: Matrix, B: Matrix, C: Matrix, axes: Axes, at: float) -> Coupling | None:
     if B.shape[1] != C.shape[0]:
         return None
     plant = SimpleNamespace(A=A, B=B, C=C, dt=axes.dt)
     try:
-        found = coupling(plant, axes.dt, min(at, 0.9 * math.pi / axes.dt), axes.names)
+        return coupling(plant, axes.dt, min(at, 0.9 * math.pi / axes.dt), axes.names)
     except ValueError:
         return None
-    return replace(found, at=found.at[-1:])
+
+
+def _given_gain(
+    plant: Any, axes: Axes, point: Any, nominal: Plant, at: float, fastest: float
+) -> GivenB0:
+    """Return what is known of the controller's B0 at a bandwidth: whether another one is better.
+
+    ``fastest`` is the largest bandwidth of the axes alone, to which zeros are compared.
+    B0 is that of the plant if its rows are those of the gains far above all dynamics, to a factor,
+    or those of the gains at some frequency above the bandwidth: lags of actuators and resonances
+    are above the frequencies for which B0 is meant.
+    """
+    A, B, C, R = nominal
+    N = A - np.eye(A.shape[0])
+    linear = linear_part_of(plant, axes.dt, point)[0]
+    B0 = gain_at(axes, estimates_at(axes, plant, point))[0]
+    high, degrees = _high_gains(linear.A, linear.B, linear.C)
+    is_of_plant = _are_rows_of(high, B0)
+    for omega in np.geomspace(min(at, 0.5 / axes.dt), math.pi / axes.dt, _FREQUENCIES):
+        if is_of_plant:
+            break
+        shifted = 1j * omega * np.eye(linear.A.shape[0]) - linear.A
+        is_of_plant = _are_rows_of(linear.C @ np.linalg.solve(shifted, linear.B), B0)
+    better: bool | None = None
+    if is_of_plant:
+        better = False
+    elif degrees == [axis.observer.order for axis in axes.axes]:
+        inverse = np.linalg.pinv(high)
+        left = _relative_gains(A, B @ inverse, C, axes, at)
+        better = left is not None and left.factor <= INDEPENDENT  # not with NaN
+        better = better and not is_turned(N, B @ inverse, C)
+    pairs = None
+    if B.shape[1] == C.shape[0]:
+        whole = _coupling(A, B, C, axes, at)
+        pairs = None if whole is None else whole.pairs
+        if pairs is not None and np.array_equal(B0 != 0.0, np.eye(len(pairs))[list(pairs)]):
+            pairs = None
+    zeros = unstable_zeros(N, B @ R, C, axes.dt, ABOVE_BANDWIDTH * fastest)
+    return GivenB0(is_of_plant, better, is_turned(N, B @ R, C), zeros, pairs)
+
+
+def _high_gains(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, list[int]]:
+    """Return the gains from u to the first derivative of each y that u reaches, and its order."""
+    found, degrees = np.zeros((C.shape[0], B.shape[1])), []
+    for i, row in enumerate(C):
+        bound, degree = np.abs(row), 1
+        while degree < A.shape[0]:
+            found[i] = row @ B
+            if np.any(np.abs(found[i]) > _CANCEL * (bound @ np.abs(B))):
+                break
+            row, bound, degree = row @ A, bound @ np.abs(A), degree + 1
+        degrees.append(degree)
+    return found, degrees
+
+
+def _are_rows_of(G: Any, B0: Matrix) -> bool:
+    """Return whether the rows of B0 are those of gains G, each to a factor."""
+    rows, columns = balancing(B0)
+    B0, G = B0 * rows * columns, G * columns
+    along = np.sum(G.conj() * B0, axis=1) / np.maximum(np.sum(np.abs(G) ** 2, axis=1), _TINY)
+    return bool(np.max(np.abs(B0 - along[:, None] * G)) <= _SAME_B0)
 
 
 def _with_learners(plant: Any, axes: Axes, point: Any) -> MultivariableLoop | None:

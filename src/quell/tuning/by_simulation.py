@@ -38,6 +38,8 @@ _WIDE = 10.0
 _FRESH = 1_000_000
 # Share of a range's ends by which a value may be beyond them through rounding.
 _ROUNDING = 1e-12
+# Options of ``tune`` for plants that it draws.
+_DRAWS = ("samples", "check_samples", "seed")
 # Logarithm by which bounds of the linear loops may be exceeded: optima keep to them within 0.1 %.
 _SLACK = 1e-3
 
@@ -167,7 +169,9 @@ def tune_by_simulation(
     plants = [LinearPlant.of(p) if is_linear_model(p) else p for p in plants]
     problem = Problem.of_runs(plants, scenario, objective)
     linear_objective = "load-iae" if how["structure"] in SEVERAL_INTEGRATORS else "load"
-    found = linear(parts, **how, objective=linear_objective)
+    # Of known plants only the search draws, which has its seed.
+    kept = {name: value for name, value in how.items() if box is not None or name not in _DRAWS}
+    found = linear(parts, **kept, objective=linear_objective)
     assert found.design.solution is not None  # ``tune`` returns no other design
     structure = found.design.solution.structure
     build = Build(structure, found.task.options(structure))

@@ -152,7 +152,9 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
             f"std(u): {100.0 * given.noise_share:g} % of half the range of u, {half:.4g}, for "
             f"noise of {given.noise:.3g} in y"
         )
-        return _with(task, u_std=given.noise_share * half), how
+        # u_std takes the place of the share, so that a result's constraints can be given again.
+        share = Constraints.noise_share
+        return _with(task, u_std=given.noise_share * half, noise_share=share), how
     if given.m_ks is not None or given.noise_over_pi is None:
         return task, ""
     ratio, by_gain = given.noise_over_pi, replace(task, objective="load")
@@ -176,7 +178,8 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
         source = f"neither a PI controller nor a PID controller with T_f = T_d/{ratio:g}"
         return task, f"NOT bounded: M_ks: {source} meets the constraints, to guess it from; {give}"
     m_ks, how = max(found)
-    return _with(task, m_ks=m_ks), f"{how}; a guess: {give}"
+    kept = Constraints.noise_over_pi  # m_ks takes its place, as above
+    return _with(task, m_ks=m_ks, noise_over_pi=kept), f"{how}; a guess: {give}"
 
 
 def _with(task: Task, **bounds: Any) -> Task:

@@ -47,6 +47,8 @@ from quell.types import Progress
 
 _STRUCTURES = ("bandwidths", "half-gain", "half-gain-law")
 _TABLES = ("b0", "all")
+# Range of b without which a point has one plant, and so no quantile.
+_NO_RANGE = (1.0, 1.0)
 # Options of ``tune`` that are for sets of plants, or for other results.
 _NOT_HERE = ("uncertain", "scenario", "search", "compare", "feedforward")
 # Bandwidths that differ by less are those of one optimum; and the ratio of the integrals of |y|
@@ -387,7 +389,9 @@ def tune_schedule(
         finer = (_finer(axis, checks.whole("between", between, 0)) for axis in axes)
         fine = [at for at in product(*finer) if at not in grid]
     report, parts = progress or (lambda part, share: None), len(grid) + len(fine) + 1
-    middle, own = grid[len(grid) // 2], {}
+    middle, own, joint_only = grid[len(grid) // 2], {}, {}
+    if tables == "b0" and tuple(options.get("b_range", _NO_RANGE)) == _NO_RANGE:
+        joint_only = {name: how.pop(name) for name in ("quantile",) if name in how}
     for i, at in enumerate(grid):
         report(f"at {_place(at)}", i / parts)
         of_file = {"setup": setup, "rest": rest} if at == middle else {}
@@ -400,7 +404,8 @@ def tune_schedule(
         # The least b: bounds on u, as M_ks, are those of the point with the largest gains.
         base = b[int(np.argmin(np.abs(b)))]
         same = [_scaled(each, base / own_b) for each, own_b in zip(given, b, strict=True)]
-        joint = tune(same, dt, **{**how, "delay": [float(each.delays[0]) for each in given]})
+        delays = [float(each.delays[0]) for each in given]
+        joint = tune(same, dt, **{**how, **joint_only, "delay": delays})
         tuned: Any = joint.controller
         found["b0"] = tuned.observer.b0 * b / base
     else:

@@ -16,7 +16,7 @@ from quell.controllers.feedforward import Feedforward, checked_feedforward
 from quell.parallel import one_blas_thread
 from quell.plants.base import signals_of
 from quell.plants.linear import LinearPlant
-from quell.signals.shapes import Signal
+from quell.signals.shapes import Signal, as_signal
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import (
@@ -121,10 +121,15 @@ def tune(
         names of other structures; by default ``COMPARED``, and ``"p-pi-notch"`` for a plant with a
         resonance. An empty list for none. A structure with several integrators is always compared
         with the same of one.
-    reference, duration
-        signal for ``"tracking"`` and the limits of u, and how long it is followed [s].
+    reference
+        signal or number, from rest, for ``"tracking"`` and for ``u_max`` and ``rate_max`` of the
+        constraints.
+    duration
+        how long the reference is followed, and u bounded by these [s]; without a reference the
+        response to the load. ``"load-iae"`` lasts until y is at rest.
     load
-        step of the load at the plant's input [u-unit], without a reference.
+        step of the load at the plant's input [u-unit], for ``"load-iae"``, and for the bounds of u
+        where there is no reference.
     feedforward
         whether the controller gets the feedforward of the first plant's model, ``Feedforward.of``
         with its delay and friction, or a ``Feedforward`` of yours. It changes no margin, so only
@@ -169,7 +174,7 @@ def tune(
     Raises
     ------
     ValueError
-        for arguments out of range, plants with different signs of the gain, a
+        for arguments out of range or without effect, plants with different signs of the gain, a
         plant that no controller of the structure stabilises, constraints that contradict each
         other (which, and by how much).
 
@@ -183,6 +188,8 @@ def tune(
     (0.63, 1.96)
     """
     u_limits = range_of_u(limits)
+    options = {"reference": reference, "duration": duration, "load": load, "quantile": quantile}
+    options |= {"samples": samples, "check_samples": check_samples, "seed": seed}
     if uncertain is None:
         constraints = with_known_noise(given_constraints(constraints), as_list(plant)[0], u_limits)
     checks.whole("seed", seed, 0)
@@ -201,6 +208,7 @@ def tune(
             feedforward = _by_model(feedforward, as_list(plant)[0], late) or False
         how["feedforward"] = feedforward
         how |= {"progress": progress, **limits}
+        _refuse(_without_effect_in_simulations(uncertain is not None), options)
         linear = partial(tune, dt=dt, rest=rest)
         return tune_by_simulation(linear, plant, scenario, objective, search or {}, how)
     if search is not None:
@@ -241,6 +249,10 @@ def tune(
         names.append(WITH_ONE_INTEGRATOR[structure])
     if forward is not None:
         _check_feedforward(names if structure == SIMPLEST else [structure], feedforward)
+    drawn = box is not None or b_range[0] != b_range[1]
+    unused = _without_effect(objective, bounds, reference is not None)
+    unused |= _without_effect_of_plants(box is not None, drawn, plants, objective)
+    _refuse(unused | _without_effect_of_noise(bounds), {**options, **vars(bounds)})
     inputs = _inputs(objective, reference, duration, load, plants, forward)
     _check_u_max(bounds.u_max, inputs, plants)
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
@@ -251,7 +263,7 @@ def tune(
         if chosen.undamped:
             task = without_damping(task)
         check = None
-        if box is not None or b_range[0] != b_range[1]:
+        if drawn:
             report("check", 1.0)
             check = _check(box, given, how, task, chosen, (check_samples, seed))
     return Tuned(
@@ -333,23 +345,110 @@ def _inputs(
     if objective == "tracking" and reference is None:
         raise ValueError("reference = None: objective = 'tracking' needs a signal to follow")
     last = checks.optional(checks.positive, "duration", duration, "s")
-    step = load_step(plants, checks.finite("load", load), last)
+    step = load_step(plants, checks.nonzero("load", load, "or nothing is rejected"), last)
     if reference is None:
         return step
+    if not callable(reference):
+        reference = as_signal(reference, "reference")
     count = samples_of(plants.dt * step.r.size * step.distance if last is None else last, plants.dt)
     t: Vector = np.arange(count, dtype=np.float64) * plants.dt
-    if not callable(reference):
-        raise ValueError(f"reference = {reference!r}: must be a signal, as quell.signals.Step()")
     r, none = np.asarray(reference(t), dtype=np.float64), np.zeros(t.size)
+    if not np.any(r):
+        raise ValueError(
+            f"reference = {reference!r}: is 0 for all of the {count * plants.dt:g} s that it is "
+            "followed; give one that moves, or a longer duration"
+        )
     if feedforward is None:
-        return Inputs(r, none)
+        return Inputs(r, none, load=load)
     if not isinstance(reference, Signal):
         raise ValueError(
             f"reference = {reference!r}: must be a signal of quell.signals, whose derivatives the "
             "feedforward uses"
         )
-    return Inputs(r, none, feedforward.linear_part(reference, t, plants.dt))
+    return Inputs(r, none, feedforward.linear_part(reference, t, plants.dt), load=load)
 
+
+# ---- Options without effect ----
+
+
+def _refuse(unused: Mapping[str, str], options: Mapping[str, Any]) -> None:
+    """Raise an error for an option that differs from its default and has no effect.
+
+    ``unused`` says why by the option's name, and what to do.
+    """
+    parameters = {**inspect.signature(tune).parameters, **inspect.signature(Constraints).parameters}
+    for name, why in unused.items():
+        value, default = options[name], parameters[name].default
+        if value is not default and value != default:
+            raise ValueError(f"{name} = {value!r}: has no effect: {why}, or leave it out")
+
+
+def _without_effect_in_simulations(uncertain: bool) -> dict[str, str]:
+    """Return why options have no effect in a tuning by simulation, by name."""
+    why = "the scenario says what a tuning by simulation runs through; change that"
+    unused = dict.fromkeys(("reference", "duration", "load"), why)
+    unused["quantile"] = (
+        "in a tuning by simulation the objective has the statistic over the plants; give an "
+        "Objective with one"
+    )
+    if not uncertain:
+        unused |= dict.fromkeys(("samples", "check_samples"), _NOTHING_DRAWN.format(""))
+    return unused
+
+
+_NOTHING_DRAWN = "no plant is drawn; give ranges of its parameters, uncertain ([plant.uncertain]){}"
+
+
+def _without_effect(objective: str, bounds: Constraints, followed: bool) -> dict[str, str]:
+    """Return why options of the responses over time have no effect, by name."""
+    if objective == "tracking":
+        return {"load": "objective = 'tracking' follows the reference; give another objective"}
+    unused: dict[str, str] = {}
+    if bounds.u_max is None and bounds.rate_max is None:
+        how = "give objective = 'tracking', or a bound of u: u_max or rate_max of the constraints"
+        unused["reference"] = f"objective = {objective!r} is about the load; {how}"
+        unused["duration"] = f"∫|y| and k_i are those until y is at rest; {how}"
+    if objective == "load" and (unused or followed):
+        unused["load"] = "k_i is the same for all loads; give objective = 'load-iae'"
+    return unused
+
+
+def _without_effect_of_plants(
+    uncertain: bool, drawn: bool, plants: PlantSet, objective: str
+) -> dict[str, str]:
+    """Return why options of the set of plants have no effect, by name."""
+    unused: dict[str, str] = {}
+    if not drawn:
+        why = _NOTHING_DRAWN.format(", or b_range")
+        unused |= dict.fromkeys(("check_samples", "seed"), why)
+    if not uncertain:
+        unused["samples"] = _NOTHING_DRAWN.format("")
+    if objective == "load":
+        unused["quantile"] = "k_i is the same for all plants; give objective = 'load-iae'"
+    elif len(plants.plants) == 1:
+        unused["quantile"] = "there is one plant; give several, b_range, or uncertain"
+    return unused
+
+
+def _without_effect_of_noise(bounds: Constraints) -> dict[str, str]:
+    """Return why rules of the noise's bound have no effect, by name."""
+    given = next((name for name in ("u_std", "m_ks") if getattr(bounds, name) is not None), None)
+    unused: dict[str, str] = {}
+    if given is not None:
+        why = f"{given} bounds what noise does to u; leave that out"
+        unused = dict.fromkeys(("noise_share", "noise_over_pi"), why)
+    elif bounds.noise:
+        unused["noise_over_pi"] = "the noise of y is known; noise_share is its bound"
+    else:
+        unused["noise_share"] = (
+            "the noise of y is not known; give noise_std or resolution, with u_min and u_max"
+        )
+    if bounds.noise_over_pi is None:  # also says that nothing is guessed
+        unused.pop("noise_over_pi", None)
+    return unused
+
+
+# ---- What u must be at rest ----
 
 # Rounding, and the plant's gain at the lowest frequency of the grid in the place of that at zero.
 _AT_REST = 1e-3

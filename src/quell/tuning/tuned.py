@@ -41,6 +41,14 @@ _MOST_CORNERS = 4
 _TOLERANCE = 1e-3
 
 
+def checked_range(name: str, ends: Any) -> tuple[float, float]:
+    """Return the ends of the range of a parameter; ``ValueError`` unless low is below high."""
+    low, high = checks.vector(f"uncertain.{name}", ends, 2).tolist()
+    if not low < high:
+        raise ValueError(f"uncertain.{name} = {ends!r}: must be [low, high], low below high")
+    return low, high
+
+
 @dataclass(frozen=True)
 class Uncertain:
     """Ranges of a plant's parameters.
@@ -67,11 +75,7 @@ class Uncertain:
         except TypeError as error:
             raise ValueError(f"uncertain: plant can't be called with these: {error}") from None
         for name, ends in self.ranges.items():
-            low, high = checks.vector(f"uncertain.{name}", ends, 2).tolist()
-            if not low < high:
-                raise ValueError(
-                    f"uncertain.{name} = {ends!r}: must be [low, high], low below high"
-                )
+            checked_range(name, ends)
 
     @property
     def ends(self) -> Matrix:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.analysis.coupling import Coupling
+from quell.analysis.coupling import Coupling, about_zeros
 from quell.analysis.multivariable import MultivariableLoop
 from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none, written_atomically
@@ -20,8 +20,8 @@ from quell.tuning.constraints import Constraints
 from quell.tuning.report import toml_text
 from quell.tuning.tuned import Tuned
 
-# A gain that changes by less with the other loops closed: as in ``analysis.coupling``.
-_INDEPENDENT = 1.25
+INDEPENDENT = 1.25
+"""A gain that changes by less with the other loops closed: as in ``analysis.coupling``."""
 TOLERANCE = 1e-3
 """A bound counts as kept up to this share beyond it, on the exact response."""
 PLACES = ("inputs", "outputs")
@@ -80,6 +80,21 @@ class AxesCheck(NamedTuple):
         )
 
 
+class GivenB0(NamedTuple):
+    """What the plant says of the B0 that the axes were given."""
+
+    is_of_plant: bool
+    """Whether its rows are those of the plant to about 1 %, each to a factor."""
+    is_other_better: bool | None
+    """Whether that of the plant decouples the axes and leaves loops stable; None if not known."""
+    is_turned: bool
+    """Whether no bandwidths are stable with it: gains at rest behind it have the wrong sign."""
+    zeros: tuple[complex, ...]
+    """Zeros in the right half plane, up to ten times the bandwidth of the axes alone [rad/s]."""
+    pairs: tuple[int, ...] | None
+    """The input of each axis by the gains at rest, if B0 has other entries, too."""
+
+
 @dataclass(frozen=True, eq=False)
 class TunedAxes:
     """Tuned axes; from ``tune_axes``.
@@ -111,6 +126,8 @@ class TunedAxes:
         relative gains behind B0: how much the axes notice each other through it.
     of_plant : Coupling or None
         those of the plant without B0; None if there are more actuators than axes.
+    given : GivenB0
+        whether B0 is that of the plant, and whether another one would be better.
     check : AxesCheck or None
         drawn errors of B0, if it may be off.
     setup : Mapping
@@ -132,6 +149,7 @@ class TunedAxes:
     objective: str
     left: Coupling | None
     of_plant: Coupling | None
+    given: GivenB0
     check: AxesCheck | None = None
     with_learners: MultivariableLoop | None = None
     setup: Mapping[str, Any] = field(default_factory=dict)
@@ -231,37 +249,84 @@ class TunedAxes:
             "of the machine, give a profile or a prefilter, or bound M_ks"
         ]
 
-    def _remedy(self) -> str:
+    @property
+    def _is_coupled(self) -> bool:
         left = self.left
-        if left is None or not left.decided or left.factor > _INDEPENDENT:
+        return left is None or not left.decided or left.factor > INDEPENDENT
+
+    def _remedy(self) -> str:
+        """Return what to do where the bounds are not met."""
+        given = self.given
+        if given.is_turned or self._is_coupled:
+            if given.is_other_better:
+                return (
+                    "the axes are coupled through this B0: give the B0 of the machine (quell b0 "
+                    "--axes finds it in a record), or looser bounds"
+                )
+            if given.is_turned or given.zeros or given.is_other_better is False:
+                return self._without_other()
             return (
-                "the axes are coupled through this B0: give the B0 of the machine (quell b0 --axes "
-                "finds it in a record), or looser bounds"
+                "the axes are coupled through this B0: give the B0 of the machine, if this is not "
+                "it (quell b0 --axes finds it in a record), or looser bounds"
             )
         if self.B0_off > 0.0:
             share = f"{100.0 * self.B0_off:.3g} %"
             return f"B0 has to be known better than to {share}, or the bounds be looser"
-        return "give looser bounds, less delay or faster samples"
+        zeros = f"{about_zeros(given.zeros)}; " if given.zeros else ""
+        return f"{zeros}give looser bounds, less delay or faster samples"
+
+    def _without_other(self) -> str:
+        """Return why another B0 of all entries is no remedy, and what may be one."""
+        given, causes, remedies = self.given, [], []
+        if given.is_turned:
+            causes.append(
+                "no bandwidths are stable with this B0, as the gains at rest behind it have a "
+                "determinant of the wrong sign"
+            )
+        if given.zeros:
+            causes.append(about_zeros(given.zeros))
+        if not causes:
+            return (
+                "the dynamics of the plant couple the axes at these bandwidths, and a constant B0 "
+                "does not undo it: give looser bounds, less delay or faster samples"
+            )
+        if given.pairs is not None:
+            names = self.controller.names
+            pairs = ", ".join(f"{names[i]} with input {j + 1}" for i, j in enumerate(given.pairs))
+            remedies.append(f"pair by the gains at rest, {pairs}, with a B0 of these entries only")
+        remedies.append("choose other inputs or outputs")
+        if not given.is_turned:
+            remedies.append("give looser bounds")
+        return f"{'; '.join(causes)}. To be tried: {', or '.join(remedies)}"
 
     def _advice(self) -> list[str]:
-        lines = []
+        lines, given = [], self.given
         if self.of_plant is not None:
-            lines.append(f"of the plant: {self.of_plant.advice.splitlines()[0]}")
+            # That B0 is to be used is said only if it is not done, and helps.
+            done = given.is_other_better is False or given.zeros
+            told = self.of_plant.facts if done else self.of_plant.advice
+            lines.append(f"of the plant: {told.splitlines()[0]}")
         left = self.left
-        if left is not None:
-            if not left.decided:
-                lines.append(f"behind B0: {left.advice.splitlines()[0]}")
-            elif left.factor > _INDEPENDENT:
-                lines.append(
-                    f"NOT decoupled by this B0: behind it a gain changes by a factor of "
-                    f"{left.factor:.3g} with the other loops closed; give the B0 of the machine"
-                )
-            else:
-                lines.append(
-                    "decoupled by this B0: behind it a gain changes by a factor of "
-                    f"{left.factor:.3g} at most with the other loops closed"
-                )
-        return lines
+        if left is None:
+            return lines
+        if not left.decided:
+            return [*lines, f"behind B0: {left.advice.splitlines()[0]}"]
+        changes = f"behind it a gain changes by a factor of {left.factor:.3g}"
+        closed = "with the other loops closed"
+        if left.factor <= INDEPENDENT:
+            return [*lines, f"decoupled by this B0: {changes} at most {closed}"]
+        if given.is_other_better:
+            rest = "give the B0 of the machine"
+        elif given.zeros:
+            rest = about_zeros(given.zeros)
+        elif given.is_other_better is None:
+            rest = "give the B0 of the machine, if this is not it"
+        else:
+            rest = "the dynamics of the plant couple the axes at these bandwidths"
+        whose = ", which is that of the plant" if given.is_of_plant else ""
+        # What to do stands in the line before where the bounds are not met.
+        rest = f"; {rest}" if self.met else ""
+        return [*lines, f"NOT decoupled by this B0{whose}: {changes} {closed}{rest}"]
 
     def summary(self) -> str:
         """Return bandwidths, figures and verdicts as lines."""
@@ -322,6 +387,10 @@ class TunedAxes:
                 "coupled": {
                     "plant": None if self.of_plant is None else self.of_plant.factor,
                     "behind_B0": None if self.left is None else self.left.factor,
+                    "given_B0": {
+                        **self.given._asdict(),
+                        "zeros": [[zero.real, zero.imag] for zero in self.given.zeros],
+                    },
                 },
                 "check": None
                 if self.check is None

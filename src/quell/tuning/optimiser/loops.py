@@ -440,7 +440,7 @@ class Inputs(NamedTuple):
     u_ff: Vector | None = None  # (k,) [u-unit]
     # Samples from one of the k to the next, a power of two; more than one for constant inputs only.
     distance: int = 1
-    lasts: bool = False  # a load that stays: what counts lasts until y is at rest, not k samples
+    load: float = 1.0  # step of the load whose ∫|y| is an objective, until y is at rest [u-unit]
 
     def of_loop(self) -> tuple[tuple[str, Vector], ...]:
         """Return the inputs of the linear loop by their names in ``closed_loop``."""
@@ -459,7 +459,7 @@ def load_step(plants: PlantSet, size: float = 1.0, duration: float | None = None
     while count > _ALL_SAMPLES * distance:
         distance *= 2
     count = -(-count // distance)
-    return Inputs(np.zeros(count), np.full(count, size), None, distance, duration is None)
+    return Inputs(np.zeros(count), np.full(count, size), None, distance, size)
 
 
 def reference_step(plants: PlantSet) -> Inputs:
@@ -509,9 +509,10 @@ class SetResponses:
     def areas(self, structure: Structure, values: Vector) -> Vector:
         """Return the integral of ``|y|`` after the step of the load, of each plant.
 
-        It lasts until y is at rest: bounds of noise may make a loop far slower than its plant.
+        It lasts until y is at rest, whatever the samples of the inputs are: bounds of noise may
+        make a loop far slower than its plant.
         """
-        law, size = _law_at(structure, values), self.plants.dt * abs(float(self.inputs.d[0]))
+        law, size = _law_at(structure, values), self.plants.dt * abs(self.inputs.load)
         loops = [closed_loop(plant, law, "d", "y") for plant in self._scaled]
         return np.array([size * area_until_rest(loop) for loop in loops])
 

@@ -426,13 +426,10 @@ def _log_root_ise(plants: PlantSet, C: Complex) -> Vector:
 
 def scores(objective: str, structure: Structure, values: Vector, over: SetResponses) -> Vector:
     """Return the objective of each plant (J,)."""
-    if objective == "load-iae" and over.inputs.lasts:
+    if objective == "load-iae":
         return over.areas(structure, values)
     found = over.of(structure, values)
-    if objective == "tracking":
-        return np.array([np.sqrt(np.mean((over.inputs.r - y) ** 2)) for y in found])
-    dt = over.plants.dt * over.inputs.distance
-    return np.array([dt * np.sum(np.abs(y)) for y in found])
+    return np.array([np.sqrt(np.mean((over.inputs.r - y) ** 2)) for y in found])
 
 
 def cost_of(objective: str, over: SetResponses, quantile: float) -> Cost:
