@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,27 @@ def test_a_pole_too_few_is_worse_and_not_mentioned() -> None:
     other = by_name(found)["order 1"]
     assert other.verdict == "worse"
     assert other.describe(found) == ""
+
+
+def test_a_flexible_axis_with_its_encoder_at_the_motor_gets_two_zeros() -> None:
+    """Four poles without zeros do not explain it; three have one that is faster than samples show, and are not advised."""
+    dt, plant = 2.5e-4, ([8333.0, 3.7e5, 6.4e9], [1.0, 69.7, 1.281e6, 1.281e6, 0.0])
+    u = np.repeat(np.random.default_rng(3).choice([-0.05, 0.05], 375), 8)
+    step = 2.0 * np.pi / 2.0**20
+    found = ql.identify(u, np.round(answer(plant, u, dt) / step) * step, dt, order=4)
+    assert not found.explained
+    others = by_name(found)
+    zeros = others["order 4 with 2 zeros"]
+    assert zeros.verdict == "better"
+    assert zeros.options == "--order 4 --zeros 2"
+    assert zeros.usable
+    assert zeros.model.num == pytest.approx(plant[0], rel=1e-2)
+    assert "take it" in zeros.describe(found)
+    poor = replace(zeros, model=replace(zeros.model, converged=False))
+    assert "do NOT take it: its search did not converge" in poor.describe(found)
+    for other in others.values():
+        if not other.usable:
+            assert not other.describe(found).endswith("; take it")
 
 
 def test_another_record_validates_the_model() -> None:

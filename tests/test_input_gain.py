@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy import signal
 from scipy.linalg import expm
 
 import quell as ql
 from quell.controllers.baselines import PID
 from quell.identification import InputGain, identify_b0, identify_b0_by
-from quell.identification.input_gain import Candidate, MarginError, bandwidth
+from quell.identification.bandwidth import Candidate, bandwidth
+from quell.identification.input_gain import MarginError, seconds_text, white_where
 from quell.identification.running_loop import Form, Inputs, linear_columns, placed, predicted
 
 from .benchmark_module import benchmark
@@ -303,6 +306,88 @@ def test_a_plant_that_no_adrc_stabilises_has_no_bandwidth() -> None:
     assert caught.value.phase_margin is None
 
 
+def servo_record(inertias: list[float], stiffnesses: list[float]) -> tuple[Any, Any]:
+    """Return torque and angle of a servo with a 20 bit encoder at the motor: a PRBS of 4000 samples of 0.25 ms."""
+    count, size = 2.0**20, len(inertias)
+    M, K = np.diag(inertias), np.zeros((size, size))
+    for i, k in enumerate(stiffnesses):
+        K[i : i + 2, i : i + 2] += k * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    A = np.zeros((2 * size, 2 * size))
+    A[:size, size:] = np.eye(size)
+    A[size:] = -np.linalg.solve(M, np.hstack([K, 5e-5 * K]))
+    B = np.zeros((2 * size, 1))
+    B[size] = 1.0 / inertias[0]
+    u = np.repeat(np.random.default_rng(3).choice([-0.05, 0.05], 500), 8)
+    C, D = np.eye(2 * size)[:1], np.zeros((1, 1))
+    _, y, _ = signal.dlsim(signal.cont2discrete((A, B, C, D), 2.5e-4), u)
+    return u, np.round(y[:, 0] / (2.0 * np.pi) * count) * 2.0 * np.pi / count
+
+
+def test_where_the_record_rejects_the_form_no_interval_and_no_bandwidth_is_given(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """A servo with a flexible coupling at 178 Hz: b0 of order 2 is neither that of the motor nor of both; a stiff one has both."""
+    u, y = servo_record([1.2e-4, 0.8e-4], [60.0])
+    found = identify_b0(u, y, 2.5e-4, order=2)
+    assert found.rejected
+    with pytest.raises(MarginError, match="omega_c not computed.*resonance.*quell identify"):
+        found.omega_c()
+    report = str(found)
+    assert "95 %" not in report
+    assert "which the record rejects" in report
+    assert found.to_json()["interval_95"] is None
+    rows = np.column_stack([np.arange(u.size) * 2.5e-4, u, y])
+    np.savetxt(tmp_path / "servo.csv", rows, delimiter=",", header="t,u,y", comments="")
+    shown = quell("b0", "servo.csv", "--order", "2", "--json", "servo.json")
+    assert "NOT: omega_c not computed" in shown.out
+    assert "keeps" not in shown.out
+    assert json.loads((tmp_path / "servo.json").read_text())["omega_c"] is None
+    stiff = identify_b0(*servo_record([2e-4], []), 2.5e-4, order=2)
+    assert not stiff.rejected
+    assert stiff.b0 == pytest.approx(5000.0, rel=1e-3)
+    assert "95 %" in str(stiff)
+
+
+def test_rounding_at_rest_does_not_reject_the_form() -> None:
+    """The error of a rounded y at rest is not white; that in motion is, and an error that is none in motion is found."""
+    rng = np.random.default_rng(4)
+    error = rng.standard_normal(3000)
+    error[1500:] = np.repeat(rng.standard_normal(150), 10)
+    moving = np.arange(3000) < 1500
+    assert white_where(error, moving, 50)
+    assert not white_where(error, ~moving, 50)
+    assert not white_where(error, np.arange(3000) < 100, 50)  # too few samples to tell
+
+
+@pytest.mark.parametrize("change", ["independent", "converged", "white_in_motion"])
+def test_each_reason_to_reject_the_form_refuses_a_bandwidth(change: str) -> None:
+    """The error depends on u, the search did not converge, or the error is not white."""
+    found = result(30.0, [1.0, 0.0, 0.0], 0.001, 0.001)
+    assert found.refusal == ""
+    assert replace(found, **{change: False}).refusal.startswith("omega_c not computed")
+    blind = replace(found, omega_max=0.0)
+    assert "at no frequency" in blind.refusal
+    assert "up to 0 rad/s" not in str(blind)
+
+
+def test_a_wrong_phase_margin_is_refused_before_the_search(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Nothing else is printed: the record need not even be searched."""
+    rows = np.column_stack([T, np.sin(T), np.cos(T)])
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="t,u,y", comments="")
+    shown = quell("b0", "run.csv", "--order", "1", "--phase-margin", "95")
+    assert shown.code == 2
+    assert "phase_margin = 95.0: must be below 90 degrees" in shown.err
+    assert shown.out == ""
+
+
+def test_a_time_has_one_unit_for_value_and_deviation() -> None:
+    """A dead time of an oven in s, that of a servo in ms; the digits are those that the deviation leaves."""
+    assert seconds_text(19.968, 0.0543) == "19.968 ± 0.054 s"
+    assert seconds_text(0.0123456, 0.0012) == "12.35 ± 1.2 ms"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -372,7 +457,7 @@ def test_the_command_succeeds_where_no_bandwidth_keeps_the_margin(
 def test_b0_by_a_signal_is_that_of_each_bin(tmp_path: Path) -> None:
     """On a loop whose gain changes with a signal; a bin without samples is NOT known, and says what to do."""
     t = np.arange(6000) * 0.01
-    signal = np.where(t < 20.0, 0.0, np.where(t < 40.0, 1.0, 3.0))
+    speed = np.where(t < 20.0, 0.0, np.where(t < 40.0, 1.0, 3.0))
     gain = np.where(t < 20.0, 4.0, np.where(t < 40.0, 2.0, 1.0))
     observer = ql.ESO.model_free(order=1, b0=2.0, omega_o=20.0, dt=0.01)
     controller, y, u = ql.ADRC(observer, omega_c=4.0), np.zeros(t.size), np.zeros(t.size)
@@ -380,17 +465,17 @@ def test_b0_by_a_signal_is_that_of_each_bin(tmp_path: Path) -> None:
     for k in range(t.size - 1):
         u[k] = controller.step(math.sin(0.2 * (t[k] % 20.0) ** 1.7), y[k] + noise[k])
         y[k + 1] = y[k] + 0.01 * (gain[k] * u[k] + 0.3)
-    found = identify_b0_by(u, y + noise, signal, 0.01, 1, bins=3)
+    found = identify_b0_by(u, y + noise, speed, 0.01, 1, bins=3)
     assert [each.is_known for each in found] == [True, True, True]
     for each, true in zip(found, (4.0, 2.0, 1.0), strict=True):
         low, high = each.interval
         assert low < true < high
         assert high - low < 0.3 * true
-    wide = identify_b0_by(u[:2500], y[:2500], signal[:2500], 0.01, 1, bins=(-0.5, 0.5, 0.8, 2.0))
+    wide = identify_b0_by(u[:2500], y[:2500], speed[:2500], 0.01, 1, bins=(-0.5, 0.5, 0.8, 2.0))
     assert not wide[1].is_known
     assert str(wide[1]).startswith("NOT known at 0.5 … 0.8")
     for bins, rule in (((1.0, 0.0), "increasing"), (0, "bins")):
         with pytest.raises(ValueError, match=rule):
-            identify_b0_by(u, y, signal, 0.01, 1, bins=bins)
+            identify_b0_by(u, y, speed, 0.01, 1, bins=bins)
     with pytest.raises(ValueError, match="nothing to divide"):
         identify_b0_by(u, y, np.ones(u.size), 0.01, 1)

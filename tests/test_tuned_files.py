@@ -282,3 +282,25 @@ def test_the_table_of_a_tuning_is_not_cut_in_80_columns(
         if line.strip().startswith("half-gain-law of order 2 ")
     ]
     assert rows, shown.out
+
+
+def test_what_the_record_does_not_show_stands_behind_the_margins(
+    quell: object, tmp_path: Path
+) -> None:
+    """A pole that depends on the sign of y, which the model lacks: its line with NOT is behind the margins, in JSON and in the file."""
+    u = np.repeat(np.random.default_rng(1).choice([-1.0, -0.3, 0.4, 1.0], 120), 5)
+    y = np.zeros(u.size)
+    for k in range(u.size - 1):
+        y[k + 1] = (0.97 if y[k] > 0.0 else 0.8) * y[k] + 0.1 * u[k]
+    table = np.column_stack([np.arange(u.size) * DT, u, y])
+    np.savetxt(tmp_path / "rec.csv", table, delimiter=",", header="t,u,y", comments="")
+    order = ("tune", "rec.csv", "--model-order", "1", "--u-min", "-1", "--u-max", "1", *FEW)
+    shown: Shown = quell(*order, "--out", "rec.toml", "--json", "rec.json")  # type: ignore[operator]
+    assert shown.code == 0, shown.err
+    behind = shown.out[shown.out.index("Optima under these constraints") :]
+    line = "NOT: the margins hold for the model only: the response to u is not of this form"
+    assert line in " ".join(behind.split())
+    assert f"# {line}" in (tmp_path / "rec.toml").read_text()
+    (doubt,) = json.loads((tmp_path / "rec.json").read_text())["doubts"]
+    assert doubt.startswith("the response to u is not of this form")
+    assert load(tmp_path / "rec.toml").controller is not None

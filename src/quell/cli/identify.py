@@ -224,8 +224,10 @@ def b0(
     """
     from quell.commissioning import measured
     from quell.identification import identify_b0
+    from quell.identification.input_gain import asked_margin
 
     outputs = check_outputs(outputs)
+    asked_margin(phase_margin, ratio)
     if axes is not None or actuators is not None:
         single = {
             "loop": (loop, None),
@@ -264,8 +266,9 @@ def b0(
     if "b0" in ran:
         results["b_over_b0"] = found.b0 / ran["b0"]
         factor, spread = found.b0 / ran["b0"], found.b0_std / abs(ran["b0"])
+        deviation = " within this form only" if found.rejected else f" ± {spread:.2g}"
         print_line(
-            console, f"the loop ran with b0 = {ran['b0']:.5g}: b/b0 = {factor:.3g} ± {spread:.2g}"
+            console, f"the loop ran with b0 = {ran['b0']:.5g}: b/b0 = {factor:.3g}{deviation}"
         )
     results |= _print_bandwidth(console, found, phase_margin, ratio)
     write_results(console, results, outputs)
@@ -404,13 +407,10 @@ def _of_loop(path: Path, dt: float, trust: bool) -> dict[str, Any]:
 def _print_bandwidth(
     console: Console, found: InputGain, phase_margin: float, ratio: float | None
 ) -> dict[str, Any]:
-    """Print and return the omega_c that keeps the phase margin, if b0 is known well enough."""
+    """Print and return the omega_c that keeps the phase margin, if the record shows one."""
     from quell.identification.input_gain import MarginError
 
     nothing = {"omega_c": None, "omega_c_std": None, "ratio": ratio}
-    if found.is_poor:
-        print_line(console, "omega_c: not computed, as b0 is not known")
-        return nothing
     try:
         with console.status("Searching for the omega_c that keeps the phase margin."):
             omega_c, spread, ratio = found.omega_c(phase_margin, ratio)

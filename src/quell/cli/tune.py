@@ -369,7 +369,7 @@ def tune(
     from quell.setup.points import has_schedule
     from quell.setup.schema import read as tables_of
     from quell.tuning.designs import range_of_u
-    from quell.tuning.plants import with_known_noise
+    from quell.tuning.plants import doubts, with_known_noise
 
     named: dict[str, Any] = {
         "structure": structure,
@@ -432,7 +432,8 @@ def tune(
         plant, dt, more, model = from_record(console, setup, asked)
         more |= given_rest or rest_of_model(model)
     options["constraints"] = with_known_noise(options["constraints"], model, range_of_u(options))
-    tuned = replace(_tuned(console, plant, dt, options | more), signals=model.signals)
+    tuned = _tuned(console, plant, dt, options | more)
+    tuned = replace(tuned, signals=model.signals, doubts=doubts(model))
     _print(console, tuned, rig.device or str(setup))
     step = None
     if place is not None:
@@ -674,3 +675,5 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
         print_line(console, str(tuned.check))
     values = ", ".join(f"{key} = {value:.5g}" for key, value in tuned.design.values.items())
     print_line(console, f"{tuned.design.name}: {values}")
+    for line in tuned.nots:
+        print_line(console, line)

@@ -366,6 +366,11 @@ def identified(
     least = max(_SAMPLES_PER_PARAMETER * (3 * order + zeros + 2), least_held)
     shortest = min(records.samples or (u.size,))
     delays = delay_range(delay, dt, shortest)
+    if delays[1] >= shortest:
+        raise ValueError(
+            f"delay = {delay!r} s: the longest delay to search (--max-delay) is longer than the "
+            f"record, which has {shortest * dt:.4g} s; give a quarter of it at most"
+        )
     least = max(least, 4 * delays[1])
     held_from = first_held_out(records, order, held_out, least, least_held)
     other = None if validation is None else other_record(*validation, least_held)
@@ -562,6 +567,8 @@ _HINT = 0.5
 _RIGID = "order 2 with friction"
 # Least and largest order that ``identify`` fits, and least order in which friction has a place.
 _LEAST_ORDER, _MOST_ORDER, _LEAST_WITH_FRICTION = 1, 8, 2
+# The zeros of a flexible axis that is measured where u acts, and least order in which they are.
+_ZEROS, _LEAST_WITH_ZEROS = 2, 4
 
 
 OF_MODEL: Literal["of model"] = "of model"
@@ -601,6 +608,18 @@ class Alternative:
         return self.z > -_HINT * self.limit or self.gain > -_EQUAL
 
     @property
+    def usable(self) -> bool:
+        """Whether its model converged, has no ``faults``, and nothing is ``undecided``."""
+        return not self._why_not
+
+    @property
+    def _why_not(self) -> str:
+        """Why its model is of no use, whatever its fit; empty if it may be."""
+        if not self.model.converged:
+            return "its search did not converge"
+        return next(iter([*self.model.faults, *self.model.undecided]), "")
+
+    @property
     def _measure(self) -> str:
         """The measure that decides, and its limit."""
         name = "likelihood ratio" if self.by_likelihood else "z"
@@ -615,9 +634,14 @@ class Alternative:
         if self.name == _RIGID:
             here = f"{here} without friction"
         if self.verdict == "better":
-            return (
-                f"NOT: {self.name} ({self.options}) fits better: {fits}, {self._measure}; take it"
-            )
+            text = f"{self.name} ({self.options}) fits better: {fits}, {self._measure}"
+            if self._why_not:
+                return f"{text}; but do NOT take it: {self._why_not}"
+            if self.model.shortcomings:
+                return (
+                    f"NOT: {text}; it is nearer, but NOT good either: {self.model.shortcomings[0]}"
+                )
+            return f"NOT: {text}; take it"
         hinted = "friction" in self.name and self.z > _HINT * self.limit
         if self.verdict == "worse" or not (self.smaller or hinted):
             return ""
@@ -646,8 +670,10 @@ def alternatives(
     They are: one pole less, and one zero less; if the error is not white, also the opposite of the
     given assumption on Coulomb friction, and for a larger model without friction that of a mass
     with friction, unless friction would drive the plant; and one pole more, if the model does not
-    explain the response to u or leaves something ``undecided``, and has no ``faults``. A structure
-    that cannot be fitted is left out.
+    explain the response to u or leaves something ``undecided``, and has no ``faults``; and two
+    zeros from order 4 on, if the model has fewer and does not explain the response to u or has
+    ``faults``: a motor with its encoder before a flexible coupling has them. A structure that
+    cannot be fitted is left out.
 
     Parameters
     ----------
@@ -678,6 +704,9 @@ def alternatives(
     doubtful = not found.explained or bool(found.undecided)
     if order < _MOST_ORDER and doubtful and not found.faults:
         tried.append((f"order {order + 1}", False, {"order": order + 1, "zeros": zeros + direct}))
+    if order >= _LEAST_WITH_ZEROS and zeros < _ZEROS and (not found.explained or found.faults):
+        name = f"order {order} with {_ZEROS} zeros"
+        tried.append((name, False, {"order": order, "zeros": _ZEROS}))
     held_out = None if found.samples else 1.0 - found.held_from / found.y.size
     same = Options(
         order,
@@ -763,6 +792,7 @@ def not_told_apart(
         first, last = (k / (k + 1.0) for k in (step, step + 1))
         others = alternatives(found, delay, progress=part_of(progress, first, last, 1.0), **given)
         better = [one for one in others if one.verdict == "better" and one.model.converged]
+        better = [one for one in better if one.usable] or (better if found.faults else [])
         doubtful = bool(found.faults) or not found.converged
         smaller = [
             one

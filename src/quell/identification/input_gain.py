@@ -9,24 +9,11 @@ denominators of ``initial_estimate`` and that of a chain of integrators, a grid 
 and of a few bandwidths of the predictor. Forms with a drifting load are left out if the output
 error alone is white. Those with a load that forgets start at the ones whose load does not. In a
 loop the plant may be unstable, so unstable denominators are among the starts.
-
-The largest omega_c with which a loop keeps a phase margin, and the ratio of omega_o to it.
-
-The observer, with ``omega_o = r omega_c``, costs phase: the loop of y'' = b u has a margin of 41°
-with r = 5, at any omega_c, and 60° from r = 30 on. But a larger r meets the delay and the sample
-time at a lower omega_c. So r is searched for, too: the omega_c of each r of a grid is found, and
-the least r is taken whose omega_c comes near to the largest, because the noise in u grows with
-omega_o.
-
-An unstable plant needs an omega_c above a least one, so the range that keeps the margin is searched
-from its upper end.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -34,9 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.analysis.linearise import linear_law
-from quell.analysis.loop import LoopAnalysis
-from quell.controllers.adrc import ADRC
+from quell.identification.bandwidth import Candidate, Reach, bandwidth, near
+from quell.identification.identify import resolution_of
 from quell.identification.model import Structure, autocorrelation, linear_columns, nonzero_lengths
 from quell.identification.result import residuals
 from quell.identification.running_loop import (
@@ -52,10 +38,8 @@ from quell.identification.running_loop import (
 )
 from quell.identification.search import delayed
 from quell.identification.starts import equation, filtered_estimates
-from quell.observers.eso import ESO
 from quell.parallel import one_blas_thread
-from quell.plants.linear import SampledPlant, sampled_plant
-from quell.types import DesignWarning, Matrix, Vector
+from quell.types import Matrix, Vector
 
 # ---- Averages over the fits of several forms ----
 
@@ -300,180 +284,6 @@ def _white(found: LoopFit, y: Vector) -> bool:
     return float(y.size * np.sum(correlation[1:] ** 2)) <= float(chi2.isf(_LEVEL, lags))
 
 
-# ---- The largest omega_c with which a loop keeps a phase margin ----
-
-# Range of omega_c relative to 1/dt: omega_o is 0.5/dt at most, below the limit of 1/dt that designs
-# warn of; and trials for each factor of ten. Chosen by hand.
-_LOWEST, _MOST_OBSERVER, _PER_DECADE = 1e-4, 0.5, 8
-# Relative errors of omega_c: to compare ratios, and of the result.
-_ROUGH, _TOLERANCE = 1e-2, 1e-6
-# Factors by which a neighbour of a rough omega_c is sought on the other side of the edge.
-_STEPS = (1.01, 1.05, 1.2, 1.5)
-# Ratios omega_o/omega_c that are tried: from the usual range of 3 to 10 (Gao 2003; Herbst 2013) to
-# where the observer costs hardly any phase. A double integrator has 60° from 30 on.
-RATIOS = tuple(np.geomspace(3.0, 100.0, 9).tolist())
-# Share of the largest omega_c that is enough for a smaller ratio: chosen by hand.
-_ENOUGH = 0.9
-# Loss of phase at an edge that is more than rounding [degrees].
-_JUMP = 1e-3
-# Phase margin that stands for an unstable loop [degrees].
-_UNSTABLE_BANDWIDTH = -180.0
-
-
-class Reach(NamedTuple):
-    """The largest omega_c that keeps a margin; if none does, the one of the largest margin."""
-
-    omega_c: float  #: [rad/s]; NaN if no loop is stable
-    ratio: float  #: omega_o/omega_c
-    phase: float  #: phase margin there [degrees]; −180 if no loop is stable
-    keeps: bool  #: whether it keeps the margin
-
-
-class Candidate:
-    """Loops of a sampled plant ``b/den`` behind a lag and a delay, and ADRC, by omega_c and ratio.
-
-    Parameters
-    ----------
-    b
-        gain of the plant.
-    den
-        its denominator of degree n, the first coefficient 1.
-    lag, delay
-        time constant of the lag, and the delay [s].
-    b0
-        gain that the model-free ESO assumes.
-    dt
-        sample time [s].
-    """
-
-    def __init__(
-        self, b: float, den: Vector, lag: float, delay: float, *, b0: float, dt: float
-    ) -> None:
-        self.order, self.b0, self.dt = den.size - 1, b0, dt
-        self.plant: SampledPlant = sampled_plant((np.array([b]), den), dt, delay, lag)
-
-    def loop(self, omega_c: float, ratio: float) -> LoopAnalysis:
-        """Return the loop."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DesignWarning)
-            controller = ADRC(
-                ESO.model_free(self.order, self.b0, ratio * omega_c, self.dt), omega_c
-            )
-        return LoopAnalysis(self.plant, linear_law(controller), self.dt)
-
-    def exact(self, omega_c: float, ratio: float) -> float:
-        """Return the phase margin [degrees]."""
-        loop = self.loop(omega_c, ratio)
-        return loop.margins.phase if loop.stable else _UNSTABLE_BANDWIDTH
-
-    def rough(self, omega_c: float, ratio: float) -> float:
-        """Return the phase margin to 0.1 degrees, by lines between frequencies: a third as long."""
-        loop = self.loop(omega_c, ratio)
-        if not loop.stable:
-            return _UNSTABLE_BANDWIDTH
-        with np.errstate(all="ignore"):  # a pole at a frequency
-            L = loop.response("L", loop.omega)
-            size = np.log(np.abs(L))
-            at = np.flatnonzero(np.signbit(size[:-1]) != np.signbit(size[1:]))
-            at = at[np.isfinite(size[at]) & np.isfinite(size[at + 1])]
-            share = size[at] / (size[at] - size[at + 1])
-            lead = np.angle(-L[at]) + share * np.angle(L[at + 1] / L[at])
-        if not at.size:
-            return math.inf
-        return math.degrees(np.min(np.abs(np.remainder(lead + np.pi, 2.0 * np.pi) - np.pi)))
-
-
-def bandwidth(loops: Candidate, margin: float, ratio: float | None = None) -> Reach:
-    """Return the largest omega_c with which ADRC keeps a phase margin [degrees].
-
-    Without a ``ratio`` that is searched for, too: of those of ``RATIOS`` whose omega_c is at least
-    0.9 times the largest, the least.
-    """
-    tried = [_reach(loops, margin, one) for one in (RATIOS if ratio is None else (ratio,))]
-    kept = [one for one in tried if one.keeps]
-    if not kept:
-        return max(tried, key=lambda one: one.phase)
-    enough = _ENOUGH * max(one.omega_c for one in kept)
-    found = next(one for one in kept if one.omega_c >= enough)
-    omega_c = near(loops, margin, found.omega_c, found.ratio)
-    if math.isnan(omega_c):  # kept by less than the error of the rough value
-        return found._replace(keeps=False, phase=loops.exact(found.omega_c, found.ratio))
-    return Reach(omega_c, found.ratio, loops.exact(omega_c, found.ratio), True)
-
-
-def near(loops: Candidate, margin: float, omega_c: float, ratio: float) -> float:
-    """Return the largest omega_c near a given one that keeps the margin, exactly; NaN for none."""
-    top = _MOST_OBSERVER / (ratio * loops.dt)
-
-    def excess(omega_c: float) -> float:
-        return min(loops.exact(omega_c, ratio), 180.0) - margin
-
-    keeps = excess(omega_c) >= 0.0
-    inside, outside = omega_c, omega_c
-    for factor in _STEPS:
-        if keeps and inside >= top:
-            return top
-        other = min(omega_c * factor, top) if keeps else omega_c / factor
-        if (excess(other) >= 0.0) != keeps:
-            inside, outside = (inside, other) if keeps else (other, outside)
-            return _edge(excess, inside, outside, _TOLERANCE)
-        inside, outside = (other, outside) if keeps else (inside, other)
-    return inside if keeps else math.nan
-
-
-def _reach(loops: Candidate, margin: float, ratio: float) -> Reach:
-    """Return the largest omega_c for a ratio, roughly."""
-    from scipy.optimize import minimize_scalar
-
-    def excess(omega_c: float) -> float:
-        return min(loops.rough(omega_c, ratio), 180.0) - margin
-
-    low, high = _LOWEST / loops.dt, _MOST_OBSERVER / (ratio * loops.dt)
-    count = max(round(math.log10(high / low) * _PER_DECADE) + 1, 3)
-    grid = np.geomspace(low, high, count)[::-1].tolist()
-    values: list[float] = []
-    for at, omega_c in enumerate(grid):
-        values.append(excess(omega_c))
-        if values[-1] >= 0.0:
-            edge = omega_c if at == 0 else _edge(excess, omega_c, grid[at - 1], _ROUGH)
-            return Reach(edge, ratio, margin, True)
-    best = int(np.argmax(values))
-    if values[best] + margin <= _UNSTABLE_BANDWIDTH:
-        return Reach(math.nan, ratio, _UNSTABLE_BANDWIDTH, False)
-    # A range that keeps it may lie between two trials.
-    ends = grid[min(best + 1, count - 1)], grid[max(best - 1, 0)]
-    top = minimize_scalar(
-        lambda x: -excess(math.exp(x)), bounds=np.log(ends), options={"xatol": _ROUGH}
-    )
-    omega_c, value = (grid[best], values[best])
-    if -float(top.fun) > value:
-        omega_c, value = math.exp(float(top.x)), -float(top.fun)
-    if value < 0.0:
-        return Reach(omega_c, ratio, value + margin, False)
-    return Reach(_edge(excess, omega_c, ends[1], _ROUGH), ratio, margin, True)
-
-
-def _edge(
-    excess: Callable[[float], float], inside: float, outside: float, tolerance: float
-) -> float:
-    """Return the last omega_c from ``inside``, which keeps the margin, to ``outside``."""
-    from scipy.optimize import brentq
-
-    if excess(outside) >= 0.0:
-        return outside
-    root = brentq(
-        lambda x: excess(math.exp(x)), math.log(inside), math.log(outside), xtol=tolerance
-    )
-    found = math.exp(float(root))
-    if excess(found) >= -_JUMP:
-        return found
-    # Where the gain comes to 1 at another frequency the margin jumps: the side that keeps it.
-    while outside > inside * (1.0 + tolerance):
-        middle = math.sqrt(inside * outside)
-        inside, outside = (middle, outside) if excess(middle) >= 0.0 else (inside, middle)
-    return inside
-
-
 # ---- b0, lag and delay of a plant from a record of its running loop ----
 
 # Least number of samples for each parameter, as in ``identify``.
@@ -499,7 +309,23 @@ _MOST_DIFFERENCE = 20.0
 _IN_JSON = (
     *("order", "b0", "b0_std", "lag", "lag_std", "delay", "delay_std", "total_delay"),
     *("total_delay_std", "dt", "samples", "noise", "omega_max", "white", "independent"),
-    "converged",
+    *("converged", "white_in_motion", "rejected", "refusal"),
+)
+# Counts of an encoder in a sample from which on rounding is white (Widrow & Kollár, *Quantization
+# Noise*, 2008, ch. 20), and such samples that the test needs for each of its lags: by hand.
+_MOVING, _MOVING_PER_LAG = 2.0, 4
+# Error relative to y's n-th difference, what u moves in a sample, that is rounding of a simulation.
+_EXACT = 1e-4
+# Difference of N log Σ e² from which on two fits do not have the same error: as ``_STALLED``.
+_SAME_ERROR = 0.1
+
+
+# What to do, and what a plant of another form may be.
+_EXCITE = "record a reference or a u that moves faster and farther, or for a longer time"
+_OTHER_FORM = (
+    "the plant is of this form: it may have a resonance, as of a flexible coupling, friction, play "
+    "or zeros; look for it with quell identify --order 4 --zeros 2 or --friction, and tune for "
+    "that plant, or record a motion that is slower than a resonance and faster than friction"
 )
 
 
@@ -512,7 +338,7 @@ class Bandwidth(NamedTuple):
 
 
 class MarginError(ValueError):
-    """No omega_c keeps the phase margin that was asked for."""
+    """No omega_c keeps the phase margin that was asked for, or the record does not show one."""
 
     def __init__(self, message: str, best: Reach | None = None) -> None:
         super().__init__(message)
@@ -548,10 +374,13 @@ class InputGain:
     independent: bool  #: whether it is independent of the u before, at 99 %
     converged: bool  #: whether the search ended at a minimum
     covariance: Matrix  #: of ``den`` without its 1, b0, lag and delay, of the best model
+    #: whether the error is white where y moves by two counts of its rounding or more in a sample;
+    #: ``white`` if y is not rounded. A rounded y at rest has an error that is not white
+    white_in_motion: bool = True
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Interval in which b0 lies with a probability of 95 %."""
+        """Interval in which b0 lies with a probability of 95 %, unless the form is ``rejected``."""
         half = _WITHIN_95 * self.b0_std
         return self.b0 - half, self.b0 + half
 
@@ -559,6 +388,29 @@ class InputGain:
     def is_poor(self) -> bool:
         """Whether the excitation is too poor: the interval of b0 is wider than ±30 %."""
         return not self.b0_std < _POOR * abs(self.b0)
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the record rejects the form of the plant, so that b0 and deviations do not hold.
+
+        The error depends on past u, or is not white (``white_in_motion``), or the search did not
+        converge.
+        """
+        return not (self.independent and self.white_in_motion and self.converged)
+
+    @property
+    def refusal(self) -> str:
+        """Why ``omega_c`` is not computed, and what to do; empty if it is."""
+        if self.is_poor:
+            return f"omega_c not computed, as b0 is not known; {_EXCITE}"
+        if self.rejected:
+            return f"omega_c not computed, as the record does not show that {_OTHER_FORM}"
+        if self.omega_max == 0.0:
+            return (
+                "omega_c not computed, as at no frequency u moves y by more than noise does; "
+                f"{_EXCITE}"
+            )
+        return ""
 
     @property
     def shortcomings(self) -> tuple[str, ...]:
@@ -571,18 +423,26 @@ class InputGain:
                 asked = "; this u moves y by no more than noise does: is it u that was recorded?"
             found.append(
                 f"the excitation is too poor: b0 may be anything from {low:.4g} to {high:.4g}; "
-                "record a reference or a u that moves faster and farther, or for a longer time"
-                f"{asked}"
+                f"{_EXCITE}{asked}"
             )
         if not self.converged:
             found.append("the search did not converge; record longer, or check the order")
         if not self.independent:
             found.append(
-                "the error depends on past u, so the plant is not of this form (order, zeros, "
-                "friction, limits that the recorded u does not have): the deviations are too small"
+                "the error depends on past u, so the plant is not of this form (order, a "
+                "resonance, zeros, friction, limits that the recorded u does not have): the "
+                "deviations are too small"
+            )
+        elif not self.white_in_motion:
+            found.append(
+                "the error is not white, so plant or load are not of this form (a resonance, "
+                "friction): the deviations are too small"
             )
         elif not self.white:
-            found.append("the error is not white: the deviations may be too small")
+            found.append(
+                "the error is not white, as that of the rounding of y at rest: the deviations may "
+                "be too small"
+            )
         return tuple(found)
 
     def omega_c(self, phase_margin: float = 60.0, ratio: float | None = None) -> Bandwidth:
@@ -605,16 +465,15 @@ class InputGain:
         ------
         MarginError
             (a ``ValueError``) for a plant with which no omega_c keeps the margin; it has the best
-            one.
+            one. Also for a record that does not show one (``refusal``).
         ValueError
             for an argument out of range, or a b0 of zero.
         """
-        margin = checks.positive("phase_margin", phase_margin, "degrees")
-        if margin >= 90.0:
-            raise ValueError(f"phase_margin = {phase_margin!r}: must be below 90 degrees")
-        ratio = None if ratio is None else checks.positive("ratio", ratio)
+        margin, ratio = asked_margin(phase_margin, ratio)
         if self.b0 == 0.0:
             raise ValueError("b0 is zero: there is no loop; record u and y while u moves y")
+        if self.refusal:
+            raise MarginError(self.refusal)
         asked = f"{margin:g}° of phase margin"
         if self.delay > _MOST_SAMPLES * self.dt:
             rule = f"the delay of {self.delay:.4g} s is longer than {_MOST_SAMPLES} samples"
@@ -648,13 +507,18 @@ class InputGain:
         """Return the report as text."""
         low, high = self.interval
         unit = f"y-unit/u-unit/s^{self.order}" if self.order > 1 else "y-unit/u-unit/s"
+        holds = f"95 %: {low:.5g} to {high:.5g}"
+        if self.rejected:
+            holds = "a deviation within this form only, which the record rejects"
+        shown = f"the record shows the plant up to {self.omega_max:.4g} rad/s"
+        if self.omega_max == 0.0:
+            shown = "at no frequency u moves y by more than noise does"
         lines = [
-            f"b0 = {self.b0:.5g} ± {self.b0_std:.2g} {unit}, 95 %: {low:.5g} to {high:.5g}",
+            f"b0 = {self.b0:.5g} ± {self.b0_std:.2g} {unit}, {holds}",
             time_line("actuator's lag", self.lag, self.lag_std),
             time_line("delay", self.delay, self.delay_std),
-            f"both together {1e3 * self.total_delay:.4g} ± {1e3 * self.total_delay_std:.2g} ms",
-            f"the record shows the plant up to {self.omega_max:.4g} rad/s; "
-            f"error of the prediction: RMS {self.noise:.3g}",
+            f"both together {seconds_text(self.total_delay, self.total_delay_std)}",
+            f"{shown}; error of the prediction: RMS {self.noise:.3g}",
             *(f"NOT: {text}" for text in self.shortcomings),
         ]
         return "\n".join(lines)
@@ -666,7 +530,8 @@ class InputGain:
         from quell.files import nonfinite_to_none
 
         value = {name: getattr(self, name) for name in _IN_JSON}
-        value |= {"interval_95": self.interval, "den": self.den.tolist()}
+        value |= {"interval_95": None if self.rejected else self.interval}
+        value |= {"den": self.den.tolist()}
         value |= {"shortcomings": self.shortcomings}
         return dict(nonfinite_to_none(value))
 
@@ -814,6 +679,12 @@ def _result(
     lags = min(50, y.size // 4)
     # In a loop u depends on the error of its own sample: only u before it counts.
     tests = residuals(best.error[1:], u[u.size - y.size : -1], lags)
+    noise = scale_y * float(np.sqrt(np.mean(best.error**2)))
+    # The rounding of a simulation is neither white nor independent, and of no matter.
+    exact = noise <= _EXACT * float(np.std(np.diff(y, n)))
+    moving = np.abs(np.diff(y)) >= _MOVING * resolution_of(y)
+    white = exact or tests.white
+    in_motion = white or bool(np.any(~moving) and white_where(best.error[1:], moving, lags))
     return InputGain(
         order=n,
         b0=unit * b0,
@@ -827,13 +698,57 @@ def _result(
         total_delay_std=total_std * dt,
         dt=dt,
         samples=u.size,
-        noise=scale_y * float(np.sqrt(np.mean(best.error**2))),
+        noise=noise,
         omega_max=visible_up_to(best, u[:, None] / scale_u, dt),
-        white=tests.white,
-        independent=tests.independent,
-        converged=best.converged,
+        white=white,
+        independent=exact or tests.independent,
+        converged=exact or _confirmed(best, found),
         covariance=covariance,
+        white_in_motion=in_motion,
     )
+
+
+def white_where(error: Vector, where: Any, lags: int) -> bool:
+    """Return whether an error is white in some samples, at 99 %, however its size changes.
+
+    The sum over lags of ``(Σ e_k e_{k−τ})²/Σ (e_k e_{k−τ})²``, over pairs of such samples, is χ².
+    """
+    from scipy.stats import chi2
+
+    if np.sum(where) < _MOVING_PER_LAG * lags:
+        return False
+    e, statistic = np.where(where, error, 0.0), 0.0
+    for lag in range(1, lags + 1):
+        products = e[lag:] * e[:-lag]
+        statistic += float(np.sum(products)) ** 2 / (float(products @ products) or 1.0)
+    return statistic <= float(chi2.ppf(0.99, lags))
+
+
+def _confirmed(best: LoopFit, found: list[LoopFit]) -> bool:
+    """Return whether the search converged, or that of a wider form did, at the same error.
+
+    Rounding of an error that is small beside y can stop a search at its minimum.
+    """
+    flags, size = best.form[1:5], best.error.size
+    power = float(best.error @ best.error)
+
+    def is_the_same(one: LoopFit) -> bool:
+        wider = all(wide >= own for wide, own in zip(one.form[1:5], flags, strict=True))
+        more = float(one.error @ one.error) - power
+        return wider and one.form.share is None and size * abs(more) <= _SAME_ERROR * power
+
+    return best.converged or any(one.converged and is_the_same(one) for one in found)
+
+
+def asked_margin(phase_margin: Any, ratio: Any = None) -> tuple[float, float | None]:
+    """Return the checked phase margin [degrees] and ratio of omega_o to omega_c.
+
+    Raises ``ValueError`` for one that is out of range.
+    """
+    margin = checks.positive("phase_margin", phase_margin, "degrees")
+    if margin >= 90.0:
+        raise ValueError(f"phase_margin = {phase_margin!r}: must be below 90 degrees")
+    return margin, None if ratio is None else checks.positive("ratio", ratio)
 
 
 def _not_reached(asked: str, best: Reach, ratio: float | None, other: Reach | None) -> str:
@@ -859,5 +774,15 @@ def time_line(name: str, value: float, spread: float) -> str:
     """Return a lag or a delay with its deviation as text."""
     if value == 0.0:
         return f"{name}: none is visible"
-    text = f"{name} {1e3 * value:.4g} ± {1e3 * spread:.2g} ms"
+    text = f"{name} {seconds_text(value, spread)}"
     return text if value > _WITHIN_99 * spread else f"{text}: hardly visible"
+
+
+def seconds_text(value: float, spread: float) -> str:
+    """Return a time and its deviation [s] in one unit, the value as exact as its deviation."""
+    factor, unit = (1.0, "s") if value >= 1.0 else (1e3, "ms")
+    value, spread = factor * value, factor * spread
+    digits = 4
+    if 0.0 < spread < value:  # the second digit of the deviation is the last one
+        digits = max(4, math.ceil(math.log10(value / spread)) + 2)
+    return f"{value:.{min(digits, 6)}g} ± {spread:.2g} {unit}"

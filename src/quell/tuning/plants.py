@@ -253,6 +253,13 @@ def _moved(theta: Vector, step: Vector, size: int) -> Vector:
 
 # ---- The model of a record, those that the record does not tell apart from it ----
 
+
+def doubts(model: Identified) -> tuple[str, ...]:
+    """Return why margins that hold for a model may not hold for its plant; empty for a good one."""
+    found = model.shortcomings
+    return found if model.converged else (*found, "the search did not converge; record longer")
+
+
 # Poles of the model at first: a flexible axis has four.
 _ORDER = 4
 

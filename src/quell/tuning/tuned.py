@@ -211,6 +211,9 @@ class Tuned:
         the objectives on fresh samples, if the plant has ranges and the tuning was by simulation.
     signals : Signals
         names and units of the plant's u and y.
+    doubts : tuple
+        why the plant may differ from the model of a record that it was tuned for (``doubts`` of
+        ``quell.tuning.plants``); they are in ``summary()``, JSON and the setup file.
     """
 
     design: Design
@@ -225,6 +228,12 @@ class Tuned:
     search: Search | None = None
     simulated_check: Mapping[str, Checked] | None = None
     signals: Signals = UNKNOWN
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def nots(self) -> tuple[str, ...]:
+        """The ``doubts`` as lines that begin with NOT."""
+        return tuple(f"NOT: the margins hold for the model only: {text}" for text in self.doubts)
 
     @property
     def controller(self) -> Controller:
@@ -315,7 +324,7 @@ class Tuned:
         for name, each in (self.simulated_check or {}).items():
             ends = f"95 % interval {each.low:.4g} to {each.high:.4g}"
             lines.append(f"{name} on {each.samples} fresh samples: {each.value:.4g} ({ends})")
-        return "\n".join([*lines, self.analysis.summary()])
+        return "\n".join([*lines, self.analysis.summary(), *self.nots])
 
     def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw Bode diagram, sensitivities with their bounds, step and load responses.
@@ -335,6 +344,7 @@ class Tuned:
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
         comment += f"active: {', '.join(self.active) or 'none'}\n{self.reference_step}"
         comment += f"\n{self.left_out}" if self.left_out else ""
+        comment += "".join(f"\n{line}" for line in self.nots)
         replaced = ("observer", "controller")
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
         return toml_text({**tables, **self.design.tables}, comment)
@@ -356,6 +366,7 @@ class Tuned:
                 "objective": self.objective,
                 "constraints": dict(vars(self.constraints)),
                 "noise_bound": self.noise_bound,
+                "doubts": self.doubts,
                 "design": self.design.to_json(),
                 "designs": {name: each.to_json() for name, each in self.designs.items()},
                 "costs": self.costs,
