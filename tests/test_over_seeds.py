@@ -240,6 +240,16 @@ def in_windows(*windows: Any) -> Any:
             lambda: over_seeds.of_setups(setups(8.0, 9.0, duration=0.1)),
             r"windows\[0\].start = 0.1: must be less than the scenario's duration",
         ),
+        (
+            lambda: over_seeds.of_setups(setups(8.0) | {"longer": made_axes("l", gantry() | {"dt": 2e-3})}),
+            r"c8 has dt = 0.001 s, longer 0.002 s: must have one dt, as the errors between samples",
+        ),
+        (
+            lambda: over_seeds.over_seeds(
+                ql.plants.LinearPlant([[-1.0]], [1.0], [1.0]), {f"{dt}": ql.baselines.PID(2.0, dt=dt) for dt in (0.02, 0.01)}, ql.Scenario()
+            ),
+            r"0.01 has dt = 0.01 s, 0.02 0.02 s: must have one dt",
+        ),
         (lambda: in_windows({"start": None}), r"windows\[0\]: start = None: must be a number"),
         (lambda: in_windows({}, {"begin": 1.0}), r"windows\[1\]: 'begin' is unknown; .*start"),
         (lambda: in_windows({"start": -1.0}), r"windows\[0\]: start = -1.0: must be .*not negative"),
@@ -310,6 +320,10 @@ scenario = {{ duration = {}, reference = {{ kind = "step" }} }}
     shown = quell("compare", "high.toml", "right.toml", "--no-figures")
     assert shown.code == 0, shown.err
     assert "0 to 2 s: best is right" in shown.out
+    longer = text.format(4.0, 2.0).replace("dt = 0.02", "dt = 0.1")
+    (tmp_path / "longer.toml").write_text(longer, encoding="utf-8")
+    shown = quell("compare", "high.toml", "longer.toml", "--no-figures")
+    assert (shown.code, "high has dt = 0.02 s, longer 0.1 s: must have one dt" in shown.err) == (2, True)  # fmt: skip
     shown = quell("compare", "high.toml", "wrong.toml", "--no-figures")
     assert shown.code == 4
     assert "NOT stable: wrong diverged in 1 of 1 runs" in shown.out

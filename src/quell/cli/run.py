@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -207,6 +207,9 @@ def sweep(
     results = summary(found, worst)
     where_option = "" if folder is None else f" --folder {folder}"
     print_summary(console, given.title, found, results, f"quell sweep {setup}{where_option}")
+    results["notes"] = _notes(plan["build"].cases, varied, float(given.controller.dt))
+    for note in results["notes"]:
+        print_line(console, note)
     paths = _save_figures(found, figures, outputs)
     write_results(console, {**results, "setup": given.as_json()}, outputs, paths)
 
@@ -225,6 +228,17 @@ def _varies(given: Any) -> bool:
 
     values = as_values("", given)
     return not isinstance(values, tuple) or len(values) > 1
+
+
+def _notes(cases: Mapping[str, Any], varied: Sequence[str], dt: float) -> list[str]:
+    """Return lines with NOT about what the measures of a sweep can not be compared over."""
+    of_cases = {float(case.get("dt", dt)) for case in cases.values()}
+    if "dt" not in varied and len(of_cases) < 2:
+        return []
+    return [
+        "NOT comparable over dt: measures are of samples and change with dt by themselves, as what "
+        "y does between samples is in none; compare runs of one dt"
+    ]
 
 
 def _slug(name: str) -> str:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import check_controller
-from quell.experiments.common import save_figures
+from quell.experiments.common import check_sample_times, save_figures
 from quell.files import nonfinite_to_none
 from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
@@ -224,8 +224,8 @@ def over_seeds(
     plant, scenario
         as for ``simulate``; the seeds are that of the scenario and those that follow it.
     controllers
-        by name, two or more: all of one axis, or all ``quell.Axes`` of the same axes; with any
-        sample times.
+        by name, two or more: all of one axis, or all ``quell.Axes`` of the same axes; with one
+        sample time, as what y does between samples is in no measure.
     seeds
         number of seeds; by default 10, or one where nothing in the scenario is random.
     windows
@@ -248,9 +248,9 @@ def over_seeds(
     Raises
     ------
     ValueError
-        for fewer than two controllers, controllers of different axes, a window with other keys,
-        before 0 s or without samples, several seeds where nothing is random, one where something
-        is, and what ``simulate`` raises.
+        for fewer than two controllers, controllers of different axes or sample times, a window with
+        other keys, before 0 s or without samples, several seeds where nothing is random, one where
+        something is, and what ``simulate`` raises.
 
     Examples
     --------
@@ -269,6 +269,7 @@ def over_seeds(
     if len(controllers) < 2:
         raise ValueError(f"controllers has {len(controllers)}: give two or more to compare")
     axes = _axes_of(controllers)
+    check_sample_times(controllers)
     numbers = _seeds(scenario, seeds)
     judged = _windows(scenario, windows)
     spans = tuple(_span(window, scenario.duration) for window in judged)
@@ -487,9 +488,9 @@ def of_setups(
     Parameters
     ----------
     setups
-        by name, two or more; all of one axis, or all of the same axes. Where another one has a
-        plant, a scenario, references or windows of its own that differ, a note that begins with NOT
-        says that they are not used.
+        by name, two or more; all of one axis, or all of the same axes, with one dt. Where another
+        one has a plant, a scenario, references or windows of its own that differ, a note that
+        begins with NOT says that they are not used.
     seeds, criterion, progress
         as for ``over_seeds``; the windows are those of [[metrics]].
     """
