@@ -209,6 +209,27 @@ def test_one_axis_is_compared_in_the_same_way() -> None:
     assert found.describe().startswith("0 to 2 s: best is k6: ∫|error| ")
 
 
+def test_the_variation_of_u_is_that_of_the_actuators_whatever_b0_is() -> None:
+    """Half of B0 halves v of the same motors, so all have the B of the first; the rest of the measures stays."""
+    half = gantry(8.0)
+    half["axes"]["B0"] = [[2.5, 0.25], [0.2, 3.0]]
+    given = {"one": made_axes("one", gantry(8.0)), "half": made_axes("half", half)}
+    found = over_seeds.of_setups(given, seeds=2)
+    first = given["one"]
+    B = np.array([[5.0, 0.5], [0.4, 6.0]])
+    for s, seed in enumerate(found.seeds):
+        scenario = replace(first.needed("scenario"), seed=seed)
+        run = ql.simulate(first.plant, given["half"].controller, scenario)
+        moved = np.abs(np.diff(run["u"][run.t >= 0.1 - 1e-9] @ B.T, axis=0)).sum(axis=0)
+        assert found.values["control_variation"][1, 0, :, s] == pytest.approx(moved)
+        assert found.values["rms"][1, 0, 0, s] == run.metrics(0.1)["x"]["rms"]
+    assert (
+        "u of an axis is B u with B = [[5, 0.5], [0.4, 6]] for all, as their B0 differ"
+        in found.notes
+    )
+    assert over_seeds.of_setups(setups(8.0, 9.0), seeds=2).notes == ()
+
+
 def in_windows(*windows: Any) -> Any:
     """Compare two controllers in these windows."""
     lag = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.commissioning import controlled, measured, measured_run, runs_in
+from quell.commissioning import by_axis, controlled, measured, measured_run, run_in
 from quell.files import MAX_SIZE
 from quell.realtime.recordings import Event
 from quell.records.trajectory import Trajectory
@@ -94,11 +94,11 @@ def signals_of(
     ValueError
         as ``quell.commissioning.measured``.
     """
-    runs = runs_in(path, columns, dt, time_unit, max_size)
-    if not runs:
+    run = run_in(path, columns, dt, time_unit, max_size)
+    if run is None:
         found = measured(path, columns, dt, time_unit, max_size)
         return {"": Signals(found.u, found.y, found.reference, None, {}, found.dt)}
-    return {name: _signals_in(run) for name, run in runs.items()}
+    return {name: _signals_in(each) for name, each in by_axis(run).items()}
 
 
 def _signals_in(run: Trajectory) -> Signals:
