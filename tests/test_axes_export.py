@@ -315,13 +315,30 @@ class TestMemory:
             lambda: ql.Axes(two()[::-1], [[1.0, 0.3], [0.2, 1.0]], **LIMITS),
             lambda: ql.Axes(two(), gain_functions.nested_tuples, **LIMITS),
             lambda: ql.Axes([*two(), joint()], SQUARE, **LIMITS),
+            lambda: ql.Axes(
+                dict(zip("ab", two(), strict=True)), [[1.0, 0.3], [0.2, 1.0]], **LIMITS
+            ),
         ],
-        ids=["another B0", "another order of axes", "a function", "another axis"],
+        ids=["another B0", "another order of axes", "a function", "another axis", "other names"],
     )
     def test_images_of_other_axes_are_refused(self, other: Any) -> None:
         """What is learned of an axis is relative to B0."""
         with pytest.raises(ValueError, match="of another controller"):
             other().restore(taught(learning(), 10).memory())
+
+    @needs_gcc
+    def test_an_image_of_equal_axes_in_another_order_is_refused(self, tmp_path: Path) -> None:
+        """In Python as in C: only their names say which is which."""
+        parts = [joint(learner=ql.learners.Kalman(), guard=ql.Guard()) for _ in range(2)]
+        axes = ql.Axes(dict(zip("xz", parts, strict=True)), **LIMITS)
+        image = taught(axes).memory()
+        ql.Axes(dict(zip("xz", parts, strict=True)), **LIMITS).restore(image)
+        exchanged = ql.Axes(dict(zip("zx", parts, strict=True)), **LIMITS)
+        with pytest.raises(ValueError, match="names and order of axes must be those"):
+            exchanged.restore(image)
+        robot = RobotInC(c_source(exchanged, "robot"), tmp_path)
+        length = ctypes.c_size_t(len(image))
+        assert not robot.call("load", ctypes.c_bool, image, length, ctypes.c_bool(False))
 
     def test_an_image_of_a_robot_with_other_links_is_refused(self) -> None:
         """The parameters of a function are compared, as a constant B0 is; limits are not."""

@@ -482,6 +482,24 @@ def test_what_an_fmu_cannot_do_is_refused_with_a_reason(made: Maker) -> None:
     one.instantiate()
 
 
+@pytest.mark.parametrize(
+    "plant",
+    [
+        ql.plants.arm(),
+        ql.plants.encoded_outputs(ql.plants.arm(), 1e-6),
+        ql.plants.delayed_inputs(ql.plants.arm(), 1e-3, DT),
+        ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2)),
+    ],
+)
+def test_a_plant_with_several_signals_is_refused_with_a_reason(plant: Any, tmp_path: Path) -> None:
+    """Alone, and behind its encoders and delays; no file is left."""
+    with pytest.raises(
+        ql.export.TranslationError, match="is of one u and one y, and this one has 2"
+    ):
+        ql.export.fmu(plant, tmp_path / "plant.fmu", dt=DT)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", ["servo", "learner", "mass", "loop"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_the_sources_compile_without_a_warning(

@@ -159,7 +159,7 @@ def test_without_frama_c_nothing_is_proved(
     names = {path.name for path in Path("out/proof").iterdir()}
     assert names == {"servo_contract.h", "servo_proof.c", "prove.sh", "REPORT.md"}
     fmu = in_this_process((*arguments, "--to", "fmu", "--prove"), monkeypatch, capsys)
-    assert (fmu.code, "--prove: are for --to c" in fmu.err) == (2, True)
+    assert (fmu.code, "--prove: only with --to c" in fmu.err) == (2, True)
 
 
 def test_the_contract_of_several_signals_has_each_actuator() -> None:

@@ -197,26 +197,47 @@ def test_one_axis_is_not_several() -> None:
         made_axes("a.toml", {"dt": 0.01})
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu"),
-        ("b0", "run.csv", "--loop", "gantry.toml"),
-    ],
-)
-def test_a_command_of_one_axis_says_so(
-    quell: Callable[..., Shown], tmp_path: Path, arguments: tuple[str, ...]
-) -> None:
+def test_a_command_of_one_axis_says_so(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """In a line with NOT, with the exit code of a wrong input; no file is written."""
     (tmp_path / "gantry.toml").write_text(GANTRY, encoding="utf-8")
     t = np.arange(50) * 1e-3
     np.savetxt(
         tmp_path / "run.csv", np.column_stack([t, t, t]), delimiter=",", header="t,u,y", comments=""
     )
-    shown = quell(*arguments)
+    shown = quell("b0", "run.csv", "--loop", "gantry.toml")
     assert shown.code == 2
     assert "gantry.toml: NOT for several axes yet" in shown.err
     assert {path.name for path in tmp_path.iterdir()} == {"gantry.toml", "run.csv"}
+
+
+def test_the_controller_of_several_axes_is_exported_as_an_fmu(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """``quell export --to fmu`` takes its file; an FMU of its plant, or of both, is refused."""
+    pytest.importorskip("fmpy")
+    (tmp_path / "gantry.toml").write_text(GANTRY, encoding="utf-8")
+    shown = quell("export", "gantry.toml", "--to", "fmu", "--out", "gantry.fmu")
+    assert shown.code == 0, shown.err
+    assert (tmp_path / "gantry.fmu").exists()
+    for what, reason in (("plant", "has 2 and 2; write"), ("loop", "2 axes: an FMU with a plant")):
+        shown = quell("export", "gantry.toml", "--to", "fmu", "--what", what, "--out", "p.fmu")
+        assert shown.code == 2
+        assert reason in shown.err.replace("\n", " ")
+    assert not (tmp_path / "p.fmu").exists()
+
+
+def test_what_is_missing_is_shown_as_a_setup_of_axes_has_it() -> None:
+    """The scenario without a reference, which belongs into each [[axis]], and a plant with several signals."""
+    data = gantry()
+    del data["scenario"], data["plant"]
+    data["axes"] = {"B0": [[5.0, 0.5], [0.4, 6.0]]}
+    setup = made_axes("a.toml", data)
+    with pytest.raises(
+        SetupError, match=r"scenario: missing.* reference = .* in each \[\[axis\]\]"
+    ):
+        setup.needed("scenario")
+    with pytest.raises(SetupError, match="plant: missing.*multivariable-linear"):
+        setup.needed("plant")
 
 
 def test_the_controller_of_several_axes_is_exported_to_c(

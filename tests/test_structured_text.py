@@ -18,7 +18,7 @@ from quell.export.structured_text.c_reader import CFile
 from quell.export.structured_text.places import Node, Whole
 from quell.export.structured_text.translator import Translator
 
-from .commands import in_this_process
+from .commands import Shown, in_this_process
 from .in_c import InC, needs_gcc
 from .setups import TWO_MASS
 from .st_in_python import FunctionBlock
@@ -247,7 +247,8 @@ def test_the_text_compiled_by_matiec_has_the_bits_of_the_c_code(
 
 def test_the_files_have_no_placeholder_and_names_are_those_of_the_standard(tmp_path: Path) -> None:
     """No name has two _ in a row or one at its end; the README names every input."""
-    files = ql.export.st(adrc(feedforward=True), tmp_path / "out", name="axis")
+    files, comparison = ql.export.st(adrc(feedforward=True), tmp_path / "out", name="axis")
+    assert comparison is None
     assert [path.name for path in files] == ["axis.st", "README.md"]
     text, readme = (path.read_text() for path in files)
     assert text.isascii()
@@ -379,18 +380,39 @@ def test_c_that_the_reader_does_not_know_is_refused(body: str, rule: str) -> Non
         file.function("f")
 
 
-def test_the_command_writes_the_block_and_refuses_options_of_the_c_files(
+def test_the_command_writes_the_block_and_compares_single_precision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It says NOT, because no PLC has tried it."""
+    """As for C; it says NOT, because no PLC has tried it."""
     monkeypatch.chdir(tmp_path)
-    Path("servo.toml").write_text(TWO_MASS + "u_min = -1.0\nu_max = 1.0\n")
     arguments = ("export", "servo.toml", "--to", "st", "--out", "out", "--name", "axis")
-    shown = in_this_process((*arguments, "--precision", "single"), monkeypatch, capsys)
+
+    def export(scenario: str, *options: str) -> Shown:
+        Path("servo.toml").write_text(f"{TWO_MASS}u_min = -1.0\nu_max = 1.0\n{scenario}")
+        return in_this_process((*arguments, *options), monkeypatch, capsys)
+
+    for scenario, options, rule in (
+        ("", ("--prove",), "--prove: only with --to c"),
+        ("", ("--accept",), "--accept: goes with --precision single"),
+        ("", ("--precision", "single"), "scenario: missing"),
+        ("scenario = 3", ("--precision", "single"), "scenario"),
+        (FAR, ("--precision", "single"), "changes u by"),
+    ):
+        shown = export(scenario, *options)
+        assert (shown.code, rule in " ".join(shown.err.split())) == (2, True), shown
+        assert not Path("out").exists()
+    shown = export("[scenario]\nduration = 2.0\n", "--precision", "single")
     assert shown.code == 0, shown
+    assert "Single precision changes u by" in shown.out
     assert "NOT tried on a PLC" in shown.out
     assert " : REAL;" in Path("out/axis.st").read_text()
-    for option in ("--prove", "--accept"):
-        shown = in_this_process((*arguments, option), monkeypatch, capsys)
-        assert shown.code != 0
-        assert option in shown.err
+    shown = export(FAR, "--precision", "single", "--accept", "--overwrite")
+    assert shown.code == 0, shown
+
+
+FAR = """
+[scenario]
+duration = 2.0
+x0 = [1000.0, 1000.0, 0.0, 0.0]
+reference = 1000.1
+"""

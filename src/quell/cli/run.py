@@ -362,36 +362,29 @@ def export(
         exit code is not 0.
     """
     from quell.export import c
-    from quell.setup import load, made, made_axes, read
+    from quell.setup import made, made_axes, read
     from quell.setup.description import is_of_axes
 
-    if to == "fmu":
-        if precision != "double" or accept or prove or resolution is not None:
-            rule = "are for --to c; an FMU is in double"
-            raise ValueError(f"--precision, --resolution, --accept and --prove: {rule}")
-        if what == "plant":
-            refuse({"memory": (memory, None)}, "is of a controller; a plant has none")
-        given = load(setup, trust)
-        _learned(given.controller, memory, "double")
-        _to_fmu(given, what, out, name or "", overwrite)
-        return
-    if what != "controller":
-        raise ValueError(f"--what = {what}: is for --to fmu; {to} is of the controller")
-    if to in ("ros2", "st"):
-        if accept or prove or resolution is not None:
-            raise ValueError(
-                f"--resolution, --accept and --prove: are for --to c, not for --to {to}"
-            )
-        controller, title = _any_controller(setup, memory, precision, trust)
-        if to == "ros2":
-            _to_ros2(controller, title, precision, out, name or "controller", overwrite)
-        else:
-            _to_st(controller, title, precision, out, name or "controller", overwrite)
-        return
-    if precision == "double":
+    if to != "c":
+        refuse({"resolution": (resolution, None), "prove": (prove, False)}, "only with --to c")
+    if to in ("fmu", "ros2"):
+        single = {"precision": (precision, "double"), "accept": (accept, False)}
+        refuse(single, f"only with --to c or --to st; --to {to} is in double")
+    elif precision == "double":
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
+    if to != "fmu":
+        refuse({"what": (what, "controller")}, f"is for --to fmu; {to} is of the controller")
+    if what == "plant":
+        refuse({"memory": (memory, None)}, "is of a controller; a plant has none")
     file, data = read(setup)
     given = (made_axes if is_of_axes(data) else made)(file, data, trust)
+    controller = _learned(given.controller, memory, precision)
+    if to == "fmu":
+        _to_fmu(given, what, out, name or "", overwrite)
+        return
+    if to == "ros2":
+        _to_ros2(controller, given.title, out, name or "controller", overwrite)
+        return
     # Single precision is compared with double in a simulated run.
     if precision == "single" and not accept:
         given.needed("plant")
@@ -399,8 +392,12 @@ def export(
     loop: dict[str, Any] = {"plant": given.plant, "scenario": given.scenario}
     if precision == "double" or None in loop.values():
         loop = {}
+    if to == "st":
+        options: dict[str, Any] = loop | {"accept": accept, "overwrite": overwrite}
+        _to_st(controller, given.title, precision, out, name or "controller", options)
+        return
     exported = c(
-        _learned(given.controller, memory, precision),
+        controller,
         out,
         name=name or "controller",
         precision=precision,
@@ -448,37 +445,22 @@ def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> N
     print_line(Console(), f"FMU of the {what}: {out}")
 
 
-def _any_controller(
-    setup: Path, memory: Path | None, precision: str, trust: bool
-) -> tuple[Any, str]:
-    """Return the controller of a setup, of one axis or of several, and the title of the setup."""
-    from quell.setup import made, made_axes, read
-    from quell.setup.description import is_of_axes
-
-    file, data = read(setup)
-    given = (made_axes if is_of_axes(data) else made)(file, data, trust)
-    return _learned(given.controller, memory, precision), given.title
-
-
-def _to_ros2(
-    controller: Any, title: str, precision: str, out: Path, name: str, overwrite: bool
-) -> None:
+def _to_ros2(controller: Any, title: str, out: Path, name: str, overwrite: bool) -> None:
     from quell.export import ros2
 
-    if precision != "double":
-        raise ValueError("--precision single: the interfaces of ros2_control are in double")
     ros2(controller, out, name=name, overwrite=overwrite)
     print_line(Console(), f"{title}: package {name} of ROS 2 Jazzy in {out}")
     print_line(Console(), "NOT built with ROS here: run colcon build and colcon test")
 
 
 def _to_st(
-    controller: Any, title: str, precision: str, out: Path, name: str, overwrite: bool
+    controller: Any, title: str, precision: str, out: Path, name: str, options: dict[str, Any]
 ) -> None:
     from quell.export import st
 
-    st(controller, out, name=name, precision=precision, overwrite=overwrite)
+    done = st(controller, out, name=name, precision=precision, **options)
     print_line(Console(), f"{title}: function block {name} in {out}/{name}.st")
+    _print_comparison(Console(), done.comparison)
     print_line(Console(), "NOT tried on a PLC: compare a record of it with a simulated one")
 
 
@@ -488,9 +470,7 @@ def _print(title: str, exported: Exported) -> None:
     name = source.name
     console = Console()
     print_line(console, f"{title}: {folder}/src/{name}.h and .c, in {source.precision} precision")
-    if exported.comparison is not None:
-        for line in _differences(exported.comparison):
-            print_line(console, line)
+    _print_comparison(console, exported.comparison)
     print_line(console, _sizes(exported))
     if exported.proof is not None:
         print_line(console, exported.proof.summary)
@@ -498,6 +478,12 @@ def _print(title: str, exported: Exported) -> None:
             print_line(console, f"NOT proved: {line}")
         print_line(console, f"Report: {folder}/proof/REPORT.md; again: {folder}/proof/prove.sh")
     print_line(console, f"Test: {folder}/test_{name}.c; how to use it: {folder}/README.md")
+
+
+def _print_comparison(console: Console, comparison: Comparison | None) -> None:
+    """Print what single precision changes, where it was compared."""
+    for line in [] if comparison is None else _differences(comparison):
+        print_line(console, line)
 
 
 def _differences(found: Comparison) -> list[str]:

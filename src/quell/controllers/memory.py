@@ -20,10 +20,10 @@ at end    uint64      check of all that is before it
 
 *Layout*: what the numbers need so that they mean the same. Names and shapes of the arrays, kinds
 of controller, learner and guard, dt, b0 (of several axes B0, of a function its name), the model's
-coefficients a, and those parameters of the learner that ``learners.base.meaning`` returns: its
-features, scales and orders. Gains may change between two starts of a machine: omega_o, omega_c,
-limits, the guard and times of forgetting are not in it. So a product whose loop is tuned again
-keeps its map.
+coefficients a, names and order of the axes, and those parameters of the learner that
+``learners.base.meaning`` returns: its features, scales and orders. Gains may change between
+two starts of a machine: omega_o, omega_c, limits, the guard and times of forgetting are not in it.
+So a product whose loop is tuned again keeps its map.
 
 *Design*: all parameters but the limits of u. An image continues a running loop only where these are
 the same, too. Both hashes are of numbers with 9 digits (6 in single precision), because another
@@ -52,6 +52,7 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -143,13 +144,16 @@ def _work_of(state: Any, prefix: str) -> set[str]:
     return found
 
 
-def images_of(parameters: Any, state: Any, dt: float) -> Layout:
-    """Return the layout of the images of a controller, given by its kernels' parameters."""
+def images_of(parameters: Any, state: Any, dt: float, names: Sequence[str] = ()) -> Layout:
+    """Return the layout of the images of a controller, given by its kernels' parameters.
+
+    ``names`` are those of its axes: an image with the axes in another order is of another one.
+    """
     arrays = kept_arrays(state)
     single = any(array.dtype == np.float32 for array in arrays.values())
     shapes = tuple((name, array.shape) for name, array in arrays.items())
     digits, width = (6, 4) if single else (9, 8)
-    what = _what(parameters), float(dt), shapes
+    what = _what(parameters), float(dt), shapes, *names
     layout, design = _hash(what, digits), _hash((what, parameters), digits)
     return Layout(arrays, width, layout, design, _zero_places(state, arrays))
 
@@ -291,8 +295,8 @@ def read_image(known: Layout, image: Any, *, running: bool) -> dict[str, NDArray
     if layout != known.layout or size != known.size:
         raise ValueError(
             "image is of another controller: kind, orders, features and scales of the learner, dt, "
-            "b0 and model must be those of the controller that has saved it; make the controller "
-            "as that one was made, or let it learn anew"
+            "b0, model, and names and order of axes must be those of the controller that has saved "
+            "it; make the controller as that one was made, or let it learn anew"
         )
     if running and design != known.design:
         raise ValueError(

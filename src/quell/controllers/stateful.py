@@ -480,7 +480,7 @@ class StatefulController(Described):
                 "take a learner of quell.learners such as Kalman() or RLS()"
             )
         this: Any = self
-        return images_of(self.parameters, self._state, float(this.dt))
+        return images_of(self.parameters, self._state, float(this.dt), getattr(this, "names", ()))
 
     @property
     def _external_fields(self) -> tuple[str, ...]:

@@ -9,10 +9,11 @@ from quell.export.fmi import fmu
 from quell.export.library import Comparison, Difference, Exported, NoCompilerError, Sizes, c
 from quell.export.proof import Alarm, Proof
 from quell.export.ros2 import ros2
-from quell.export.structured_text import st, st_source
+from quell.export.structured_text import FunctionBlock, st, st_source
 from quell.export.translate.text import TranslationError
 
 __all__ = [
-    "Alarm", "CSource", "Comparison", "Difference", "Exported", "NoCompilerError", "Proof", "Sizes",
-    "TranslationError", "c", "c_source", "fmu", "plant_source", "ros2", "st", "st_source",
+    "Alarm", "CSource", "Comparison", "Difference", "Exported", "FunctionBlock", "NoCompilerError",
+    "Proof", "Sizes", "TranslationError", "c", "c_source", "fmu", "plant_source", "ros2", "st",
+    "st_source",
 ]  # fmt: skip

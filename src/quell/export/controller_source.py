@@ -377,7 +377,8 @@ class _Writer:
         self.parts, self.name, self.resolution = parts, name, resolution
         self.described, self.kernels = parts.controller, parts.kernels
         self.files = CFiles(name, parts.parameters, parts.state, findings)
-        self.images = images_of(parts.parameters, parts.state, float(self.described.dt))
+        names = getattr(self.described, "names", ())
+        self.images = images_of(parts.parameters, parts.state, float(self.described.dt), names)
         self.real = self.files.real
         self.state = f"{name}_state *state"
         self.one = parts.sizes is None

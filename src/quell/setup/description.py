@@ -91,8 +91,8 @@ def describe(name: str, data: Mapping[str, Any]) -> Description:
         raise SetupError(
             [
                 f"{name}: NOT for several axes yet: this works on one axis, and the file has "
-                "[[axis]]; quell run, run-rig, tune, sweep, compare, studio and export take it, in "
-                "Python quell.setup.load_axes reads it"
+                "[[axis]]; quell run, run-rig, replay, proxy, tune, sweep, compare, studio and "
+                "export take it, in Python quell.setup.load_axes reads it"
             ]
         )
     values = immutable(data)

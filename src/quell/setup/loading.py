@@ -37,7 +37,7 @@ from quell.plants.base import Plant, signals_of
 from quell.plants.linear import delayed
 from quell.plants.linearise import linear_model
 from quell.records.metrics import SETTLING_BAND
-from quell.setup.description import Description, describe
+from quell.setup.description import Description, describe, is_of_axes
 from quell.setup.registry import CASE
 from quell.setup.schema import (
     Builder,
@@ -69,6 +69,11 @@ _EXAMPLES = {
     "scenario": "scenario = {duration = 10.0, reference = {kind = 'step'}}",
     "plant": "plant = {kind = 'linear', num = [1.0], den = [1.0, 1.0]}",
     "rig": "rig = {device = 'twin:'}",
+}
+_EXAMPLES_OF_AXES = {
+    "scenario": "scenario = {duration = 10.0}, and reference = {kind = 'step'} in each [[axis]]",
+    "plant": "plant = {kind = 'multivariable-linear', A = …, B = …, C = …}, or {kind = 'arm'}",
+    "rig": "rig = {device = 'udp://127.0.0.1:5005'}",
 }
 
 EXAMPLES = Path(__file__).parent / "examples"
@@ -106,7 +111,8 @@ class Setup:
     def needed(self, table: str) -> Any:
         """Return the object of an optional table; raise a ``SetupError`` if it is missing."""
         if getattr(self, table) is None:
-            example = f", {_EXAMPLES[table]}" if table in _EXAMPLES else ""
+            examples = _EXAMPLES_OF_AXES if is_of_axes(self.tables()) else _EXAMPLES
+            example = f", {examples[table]}" if table in examples else ""
             raise SetupError([f"{self.file}: {table}: missing; give a table [{table}]{example}"])
         return getattr(self, table)
 

@@ -55,6 +55,7 @@ from quell.files import check_regular, check_writable, whole_text, written_atomi
 from quell.lti.models import is_linear_model
 from quell.plants.base import check_plant
 from quell.plants.linear import LinearPlant
+from quell.plants.multivariable import is_several
 
 # ---- modelDescription.xml and buildDescription.xml of an FMU (FMI 3.0.1, 2.4 and 2.5) ----
 
@@ -618,6 +619,11 @@ def _parts(part: Any) -> tuple[Any, Any]:
         if not hasattr(plant, "sampled") and is_linear_model(plant):
             plant = LinearPlant.of(plant)
         check_plant(plant, "part")
+        if is_several(plant):
+            raise TranslationError(
+                f"{type(plant).__name__}: an FMU with a plant is of one u and one y, and this one "
+                f"has {plant.inputs} and {plant.outputs}; write the FMU of the controller alone"
+            )
     return plant, controller
 
 

@@ -761,18 +761,10 @@ def c(
         raise ValueError(f"name = {name!r}: {rule}")
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
     check_folder(folder, checks.flag("overwrite", overwrite))
-    checks.flag("accept", accept)
     checks.flag("proof", proof)
     single = single or is_in_single(controller)
     source = c_source(controller, name, precision=precision, resolution=resolution)
-    comparison = None
-    if (plant is None) != (scenario is None) or not (single or plant is None):
-        what = "a comparison needs both" if single else "are compared in single precision only"
-        raise ValueError(f"plant, scenario: {what}; leave them out, or give both and 'single'")
-    if single and plant is not None and scenario is not None:
-        comparison = compared(plant, controller, scenario)
-    if single and not accept:
-        _check_comparison(comparison, controller)
+    comparison = checked_comparison(controller, single, plant, scenario, accept)
     proving = proof_files(controller, source) if proof else {}
     vectors = golden_vectors(controller, source)
     files = write_folder(folder, library_files(controller, source, vectors) | proving, overwrite)
@@ -800,10 +792,29 @@ def _function_table(source: CSource) -> str:
     )
 
 
-def _check_comparison(comparison: Comparison | None, controller: Any) -> None:
-    if comparison is None:
-        raise ValueError(
-            "precision = 'single': needs plant and scenario, to compare it with double precision; "
-            "or accept=True (--accept)"
-        )
-    comparison.check(controller)
+def checked_comparison(
+    controller: Any, single: bool, plant: Any, scenario: Scenario | None, accept: bool
+) -> Comparison | None:
+    """Return what single precision changes in a loop; None in double, and where it is not given.
+
+    Raises
+    ------
+    ValueError
+        for a plant or a scenario alone, or for double precision; and, without ``accept``, for a
+        difference that is too large, or that is not measured.
+    """
+    checks.flag("accept", accept)
+    if (plant is None) != (scenario is None) or not (single or plant is None):
+        what = "a comparison needs both" if single else "are compared in single precision only"
+        raise ValueError(f"plant, scenario: {what}; leave them out, or give both and 'single'")
+    if plant is None or scenario is None:
+        if single and not accept:
+            raise ValueError(
+                "precision = 'single': needs plant and scenario, to compare it with double "
+                "precision; or accept=True (--accept)"
+            )
+        return None
+    comparison = compared(plant, controller, scenario)
+    if not accept:
+        comparison.check(controller)
+    return comparison

@@ -3,6 +3,6 @@
 May import: the C code of a controller, and what ``quell.export`` may.
 """
 
-from quell.export.structured_text.function_block import st, st_source
+from quell.export.structured_text.function_block import FunctionBlock, st, st_source
 
-__all__ = ["st", "st_source"]
+__all__ = ["FunctionBlock", "st", "st_source"]

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from quell.export.controller_source import (
     at_path,
     c_source,
     in_double_precision,
+    is_in_single,
     limits_path,
     parameters_of,
 )
+from quell.export.library.exported import Comparison, checked_comparison
 from quell.export.library.vectors import fill
 from quell.export.structured_text.c_reader import Assign, CFile, Evaluate, Member
 from quell.export.structured_text.places import Node, Place, Record, Variable, Whole, is_keyword
@@ -31,11 +33,19 @@ from quell.export.structured_text.translator import Translator
 from quell.export.translate.text import TranslationError, wrapped
 from quell.files import check_folder, write_folder
 from quell.learners.base import NoLearner
+from quell.simulation.driver import Scenario
 
 # Inputs besides r, y and what a step takes further: when they act is in the README.
 _MANUAL = (("manual", "BOOL"), ("u_manual", "REAL"))
 _APPLIED = (("limited", "BOOL"), ("u_limited", "REAL"))
 _RESET = (("restart", "BOOL"),)
+
+
+class FunctionBlock(NamedTuple):
+    """A controller that was written as a function block."""
+
+    files: tuple[Path, ...]  #: all files in the folder
+    comparison: Comparison | None  #: single to double precision, if they were compared
 
 
 def st(
@@ -44,8 +54,11 @@ def st(
     *,
     name: str = "controller",
     precision: str = "double",
+    plant: Any = None,
+    scenario: Scenario | None = None,
+    accept: bool = False,
     overwrite: bool = False,
-) -> tuple[Path, ...]:
+) -> FunctionBlock:
     """Write a controller as a function block in Structured Text (IEC 61131-3).
 
     The text is translated from the C code, operation by operation. Compiled by MATIEC and gcc it
@@ -63,26 +76,35 @@ def st(
         of the function block.
     precision
         ``"double"`` for ``LREAL``, ``"single"`` for ``REAL``.
+    plant, scenario
+        for single precision, both: the loop in which it is compared with double.
+    accept
+        write in single precision even if nothing is compared, or the difference is too large.
     overwrite
         whether files of the same names in the folder may be replaced.
 
     Returns
     -------
-    tuple of Path
-        the files.
+    FunctionBlock
+        the files, and the comparison.
 
     Raises
     ------
     ValueError
         for a name that Structured Text does not take, a folder with files, several axes, limits
         that are infinite, and a controller with a part that has no Structured Text, which is named
-        (``TranslationError``). Nothing is written then.
+        (``TranslationError``); a plant or a scenario alone, or for double precision; and single
+        precision that differs too much, or is not compared, without ``accept``. Nothing is written
+        then.
     """
     check_folder(folder, checks.flag("overwrite", overwrite))
     text, values = _written(controller, name, precision)
+    single = precision == "single" or is_in_single(controller)
+    comparison = checked_comparison(controller, single, plant, scenario, accept)
     templates = resources.files("quell.export") / "templates"
     readme = fill((templates / "structured_text.md").read_text("utf-8"), values)
-    return write_folder(folder, {f"{name}.st": text, "README.md": readme}, overwrite)
+    files = write_folder(folder, {f"{name}.st": text, "README.md": readme}, overwrite)
+    return FunctionBlock(files, comparison)
 
 
 def st_source(controller: Any, name: str = "controller", precision: str = "double") -> str:
