@@ -230,6 +230,25 @@ def test_the_variation_of_u_is_that_of_the_actuators_whatever_b0_is() -> None:
     assert over_seeds.of_setups(setups(8.0, 9.0), seeds=2).notes == ()
 
 
+def test_a_variation_of_u_that_cannot_be_compared_is_no_number(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where B0 differ and follow the state; the errors are compared all the same."""
+
+    def refuse(factors: Any, inputs: int) -> Any:
+        raise ValueError("B0 of one, half is not one, and follows the state")
+
+    monkeypatch.setattr(over_seeds, "one_gain", refuse)
+    half = gantry(8.0)
+    half["axes"]["B0"] = [[2.5, 0.25], [0.2, 3.0]]
+    given = {"one": made_axes("one", gantry(8.0)), "half": made_axes("half", half)}
+    found = over_seeds.of_setups(given, seeds=2)
+    assert np.all(np.isnan(found.values["control_variation"]))
+    assert np.all(np.isnan(found.values["total_variation"]))
+    assert np.all(found.values["rms"] > 0.0)
+    assert found.describe().splitlines()[-1].startswith("NOT compared: variation of u: B0 of one")
+
+
 def in_windows(*windows: Any) -> Any:
     """Compare two controllers in these windows."""
     lag = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
