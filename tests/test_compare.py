@@ -28,7 +28,7 @@ def test_any_controllers_on_any_plant_are_judged_alike() -> None:
     )
     some = {
         "PI": ql.baselines.PID(4.0, 4.0, dt=1e-3),
-        "ADRC": ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.005), 4.0),
+        "ADRC": ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 1e-3), 4.0),
         "P": ql.baselines.PID(1.0, dt=1e-3),
     }
     result = compare.compare(LAG, some, scenario, load_at=5.0)
@@ -104,6 +104,12 @@ def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() 
             r"controllers\['P'\] = 1: must be a controller",
         ),
         (
+            lambda: compare.compare(
+                LAG, {"P": ql.baselines.PID(1.0, dt=1e-3), "Q": ql.baselines.PID(1.0, dt=0.02)}, ql.Scenario()
+            ),
+            "P has dt = 0.001 s, Q 0.02 s: must have one dt",
+        ),
+        (
             lambda: compare.controller("pdi", 0.01),
             "controllers: 'pdi' must be one of mf-eso, mb-eso",
         ),
@@ -113,7 +119,7 @@ def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() 
         (lambda: Benchmark(k=-1.0), "k = -1.0: must be finite and greater than zero"),
         (lambda: Benchmark(seed=-1), "seed = -1: must be a whole number"),
     ],
-)
+)  # fmt: skip
 def test_a_mistake_is_named(wrong: object, message: str) -> None:
     """With the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message):

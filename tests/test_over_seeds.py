@@ -209,6 +209,46 @@ def test_one_axis_is_compared_in_the_same_way() -> None:
     assert found.describe().startswith("0 to 2 s: best is k6: ∫|error| ")
 
 
+def test_the_variation_of_u_is_that_of_the_actuators_whatever_b0_is() -> None:
+    """Half of B0 halves v of the same motors, so all have the B of the first; the rest of the measures stays."""
+    half = gantry(8.0)
+    half["axes"]["B0"] = [[2.5, 0.25], [0.2, 3.0]]
+    given = {"one": made_axes("one", gantry(8.0)), "half": made_axes("half", half)}
+    found = over_seeds.of_setups(given, seeds=2)
+    first = given["one"]
+    B = np.array([[5.0, 0.5], [0.4, 6.0]])
+    for s, seed in enumerate(found.seeds):
+        scenario = replace(first.needed("scenario"), seed=seed)
+        run = ql.simulate(first.plant, given["half"].controller, scenario)
+        moved = np.abs(np.diff(run["u"][run.t >= 0.1 - 1e-9] @ B.T, axis=0)).sum(axis=0)
+        assert found.values["control_variation"][1, 0, :, s] == pytest.approx(moved)
+        assert found.values["rms"][1, 0, 0, s] == run.metrics(0.1)["x"]["rms"]
+    assert (
+        "u of an axis is B u with B = [[5, 0.5], [0.4, 6]] for all, as their B0 differ"
+        in found.notes
+    )
+    assert over_seeds.of_setups(setups(8.0, 9.0), seeds=2).notes == ()
+
+
+def test_a_variation_of_u_that_cannot_be_compared_is_no_number(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where B0 differ and follow the state; the errors are compared all the same."""
+
+    def refuse(factors: Any, inputs: int) -> Any:
+        raise ValueError("B0 of one, half is not one, and follows the state")
+
+    monkeypatch.setattr(over_seeds, "one_gain", refuse)
+    half = gantry(8.0)
+    half["axes"]["B0"] = [[2.5, 0.25], [0.2, 3.0]]
+    given = {"one": made_axes("one", gantry(8.0)), "half": made_axes("half", half)}
+    found = over_seeds.of_setups(given, seeds=2)
+    assert np.all(np.isnan(found.values["control_variation"]))
+    assert np.all(np.isnan(found.values["total_variation"]))
+    assert np.all(found.values["rms"] > 0.0)
+    assert found.describe().splitlines()[-1].startswith("NOT compared: variation of u: B0 of one")
+
+
 def in_windows(*windows: Any) -> Any:
     """Compare two controllers in these windows."""
     lag = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
@@ -239,6 +279,16 @@ def in_windows(*windows: Any) -> Any:
         (
             lambda: over_seeds.of_setups(setups(8.0, 9.0, duration=0.1)),
             r"windows\[0\].start = 0.1: must be less than the scenario's duration",
+        ),
+        (
+            lambda: over_seeds.of_setups(setups(8.0) | {"longer": made_axes("l", gantry() | {"dt": 2e-3})}),
+            r"c8 has dt = 0.001 s, longer 0.002 s: must have one dt, as the errors between samples",
+        ),
+        (
+            lambda: over_seeds.over_seeds(
+                ql.plants.LinearPlant([[-1.0]], [1.0], [1.0]), {f"{dt}": ql.baselines.PID(2.0, dt=dt) for dt in (0.02, 0.01)}, ql.Scenario()
+            ),
+            r"0.01 has dt = 0.01 s, 0.02 0.02 s: must have one dt",
         ),
         (lambda: in_windows({"start": None}), r"windows\[0\]: start = None: must be a number"),
         (lambda: in_windows({}, {"begin": 1.0}), r"windows\[1\]: 'begin' is unknown; .*start"),
@@ -310,6 +360,10 @@ scenario = {{ duration = {}, reference = {{ kind = "step" }} }}
     shown = quell("compare", "high.toml", "right.toml", "--no-figures")
     assert shown.code == 0, shown.err
     assert "0 to 2 s: best is right" in shown.out
+    longer = text.format(4.0, 2.0).replace("dt = 0.02", "dt = 0.1")
+    (tmp_path / "longer.toml").write_text(longer, encoding="utf-8")
+    shown = quell("compare", "high.toml", "longer.toml", "--no-figures")
+    assert (shown.code, "high has dt = 0.02 s, longer 0.1 s: must have one dt" in shown.err) == (2, True)  # fmt: skip
     shown = quell("compare", "high.toml", "wrong.toml", "--no-figures")
     assert shown.code == 4
     assert "NOT stable: wrong diverged in 1 of 1 runs" in shown.out

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from quell.identification import Measured
 from quell.monitoring import rank
 from quell.monitoring.rank import correlation_time, period_of
-from quell.records.axes import AxesTrajectory
+from quell.records.axes import AxesTrajectory, one_gain
 from tests.commands import in_this_process
 
 DT = 0.01
@@ -260,12 +260,14 @@ def test_the_command_names_the_best_and_takes_parts_of_logs(
     assert "must be a part of the 320 s of the log" in beyond.err
 
 
-def axes_log(path: Path, sizes: tuple[float, float], seed: int, load: float = 1.0) -> str:
-    """Write a saved run of two axes whose errors have these sizes."""
+def axes_log(
+    path: Path, sizes: tuple[float, float], seed: int, *, effort: float = 0.1, B0: Any = 1.0
+) -> str:
+    """Write a saved run of two axes whose errors have these sizes, under the same load; B0 (or of each sample) times u is v."""
     noise = np.random.default_rng(seed).normal(size=(4, 6000))
     errors = np.column_stack([size * each for size, each in zip(sizes, noise, strict=False)])
-    u = load + 0.1 * noise[2:].T
-    log = np.column_stack([np.zeros((6000, 2)), errors, errors, u, u])
+    u = 1.0 + effort * noise[2:].T
+    log = np.column_stack([np.zeros((6000, 2)), errors, errors, u, B0 * u])
     channels = (("r", 2), ("y", 2), ("y_measured", 2), ("u", 2), ("v", 2))
     AxesTrajectory(log, channels, 0.1, axis_names=("x", "y")).save(path)
     return str(path)
@@ -303,3 +305,65 @@ def test_tunings_of_several_axes_are_judged_for_each(
         2,
         True,
     )
+
+
+def test_efforts_and_loads_of_axes_are_those_of_the_actuators_whatever_b0_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of B0 halves v: what moves the motors more is not called better, and the load is not called another one."""
+    gains = {"A": 1.0, "B": 0.5, "C": 0.5 + 0.4 * np.sin(np.arange(6000.0))[:, None]}
+    efforts = {"A": 0.1, "B": 0.13, "C": 0.1}
+    logs = {
+        name: axes_log(tmp_path / f"{name}.nc", (1.0, 1.0), i, effort=efforts[name], B0=gain)
+        for i, (name, gain) in enumerate(gains.items())
+    }
+    for order in ("AB", "BA"):
+        given = [f"{name}={logs[name]}" for name in order]
+        file = tmp_path / f"{order}.json"
+        arguments = ["rank", *given, "--criterion", "effort", "--json", str(file)]
+        shown = in_this_process(arguments, monkeypatch, capsys)
+        assert "best for all axes: A, at 95 %" in shown.out, shown.err
+        assert "A is better than B: mean |du/dt| lower by 2" in shown.out
+        b = gains[order[0]]
+        line = f"u of an axis is B u with B = [[{b:g}, 0], [0, {b:g}]] for all, as their B0 differ"
+        assert line in shown.out
+        assert np.allclose(json.loads(file.read_text())["B"], b * np.eye(2))
+        shown = in_this_process(["rank", *given], monkeypatch, capsys)
+        assert "another load" not in shown.out
+    shown = in_this_process(["rank", f"A={logs['A']}", f"C={logs['C']}"], monkeypatch, capsys)
+    assert shown.code == 2
+    assert "C.nc is not one, and follows the state: v = B0 u is in other units" in shown.err
+    assert "take runs with one B0" in shown.err
+
+
+def run_of(u: Any, B0: Any) -> AxesTrajectory:
+    """Return a record with these u and v = B0 u of one axis."""
+    v = np.sum(np.broadcast_to(B0, u.shape) * u, axis=1, keepdims=True)
+    return AxesTrajectory(np.column_stack([u, v]), (("u", u.shape[1]), ("v", 1)), 0.1)
+
+
+def test_v_of_one_b0_is_taken_as_it_is_and_another_b0_needs_all_actuators_to_have_moved() -> None:
+    """Of three actuators for an axis: other weights are no other B0; a B0 that one run shows in part can't be taken for another run."""
+    rng = np.random.default_rng(4)
+    B0, wish = np.array([1.0, 2.0, 0.5]), rng.normal(size=(400, 1))
+    even, uneven = wish @ [[1.0, 1.0, 1.0]], wish @ [[5.0, 0.1, 0.0]]
+    free = rng.normal(size=(400, 3))
+
+    def found(**runs: Any) -> Any:
+        return one_gain({name: run_of(*run).gain_factor() for name, run in runs.items()}, 3)
+
+    assert found(a=(even, B0), b=(1e3 * uneven, B0)) == (None, True)
+    assert found(a=(0.0 * even, B0), b=(uneven, B0)).B is None
+    with pytest.raises(
+        ValueError, match="B0 of a, b, c is not one, and can't be seen in full in any"
+    ):
+        found(a=(even, B0), b=(np.roll(uneven, 1, axis=1), [3.0, 1.0, 1.0]), c=(even, 3.0 * B0))
+    B, constant = found(a=(even, B0), b=(free, 3.0 * B0), c=(free, B0))
+    assert np.allclose(B, 3.0 * B0)
+    assert constant
+    slow = 1.0 + 0.3 * np.sin(0.01 * np.arange(400.0))[:, None]
+    same, other = found(a=(free, slow * B0), b=(rng.normal(size=(400, 3)), slow * B0)), B0 * slow
+    assert same.B is None
+    assert same.describe()[0].startswith("NOT protected against another B0: it follows the state")
+    with pytest.raises(ValueError, match="B0 of a, b is not one, and follows the state"):
+        found(a=(free, other), b=(free, 1.2 * other))

@@ -500,6 +500,27 @@ def test_the_command_does_a_sweep_and_repeats_a_run(
     assert "sweep: missing; give a table [sweep]" in quell("sweep", "plain.toml").err
 
 
+@pytest.mark.parametrize(
+    ("varied", "told"),
+    [
+        ("[sweep.parameters]\ndt = [0.01, 0.02]\n", True),
+        ("[sweep.parameters]\nplant.m1 = [0.9]\n[sweep.cases]\na = {}\nb = { dt = 0.02 }\n", True),
+        ("[sweep.parameters]\nplant.m1 = [0.9]\ndt = [0.01]\n", False),
+    ],
+)  # fmt: skip
+def test_what_varies_dt_is_told_as_not_comparable(
+    varied: str, told: bool, quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Measures are of samples; a parameter or a case may be the dt."""
+    before = SETUP.partition("draws")[0].replace("duration = 0.5", "duration = 0.2")
+    setup_of(tmp_path, f'{before}metrics = ["rms"]\n{varied}')
+    shown = quell("sweep", "drive.toml", "--workers", "1", "--no-figures", "--json", "a.json")
+    assert shown.code == 0, shown.err
+    assert ("NOT comparable over dt" in shown.out) == told
+    notes = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))["notes"]
+    assert [note[:22] for note in notes] == ["NOT comparable over dt"] * told
+
+
 def test_a_cluster_that_loses_a_worker_finds_what_this_machine_finds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

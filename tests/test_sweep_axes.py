@@ -126,3 +126,23 @@ def test_the_command_sweeps_and_repeats_a_run(quell: Callable[..., Shown], tmp_p
     again = quell("sweep", "gantry.toml", "--repeat", "1", "--no-figures")
     assert again.code == 0, again.err
     assert "the same, bit for bit" in again.out
+
+
+def test_the_variation_of_v_over_another_b0_is_told_as_not_comparable(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """The plant's B0 and a B0 of its own are in other units; without a measure of u, or of another parameter, no line."""
+    for metrics, parameters, told in (
+        (["control_variation"], {"plant.B[1][0]": [5.0, 6.0]}, "plant.B[1][0]: x.control_var"),
+        (["control_variation"], {"axis[0].controller.omega_c": [7.0, 8.0]}, ""),
+        (["rms"], {"plant.B[1][0]": [5.0, 6.0]}, ""),
+    ):
+        data = gantry()
+        data["sweep"] = {"metrics": metrics, "parameters": parameters}
+        data["scenario"]["duration"] = 0.12
+        (tmp_path / "gantry.toml").write_text(toml_text(data))
+        folder = str(tmp_path / f"{len(list(tmp_path.iterdir()))}")
+        shown = quell("sweep", "gantry.toml", "--workers", "1", "--no-figures", "--folder", folder)
+        assert shown.code == 0, shown.err
+        assert (f"NOT comparable over {told}" in shown.out) == bool(told)
+        assert ("NOT comparable" in shown.out) == bool(told)

@@ -94,6 +94,51 @@ def test_a_shift_alarms_and_is_told_with_its_begin_and_its_size(shift: float, mo
     assert fed(watch, values[200:]) == []  # told once
 
 
+@pytest.mark.parametrize("line", [False, True])
+def test_a_change_below_the_drift_of_converters_is_no_alarm(line: bool) -> None:
+    """Of a machine without noise, 1e-7, also across a line of the grid; 0.02 % alarms soon, with digits that differ."""
+    value = math.exp((round(math.log(10.24) * 1e4) + (0.5 if line else 0.0)) * 1e-4)
+    watch = Watch(("u_rms",))
+    steps = value * (1.0 + 5e-8 * np.where(np.arange(60) >= 30, 1.0, -1.0))
+    assert fed(watch, steps[:, None]) == []
+    lines = watch.describe().splitlines()
+    assert lines[0].startswith("no alarm in 60 windows")
+    small = "too small for an alarm, below 0.01% of the value, which converters drift by: u_rms (+1e-05 %)"
+    assert ("NOT exchangeable" in lines[-1]) == line
+    assert lines[1:2] == [small] * line
+    (alarm,) = fed(watch, np.full((60, 1), 1.0002 * value))
+    if not line:
+        assert abs(alarm.since - 61) <= 3
+        assert alarm.window < 70
+        assert f"rose from {value:.4g} " in alarm.describe()
+    before, after = alarm.describe().partition("from ")[2].split(" to ")
+    assert before.split()[0] != after.split()[0]
+
+
+def test_what_no_window_shows_is_told_at_once_with_what_would_show_it() -> None:
+    """More windows like these do not help; a number that some windows show needs more of them."""
+    watch = Watch(("a: b0", "a: resonance", "a: noise", "other"))
+    for value in np.random.default_rng(11).normal(size=16):
+        watch.update({"a: noise": value, "a: b0": math.nan})
+    never, unable = watch.describe().splitlines()[1:3]
+    assert never.startswith(
+        "NOT watched: a: b0, a: resonance, other: none of 16 windows shows them"
+    )
+    assert "b0 and friction need windows in which u moves y" in never
+    assert "a resonance needs a peak in the spectrum of y" in never
+    assert unable.startswith("NOT enough windows yet: a: noise: ")
+
+
+def test_what_is_rounding_is_zero() -> None:
+    """The error of a loop that stands at 1000, its noise, and the mean of an f that swings."""
+    t = np.arange(2000.0)
+    y = np.full(2000, 1e3) + np.where(t % 3 == 0, 1.2e-13, 0.0)
+    f = np.sin(2.0 * np.pi * t / 100.0)
+    found = features_of(Signals(np.ones(2000), y, np.full(2000, 1e3), f, {}, 1e-3), 2)
+    assert (found["error"], found["noise"], found["f_mean"]) == (0.0, 0.0, 0.0)
+    assert found["f_rms"] == pytest.approx(math.sqrt(0.5))
+
+
 def test_a_slow_drift_alarms_too() -> None:
     """A wear of five deviations over 300 windows."""
     rng, watch = np.random.default_rng(8), Watch(("a",))

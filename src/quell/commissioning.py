@@ -23,7 +23,7 @@ A verifying step: the tuned loop at the rig beside its prediction from the ident
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,7 +44,7 @@ from quell.realtime.recordings import Event, is_recording, load, load_one
 from quell.realtime.run import RigRun, run_rig
 from quell.realtime.safety import Safety
 from quell.realtime.supervisor import Cause
-from quell.records.axes import AxesTrajectory
+from quell.records.axes import AxesTrajectory, OneGain, one_gain
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory
 from quell.signals import Signal, Step
@@ -269,24 +269,52 @@ def recorded_run(
     return load_one(path, max_size) if is_recording(path) else None
 
 
-def runs_in(
+def run_in(
     path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
-) -> dict[str, Trajectory]:
-    """Return the runs in a file that quell wrote: that of each axis by its name, or one without.
-
-    The u of an axis is v = B0 u, as applied. No run for a table in text.
-    """
+) -> Trajectory | AxesTrajectory | None:
+    """Return the run in a file that quell wrote; None for a table in text."""
     if columns or dt is not None or time_unit is not None:
-        return {}
+        return None
     if path.suffix.lower() == ".nc":
-        run = _saved_run(path, max_size)
-    elif is_recording(path):
-        run = load(path, max_size)
-    else:
-        return {}
+        return _saved_run(path, max_size)
+    return load(path, max_size) if is_recording(path) else None
+
+
+def by_axis(run: Trajectory | AxesTrajectory) -> dict[str, Trajectory]:
+    """Return the run of each axis by its name, whose u is v, or the only one without a name."""
     if isinstance(run, AxesTrajectory):
         return {name: run.axis(name) for name in run.axis_names}
     return {"": run}
+
+
+def with_one_gain(
+    runs: Mapping[str, Trajectory | AxesTrajectory],
+) -> tuple[dict[str, Trajectory | AxesTrajectory], OneGain]:
+    """Return runs by name whose v, of several axes, can be compared, and how.
+
+    Of runs of several axes only the samples under control are left.
+
+    Raises
+    ------
+    ValueError
+        for runs with different numbers of actuators, and as ``quell.records.axes.one_gain``.
+    """
+    several = {
+        name: replace(run, log=np.ascontiguousarray(run.log[controlled(run)]))
+        for name, run in runs.items()
+        if isinstance(run, AxesTrajectory)
+    }
+    counts = {name: run["u"].shape[1] for name, run in several.items()}
+    if len(set(counts.values())) > 1:
+        texts = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise ValueError(f"numbers of actuators: {texts}: must be those of one machine")
+    if not several:
+        return dict(runs), OneGain(None, True)
+    factors = {name: run.gain_factor() for name, run in several.items()}
+    found = one_gain(factors, next(iter(counts.values())))
+    if found.B is not None:
+        several = {name: run.with_gain(found.B) for name, run in several.items()}
+    return {**runs, **several}, found
 
 
 def _saved_run(path: Path, max_size: float) -> Trajectory | AxesTrajectory:

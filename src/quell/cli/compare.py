@@ -385,7 +385,7 @@ def _print_means(console: Console, found: SeedComparison, window: int) -> None:
     if any(len(row) < len(columns) for row in means.values()):
         print_line(console, "–: not in all runs: no step, not settled, or diverged.")
     if len(found.axes) > 1:
-        print_line(console, "u of an axis is its v.")
+        print_line(console, "u of an axis is its v = B0 u, with one B0 for all.")
 
 
 def _with_reach(value: float, half: float) -> str:

@@ -50,7 +50,8 @@ def rank(
     """Decide which of several tunings was best, from logs of the running machine.
 
     A verdict that the logs do not allow is a line that begins with NOT, with what to do. Logs of
-    several axes are judged for each of them, with v = B0 u in the place of u.
+    several axes are judged for each of them, with v = B0 u in the place of u, and one B0 for all
+    logs, that of the first one.
 
     Parameters
     ----------
@@ -66,16 +67,20 @@ def rank(
     dt
         Sample time [s] of tables without times; columns are then u,y,r by default.
     """
-    from quell.commissioning import measured, measured_run, runs_in
+    from quell.commissioning import by_axis, measured, measured_run, run_in, with_one_gain
     from quell.monitoring import rank as rank_logs
 
     outputs = check_outputs(outputs)
     given = [_named(text) for text in logs]
     axes: dict[str, dict[str, list[Measured]]] = {}
+    how = read.columns, dt, read.time_unit, read.max_size
+    runs = {f"{one.path}": run_in(one.path, *how) for one in given}
+    known, gain = with_one_gain({name: run for name, run in runs.items() if run is not None})
     for one in given:
-        how = read.columns, dt, read.time_unit, read.max_size
-        runs = {axis: measured_run(run) for axis, run in runs_in(one.path, *how).items()}
-        records = runs or {"": measured(one.path, *how, reference=True)}
+        if (run := known.get(f"{one.path}")) is None:
+            records = {"": measured(one.path, *how, reference=True)}
+        else:
+            records = {axis: measured_run(each) for axis, each in by_axis(run).items()}
         if axes and [*axes] != [*records]:
             theirs, ours = (", ".join(filter(None, each)) or "one y" for each in (records, axes))
             raise ValueError(f"{one.path}: has {theirs}, the logs before {ours}: must be the same")
@@ -98,7 +103,14 @@ def rank(
         return
     verdict = _together({axis: ranking.best for axis, ranking in found.items()}, confidence)
     print_line(console, verdict)
-    results = {"axes": {axis: each.to_json() for axis, each in found.items()}, "verdict": verdict}
+    results: dict[str, Any] = {"axes": {axis: each.to_json() for axis, each in found.items()}}
+    results |= {
+        "verdict": verdict,
+        "B": None if gain.B is None else gain.B.tolist(),
+        "notes": gain.describe(),
+    }
+    for note in gain.describe():
+        print_line(console, note)
     write_results(console, results, outputs)
 
 
@@ -147,20 +159,21 @@ def _part(record: Measured, one: _Named) -> Measured:
 
 def _print_scores(console: Console, found: Ranking, axis: str) -> None:
     headings = (
-        "RMS error",
-        "mean |error|",
-        "mean |du/dt|",
-        "overshoot [%]",
-        "logged [s]",
+        "RMS\nerror",
+        "mean\n|error|",
+        "mean\n|du/dt|",
+        "overshoot\n[%]",
+        "logged\n[s]",
         "batches",
     )
     title = "Tunings, the lowest criterion first"
-    rows = table(f"{axis}: {title}" if axis else title, "", *headings)
-    for name, scores in found.scores.items():
+    name = f"{axis}: {title}" if axis else title
+    rows = table(name, "", *headings, padding=(0, 1, 0, 0), pad_edge=False)
+    for tuning, scores in found.scores.items():
         beyond = None if scores.overshoot != scores.overshoot else scores.overshoot
         cells = [number(value, ".4g") for value in (scores.rms, scores.iae, scores.effort)]
         cells += [number(beyond, ".3g", 100.0), number(scores.duration, ".4g"), str(scores.batches)]
-        rows.add_row(name, *cells)
+        rows.add_row(tuning, *cells)
     console.print(rows)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -199,6 +199,9 @@ def sweep(
     results = summary(found, worst)
     where_option = "" if folder is None else f" --folder {folder}"
     print_summary(console, given.title, found, results, f"quell sweep {setup}{where_option}")
+    results["notes"] = _notes(given, plan, varied)
+    for note in results["notes"]:
+        print_line(console, note)
     paths = _save_figures(found, figures, outputs)
     write_results(console, {**results, "setup": given.as_json()}, outputs, paths)
 
@@ -217,6 +220,33 @@ def _varies(given: Any) -> bool:
 
     values = as_values("", given)
     return not isinstance(values, tuple) or len(values) > 1
+
+
+def _notes(given: Setup, plan: Mapping[str, Any], varied: Sequence[str]) -> list[str]:
+    """Return lines with NOT about what the measures of a sweep can not be compared over."""
+    cases = plan["build"].cases.values()
+    paths = [*varied, *(path for case in cases for path in case)]
+    dt = float(given.controller.dt)
+    notes = []
+    if "dt" in varied or len({float(case.get("dt", dt)) for case in cases}) > 1:
+        notes.append(
+            "NOT comparable over dt: measures are of samples and change with dt by themselves, as "
+            "what y does between samples is in none; compare runs of one dt"
+        )
+    of_plant = given.tables().get("axes", {}).get("B0") == "plant"
+    gains = ("axes.B0", "axes.M", *(["plant."] if of_plant else []))
+    of_u = [
+        name
+        for name, each in plan["metrics"].items()
+        if getattr(each, "axis", "") and each.name in ("control_variation", "total_variation")
+    ]
+    by = [path for path in paths if path == "axes" or path.startswith(gains)]
+    if of_u and by:
+        notes.append(
+            f"NOT comparable over {', '.join(by)}: {', '.join(of_u)}: u of an axis is v = B0 u, "
+            "which is in another unit for each B0; compare runs of one B0"
+        )
+    return notes
 
 
 def _slug(name: str) -> str:

@@ -5,6 +5,8 @@ A published claim, the measured value, and whether the claim holds.
 Figures as files: PNG, SVG and PDF, each written completely or not at all.
 
 Scores of runs for tables and JSON files; None stands for a number that a run does not have.
+
+The check that controllers which are compared have one sample time.
 """
 
 from __future__ import annotations
@@ -230,3 +232,24 @@ def ended_early(runs: Mapping[str, Trajectory]) -> dict[str, dict[str, Any]]:
     """Return time and message of the runs that diverged, by name."""
     ended = {name: run for name, run in runs.items() if run.diverged}
     return {name: {"at": run.ended, "message": run.message} for name, run in ended.items()}
+
+
+# ---- One sample time for all that is compared ----
+
+# Sample times that differ by less than this share are one: 1/4000 and 2.5e-4 s. Chosen by hand.
+_SAME_DT = 1e-9
+
+
+def check_sample_times(controllers: Mapping[str, Any]) -> None:
+    """Raise ``ValueError`` if controllers by name have different sample times.
+
+    All measures are of samples. What y does between them is in none, so they change with dt by
+    themselves, and by more than good controllers differ.
+    """
+    times = {name: float(controller.dt) for name, controller in controllers.items()}
+    least, most = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
+    if times[most] > (1.0 + _SAME_DT) * times[least]:
+        raise ValueError(
+            f"{least} has dt = {times[least]:g} s, {most} {times[most]:g} s: must have one dt, as "
+            "the errors between samples are in no measure; design all for the same dt"
+        )

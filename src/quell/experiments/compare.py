@@ -51,7 +51,7 @@ from quell.controllers import (
 from quell.controllers.base import check_controller
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
 from quell.controllers.prefilters import without_prefilters
-from quell.experiments.common import Scores, save_figures, step_scores
+from quell.experiments.common import Scores, check_sample_times, save_figures, step_scores
 from quell.guard import Guard
 from quell.learners import Kalman
 from quell.observers import ESO
@@ -332,7 +332,7 @@ def compare(
     plant, scenario, record_every
         as for ``simulate``; with ``record_every`` above 1 there is no control variation.
     controllers
-        by name, any number, with any sample times.
+        by name, any number, with one sample time, as what y does between samples is in no score.
     load_at
         time from which on a disturbance is scored [s]. The run before it is scored as a step, from
         its first value to the last reference before ``load_at``. By default the whole run is the
@@ -369,6 +369,7 @@ def compare(
         )
     for name, controller in controllers.items():
         check_controller(controller, f"controllers[{name!r}]")
+    check_sample_times(controllers)
     jobs = [
         partial(simulate, plant, controller, scenario, record_every=record_every)
         for controller in controllers.values()

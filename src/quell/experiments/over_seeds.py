@@ -30,11 +30,12 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import check_controller
-from quell.experiments.common import save_figures
+from quell.experiments.common import check_sample_times, save_figures
 from quell.files import nonfinite_to_none
 from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
 from quell.plants.base import one_at_a_time, signals_of
+from quell.records.axes import one_gain
 from quell.records.metrics import MEASURES
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.setup.axes import signals_in
@@ -45,7 +46,7 @@ from quell.simulation.driver import is_random
 from quell.sweeping.measures import Measure, measure_run
 from quell.sweeping.sweep import share_interval
 from quell.tuning.simulated.problem import half_width_of_mean
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 CRITERIA = {"rms": "RMS error", "iae": "∫|error|", "peak_error": "largest |error|"}
 """Measures by which controllers are compared, with their names in sentences."""
@@ -53,6 +54,8 @@ ALL_AXES = "all axes"
 """Name of the verdict on all axes together."""
 # Seeds by default: with ten, differences of a third of their spread are decided for two axes.
 SEEDS = 10
+# Measures of u, of an axis of several v.
+_OF_U = ("control_variation", "total_variation")
 # A smaller difference is called alike: no model is as exact. Chosen by hand.
 _ALIKE = 1e-3
 # A criterion is rounding up to this part of the largest |r| or |y| of its axis: loops at rest with
@@ -224,8 +227,8 @@ def over_seeds(
     plant, scenario
         as for ``simulate``; the seeds are that of the scenario and those that follow it.
     controllers
-        by name, two or more: all of one axis, or all ``quell.Axes`` of the same axes; with any
-        sample times.
+        by name, two or more: all of one axis, or all ``quell.Axes`` of the same axes; with one
+        sample time, as what y does between samples is in no measure.
     seeds
         number of seeds; by default 10, or one where nothing in the scenario is random.
     windows
@@ -243,14 +246,15 @@ def over_seeds(
     -------
     SeedComparison
         with all ``MEASURES`` of each run, axis and window, and verdicts that begin with NOT where
-        the seeds do not decide. u of an axis of several is its v.
+        the seeds do not decide. u of an axis of several is its v = B0 u; where B0 of the
+        controllers differ, with that of the first for all (``quell.records.axes.one_gain``).
 
     Raises
     ------
     ValueError
-        for fewer than two controllers, controllers of different axes, a window with other keys,
-        before 0 s or without samples, several seeds where nothing is random, one where something
-        is, and what ``simulate`` raises.
+        for fewer than two controllers, controllers of different axes or sample times, a window with
+        other keys, before 0 s or without samples, several seeds where nothing is random, one where
+        something is, and what ``simulate`` raises.
 
     Examples
     --------
@@ -269,6 +273,7 @@ def over_seeds(
     if len(controllers) < 2:
         raise ValueError(f"controllers has {len(controllers)}: give two or more to compare")
     axes = _axes_of(controllers)
+    check_sample_times(controllers)
     numbers = _seeds(scenario, seeds)
     judged = _windows(scenario, windows)
     spans = tuple(_span(window, scenario.duration) for window in judged)
@@ -278,6 +283,9 @@ def over_seeds(
         for axis in axes
         for name in MEASURES
     }
+    first = replace(scenario, seed=numbers[0])
+    gain, notes = _common_gain(plant, controllers, first) if axes != ("",) else (None, ())
+    unlike = any(note.startswith("NOT compared") for note in notes)
     own: dict[str, Callable[[Any], float]] = {
         f"{i}.{axis}": partial(_largest, start=start, stop=stop, axis=axis)
         for i, (start, stop) in enumerate(spans)
@@ -286,6 +294,8 @@ def over_seeds(
 
     def run(controller: Any, seed: int) -> tuple[dict[str, float], bool]:
         found = simulate(plant, controller, replace(scenario, seed=seed))
+        if gain is not None:
+            found = found.with_gain(gain)
         return measure_run(found, {**measures, **own}), bool(found.diverged)
 
     made = [*controllers.values()]
@@ -303,12 +313,43 @@ def over_seeds(
     largest = np.array([[found[name] for name in own] for found, _ in results])
     largest = np.moveaxis(largest.reshape(shape[:4]), 0, -1)
     values = {name: np.moveaxis(table[..., k], 0, -1) for k, name in enumerate(MEASURES)}
+    if unlike:
+        values |= {name: np.full_like(values[name], math.nan) for name in _OF_U}
     names = tuple(controllers)
     rounding = _rounding(largest, diverged.T, spans, criterion)
     level = _level(confidence, names, axes, spans)
     verdicts = _verdicts(names, axes, spans, values[criterion], diverged.T, level, rounding)
     found = names, axes, spans, numbers, criterion, values, diverged.T
-    return SeedComparison(*found, rounding, verdicts)
+    return SeedComparison(*found, rounding, verdicts, notes=notes)
+
+
+def _common_gain(
+    plant: Any, controllers: Mapping[str, Any], scenario: Scenario
+) -> tuple[Matrix | None, tuple[str, ...]]:
+    """Return B for v = B u of all axes where their B0 differ, and lines about it."""
+    first, *others = controllers.values()
+    if all(_same_gain(getattr(first, n), getattr(c, n)) for c in others for n in ("B0", "M")):
+        return None, ()
+    jobs = [partial(simulate, plant, controller, scenario) for controller in controllers.values()]
+    runs: Any = in_parallel(jobs, None, 1 if one_at_a_time(plant) else None)
+    factors = {name: run.gain_factor() for name, run in zip(controllers, runs, strict=True)}
+    try:
+        found = one_gain(factors, first.inputs)
+    except ValueError as error:
+        return None, (f"NOT compared: variation of u: {error}",)
+    return found.B, tuple(found.describe())
+
+
+def _same_gain(one: Any, other: Any) -> bool:
+    """Return whether two B0 or M are the same matrix, or function with the same parameters."""
+    if isinstance(one, partial) and isinstance(other, partial):
+        given = one.keywords, other.keywords
+        return one.func is other.func and all(
+            _same_gain(*(each.get(name) for each in given)) for name in {*given[0], *given[1]}
+        )
+    if callable(one) or callable(other) or one is None or other is None:
+        return one is other
+    return bool(np.array_equal(one, other))
 
 
 def _axes_of(controllers: Mapping[str, Any]) -> tuple[str, ...]:
@@ -487,9 +528,9 @@ def of_setups(
     Parameters
     ----------
     setups
-        by name, two or more; all of one axis, or all of the same axes. Where another one has a
-        plant, a scenario, references or windows of its own that differ, a note that begins with NOT
-        says that they are not used.
+        by name, two or more; all of one axis, or all of the same axes, with one dt. Where another
+        one has a plant, a scenario, references or windows of its own that differ, a note that
+        begins with NOT says that they are not used.
     seeds, criterion, progress
         as for ``over_seeds``; the windows are those of [[metrics]].
     """
@@ -512,7 +553,7 @@ def of_setups(
         units = tuple(each.unit for each in signals.y)
     else:
         units = (signals_of(plant).y.unit,)
-    return replace(found, units=units, notes=tuple(notes))
+    return replace(found, units=units, notes=(*found.notes, *notes))
 
 
 def _task(given: Mapping[str, Any]) -> tuple[str, ...]:

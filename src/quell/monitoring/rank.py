@@ -159,7 +159,8 @@ def rank(
     ----------
     logs
         for each tuning its log or logs, with a reference: r, y and u in samples (N,), all with one
-        sample time. Leave out the first seconds after a change of the tuning.
+        sample time and u in one unit: v = B0 u of an axis is so for one B0 only, see
+        ``quell.records.axes.one_gain``. Leave out the first seconds after a change of the tuning.
     criterion
         ``"rms"``, ``"iae"`` or ``"effort"``, see ``CRITERIA``; lower is better.
     confidence

@@ -29,6 +29,12 @@ often one looks, is α at most. The sums over s are one number for each δ::
 What it costs: a begin at window s must make up for ``w_s ≈ 1/(s ln² s)``, some 13 nats after half a
 year of hours, beside 7 for α and F; a shift by δ gives δ²/2 in each window.
 
+Ranks find any difference, however small: in a simulated machine without noise one of 1e-7. But no
+sensor or converter holds its own gain better over months than 0.01 %: 10 ppm/K, of a good
+reference, and 10 K. So values are ranked on a fixed grid of steps of 0.01 %, on which they stay
+exchangeable, and what is less apart is a tie; and a change of less than 0.01 % that crosses a line
+of the grid is no alarm, which can only lower the probability of a false one.
+
 Exchangeable is an assumption. It fails where windows differ for other reasons (another product,
 another program of moves, day and night), or where neighbouring windows are alike because of a slow
 temperature: then changes of these are found, as alarms. The correlation of neighbours is looked at,
@@ -71,6 +77,10 @@ _MOST_WINDOWS = 100_000
 # Share of windows in which a feature must be seen to be watched; windows from which on that and the
 # correlation of neighbours is judged; least correlation that is told. Chosen by hand.
 _SEEN, _JUDGED, _CORRELATED = 0.5, 30, 0.15
+# Least change that alarms, as a share of the value: what converters drift by, see above.
+_MATTERS = 1e-4
+# Number of steps of the grid that makes those of all numbers above zero: ln of the least is -745.
+_PLACES = 10_000_000
 # Windows after which a change that does not alarm never will: the ranks are full of it.
 _NEVER = 300
 
@@ -91,6 +101,14 @@ _HINTS = {
 }
 
 
+# What shows numbers that no window has shown, by the first of each group.
+_SHOWN_BY = {
+    "b0": "b0 and friction need windows in which u moves y, with speeds and accelerations that "
+    "differ: longer ones, or another --band or --order, in a new state",
+    "resonance": "a resonance needs a peak in the spectrum of y, and a machine may have none",
+}
+
+
 class Alarm(NamedTuple):
     """A feature that has changed."""
 
@@ -103,17 +121,43 @@ class Alarm(NamedTuple):
     after: float  #: median from then on
     spread: float  #: deviation of single windows before
 
+    @property
+    def matters(self) -> bool:
+        """Whether the change is above the drift of converters, 0.01 % of the value."""
+        size = max(abs(self.before), abs(self.after))
+        return not abs(self.after - self.before) <= _MATTERS * size  # unknown without a before
+
+    @property
+    def share(self) -> str:
+        """The change as a share of the value before, as text; empty if that is zero."""
+        change = self.after - self.before
+        return f" ({100.0 * change / abs(self.before):+.3g} %)" if self.before else ""
+
     def describe(self) -> str:
         """Return the change in a line."""
         change = self.after - self.before
-        share = f" ({100.0 * change / abs(self.before):+.3g} %)" if self.before else ""
+        before, after = _apart(self.before, self.after)
         hint = _HINTS.get((self.feature.rpartition(": ")[2], 1 if change > 0.0 else -1))
         return (
-            f"ALARM: {self.feature} {'rose' if change > 0.0 else 'fell'} from {self.before:.4g} "
-            f"± {self.spread:.2g} to {self.after:.4g}{share} since window {self.since} "
+            f"ALARM: {self.feature} {'rose' if change > 0.0 else 'fell'} from "
+            f"{before} ± {self.spread:.2g} to {after}{self.share} since window {self.since} "
             f"({self.since_at}), seen at window {self.window} ({self.at})"
             f"{f': {hint}' if hint else ''}"
         )
+
+
+def _apart(one: float, other: float) -> tuple[str, str]:
+    """Return two values as text, with four digits or as many as they need to differ."""
+    texts = [(f"{one:.{digits}g}", f"{other:.{digits}g}") for digits in range(4, 10)]
+    return next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
+
+
+def _step(value: float) -> int:
+    """Return the step of a value on the grid of 0.01 %, in the order of values."""
+    if value == 0.0:
+        return 0
+    place = _PLACES + round(math.log(abs(value)) / _MATTERS)
+    return place if value > 0.0 else -place
 
 
 class _Track:
@@ -123,7 +167,7 @@ class _Track:
         self.name = name
         self.values: list[float] = []
         self.windows: list[int] = []  # in which they were, from 1 on
-        self.ranked: list[float] = []
+        self.ranked: list[int] = []  # steps of the values
         self.evidence = np.full(_BETS.size, -math.inf)  # ln S
         self.runs = np.zeros(_BETS.size)  # ln of the best product so far, from ``begins`` on
         self.begins = np.ones(_BETS.size, dtype=np.int64)
@@ -143,9 +187,10 @@ class _Track:
 
     def take(self, value: float, window: int, draw: float) -> None:
         """Take the value of a window."""
-        below, upto = bisect_left(self.ranked, value), bisect_right(self.ranked, value)
+        step = _step(value)
+        below, upto = bisect_left(self.ranked, step), bisect_right(self.ranked, step)
         count = self.count + 1
-        insort(self.ranked, value)
+        insort(self.ranked, step)
         self.values.append(value)
         self.windows.append(window)
         self.bet((below + draw * (upto - below + 1)) / count)
@@ -168,7 +213,9 @@ class _Track:
         begin = int(self.begins[best]) - 1
         before, after = np.array(self.values[:begin]), np.array(self.values[begin:])
         known = before.size > 0
-        middle = float(np.median(before)) if known else math.nan
+        if not known and np.ptp(after) <= _MATTERS * np.max(np.abs(after)):
+            before = after[:1]  # no window differs from the others by what matters
+        middle = float(np.median(before)) if before.size else math.nan
         spread = 1.4826 * float(np.median(np.abs(before - middle))) if known else math.nan
         since, now = self.windows[begin], self.windows[-1]
         labels = at[now - 1], since, at[since - 1]
@@ -279,8 +326,10 @@ class Watch:
             draw = random.Random(f"{self.seed}/{name}/{number}").random()
             track.take(value, number, draw)
             if track.alarm is None and track.log_evidence() >= self.threshold:
-                track.alarm = track.alarmed(self.labels)
-                new.append(track.alarm)
+                alarm = track.alarmed(self.labels)
+                if alarm.matters:
+                    track.alarm = alarm
+                    new.append(alarm)
         self.alarms += new
         return new
 
@@ -314,18 +363,38 @@ class Watch:
                 f"no alarm in {count} windows; false alarms have a probability of "
                 f"{self.alpha:g} at most, over all time"
             )
-        unseen, unable, correlated = [], [], []
+        unseen, unable, correlated, never, small = [], [], [], [], []
         for name, track in self._tracks.items():
-            if count >= _JUDGED and track.count < _SEEN * count:
+            if track.count and track.alarm is None and track.log_evidence() >= self.threshold:
+                small.append(f"{name}{track.alarmed(self.labels).share}")
+            if track.count == 0 and count:
+                never.append(name)
+            elif count >= _JUDGED and track.count < _SEEN * count:
                 unseen.append(f"{name} (in {track.count} of {count} windows)")
             elif track.alarm is None and self.windows_to_alarm(name) is None:
                 unable.append(name)
             if track.alarm is None and (rho := self._neighbours(track)) is not None:
                 correlated.append(f"{name} ({rho:.2f})")
+        if small:
+            lines.append(
+                f"too small for an alarm, below {_MATTERS:.2%} of the value, which converters "
+                f"drift by: {', '.join(small)}"
+            )
+        if never:
+            kinds = {name.rpartition(": ")[2] for name in never}
+            how = [text for kind, text in _SHOWN_BY.items() if kind in kinds]
+            lines.append(
+                f"NOT watched: {', '.join(never)}: none of {count} windows shows them, and more "
+                f"windows like these do not either{''.join(f'; {text}' for text in how)}"
+            )
         if unseen:
-            lines.append(f"NOT watched well: {', '.join(unseen)}: the windows do not show them")
+            lines.append(
+                f"NOT watched well: {', '.join(unseen)}: the other windows do not show them: take "
+                "longer ones, in a new state"
+            )
         if unable:
-            names = "all numbers" if len(unable) == len(self._tracks) else ", ".join(unable)
+            every = len(unable) == len(self._tracks)
+            names = "all numbers" if every else ", ".join(unable)
             lines.append(
                 f"NOT enough windows yet: {names}: a change now may never alarm; "
                 f"{self._needed()} are needed before it"
@@ -361,7 +430,8 @@ class Watch:
         follow = np.flatnonzero(np.diff(track.windows) == 1)
         if follow.size < _JUDGED:
             return None
-        scores = ndtri((rankdata(track.values) - 0.5) / track.count)
+        steps = [_step(value) for value in track.values]
+        scores = ndtri((rankdata(steps) - 0.5) / track.count)
         first, second = scores[follow], scores[follow + 1]
         size = float(np.std(first) * np.std(second))
         if size == 0.0:
@@ -422,7 +492,7 @@ def _track_of(name: str, kept: Any, windows: int) -> _Track:
     track.windows = [checks.whole(f"{name}.windows", k, 1, windows) for k in kept["windows"]]
     if len(track.windows) != len(track.values):
         raise ValueError(f"{name}: {len(track.values)} values of {len(track.windows)} windows")
-    track.ranked = sorted(track.values)
+    track.ranked = sorted(map(_step, track.values))
     evidence = [-math.inf if v is None else checks.finite(name, v) for v in kept["evidence"]]
     track.evidence = np.array(evidence)
     track.runs = checks.vector(f"{name}.runs", kept["runs"], _BETS.size)

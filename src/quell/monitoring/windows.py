@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.commissioning import controlled, measured, measured_run, runs_in
+from quell.commissioning import by_axis, controlled, measured, measured_run, run_in
 from quell.files import MAX_SIZE
 from quell.realtime.recordings import Event
 from quell.records.trajectory import Trajectory
@@ -48,6 +48,8 @@ _BAND = 0.03
 _SEGMENTS, _FIRST, _AROUND, _HIGH, _LINES = 24, 4, 1.6, 2.0, 8
 # Least samples of a window: the regression, and a spectrum of a few lines. Chosen by hand.
 LEAST_SAMPLES = 200
+# A number is rounding, and zero, up to this share of the signals that it is a difference of.
+_ROUNDING = 1e-12
 # Share of samples that a window may lack. Chosen by hand: it hardly moves the numbers.
 MOST_MISSING = 1e-3
 
@@ -94,11 +96,11 @@ def signals_of(
     ValueError
         as ``quell.commissioning.measured``.
     """
-    runs = runs_in(path, columns, dt, time_unit, max_size)
-    if not runs:
+    run = run_in(path, columns, dt, time_unit, max_size)
+    if run is None:
         found = measured(path, columns, dt, time_unit, max_size)
         return {"": Signals(found.u, found.y, found.reference, None, {}, found.dt)}
-    return {name: _signals_in(run) for name, run in runs.items()}
+    return {name: _signals_in(each) for name, each in by_axis(run).items()}
 
 
 def _signals_in(run: Trajectory) -> Signals:
@@ -149,14 +151,17 @@ def features_of(signals: Signals, order: int, band: float | None = None) -> dict
     if band * dt >= 0.5 * math.pi:
         raise ValueError(f"band = {band!r} rad/s: must be below {0.5 * math.pi / dt:.4g} (pi/2/dt)")
     found = _regression(u, y, dt, order, band)
-    found["noise"] = _noise(y)
+    largest = float(np.max(np.abs(y)))
+    found["noise"] = _above_rounding(_noise(y), largest)
     found |= _resonance(y, dt)
     found["u_rms"] = _rms(u)
     if signals.r is not None:
-        found["error"] = _rms(checks.vector("r", signals.r, y.size) - y)
+        r = checks.vector("r", signals.r, y.size)
+        found["error"] = _above_rounding(_rms(r - y), max(largest, float(np.max(np.abs(r)))))
     if signals.f is not None:
         f = checks.vector("f", signals.f, y.size)
-        found["f_mean"], found["f_rms"] = float(np.mean(f)), _rms(f)
+        size = _rms(f)
+        found["f_mean"], found["f_rms"] = _above_rounding(float(np.mean(f)), size), size
     for name, value in signals.theta.items():
         found[f"theta {name}"] = float(np.mean(value))
     return found
@@ -184,6 +189,11 @@ def check_window(samples: int) -> None:
 
 def _rms(values: Vector) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _above_rounding(value: float, size: float) -> float:
+    """Return a value, or zero where it is rounding of numbers of this size."""
+    return value if abs(value) > _ROUNDING * size else 0.0
 
 
 def _noise(y: Vector) -> float:

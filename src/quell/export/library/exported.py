@@ -28,7 +28,7 @@ from quell.export.controller_source import (
     limits_path,
 )
 from quell.export.library.packages import package_files, package_note
-from quell.export.library.precision import Comparison, compared
+from quell.export.library.precision import Comparison, checked_comparison
 from quell.export.library.vectors import (
     TOLERANCE_REASON,
     Vectors,
@@ -626,31 +626,3 @@ def _function_table(source: CSource) -> str:
         "counted once. Functions of the C library are not counted, nor registers of interrupts.\n\n"
         f"| function | stack at most [bytes] | instructions in the code |\n|---|---|---|\n{rows}"
     )
-
-
-def checked_comparison(
-    controller: Any, single: bool, plant: Any, scenario: Scenario | None, accept: bool
-) -> Comparison | None:
-    """Return what single precision changes in a loop; None in double, and where it is not given.
-
-    Raises
-    ------
-    ValueError
-        for a plant or a scenario alone, or for double precision; and, without ``accept``, for a
-        difference that is too large, or that is not measured.
-    """
-    checks.flag("accept", accept)
-    if (plant is None) != (scenario is None) or not (single or plant is None):
-        what = "a comparison needs both" if single else "are compared in single precision only"
-        raise ValueError(f"plant, scenario: {what}; leave them out, or give both and 'single'")
-    if plant is None or scenario is None:
-        if single and not accept:
-            raise ValueError(
-                "precision = 'single': needs plant and scenario, to compare it with double "
-                "precision; or accept=True (--accept)"
-            )
-        return None
-    comparison = compared(plant, controller, scenario)
-    if not accept:
-        comparison.check(controller)
-    return comparison

@@ -25,7 +25,7 @@ from quell.export.controller_source import (
     limits_path,
     parameters_of,
 )
-from quell.export.library.exported import Comparison, checked_comparison
+from quell.export.library.precision import Comparison, checked_comparison
 from quell.export.library.vectors import fill
 from quell.export.structured_text.c_reader import Assign, CFile, Evaluate, Member
 from quell.export.structured_text.places import Node, Place, Record, Variable, Whole, is_keyword
