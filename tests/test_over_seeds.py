@@ -278,7 +278,11 @@ def in_windows(*windows: Any) -> Any:
         ),
         (
             lambda: over_seeds.of_setups(setups(8.0, 9.0, duration=0.1)),
-            r"windows\[0\].start = 0.1: must be less than the scenario's duration",
+            r"metrics\[0\].start = 0.1: must be less than the scenario's duration",
+        ),
+        (
+            lambda: in_windows({"start": 50.0}),
+            r"windows\[0\].start = 50: must be less than the scenario's duration",
         ),
         (
             lambda: over_seeds.of_setups(setups(8.0) | {"longer": made_axes("l", gantry() | {"dt": 2e-3})}),
