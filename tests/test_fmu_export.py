@@ -487,7 +487,7 @@ def test_what_an_fmu_cannot_do_is_refused_with_a_reason(made: Maker) -> None:
     [
         ql.plants.arm(),
         ql.plants.encoded_outputs(ql.plants.arm(), 1e-6),
-        ql.plants.delayed_inputs(ql.plants.arm(), 1e-3, DT),
+        ql.plants.delayed_inputs(ql.plants.arm(), 2 * DT, DT),
         ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2)),
     ],
 )
