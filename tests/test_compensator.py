@@ -201,9 +201,34 @@ def test_the_integral_of_the_error_beside_a_gentle_controller_has_its_end() -> N
         assert iae == pytest.approx(0.1 * np.sum(np.abs(run["y"])), rel=1e-6)
 
 
+def test_the_integral_of_an_error_that_stays_is_without_end() -> None:
+    """A PD controller leaves a constant error under a load, which no time ends; the compensator removes it."""
+    pd = ql.baselines.PID(kp=4.0, ki=0.0, kd=3.0, tf=0.05, dt=0.01)
+    tuned = ql.tuning.tune_compensator(([1.0], [1.0, 1.0, 0.0]), pd, speeds=(1.0, 1.0))
+    assert tuned.before.iae == np.inf
+    assert np.isfinite(tuned.after.iae)
+    assert tuned.worth
+    told = " ".join(str(tuned).split())
+    assert "∫|y| without end: y stays off under a load" in told
+    assert "leaves no constant error, which the controller alone leaves" in told
+    assert tuned.to_json()["before"]["iae"] is None
+    run = ql.simulate(
+        ql.plants.LinearPlant.of(([1.0], [1.0, 1.0, 0.0])), tuned.controller,
+        ql.Scenario(disturbances=(1.0,), duration=100.0),
+    )  # fmt: skip
+    assert tuned.after.iae == pytest.approx(0.01 * np.sum(np.abs(run["y"])), rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("controller", "options", "message"),
     [
+        (
+            PID,
+            {"constraints": ql.tuning.Constraints(m_s=2.0, noise_std=1e-3)},
+            "noise_std = 0.001: does not hold",
+        ),
+        (PID, {"constraints": ql.tuning.Constraints(damping=0.7)}, "constraints.damping = 0.7"),
+        (PID, {"constraints": ql.tuning.Constraints(u_max=2.0)}, "constraints.u_max = 2.0"),
         (ql.ADRC(OBSERVER, 3.0), {}, "has an observer"),
         (None, {}, "must be a controller"),
         (PID, {"speeds": 0.9}, "speeds"),

@@ -34,6 +34,7 @@ from quell.analysis.margins import Response
 from quell.controllers.base import Controller
 from quell.controllers.compensated import Compensated, check_takes_compensator
 from quell.controllers.compensator import Compensator
+from quell.files import nonfinite_to_none
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
@@ -70,13 +71,16 @@ class Measures(NamedTuple):
     m_s: float  #: largest ``|S|``
     m_t: float  #: largest ``|T|``
     m_ks: float  #: largest ``|K S|`` [u-unit/y-unit]
-    iae: float  #: ``∫|y|`` after a unit step of the load [y-unit s/u-unit]
+    iae: float
+    """``∫|y|`` after a unit step of the load [y-unit s/u-unit]; infinite if y stays off."""
     m_s_elsewhere: float  #: largest ``|S|`` with the poles and zeros of ``speeds``
 
     def __str__(self) -> str:
+        area = f"∫|y| {self.iae:.4g} per unit of the load"
         return (
             f"M_s {self.m_s:.3g} ({self.m_s_elsewhere:.3g} at other speeds of the plant), "
-            f"M_t {self.m_t:.3g}, M_ks {self.m_ks:.3g}, ∫|y| {self.iae:.4g} per unit of the load"
+            f"M_t {self.m_t:.3g}, M_ks {self.m_ks:.3g}, "
+            + (area if math.isfinite(self.iae) else "∫|y| without end: y stays off under a load")
         )
 
 
@@ -133,19 +137,22 @@ class TunedCompensator:
         return ax
 
     def to_json(self) -> dict[str, Any]:
-        """Return all results for ``quell.files.write_json``."""
+        """Return all results for ``quell.files.write_json``; infinite numbers become None."""
         figures = {"before": self.before._asdict(), "after": self.after._asdict()}
-        return {"observer": self.name, "worth": self.worth, **figures, "tables": self.tables}
+        found = {"observer": self.name, "worth": self.worth, **figures, "tables": self.tables}
+        return dict(nonfinite_to_none(found))
 
     def __str__(self) -> str:
-        share = self.after.iae / self.before.iae
+        left = "a load leaves no constant error, which the controller alone leaves"
+        if math.isfinite(self.before.iae):
+            left = f"a load leaves {self.after.iae / self.before.iae:.3g} of what it leaves without"
         lines = [
             f"Compensator with a {self.name} observer, omega_o = "
             f"{self.compensator.observer.omega_o:.4g} rad/s, b0 = "
             f"{self.compensator.observer.b0:.4g}",
             f"controller alone: {self.before}",
             f"with compensator: {self.after}",
-            f"a load leaves {share:.3g} of what it leaves without (bounds: {self.constraints})",
+            f"{left} (bounds: {self.constraints})",
         ]
         if not self.worth:
             lines.append(
@@ -180,8 +187,8 @@ def tune_compensator(
         a linear controller without observer, which stays as it is: ``quell.baselines.PID``,
         ``PPI``, ``LQG``, ``LinearController.from_transfer_function``.
     constraints
-        M_s, M_t, M_ks, delay margin and ``omega_o_dt`` of the whole loop. By default M_s = M_t = 2
-        and three times the controller's M_ks.
+        M_s, M_t, M_ks, delay margin and ``omega_o_dt`` of the whole loop; others do not hold for a
+        compensator. By default M_s = M_t = 2 and three times the controller's M_ks.
     b_range
         lowest and highest gain of the plant over that of the model.
     speeds
@@ -199,7 +206,8 @@ def tune_compensator(
     ------
     ValueError
         for a controller that is not linear, that does not stabilise the plant or exceeds the
-        bounds by itself, and if no compensator keeps them.
+        bounds by itself, for bounds that do not hold for a compensator, and if no compensator keeps
+        them.
 
     Examples
     --------
@@ -225,6 +233,7 @@ def tune_compensator(
             "needs one that is stable without it"
         )
     bounds = given_constraints(constraints, Constraints(m_s=_PEAKS, m_t=_PEAKS, damping=None))
+    _check_used(bounds)
     if bounds.m_ks is None:
         bounds = replace(bounds, m_ks=_NOISE * before.m_ks)
     model = model_of(given, plants.all, bounds)
@@ -258,6 +267,24 @@ def tune_compensator(
     )
     known, apart = (before, best.measures, bounds, tables, dt, loads), dt * inputs.distance
     return TunedCompensator(both, best.name, *known, apart)
+
+
+# Bounds that the search of an observer does not know.
+_NOT_USED = ("u_std", "noise_std", "resolution", "noise_share", "noise_over_pi")
+_NOT_USED += ("damping", "u_max", "rate_max")
+
+
+def _check_used(bounds: Constraints) -> None:
+    """Raise a ``ValueError`` for bounds that would not hold; values by default are none."""
+    default = Constraints()
+    for name in _NOT_USED:
+        value = getattr(bounds, name)
+        if value is not None and value != getattr(default, name):
+            raise ValueError(
+                f"constraints.{name} = {value!r}: does not hold for a compensator; leave it out "
+                "and bound m_s, m_t, m_ks and delay_margin, or tune the whole controller with "
+                "quell.tune"
+            )
 
 
 def _with_speeds(given: Given, speeds: tuple[float, float]) -> Given:

@@ -590,6 +590,8 @@ _ONE_BY_ONE, _OF_A_DISTANCE = 50_000, 10_000
 # Where the response to a step ends, in time constants of the slowest pole: what is left is a share
 # of e⁻²⁰ of y. And the limits of that pole in the z-plane, beyond which it is rounding.
 _TIME_CONSTANTS, _FASTEST, _SLOWEST = 20.0, 1e-9, 1.0 - 1e-12
+# A last value that makes more than this share of the sum is not rounding: y does not come back.
+_LAST_VALUE = 0.5
 
 
 def area_of_step(system: System, samples: int) -> float:
@@ -626,4 +628,8 @@ def area_until_rest(system: System) -> float:
     if pole >= 1.0:
         return math.inf
     pole = min(max(pole, _FASTEST), _SLOWEST)
-    return area_of_step(system, math.ceil(_TIME_CONSTANTS / -math.log(pole)) + 1)
+    count = math.ceil(_TIME_CONSTANTS / -math.log(pole)) + 1
+    area = area_of_step(system, count)
+    N, B, C, D = System.balanced(*system)
+    last = D - float(C @ np.linalg.solve(N, B))
+    return math.inf if abs(last) * count > _LAST_VALUE * area else area
