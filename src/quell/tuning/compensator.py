@@ -270,8 +270,10 @@ def tune_compensator(
 
 
 # Bounds that the search of an observer does not know.
-_NOT_USED = ("u_std", "noise_std", "resolution", "noise_share", "noise_over_pi")
-_NOT_USED += ("damping", "u_max", "rate_max")
+_NOT_USED = (
+    *("u_std", "noise_std", "resolution", "noise_share", "noise_over_pi"),
+    *("damping", "u_max", "rate_max"),
+)
 
 
 def _check_used(bounds: Constraints) -> None:
