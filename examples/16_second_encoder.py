@@ -7,6 +7,7 @@ encoders estimates a disturbance on each side, and state feedback carries the lo
 
 import math
 
+import numba
 import numpy as np
 
 import quell as ql
@@ -18,6 +19,7 @@ PLAY, FRICTION = 1e-3, (0.03, 0.02)  # rad, N m
 OMEGA = 60.0  # bandwidth of both loops [rad/s]
 
 
+@numba.njit  # the plants below call it, compiled
 def drive(t, x, u, w):
     """Motor and load: angle and speed of each; w are torques on them."""
     twist, slip = x[0] - x[2], x[1] - x[3]

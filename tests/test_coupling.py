@@ -179,7 +179,7 @@ def tanks(shares: tuple[float, float]) -> ql.plants.MultivariableLinearPlant:
 def test_a_zero_in_the_right_half_plane_is_named_and_b0_is_no_remedy() -> None:
     """The zero of a quadruple tank, of its model in continuous time; with more share below there is none, and B0 is proposed."""
     found = coupling(tanks((0.43, 0.34)), 1.0, bandwidth=0.01, axes=("h1", "h2"))
-    assert found.pairs == (1, 0)
+    assert found.pairing == (1, 0)
     (zero,) = found.zeros
     plant = tanks((0.43, 0.34))
     exact = max(invariant_zeros(plant.A, plant.B, plant.C).values.real)

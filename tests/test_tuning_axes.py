@@ -195,7 +195,7 @@ def test_the_pairs_that_are_proposed_meet_the_bounds() -> None:
     rest = -plant.C @ np.linalg.solve(plant.A, plant.B) / np.array([[62.0], [90.0]])
     found = tune_axes(plant, of_tanks(rest * [[0.0, 1.0], [1.0, 0.0]]))
     assert found.met
-    assert found.given.pairs is None
+    assert found.given.pairing is None
     assert "give the B0" not in found.summary()
     assert "a zero in the right half plane" in found.summary()
 

@@ -146,7 +146,7 @@ class Coupling:
         return "\n".join(self._sentence(gains)[0] for gains in self.at)
 
     @property
-    def pairs(self) -> tuple[int, ...] | None:
+    def pairing(self) -> tuple[int, ...] | None:
         """The input of each axis by the gains at rest; None for a plant that has none.
 
         It is also None if no pairs have positive relative gains.

@@ -699,7 +699,7 @@ def _given_gain(
     pairs = None
     if B.shape[1] == C.shape[0]:
         whole = _coupling(A, B, C, axes, at)
-        pairs = None if whole is None else whole.pairs
+        pairs = None if whole is None else whole.pairing
         if pairs is not None and np.array_equal(B0 != 0.0, np.eye(len(pairs))[list(pairs)]):
             pairs = None
     zeros = unstable_zeros(N, B @ R, C, axes.dt, ABOVE_BANDWIDTH * fastest)

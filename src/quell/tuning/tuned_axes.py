@@ -91,7 +91,7 @@ class GivenB0(NamedTuple):
     """Whether no bandwidths are stable with it: gains at rest behind it have the wrong sign."""
     zeros: tuple[complex, ...]
     """Zeros in the right half plane, up to ten times the bandwidth of the axes alone [rad/s]."""
-    pairs: tuple[int, ...] | None
+    pairing: tuple[int, ...] | None
     """The input of each axis by the gains at rest, if B0 has other entries, too."""
 
 
@@ -290,9 +290,9 @@ class TunedAxes:
                 "the dynamics of the plant couple the axes at these bandwidths, and a constant B0 "
                 "does not undo it: give looser bounds, less delay or faster samples"
             )
-        if given.pairs is not None:
+        if given.pairing is not None:
             names = self.controller.names
-            pairs = ", ".join(f"{names[i]} with input {j + 1}" for i, j in enumerate(given.pairs))
+            pairs = ", ".join(f"{names[i]} with input {j + 1}" for i, j in enumerate(given.pairing))
             remedies.append(f"pair by the gains at rest, {pairs}, with a B0 of these entries only")
         remedies.append("choose other inputs or outputs")
         if not given.is_turned:
