@@ -49,7 +49,7 @@ from quell.types import Matrix, Vector
 
 # A gain that changes by less than this factor leaves two loops as they are. Chosen by hand: it is
 # within the gain margin of every sensible design.
-_INDEPENDENT = 1.25
+INDEPENDENT = 1.25
 # From this entry on, an error of a tenth makes the matrix singular.
 _SENSITIVE = 10.0
 # From this entry on, an error of a hundredth does, and nobody knows gains that well.
@@ -182,7 +182,7 @@ class Coupling:
             return f"the axes are paired with the wrong inputs {where}", f"move {text}{rest}"
         changes = _changes(relative)
         first = int(np.argmax(changes))
-        if changes[first] <= _INDEPENDENT:
+        if changes[first] <= INDEPENDENT:
             return self._independent(gains, where, float(changes[first]))
         others = np.abs(relative[first]) + np.abs(relative[:, first])
         others[first] = -1.0

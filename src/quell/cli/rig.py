@@ -191,14 +191,6 @@ def _print_counters(server: Rig) -> None:
         print(f"the log lacks {server.unlogged} ticks: it could not be written as quickly")
 
 
-def _loaded(name: str, data: Mapping[str, Any], trust: bool) -> Setup:
-    """Return the objects of a file of one axis, or of several."""
-    from quell.setup import made, made_axes
-    from quell.setup.description import is_of_axes
-
-    return (made_axes if is_of_axes(data) else made)(name, data, trust)
-
-
 # ---- quell proxy ----
 
 _HOST = (
@@ -250,8 +242,9 @@ def proxy(
     from quell.realtime.registry import listen
     from quell.realtime.rig import Rig
     from quell.setup import read
+    from quell.setup.axes import made_any
 
-    loaded = _loaded(*read(setup), trust)
+    loaded = made_any(*read(setup), trust)
     url = str(loaded.needed("rig")["device"]) if device is None else device
     _check_pace(seconds, priority, cpu)
     compensator, dt = cast("Compensator | Axes", loaded.controller), float(loaded.controller.dt)
@@ -362,6 +355,7 @@ def run_rig(
         watch for other windows.
     """
     from quell.setup import EXAMPLES, read
+    from quell.setup.axes import made_any
     from quell.setup.description import is_of_axes
 
     numbers: dict[str, Any] = {
@@ -406,7 +400,7 @@ def run_rig(
     if seconds is not None and isinstance(windows := tables.get("metrics"), list):
         # A shorter run is not judged after its end.
         tables["metrics"] = [each for each in windows if not _begins_after(each, seconds)]
-    given = _loaded(name, tables, trust)
+    given = made_any(name, tables, trust)
     if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
 
@@ -671,12 +665,13 @@ def replay(
     from quell.realtime import replay as replay_record
     from quell.records import metrics
     from quell.setup import EXAMPLES, read
+    from quell.setup.axes import made_any
     from quell.setup.description import is_of_axes
     from quell.setup.schema import with_path
 
     file, data = read(setup or EXAMPLES / "torsional_rig.toml")
     several = is_of_axes(data)
-    given = _loaded(file, data, trust)
+    given = made_any(file, data, trust)
     name = f"{record.stem}-replayed"
     outputs = check_outputs(outputs, [name])
     recorded = load_record(record, max_size)

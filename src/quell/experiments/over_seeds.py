@@ -35,7 +35,7 @@ from quell.files import nonfinite_to_none
 from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
 from quell.plants.base import one_at_a_time, signals_of
-from quell.records.axes import one_gain
+from quell.records.axes import OneGain, one_gain
 from quell.records.metrics import MEASURES
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.setup.axes import signals_in
@@ -46,7 +46,7 @@ from quell.simulation.driver import is_random
 from quell.sweeping.measures import Measure, measure_run
 from quell.sweeping.sweep import share_interval
 from quell.tuning.simulated.problem import half_width_of_mean
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 CRITERIA = {"rms": "RMS error", "iae": "∫|error|", "peak_error": "largest |error|"}
 """Measures by which controllers are compared, with their names in sentences."""
@@ -284,8 +284,9 @@ def over_seeds(
         for name in MEASURES
     }
     first = replace(scenario, seed=numbers[0])
-    gain, notes = _common_gain(plant, controllers, first) if axes != ("",) else (None, ())
-    unlike = any(note.startswith("NOT compared") for note in notes)
+    gain, fault = (
+        _common_gain(plant, controllers, first) if axes != ("",) else (OneGain(None, True), "")
+    )
     own: dict[str, Callable[[Any], float]] = {
         f"{i}.{axis}": partial(_largest, start=start, stop=stop, axis=axis)
         for i, (start, stop) in enumerate(spans)
@@ -294,8 +295,8 @@ def over_seeds(
 
     def run(controller: Any, seed: int) -> tuple[dict[str, float], bool]:
         found = simulate(plant, controller, replace(scenario, seed=seed))
-        if gain is not None:
-            found = found.with_gain(gain)
+        if gain.B is not None:
+            found = found.with_gain(gain.B)
         return measure_run(found, {**measures, **own}), bool(found.diverged)
 
     made = [*controllers.values()]
@@ -313,31 +314,31 @@ def over_seeds(
     largest = np.array([[found[name] for name in own] for found, _ in results])
     largest = np.moveaxis(largest.reshape(shape[:4]), 0, -1)
     values = {name: np.moveaxis(table[..., k], 0, -1) for k, name in enumerate(MEASURES)}
-    if unlike:
+    if fault:
         values |= {name: np.full_like(values[name], math.nan) for name in _OF_U}
     names = tuple(controllers)
     rounding = _rounding(largest, diverged.T, spans, criterion)
     level = _level(confidence, names, axes, spans)
     verdicts = _verdicts(names, axes, spans, values[criterion], diverged.T, level, rounding)
     found = names, axes, spans, numbers, criterion, values, diverged.T
-    return SeedComparison(*found, rounding, verdicts, notes=notes)
+    notes = [f"NOT compared: variation of u: {fault}"] if fault else gain.describe()
+    return SeedComparison(*found, rounding, verdicts, notes=tuple(notes))
 
 
 def _common_gain(
     plant: Any, controllers: Mapping[str, Any], scenario: Scenario
-) -> tuple[Matrix | None, tuple[str, ...]]:
-    """Return B for v = B u of all axes where their B0 differ, and lines about it."""
+) -> tuple[OneGain, str]:
+    """Return how v of all axes can be compared, and why it can't be."""
     first, *others = controllers.values()
     if all(_same_gain(getattr(first, n), getattr(c, n)) for c in others for n in ("B0", "M")):
-        return None, ()
+        return OneGain(None, True), ""
     jobs = [partial(simulate, plant, controller, scenario) for controller in controllers.values()]
     runs: Any = in_parallel(jobs, None, 1 if one_at_a_time(plant) else None)
     factors = {name: run.gain_factor() for name, run in zip(controllers, runs, strict=True)}
     try:
-        found = one_gain(factors, first.inputs)
+        return one_gain(factors, first.inputs), ""
     except ValueError as error:
-        return None, (f"NOT compared: variation of u: {error}",)
-    return found.B, tuple(found.describe())
+        return OneGain(None, False), str(error)
 
 
 def _same_gain(one: Any, other: Any) -> bool:
@@ -406,9 +407,9 @@ def _windows(scenario: Scenario, windows: Sequence[Any]) -> tuple[dict[str, Any]
                 raise ValueError(f"{where}: {key!r:.60} is unknown; {hint}")
         try:
             check_window(**window)
-            start = checks.non_negative("start", window.get("start", 0.0), "s")
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
+        start = float(window.get("start", 0.0))
         if start >= scenario.duration:
             rule = f"must be less than the scenario's duration, {scenario.duration:g} s"
             raise ValueError(f"{where}.start = {start:g}: {rule}")

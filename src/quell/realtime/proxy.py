@@ -83,7 +83,7 @@ _REASONS = {
 
 
 class Drive(NamedTuple):
-    """What is known of a drive."""
+    """The measurements and faults of a drive."""
 
     last: Vector  # last good measurements; NaN before the first (n,)
     silent: NDArray[np.int64]  # samples in a row without one (n,)

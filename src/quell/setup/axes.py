@@ -33,12 +33,13 @@ from quell.plants.multivariable import (
 from quell.quantities import AxesSignals
 from quell.records.axes import AxesTrajectory
 from quell.setup import registry
-from quell.setup.description import DT, TITLE, Title, optional
+from quell.setup.description import DT, TITLE, Title, is_of_axes, optional
 from quell.setup.loading import (
     Known,
     Setup,
     Variation,
     changed,
+    made,
     made_once,
     sweep_of,
     title_of,
@@ -391,6 +392,11 @@ def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     ('shoulder', 'elbow')
     """
     return made_axes(*read(path), trust)
+
+
+def made_any(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
+    """Build the objects of a file of one axis, as ``made``, or of several, as ``made_axes``."""
+    return (made_axes if is_of_axes(data) else made)(name, data, trust)
 
 
 def made_axes(

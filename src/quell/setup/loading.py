@@ -151,7 +151,7 @@ def made(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     SetupError
         as ``load``.
     """
-    return usable(assembled(name, describe(name, data), trust=trust))
+    return usable(unchecked(name, data, trust))
 
 
 def assembled(
@@ -423,7 +423,7 @@ def varied(setup: Setup, changes: Mapping[str, Any]) -> Setup:
     """
     if not isinstance(setup, Setup):
         raise ValueError(f"setup = {setup!r:.80}: must be a Setup, as quell.setup.load returns it")
-    return _unchecked(setup.file, changed(setup.file, setup.tables(), changes), setup.trust)
+    return unchecked(setup.file, changed(setup.file, setup.tables(), changes), setup.trust)
 
 
 def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
@@ -450,10 +450,11 @@ def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
 def _controller(
     name: str, tables: Mapping[str, Any], values: Mapping[str, float], trust: bool
 ) -> Controller:
-    return _unchecked(name, changed(name, tables, values), trust).controller
+    return unchecked(name, changed(name, tables, values), trust).controller
 
 
-def _unchecked(name: str, data: Mapping[str, Any], trust: bool) -> Setup:
+def unchecked(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
+    """Build what ``made`` builds, without the checks of ``usable``."""
     return assembled(name, describe(name, data), trust=trust)
 
 
@@ -552,7 +553,7 @@ def tuning_task(
             asked = _feedforward(given) | asked
         if asked:
             kept["tune"] = asked
-    setup = _unchecked(name, kept, trust)
+    setup = unchecked(name, kept, trust)
     check_windows(setup)
     plant, ranges = setup.needed("plant"), _ranges(setup)
     options = tuning_options(setup, given, plant, limits or {})
@@ -632,7 +633,7 @@ def _with_tuning_task(
     name: str, data: Mapping[str, Any], values: Mapping[str, float], trust: bool
 ) -> Setup:
     changes = {f"plant.{key}": value for key, value in values.items()}
-    return _unchecked(name, changed(name, data, changes), trust)
+    return unchecked(name, changed(name, data, changes), trust)
 
 
 def _ranges(setup: Setup) -> dict[str, tuple[float, float]]:

@@ -14,16 +14,15 @@ from typing import Any, NamedTuple, TypeAlias
 
 from quell import checks
 from quell.plants.linearise import linear_model
-from quell.setup.description import describe
 from quell.setup.loading import (
     NO_CONTROLLER,
     REPLACED,
     Setup,
-    assembled,
     changed,
     check_windows,
     tuned_tables,
     tuning_options,
+    unchecked,
 )
 from quell.setup.schema import SetupError, read
 from quell.tuning.report import rest_of_plant
@@ -83,8 +82,7 @@ def schedule_task(
     asked = {**data["tune"], **(changes or {})}
     _check(name, data, asked)
     first = {"dt": data["dt"]} if "dt" in data else {}
-    tables = first | {"controller": NO_CONTROLLER, "tune": asked}
-    alone = assembled(name, describe(name, tables))
+    alone = unchecked(name, first | {"controller": NO_CONTROLLER, "tune": asked})
     given = (alone.tune or {})["schedule"]
     how: dict[str, Any] = dict(given["options"])
     at = _Points(name, data, given, asked["schedule"], trust)
@@ -96,8 +94,7 @@ def schedule_task(
     table = data["plant"] if "plant" in data and has_signals else at.table(middle)
     whole = {key: value for key, value in data.items() if key not in REPLACED}
     whole |= {"plant": table, "tune": asked}
-    without = describe(name, {**whole, "controller": NO_CONTROLLER})
-    setup = assembled(name, without, trust=trust)
+    setup = unchecked(name, {**whole, "controller": NO_CONTROLLER}, trust)
     check_windows(setup)
     options = tuning_options(setup, data.get("controller"), setup.plant, limits or {})
     del options["schedule"]
@@ -182,7 +179,7 @@ class _Points:
         if at in self.changes:
             where = f"tune.schedule.points[{self.changes[at][0]}]"
         try:
-            setup = assembled(self.name, describe(self.name, tables), trust=self.trust)
+            setup = unchecked(self.name, tables, self.trust)
             if getattr(setup.description.plant, "uncertain", None) is not None:
                 raise SetupError([f"plant.uncertain: {_RANGES}; b_range of [tune] is a range of b"])
         except SetupError as error:

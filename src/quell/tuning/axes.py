@@ -43,6 +43,7 @@ import numpy as np
 from quell import checks
 from quell.analysis.coupling import (
     ABOVE_BANDWIDTH,
+    INDEPENDENT,
     Coupling,
     balancing,
     coupling,
@@ -66,7 +67,7 @@ from quell.plants.linear import LinearPlant
 from quell.plants.linearise import held_points
 from quell.plants.multivariable import MultivariableLinearPlant, delayed_inputs
 from quell.sweeping.sweep import share_interval
-from quell.tuning.constraints import Constraints, given_constraints
+from quell.tuning.constraints import Constraints, first_given, given_constraints
 from quell.tuning.optimiser.coupled import (
     UNSTABLE,
     CoupledLoops,
@@ -80,7 +81,6 @@ from quell.tuning.optimiser.coupled import (
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 from quell.tuning.tuned_axes import (
-    INDEPENDENT,
     PLACES,
     TOLERANCE,
     AxesBound,
@@ -266,11 +266,10 @@ def tune_axes(
 
 def _checked_bounds(given: Constraints | None) -> Constraints:
     bounds = given_constraints(given)
-    for name in _NOT_HERE:
-        if getattr(bounds, name) is not None:
-            raise ValueError(
-                f"constraints: {name} is not bounded for axes; bound m_ks, the gain from y to v"
-            )
+    if name := first_given(bounds, _NOT_HERE):
+        raise ValueError(
+            f"constraints: {name} is not bounded for axes; bound m_ks, the gain from y to v"
+        )
     return bounds
 
 

@@ -38,7 +38,7 @@ from quell.files import nonfinite_to_none
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
-from quell.tuning.constraints import Constraints, given_constraints
+from quell.tuning.constraints import Constraints, first_given, given_constraints
 from quell.tuning.optimiser.loops import (
     PlantSet,
     area_until_rest,
@@ -278,15 +278,12 @@ _NOT_USED = (
 
 def _check_used(bounds: Constraints) -> None:
     """Raise a ``ValueError`` for bounds that would not hold; values by default are none."""
-    default = Constraints()
-    for name in _NOT_USED:
-        value = getattr(bounds, name)
-        if value is not None and value != getattr(default, name):
-            raise ValueError(
-                f"constraints.{name} = {value!r}: does not hold for a compensator; leave it out "
-                "and bound m_s, m_t, m_ks and delay_margin, or tune the whole controller with "
-                "quell.tune"
-            )
+    if name := first_given(bounds, _NOT_USED):
+        raise ValueError(
+            f"constraints.{name} = {getattr(bounds, name)!r}: does not hold for a compensator; "
+            "leave it out and bound m_s, m_t, m_ks and delay_margin, or tune the whole controller "
+            "with quell.tune"
+        )
 
 
 def _with_speeds(given: Given, speeds: tuple[float, float]) -> Given:

@@ -8,6 +8,7 @@ With ``S = 1/(1 + L)``, ``T = 1 − S`` and the controller C_y from −y to u, t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,6 +126,14 @@ class Constraints:
             ("|p| dt ≤ {:g} for poles of observers and filters", self.omega_o_dt),
         ]
         return ", ".join(text.format(value) for text, value in parts if value is not None)
+
+
+def first_given(bounds: Constraints, names: Sequence[str]) -> str:
+    """Return the first of these bounds that was given and is not the default; empty for none."""
+    default = Constraints()
+    given = ((name, getattr(bounds, name)) for name in names)
+    known = (name for name, value in given if value not in (None, getattr(default, name)))
+    return next(known, "")
 
 
 def given_constraints(given: Any, default: Constraints | None = None) -> Constraints:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.analysis.coupling import Coupling, about_zeros
+from quell.analysis.coupling import INDEPENDENT, Coupling, about_zeros
 from quell.analysis.multivariable import MultivariableLoop
 from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none, written_atomically
@@ -20,8 +20,6 @@ from quell.tuning.constraints import Constraints
 from quell.tuning.report import toml_text
 from quell.tuning.tuned import Tuned
 
-INDEPENDENT = 1.25
-"""A gain that changes by less with the other loops closed: as in ``analysis.coupling``."""
 TOLERANCE = 1e-3
 """A bound counts as kept up to this share beyond it, on the exact response."""
 PLACES = ("inputs", "outputs")
@@ -81,7 +79,7 @@ class AxesCheck(NamedTuple):
 
 
 class GivenB0(NamedTuple):
-    """What the plant says of the B0 that the axes were given."""
+    """The B0 that axes were given, compared with the plant."""
 
     is_of_plant: bool
     """Whether its rows are those of the plant to about 1 %, each to a factor."""

@@ -166,6 +166,7 @@ def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
         quiet = simulate(plant, controller, replace(scenario, noise=0.0))
     each = []
     limited = _limited(double, single, controller)
+    limited_quiet = limited if quiet is None else _limited(double, quiet, controller)
     shares = np.mean(limited, axis=0)
     least = float(np.min(shares))
     for name, (channel, column) in _signals_of(controller):
@@ -173,8 +174,12 @@ def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
         if share > _MOST_LIMITED:
             each.append(Difference(name, None, None, share))
             continue
-        change = _change(double, single, controller, channel, column)
-        noise = None if quiet is None else _change(double, quiet, controller, channel, column)
+        largest = _largest(double, controller, channel, column)
+        place = channel, column, largest
+        change, noise = (
+            None if other is None else _difference(double, other, *place, at_limits)
+            for other, at_limits in ((single, limited), (quiet, limited_quiet))
+        )
         each.append(Difference(name, change, noise, share))
     worst = [
         max((own for own in each if own.name.startswith(kind)), key=lambda own: own.single or 0.0)
@@ -183,13 +188,6 @@ def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
     u, y = (math.nan if least > _MOST_LIMITED else own.single or 0.0 for own in worst)
     several = tuple(each) if hasattr(controller, "inputs") else ()
     return Comparison(u, y, worst[0].noise, worst[1].noise, diverged, several, least)
-
-
-def _change(one: Any, two: Any, controller: Any, channel: str, column: int) -> float | None:
-    """Return the difference of a signal of two runs; of u in the samples off its limits."""
-    largest = _largest(one, controller, channel, column)
-    off = ~_limited(one, two, controller)[:, column] if channel == "u" else None
-    return _difference(one, two, channel, column, largest, off)
 
 
 def _limited(one: Any, two: Any, controller: Any) -> NDArray[np.bool_]:
@@ -245,17 +243,19 @@ def _difference(
     name: str,
     column: int,
     largest: float,
-    samples: NDArray[np.bool_] | None = None,
+    limited: NDArray[np.bool_] | None = None,
 ) -> float | None:
     """Return the RMS difference of a signal, relative to the RMS of the reference.
 
-    ``samples`` are those that count, all by default. None for a signal that rests in both: below
-    rounding in the one, and within ``LIMIT`` of ``largest`` in the other.
+    Of u the samples count that are not ``limited`` (samples, actuators), or all where all are. None
+    for a signal that rests in both: below rounding in the one, and within ``LIMIT`` of ``largest``
+    in the other.
     """
     count = min(len(reference), len(other))
     one, two = (each[name][:count].reshape(count, -1)[:, column] for each in (reference, other))
-    if samples is not None and np.any(samples):
-        one, two = one[samples], two[samples]
+    if name == "u" and limited is not None and not np.all(limited[:, column]):
+        off = ~limited[:, column]
+        one, two = one[off], two[off]
     size, change = float(_rms(one)), float(_rms(two - one))
     if size <= _REST * largest:
         size = largest
