@@ -111,7 +111,6 @@ def _residual_loop(name: str) -> dict[str, Any]:
     loop = _loop(name)
     dt, u_min, u_max = loop.pop("dt"), loop.pop("u_min"), loop.pop("u_max")
     if name == "arm":
-        loop.pop("x_limit")  # x is not observed
         return loop | {"controller": _axes_of_arm(dt, u_min, u_max)}
     order, b0, omega_o, omega_c, most = {
         "two-mass": (4, 1.0, 10.0, 1.0, 2.0),
