@@ -53,7 +53,8 @@ if tool := emulator.missing_tool():
 constraints = ql.tuning.Constraints(m_ks=500.0)
 how = {"feedforward": True, "compare": (), "constraints": constraints}
 tuned = ql.tune(DRIVE, DT, u_min=-10.0, u_max=10.0, **how)
-controller = Prefiltered(tuned.controller, ProfileGenerator(**LIMITS))
+# The tuned controller is behind a generator of its own, for the limits of u: here are others.
+controller = Prefiltered(tuned.design.controller, ProfileGenerator(**LIMITS))
 print(tuned.summary().splitlines()[1])
 load = ql.signals.Step(height=LOAD, at=LOAD_AT)
 scenario = ql.Scenario(reference=REFERENCE, disturbances=(load,), duration=DURATION)

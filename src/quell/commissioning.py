@@ -38,6 +38,7 @@ from quell.controllers.baselines.pid import PID
 from quell.controllers.linear import LinearController, LinearLaw
 from quell.files import MAX_SIZE, nonfinite_to_none
 from quell.identification import Measured, excitation
+from quell.identification.record_file import in_common_units
 from quell.identification.result import Identified, nrmse, simulated_plant
 from quell.realtime.devices import Device, TwinDevice
 from quell.realtime.recordings import Event, is_recording, load, load_one
@@ -47,10 +48,11 @@ from quell.realtime.supervisor import Cause
 from quell.records.axes import AxesTrajectory, OneGain, one_gain
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory
+from quell.records.units import runs_in_common_units
 from quell.signals import Signal, Step
 from quell.simulation.driver import Scenario
 from quell.simulation.simulate import simulate
-from quell.types import Matrix, Vector
+from quell.types import Matrix, Vector, warn
 
 # ---- The limits of an experiment at a rig ----
 
@@ -292,12 +294,14 @@ def with_one_gain(
 ) -> tuple[dict[str, Trajectory | AxesTrajectory], OneGain]:
     """Return runs by name whose v, of several axes, can be compared, and how.
 
-    Of runs of several axes only the samples under control are left.
+    Of runs of several axes only the samples under control are left, in the units of the first; a
+    ``UserWarning`` says what was converted.
 
     Raises
     ------
     ValueError
-        for runs with different numbers of actuators, and as ``quell.records.axes.one_gain``.
+        for runs with different numbers of actuators, units that do not convert, and as
+        ``quell.records.axes.one_gain``.
     """
     several = {
         name: replace(run, log=np.ascontiguousarray(run.log[controlled(run)]))
@@ -310,6 +314,10 @@ def with_one_gain(
         raise ValueError(f"numbers of actuators: {texts}: must be those of one machine")
     if not several:
         return dict(runs), OneGain(None, True)
+    if len({run.axis_names for run in several.values()}) == 1:
+        several, notes = runs_in_common_units(several)
+        for note in notes:
+            warn(note, UserWarning)
     factors = {name: run.gain_factor() for name, run in several.items()}
     found = one_gain(factors, next(iter(counts.values())))
     if found.B is not None:
@@ -336,16 +344,24 @@ def measured_records(
 ) -> list[Measured]:
     """Read several records of one plant, as ``measured`` does; all have the same sample time.
 
-    Sample times that differ by rounding or drift are replaced by their mean, by samples.
+    Sample times that differ by rounding or drift are replaced by their mean, by samples. Units that
+    differ are converted to those of the first record that has some, and a ``UserWarning`` says so.
 
     Raises
     ------
     ValueError
-        as ``measured``; and if there is no file, or two files have different sample times.
+        as ``measured``; and if there is no file, or two files have different sample times, or units
+        that do not convert.
     """
     if not paths:
         raise ValueError("data: missing; give a file of a record")
-    records = [measured(path, columns, dt, time_unit, max_size) for path in paths]
+    each = [measured(path, columns, dt, time_unit, max_size) for path in paths]
+    again = [list(paths[:i]).count(path) for i, path in enumerate(paths)]
+    names = [f"{path} ({k + 1})" if k else f"{path}" for path, k in zip(paths, again, strict=True)]
+    alike, notes = in_common_units(dict(zip(names, each, strict=True)))
+    for note in notes:
+        warn(note, UserWarning)
+    records = [*alike.values()]
     first = records[0]
     for path, record in zip(paths, records, strict=True):
         if abs(record.dt - first.dt) > _SAME * first.dt:
@@ -650,8 +666,9 @@ class Verification:
             found = record.metrics(start=self.at)
             settling = found.get("settling_time", math.nan)
             overshoot = 100.0 * found.get("overshoot", math.nan)
+            beyond = f"overshoot {overshoot:.1f} %" if overshoot < math.inf else "no rest there"
             settled = f"settling time {settling:.3g} s" if settling < math.inf else "not settled"
-            rows.append(f"{name}: overshoot {overshoot:.1f} %, {settled}")
+            rows.append(f"{name}: {beyond}, {settled}")
         return "\n".join([*rows, f"fit of the prediction {self.fit:.1f} %"])
 
     def to_json(self) -> dict[str, Any]:

@@ -74,6 +74,56 @@ def written_atomically(path: str | os.PathLike[str], overwrite: bool = False) ->
         part.unlink(missing_ok=True)
 
 
+class GrowingFile:
+    """A file to which whole lines are added; after a failure it ends with the last whole one.
+
+    What was added is with the operating system, where it outlives this process.
+
+    Parameters
+    ----------
+    path
+        a new file, or a device like ``/dev/null``.
+
+    Attributes
+    ----------
+    lines : int
+        number of whole lines that are in the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._raw = path.open("wb" if path.exists() else "xb", buffering=0)
+        self._size = self.lines = 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file is closed."""
+        return self._raw.closed
+
+    def add(self, text: str) -> None:
+        """Add lines, each with its end.
+
+        An ``OSError`` says why not all of them are in the file, such as a full disk; a line of
+        which only a part was written is taken out of it.
+        """
+        data = text.encode()
+        written = 0
+        try:
+            while written < len(data):
+                written += self._raw.write(data[written:])
+        finally:
+            whole = data[:written].rfind(b"\n") + 1
+            if whole < written:
+                with suppress(OSError):  # a device has no end
+                    self._raw.truncate(self._size + whole)
+                    self._raw.seek(self._size + whole)
+            self._size += whole
+            self.lines += data.count(b"\n", 0, whole)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._raw.close()
+
+
 def write_folder(
     path: str | os.PathLike[str], files: Mapping[str, str], overwrite: bool = False
 ) -> tuple[Path, ...]:

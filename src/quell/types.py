@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import IntFlag
 from typing import TypeAlias
 
@@ -46,14 +46,31 @@ class Status(IntFlag):
     HELD = 8192
     SCHEDULE_HELD = 16384
     GAIN_HELD = 32768
+    RAN_AWAY = 65536
 
     @property
     def message(self) -> str:
         """A sentence for each flag: what happened and what to do."""
+        return self.explained({})
+
+    def explained(self, shares: Mapping[Status, float]) -> str:
+        """Return ``message`` with the shares of the samples that have a flag, where they are known.
+
+        Parameters
+        ----------
+        shares
+            Share of the samples, from 0 to 1, by flag; 0 is not shown.
+        """
         if Status.DIVERGED | Status.POORLY_INTEGRATED in self:
             others = self & ~(Status.DIVERGED | Status.POORLY_INTEGRATED)
-            return " ".join([*([others.message] if others else []), _INTEGRATION_DIVERGED])
-        return " ".join(text for flag, text in _MESSAGES.items() if flag in self) or _NOTHING
+            sentences = [others.explained(shares)] if others else []
+            return " ".join([*sentences, _INTEGRATION_DIVERGED])
+        sentences = []
+        for flag, text in _MESSAGES.items():
+            if flag in self:
+                share = shares.get(flag, 0.0)
+                sentences.append(f"{100.0 * share:.3g} % of the samples: {text}" if share else text)
+        return " ".join(sentences) or _NOTHING
 
 
 _MESSAGES = {
@@ -82,6 +99,11 @@ _MESSAGES = {
     Status.DIVERGED: (
         "The loop diverged and the run ended early: check the sign and size of b0, lower omega_c "
         "or omega_o, or the learning rate."
+    ),
+    Status.RAN_AWAY: (
+        "The output ran away from r: at the end |r − y| is far beyond what r asks for, or grows "
+        "with u at a limit: check the sign and size of b0 and whether u can hold the load, or "
+        "lower omega_c or omega_o."
     ),
     Status.LEARNER_LATE: (
         "The learner took longer than its budget and the loop went on with its last prediction: "
@@ -127,6 +149,10 @@ _INTEGRATION_DIVERGED = (
 )
 
 
+LOST = Status.DIVERGED | Status.RAN_AWAY
+"""The flags of a run that did not do its task: none of its measures is one of a loop that works."""
+
+
 # Modules whose frames are between the user's call and the warning.
 _BETWEEN = ("quell", "functools")
 
@@ -137,6 +163,15 @@ def warn(message: str, category: type[Warning] = DesignWarning) -> None:
     while frame.f_back is not None and _package(frame.f_globals) in _BETWEEN:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, category, stacklevel=level)
+
+
+def called_by_quell(depth: int) -> bool:
+    """Return whether the function this number of calls above was called from inside quell.
+
+    1 is the function that asks. What is inside judges the results of its runs itself, and needs no
+    warning.
+    """
+    return _package(sys._getframe(depth + 1).f_globals) in (*_BETWEEN, "concurrent")
 
 
 def _package(names: dict[str, object]) -> str:

@@ -92,6 +92,8 @@ def print_scores(
         status = (run.status.name or "OK").lower().replace("_", " ").replace("|", ", ")
         if run.diverged:
             status = f"[red]diverged {run.ended:.0f} s[/]"
+        elif run.lost:
+            status = "[red]ran away[/]"
         elif stable[name] is False:
             status = "[red]unstable[/]"
         rows.add_row(name, *cells, status)
@@ -106,7 +108,7 @@ def print_two_mass(console: Console, settings: Benchmark) -> None:
     console.print(
         f"Unit step from rest, judged until {FORCE_AT:g} s (settling ±{100.0 * BAND:g} %); "
         f"{FORCE:g} N on m2 from then on (peak). RMS and variation: all {END:g} s. "
-        f"dt = {settings.dt:g} s, {limit}. –: not settled, or diverged before. "
+        f"dt = {settings.dt:g} s, {limit}. –: y does not come to rest there, or diverged before. "
         "Variation of u without its first jump. "
         "Unstable: the linear loop has a growing pole, perhaps a slow one.",
         soft_wrap=True,

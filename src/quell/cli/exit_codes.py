@@ -28,6 +28,8 @@ class ExitCode(IntEnum):
     NOT_PROVED = 5
     ALARM = 6
     BROKEN = 7
+    RUNS_FAILED = 8
+    NOT_VALID = 9
     INTERRUPTED = 130
     TERMINATED = 143
 
@@ -45,12 +47,12 @@ _MEANINGS = {
         "says which; no run was finished"
     ),
     ExitCode.ENDED_BY_SAFETY: (
-        "quell run-rig, quell tune --device: a limit of safety or a fault ended the run; u was "
-        "ramped to zero; quell proxy: the drive was lost, a line with NOT says how"
+        "quell run-rig, proxy, tune --device: a limit of safety or a fault ended the run, of the "
+        "proxy also the loss of its host; u was ramped to zero"
     ),
     ExitCode.DIVERGED: (
-        "quell run, compare, reproduce two-mass and torsional: a simulated run diverged; all "
-        "results were written"
+        "quell run, sweep, compare, reproduce two-mass and torsional: a simulated run diverged, or "
+        "its y ran away from r; all results were written"
     ),
     ExitCode.NOT_PROVED: (
         "quell export --prove: something is not proved, or there is no Frama-C; all files were "
@@ -62,6 +64,14 @@ _MEANINGS = {
     ExitCode.BROKEN: (
         "quell doctor: something that quell needs does not work here; a line with NOT says what"
     ),
+    ExitCode.RUNS_FAILED: (
+        "quell sweep: a run could not be made, simulated or judged; a line with NOT says why, and "
+        "all results were written"
+    ),
+    ExitCode.NOT_VALID: (
+        "quell identify: on samples that were held out, or on the record of --validate, the model "
+        "is worse than the mean of y; all results were written"
+    ),
     ExitCode.INTERRUPTED: (
         "stopped by Ctrl-C, quell run-rig in its loop also by SIGTERM or SIGHUP; it ramps u to zero"
     ),
@@ -72,8 +82,8 @@ HELP = "Exit codes: " + "; ".join(f"{code.value} {code.about}" for code in ExitC
 
 
 def exit_if_diverged(runs: Iterable[Trajectory]) -> None:
-    """End the process with the code for diverged runs if one of them diverged."""
-    if any(run.diverged for run in runs):
+    """End the process with the code for diverged runs if one diverged, or its y ran away."""
+    if any(run.lost for run in runs):
         sys.exit(ExitCode.DIVERGED)
 
 

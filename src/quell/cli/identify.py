@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quell.cli.exit_codes import ExitCode
 from quell.cli.options import (
     MODEL_OPTIONS,
     OUTPUTS,
@@ -126,6 +128,8 @@ def identify(
         paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
     results = model.to_json() | {"alternatives": [one.to_json() for one in others]}
     write_results(console, results, outputs, paths)
+    if model.fails:
+        sys.exit(ExitCode.NOT_VALID)
 
 
 def _look_swapped(model: Identified, order: int, delays: Any) -> bool:

@@ -75,9 +75,9 @@ def yes_or_no(holds: bool) -> str:
 
 
 def print_diverged(console: Console, runs: Mapping[str, Trajectory]) -> None:
-    """Print the message of each run that diverged."""
+    """Print the message of each run that diverged, or whose y ran away."""
     for name, run in runs.items():
-        if run.diverged:
+        if run.lost:
             print_line(console, f"{name}: {run.message}")
 
 

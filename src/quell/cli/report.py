@@ -6,7 +6,6 @@ Report of a sweep: failures, quantiles of the measures, worst runs.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -149,8 +148,8 @@ def print_axes(
         learned[name] = _learned(axis)
         if learned[name]:
             print_line(console, f"{name} learned: {_listed(learned[name])}")
-    if run.diverged or run.status:
-        console.print(("[red]" if run.diverged else "") + escape(run.message), soft_wrap=True)
+    if run.status:
+        console.print(("[red]" if run.lost else "") + escape(run.message), soft_wrap=True)
     return scores, learned
 
 
@@ -168,8 +167,8 @@ def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:
     learned = _learned(run)
     if learned:
         print_line(console, f"Learned: {_listed(learned)}")
-    if run.diverged or run.status:
-        console.print(("[red]" if run.diverged else "") + escape(run.message), soft_wrap=True)
+    if run.status:
+        console.print(("[red]" if run.lost else "") + escape(run.message), soft_wrap=True)
     return learned
 
 
@@ -193,25 +192,26 @@ def save_run_figure(
     return save_figure(figure, outputs.figures, name, outputs.overwrite)
 
 
-# Distinct messages of failing runs that are printed. By hand.
-_MESSAGES = 3
+# Failed runs that are printed, and that the results for programs name. By hand.
+_PRINTED, _NAMED = 10, 1000
 
 
 def summary(found: Sweep, worst: int) -> dict[str, Any]:
     """Return numbers of failures, quantiles of the measures and the worst runs.
 
-    The quantiles are those of runs that did not diverge.
+    The quantiles are those of runs that neither diverged nor ran away.
     """
     import numpy as np
 
     from quell.sweeping.sweep import QUANTILES, share_interval
+    from quell.types import Status
 
     data, failed = found.dataset, found.failed
     status = data["status"].values
-    diverged = (status >= 0) & ~found.complete
+    lost = (status >= 0) & ~found.complete
     failures = int(np.sum(failed))
     beyond = {
-        name: int(np.sum(~(data[name].values <= limit) & (status >= 0) & ~diverged))
+        name: int(np.sum(~(data[name].values <= limit) & (status >= 0) & ~lost))
         for name, limit in found.limits.items()
     }
     quantiles = {}
@@ -238,12 +238,27 @@ def summary(found: Sweep, worst: int) -> dict[str, Any]:
         "failure_rate": failures / found.store.runs,
         "ci95": list(share_interval(failures, found.store.runs)),
         "errors": int(np.sum(status < 0)),
-        "diverged": int(np.sum(diverged)),
+        "diverged": int(np.sum(lost & ((status & int(Status.DIVERGED)) != 0))),
+        "ran_away": int(np.sum(lost & ((status & int(Status.DIVERGED)) == 0))),
         "beyond_limits": beyond,
         "measures": quantiles,
         "quantiles": list(QUANTILES),
         "worst": ordered,
+        "failed_runs": [
+            {"run": run, "name": found.describe(run), "reason": found.reason(run)}
+            for run in _failed_first(found)[:_NAMED]
+        ],
     }
+
+
+def _failed_first(found: Sweep) -> list[int]:
+    """Return the runs that failed: those with an error, then those lost, then beyond a limit."""
+    import numpy as np
+
+    failed = np.flatnonzero(found.failed)
+    with_error, complete = found.dataset["status"].values[failed] < 0, found.complete[failed]
+    order = np.lexsort((failed, complete, ~with_error))
+    return [int(run) for run in failed[order]]
 
 
 def _number(value: float) -> float | None:
@@ -269,17 +284,21 @@ def print_summary(
         console,
         f"{title}: {results['runs']} runs, {results['failures']} fail "
         f"({100.0 * results['failure_rate']:.3g} %, 95 % interval {low:.3g} … {high:.3g} %): "
-        f"{results['errors']} with an error, {results['diverged']} diverged{limits}.",
+        f"{results['errors']} with an error, {results['diverged']} diverged, "
+        f"{results['ran_away']} ran away{limits}.",
     )
-    rows = table("Runs that did not diverge", "measure", "runs", "5 %", "median", "95 %", "largest")
+    rows = table("Runs to their end", "measure", "runs", "5 %", "median", "95 %", "largest")
     for name, each in results["measures"].items():
         numbers = [*each["quantiles"], each["largest"]]
         cells = ["–" if value is None else f"{value:.4g}" for value in numbers]
         rows.add_row(escape(found.label(name)), str(each["runs"]), *cells)
     console.print(rows)
-    messages = Counter(text for text in found.dataset["message"].values.tolist() if text)
-    for text, count in messages.most_common(_MESSAGES):
-        print_line(console, f"{count} runs: {text}")
+    lost = results["errors"] + results["diverged"] + results["ran_away"]
+    for i, each in enumerate(results["failed_runs"][: min(lost, _PRINTED)]):
+        what = "done" if i < results["errors"] else "stable"
+        print_line(console, f"NOT {what}: {each['name']}: {each['reason']}")
+    if lost > _PRINTED:
+        print_line(console, f"NOT done or not stable: {lost - _PRINTED} more; --json names them")
     metric = next(iter(found.store.measures))
     print_line(console, f"Worst runs by {metric}:")
     for each in results["worst"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -157,14 +157,19 @@ def _check_pace(seconds: float | None, priority: int, cpu: int | None) -> None:
 
 
 def _served(
-    server: Rig, line: str, seconds: float | None, priority: int, cpu: int | None
+    server: Rig,
+    line: str,
+    seconds: float | None,
+    priority: int,
+    cpu: int | None,
+    watch: Callable[[], Any] | None = None,
 ) -> list[str]:
     """Print a line and tick until the time is over or a signal comes; return the notes."""
     from quell.realtime.system import termination_handler
 
     with termination_handler(lambda *_: server.stop()):
         print(line, flush=True)
-        return server.run(seconds, priority=priority, cpu=cpu)
+        return server.run(seconds, priority=priority, cpu=cpu, watch=watch)
 
 
 def _print_counters(server: Rig) -> None:
@@ -188,7 +193,7 @@ def _print_counters(server: Rig) -> None:
             f"beyond 1e9): {count['restored']}"
         )
     if server.unlogged:
-        print(f"the log lacks {server.unlogged} ticks: it could not be written as quickly")
+        print(f"the log lacks {server.unlogged} ticks: it could not be written, or not as quickly")
 
 
 # ---- quell proxy ----
@@ -204,11 +209,10 @@ def proxy(
     *,
     host: Annotated[str, Parameter(help=_HOST)],
     device: Annotated[str | None, Parameter(help="Drive in place of the file's [rig].")] = None,
-    watchdog: Whole = 20,
     seconds: float | None = None,
     log: Path | None = None,
     overwrite: Overwrite = False,
-    priority: Whole = 50,
+    priority: WholeOrNone = None,
     cpu: WholeOrNone = None,
     trust: Trust = False,
 ) -> None:
@@ -218,24 +222,26 @@ def proxy(
     setup with [[axis]] stands between a host and a drive of as many measurements and control
     signals.
 
-    Where the drive falls silent the host gets no measurement either. After a second of that, or
-    where the drive has set u to zero or ended the session, the proxy ends, with exit code 3.
+    It has the supervisor of `quell run-rig`, with the rules of [rig.safety]. Without a host that
+    commands, u is zero. Where the host falls silent, the drive is lost or a limit is exceeded, u is
+    ramped to zero, the compensation as well, and the proxy ends with exit code 3 and a line with
+    NOT: the drive then stays at rest until the proxy is started again. Where the host ends its
+    session u is ramped to zero and the proxy waits for the next one.
 
     Parameters
     ----------
     setup
         The file, in TOML, with [controller] kind = "compensator", limits of u, and the drive in
         [rig]; of several axes with a compensator in each [[axis]].
-    watchdog
-        After so many ticks in a row without a command of the host u_0 is zero until a new session.
     seconds
-        How long to run [s]; until interrupted by default.
+        How long to run [s]; until interrupted by default. Then u is ramped to zero.
     log
-        Write each tick to this CSV file: y, u_0, the command as it came, state.
+        Write each tick to this CSV file: y, u_0, the command as it came, state of the session,
+        mode of the supervisor, u as sent to the drive.
     priority
-        SCHED_FIFO priority of the ticks, 1 to 99; 0 for ordinary scheduling.
+        SCHED_FIFO priority of the ticks in place of the file's, 1 to 99; 0 for ordinary scheduling.
     cpu
-        Number of the processor for the ticks; any by default.
+        Number of the processor for the ticks in place of the file's; any by default.
     """
     from quell.realtime import CompensatedDrive
     from quell.realtime.devices import counts_text
@@ -243,16 +249,31 @@ def proxy(
     from quell.realtime.rig import Rig
     from quell.setup import read
     from quell.setup.axes import made_any
+    from quell.setup.schema import SetupError, with_path
 
     loaded = made_any(*read(setup), trust)
-    url = str(loaded.needed("rig")["device"]) if device is None else device
+    options = dict(loaded.needed("rig"))
+    url = str(options.pop("device")) if device is None else device
+    for name, value in options.items():
+        if value is not None and name not in (*_OF_PROXY, "signals"):
+            rule = f"has no effect in quell proxy, which uses device, {', '.join(_OF_PROXY)}"
+            raise SetupError([f"{loaded.file}: rig.{name}: {rule}; leave it out"])
+    priority = options.get("priority", 50) if priority is None else priority
+    cpu = options.get("cpu") if cpu is None else cpu
+    given = {name: options[name] for name in ("channels", "safety") if name in options}
     _check_pace(seconds, priority, cpu)
     compensator, dt = cast("Compensator | Axes", loaded.controller), float(loaded.controller.dt)
-    limits: dict[str, Any] = {"watchdog": watchdog, "log": log, "overwrite": overwrite}
-    names = (loaded.rig or {}).get("channels", ())
+    limits: dict[str, Any] = {"log": log, "overwrite": overwrite}
+
+    def behind(device: Any) -> CompensatedDrive:
+        try:
+            return CompensatedDrive(device, compensator, **given)
+        except ValueError as error:
+            raise with_path(loaded.file, "rig", error, ["device", *options]) from None
+
     with (
-        closing(_device(url, loaded)) as behind,
-        closing(CompensatedDrive(behind, compensator, channels=names)) as drive,
+        closing(_device(url, loaded)) as opened,
+        closing(behind(opened)) as drive,
         closing(listen(host)) as listener,
         Rig(drive, dt, listener=listener, **limits) as server,
     ):
@@ -260,11 +281,20 @@ def proxy(
             server.prepare()
         if hasattr(drive.device, "restart_session"):
             drive.device.restart_session()  # compiling may have taken longer than it waits
-        rule = f"u_0 = 0 after {watchdog} ticks without a command"
         between = f"compensator between {listener.url} and {url}"
         of = "" if server.signal_counts is None else f", with {counts_text(server.signal_counts)}"
-        line = f"{between}{of}: a tick every {dt:g} s, {rule}"
-        notes = _served(server, line, seconds, priority, cpu)
+        print(f"Safety: {drive.rules.text(dt)}.")
+        line = f"{between}{of}: a tick every {dt:g} s, u = 0 without a host that commands"
+        shown = 0
+
+        def show_changes() -> None:
+            nonlocal shown
+            for change in drive.changes(shown):
+                shown += 1
+                if change.cause.name not in ("MISSED", "RECOVERED"):
+                    print(change, flush=True)
+
+        notes = _served(server, line, seconds, priority, cpu, show_changes)
         _print_counters(server)
         several, found = hasattr(drive, "inputs"), drive.estimate
         for axis, each in found.items() if several else (("", found),):
@@ -278,12 +308,15 @@ def proxy(
     for note in notes:
         print(note)
     if fault:
-        ended = "the host's session was ended, and the drive told to set u to zero, if it hears"
         print(
-            f"NOT connected to the drive at {url}: {fault}; {ended}. Look at the drive, its power "
-            "and its wire, then start the proxy again"
+            f"NOT driving {url} any more: {fault}. u was ramped to zero, the compensation as well, "
+            "and the host's session was ended; start the proxy again when the cause is gone"
         )
         sys.exit(ExitCode.ENDED_BY_SAFETY)
+
+
+# Keys of [rig] that ``quell proxy`` uses.
+_OF_PROXY = ("channels", "safety", "priority", "cpu")
 
 
 # ---- quell run-rig ----
@@ -650,7 +683,8 @@ def replay(
 ) -> None:
     """Run a setup's observer and learner on a recorded run, and compare the estimates.
 
-    A record of several axes needs a setup with the same [[axis]] and actuators, in their order.
+    A record of several axes needs a setup with the same [[axis]] and actuators, in their order. A
+    record in other units than the plant of the setup is converted, or refused.
 
     Parameters
     ----------
@@ -661,11 +695,14 @@ def replay(
         `quell run-rig`.
     """
     from quell.commissioning import controlled
+    from quell.plants.base import signals_of
+    from quell.quantities import UNKNOWN
     from quell.realtime import load as load_record
     from quell.realtime import replay as replay_record
     from quell.records import metrics
+    from quell.records.units import runs_in_common_units
     from quell.setup import EXAMPLES, read
-    from quell.setup.axes import made_any
+    from quell.setup.axes import made_any, signals_in
     from quell.setup.description import is_of_axes
     from quell.setup.schema import with_path
 
@@ -674,7 +711,15 @@ def replay(
     given = made_any(file, data, trust)
     name = f"{record.stem}-replayed"
     outputs = check_outputs(outputs, [name])
-    recorded = load_record(record, max_size)
+    console = Console()
+    # The controller is made for the units of the setup's plant, if it has some.
+    plant = UNKNOWN if given.plant is None else signals_of(given.plant)
+    known = signals_in(given.description, given.controller) if several else plant
+    of_record = {record.name: load_record(record, max_size)}
+    alike, notes = runs_in_common_units(of_record, known, given.file)
+    recorded = alike[record.name]
+    for note in notes:
+        print_line(console, note)
     try:  # replay refuses a controller that is no ADRC
         names = (given.rig or {}).get("channels", ())
         if several:
@@ -682,7 +727,6 @@ def replay(
         replayed = replay_record(recorded, given.controller, channels=names)
     except ValueError as error:
         raise with_path(given.file, "", error, ()) from None
-    console = Console()
     part = controlled(recorded)
     scores: Any
     learned: Any

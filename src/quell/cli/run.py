@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -62,7 +63,8 @@ def run(
 ) -> None:
     """Simulate the plant, controller and scenario of a setup file, of one axis or several.
 
-    If the run diverges the exit code is 4; the part before that is recorded and drawn.
+    If the run diverges, or y runs away from r, the exit code is 4; what was run is recorded and
+    drawn.
 
     Parameters
     ----------
@@ -75,6 +77,7 @@ def run(
     from quell.setup.axes import made_any, signals_in
     from quell.setup.description import is_of_axes
     from quell.simulation import simulate
+    from quell.types import Status
 
     if example:
         unused = {"setup": (setup, None)} | options_of(outputs, RUN_OUTPUTS)
@@ -114,6 +117,7 @@ def run(
         "dt": result.dt,
         "status": result.status.name or "OK",
         "diverged": result.diverged,
+        "ran_away": Status.RAN_AWAY in result.status,
         "metrics": scores,
         "learned": learned,
         "setup": given.as_json(),
@@ -142,7 +146,8 @@ def sweep(
     """Do the runs of a setup's table [sweep], and store their measures.
 
     A sweep that was interrupted or killed goes on where it stopped when the command is given again.
-    Failing runs are recorded and do not stop it.
+    Failing runs are recorded and do not stop it; the exit code is then not 0, but for runs that
+    are only beyond a limit.
 
     Parameters
     ----------
@@ -204,6 +209,10 @@ def sweep(
         print_line(console, note)
     paths = _save_figures(found, figures, outputs)
     write_results(console, {**results, "setup": given.as_json()}, outputs, paths)
+    if results["errors"]:
+        sys.exit(ExitCode.RUNS_FAILED)
+    if results["diverged"] or results["ran_away"]:
+        sys.exit(ExitCode.DIVERGED)
 
 
 @contextmanager
@@ -490,6 +499,11 @@ def _differences(found: Comparison) -> list[str]:
         if each.noise is not None:
             text += f"; the measurement noise changes it by {100 * each.noise:.2g} %"
         lines.append(text)
+    if math.isfinite(found.error + found.activity):
+        lines.append(
+            f"Single precision changes the RMS error of y by {100 * found.error:+.2g} %, the "
+            f"activity of u by {100 * found.activity:+.2g} %"
+        )
     return lines
 
 

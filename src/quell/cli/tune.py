@@ -670,7 +670,8 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
     for line in report.tradeoff_lines(tuned.tradeoff, tuned.objective):
         print_line(console, f"with {line}")
     print_line(console, tuned.damping)
-    print_line(console, str(tuned.reference_step))
+    for line in tuned.in_the_file:
+        print_line(console, line)
     if tuned.check is not None:
         print_line(console, str(tuned.check))
     values = ", ".join(f"{key} = {value:.5g}" for key, value in tuned.design.values.items())

@@ -36,6 +36,7 @@ been 100 times nearer to r than v_1 for 1000 samples in a row.
 from __future__ import annotations
 
 import copy
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -83,6 +84,15 @@ class Wrapper(StatefulController):
     """
 
     controller: Any
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a number that the controller inside was made with, as ``omega_c`` or ``kp``."""
+        known = name != "controller" and not name.startswith("_")
+        if known and name in inspect.signature(type(self.controller)).parameters:
+            value = getattr(self.controller, name, self)
+            if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+                return value
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __copy__(self) -> Any:
         """Return a copy with a controller of its own, which shares no state with this one."""

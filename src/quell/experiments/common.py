@@ -210,12 +210,12 @@ METRICS = (
 
 
 def step_scores(t: Vector, y: Vector, target: float, band: float, initial: float = 0.0) -> Scores:
-    """Return overshoot (fraction) and settling time [s], None if y does not settle."""
-    settling = metrics.settling_time(t, y, target, band, initial)
-    return {
-        "overshoot": metrics.overshoot(y, target, initial),
-        "settling_time": None if math.isnan(settling) else settling,
+    """Return overshoot (fraction) and settling time [s], None for what does not settle."""
+    found = {
+        "overshoot": metrics.overshoot(y, target, initial, band),
+        "settling_time": metrics.settling_time(t, y, target, band, initial),
     }
+    return {name: None if math.isnan(value) else value for name, value in found.items()}
 
 
 def quantiles(values: Iterable[float]) -> Scores:
@@ -229,8 +229,8 @@ def quantiles(values: Iterable[float]) -> Scores:
 
 
 def ended_early(runs: Mapping[str, Trajectory]) -> dict[str, dict[str, Any]]:
-    """Return time and message of the runs that diverged, by name."""
-    ended = {name: run for name, run in runs.items() if run.diverged}
+    """Return time and message of the runs that diverged or whose y ran away, by name."""
+    ended = {name: run for name, run in runs.items() if run.lost}
     return {name: {"at": run.ended, "message": run.message} for name, run in ended.items()}
 
 

@@ -261,8 +261,8 @@ def shaped(plant: Any, controller: Controller, delay: float = 0.0) -> Controller
 
 
 def _settled(t: Vector, y: Vector) -> float:
-    """Return the settling time; infinite with too much overshoot."""
-    if metrics.overshoot(y, 1.0) > metrics.SETTLING_BAND:
+    """Return the settling time; infinite with too much overshoot, or where y does not settle."""
+    if not metrics.overshoot(y, 1.0) <= metrics.SETTLING_BAND:
         return math.inf
     found = metrics.settling_time(t, y, 1.0, metrics.SETTLING_BAND)
     return math.inf if found is None or math.isnan(found) else float(found)
@@ -309,7 +309,7 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         """Return scores and statuses, for programs."""
         ends = {
-            name: {"status": run.status.name or "OK", "diverged": run.diverged}
+            name: {"status": run.status.name or "OK", "diverged": run.diverged, "lost": run.lost}
             for name, run in self.runs.items()
         }
         return {"controllers": {name: score | ends[name] for name, score in self.scores.items()}}
@@ -704,7 +704,7 @@ def draw(result: Comparison, axes: Any = None, *, ax: Any = None) -> Any:
     variation = {name: np.sum(np.abs(np.diff(run["u"]))) for name, run in result.runs.items()}
     quietest_first = sorted(variation, key=variation.__getitem__)
     for i, (name, run) in enumerate(result.runs.items()):
-        label = f"{name} (diverged)" if run.diverged else name
+        label = f"{name} (diverged)" if run.lost else name
         style = {"color": f"C{i % 10}", "linewidth": 1.3, "linestyle": "-" if i < 10 else "--"}
         depth = 3.0 - quietest_first.index(name) / len(quietest_first)
         draw_line(above, run.t, run["y"], label=label, **style)

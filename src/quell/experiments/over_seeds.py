@@ -35,8 +35,9 @@ from quell.files import nonfinite_to_none
 from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
 from quell.plants.base import one_at_a_time, signals_of
+from quell.quantities import UNKNOWN, Conversion, Quantity, conversion
 from quell.records.axes import OneGain, one_gain
-from quell.records.metrics import MEASURES
+from quell.records.metrics import MEASURES, worsened
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.setup.axes import signals_in
 from quell.setup.description import is_of_axes
@@ -154,6 +155,30 @@ class SeedComparison:
         half = half_width_of_mean(found) if known and found.size > 1 else math.nan
         return (float(np.mean(found)) if known else math.nan), half
 
+    @property
+    def worse(self) -> list[str]:
+        """Lines on what of the best is worse than of another controller, by more than 10 %."""
+        lines = []
+        for verdict in self.verdicts:
+            if verdict.best is None or verdict.axis not in self.axes:
+                continue
+            window = self.windows.index((verdict.start, verdict.stop))
+            axis = self.axes.index(verdict.axis)
+            means = {
+                name: {each: self.mean(each, name, window, axis)[0] for each in self.values}
+                for name in self.names
+            }
+            where = f"{verdict.axis}, " if verdict.axis else ""
+            where += f"{verdict.start:g} to {verdict.stop:g} s"
+            for pair in verdict.pairs:
+                if pair.better != verdict.best:
+                    continue
+                found = worsened(means[pair.other], means[pair.better])
+                texts = "; ".join(each.text for each in found if each.name != self.criterion)
+                if texts:
+                    lines.append(f"{where}: {pair.better} is worse than {pair.other} in {texts}")
+        return lines
+
     def ratio(self, name: str, window: int) -> tuple[float, float]:
         """Return the geometric mean of the axes' ratios to the first controller.
 
@@ -173,11 +198,13 @@ class SeedComparison:
         """Return the verdicts as text: which is best for each axis, and NOT where that is open."""
         count = len(self.seeds)
         lines = [line for each in self.verdicts for line in each.describe(self.criterion, count)]
+        lines += self.worse
         for name, lost in zip(self.names, self.diverged, strict=True):
             if found := int(np.sum(lost)):
                 low, high = (100.0 * end for end in share_interval(found, count))
                 share = f", {low:.3g} to {high:.3g} % of all" if count > 1 else ""
-                lines.append(f"NOT stable: {name} diverged in {found} of {count} runs{share}")
+                runs = f"{found} of {count} runs{share}"
+                lines.append(f"NOT stable: {name} diverged or ran away in {runs}")
         if count == 1:
             lines.append(
                 "NOT shown for other noise and disturbances: nothing in the scenario is random, so "
@@ -297,7 +324,7 @@ def over_seeds(
         found = simulate(plant, controller, replace(scenario, seed=seed))
         if gain.B is not None:
             found = found.with_gain(gain.B)
-        return measure_run(found, {**measures, **own}), bool(found.diverged)
+        return measure_run(found, {**measures, **own}), bool(found.lost)
 
     made = [*controllers.values()]
     # The first seed of each compiles what is not compiled yet; the others then only run.
@@ -540,6 +567,7 @@ def of_setups(
     (name, first), *others = setups.items()
     plant, scenario = first.needed("plant"), first.needed("scenario")
     controllers = {key: setup.controller for key, setup in setups.items()}
+    _check_units(setups)
     how: dict[str, Any] = {"seeds": seeds, "criterion": criterion, "progress": progress}
     found = over_seeds(plant, controllers, scenario, windows=first.windows, **how)
     given = first.tables()
@@ -555,6 +583,36 @@ def of_setups(
     else:
         units = (signals_of(plant).y.unit,)
     return replace(found, units=units, notes=(*found.notes, *notes))
+
+
+def _check_units(setups: Mapping[str, Setup]) -> None:
+    """Raise a ``ValueError`` for setups whose plants have y or u in other units than the first.
+
+    Their controllers are made for these units, and run on the plant of the first.
+    """
+    found = {key: _quantities(setup) for key, setup in setups.items()}
+    (name, first), *others = found.items()
+    for key, each in others:
+        for what, own in each.items():
+            wanted = first.get(what, Quantity())
+            known = conversion(own.unit, wanted.unit) if own.unit and wanted.unit else Conversion()
+            if known is None or known.changes:
+                raise ValueError(
+                    f"{key}: {what} is {own.label(what)}, in {name} it is {wanted.label(what)}: "
+                    "all controllers run on the plant of the first, so units must be the same; "
+                    "design them in one unit"
+                )
+
+
+def _quantities(setup: Setup) -> dict[str, Quantity]:
+    """Return what y and u of a setup's plant are, as far as it has one, or its axes."""
+    tables = setup.tables()
+    if is_of_axes(tables):
+        signals = signals_in(setup.description, setup.controller)
+        named = {f"y of {axis}": y for axis, y in zip(signals.axes, signals.y, strict=True)}
+        return named | {f"u{k + 1}": u for k, u in enumerate(signals.u)}
+    signals_of_it = signals_of(setup.plant) if setup.plant is not None else UNKNOWN
+    return {"y": signals_of_it.y, "u": signals_of_it.u}
 
 
 def _task(given: Mapping[str, Any]) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
@@ -32,6 +32,7 @@ from quell.identification.record_layout import (
     layout_of,
     listed,
     name_of,
+    quantity_of,
     time_unit_of,
     unwrapped,
 )
@@ -42,7 +43,7 @@ from quell.identification.record_times import (
     warn_of_another_unit,
 )
 from quell.plants import Plant
-from quell.quantities import UNKNOWN, Signals
+from quell.quantities import UNKNOWN, Conversion, Quantity, Signals, in_one_unit
 from quell.simulation import Scenario, simulate
 from quell.types import Matrix, Vector
 
@@ -55,6 +56,7 @@ class Measured(NamedTuple):
     dt: float  #: [s]
     reference: Vector | None
     signals: Signals = UNKNOWN  #: names and units of u and y
+    r: Quantity = Quantity()  #: name and unit of the reference; without a unit it is that of y
 
 
 def excited(plant: Plant, design: Excitation) -> Measured:
@@ -170,7 +172,57 @@ def read_record(
         begin = [row for _, row in first[:_FEWEST]]
         warn_of_another_step(where, layout.names, layout.units, begin, dt)
     u, y, *reference = (column.copy() for column in values.T)
-    return Measured(u, y, dt, reference[0] if reference else None)
+    found = Measured(u, y, dt, reference[0] if reference else None)
+    if layout.names is None:
+        return found
+    roles = ROLES[int(not timed) :]
+    known = {
+        role: quantity_of(layout.names[place], layout.units[place], role)
+        for role, place in zip(roles, places, strict=False)
+    }
+    return found._replace(signals=Signals(known["y"], known["u"]), r=known.get("r", Quantity()))
+
+
+def in_common_units(
+    given: Mapping[str, Measured], error: bool = False
+) -> tuple[dict[str, Measured], list[str]]:
+    """Return records, by their names, with all y and r in one unit and all u in one.
+
+    Units are those of the first record that has one. The second result says what was converted.
+
+    Parameters
+    ----------
+    given
+        the records.
+    error
+        whether r − y is used: then r must be in a unit that converts to that of y.
+
+    Raises
+    ------
+    ValueError
+        for units that do not convert, with the names of columns and units.
+    """
+    of_y, y, notes = in_one_unit({name: one.signals.y for name, one in given.items()}, "y")
+    of_u, u, more = in_one_unit({name: one.signals.u for name, one in given.items()}, "u")
+    found = {}
+    for name, one in given.items():
+        r, of_r = one.reference, of_y[name]
+        if r is not None and one.r.unit and y.unit and one.r.unit != one.signals.y.unit:
+            try:
+                pair, _, said = in_one_unit({"y": y, name: one.r}, "r")
+            except ValueError:
+                if error:
+                    raise
+                pair, said = {name: Conversion()}, []
+            of_r, notes = pair[name], [*notes, *said]
+        found[name] = one._replace(
+            u=of_u[name].of(one.u),
+            y=of_y[name].of(one.y),
+            reference=None if r is None else of_r.of(r),
+            signals=one.signals._replace(y=y, u=u),
+            r=one.r if r is None else y,
+        )
+    return found, [*notes, *more]
 
 
 def _check_columns(columns: Sequence[str], timed: bool) -> None:

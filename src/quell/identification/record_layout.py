@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.files import csv_rows, words_of
+from quell.quantities import Quantity, is_known_unit
 from quell.types import Vector
 
 # ---- Columns of a record ----
@@ -99,6 +100,23 @@ def name_of(text: str, below: str = "") -> Name:
     if text.lower() in _TIMES and text.lower() not in ("s", "h", "d", "min"):
         return Name("time", text)
     return Name(text.lower(), below)
+
+
+def quantity_of(text: str, below: str, role: str) -> Quantity:
+    """Return name and unit of a column; no name where it is that of a role, such as u or output.
+
+    Words in round brackets that are no known unit, as in ``speed (left)``, are none.
+    """
+    text, (base, unit) = " ".join(text.split()), name_of(text, below)
+    name = text
+    found = _BRACKETS.fullmatch(text) or _BEHIND.fullmatch(text)
+    if found is not None and found[2] == unit:
+        if "[" not in text and not is_unit(unit) and not is_known_unit(unit):
+            return Quantity()
+        name = found[1]
+    if not unit or base in _SYNONYMS[role] or "[" in name or "]" in name:
+        name = ""
+    return Quantity(name, unit)
 
 
 def time_unit_of(name: Name) -> str | None:

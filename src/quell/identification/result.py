@@ -486,8 +486,9 @@ class Identified:
     def shortcomings(self) -> tuple[str, ...]:
         """Reasons not to rely on the model, each with what to do; empty for a good one.
 
-        They are the ``faults``, what is ``undecided``, a u that explains nothing, a response to u
-        that the model does not explain, and a start not at rest although ``rest`` says so.
+        They are the ``faults``, what is ``undecided``, a u that explains nothing, a record for
+        validation of which the model is worse than the mean, a response to u that the model does
+        not explain, and a start not at rest although ``rest`` says so.
         """
         found = [*self.faults, *self.undecided]
         fit = self.fits.get("held out", self.fits["estimation"])
@@ -495,6 +496,13 @@ class Identified:
             found.append(
                 f"u explains hardly anything of y (fit {percent(fit, 1)} %); check that they "
                 "belong to each other, which is which, the order and the delay"
+            )
+        other = self.fits.get("validation", 100.0)
+        if other < 0.0:
+            found.append(
+                "on the record for validation the model is worse than the mean of its y (fit "
+                f"{percent(other, 1)} %); check that both are of one plant, in one unit and at one "
+                "operating point, and that columns and signs are the same"
             )
         if self._gain_is_wide and self._input_is_certain:
             found.append(
@@ -514,6 +522,11 @@ class Identified:
                 f"(probability {self.rest_probability:.2g}); leave rest=True (--rest) out"
             )
         return tuple(found)
+
+    @property
+    def fails(self) -> bool:
+        """Whether the model is worse than the mean of y on samples that were not fitted."""
+        return any(self.fits.get(name, 0.0) < 0.0 for name in ("held out", "validation"))
 
     @property
     def faults(self) -> tuple[str, ...]:

@@ -34,7 +34,8 @@ import numpy as np
 from quell import checks
 from quell.files import nonfinite_to_none
 from quell.identification import Measured
-from quell.records.metrics import overshoot
+from quell.identification.record_file import in_common_units
+from quell.records.metrics import overshoot, runs_away, worsened
 from quell.types import Vector
 
 CRITERIA = {"rms": "RMS error", "iae": "mean |error|", "effort": "mean |du/dt|"}
@@ -66,7 +67,8 @@ class Scores(NamedTuple):
     rms: float  #: RMS error [y-unit]
     iae: float  #: mean of |r − y| [y-unit]
     effort: float  #: mean of |du/dt| [u-unit/s]
-    overshoot: float  #: mean over the steps of r, as a share of the step; NaN without steps
+    #: mean over the steps of r, as a share of the step; NaN without steps, or where y does not rest
+    overshoot: float
     duration: float  #: of all logs together [s]
     batches: int  #: that the decision is based on
 
@@ -110,17 +112,21 @@ class Ranking(NamedTuple):
     scores: dict[str, Scores]  #: by tuning, the lowest criterion first
     comparisons: tuple[Comparison, ...]  #: of all pairs
     notes: tuple[str, ...]  #: what the logs leave open for all
+    lost: tuple[str, ...] = ()  #: tunings with which y ran away from r, which have no rank
 
     @property
     def best(self) -> str | None:
-        """The tuning that is better than each other one; None if that is not decided."""
+        """The tuning that is better than each other one that has a rank; None if not decided."""
         first = next(iter(self.scores))
         beaten = {each.worse for each in self.comparisons if each.better == first and each.decided}
-        return first if len(beaten) == len(self.scores) - 1 else None
+        ranked = len(self.scores) - len(self.lost)
+        return first if ranked and len(beaten) == ranked - 1 else None
 
     def describe(self) -> str:
         """Return the verdicts as text, those of the best with each other one first."""
         first = next(iter(self.scores))
+        if not len(self.lost) < len(self.scores):
+            return "\n".join(self.notes)
         mine = [each for each in self.comparisons if first in (each.better, each.worse)]
         others = [each for each in self.comparisons if each not in mine]
         lines = [each.describe(self.criterion) for each in mine + others]
@@ -129,7 +135,20 @@ class Ranking(NamedTuple):
             lines.insert(0, f"best: {self.best}, {level}")
         else:
             lines.insert(0, f"NOT decided which is best, {level}; lowest so far: {first}")
-        return "\n".join([*lines, *self.notes])
+        return "\n".join([*lines, *self.worse, *self.notes])
+
+    @property
+    def worse(self) -> list[str]:
+        """Lines on what of the best is worse than of another tuning, by more than 10 %."""
+        if self.best is None:
+            return []
+        own, lines = self.scores[self.best]._asdict(), []
+        for name, scores in self.scores.items():
+            if name not in (self.best, *self.lost):
+                found = worsened(scores._asdict(), own)
+                texts = "; ".join(each.text for each in found if each.name != self.criterion)
+                lines += [f"{self.best} is worse than {name} in {texts}"] if texts else []
+        return lines
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers for JSON."""
@@ -137,8 +156,10 @@ class Ranking(NamedTuple):
             "criterion": self.criterion,
             "confidence": self.confidence,
             "best": self.best,
+            "lost": list(self.lost),
             "scores": {name: scores._asdict() for name, scores in self.scores.items()},
             "comparisons": [each._asdict() for each in self.comparisons],
+            "worse": self.worse,
             "notes": list(self.notes),
         }
         return dict(nonfinite_to_none(value))
@@ -161,6 +182,8 @@ def rank(
         for each tuning its log or logs, with a reference: r, y and u in samples (N,), all with one
         sample time and u in one unit: v = B0 u of an axis is so for one B0 only, see
         ``quell.records.axes.one_gain``. Leave out the first seconds after a change of the tuning.
+        Logs in other units (``Measured.signals``) are converted to those of the first one, as from
+        °F to K, and ``notes`` say so.
     criterion
         ``"rms"``, ``"iae"`` or ``"effort"``, see ``CRITERIA``; lower is better.
     confidence
@@ -175,7 +198,7 @@ def rank(
     ------
     ValueError
         for fewer than two tunings, a log without reference, with another sample time, too short or
-        with values that are not finite, and arguments out of range.
+        with values that are not finite, units that do not convert, and arguments out of range.
 
     Examples
     --------
@@ -195,21 +218,33 @@ def rank(
     tunings = {name: _checked(name, given) for name, given in logs.items()}
     if len(tunings) < 2:
         raise ValueError(f"logs: {len(tunings)} tuning; give logs of two or more to compare")
+    tunings, notes = _in_common_units(tunings)
     dt = _common_sample_time(tunings)
     shared = _Batches(tunings, criterion)
     found = {name: _scores(tuning, shared.means[name].size) for name, tuning in tunings.items()}
-    order = sorted(found, key=lambda name: float(getattr(found[name], criterion)))
-    pairs = list(combinations(order, 2))
-    level = (1.0 - confidence) / len(pairs)
+    away = {name: sum(map(_ran_away, logs)) for name, logs in tunings.items()}
+    lost = tuple(name for name in found if away[name])
+    order = sorted(found, key=lambda name: (name in lost, float(getattr(found[name], criterion))))
+    pairs = list(combinations([name for name in order if name not in lost], 2))
+    level = (1.0 - confidence) / max(len(pairs), 1)
+    notes += [
+        f"NOT ranked: {name}: y ran away from r in {away[name]} of {len(tunings[name])} logs; look "
+        "at these, and take a tuning that is stable"
+        for name in lost
+    ]
     comparisons = tuple(_compared(*pair, shared, tunings, criterion, level, dt) for pair in pairs)
-    notes = []
     if all(len(tuning) == 1 for tuning in tunings.values()):
         notes.append(
             "NOT protected against drift: each tuning has one log; alternate them (A, B, A, B), "
             "as logs of the same name"
         )
     return Ranking(
-        criterion, confidence, {name: found[name] for name in order}, comparisons, tuple(notes)
+        criterion,
+        confidence,
+        {name: found[name] for name in order},
+        comparisons,
+        tuple(notes),
+        lost,
     )
 
 
@@ -236,6 +271,20 @@ def _checked(name: str, given: Any) -> list[Measured]:
         if size < 2 * _LEAST:
             raise ValueError(f"{where}: {size} samples; must have {2 * _LEAST} at least")
     return several
+
+
+def _in_common_units(
+    tunings: Mapping[str, list[Measured]],
+) -> tuple[dict[str, list[Measured]], list[str]]:
+    """Return all logs in the units of the first, and what was converted."""
+    every = {
+        (name if len(logs) == 1 else f"{name}, log {i + 1}"): log
+        for name, logs in tunings.items()
+        for i, log in enumerate(logs)
+    }
+    alike, notes = in_common_units(every, error=True)
+    left = iter(alike.values())
+    return {name: [next(left) for _ in logs] for name, logs in tunings.items()}, notes
 
 
 def _common_sample_time(tunings: Mapping[str, list[Measured]]) -> float:
@@ -280,8 +329,14 @@ def _scores(logs: list[Measured], batches: int) -> Scores:
     )
 
 
+def _ran_away(log: Measured) -> bool:
+    """Return whether y ran away from r in a log."""
+    r = np.asarray(log.reference, dtype=np.float64)
+    return bool(runs_away(r[None], log.y[None], log.u[None, :, None])[0])
+
+
 def _overshoots(log: Measured) -> list[float]:
-    """Return the overshoot of each step of r that is followed by rest."""
+    """Return the overshoot of each step of r before a rest of r, NaN where y does not rest."""
     r = np.asarray(log.reference)
     changes = np.flatnonzero(np.diff(r)) + 1
     if changes.size == 0 or changes.size > r.size // _REST:

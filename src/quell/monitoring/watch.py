@@ -64,6 +64,7 @@ from quell.monitoring.windows import (
     windows_of,
     without_gaps,
 )
+from quell.quantities import AxesSignals, Conversion, Quantity, in_one_unit
 from quell.records.record import columns_of
 from quell.types import Vector
 
@@ -556,6 +557,8 @@ class Machine:
         self.watch = Watch(alpha=alpha)
         self.records: list[str] = []
         self.axes: tuple[str, ...] | None = None  #: names of the axes; None before the first window
+        self.units: dict[str, tuple[str, str]] = {}  #: those of y and u of each axis, if known
+        self.notes: list[str] = []  #: what was converted, since it was made or loaded
         self.left_out = 0  #: windows with too many missing samples, since it was made or loaded
 
     @property
@@ -577,8 +580,8 @@ class Machine:
         Raises
         ------
         ValueError
-            for a record that is shorter than a window, other axes than those before, and as
-            ``features_of``.
+            for a record that is shorter than a window, other axes than those before, units that
+            do not convert to those of the windows before, and as ``features_of``.
         """
         axes = {"": signals} if isinstance(signals, Signals) else signals
         self.check_axes(tuple(axes))
@@ -615,6 +618,7 @@ class Machine:
         """Take a window of each axis; leave it out if too much is missing in one of them."""
         self.axes = tuple(parts)
         row: dict[str, float] = {}
+        parts = {name: self._in_its_units(name, part, label) for name, part in parts.items()}
         for i, (name, part) in enumerate(parts.items()):
             whole = without_gaps(part)
             if whole is None:
@@ -624,6 +628,24 @@ class Machine:
             own = features_of(whole, order, self.band)
             row |= {f"{name}: {key}" if name else key: value for key, value in own.items()}
         return self.watch.update(row, label)
+
+    def _in_its_units(self, axis: str, part: Signals, label: str) -> Signals:
+        """Return a window of an axis in the units of the windows before it."""
+        record = label.rpartition(", ")[0] or label
+        units, into = self.units.get(axis, ("", "")), []
+        found = []
+        for name, before, own in zip("yu", units, (part.y_unit, part.u_unit), strict=True):
+            given = {"the state": Quantity("", before), record: Quantity("", own)}
+            which = f"{name} of axis {axis}," if axis else name
+            each, wanted, notes = in_one_unit(given, which)
+            into.append(each[record])
+            found.append(wanted.unit or own)
+            if axis in self.units:
+                self.notes += [note for note in notes if note not in self.notes]
+        self.units[axis] = (found[0], found[1])
+        if axis:  # its u is v
+            into[1] = Conversion(into[0].factor)
+        return part.converted(into[0], into[1])
 
     def _coupled(self) -> list[str]:
         """Return lines on axes without alarm, and on alarms of several that may have one cause."""
@@ -651,6 +673,7 @@ class Machine:
         """Return alarms, and in lines with NOT what can not be said."""
         lines = [self.watch.describe()] if self.watch.labels else []
         lines += self._coupled()
+        lines += self.notes
         if self.left_out:
             lines.append(
                 f"NOT watched: {self.left_out} windows in which more than {MOST_MISSING:.1%} of "
@@ -662,6 +685,7 @@ class Machine:
         """Write the state to a JSON file, whole or not at all; replace the one before."""
         value = {"settings": self.settings, "records": self.records, **self.watch.to_json()}
         value["axes"] = None if self.axes is None else list(self.axes)
+        value["units"] = {axis: list(units) for axis, units in self.units.items()}
         write_json(path, value, overwrite=True)
 
     @classmethod
@@ -676,9 +700,18 @@ class Machine:
             made.watch = Watch.from_json(value)
             axes = value.get("axes", [""] if made.watch.labels else None)
             made.axes = None if axes is None else tuple(map(str, axes))
+            units = dict(value.get("units", {}))
+            made.units = {str(axis): (str(y), str(u)) for axis, (y, u) in units.items()}
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise ValueError(f"path = {name!r}: no state of quell watch ({error})") from None
         return made
+
+
+def _quantities_of(known: Any, axis: int) -> tuple[str, str]:
+    """Return the units of y and u of an axis; none for u of several, which is v."""
+    if isinstance(known, AxesSignals):
+        return known.y[axis].unit, ""
+    return known.y.unit, known.u.unit
 
 
 class WatchSink:
@@ -779,7 +812,8 @@ class WatchSink:
                 rows[:, columns_of(header.channels, each).start + i].copy()
                 for each in ("y_measured", "r", u)
             )
-            found[name] = Signals(acts, y, r, f, learned, self._dt)
+            known = _quantities_of(header.signals, i)
+            found[name] = Signals(acts, y, r, f, learned, self._dt, *known)
         return found
 
     def describe(self) -> str:

@@ -31,6 +31,8 @@ import numpy as np
 from quell import checks
 from quell.commissioning import by_axis, controlled, measured, measured_run, run_in
 from quell.files import MAX_SIZE
+from quell.identification.record_file import in_common_units
+from quell.quantities import Conversion
 from quell.realtime.recordings import Event
 from quell.records.trajectory import Trajectory
 from quell.types import Vector
@@ -63,13 +65,23 @@ class Signals(NamedTuple):
     f: Vector | None  # total disturbance as the controller estimated it
     theta: Mapping[str, Vector]  # the learner's coefficients by name
     dt: float
+    y_unit: str = ""
+    u_unit: str = ""  # of an axis of several none: its u is v, in the unit of a derivative of y
 
     def part(self, begin: int, end: int) -> Signals:
         """Return the samples from ``begin`` to before ``end``."""
         cut = slice(begin, end)
         r, f = (None if one is None else one[cut] for one in (self.r, self.f))
         theta = {name: value[cut] for name, value in self.theta.items()}
-        return Signals(self.u[cut], self.y[cut], r, f, theta, self.dt)
+        return self._replace(u=self.u[cut], y=self.y[cut], r=r, f=f, theta=theta)
+
+    def converted(self, of_y: Conversion, of_u: Conversion) -> Signals:
+        """Return the samples in other units, f with y, and without the learner's coefficients."""
+        if not (of_y.changes or of_u.changes):
+            return self
+        r = None if self.r is None else of_y.of(self.r)
+        f = None if self.f is None else of_y.factor * self.f
+        return self._replace(u=of_u.of(self.u), y=of_y.of(self.y), r=r, f=f, theta={})
 
 
 def signals_of(
@@ -98,12 +110,18 @@ def signals_of(
     """
     run = run_in(path, columns, dt, time_unit, max_size)
     if run is None:
-        found = measured(path, columns, dt, time_unit, max_size)
-        return {"": Signals(found.u, found.y, found.reference, None, {}, found.dt)}
-    return {name: _signals_in(each) for name, each in by_axis(run).items()}
+        record = measured(path, columns, dt, time_unit, max_size)
+        found = in_common_units({path.name: record}, error=True)[0][path.name]
+        units = found.signals.y.unit, found.signals.u.unit
+        return {"": Signals(found.u, found.y, found.reference, None, {}, found.dt, *units)}
+    # The u of an axis of several is v, in the unit of a derivative of y.
+    return {
+        name: _signals_in(each, "" if name else each.signals.u.unit)
+        for name, each in by_axis(run).items()
+    }
 
 
-def _signals_in(run: Trajectory) -> Signals:
+def _signals_in(run: Trajectory, u_unit: str) -> Signals:
     """Return the signals of a run while it was under control."""
     part, known = controlled(run), measured_run(run)
     # As received: NaN where nothing was, or where the loop skipped the deadline.
@@ -115,7 +133,8 @@ def _signals_in(run: Trajectory) -> Signals:
     if "theta" in run.names:
         table = run["theta"][part].reshape(known.y.size, -1)
         theta = {name: table[:, i] for i, name in enumerate(run.features)}
-    return Signals(known.u, y, known.reference, f, theta, known.dt)
+    units = run.signals.y.unit, u_unit
+    return Signals(known.u, y, known.reference, f, theta, known.dt, *units)
 
 
 def windows_of(signals: Signals, length: float) -> Iterator[Signals]:

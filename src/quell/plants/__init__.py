@@ -13,7 +13,7 @@ from quell.plants.flexible import (
     two_mass_spring,
 )
 from quell.plants.fmu import FMU, MultivariableFMU
-from quell.plants.linear import LinearPlant, delayed, encoded
+from quell.plants.linear import LinearPlant, delayed, encoded, lagged
 from quell.plants.linearise import linearised
 from quell.plants.multibody import Arm, Craft, arm, quadrotor_attitude, rotor_levers
 from quell.plants.multivariable import (
@@ -29,7 +29,7 @@ __all__ = [
     "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "LinearPlant", "MultivariableFMU",
     "MultivariableLinearPlant", "MultivariableNonlinearPlant", "NMassPlant", "NonlinearPlant",
     "Plant", "PlantBatch", "TorsionalPlant", "arm", "batch", "dc_motor", "delayed",
-    "delayed_inputs", "encoded", "encoded_outputs", "labelled", "lagged_two_mass_spring",
-    "linearised", "n_mass", "quadrotor_attitude", "rotor_levers", "signals_of", "torsional",
-    "torsional_identified", "two_mass_spring",
+    "delayed_inputs", "encoded", "encoded_outputs", "labelled", "lagged",
+    "lagged_two_mass_spring", "linearised", "n_mass", "quadrotor_attitude", "rotor_levers",
+    "signals_of", "torsional", "torsional_identified", "two_mass_spring",
 ]  # fmt: skip

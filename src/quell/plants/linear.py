@@ -16,6 +16,8 @@ this state, and a start from rest sets it to zero.
 With a part of a sample the plant sees ``u_(k−d−1)`` for the first l of each sample and ``u_(k−d)``
 for the rest: two exact steps of a linear plant.
 
+A plant behind a lag of its actuator.
+
 A plant whose output is quantized by an encoder with a finite number of counts a turn.
 
 ``y = q floor(y_plant/q + 1/2)`` with ``q = turn/counts``. The counter is zeroed half-way between
@@ -26,7 +28,7 @@ state.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,7 +53,9 @@ from quell.plants.base import (
     check_one_input,
     check_plant,
     check_run,
+    labelled,
     measure,
+    signals_of,
 )
 from quell.types import Matrix, Vector
 
@@ -237,15 +241,12 @@ def sampled_plant(
         model = to_state_space(model) if isinstance(model, TransferFunction) else model
         N, B = model.A - np.eye(model.C.size), model.B[:, None]
         return _delayed(N, B, np.zeros_like(B), model.C, B, round(delay / dt), {})
-    linear = LinearPlant.of(plant)
-    A, B, C, E = linear.A, linear.B, linear.C[0], linear.E
-    first = leading_gain(A, B, linear.C)
+    linear: Any = LinearPlant.of(plant)
+    first = leading_gain(linear.A, linear.B, linear.C)
     gains = {} if first is None else {first[1]: first[0]}
     if actuator_lag > 0.0:
-        n = A.shape[0]
-        A = np.block([[A, B], [np.zeros((1, n)), np.full((1, 1), -1.0 / actuator_lag)]])
-        B = np.vstack([np.zeros_like(B), [[1.0 / actuator_lag]]])
-        C, E = np.append(C, 0.0), np.vstack([E, np.zeros((1, E.shape[1]))])
+        linear = lagged(linear, actuator_lag)
+    A, B, C, E = linear.A, linear.B, linear.C[0], linear.E
     if delay > _MOST_SAMPLES * dt:
         limit = f"{_MOST_SAMPLES} samples of {dt!r} s"
         raise ValueError(f"delay = {delay!r} s: must be at most {limit}")
@@ -433,6 +434,108 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
         return DelayedPlant(plant, samples, dt) if samples else DelayedPlant(plant, 0, dt, delay)
     samples = math.floor(delay / dt)
     return DelayedPlant(plant, samples, dt, delay - samples * dt)
+
+
+# ---- A plant behind a lag of its actuator ----
+
+
+class LaggedPlantModel(NamedTuple):
+    """A sampled plant behind a lag; the last state is what the actuator gives."""
+
+    inner: Any  # parameters of the plant without lag
+    rest: float  # e^(−dt/T): the share of its distance from u that is left after a sample
+    mean: float  # the mean of that share over a sample
+
+
+@measure.register(LaggedPlantModel)
+def _measure_lag(plant: LaggedPlantModel, x: Vector) -> float:
+    return measure(plant.inner, x[: x.size - 1])
+
+
+@advance.register(LaggedPlantModel)
+def _advance_lag(
+    plant: LaggedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
+    last = x.size - 1
+    away = x[last] - u
+    x[last] = u + plant.rest * away
+    advance(plant.inner, x[:last], scratch, t, u + plant.mean * away, w)
+
+
+@begin_run.register(LaggedPlantModel)
+def _begin_run_lag(plant: LaggedPlantModel, x: Vector, scratch: Vector) -> None:
+    begin_run(plant.inner, x[: x.size - 1], scratch)
+
+
+@check_run.register(LaggedPlantModel)
+def _check_run_lag(plant: LaggedPlantModel, scratch: Vector) -> None:
+    check_run(plant.inner, scratch)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LaggedPlant(PlantWrapper):
+    """A plant that is not linear behind a lag ``1/(lag s + 1)`` of its actuator.
+
+    Make it with ``lagged``. The plant gets the mean of what the actuator gives in a sample.
+    """
+
+    plant: Plant
+    lag: float  #: [s]
+
+    @property
+    def name(self) -> str:
+        """Name for tables and plots."""
+        return f"{self.plant.name}, actuator lag {self.lag:g} s"
+
+    @property
+    def order(self) -> int:
+        """Number of states, with that of the actuator."""
+        return self.plant.order + 1
+
+    def sampled(self, dt: float, interpret: bool = False) -> LaggedPlantModel:
+        """Return the parameters for a sample time ``dt`` [s]."""
+        rate = checks.positive("dt", dt, "s") / self.lag
+        mean = -math.expm1(-rate) / rate
+        return LaggedPlantModel(self.plant.sampled(dt, interpret), math.exp(-rate), mean)
+
+
+def lagged(plant: Plant, lag: float) -> Plant:
+    """Return a plant behind a lag ``1/(lag s + 1)`` of its actuator, whose state comes last.
+
+    Parameters
+    ----------
+    plant
+        any plant. Of a linear one the result is linear, and sampled exactly; another one gets the
+        mean of what the actuator gives in each sample. A delay of u stays outside of the lag: its
+        states are the last ones.
+    lag
+        time constant [s].
+
+    Raises
+    ------
+    ValueError
+        if the lag is not positive, or ``plant`` is no plant.
+
+    Examples
+    --------
+    >>> late = lagged(LinearPlant.of(([1.0], [1.0, 0.0])), lag=0.1)
+    >>> late.A.tolist(), late.B[:, 0].tolist()
+    ([[0.0, 1.0], [0.0, -10.0]], [0.0, 10.0])
+    """
+    check_plant(plant)
+    check_one_input(plant, "a lag in A and B of a MultivariableLinearPlant")
+    lag = checks.positive("lag", lag, "s")
+    if isinstance(plant, DelayedPlant | EncodedPlant):
+        return replace(plant, plant=lagged(plant.plant, lag))
+    if not isinstance(plant, LinearPlant):
+        return LaggedPlant(plant, lag)
+    n = plant.order
+    A = np.block([[plant.A, plant.B], [np.zeros((1, n)), np.full((1, 1), -1.0 / lag)]])
+    E = np.vstack([plant.E, np.zeros((1, plant.disturbances))])
+    B, C = np.append(np.zeros(n), 1.0 / lag), np.append(plant.C[0], 0.0)
+    found = LinearPlant(A, B, C, E, name=f"{plant.name}, actuator lag {lag:g} s")
+    known = signals_of(plant)
+    return labelled(found, known.y, known.u) if known.known else found
 
 
 # ---- A plant whose output is quantized by an encoder with a finite number of counts a turn ----

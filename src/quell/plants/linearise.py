@@ -14,7 +14,7 @@ from quell import checks
 from quell.lti.models import is_linear_model
 from quell.plants.base import labelled, signals_of
 from quell.plants.flexible import CubicSpringPlant
-from quell.plants.linear import DelayedPlant, EncodedPlant, LinearPlant
+from quell.plants.linear import DelayedPlant, EncodedPlant, LaggedPlant, LinearPlant, lagged
 from quell.plants.multivariable import (
     DelayedInputs,
     EncodedOutputs,
@@ -256,6 +256,9 @@ def linear_model(plant: Any) -> Any:
     if isinstance(plant, DelayedPlant | EncodedPlant):
         inner = linear_model(plant.plant)
         return plant if inner is plant.plant else replace(plant, plant=inner)
+    if isinstance(plant, LaggedPlant):
+        inner = linear_model(plant.plant)
+        return plant if inner is plant.plant else _named_as(plant, lagged(inner, plant.lag))
     return _named_as(plant, getattr(plant, "linear", plant))
 
 
@@ -302,6 +305,9 @@ def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any
                 )
             delay += plant.delay
         plant = plant.plant
+    if isinstance(plant, LaggedPlant):
+        inner, more = linear_part(plant.plant, dt, operating_point)
+        return lagged(LinearPlant.of(inner), plant.lag), delay + more
     if operating_point is not None:
         return linearised(plant, *checked_point(operating_point)), delay
     if isinstance(plant, NonlinearPlant):

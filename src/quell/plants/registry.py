@@ -17,7 +17,7 @@ from quell.files import whole_text
 from quell.plants.base import Plant, check_plant
 from quell.plants.flexible import lagged_two_mass_spring, n_mass, two_mass_spring
 from quell.plants.fmu import FMU, MultivariableFMU
-from quell.plants.linear import LinearPlant, delayed, encoded
+from quell.plants.linear import LinearPlant, delayed, encoded, lagged
 from quell.plants.multibody import arm, quadrotor_attitude
 from quell.plants.multivariable import (
     MultivariableLinearPlant,
@@ -339,6 +339,7 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
     "linear": linear,
     "n-mass": n_mass,
     "delayed": delayed,
+    "lagged": lagged,
     "encoded": encoded,
     "fmu": FMU,
     "identified": identified,

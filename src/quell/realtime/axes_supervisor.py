@@ -28,6 +28,7 @@ from quell.realtime.supervisor import (
     begin_watch,
     change_mode,
     choose_mode,
+    is_opposed,
     runs_away,
     widen_rest,
 )
@@ -139,6 +140,8 @@ def update_axes_mode(
     memory.culprit = 0
     memory.y = axes.good[0]
     if settling and memory.mode == Mode.RUN:
+        for c in range(axes.at_limit.size):
+            axes.at_limit[c] = 0
         for i in range(count):
             begin_watch(axes.watched[i], axes.y[i], rules.direction[i])
     elif settling and missing == 0 and memory.mode == Mode.START:
@@ -165,6 +168,7 @@ def supervise_outputs(rules: AxesLimits, state: SupervisorState, axes: AxesMemor
     for c in range(u.size):
         u[c] = axes.u[c] if memory.mode == Mode.HOLD else 0.0
     if memory.mode == Mode.RUN:
+        _oppose(rules, axes)
         _limit(rules, axes)
         _end_by_limits(rules, state, axes, k)
     if memory.mode == Mode.RAMP:
@@ -174,6 +178,18 @@ def supervise_outputs(rules: AxesLimits, state: SupervisorState, axes: AxesMemor
     for c in range(u.size):
         axes.u[c] = u[c]
     memory.u = u[0]
+
+
+@kernel
+def _oppose(rules: AxesLimits, axes: AxesMemory) -> None:
+    """Update the scores of the checks of B0, as ``is_opposed`` does."""
+    at_limit = False
+    for c in range(axes.at_limit.size):
+        at_limit |= axes.at_limit[c] > 0
+    for i in range(axes.watched.size):
+        watched = axes.watched[i]
+        most, push = rules.most_opposed[i], rules.push[i]
+        is_opposed(watched, most, watched.u, axes.f_hat[i], push, at_limit)
 
 
 @kernel
@@ -194,7 +210,8 @@ def _end_by_limits(rules: AxesLimits, state: SupervisorState, axes: AxesMemory, 
         watched = axes.watched[i]
         watched.y = axes.good[i]
         own = MotionRules(-rules.push[i], rules.push[i], rules.direction[i], rules.reach[i])
-        if runs_away(own, watched, axes.r[i]):
+        against = runs_away(own, watched, axes.r[i])
+        if against or watched.opposed > rules.most_opposed[i]:
             cause, culprit = Cause.WRONG_WAY, i + 1
     for c in range(axes.u.size):
         if axes.at_limit[c] > rules.most_saturated:

@@ -146,7 +146,7 @@ class SupervisedController(NamedTuple):
     state: Any  #: state of the controller
     rules: Rules
     supervisor: SupervisorState
-    reference: ReferenceSamples
+    reference: Any  #: ``ReferenceSamples``, or another one with ``set_reference``
     log: CycleLog
     inputs: ChannelInputs  #: what the device gives beside y
 
@@ -327,18 +327,18 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
     supervisor, reference, row = controller.supervisor, controller.reference, controller.log.row
     memory = supervisor.memory[0]
     store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
-    update_mode(rules, supervisor, k, y, reference.r.size)
+    update_mode(rules, supervisor, k, y, samples_of(reference))
     first = k - min(left_out, rules.hold)
     if memory.mode == Mode.RUN and memory.began == k:
         bumpless_transfer(design, state)
-        memory.offset = y - reference.r[0]
+        memory.offset = y - first_of(reference, 0)
         first = k
     awake = memory.mode != Mode.STOPPED and is_finite(memory.y)
     pass_channels(controller.inputs, design, state, rules.hold)
     record_channels(controller.inputs, row[controller.log.channels :])
     r, wished, f_hat = 0.0, 0.0, 0.0
     for i in range(first, k + 1):
-        r = _set_reference(design, state, reference, memory, i)
+        r = set_reference(reference, design, state, memory, i)
         if awake:
             wished = control(design, state, r, y if i == k else np.nan)
             if i < k:
@@ -355,11 +355,38 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
     return u
 
 
-@kernel
-def _set_reference(
-    design: Any, state: Any, reference: ReferenceSamples, memory: Memory, k: int
-) -> float:
+@generic
+def samples_of(reference: Any) -> int:
+    """Return after how many samples a reference is over."""
+    raise TypeError
+
+
+@generic
+def first_of(reference: Any, i: int) -> float:
+    """Return the first sample of a reference, of axis i."""
+    raise TypeError
+
+
+@generic
+def set_reference(reference: Any, design: Any, state: Any, memory: Memory, k: int) -> float:
     """Return the reference of sample k (y before the scenario begins); pass its derivatives on."""
+    raise TypeError
+
+
+@samples_of.register(ReferenceSamples)
+def _samples(reference: ReferenceSamples) -> int:
+    return reference.r.size
+
+
+@first_of.register(ReferenceSamples)
+def _first(reference: ReferenceSamples, i: int) -> float:
+    return reference.r[0]
+
+
+@set_reference.register(ReferenceSamples)
+def _set_reference(
+    reference: ReferenceSamples, design: Any, state: Any, memory: Memory, k: int
+) -> float:
     if memory.began < 0:
         return memory.y
     i = min(k - memory.began, reference.r.size - 1)
@@ -389,7 +416,7 @@ class SupervisedAxes(NamedTuple):
     state: Any  #: state of the controller
     rules: AxesLimits
     supervisor: SupervisorState
-    reference: AxesReference
+    reference: Any  #: ``AxesReference``, or another one with ``set_references``
     log: CycleLog
     inputs: ChannelInputs
     axes: AxesMemory
@@ -454,12 +481,12 @@ def _control_axes(controller: SupervisedAxes, k: int, left_out: int, y: float) -
     supervisor, reference, row = controller.supervisor, controller.reference, controller.log.row
     memory, axes = supervisor.memory[0], controller.axes
     store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
-    update_axes_mode(rules, supervisor, axes, k, reference.r.shape[0])
+    update_axes_mode(rules, supervisor, axes, k, samples_of(reference))
     first = k - min(left_out, rules.hold)
     if memory.mode == Mode.RUN and memory.began == k:
         bumpless_transfer(design, state)
         for i in range(axes.y.size):
-            axes.offset[i] = axes.y[i] - reference.r[0, i]
+            axes.offset[i] = axes.y[i] - first_of(reference, i)
         first = k
     awake = memory.mode != Mode.STOPPED and all_measured(axes)
     pass_channels(controller.inputs, design, state, rules.hold)
@@ -467,11 +494,11 @@ def _control_axes(controller: SupervisedAxes, k: int, left_out: int, y: float) -
     for c in range(axes.u.size):
         axes.wished[c] = 0.0
     for i in range(first, k + 1):
-        _set_references(design, state, reference, memory, axes, i)
+        set_references(reference, design, state, memory, axes, i)
         for j in range(axes.y.size):
             axes.measured[j] = axes.y[j] if i == k else np.nan
         if awake:
-            control_all(design, state, axes.r, axes.measured, axes.wished)
+            control_all(design, state, reference.given, axes.measured, axes.wished)
             if i < k:
                 set_applied_controls(design, state, axes.u)
     write_row(design, state, row[controller.log.controller : controller.log.channels])
@@ -492,19 +519,31 @@ def _control_axes(controller: SupervisedAxes, k: int, left_out: int, y: float) -
     return axes.u[0]
 
 
-@kernel
-def _set_references(
-    design: Any,
-    state: Any,
-    reference: AxesReference,
-    memory: Memory,
-    axes: AxesMemory,
-    k: int,
+@generic
+def set_references(
+    reference: Any, design: Any, state: Any, memory: Memory, axes: AxesMemory, k: int
 ) -> None:
-    """Write the references of sample k (y before the scenario begins); pass derivatives on."""
+    """Set ``reference.given``, what controllers get in sample k: y before the scenario begins."""
+    raise TypeError
+
+
+@samples_of.register(AxesReference)
+def _axes_samples(reference: AxesReference) -> int:
+    return reference.r.shape[0]
+
+
+@first_of.register(AxesReference)
+def _first_of_axis(reference: AxesReference, i: int) -> float:
+    return reference.r[0, i]
+
+
+@set_references.register(AxesReference)
+def _set_references(
+    reference: AxesReference, design: Any, state: Any, memory: Memory, axes: AxesMemory, k: int
+) -> None:
     if memory.began < 0:
         for i in range(axes.r.size):
-            axes.r[i] = axes.good[i]
+            axes.r[i] = reference.given[i] = axes.good[i]
         return
     at = min(k - memory.began, reference.r.shape[0] - 1)
     approaches, place = at < reference.approach.shape[0], 0
@@ -513,6 +552,7 @@ def _set_references(
         axes.r[i] = reference.r[at, i]
         if offset != 0.0:
             axes.r[i] += offset * reference.approach[at, 0]
+        reference.given[i] = axes.r[i]
         for j in range(reference.counts[i]):
             reference.current[place] = reference.derivatives[at, place]
             if offset != 0.0:
@@ -727,6 +767,48 @@ def compiled_controller(controller: Any) -> CompiledController:
 # ---- A control loop ----
 
 
+def supervise(
+    controller: Any,
+    reference: Any,
+    rules: Any,
+    ring: Ring,
+    channels: Sequence[str] = (),
+    state: Any = None,
+) -> Any:
+    """Return a supervised controller for ``control_step``; arguments are those of ``of`` below."""
+    axes = isinstance(controller, Axes)
+    counts = (controller.outputs, controller.inputs) if axes else (1, 1)
+    columns = row_channels(controller.channels, channels, *counts)
+    row = np.zeros(sum(width for _, width in columns))
+    f_learned, f_residual = _places_of_f(columns)
+    log = CycleLog(
+        ring=ring,
+        row=row,
+        f_learned=f_learned,
+        f_residual=f_residual,
+        channels=row.size - len(channels),
+        controller=sum(width for _, width in loop_channels(*counts)),
+        lateness=empty_counts(),
+        step_time=empty_counts(),
+    )
+    common: dict[str, Any] = {
+        "design": controller.parameters,
+        "state": controller.initial_state() if state is None else state,
+        "supervisor": initial_state(),
+        "reference": reference,
+        "log": log,
+        "inputs": channel_inputs(controller, channels),
+    }
+    supervised: Any
+    if axes:
+        places = np.array([_places_of_f(columns, f"{name}.") for name in controller.names])
+        memory = axes_memory(*counts)
+        supervised = SupervisedAxes(rules=rules.limits, axes=memory, f_hat=places, **common)
+    else:
+        supervised = SupervisedController(rules=rules, **common)
+    return supervised
+
+
 @dataclass(frozen=True, eq=False)
 class ControlLoop:
     """A supervised controller around a device; ``of`` makes and compiles one.
@@ -762,36 +844,7 @@ class ControlLoop:
         of the device, as ``checked_channels`` returns them. Reference and rules of several axes are
         an ``AxesReference`` and ``AxesRules``.
         """
-        axes = isinstance(controller, Axes)
-        counts = (controller.outputs, controller.inputs) if axes else (1, 1)
-        columns = row_channels(controller.channels, channels, *counts)
-        row = np.zeros(sum(width for _, width in columns))
-        f_learned, f_residual = _places_of_f(columns)
-        log = CycleLog(
-            ring=ring,
-            row=row,
-            f_learned=f_learned,
-            f_residual=f_residual,
-            channels=row.size - len(channels),
-            controller=sum(width for _, width in loop_channels(*counts)),
-            lateness=empty_counts(),
-            step_time=empty_counts(),
-        )
-        common: dict[str, Any] = {
-            "design": controller.parameters,
-            "state": controller.initial_state() if state is None else state,
-            "supervisor": initial_state(),
-            "reference": reference,
-            "log": log,
-            "inputs": channel_inputs(controller, channels),
-        }
-        supervised: Any
-        if axes:
-            places = np.array([_places_of_f(columns, f"{name}.") for name in controller.names])
-            memory = axes_memory(*counts)
-            supervised = SupervisedAxes(rules=rules.limits, axes=memory, f_hat=places, **common)
-        else:
-            supervised = SupervisedController(rules=rules, **common)
+        supervised = supervise(controller, reference, rules, ring, channels, state)
         handle = handle_of(device)
         paced = getattr(device, "paced", False) and not isinstance(handle, PythonHandle)
         loop = cls(handle, clock, controller.dt * 1e9, supervised, paced, interpret)

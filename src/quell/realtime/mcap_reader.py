@@ -87,6 +87,25 @@ def read_mcap(path: Path, most: int) -> tuple[str, Matrix]:
     return header, np.concatenate(blocks) if blocks else np.empty((0, 0))
 
 
+def whole_part(path: Path) -> tuple[int, int]:
+    """Return how many bytes of a file are whole records, and how many messages are in them."""
+    size, messages = len(MAGIC), 0
+    end = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(size)
+        while len(start := file.read(_START.size)) == _START.size:
+            opcode, length = _START.unpack(start)
+            if length > end - file.tell():
+                break
+            if opcode == _CHUNK:
+                content = _split(_expanded(file.read(length), end))
+                messages += sum(each.opcode == _MESSAGE for each in content)
+            else:
+                file.seek(length, os.SEEK_CUR)
+            size = file.tell()
+    return min(size, end), messages
+
+
 def _rows(messages: list[bytes]) -> Matrix:
     """Return the rows (messages, width) of messages."""
     if not messages:

@@ -1,26 +1,39 @@
 """A compensator between a host and a drive that both stay as they are.
 
 To the host the proxy is the drive: it listens as a rig does (``realtime/rig.py``), sends
-measurements, takes commands, and has the rig's watchdog. To the drive it is the loop. In each tick
+measurements and takes commands. To the drive it is the loop of ``run_rig``, with the same
+supervisor, rules and causes (``realtime/supervisor.py``). In each tick
 
-1. the newest command of the host is u_0 (zero if its watchdog has tripped);
+1. the newest command of the host is u_0;
 2. the newest measurement of the drive goes to the compensator and to the host, and so do the
    drive's channels (``realtime/channels.py``);
-3. the compensator's u goes to the drive.
+3. the supervisor's u goes to the drive: in RUN the compensator's, zero in START and STOPPED.
 
 So the drive has one more sample of delay than without the proxy, where host and proxy have clocks
 of their own: a command waits for the proxy's tick, a measurement for the host's.
 
+=======  ========================================================================================
+mode     while
+=======  ========================================================================================
+START    there is no host that commands, or ``settle`` good samples have not come since: u = 0
+RUN      the host commands
+HOLD     a measurement is missing: u stays as it is
+RAMP     after a fault, or at the end of the host's session: u goes to zero within ``ramp`` samples,
+         u_0 and the compensation together
+STOPPED  u = 0. After a fault the proxy ends and the host's session with it; it stays at rest until
+         it is started anew. After a session that its host has ended it goes back to START
+=======  ========================================================================================
+
+A host is lost if more than ``hold`` ticks in a row had no command of it: u_0 is held until then. A
+host that comes back, or another one, can change nothing in RAMP and STOPPED. What it commands in
+START is not applied.
+
 Drives of several axes have ``Axes`` of compensators: the host's command is u_0 of all actuators. A
-measurement that is missing is so for its own axis.
+measurement that is missing holds all u, and is so for its own axis in the observers.
 
 Where clocks differ, a tick may find no new measurement. One is replaced by the last one for the
 host; from the second in a row on the host gets NaN, which is no measurement, and no channels. So it
 does what it does without the proxy. The compensator gets NaN in each case.
-
-A drive is lost if it has set u to zero or ended its session, takes no command for more than
-``Safety.hold`` samples, or gives no measurement for a second, at least fifty samples. Then the rig
-ends the host's session and ``Rig.run``.
 """
 
 from __future__ import annotations
@@ -33,20 +46,25 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.axes import Axes
-from quell.controllers.base import check_controller, control, limits_of
+from quell.controllers.base import check_controller, limits_of
 from quell.controllers.compensated import takes_control
 from quell.controllers.compensator import Compensator
-from quell.controllers.several import control_all
 from quell.kernels.dispatch import is_finite, kernel
 from quell.plants.base import advance, measure
 from quell.plants.multivariable import measure_all
-from quell.realtime.channels import (
-    ChannelInputs,
-    await_channels,
-    channel_inputs,
-    checked_channels,
-    pass_channels,
-    read_inputs,
+from quell.realtime.axes_supervisor import AxesMemory
+from quell.realtime.channels import await_channels, checked_channels
+from quell.realtime.cycle import (
+    control_step,
+    count_cycle,
+    count_fault,
+    first_of,
+    samples_of,
+    send_control,
+    set_reference,
+    set_references,
+    supervise,
+    take_inputs,
 )
 from quell.realtime.devices import (
     Device,
@@ -55,40 +73,86 @@ from quell.realtime.devices import (
     counts_of,
     handle_of,
     read_measurement,
-    read_signals,
-    write_command,
-    write_signals,
 )
-from quell.realtime.rig import is_lost, measure_channels
-from quell.realtime.safety import default_hold
-from quell.realtime.system import now, system_clock
-from quell.realtime.wire import COMMAND_NOT_SENT, SESSION_GONE, TRIPPED
+from quell.realtime.rig import (
+    BEHIND,
+    LIVE,
+    STATE,
+    TRIPPED,
+    fill_log,
+    has_ended,
+    may_end,
+    measure_channels,
+    tell_host,
+)
+from quell.realtime.run import ModeChange, mode_changes, signal_name
+from quell.realtime.safety import Safety
+from quell.realtime.supervisor import (
+    Cause,
+    Ending,
+    Host,
+    Memory,
+    Mode,
+    Request,
+    SupervisorState,
+    change_mode,
+    finished,
+    wait_for_host,
+)
+from quell.realtime.system import now, store_release, system_clock
+from quell.realtime.telemetry import ring
 from quell.types import Vector
 
 # Measurements in a row that are replaced by the last one for the host: two clocks that differ leave
 # one out now and then, but not two.
 _REPLACED = 1
-# Time without any measurement after which the drive is lost [s], and least samples: by then a host
-# with the default ``Safety`` has ramped u to zero. Chosen by hand.
-_LOST_AFTER, _LOST_SAMPLES = 1.0, 50
-# Entries of ``Drive.counts``: ticks without a measurement, commands that could not be sent, those
-# in a row, why the drive is lost; and the reason that ``write_command`` does not know.
-_MISSING, _UNSENT, _UNSENT_IN_ROW, _FAULT = range(4)
-_SILENT = 4
-_REASONS = {
-    COMMAND_NOT_SENT: "commands could not be sent any more",
-    TRIPPED: "its watchdog has set u to zero, because no command came in time",
-    SESSION_GONE: "it has ended the session",
-}
+# Time that the drive has for its first measurement [s], and least samples: as in ``run_rig``.
+_FIRST, _FIRST_SAMPLES = 2.0, 50
+# More samples than any run has.
+_NEVER = 1 << 60
+# Entries of ``Drive.counts``: ticks, the session that the compensator works for, and
+# ``RigModel.counts[BEHIND]``.
+_TICK, _SESSION, _LATE = range(3)
+
+
+class HostCommand(NamedTuple):
+    """The commands of the host, in the place of a reference."""
+
+    given: Vector  # u_0 of this tick (m,)
+
+
+@samples_of.register(HostCommand)
+def _samples(reference: HostCommand) -> int:
+    return _NEVER
+
+
+@first_of.register(HostCommand)
+def _first(reference: HostCommand, i: int) -> float:
+    return 0.0
+
+
+@set_reference.register(HostCommand)
+def _set_command(reference: HostCommand, design: Any, state: Any, memory: Memory, k: int) -> float:
+    return 0.0 if memory.began < 0 else reference.given[0]
+
+
+@set_references.register(HostCommand)
+def _set_commands(
+    reference: HostCommand, design: Any, state: Any, memory: Memory, axes: AxesMemory, k: int
+) -> None:
+    if memory.began < 0:
+        for c in range(reference.given.size):
+            reference.given[c] = 0.0
 
 
 class Drive(NamedTuple):
-    """The measurements and faults of a drive."""
+    """The measurements of a drive."""
 
-    last: Vector  # last good measurements; NaN before the first (n,)
+    y: Vector  # of this tick, NaN where they are missing (n,)
+    last: Vector  # last good ones; NaN before the first (n,)
     silent: NDArray[np.int64]  # samples in a row without one (n,)
     counts: NDArray[np.int64]
-    most: int  # samples without a measurement after which the drive is lost
+    first: int  # ticks until which the first ones must have come
 
 
 class ProxyDesign(NamedTuple):
@@ -96,73 +160,49 @@ class ProxyDesign(NamedTuple):
 
     handle: Any  # of the device
     clock: Any
-    design: Any  # parameters of the compensator
-    state: Any
-    inputs: ChannelInputs
-    hold: int  # samples for which a missing ``held`` keeps its state, and commands may stay unsent
+    controller: Any  # ``SupervisedController``, or ``SupervisedAxes``
     drive: Drive
 
 
 class AxesProxyDesign(NamedTuple):
     """Drives of several axes and the compensators in front of them."""
 
-    one: ProxyDesign  # what one drive has as well
-    y: Vector  # measurements, NaN where they are missing (n,)
-    u: Vector  # what acts (m,)
+    one: ProxyDesign
+
+
+# ---- The host's side ----
 
 
 @kernel
-def _take(proxy: ProxyDesign, i: int, y: float) -> float:
+def _shown(drive: Drive, i: int, y: float) -> float:
     """Take the newest measurement of an axis, NaN if it is missing; return that for the host."""
-    drive = proxy.drive
+    drive.y[i] = y
     if is_finite(y):
         drive.last[i] = y
         drive.silent[i] = 0
     else:
         drive.silent[i] += 1
-        if drive.silent[i] > drive.most and drive.counts[_FAULT] == 0:
-            drive.counts[_FAULT] = _SILENT
     return drive.last[i] if drive.silent[i] <= _REPLACED else np.nan
 
 
 @kernel
-def _taken(proxy: ProxyDesign, i: int) -> float:
-    """Return the newest measurement of an axis; NaN if it is missing."""
-    return proxy.drive.last[i] if proxy.drive.silent[i] == 0 else np.nan
-
-
-@kernel
-def _take_channels(proxy: ProxyDesign) -> None:
-    """Read the channels after the measurements: none of a silent drive. Count what is missing."""
-    silent = proxy.drive.silent
-    least = most = silent[0]
-    for i in range(silent.size):
-        least, most = min(least, silent[i]), max(most, silent[i])
-    proxy.drive.counts[_MISSING] += 1 if most > 0 else 0
-    read_inputs(proxy.inputs, proxy.handle)
+def _hide_channels(proxy: ProxyDesign) -> None:
+    """Make the channels of a silent drive missing."""
+    least = proxy.drive.silent[0]
+    for i in range(proxy.drive.silent.size):
+        least = min(least, proxy.drive.silent[i])
     if least > _REPLACED:
-        for i in range(proxy.inputs.values.size):
-            proxy.inputs.values[i] = np.nan
-
-
-@kernel
-def _count_fault(proxy: ProxyDesign, fault: int) -> None:
-    """Count what writing a command has returned."""
-    counts = proxy.drive.counts
-    if fault == 0:
-        counts[_UNSENT_IN_ROW] = 0
-        return
-    counts[_UNSENT] += 1
-    counts[_UNSENT_IN_ROW] += 1
-    if counts[_FAULT] == 0 and (fault > COMMAND_NOT_SENT or counts[_UNSENT_IN_ROW] > proxy.hold):
-        counts[_FAULT] = fault
+        values = proxy.controller.inputs.values
+        for i in range(values.size):
+            values[i] = np.nan
 
 
 @measure.register(ProxyDesign)
 def _measure(proxy: ProxyDesign, x: Vector) -> float:
     y, _ = read_measurement(proxy.handle, proxy.clock, now(proxy.clock))
-    shown = _take(proxy, 0, y)
-    _take_channels(proxy)
+    take_inputs(proxy.controller, proxy.handle)
+    shown = _shown(proxy.drive, 0, y)
+    _hide_channels(proxy)
     return shown
 
 
@@ -170,26 +210,16 @@ def _measure(proxy: ProxyDesign, x: Vector) -> float:
 def _measure_all(proxy: AxesProxyDesign, x: Vector, y: Vector) -> None:
     one = proxy.one
     read_measurement(one.handle, one.clock, now(one.clock))
-    read_signals(one.handle, proxy.y)
+    take_inputs(one.controller, one.handle)
     for i in range(y.size):
-        y[i] = _take(one, i, proxy.y[i])
-    _take_channels(one)
-
-
-@is_lost.register(ProxyDesign)
-def _is_lost(proxy: ProxyDesign) -> bool:
-    return proxy.drive.counts[_FAULT] != 0
-
-
-@is_lost.register(AxesProxyDesign)
-def _are_lost(proxy: AxesProxyDesign) -> bool:
-    return proxy.one.drive.counts[_FAULT] != 0
+        y[i] = _shown(one.drive, i, one.controller.axes.y[i])
+    _hide_channels(one)
 
 
 @measure_channels.register(ProxyDesign)
 def _measure_channels(proxy: ProxyDesign, x: Vector, values: Vector) -> None:
     for i in range(values.size):
-        values[i] = proxy.inputs.values[i]
+        values[i] = proxy.controller.inputs.values[i]
 
 
 @measure_channels.register(AxesProxyDesign)
@@ -197,23 +227,101 @@ def _measure_channels_of_axes(proxy: AxesProxyDesign, x: Vector, values: Vector)
     measure_channels(proxy.one, x, values)
 
 
+@tell_host.register(ProxyDesign)
+def _tell(proxy: ProxyDesign, counts: NDArray[np.int64], session: int) -> None:
+    memory, own = proxy.controller.supervisor.memory[0], proxy.drive.counts
+    if memory.mode == Mode.START:
+        own[_SESSION] = session
+    memory.host = Host.ABSENT
+    if counts[STATE] == TRIPPED:
+        memory.host = Host.LOST
+    elif counts[STATE] == LIVE and session == own[_SESSION]:
+        memory.host = Host.PRESENT
+    own[_LATE] = counts[BEHIND]
+
+
+@tell_host.register(AxesProxyDesign)
+def _tell_axes(proxy: AxesProxyDesign, counts: NDArray[np.int64], session: int) -> None:
+    tell_host(proxy.one, counts, session)
+
+
+# ---- The drive's side ----
+
+
+@kernel
+def _step(proxy: ProxyDesign) -> None:
+    """Take the sample of a tick and send its u to the drive."""
+    controller, drive = proxy.controller, proxy.drive
+    supervisor, k = controller.supervisor, drive.counts[_TICK]
+    memory, seen = supervisor.memory[0], True
+    for i in range(drive.last.size):
+        seen &= is_finite(drive.last[i])
+    if not seen:  # the first ones may take their time
+        memory.missed_in_row = 0
+        if k == drive.first and memory.mode != Mode.STOPPED:
+            change_mode(supervisor, k, Mode.STOPPED, Cause.NO_MEASUREMENT)
+    elif drive.counts[_LATE] != 0 and not is_finite(drive.y[0]):
+        memory.skipped_in_row += 1
+    if finished(supervisor) and memory.ended_by == Cause.HOST_LEFT:
+        wait_for_host(supervisor, k)
+    u = control_step(controller, k, 0, drive.y[0])
+    count_fault(supervisor, send_control(controller, proxy.handle, u))
+    count_cycle(supervisor, drive.counts[_LATE] > 1)
+    drive.counts[_TICK] = k + 1
+
+
 @advance.register(ProxyDesign)
 def _advance(proxy: ProxyDesign, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
-    pass_channels(proxy.inputs, proxy.design, proxy.state, proxy.hold)
-    acting = control(proxy.design, proxy.state, u, _taken(proxy, 0))
-    _count_fault(proxy, write_command(proxy.handle, acting))
+    proxy.controller.reference.given[0] = u
+    _step(proxy)
 
 
 @advance.register(AxesProxyDesign)
 def _advance_all(
     proxy: AxesProxyDesign, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
 ) -> None:
-    one = proxy.one
-    for i in range(proxy.y.size):
-        proxy.y[i] = _taken(one, i)
-    pass_channels(one.inputs, one.design, one.state, one.hold)
-    control_all(one.design, one.state, u, proxy.y, proxy.u)
-    _count_fault(one, write_signals(one.handle, proxy.u))
+    for c in range(u.size):
+        proxy.one.controller.reference.given[c] = u[c]
+    _step(proxy.one)
+
+
+@has_ended.register(ProxyDesign)
+def _has_ended(proxy: ProxyDesign) -> bool:
+    supervisor = proxy.controller.supervisor
+    return finished(supervisor) and supervisor.memory[0].ended_by != Cause.HOST_LEFT
+
+
+@has_ended.register(AxesProxyDesign)
+def _axes_have_ended(proxy: AxesProxyDesign) -> bool:
+    return has_ended(proxy.one)
+
+
+@may_end.register(ProxyDesign)
+def _may_end(proxy: ProxyDesign, stop: int) -> bool:
+    supervisor = proxy.controller.supervisor
+    asked = Request.RAMP if stop < 2 else Request.ZERO
+    if asked > supervisor.requests[0]:
+        store_release(supervisor.requests, 0, asked)
+    return finished(supervisor)
+
+
+@may_end.register(AxesProxyDesign)
+def _axes_may_end(proxy: AxesProxyDesign, stop: int) -> bool:
+    return may_end(proxy.one, stop)
+
+
+@fill_log.register(ProxyDesign)
+def _fill_log(proxy: ProxyDesign, row: Vector) -> None:
+    memory = proxy.controller.supervisor.memory[0]
+    row[0], row[1] = memory.mode, memory.u
+
+
+@fill_log.register(AxesProxyDesign)
+def _fill_log_of_axes(proxy: AxesProxyDesign, row: Vector) -> None:
+    controller = proxy.one.controller
+    row[0] = controller.supervisor.memory[0].mode
+    for c in range(controller.axes.u.size):
+        row[1 + c] = controller.axes.u[c]
 
 
 class CompensatedDrive:
@@ -230,12 +338,16 @@ class CompensatedDrive:
     channels
         names of the numbers that the drive gives beside y, as for ``run_rig``; the host gets them,
         too.
+    safety
+        rules of the supervisor, as for ``run_rig``; ``Safety()`` by default, in which y has no
+        bounds, as nobody knows where the host will go. ``drive.rules.text(dt)`` shows them.
 
     Raises
     ------
     ValueError
         for another controller, limits of u that are not finite, a device of another dt, with other
-        numbers of signals or in Python only, a schedule without its signals.
+        numbers of signals or in Python only, a schedule without its signals, and for
+        ``most_error``, as the host alone has a reference.
     ConnectionError
         if a channel that the compensator uses does not come.
 
@@ -254,7 +366,12 @@ class CompensatedDrive:
     order = 0  # its state is not the rig's: a session of the host does not reset the drive
 
     def __init__(
-        self, device: Device, compensator: Compensator | Axes, *, channels: Sequence[str] = ()
+        self,
+        device: Device,
+        compensator: Compensator | Axes,
+        *,
+        channels: Sequence[str] = (),
+        safety: Safety | None = None,
     ) -> None:
         axes = compensator if isinstance(compensator, Axes) else None
         check_controller(compensator, "compensator", several=axes is not None)
@@ -268,11 +385,19 @@ class CompensatedDrive:
         limits = limits_of(compensator) if axes is None else (axes.limits.low, axes.limits.high)
         if not np.all(np.isfinite(limits)):
             raise ValueError("compensator: give it u_min and u_max, finite limits for the drive")
+        safety = Safety() if safety is None else safety
+        if np.any(np.isfinite(safety.most_error)):
+            raise ValueError(
+                f"most_error = {safety.most_error!r}: has no effect here, as the host has the "
+                "reference; leave it out, and give y_min and y_max where the plant must not go"
+            )
+        self.rules = safety.rules(compensator)
         check_counts(device, counts_of(compensator))
-        outputs = 1
+        outputs, inputs = counts_of(compensator) or (1, 1)
+        self.log_columns: tuple[str, ...] = ("mode", "u_drive")
         if axes is not None:  # a plant with several signals has these attributes
-            self.outputs, self.inputs = axes.outputs, axes.inputs
-            outputs = axes.outputs
+            self.outputs, self.inputs = outputs, inputs
+            self.log_columns = ("mode", *(f"u_drive[{c}]" for c in range(inputs)))
         own = float(getattr(device, "dt", compensator.dt))
         if abs(own - compensator.dt) > 1e-9 * compensator.dt:
             raise ValueError(
@@ -286,14 +411,19 @@ class CompensatedDrive:
                 "serial://"
             )
         self._state = compensator.initial_state()
+        command = HostCommand(np.zeros(inputs))
+        parts = (compensator, command, self.rules, ring(1, 1), self.channels, self._state)
+        self._controller = supervise(*parts)
+        # The drive's clock is not the proxy's: good samples in a row may never be many.
+        self._supervisor.memory[0].forgiven = self._controller.rules.hold
         self._drive = Drive(
+            y=np.full(outputs, np.nan),
             last=np.full(outputs, np.nan),
             silent=np.zeros(outputs, dtype=np.int64),
-            counts=np.zeros(4, dtype=np.int64),
-            most=max(round(_LOST_AFTER / compensator.dt), _LOST_SAMPLES),
+            counts=np.zeros(3, dtype=np.int64),
+            first=max(round(_FIRST / compensator.dt), _FIRST_SAMPLES),
         )
-        self._inputs = channel_inputs(compensator, self.channels)
-        await_channels(device, self._inputs, self.channels, compensator.dt)
+        await_channels(device, self._controller.inputs, self.channels, compensator.dt)
 
     def __repr__(self) -> str:
         place = getattr(self.device, "url", type(self.device).__name__)
@@ -308,13 +438,13 @@ class CompensatedDrive:
         """Return the parameters, for the compensator's sample time."""
         if abs(checks.positive("dt", dt, "s") - self.compensator.dt) > 1e-9 * dt:
             raise ValueError(f"dt = {dt!r} s: must be the compensator's, {self.compensator.dt!r} s")
-        controller = self.compensator.parameters, self._state
-        hold = default_hold(self.compensator.dt)
-        parts: Any = (*controller, self._inputs, hold, self._drive)
-        one = ProxyDesign(self._handle, system_clock(), *parts)
-        if not isinstance(self.compensator, Axes):
-            return one
-        return AxesProxyDesign(one, np.zeros(self.outputs), np.zeros(self.inputs))
+        one = ProxyDesign(self._handle, system_clock(), self._controller, self._drive)
+        return AxesProxyDesign(one) if isinstance(self.compensator, Axes) else one
+
+    @property
+    def watchdog(self) -> int:
+        """Ticks in a row without a command after which the host is lost: more than ``hold``."""
+        return int(self._controller.rules.hold) + 1
 
     @property
     def estimate(self) -> Any:
@@ -325,24 +455,41 @@ class CompensatedDrive:
     @property
     def counters(self) -> dict[str, int]:
         """Number of ticks without a measurement, of any axis, and of commands not sent."""
-        counts = self._drive.counts
-        return {"missing": int(counts[_MISSING]), "unsent": int(counts[_UNSENT])}
+        counters = self._supervisor.counters[0]
+        return {"missing": int(counters.missed), "unsent": int(counters.unsent)}
+
+    @property
+    def mode(self) -> Mode:
+        """The supervisor's mode."""
+        return Mode(int(self._supervisor.memory[0].mode))
+
+    @property
+    def u(self) -> Any:
+        """The u of the last tick, as sent to the drive; of several axes an array (m,)."""
+        if isinstance(self.compensator, Axes):
+            return self._controller.axes.u.copy()
+        return float(self._supervisor.memory[0].u)
+
+    def changes(self, first: int = 0) -> tuple[ModeChange, ...]:
+        """Return the changes of the supervisor's mode, from number ``first`` on."""
+        names = getattr(self.compensator, "names", ())
+        return mode_changes(self._supervisor, self.compensator.dt, first, names)
 
     @property
     def fault(self) -> str:
-        """Why the drive is lost, or silent for more than ``Safety.hold`` samples; else empty."""
-        reason, silent = int(self._drive.counts[_FAULT]), self._drive.silent
-        if reason in _REASONS:
-            return _REASONS[reason]
-        missing = np.flatnonzero(silent > default_hold(self.compensator.dt))
-        if missing.size == 0:
+        """The limit or fault for which u was ramped to zero, as a clause; else empty."""
+        memory = self._supervisor.memory[0]
+        cause = Cause(int(memory.ended_by))
+        if memory.mode < Mode.RAMP or cause.ending is not Ending.FAULT:
             return ""
-        ticks = int(silent.max())
-        of = ""
-        if isinstance(self.compensator, Axes) and missing.size < silent.size:
-            of = " of " + ", ".join(self.compensator.names[i] for i in missing)
-        time = f"{ticks} ticks, {ticks * self.compensator.dt:.3g} s"
-        return f"no measurement{of} has come for {time}"
+        names = getattr(self.compensator, "names", ())
+        signal = signal_name(cause, int(memory.ended_signal), names)
+        return f"{signal}: {cause.text}" if signal else cause.text
+
+    @property
+    def _supervisor(self) -> SupervisorState:
+        state: SupervisorState = self._controller.supervisor
+        return state
 
     def close(self) -> None:
         """Set the drive's u to zero and release it."""

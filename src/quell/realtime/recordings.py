@@ -23,9 +23,7 @@ nothing is padded, and arrays of fixed length have no count.
 
 from __future__ import annotations
 
-import functools
 import json
-import operator
 import os
 import re
 import time
@@ -36,7 +34,7 @@ from enum import IntFlag
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -44,6 +42,7 @@ from quell import checks
 from quell.checks import import_extra
 from quell.files import (
     MAX_SIZE,
+    GrowingFile,
     TooLargeError,
     byte_lines,
     bytes_of,
@@ -54,9 +53,25 @@ from quell.files import (
     written_atomically,
 )
 from quell.quantities import OF_AXES, AxesSignals, signals_from
-from quell.realtime.mcap_reader import MAGIC, MARK, RECORD, SCHEMA, TOPIC, read_mcap
+from quell.realtime.mcap_reader import (
+    MAGIC,
+    MARK,
+    RECORD,
+    SCHEMA,
+    TOPIC,
+    read_mcap,
+    whole_part,
+)
 from quell.records.axes import AxesTrajectory
-from quell.records.record import check_steps, check_times, columns_of, describe, is_vector, units_of
+from quell.records.record import (
+    check_steps,
+    check_times,
+    columns_of,
+    describe,
+    flags_of,
+    is_vector,
+    units_of,
+)
 from quell.records.trajectory import Trajectory
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -255,7 +270,8 @@ class CsvSink:
     def __init__(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         self.path, self.overwrite = Path(path), overwrite
         self.name = str(self.path)
-        self._file: BinaryIO | None = None
+        self.stored = 0  #: rows that are in the file; after a failure it ends with the last one
+        self._file: GrowingFile | None = None
         self._dt = 0.0
         self._first = True
 
@@ -270,10 +286,15 @@ class CsvSink:
         self.path.unlink(missing_ok=True)
         with written_atomically(header_path(self.path), self.overwrite) as part:
             part.write_text(header.to_json() + "\n", encoding="utf-8")
-        self._dt, self._first = header.dt, True
-        self._file = self.path.open("xb")
-        self._file.write((",".join(("time", *header.columns)) + "\n").encode())
-        self._file.flush()
+        self._dt, self._first, self.stored = header.dt, True, 0
+        self._file = GrowingFile(self.path)
+        try:
+            self._file.add(",".join(("time", *header.columns)) + "\n")
+        except OSError:
+            self.close()
+            self.path.unlink(missing_ok=True)
+            header_path(self.path).unlink(missing_ok=True)
+            raise
 
     def write(self, rows: Matrix) -> None:
         """Add a line for each row."""
@@ -286,12 +307,13 @@ class CsvSink:
             text = partial(np.format_float_positional, trim="0") if self._first else repr
             lines.append(",".join(map(text, numbers)))
             self._first = False
-        self._file.write(("\n".join(lines) + "\n").encode())
+        try:
+            self._file.add("\n".join(lines) + "\n")
+        finally:
+            self.stored = self._file.lines - 1
 
     def flush(self) -> None:
-        """Pass what was written to the operating system, where it outlives the process."""
-        if self._file is not None:
-            self._file.flush()
+        """Do nothing: the file has no buffer."""
 
     def close(self) -> None:
         """Close the file."""
@@ -550,6 +572,7 @@ class McapSink:
     def __init__(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         self.path, self.overwrite = Path(path), overwrite
         self.name = str(self.path)
+        self.stored = 0  #: number of rows in the file, once it is closed
         self._writer: Any = None
         self._flushed = 0.0
 
@@ -575,12 +598,14 @@ class McapSink:
         if self._file.error is not None:  # a full disk: nothing must move unrecorded
             with suppress(OSError):
                 self.close()
+            self.path.unlink(missing_ok=True)
             raise self._file.error
 
     def write(self, rows: Matrix) -> None:
         """Add a message for each row."""
         log_rows(self._topic, self._header, rows)
         self._check()
+        self.stored += rows.shape[0]
 
     def flush(self) -> None:
         """Finish the chunk if it is half a second old."""
@@ -590,12 +615,15 @@ class McapSink:
         self._check()
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file; after a failure, make it end with its last whole chunk."""
         if self._writer is not None:
             writer, self._writer = self._writer, None
             self._topic.close()
             writer.close()
             self._file.close()
+            if self._file.error is not None:
+                size, self.stored = whole_part(self.path)
+                os.truncate(self.path, size)
             self._check()
 
     def _check(self) -> None:
@@ -689,7 +717,8 @@ def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE
     log, status = _filled(header.channels, rows, most), 0
     check_times(log.shape[0], header.dt)
     if any(name == "status" for name, _ in header.channels):
-        status = _all_flags(rows[:, columns_of(header.channels, "status").start])
+        column = rows[:, columns_of(header.channels, "status").start]
+        status = int(np.bitwise_or.reduce(flags_of(column)))
     common: dict[str, Any] = {
         "log": log,
         "channels": header.channels,
@@ -705,13 +734,6 @@ def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE
     return AxesTrajectory(
         **common, axis_names=header.axis_names, axis_features=header.axis_features
     )
-
-
-def _all_flags(column: Vector) -> int:
-    """Return the flags that any row has; a number that is no sum of flags counts as none."""
-    known = functools.reduce(operator.or_, Status)
-    valid = np.where((column >= 0.0) & (column <= known), column, 0.0)
-    return int(np.bitwise_or.reduce(valid.astype(np.int64)))
 
 
 def _filled(channels: Channels, rows: Matrix, most: int) -> Matrix:
@@ -738,7 +760,10 @@ def _filled(channels: Channels, rows: Matrix, most: int) -> Matrix:
 
 
 class Sink(Protocol):
-    """A receiver of rows; all methods except ``open`` are called on the writer's thread."""
+    """A receiver of rows; all methods except ``open`` are called on the writer's thread.
+
+    One that can lose rows which it has taken says with ``stored`` how many are safe.
+    """
 
     name: str  #: name in messages
 

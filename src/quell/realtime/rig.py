@@ -47,15 +47,15 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TextIO
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
-from quell.files import check_writable
+from quell.files import GrowingFile, check_writable
 from quell.kernels.dispatch import (
     call_specialised,
     compiled,
@@ -103,6 +103,8 @@ STATES = ("idle", "waiting", "live", "tripped")
 # Longest wait before ``stop`` is checked again [ns]: 0.1 s, short for a person. Chosen by hand.
 _CHECK_STOP_EVERY = 100_000_000
 
+WATCHDOG = 20
+"""Ticks without a command after which u is zero, by default."""
 HELLO_WORTH = 2
 """Measurements for a hello. With the welcome it is answered by three times its bytes at most, the
 limit of RFC 9000 (QUIC), section 8.1, for an address that has not proved that it receives."""
@@ -112,10 +114,12 @@ LAST_WORDS = 10
 
 # Entries of ``RigModel.counts``: state, ticks without a fresh command, all ticks, ticks since the
 # plant was at rest, sessions, refused hellos, trips of the watchdog, clipped commands, late ticks,
-# destroyed states that were put back to rest, measurements that the other side has asked for.
+# destroyed states that were put back to rest, measurements that the other side has asked for, the
+# next channel in turn, and 0, or for a tick that is late by more than one 1, or 2 if the one before
+# was less late.
 STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
-RESTORED, ASKED, TURN = 9, 10, 11
-COUNTS = 12
+RESTORED, ASKED, TURN, BEHIND = 9, 10, 11, 12
+COUNTS = 13
 # Rows of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
 APPLIED, COMMANDED, LARGEST = range(3)
 
@@ -142,9 +146,28 @@ def measure_channels(plant: Any, x: Vector, values: Vector) -> None:
 
 
 @generic_with_default
-def is_lost(plant: Any) -> bool:
-    """Return whether a plant that is a machine can't go on; the rig then ends. By default not."""
+def has_ended(plant: Any) -> bool:
+    """Return whether a plant that is a machine is at rest for good; the rig then ends."""
     return False
+
+
+@generic_with_default
+def may_end(plant: Any, stop: int) -> bool:
+    """Return whether the rig may end; a machine is brought to rest first, and ends the rig then.
+
+    ``stop`` says how often ``Rig.stop`` was called.
+    """
+    return True
+
+
+@generic_with_default
+def tell_host(plant: Any, counts: NDArray[np.int64], session: int) -> None:
+    """Tell a plant that is a machine the state of its host's session (``RigModel.counts``)."""
+
+
+@generic_with_default
+def fill_log(plant: Any, row: Vector) -> None:
+    """Write what a plant adds to a row of the log: the columns that it has as ``log_columns``."""
 
 
 class OneSignal(NamedTuple):
@@ -222,7 +245,7 @@ class RigModel(NamedTuple):
     log: Ring
     logged: bool
     lateness: NDArray[np.int64]  # histogram of how late ticks were, see ``system.histogram``
-    stop: NDArray[np.int64]  # ``serve`` ends if this is not zero (1,)
+    stop: NDArray[np.int64]  # how often ``Rig.stop`` was called, which ends ``serve`` (1,)
 
 
 @kernel
@@ -234,6 +257,7 @@ def tick(rig: RigModel, time: int, fresh: bool) -> None:
     counts, signals = rig.counts, rig.signals
     fresh |= _receive_command(rig, time)
     _update_watchdog(rig, fresh)
+    tell_host(rig.plant.plant, counts, rig.endpoint.numbers[wire.SESSION])
     measure_into(rig.plant, rig.x, rig.y)
     measure_channels(rig.plant.plant, rig.x, rig.channels)
     if counts[STATE] != IDLE and counts[ASKED] > 0:
@@ -243,12 +267,12 @@ def tick(rig: RigModel, time: int, fresh: bool) -> None:
         wire.write_next_numbers(rig.outbox, rig.endpoint, wire.MEASUREMENT, time, rig.y, state)
         if send(rig.transport, rig.outbox) != 0:
             rig.endpoint.counters[wire.NOT_SENT] += 1
+    t, u = counts[SINCE_REST] * rig.dt, signals[APPLIED]
+    advance_under(rig.plant, rig.x, rig.scratch, t, u, rig.w)
     if rig.logged:
         _log(rig)
     for k in range(signals.shape[1]):
         signals[COMMANDED, k] = np.nan
-    t, u = counts[SINCE_REST] * rig.dt, signals[APPLIED]
-    advance_under(rig.plant, rig.x, rig.scratch, t, u, rig.w)
     counts[SINCE_REST] += 1
     counts[TICKS] += 1
 
@@ -416,6 +440,7 @@ def _log(rig: RigModel) -> None:
     for k in range(inputs):
         row[4 + outputs + k] = signals[APPLIED, k]
         row[4 + outputs + inputs + k] = signals[COMMANDED, k]
+    fill_log(rig.plant.plant, row[4 + outputs + 2 * inputs :])
     push(rig.log, row)
 
 
@@ -423,33 +448,39 @@ def _log(rig: RigModel) -> None:
 def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> bool:
     """Tick until ``rig.stop`` is set, or ``most`` times if it is not negative.
 
-    Return whether the plant is lost; then there is no further tick. If ``paced``, there is one tick
-    each dt; otherwise they follow each other at once.
+    Return whether the plant has ended; then there is no further tick. If ``paced``, there is one
+    tick each dt; otherwise they follow each other at once.
     """
     begin = now(clock)
     period = 1e9 * rig.dt
-    k = 0
-    while k != most and load_acquire(rig.stop, 0) == 0:
+    k = before = 0
+    while True:
+        over = (most >= 0 and k >= most) or load_acquire(rig.stop, 0) != 0
+        if over and (not paced or may_end(rig.plant.plant, load_acquire(rig.stop, 0))):
+            break
         time = begin
         if paced:
             deadline = begin + int(np.rint(k * period))
             time = now(clock)
-            while deadline - time > _CHECK_STOP_EVERY and load_acquire(rig.stop, 0) == 0:
+            while deadline - time > _CHECK_STOP_EVERY and (over or load_acquire(rig.stop, 0) == 0):
                 time = wait_until(clock, time + _CHECK_STOP_EVERY)
-            if load_acquire(rig.stop, 0) != 0:
-                break
+            if not over and load_acquire(rig.stop, 0) != 0:
+                continue
             time = wait_until(clock, deadline)
             late = time - deadline
             count_duration(rig.lateness, late)
+            rig.counts[BEHIND] = 0
             if late > period:
+                rig.counts[BEHIND] = 2 if late > before else 1
                 rig.counts[CAUGHT_UP] += 1
+            before = late
         fresh = False
         if rig.wait > 0:
             fresh, waited = _await_answer(rig, clock)
             begin += waited
         tick(rig, time, fresh)
         k += 1
-        if is_lost(rig.plant.plant):
+        if has_ended(rig.plant.plant):
             return True
     return False
 
@@ -503,7 +534,8 @@ class Rig:
     listener
         its end of the wire; ``close`` closes it.
     watchdog
-        ticks in a row without a fresh, finite command after which u is zero until a new session.
+        ticks in a row without a fresh, finite command after which u is zero until a new session; 20
+        by default, or what a ``CompensatedDrive`` allows its host.
     u_max
         larger commands are cut to it [u-unit]; one for all control signals, or one for each.
     rest
@@ -534,7 +566,7 @@ class Rig:
         dt: float,
         listener: Listener,
         *,
-        watchdog: int = 20,
+        watchdog: int | None = None,
         u_max: ArrayLike = np.inf,
         rest: bool = True,
         wait: float = 0.0,
@@ -557,11 +589,14 @@ class Rig:
             rule = f"must have at most {wire.MOST_SIGNALS} of each, for a frame of the wire"
             raise ValueError(f"plant: {outputs} outputs and {inputs} control signals; {rule}")
         largest = _checked_limits(u_max, inputs)
+        if watchdog is None:
+            watchdog = getattr(plant, "watchdog", WATCHDOG)
         watchdog = checks.whole("watchdog", watchdog, 1, _MOST_TICKS)
         start = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)
         rows = max(round(_BUFFERED / dt), _LEAST_ROWS)
         self.channels = _checked_channels(plant, channels)
-        self._columns, model = log_columns(outputs, inputs), plant.sampled(dt)
+        self._columns = (*log_columns(outputs, inputs), *getattr(plant, "log_columns", ()))
+        model = plant.sampled(dt)
         room = 1 if outputs == inputs == 1 else wire.MOST_SIGNALS
         self.listener = listener
         self.dt, self.signal_counts = dt, several
@@ -593,7 +628,7 @@ class Rig:
             stop=np.zeros(1, dtype=np.int64),
         )
         self._file = None if log is None else _opened(log, overwrite, self._columns)
-        self._log_failure = ""
+        self._log_failure, self._lost = "", 0
         self._clock = system_clock()
         self._open = True
 
@@ -635,8 +670,8 @@ class Rig:
 
     @property
     def unlogged(self) -> int:
-        """Ticks that are missing in the log because it could not be written fast enough."""
-        return dropped(self.model.log) if self.model.logged else 0
+        """Ticks that are missing in the log, which could not be written, or not fast enough."""
+        return dropped(self.model.log) + self._lost if self.model.logged else 0
 
     def tick(self, count: int = 1) -> None:
         """Perform ``count`` ticks at once, without a clock: for tests that go step by step."""
@@ -648,13 +683,18 @@ class Rig:
         self._serve(0, False)
 
     def run(
-        self, seconds: float | None = None, *, priority: int = 0, cpu: int | None = None
+        self,
+        seconds: float | None = None,
+        *,
+        priority: int = 0,
+        cpu: int | None = None,
+        watch: Callable[[], Any] | None = None,
     ) -> list[str]:
         """Tick in real time for ``seconds``, or until a signal or another thread calls ``stop``.
 
-        It ends at once, and the session with it, where the plant is a drive that is lost. The ticks
-        run on their own thread, which needs no Python; the calling thread writes the log.
-        Return sentences about which requests the system has granted.
+        Where the plant is a ``CompensatedDrive``, it is brought to rest first, and its end is that
+        of the run and of the session. The ticks run on their own thread, which needs no Python; the
+        calling thread writes the log. Return sentences about which requests the system has granted.
 
         Parameters
         ----------
@@ -664,6 +704,8 @@ class Rig:
             SCHED_FIFO priority of the ticks, 1 to 99, together with locked memory; 0 for neither.
         cpu
             number of the processor for the ticks; any by default.
+        watch
+            called about twenty times a second, and at the end, in this thread.
 
         Raises
         ------
@@ -692,6 +734,8 @@ class Rig:
                 while thread.is_alive():
                     thread.join(_WRITE_EVERY)
                     self._write_log()
+                    if watch is not None:
+                        watch()
             finally:
                 self.stop()
                 thread.join()
@@ -703,8 +747,8 @@ class Rig:
         return notes
 
     def stop(self) -> None:
-        """End ``run`` at its next tick."""
-        store_release(self.model.stop, 0, 1)
+        """End ``run`` at its next tick; a second call does not wait for a ramp of u."""
+        store_release(self.model.stop, 0, int(self.model.stop[0]) + 1)
 
     def close(self) -> None:
         """End the session, if there is one, and release the wire; a second call does nothing."""
@@ -738,18 +782,24 @@ class Rig:
             self._end_session()
 
     def _write_log(self) -> None:
-        if self._file is None or self._file.closed:
+        if self._file is None:
             return
-        try:
-            for row in drain(self.model.log):
-                k, t, session, state, *values = row.tolist()
-                cells = f"{int(k)},{t:.9g},{int(session)},{int(state)}"
-                self._file.write(",".join((cells, *map(repr, values))) + "\n")
-            self._file.flush()
-        except OSError as error:  # a full disk must not end the loop
-            self._log_failure = f"the log was given up: {error.strerror}"
-            with suppress(OSError):
+        rows = drain(self.model.log).tolist()
+        lines = self._file.lines
+        if not self._file.closed:
+            try:
+                self._file.add("".join(map(_line, rows)))
+            except OSError as error:  # a full disk must not end the loop
+                self._log_failure = f"the log was given up: {error.strerror}"
                 self._file.close()
+        self._lost += len(rows) - (self._file.lines - lines)
+
+
+def _line(row: list[float]) -> str:
+    """Return a row of the log as a line."""
+    k, t, session, state, *values = row
+    cells = f"{int(k)},{t:.9g},{int(session)},{int(state)}"
+    return ",".join((cells, *map(repr, values))) + "\n"
 
 
 def _checked_channels(plant: Any, channels: ArrayLike) -> Vector:
@@ -789,7 +839,7 @@ def checked_seconds(name: str, seconds: float) -> float:
     return seconds
 
 
-def _opened(path: str | Path, overwrite: bool, columns: tuple[str, ...]) -> TextIO:
+def _opened(path: str | Path, overwrite: bool, columns: tuple[str, ...]) -> GrowingFile:
     """Return the open log, with its header written; a device like /dev/null may be one, too."""
     target = Path(path)
     if target.is_file():
@@ -797,8 +847,15 @@ def _opened(path: str | Path, overwrite: bool, columns: tuple[str, ...]) -> Text
     try:
         if target.is_file():
             target.unlink()
-        file = target.open("w" if target.exists() else "x", encoding="utf-8", newline="")
+        new = not target.exists()
+        file = GrowingFile(target)
+        try:
+            file.add(",".join(columns) + "\n")
+        except OSError:
+            file.close()
+            if new:
+                target.unlink(missing_ok=True)
+            raise
     except OSError as error:
         raise ValueError(f"log = {str(path)!r}: can't be written ({error.strerror})") from None
-    file.write(",".join(columns) + "\n")
     return file

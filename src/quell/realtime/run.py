@@ -101,7 +101,7 @@ class Tally(NamedTuple):
     missed: int  # cycles without a good measurement
     clipped: int  # cycles in which the supervisor's limits changed the controller's u
     unsent: int  # commands that could not be sent
-    rows_lost: int  # rows that found the telemetry's ring full
+    rows_lost: int  # rows that are missing in a file, or another sink: a full disk, a slow one
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +185,15 @@ _OF_AXIS = (Cause.MISSED, Cause.LOST, Cause.IMPLAUSIBLE, Cause.TRACKING_ERROR, C
 _OF_ACTUATOR = (Cause.SATURATED, Cause.NOT_A_NUMBER)
 
 
+def signal_name(cause: Cause, signal: int, axis_names: Sequence[str]) -> str:
+    """Return the axis or actuator, number ``signal`` from 1 on, to which a cause is due."""
+    if axis_names and signal and cause in (*_OF_AXIS, Cause.WRONG_WAY):
+        return axis_names[signal - 1]
+    if axis_names and signal and cause in _OF_ACTUATOR:
+        return f"u[{signal - 1}]"
+    return ""
+
+
 def mode_changes(
     state: SupervisorState, dt: float, first: int = 0, axis_names: Sequence[str] = ()
 ) -> tuple[ModeChange, ...]:
@@ -195,11 +204,7 @@ def mode_changes(
     rows = state.changes[first : load_acquire(state.changed, 0)]
     changes = []
     for k, mode, cause, signal in rows.tolist():
-        name = ""
-        if axis_names and signal and cause in (*_OF_AXIS, Cause.WRONG_WAY):
-            name = axis_names[signal - 1]
-        elif axis_names and signal and cause in _OF_ACTUATOR:
-            name = f"u[{signal - 1}]"
+        name = signal_name(Cause(cause), signal, axis_names)
         changes.append(ModeChange(k * dt, Mode(mode), Cause(cause), name))
     return tuple(changes)
 
@@ -450,7 +455,7 @@ def run_rig(
         record=record,
         timing=loop.timing,
         changes=changes,
-        tally=tally(supervisor, writer.dropped),
+        tally=tally(supervisor, writer.lost),
         counters=counters,
         notes=tuple(notes),
         rules=rules,

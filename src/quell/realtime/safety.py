@@ -62,6 +62,22 @@ def inner_adrc(controller: Any) -> ADRC | None:
     return controller
 
 
+# Score at which the check of a compensator's b0 ends the run, in lag times of its observer
+# (``quell.realtime.supervisor``): honest loops came to 5.8.
+_OPPOSED = 8.0
+
+
+def most_opposed(controller: Any) -> float:
+    """Return the largest score of the check of b0 [samples]; infinite for none.
+
+    That is of a compensator alone, without a table of b0.
+    """
+    inner = getattr(controller, "controller", controller)
+    if not takes_control(inner) or getattr(inner.schedule, "b0", inner.schedule) is not None:
+        return math.inf
+    return float(_OPPOSED * inner.observer.lag_time / inner.dt)
+
+
 def plausible_range(reference: ArrayLike, reach: float) -> tuple[float, float]:
     """Return bounds of y that a good run does not come near to [y-unit].
 
@@ -116,6 +132,7 @@ class AxesReference(NamedTuple):
     derivatives: Buffer  # (samples, d): those of the first axis, then of the second …
     approach: Buffer  # (·, 1 + most of an axis)
     current: Vector  # work array: derivatives of one sample (d,)
+    given: Vector  # what the controllers get in one sample (n,)
     counts: NDArray[np.int64]  # derivatives of each axis (n,)
 
 
@@ -125,7 +142,8 @@ def axes_reference(scenario: Scenario, axes: Axes, approach: float) -> AxesRefer
     counts = np.array(axes.derivatives, dtype=np.int64)
     time = checks.non_negative("approach", approach, "s")
     curve = approach_curve(axes.dt, time, int(np.max(counts)))
-    return AxesReference(r, derivatives, curve, np.zeros(derivatives.shape[1]), counts)
+    current, given = np.zeros(derivatives.shape[1]), np.zeros(r.shape[1])
+    return AxesReference(r, derivatives, curve, current, given, counts)
 
 
 def axes_reference_columns(scenario: Scenario, axes: Axes) -> tuple[Matrix, Matrix]:
@@ -287,7 +305,8 @@ class Safety:
         ``most_saturated`` in seconds; any time by default.
     check_direction
         whether u is ramped to zero if y first moves, and runs away, against the sign of b0 u
-        (``quell.realtime.supervisor``); only for controllers with a b0.
+        (``quell.realtime.supervisor``); only for controllers with a b0. Of a compensator: if y goes
+        against b0 u while u is at a limit.
 
     Raises
     ------
@@ -390,6 +409,8 @@ class Safety:
             r = reference_samples(scenario, controller.dt, 0, 0.0).r
             y_low, y_high = plausible_range(r, scale)
         adrc = inner_adrc(controller) if self.check_direction else None
+        inner: Any = getattr(controller, "controller", controller)
+        opposed = most_opposed(controller) if self.check_direction else math.inf
         return Rules(
             low=low,
             high=high,
@@ -399,6 +420,8 @@ class Safety:
             y_high=y_high if limits.y_max is None else float(limits.y_max),
             direction=0.0 if adrc is None else math.copysign(1.0, adrc.parameters.b0),
             reach=scale,
+            b0=math.nan if math.isinf(opposed) else float(inner.observer.b0),
+            most_opposed=opposed,
             **self._counts(controller.dt),
         )
 
@@ -443,6 +466,12 @@ class Safety:
                 direction=np.where(np.isfinite(scale) & self.check_direction, 1.0, 0.0),
                 reach=scale,
                 push=push,
+                most_opposed=np.array(
+                    [
+                        most_opposed(axis) if axes.takes_u_0 and self.check_direction else math.inf
+                        for axis in axes.axes
+                    ]
+                ),
                 **self._counts(axes.dt),
             ),
         )

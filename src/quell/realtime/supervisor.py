@@ -34,6 +34,22 @@ plane and noise move y against u as well, but not so far. So the run ends only i
 
 The numbers come from random honest loops with loads, friction, delays, zeros in the right half
 plane and learners, and the same loops with a wrong sign: ``benchmarks/direction.py``.
+
+A check of the sign of b0 of a compensator, whose reference is known to its host only.
+
+While u is not at a limit, ``f̂ + b0 u = b0 u_0`` by definition, with each sign of b0. At a limit
+that sum is what really moves y, ``y^(n)`` without a model. With the wrong sign it goes against
+``b0 u``, and the compensator, which takes this for a load, holds u at the limit. So in each sample
+at a limit ``−(f̂ + b0 u) b0 u``, in units of the largest ``(b0 u)²``, is added to a score, and in
+the others a quarter is taken from it. The run ends where the score is above eight lag times of the
+observer. A load within the limits of u keeps it at zero; a spring that swings at a limit brought it
+to 5.8 lag times, in the worst of 300 honest loops (``benchmarks/proxy_faults.py``).
+
+The host of a loop.
+
+The proxy (``quell.realtime.proxy``) is driven by a host. Without one it stays in START, ready, with
+u at zero. A host that ends its session brings it through RAMP and STOPPED back to START; one that
+falls silent ends the run as any other fault does.
 """
 
 from __future__ import annotations
@@ -69,6 +85,14 @@ class Request(IntEnum):
     NONE = 0
     RAMP = 1  #: ramp u to zero
     ZERO = 2  #: set u to zero at once
+
+
+class Host(IntEnum):
+    """The host that a loop needs; a loop with a reference of its own needs none."""
+
+    PRESENT = 0  #: it commands, or none is needed
+    ABSENT = 1  #: there is none, or it has not sent a command yet
+    LOST = 2  #: it fell silent in the middle of its session
 
 
 class Ending(IntEnum):
@@ -123,6 +147,9 @@ class Cause(IntEnum):
         "y ran away against u: look at the sign of y, of u and of b0, or for a load beyond u's "
         "limits",
     )
+    HOST_LEFT = 21, "the host has ended its session", Ending.REQUESTED
+    HOST_LOST = 22, "no command of the host came in time: look at the host and its wire"
+    WAITING = 23, "u is zero, the next host may come", Ending.NO
 
 
 # ---- Rules and state of the supervisor ----
@@ -149,11 +176,13 @@ class Rules(NamedTuple):
     longest_start: int = 1 << 60  #: samples after which START is given up
     direction: float = 0.0  #: sign of b0; 0 for no check of the first motion
     reach: float = np.nan  #: error at which the law puts u to its limit [y-unit]
+    b0: float = np.nan  #: of a compensator [y-unit/s^n per u-unit]
+    most_opposed: float = np.inf  #: largest score of the check of its sign [samples]
 
     def text(self, dt: float) -> str:
         """Return the rules as a line of text, for a sample time ``dt`` [s]."""
         parts = [f"u from {self.low:.6g} to {self.high:.6g}", *self.bounds_text()]
-        parts.append("first motion checked" if self.direction else "first motion not checked")
+        parts.append(checked_text(bool(self.direction), self.most_opposed))
         return ", ".join([*parts, *counts_of_samples(self, dt)])
 
     def bounds_text(self) -> list[str]:
@@ -180,6 +209,7 @@ class AxesLimits(NamedTuple):
     direction: Vector  #: 1, or 0 for no check of the first motion
     reach: Vector
     push: Vector  #: largest ``|v|`` within the limits of u, with the first B0 [y-unit/s^n]
+    most_opposed: Vector
     hold: int
     ramp: int
     settle: int
@@ -208,8 +238,8 @@ class AxesRules:
                 *(limits.y_low[i], limits.y_high[i]),
             )
             parts += [f"{name}: {part}" for part in own.bounds_text()]
-        checked = "checked" if np.any(limits.direction) else "not checked"
-        return ", ".join([*parts, f"first motion {checked}", *counts_of_samples(limits, dt)])
+        checked = checked_text(bool(np.any(limits.direction)), float(np.min(limits.most_opposed)))
+        return ", ".join([*parts, checked, *counts_of_samples(limits, dt)])
 
     def _asdict(self) -> dict[str, Any]:
         """Return the rules by name, as ``Rules`` does; lists have one for each signal."""
@@ -217,6 +247,13 @@ class AxesRules:
         for name, value in self.limits._asdict().items():
             found[name] = value.tolist() if isinstance(value, np.ndarray) else value
         return found
+
+
+def checked_text(first_motion: bool, most_opposed: float) -> str:
+    """Return which check of signs there is as text."""
+    if np.isfinite(most_opposed):
+        return "sign of b0 checked"
+    return "first motion checked" if first_motion else "first motion not checked"
 
 
 def counts_of_samples(rules: Any, dt: float) -> list[str]:
@@ -251,6 +288,12 @@ class Memory(Scalars):
     pushed: float  #: sum of u since then, with the sign of b0 [u-unit]
     watching: int  #: how the first motion is judged, see ``quell.realtime.supervisor``
     culprit: int  #: number of the signal, from 1, to which the next change is due; 0 if to none
+    opposed: float  #: score of the check of the sign of b0 [samples]
+    forgiven: int  #: missed samples in a row after which START goes on to count good ones
+    host: int  #: a ``Host``
+    waited: int  #: index k of the last cycle without a host
+    ended_by: int  #: cause of the last RAMP, or of STOPPED without one
+    ended_signal: int  #: its signal, as ``culprit``
 
 
 class Counters(Scalars):
@@ -329,6 +372,28 @@ def runs_away(rules: Any, memory: Memory, r: float) -> bool:
     return abs(memory.u) >= _STRONG * limit and abs(moved) > far
 
 
+# Taken from the score of the check of b0 in a sample in which u is not at a limit. Chosen with the
+# lag times of ``quell.realtime.safety`` by random loops: benchmarks/proxy_faults.py.
+_FORGIVEN = 0.25
+
+
+@kernel
+def is_opposed(memory: Memory, most: float, v: float, f_hat: float, push: float, at: bool) -> bool:
+    """Update the score of the check of the sign of b0; return whether it is above ``most``.
+
+    ``v`` is b0 times the u that acted until this sample, ``push`` the largest, and ``at`` says
+    whether u was at a limit.
+    """
+    if not is_finite(most):
+        return False
+    if at:
+        memory.opposed -= min(max((f_hat + v) * v / (push * push), -1.0), 1.0)
+    else:
+        memory.opposed -= _FORGIVEN
+    memory.opposed = max(memory.opposed, 0.0)
+    return memory.opposed > most
+
+
 # ---- The supervisor ----
 
 # Once u is zero it is written FLUSH + 1 more times, in case frames are lost. Chosen by hand.
@@ -343,6 +408,8 @@ def change_mode(state: SupervisorState, k: int, mode: int, cause: int) -> None:
     memory.samples = 0
     if mode == Mode.RAMP:
         memory.ramp_start = memory.u
+    if mode >= Mode.RAMP and cause != Cause.RAMPED:
+        memory.ended_by, memory.ended_signal = cause, memory.culprit
     number = state.changed[0]
     kept = state.changes.shape[0]
     if number < kept - RESERVED or (number < kept and mode >= Mode.RAMP):
@@ -367,6 +434,7 @@ def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples:
     outside = memory.y < rules.y_low or memory.y > rules.y_high
     choose_mode(rules, state, k, good, 1 if outside else 0, samples)
     if settling and memory.mode == Mode.RUN:
+        memory.at_limit_in_row = 0
         begin_watch(memory, y, rules.direction)
     elif settling and good and memory.mode == Mode.START:
         widen_rest(memory, y)
@@ -375,7 +443,7 @@ def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples:
 @kernel
 def begin_watch(memory: Memory, y: float, direction: float) -> None:
     """Begin to judge the first motion, from y on, unless ``direction`` is 0."""
-    memory.y_began = y
+    memory.y_began, memory.opposed = y, 0.0
     memory.watching = ARMED if direction != 0.0 else OFF
 
 
@@ -399,6 +467,8 @@ def choose_mode(
     if not good:
         memory.missed_in_row += 1
         state.counters[0].missed += 1
+    if memory.host != Host.PRESENT:
+        memory.waited = k
     mode = memory.mode
     request = load_acquire(state.requests, 0)
     if request == Request.ZERO and mode != Mode.STOPPED:
@@ -409,12 +479,12 @@ def choose_mode(
             change_mode(state, k, Mode.RAMP, cause)
         elif mode == Mode.START:
             if not good:
-                memory.samples = 0
-            elif memory.samples >= rules.settle:
+                memory.samples = 0 if memory.missed_in_row > memory.forgiven else memory.samples
+            elif memory.samples < rules.settle:
+                memory.samples += 1
+            elif memory.host == Host.PRESENT:
                 change_mode(state, k, Mode.RUN, Cause.SETTLED)
                 memory.began = k
-            else:
-                memory.samples += 1
         elif good and mode == Mode.HOLD:
             change_mode(state, k, Mode.RUN, Cause.RECOVERED)
         elif not good and mode == Mode.RUN:
@@ -442,7 +512,11 @@ def _cause_to_end(
         cause = Cause.WATCHDOG
     elif outside != 0:
         cause, memory.culprit = Cause.IMPLAUSIBLE, outside
-    elif memory.mode == Mode.START and k > rules.longest_start:
+    elif memory.host == Host.LOST:
+        cause = Cause.HOST_LOST
+    elif memory.host == Host.ABSENT and memory.mode != Mode.START:
+        cause = Cause.HOST_LEFT
+    elif memory.mode == Mode.START and k - memory.waited > rules.longest_start:
         cause = Cause.UNSETTLED
     elif memory.began >= 0 and k - memory.began >= samples:
         cause = Cause.COMPLETED
@@ -461,6 +535,9 @@ def supervised_output(
     memory = state.memory[0]
     u = 0.0
     if memory.mode == Mode.RUN:
+        at_limit = memory.at_limit_in_row > 0
+        push = rules.b0 * max(rules.high, -rules.low)
+        opposed = is_opposed(memory, rules.most_opposed, rules.b0 * memory.u, f_hat, push, at_limit)
         u = min(max(wished, rules.low), rules.high)
         at_limit = u == rules.low or u == rules.high
         memory.at_limit_in_row = memory.at_limit_in_row + 1 if at_limit else 0
@@ -472,7 +549,7 @@ def supervised_output(
             change_mode(state, k, Mode.RAMP, Cause.F_HAT)
         elif memory.at_limit_in_row > rules.most_saturated:
             change_mode(state, k, Mode.RAMP, Cause.SATURATED)
-        elif runs_away(rules, memory, r):
+        elif opposed or runs_away(rules, memory, r):
             change_mode(state, k, Mode.RAMP, Cause.WRONG_WAY)
     elif memory.mode == Mode.HOLD:
         u = memory.u
@@ -487,6 +564,14 @@ def supervised_output(
         memory.samples += 1
     memory.u = u
     return u
+
+
+@kernel
+def wait_for_host(state: SupervisorState, k: int) -> None:
+    """Begin again in START, after a host has ended its session and u is zero."""
+    memory = state.memory[0]
+    memory.began, memory.waited = -1, k
+    change_mode(state, k, Mode.START, Cause.WAITING)
 
 
 @kernel

@@ -8,9 +8,7 @@ index of the channel as state flags, and its value.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-import operator
 import time
 
 import numpy as np
@@ -20,6 +18,7 @@ from quell.kernels.dispatch import compiled, specialised
 from quell.realtime import wire
 from quell.realtime.wire import WireHandle, is_own, receive, wait_for_frame
 from quell.realtime.wire_device import WireDevice
+from quell.records.record import flags_of
 from quell.records.trajectory import Trajectory
 from quell.signals.shapes import Signal, as_signal
 from quell.types import Channels, Matrix, Status
@@ -178,6 +177,5 @@ def _store(log: Matrix, values: Matrix, first: int) -> None:
 def _trajectory(device: WireDevice, channels: Channels, log: Matrix) -> Trajectory:
     record = Trajectory(log, channels, device.dt, ended=(len(log) - 1) * device.dt)
     flags = record["status"] if "status" in record.names else np.zeros(0)
-    known = flags[(flags >= 0.0) & (flags <= max(Status) * 2)].astype(np.int64)
-    status = Status(functools.reduce(operator.or_, known.tolist(), 0))
+    status = Status(int(np.bitwise_or.reduce(flags_of(flags))))
     return dataclasses.replace(record, status=status, plant=device.url)

@@ -82,6 +82,11 @@ class Delivery:
         self._thread = Thread(target=self._run, name=f"quell-{sink.name}", daemon=True)
         self._thread.start()
 
+    @property
+    def stored(self) -> int:
+        """Number of rows that the sink has, as far as it knows."""
+        return int(getattr(self.sink, "stored", self.rows))
+
     def put(self, rows: Matrix) -> None:
         """Take rows, which may be none, for the next round; never wait."""
         if self._failed or (not rows.size and not self._queue.empty()):
@@ -128,11 +133,11 @@ class Delivery:
         except BaseException as error:  # a panic of a library in Rust is not an Exception
             self._failed = True
             why = error.strerror if isinstance(error, OSError) and error.strerror else error
-            self._report(f"{self.sink.name}: {why}; closed after {self.rows} rows")
             try:
                 self.sink.close()
             except BaseException as again:
                 _LOG.debug("%s: closing failed as well: %s", self.sink.name, again)
+            self._report(f"{self.sink.name}: {why}; closed after {self.stored} rows")
             return False
         return True
 
@@ -273,6 +278,11 @@ class TelemetryWriter:
     def dropped(self) -> int:
         """Number of rows that were lost because the ring was full."""
         return dropped(self.ring)
+
+    @property
+    def lost(self) -> int:
+        """Number of rows that are missing in the sink that has the fewest, once all have ended."""
+        return self.dropped + max((self.rows - each.stored for each in self._deliveries), default=0)
 
     def start(self) -> None:
         """Open all sinks and start writing.

@@ -24,7 +24,7 @@ from quell.records.metrics import SETTLING_BAND, BatchMetrics, Metrics
 from quell.records.netcdf import Stored, load_record
 from quell.records.record import Record, columns_of
 from quell.records.trajectory import BatchTrajectory, Trajectory
-from quell.types import Channels, Matrix, Status, Vector
+from quell.types import LOST, Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
     import xarray
@@ -145,13 +145,18 @@ class AxesTrajectory(AxesRecord):
         return Status.DIVERGED in self.status
 
     @property
+    def lost(self) -> bool:
+        """True if the run ended early, or an output ran away from its reference."""
+        return bool(self.status & LOST)
+
+    @property
     def message(self) -> str:
         """All that the run reported, and what to do."""
         if not self.diverged:
-            return self.status.message
+            return self._explained(self.status)
         return (
             f"An output went beyond limit = {self.limit:.3g}, or was no number, at "
-            f"{self.ended:.6g} s, and the run ended there. {self.status.message}"
+            f"{self.ended:.6g} s, and the run ended there. {self._explained(self.status)}"
         )
 
     def __len__(self) -> int:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.guard import Reason
 from quell.quantities import Quantity
-from quell.records.record import Record
+from quell.records.record import Record, flags_of
 from quell.types import Status, Vector
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def _draw_control(run: Any, ax: Axes) -> None:
         label = None if i else "limit"
         ax.axhline(at, color="0.4", linestyle=":", linewidth=1.2, label=label)
     if "status" in run.names:
-        held = (run["status"].astype(np.int64) & int(Status.SATURATED)) != 0
+        held = (flags_of(run["status"]) & int(Status.SATURATED)) != 0
         edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(np.int8)))
         spans = edges.reshape(-1, 2)
         if len(spans):

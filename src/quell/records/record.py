@@ -9,18 +9,21 @@ A record as a table: a column for each number of a sample, for CSV and data fram
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+import operator
 import os
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
 from quell.files import check_writable, written_atomically
 from quell.quantities import UNKNOWN, AxesSignals
-from quell.types import Channels, Matrix, Vector
+from quell.types import Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
     import xarray
@@ -133,6 +136,12 @@ def readable_names(channels: Channels) -> tuple[str, ...]:
     return (*recorded, "f_hat") if {"f_learned", "f_residual"} <= set(recorded) else recorded
 
 
+def flags_of(column: Vector) -> NDArray[np.int64]:
+    """Return a channel ``status`` as whole numbers; what is no sum of flags counts as none."""
+    known = functools.reduce(operator.or_, Status)
+    return np.where((column >= 0.0) & (column <= known), column, 0.0).astype(np.int64)
+
+
 def columns_of(channels: Channels, name: str) -> slice:
     """Return the columns of a channel in a log."""
     start = 0
@@ -228,6 +237,13 @@ class Record:
         columns = columns_of(self.channels, name)
         vector = is_vector(name, columns.stop - columns.start)
         return self.log[..., columns] if vector else self.log[..., columns.start]
+
+    def _explained(self, status: Status) -> str:
+        """Return the sentences of the flags, with the share of the samples that have each."""
+        if "status" not in self.names or not self.log.size:
+            return status.message
+        flags = flags_of(self["status"])
+        return status.explained({one: float(np.mean((flags & int(one)) != 0)) for one in status})
 
     def window(self, start: float, stop: float) -> slice:
         """Return the samples with ``start <= t < stop`` as a slice."""

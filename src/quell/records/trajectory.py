@@ -17,7 +17,7 @@ from quell.quantities import UNKNOWN, Signals
 from quell.records.metrics import MEASURES, SETTLING_BAND, BatchMetrics, Metrics, Window, measured
 from quell.records.netcdf import Stored, load_record
 from quell.records.record import Record
-from quell.types import Channels, Matrix, Status, Vector
+from quell.types import LOST, Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
     import xarray
@@ -34,8 +34,9 @@ class Trajectory(Record):
     ``run["y"]`` is a channel: (samples,), or (samples, width) for ``w``, ``x``, ``x_hat`` and
     ``theta``; ``run.t`` are its times [s]. ``f_hat = f_learned + f_residual`` is computed.
 
-    ``status`` has all flags that any step reported, and ``DIVERGED`` if the run ended early;
-    ``message`` explains them. ``controller.read(run.final_state)`` explains the controller's state
+    ``status`` has all flags that any step reported, ``DIVERGED`` if the run ended early, and
+    ``RAN_AWAY`` if y ran away from r instead (``quell.records.metrics.runs_away``); ``message``
+    explains them. ``controller.read(run.final_state)`` explains the controller's state
     at the end.
     """
 
@@ -58,15 +59,20 @@ class Trajectory(Record):
         return Status.DIVERGED in self.status
 
     @property
+    def lost(self) -> bool:
+        """True if the run ended early, or y ran away from r."""
+        return bool(self.status & LOST)
+
+    @property
     def message(self) -> str:
         """All that the run reported, with times, and what to do."""
         if not self.diverged:
-            return self.status.message
+            return self._explained(self.status)
         what = f"|y| went beyond limit = {self.limit:.3g}, or was no number, at {self.ended:.6g} s"
         if Status.POORLY_INTEGRATED in self.status or not self._limit_is_near:
-            return f"{what}. {self.status.message}"
+            return f"{what}. {self._explained(self.status)}"
         others = self.status & ~Status.DIVERGED
-        more = f" {others.message}" if others else ""
+        more = f" {self._explained(others)}" if others else ""
         meaning = "So near to the reference that need not mean that the loop is unstable"
         return f"{what}, and the run ended there. {meaning}.{more}"
 
@@ -106,7 +112,7 @@ class Trajectory(Record):
             ``control_variation`` and ``total_variation`` of u, which also has the jump from the u
             before the window (zero before the run); if the reference steps once in the window, and
             from there on, or ``target`` is given, also ``overshoot`` (fraction of the step),
-            ``settling_time`` and ``rise_time`` [s], NaN if y does not reach the target. Its
+            ``settling_time`` and ``rise_time`` [s], NaN if y does not come to rest there. Its
             ``missing`` has the reason for each of these that does not exist. If the run diverged in
             the window, there is no step, and the others are those of the samples up to there.
 
@@ -273,9 +279,9 @@ class BatchTrajectory(Record):
     ``x_hat`` and ``theta``; ``runs.t`` are their times [s]. After the end of a run that diverged,
     its samples are NaN. ``runs.run(i)`` is the i-th run as a ``Trajectory``.
 
-    ``status`` has all ``Status`` flags that any step of a run reported, and ``DIVERGED`` if it
-    ended early; ``message`` is their summary. ``controller.read(runs.final_states[i])`` explains
-    the state of a controller at the end.
+    ``status`` has all ``Status`` flags that any step of a run reported, ``DIVERGED`` if it ended
+    early, and ``RAN_AWAY`` if y ran away from r; ``message`` is their summary.
+    ``controller.read(runs.final_states[i])`` explains the state of a controller at the end.
     """
 
     log: Matrix  #: the recorded channels side by side (runs, samples, columns)
@@ -298,6 +304,11 @@ class BatchTrajectory(Record):
     def diverged(self) -> NDArray[np.bool_]:
         """True for the runs that ended early (runs,)."""
         return (self.status & int(Status.DIVERGED)) != 0
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """True for the runs that ended early, or whose y ran away from r (runs,)."""
+        return (self.status & int(LOST)) != 0
 
     @property
     def message(self) -> str:

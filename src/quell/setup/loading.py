@@ -34,7 +34,6 @@ from quell.controllers.compensated import Compensated
 from quell.controllers.prefilters import Prefiltered
 from quell.files import nonfinite_to_none
 from quell.plants.base import Plant, signals_of
-from quell.plants.linear import delayed
 from quell.plants.linearise import linear_model
 from quell.records.metrics import SETTLING_BAND
 from quell.setup.description import Description, describe, is_of_axes
@@ -57,9 +56,9 @@ from quell.sweeping.runs import Job, Plan, as_values, check_draws, hash_of
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import SIMPLEST, range_of_u
 from quell.tuning.plants import with_known_noise
-from quell.tuning.report import late_tables, rest_of_plant
 from quell.tuning.structures.registry import FEEDING_FORWARD
 from quell.tuning.tuned import checked_range
+from quell.tuning.written import Written, late_tables, rest_of_plant
 
 # ---- A setup ----
 
@@ -558,6 +557,7 @@ def tuning_task(
     plant, ranges = setup.needed("plant"), _ranges(setup)
     options = tuning_options(setup, given, plant, limits or {})
     options["setup"] = tuned_tables(setup, data, plant, options)
+    options["written"] = _written(setup, options["setup"])
     if "scenario" not in data:
         with suppress(ValueError):  # of a plant without operating point, which tune refuses
             options["rest"] = rest_of_plant(plant, setup.controller.dt)
@@ -590,7 +590,9 @@ def tuning_options(
         options = {key: controller[key] for key in names if key in controller} | options
     options |= limits
     bounds, u_limits = options.get("constraints") or Constraints(), range_of_u(options)
-    options["constraints"] = with_known_noise(bounds, plant, u_limits)
+    file = Written(plant, setup.scenario, setup.controller.dt)
+    noise = 0.0 if setup.scenario is None else file.noise
+    options["constraints"] = with_known_noise(bounds, plant, u_limits, noise)
     return options
 
 
@@ -599,19 +601,20 @@ def tuned_tables(
 ) -> dict[str, Any]:
     """Return the tables of the tuned file beside the controller's; ``data`` are the file's.
 
-    The delay of ``[tune]`` becomes one of the plant.
+    Delay and lag of ``[tune]`` become those of the plant.
     """
     tables = {key: value for key, value in data.items() if key not in REPLACED}
-    delay = options.get("delay", 0.0)
-    if isinstance(delay, float) and delay > 0.0:
-        try:
-            samples = delayed(plant, delay, setup.controller.dt).order - plant.order
-        except ValueError as error:
-            raise SetupError([f"{setup.file}: tune: {error}"]) from None
-        tables = late_tables(tables, delay, samples)
-        if "tune" in data:
-            kept = {key: value for key, value in tables["tune"].items() if key != "delay"}
-            tables["tune"] = kept
+    late = {key: options.get(key, 0.0) for key in ("delay", "actuator_lag")}
+    late = {key: time for key, time in late.items() if isinstance(time, float) and time > 0.0}
+    if not late:
+        return tables
+    times = late.get("delay", 0.0), late.get("actuator_lag", 0.0)
+    try:
+        tables = late_tables(tables, plant, setup.controller.dt, *times)
+    except ValueError as error:
+        raise SetupError([f"{setup.file}: tune: {error}"]) from None
+    if "tune" in data:
+        tables["tune"] = {key: value for key, value in tables["tune"].items() if key not in late}
     return tables
 
 
@@ -623,6 +626,14 @@ def _feedforward(controller: Mapping[str, Any]) -> dict[str, Any]:
         model = {key: controller[key] for key in ("inertia", "viscous") if key in controller}
         return {"feedforward": {"kind": "rigid"} | model}
     return {}
+
+
+def _written(setup: Setup, tables: Mapping[str, Any]) -> Written:
+    """Return plant and scenario of the file that a tuning writes."""
+    used = ("title", "dt", "plant", "scenario")
+    kept = {key: tables[key] for key in used if key in tables} | {"controller": NO_CONTROLLER}
+    file = unchecked(setup.file, kept, setup.trust)
+    return Written(file.needed("plant"), file.scenario, file.controller.dt)
 
 
 def _whole(plant: Any) -> Any:

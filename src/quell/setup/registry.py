@@ -383,7 +383,7 @@ _RIG = {
 }
 _BOUNDS = tuple(inspect.signature(Constraints).parameters)
 _NOT_IN_FILES = (
-    *("constraints", "operating_point", "uncertain", "setup", "progress"),
+    *("constraints", "operating_point", "uncertain", "setup", "written", "progress"),
     *("scenario", "search"),
 )
 Points = call_table(

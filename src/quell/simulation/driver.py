@@ -31,7 +31,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
 from quell.controllers.base import (
@@ -67,10 +67,11 @@ from quell.plants.nonlinear import (
     PythonNonlinear,
     refined,
 )
-from quell.records.record import first_sample_at, in_steps
+from quell.records.metrics import runs_away
+from quell.records.record import columns_of, first_sample_at, in_steps
 from quell.signals import BandLimitedNoise, Constant, Signal, as_signal, seeded_apart
 from quell.signals.shapes import check_derivative
-from quell.types import Channels, Matrix, Status, Vector, warn
+from quell.types import Channels, Matrix, Status, Vector, called_by_quell, warn
 
 # ---- A scenario ----
 
@@ -745,6 +746,35 @@ def logged_channels(plant: Plant, controller: Controller) -> Channels:
 
 
 # ---- Verdict on finished runs ----
+
+
+def judged(log: Any, channels: Channels, loops: Sequence[Loop]) -> NDArray[np.int64]:
+    """Return all flags of finished runs, with ``RAN_AWAY`` where y of an axis left r (runs,).
+
+    ``log`` (runs, samples, columns) has the channels ``r`` and ``y``, or nothing more is known. A
+    run that diverged has its own flag.
+    """
+    status = np.array([int(loop.result_status) for loop in loops], dtype=np.int64)
+    names = [name for name, _ in channels]
+    if "r" not in names or "y" not in names:
+        return status
+    r, y = (log[..., columns_of(channels, name)] for name in "ry")
+    u = log[..., columns_of(channels, "u")] if "u" in names else log[..., :0]
+    # Of a loop with another number of outputs than references nothing says which belong together.
+    axes = r.shape[-1] if r.shape[-1] == y.shape[-1] else 0
+    ended = np.array([loop.diverged for loop in loops])
+    for i in range(axes):
+        status[runs_away(r[..., i], y[..., i], u) & ~ended] |= int(Status.RAN_AWAY)
+    return status
+
+
+def warn_of_lost(runs: Any) -> None:
+    """Warn a user who called ``simulate`` of runs that diverged, or whose y ran away.
+
+    ``simulate`` calls this, for a run or a batch.
+    """
+    if np.any(runs.lost) and not called_by_quell(2):
+        warn(f"{runs.plant}: {runs.message}")
 
 
 def judge_integration(plant: str, loops: Sequence[Loop]) -> None:

@@ -26,11 +26,12 @@ from quell.simulation.driver import (
     Loop,
     Scenario,
     columns_at,
+    judged,
     rest_samples,
     samples_and_start,
     size_of,
 )
-from quell.types import Channels, Matrix, Vector
+from quell.types import Channels, Matrix, Status, Vector
 
 
 class SegmentOfAxes(NamedTuple):
@@ -292,12 +293,13 @@ def simulate_axes(
     dt = sampled.dt
     loop = LoopOfAxes(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
     log = loop.run_through(every, progress)
+    channels = logged_channels(plant, controller)
     return AxesTrajectory(
         log=log,
-        channels=logged_channels(plant, controller),
+        channels=channels,
         dt=dt,
         every=every,
-        status=loop.result_status,
+        status=Status(int(judged(log[None], channels, [loop])[0])),
         ended=loop.ended * dt,
         limit=sampled.limit,
         plant=plant.name,

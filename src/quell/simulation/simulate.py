@@ -45,8 +45,10 @@ from quell.simulation.driver import (
     Segment,
     check_scenario,
     judge_integration,
+    judged,
     logged_channels,
     segment_bounds,
+    warn_of_lost,
 )
 from quell.simulation.several import (
     LoopOfAxes,
@@ -56,7 +58,7 @@ from quell.simulation.several import (
     simulate_axes,
 )
 from quell.simulation.several import logged_channels as channels_of_axes
-from quell.types import Channels
+from quell.types import Channels, Status
 
 # ---- Many runs at once, on all cores ----
 
@@ -124,8 +126,8 @@ def simulate_batch(
         log[:, i, outcome.lengths[i] :] = np.nan
     name = plants.name if isinstance(plants, PlantBatch) else plants[0].name
     judge_integration(name, loops)
-    for i, loop in enumerate(loops):
-        outcome.status[i], outcome.ended[i] = int(loop.result_status), loop.ended
+    outcome.ended[:] = [loop.ended for loop in loops]
+    outcome.status[:] = judged(np.moveaxis(log, 0, -1), channels, loops)
     found: dict[str, Any] = {
         "log": np.moveaxis(log, 0, -1),
         "channels": channels,
@@ -406,7 +408,10 @@ def simulate(
     -----
     DesignWarning
         if a nonlinear plant has too few sub-steps; the status then has ``POORLY_INTEGRATED``. A run
-        that diverged is repeated with enough of them, to find out whether they were the cause.
+        that diverged is repeated with enough of them, to find out whether they were the cause. And
+        if a run diverged, or y ran away from r (``RAN_AWAY``,
+        ``quell.records.metrics.runs_away``): its measures are not those of a loop that works. In a
+        batch y can be judged where r and y are recorded.
     """
     interpret = interpret or dispatch.interpret_all
     if not hasattr(plant, "sampled") and is_linear_model(plant):
@@ -415,11 +420,13 @@ def simulate(
     if single:
         if not interpret:
             check_compilable()
-        several = checks.is_sequence(controller)
-        controller = _in_single(controller) if several else in_single_precision(controller)
+        many = checks.is_sequence(controller)
+        controller = _in_single(controller) if many else in_single_precision(controller)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
         options = (record_every, limit, interpret, progress, record, workers)
-        return simulate_batch(plant, controller, scenario, *options)
+        runs = simulate_batch(plant, controller, scenario, *options)
+        warn_of_lost(runs)
+        return runs
     for name, value in (("record", record), ("workers", workers)):
         if value is not None:
             rule = "is for a batch; a single run records all channels, in this thread"
@@ -427,7 +434,10 @@ def simulate(
     check_plant(plant)
     if is_of_several(controller):
         check_scenario(scenario)
-        return simulate_axes(plant, controller, scenario, record_every, limit, interpret, progress)
+        more = (record_every, limit, interpret, progress)
+        several = simulate_axes(plant, controller, scenario, *more)
+        warn_of_lost(several)
+        return several
     check_controller(controller)
     check_scenario(scenario)
     every = checks.whole("record_every", record_every, 1)
@@ -436,12 +446,12 @@ def simulate(
     loop = Loop(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
     channels = logged_channels(plant, controller)
     log = loop.run_through(every, progress)
-    return Trajectory(
+    run = Trajectory(
         log=log,
         channels=channels,
         dt=dt,
         every=every,
-        status=loop.result_status,
+        status=Status(int(judged(log[None], channels, [loop])[0])),
         ended=loop.ended * dt,
         limit=sampled.limit,
         plant=plant.name,
@@ -450,6 +460,8 @@ def simulate(
         u_limits=limits_of(controller),
         final_state=loop.state,
     )
+    warn_of_lost(run)
+    return run
 
 
 def _in_single(controllers: Sequence[Controller]) -> list[Controller]:

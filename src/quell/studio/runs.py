@@ -22,6 +22,7 @@ from quell.plants.base import PlantWrapper
 from quell.plants.linearise import held_at, linear_model, linear_part
 from quell.plants.multivariable import MultivariableNonlinearPlant
 from quell.records.axes import AxesTrajectory
+from quell.records.metrics import worsened
 from quell.records.record import describe
 from quell.records.trajectory import Trajectory
 from quell.setup.axes import made_axes
@@ -117,6 +118,7 @@ def run_frames(
     stale: Callable[[], bool],
     design_warnings: Sequence[str] = (),
     axis: int = 0,
+    told: dict[str, dict[str, Any]] | None = None,
 ) -> Iterator[bytes]:
     """Yield two frames for a setup: the run, and the analysis of its loop.
 
@@ -137,6 +139,8 @@ def run_frames(
         warnings of the setup, which stand before those of the run.
     axis
         number of the axis, from 0, of a setup of several.
+    told
+        gets the measures of the frames for a verdict: ``loop``, and ``run.0`` of the first window.
     """
     began, compiled = time.perf_counter(), compile_time.seconds
     plant, scenario = setup.needed("plant"), setup.needed("scenario")
@@ -150,8 +154,9 @@ def run_frames(
         "kind": "run",
         "plant": run.plant,
         "status": int(run.status),
-        "diverged": bool(run.diverged),
-        "message": run.message if run.diverged or run.status else "",
+        "diverged": bool(run.lost),
+        "ran_away": bool(run.lost and not run.diverged),
+        "message": run.message if run.status else "",
         "warnings": [*design_warnings, *caught],
         "metrics": _metrics(run, setup),
         "signals": {"y": str(run.signals.y), "u": str(run.signals.u)},
@@ -161,6 +166,8 @@ def run_frames(
         "axes": list(getattr(whole, "axis_names", ())),
     }
     yield frame(header | dict(about), _curves(run, columns, actuators))
+    if told is not None:
+        told |= {f"run.{i}": dict(each) for i, each in enumerate(header["metrics"])}
     if stale():
         raise StoppedError
     began = time.perf_counter()
@@ -171,6 +178,8 @@ def run_frames(
             numbers, curves = _analysis(loop_of(setup))
     except (ValueError, ArithmeticError) as error:
         numbers, curves = {"reason": " ".join(str(error).split())}, {}
+    if told is not None:
+        told["loop"] = dict(numbers)
     more = {"kind": "loop", "loop": numbers, "seconds": time.perf_counter() - began}
     yield frame(more | dict(about), curves)
 
@@ -315,11 +324,44 @@ def _analysis(loop: LoopAnalysis) -> tuple[dict[str, Any], dict[str, Vector]]:
     numbers: dict[str, Any] = {"stable": loop.stable, "largest_pole": largest}
     if loop.stable:
         numbers |= _margins(loop.margins) | {
+            "m_t": 10.0 ** (0.05 * float(np.max(curves["T"]))),
             "b_range": list(loop.b_range),
             "b_over_b0": loop.b_over_b0,
             "noise_to_control": loop.noise_to_control,
         }
     return numbers, curves
+
+
+def verdict(
+    before: Mapping[str, Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]
+) -> list[dict[str, str]]:
+    """Return what of a design is worse than of the one before: key and text of each number.
+
+    ``before`` and ``now`` are what ``run_frames`` told of both.
+    """
+    found = []
+    for part, own in now.items():
+        old = before.get(part, {})
+        if part == "loop" and not own.get("stable"):
+            if old.get("stable") and "reason" not in own:
+                found.append({"key": "loop.stable", "text": "the loop, which is unstable"})
+            continue
+        where = ""
+        if part != "loop" and len(now) > 2:
+            where = f" (from {own.get('start', 0.0):g} s on)"
+        for each in worsened(_numbers(old), _numbers(own)):
+            key = each.name.replace("gain_reduction", "gain_margin")
+            found.append({"key": f"{part}.{key}", "text": each.text + where})
+    return found
+
+
+def _numbers(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the single numbers among measures, with both gain margins apart."""
+    found = {name: each for name, each in told.items() if isinstance(each, int | float)}
+    if "gain_margin" in told:
+        low, high = told["gain_margin"]
+        found |= {"gain_margin": high, "gain_reduction": math.inf if low == 0.0 else 1.0 / low}
+    return found
 
 
 _SCRIPT = '''"""{title}: simulated, analysed and drawn."""

@@ -39,11 +39,13 @@ from quell.studio.runs import (
     stoppable,
     tables_of_text,
     toml_of,
+    verdict,
     watched,
 )
 from quell.tuning import Constraints, tune
 from quell.tuning.designs import SIMPLEST
 from quell.tuning.structures.registry import FEEDING_FORWARD
+from quell.tuning.written import Written
 
 # ---- Long tasks of the page ----
 
@@ -77,7 +79,8 @@ def tuned_frames(
 ) -> Iterator[bytes]:
     """Yield the tuned controller's tables, and then the trade-off between M_s and load rejection.
 
-    In between are run and loop of the setup as it was and of the tuned one, to compare them.
+    In between are run and loop of the setup as it was and of the tuned one, and a verdict: what
+    of the tuned one is worse.
 
     The message has ``structure``, ``m_s``, ``m_t`` and, if noise is bounded, ``m_ks``, or the noise
     of y: ``noise_std`` and ``resolution``. A controller that feeds forward is tuned with the
@@ -94,11 +97,14 @@ def tuned_frames(
     first["compare"] = None if structure == SIMPLEST else ()
     given = getattr(without_prefilters(setup.controller), "feedforward", False)
     if structure in (SIMPLEST, *FEEDING_FORWARD):
-        first["feedforward"] = given
-    best = tune(plant, dt, **first, **options)
+        first["feedforward"] = given or None
+    file: Any = True
+    if setup.plant is not None and setup.scenario is not None:
+        file = Written(setup.plant, setup.scenario, dt)
+    best = tune(plant, dt, written=file, **first, **options)
     design = best.design
     structure = next(name for name, each in best.designs.items() if each is design)
-    tables = setup.tables() | {key: dict(table) for key, table in design.tables.items()}
+    tables = setup.tables() | {key: dict(table) for key, table in best.tables.items()}
     if limits:
         tables["controller"] = tables["controller"] | limits
     if "observer" not in design.tables:
@@ -116,13 +122,16 @@ def tuned_frames(
             "active": list(best.active),
             "constraints": str(best.constraints),
             "noise_bound": _WITH_OPTIONS.sub("", best.noise_bound),
-            "step": _sentence(str(best.reference_step)),
+            "step": _sentence("; ".join(str(best.judged or "").splitlines())),
             "plants": len(best.plants.plants),
         }
     )
     wide = columns(message)
-    for pin, each in (("before tuning", setup), ("tuned", make(tables))):
-        yield from run_frames(each, wide, {"id": message["id"], "pin": pin}, stale)
+    told: list[dict[str, dict[str, Any]]] = [{}, {}]
+    pairs = zip(told, (("before tuning", setup), ("tuned", make(tables))), strict=True)
+    for numbers, (pin, each) in pairs:
+        yield from run_frames(each, wide, {"id": message["id"], "pin": pin}, stale, told=numbers)
+    yield frame({"kind": "verdict", "id": message["id"], "worse": verdict(*told)})
     for at in sorted({*_TRADEOFF, bounds.m_s or _TRADEOFF[0]}):
         other = dataclasses.replace(best.constraints, m_s=at)
         try:
@@ -187,7 +196,7 @@ def band_frames(
         other = {**tables, "plant": varied(tables["plant"], percent, ranges, random)}
         plant = make(other).needed("plant")
         run = simulate(plant, setup.controller, scenario, progress=progress)
-        if run.diverged:
+        if run.lost:
             diverged += 1
             continue
         if cut is None:

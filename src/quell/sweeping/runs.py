@@ -158,8 +158,9 @@ def as_values(name: str, given: Any) -> Distribution | tuple[Any, ...]:
     if not values:
         raise ValueError(f"parameters[{name!r}] is empty: must have at least one value")
     if all(map(_is_number, values)):
-        return tuple(checks.finite(f"parameters[{name!r}]", value) and value for value in values)
-    return values
+        for value in values:
+            checks.finite(f"parameters[{name!r}]", value)
+    return values  # as they are: a whole number stays one
 
 
 def labels(values: Sequence[Any]) -> list[str] | None:

@@ -32,6 +32,7 @@ from quell.records.trajectory import Trajectory
 from quell.simulation.simulate import simulate
 from quell.sweeping.measures import as_measures, describe_measures
 from quell.sweeping.runs import (
+    ERROR,
     Job,
     Parts,
     Plan,
@@ -47,7 +48,7 @@ from quell.sweeping.runs import (
     probe,
     run_part,
 )
-from quell.types import DesignWarning, Status, Vector
+from quell.types import LOST, DesignWarning, Status, Vector, called_by_quell, warn
 
 if TYPE_CHECKING:
     import xarray
@@ -56,6 +57,8 @@ if TYPE_CHECKING:
 
 NOT_DONE = -2
 """Status of a run that the sweep has not done yet."""
+# Failed runs that a warning names. Chosen by hand.
+_SAID = 3
 
 
 def lazy_dataset(store: Store) -> xarray.Dataset:
@@ -372,8 +375,8 @@ class Sweep:
     def failed(self) -> NDArray[np.bool_]:
         """True for runs with an error, that diverged, or with a measure beyond its limit (runs,).
 
-        A measure that does not exist is beyond its limit, the settling time of a run that does not
-        settle for example.
+        So is a run whose y ran away from r. A measure that does not exist is beyond its limit, the
+        settling time of a run that does not settle for example.
         """
         found = ~self.complete
         for name, limit in self.limits.items():
@@ -382,9 +385,37 @@ class Sweep:
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """True for runs that were simulated to their end, without divergence (runs,)."""
+        """True for runs to their end, that did not diverge and whose y did not run away (runs,)."""
         status = self.dataset["status"].values
-        return np.asarray((status >= 0) & ((status & int(Status.DIVERGED)) == 0))
+        return np.asarray((status >= 0) & ((status & int(LOST)) == 0))
+
+    @property
+    def errors(self) -> NDArray[np.int64]:
+        """Runs that could not be built, simulated or judged; ``reason`` says why."""
+        return np.flatnonzero(self.dataset["status"].values == ERROR)
+
+    def fault(self, run: int) -> str:
+        """Return the name of a run, with its parameters, and why it failed."""
+        return f"{self.describe(run)}: {self.reason(run)}"
+
+    def reason(self, run: int) -> str:
+        """Return why a run failed; empty if it did not."""
+        checks.whole("run", run, 0, self.store.runs - 1)
+        one = self.dataset.isel(run=run)
+        status = int(one["status"].item())
+        if status == NOT_DONE:
+            return ""
+        if status == ERROR:
+            return str(one["message"].item())
+        if status & int(LOST):
+            ended = "diverged" if status & int(Status.DIVERGED) else "y ran away from r, seen"
+            return f"{ended} at {one['ended'].item():.6g} s"
+        beyond = [
+            f"{name} = {value:.6g}, beyond {limit:g}" if value == value else f"no {name}"
+            for name, limit in self.limits.items()
+            if not (value := float(one[name].item())) <= limit
+        ]
+        return "; ".join(beyond)
 
     def worst(self, metric: str | None = None, count: int = 5) -> list[int]:
         """Return the runs with the largest values of a measure, by default the first one.
@@ -562,6 +593,11 @@ def sweep(
         done; nothing is written then.
     ChildProcessError
         if a worker process was ended, for instance because memory ran out.
+
+    Warns
+    -----
+    RuntimeWarning
+        that names runs with an error, that diverged, or whose y ran away.
     """
     plan = Plan(parameters, draws, sampling, seed)
     measures = as_measures(metrics)
@@ -574,16 +610,20 @@ def sweep(
         check_sendable("build and functions in metrics", job)
     about = _about(plan, job, checked)
     store = existing_store(folder, about)
-    if store is not None and not store.missing():
-        return Sweep(store, plan, job)
-    with executor_on(executor, workers) as pool, _without_design_warnings():
-        if store is None:
-            size = _runs_per_file(pool, plan, job, runs_per_file)
-            store = new_store(folder, plan, size, about, measures)
-        else:
-            _check_unchanged(pool, plan, job, store)
-        _do(pool, plan, job, store, progress)
-    return Sweep(store, plan, job)
+    if store is None or store.missing():
+        with executor_on(executor, workers) as pool, _without_design_warnings():
+            if store is None:
+                size = _runs_per_file(pool, plan, job, runs_per_file)
+                store = new_store(folder, plan, size, about, measures)
+            else:
+                _check_unchanged(pool, plan, job, store)
+            _do(pool, plan, job, store, progress)
+    found = Sweep(store, plan, job)
+    if (lost := np.flatnonzero(~found.complete)).size and not called_by_quell(1):
+        few = "; ".join(found.fault(run) for run in lost[:_SAID].tolist())
+        more = f"; {lost.size - _SAID} more" if lost.size > _SAID else ""
+        warn(f"{lost.size} of {plan.runs} runs failed: {few}{more}", RuntimeWarning)
+    return found
 
 
 def parts_of(run: int, arguments: Mapping[str, Any]) -> tuple[str, Parts]:

@@ -179,7 +179,8 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
         return task, f"NOT bounded: M_ks: {source} meets the constraints, to guess it from; {give}"
     m_ks, how = max(found)
     kept = Constraints.noise_over_pi  # m_ks takes its place, as above
-    return _with(task, m_ks=m_ks, noise_over_pi=kept), f"{how}; a guess: {give}"
+    how = f"NOT known what noise does to u, so a guess: {how}; {give}"
+    return _with(task, m_ks=m_ks, noise_over_pi=kept), how
 
 
 def _with(task: Task, **bounds: Any) -> Task:

@@ -37,7 +37,7 @@ from quell.identification.result import Identified
 from quell.lti.canonical import canonical
 from quell.parallel import part_of
 from quell.plants.base import PlantBatch
-from quell.plants.linear import DelayedPlant, SampledPlant, sampled_plant
+from quell.plants.linear import DelayedPlant, LaggedPlant, SampledPlant, sampled_plant
 from quell.plants.linearise import linear_part
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import PlantSet
@@ -77,21 +77,25 @@ def as_list(plant: Any) -> list[Any]:
     return [plant]
 
 
-def with_known_noise(given: Constraints, plant: Any, limits: tuple[float, float]) -> Constraints:
-    """Return the constraints with the noise of y that a plant tells of, if nothing bounds it yet.
+def with_known_noise(
+    given: Constraints, plant: Any, limits: tuple[float, float], noise: float = 0.0
+) -> Constraints:
+    """Return the constraints with the noise of y that is known, if nothing bounds it yet.
 
-    A plant with an encoder tells of its resolution, the model of a record of ``noise_std``. Either
-    is of use between finite ``limits`` of u [u-unit], a share of which noise may take.
+    A plant with an encoder tells of its resolution, the model of a record of ``noise_std``, and a
+    scenario of ``noise``, a standard deviation [y-unit]. Each is of use between finite ``limits``
+    of u [u-unit], a share of which noise may take.
     """
     bounded = given.noise or given.m_ks or given.u_std or given.noise_over_pi is None
     if bounded or not math.isfinite(limits[1] - limits[0]):
         return given
-    while isinstance(plant, DelayedPlant):
+    while isinstance(plant, DelayedPlant | LaggedPlant):
         plant = plant.plant
     std, step = (getattr(plant, name, None) or 0.0 for name in ("noise_std", "resolution"))
     if std > 0.0:  # rounding is part of it
-        return replace(given, noise_std=std)
-    return replace(given, resolution=step) if step > 0.0 else given
+        return replace(given, noise_std=math.hypot(std, noise))
+    known = {"noise_std": noise, "resolution": step}
+    return replace(given, **{name: value for name, value in known.items() if value > 0.0})
 
 
 def given_plants(

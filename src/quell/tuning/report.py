@@ -20,25 +20,17 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
-from quell import checks
 from quell.analysis.loop import duration
 from quell.controllers.base import Controller
 from quell.controllers.feedforward import Feedforward
-from quell.controllers.prefilters import ReferenceModel
 from quell.files import nonfinite_to_none
-from quell.plants.base import measure
-from quell.plants.linear import DelayedPlant, EncodedPlant, LinearPlant, delayed
-from quell.plants.linearise import operating_point_of
-from quell.plants.nonlinear import NonlinearPlant, checked_point
 from quell.quantities import Signals
 from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
-from quell.tuning.optimiser import loops
 from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of, load_step, response
 from quell.tuning.optimiser.requirements import (
     USUAL_DAMPING,
@@ -54,7 +46,7 @@ from quell.tuning.optimiser.requirements import (
 )
 from quell.tuning.optimiser.search import Problem, Solution, delay_margin, noise_gain
 from quell.tuning.structures.base import named
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 # ---- A structure tuned under constraints, with what it reaches ----
 
@@ -353,91 +345,6 @@ def tradeoff_lines(tradeoff: Sequence[tuple[str, float, float]], objective: str)
     return [f"{name} {limit:.4g}: {what} {value:.4g}" for name, limit, value in tradeoff]
 
 
-# ---- The step of the reference ----
-
-# Overshoot from which on a prefilter is offered, and that it leaves; the band of the settling time.
-MOST_OVERSHOOT, _BAND = 0.05, 0.02
-# Order of the prefilter, steps of the bisection for its bandwidth, and its range in 1/dt.
-_ORDER, _BISECTIONS, _SLOWEST = 2, 30, 1e-6
-
-
-class ReferenceStep(NamedTuple):
-    """The response of the first plant to a step of the reference."""
-
-    overshoot: float  #: share of the step
-    settling: float  #: time until it stays within 2 % of the step [s]; NaN if it does not
-    prefilter: ReferenceModel | None  #: the fastest with which it overshoots by 5 % at most
-    settling_with_prefilter: float  #: [s]; NaN without one
-
-    def __str__(self) -> str:
-        """Return overshoot, settling time and the offer of a prefilter as a sentence."""
-        if math.isnan(self.settling):
-            return "step of the reference: it does not settle in the time that was looked at"
-        text = (
-            f"step of the reference: overshoots by {100.0 * self.overshoot:.1f} %, settles within "
-            f"2 % in {self.settling:.3g} s"
-        )
-        if self.prefilter is None:
-            return text
-        return (
-            f'{text}; with a prefilter ([prefilter] kind = "reference-model", order = {_ORDER}, '
-            f"omega = {self.prefilter.omega:.4g}) it overshoots by 5 % and settles in "
-            f"{self.settling_with_prefilter:.3g} s"
-        )
-
-
-def reference_step(plants: PlantSet, controller: Controller) -> ReferenceStep:
-    """Return the response of the first plant with a linear controller."""
-    inputs, law = loops.reference_step(plants), law_of(controller)
-    y, dt = response(plants.scaled()[0], law, inputs), plants.dt * inputs.distance
-    overshoot, settling = _measured(y, dt)
-    if not overshoot > MOST_OVERSHOOT:
-        return ReferenceStep(overshoot, settling, None, math.nan)
-    # With the pulse response any prefilter is a convolution.
-    pulse = np.diff(y, prepend=0.0)
-    low, high, best = _SLOWEST / dt, 1.0 / dt, None
-    for _ in range(_BISECTIONS):
-        omega = math.sqrt(low * high)
-        after = _measured(_behind(ReferenceModel(omega, _ORDER), pulse, dt), dt)
-        if after[0] <= MOST_OVERSHOOT:
-            low, best = omega, (ReferenceModel(omega, _ORDER), after[1])
-        else:
-            high = omega
-    if best is None:
-        return ReferenceStep(overshoot, settling, None, math.nan)
-    return ReferenceStep(overshoot, settling, *best)
-
-
-def peak_of_u(plants: PlantSet, controller: Controller) -> float:
-    """Return the largest ``|u|`` after a unit step of r [u-unit/y-unit], without limits of u."""
-    inputs, first, law = loops.reference_step(plants), plants.scaled()[0], law_of(controller)
-    largest = float(np.max(np.abs(response(first, law, inputs, "u"))))
-    if inputs.distance > 1:  # the law may be faster than that
-        start = inputs._replace(distance=1)
-        largest = max(largest, float(np.max(np.abs(response(first, law, start, "u")))))
-    return largest
-
-
-def _behind(model: ReferenceModel, pulse: Vector, dt: float) -> Vector:
-    """Return the response to a step through a prefilter (k,)."""
-    # All its poles are at the same place: r_f is the step through that many equal lags.
-    lag = math.exp(-model.omega * dt)
-    found = np.cumsum(pulse)
-    for _ in range(model.order):
-        found = lfilter([1.0 - lag], [1.0, -lag], found)
-    return np.asarray(found, dtype=np.float64)
-
-
-def _measured(y: Vector, dt: float) -> tuple[float, float]:
-    """Return overshoot and settling time of the response to a unit step, NaN if it does not."""
-    if not np.all(np.isfinite(y)):
-        return math.nan, math.nan
-    off = np.flatnonzero(np.abs(y - 1.0) > _BAND)
-    settled = off.size == 0 or off[-1] < y.size - 1
-    settling = float((off[-1] + 1 if off.size else 0) * dt) if settled else math.nan
-    return max(float(np.max(y)) - 1.0, 0.0), settling
-
-
 # ---- Figures of a tuning ----
 
 # The responses last so many times the radian of the loop's crossover; most samples of them. They
@@ -541,213 +448,6 @@ def _crossover(L: Any, omega: Vector, otherwise: float) -> float:
     return float(omega[falls[0]]) if falls.size else otherwise
 
 
-# ---- The scenario of a tuned setup file ----
-
-# A step and a load take at most this share each of what u has left at rest, as both act in the end.
-_SHARE = 0.4
-# A solution of A x + B u = −E w, C x = r within this share of its right side is one.
-_SOLVED = 1e-6
-# Smaller parts of a solution are rounding.
-_ROUNDING = 1e-12
-# Names of the times at which signals begin, in their tables.
-_TIMES = ("at", "start")
-
-
-Limits = tuple[float, float]
-"""u_min and u_max of the controller [u-unit], infinite where it has none."""
-
-
-class Rest(NamedTuple):
-    """An operating point: what holds the plant at rest there."""
-
-    u: float  # [u-unit]
-    y: float  # [y-unit]
-    x0: tuple[float, ...] = ()  # state of the plant in the setup file; empty if it is not known
-    w: tuple[float, ...] = ()  # its disturbances
-
-
-def checked_rest(rest: Any) -> Rest | None:
-    """Return the argument ``rest`` of ``tune``: None, (u, y) or a ``Rest``."""
-    if rest is None or isinstance(rest, Rest):
-        return rest
-    u, y = checks.vector("rest", rest, 2).tolist()
-    return Rest(u, y)
-
-
-def rest_of_plant(plant: Any, dt: float, operating_point: Any = None) -> Rest | None:
-    """Return the operating point of a nonlinear plant, as ``linear_part`` takes it; else None."""
-    delayed: list[DelayedPlant] = []
-    while isinstance(plant, DelayedPlant | EncodedPlant):
-        delayed += [plant] if isinstance(plant, DelayedPlant) else []
-        plant = plant.plant
-    if operating_point is not None and hasattr(plant, "sampled"):
-        x, u = checked_point(operating_point)
-    elif isinstance(plant, NonlinearPlant):
-        x, u = operating_point_of(plant)
-    else:
-        return None
-    state = np.asarray(x, dtype=np.float64)
-    y = float(measure(plant.sampled(dt, interpret=True), state))
-    waiting = sum(each.order - each.plant.order for each in delayed)
-    return Rest(float(u), y, (*state.tolist(), *[float(u)] * waiting), (0.0,) * plant.disturbances)
-
-
-def rest_of_linear(linear: LinearPlant, rest: Rest) -> Rest:
-    """Return state and disturbances that hold a linear plant at rest at (u, y).
-
-    They solve ``A x + B u + E w = 0``, ``C x = y``, with the smallest ones if there are several.
-    """
-    n, m = linear.order, linear.disturbances
-    matrix = np.block([[linear.A, linear.E], [linear.C, np.zeros((1, m))]])
-    right = np.append(-linear.B[:, 0] * rest.u, rest.y)
-    found = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    found[np.abs(found) < _ROUNDING * np.max(np.abs(found), initial=0.0)] = 0.0
-    return rest._replace(x0=tuple(found[:n].tolist()), w=tuple(found[n:].tolist()))
-
-
-def rest_within(linear: LinearPlant, rest: Rest | None, limits: Limits) -> Rest | None:
-    """Return an operating point within the limits of u: the given one, else zero or their middle.
-
-    Raises ``ValueError`` for limits within which there is no such point.
-    """
-    low, high = limits
-    at = 0.0 if rest is None else rest.u
-    if low <= at <= high:
-        return rest
-    within = f"must lie within u_min = {low:g} and u_max = {high:g}"
-    if rest is not None:
-        raise ValueError(f"u at rest = {at:g}: {within}; no controller can hold the plant there")
-    middle = 0.5 * (low + high)
-    if not np.isfinite(middle) or np.linalg.matrix_rank(linear.A) < linear.order:
-        raise ValueError(
-            f"u at rest = 0: {within}; give u and y at rest: rest = (u, y), or --u-rest and "
-            "--y-rest"
-        )
-    y = -float((linear.C @ np.linalg.solve(linear.A, linear.B))[0, 0]) * middle
-    return Rest(middle, y)
-
-
-def held_sizes(
-    linear: LinearPlant, rest: Rest | None, limits: Limits, peak: float
-) -> tuple[float, float]:
-    """Return the sizes of a step of r [y-unit] and of the first load that u can hold, of 1 at most.
-
-    At rest the step needs u with ``A x + B u = 0``, ``C x = 1``, the load ``A x + B u = −E``,
-    ``C x = 0``; each gets 40 % of what the limits leave. A step that needs no u at rest, as that of
-    an axis, keeps the largest ``|u|`` on the way within the limits, which is ``peak`` after a step
-    of 1 without limits [u-unit/y-unit]. A size is negative where u has more room on the other side,
-    as that of a load on a heater at zero.
-    """
-    at = 0.0 if rest is None else rest.u
-    low, high = limits
-    n = linear.order
-    matrix = np.block([[linear.A, linear.B], [linear.C, np.zeros((1, 1))]])
-    rights = [np.append(np.zeros(n), 1.0)]
-    rights += [np.append(-linear.E[:, 0], 0.0)] if linear.disturbances else []
-    sizes: list[float] = []
-    for right in rights:
-        found = np.linalg.lstsq(matrix, right, rcond=None)[0]
-        solved = np.linalg.norm(matrix @ found - right) <= _SOLVED * np.linalg.norm(right)
-        u = float(found[-1]) if solved else 0.0
-        # How large a positive and a negative one may be.
-        ends = (high - at, low - at) if u > 0.0 else (low - at, high - at)
-        most = [1.0 if u == 0.0 else min(1.0, abs(_SHARE * end / u)) for end in ends]
-        size = most[0] if most[0] >= most[1] else -most[1]
-        if not sizes and u == 0.0 and peak > 0.0:
-            size = min(1.0, min(high - at, at - low) / peak)
-        sizes.append(float(f"{size:.2g}"))
-    return sizes[0], sizes[-1]
-
-
-def scenario_tables(
-    last: float, disturbances: int, rest: Rest | None, sizes: tuple[float, float] = (1.0, 1.0)
-) -> dict[str, Any]:
-    """Return ``scenario`` and ``metrics``: a step, and later a load if there is an input for it.
-
-    ``sizes`` are those of the step and the load.
-    A loop at an operating point has half of ``last`` [s] to come to rest: the controller starts
-    from u = 0.
-    """
-    half, step = 0.5 * last, {"kind": "step"}
-    if rest is None:
-        at, constant, y = 0.0, [0.0] * disturbances, 0.0
-    else:
-        at, y = half, rest.y
-        constant = [*rest.w, *[0.0] * (disturbances - len(rest.w))]
-    at, load_at, end = (float(f"{time:.6g}") for time in (at, at + half, at + last))
-    begins: Mapping[str, Any] = {"at": at} if at else {}
-    reference: Any = {**step, **begins, **_size(sizes[0])}
-    scenario: dict[str, Any] = {"duration": end, "reference": [y, reference] if y else reference}
-    if rest is not None and rest.x0:
-        scenario["x0"] = list(rest.x0)
-    if disturbances:
-        load: Any = {**step, "at": load_at, **_size(sizes[1])}
-        first = [constant[0], load] if constant[0] else load
-        scenario["disturbances"] = [first, *constant[1:]]
-    return {"scenario": scenario, "metrics": _windows([at, load_at] if disturbances else [at])}
-
-
-def _size(size: float) -> dict[str, float]:
-    return {} if size == 1.0 else {"height": size}
-
-
-def windows_of(scenario: Mapping[str, Any]) -> list[dict[str, float]]:
-    """Return windows of a scenario's table, from one beginning of a signal to the next."""
-    times = {0.0}
-    signals = [scenario.get("reference"), *scenario.get("disturbances", ())]
-    for signal in signals:
-        parts = signal if isinstance(signal, list | tuple) else [signal]
-        for part in parts:
-            known = part if isinstance(part, Mapping) else {}
-            begins = (known.get(name) for name in _TIMES)
-            times |= {float(time) for time in begins if isinstance(time, float | int)}
-    end = float(scenario.get("duration", np.inf))
-    return _windows(sorted(time for time in times if 0.0 <= time < end))
-
-
-def _windows(times: list[float]) -> list[dict[str, float]]:
-    ends = [{"stop": later} for later in times[1:]]
-    return [{"start": at, **end} for at, end in zip(times, [*ends, {}], strict=True)]
-
-
-def late_tables(tables: Mapping[str, Any], delay: float, samples: int) -> dict[str, Any]:
-    """Return the tables of a setup whose plant is behind a further delay [s] of so many states.
-
-    Names, ranges, paths of a sweep and operating points stay those of the plant inside.
-    """
-    plant = tables["plant"]
-    inner: dict[str, Any] = {"kind": plant} if isinstance(plant, str) else dict(plant)
-    outer: dict[str, Any] = {"kind": "delayed", "delay": delay}
-    if "signals" in inner:
-        outer["signals"] = inner.pop("signals")
-    if "uncertain" in inner:
-        outer["uncertain"] = {f"plant.{key}": ends for key, ends in inner.pop("uncertain").items()}
-    found = {**tables, "plant": outer | {"plant": inner}}
-    scenario, sweep = tables.get("scenario"), tables.get("sweep")
-    if isinstance(scenario, Mapping) and "x0" in scenario:
-        found["scenario"] = {**scenario, "x0": [*scenario["x0"], *[0.0] * samples]}
-    if isinstance(sweep, Mapping) and isinstance(sweep.get("parameters"), Mapping):
-        moved = {
-            f"plant.{key}" if key.startswith("plant.") else key: value
-            for key, value in sweep["parameters"].items()
-        }
-        found["sweep"] = {**sweep, "parameters": moved}
-    tune = tables.get("tune")
-    if isinstance(tune, Mapping) and isinstance(tune.get("schedule"), Mapping):
-        found["tune"] = {**tune, "schedule": _inside(tune["schedule"])}
-    return found
-
-
-def _inside(schedule: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the operating points of a plant for one that contains it as ``plant``."""
-    if "parameter" in schedule:
-        names = schedule["parameter"]
-        moved = [f"plant.{each}" for each in ([names] if isinstance(names, str) else names)]
-        return {**schedule, "parameter": moved[0] if isinstance(names, str) else moved}
-    points = [{**each, "plant": {"plant": each["plant"]}} for each in schedule["points"]]
-    return {**schedule, "points": points}
-
-
 # ---- A tuned controller as a setup file in TOML ----
 
 # A comment may have none of them, and a tab is of no use there.
@@ -806,35 +506,3 @@ def _value(value: Any) -> str:
     if isinstance(value, int | np.integer):
         return str(int(value))
     return repr(float(value))
-
-
-def plant_table(
-    linear: LinearPlant, actuator_lag: float, delay: float, dt: float
-) -> tuple[dict[str, Any], int]:
-    """Return the table of a linear plant behind a lag and a delay [s] of u, sampled at ``dt`` [s].
-
-    Beside it, how many states lag and delay append, which are u at rest.
-    """
-    if actuator_lag > 0.0:
-        n = linear.order
-        A = np.block([[linear.A, linear.B], [np.zeros((1, n)), np.full((1, 1), -1 / actuator_lag)]])
-        B = np.append(np.zeros(n), 1.0 / actuator_lag)
-        E = np.vstack([linear.E, np.zeros((1, linear.disturbances))])
-        linear = LinearPlant(A, B, np.append(linear.C[0], 0.0), E)
-    table: dict[str, Any] = {
-        "kind": "linear",
-        "A": _rows(linear.A),
-        "B": linear.B[:, 0].tolist(),
-        "C": linear.C[0].tolist(),
-        "E": _rows(linear.E),
-    }
-    appended = int(actuator_lag > 0.0)
-    if delay == 0.0:
-        return table, appended
-    appended += delayed(linear, delay, dt).order - linear.order
-    return {"kind": "delayed", "plant": table, "delay": delay}, appended
-
-
-def _rows(matrix: Matrix) -> list[list[float]]:
-    found: list[list[float]] = matrix.tolist()
-    return found

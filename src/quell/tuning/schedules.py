@@ -383,6 +383,7 @@ def tune_schedule(
         given_constraints(options.get("constraints")), plant_at(grid[0]), range_of_u(limits)
     )
     how: dict[str, Any] = {"structure": structure, "order": order, "compare": (), **late, **options}
+    how |= {"written": False}
     how["constraints"] = bounds
     fine = []
     if is_function:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,10 +14,12 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.controllers.feedforward import Feedforward, checked_feedforward
+from quell.lti.canonical import canonical
 from quell.parallel import one_blas_thread
 from quell.plants.base import signals_of
 from quell.plants.linear import LinearPlant
 from quell.signals.shapes import Signal, as_signal
+from quell.tuning.acceptance import Judged, Loop, axis_of, judge, time_constant
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import (
@@ -31,20 +34,7 @@ from quell.tuning.designs import (
 from quell.tuning.optimiser.loops import Inputs, PlantSet, load_step, samples_of
 from quell.tuning.optimiser.requirements import OBJECTIVES
 from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set, with_known_noise
-from quell.tuning.report import (
-    Design,
-    Limits,
-    Rest,
-    checked_rest,
-    held_sizes,
-    peak_of_u,
-    plant_table,
-    rest_of_linear,
-    rest_of_plant,
-    rest_within,
-    scenario_tables,
-    windows_of,
-)
+from quell.tuning.report import Design, relative
 from quell.tuning.structures.base import resonances
 from quell.tuning.structures.registry import (
     CASCADE,
@@ -53,6 +43,21 @@ from quell.tuning.structures.registry import (
     WITH_ONE_INTEGRATOR,
 )
 from quell.tuning.tuned import Check, Tuned, Uncertain, checked
+from quell.tuning.written import (
+    Limits,
+    Rest,
+    Written,
+    checked_rest,
+    held_sizes,
+    late_plant,
+    plant_table,
+    rest_of_linear,
+    rest_of_plant,
+    rest_within,
+    scenario_of,
+    scenario_tables,
+    windows_of,
+)
 from quell.types import Progress, Vector
 
 COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "poles", "model-based")
@@ -73,7 +78,7 @@ def tune(
     reference: Any = None,
     duration: float | None = None,
     load: float = 1.0,
-    feedforward: bool | Feedforward = False,
+    feedforward: bool | Feedforward | None = None,
     delay: Any = 0.0,
     actuator_lag: float = 0.0,
     operating_point: Any = None,
@@ -84,6 +89,7 @@ def tune(
     check_samples: int = 400,
     seed: int = 0,
     setup: Mapping[str, Any] | None = None,
+    written: Written | bool = True,
     rest: Any = None,
     scenario: Any = None,
     search: Mapping[str, Any] | None = None,
@@ -134,7 +140,10 @@ def tune(
         whether the controller gets the feedforward of the first plant's model, ``Feedforward.of``
         with its delay and friction, or a ``Feedforward`` of yours. It changes no margin, so only
         ``"tracking"`` has to do with it. The cascade uses inertia and viscous friction; PID and LQG
-        controllers have none, so ``"simplest"`` is one of the others.
+        controllers have none, so ``"simplest"`` is one of the others. By default an axis, which
+        needs no u at rest, has it where limits of u are given, with a profile generator that keeps
+        u within them (``reference.py``), unless the objective is ``"tracking"`` or the reference of
+        the scenario moves from sample to sample.
     delay, actuator_lag, operating_point
         as for ``analyse``; ``delay`` may have a value for each plant.
     uncertain
@@ -149,6 +158,10 @@ def tune(
         of the samples.
     setup
         tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default.
+    written
+        plant and scenario of ``setup`` as objects, in which the controller is judged with all that
+        is not linear in the plant; True for those of the tables that are made, False to simulate
+        nothing and to add no prefilter.
     rest
         u and y at rest, where the plant works: the scenario of ``Tuned.toml`` begins there. Of a
         nonlinear plant the operating point by default, else zero.
@@ -205,12 +218,15 @@ def tune(
         how |= {"samples": samples, "check_samples": check_samples, "seed": seed}
         if uncertain is None and operating_point is None:
             late = float(np.ravel(delay)[0]) + actuator_lag
-            feedforward = _by_model(feedforward, as_list(plant)[0], late) or False
-        how["feedforward"] = feedforward
+            feedforward = _by_model(feedforward, as_list(plant)[0], late)
+        how["feedforward"] = feedforward or False
         how |= {"progress": progress, **limits}
         _refuse(_without_effect_in_simulations(uncertain is not None), options)
-        linear = partial(tune, dt=dt, rest=rest)
-        return tune_by_simulation(linear, plant, scenario, objective, search or {}, how)
+        linear = partial(tune, dt=dt, rest=rest, written=False)
+        found = tune_by_simulation(linear, plant, scenario, objective, search or {}, how)
+        if not isinstance(written, Written) or found.loop is None:
+            return found  # what was tuned by simulation was judged in it
+        return replace(found, loop=found.loop._replace(written=written))
     if search is not None:
         raise ValueError("search = {...}: is for a tuning by simulation; give a scenario, too")
     dt = checks.positive("dt", dt, "s")
@@ -255,11 +271,20 @@ def tune(
     _refuse(unused | _without_effect_of_noise(bounds), {**options, **vars(bounds)})
     inputs = _inputs(objective, reference, duration, load, plants, forward)
     _check_u_max(bounds.u_max, inputs, plants)
+    by_default = feedforward is None and objective != "tracking" and written is not False
+    by_default &= not (isinstance(written, Written) and written.moves)
+    if by_default and math.isfinite(u_limits[1] - u_limits[0]):
+        forward = _of_axis(given, written)
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task)
         designs = tuned_designs(list(dict.fromkeys(names)), task, report)
         chosen = _chosen(designs, structure, task)
+        tables, loop = _file(given, task, setup, written, known_rest, u_limits, chosen)
+        judged, refused = None, ""
+        if loop is not None and loop.shaped and any(map(math.isfinite, u_limits)):
+            report("limits of u", 1.0)
+            chosen, judged, refused = _accepted(chosen, designs, structure, task, given, loop)
         if chosen.undamped:
             task = without_damping(task)
         check = None
@@ -274,7 +299,10 @@ def tune(
         objective=objective,
         task=task,
         check=check,
-        setup=_setup(given, plants, setup, known_rest, u_limits, chosen),
+        setup=tables,
+        loop=loop,
+        judged_at_limits=judged,
+        refused=refused,
         noise_bound=noise_bound,
         signals=signals_of(as_list(plant)[0]),
     )
@@ -293,9 +321,11 @@ def _chosen(designs: Mapping[str, Design], structure: str, task: Task) -> Design
     return found
 
 
-def _by_model(feedforward: bool | Feedforward, plant: Any, late: float) -> Feedforward | None:
+def _by_model(
+    feedforward: bool | Feedforward | None, plant: Any, late: float
+) -> Feedforward | None:
     """Return the feedforward of a plant with a delay [s] of u besides its own, if it is wanted."""
-    given = checked_feedforward(feedforward)
+    given = checked_feedforward(bool(feedforward) if feedforward is None else feedforward)
     if isinstance(given, Feedforward):
         return given
     if not given:
@@ -312,7 +342,7 @@ def _check_names(structure: str, compare: Sequence[str] | None, objective: str) 
     checks.one_of("objective", objective, OBJECTIVES)
 
 
-def _check_feedforward(names: Sequence[str], given: bool | Feedforward) -> None:
+def _check_feedforward(names: Sequence[str], given: bool | Feedforward | None) -> None:
     """Raise an error unless one of the structures has all of the feedforward that is given."""
     if not set(names) & set(FEEDING_FORWARD):
         raise ValueError(
@@ -516,35 +546,108 @@ def _check(
     return checked(task.problem(), design.solution, plants, values, names)
 
 
-def _setup(
+def _file(
     given: Given,
-    plants: PlantSet,
+    task: Task,
     known: Mapping[str, Any] | None,
+    written: Written | bool,
     rest: Rest | None,
     limits: Limits,
     design: Design,
-) -> dict[str, Any]:
-    """Return the tables of a setup file: ``known``, else the first plant, a step, a load.
+) -> tuple[dict[str, Any], Loop | None]:
+    """Return the tables of a setup file, ``known`` ones first, and the loop that they describe.
 
-    What is not in ``known`` is added: ``[[metrics]]`` have a window for each part of the scenario.
+    By default they have the first plant, a step and a load. What is not in ``known`` is added:
+    ``[[metrics]]`` have a window for each part of the scenario. The loop is None for tables with a
+    scenario whose objects are not in ``written``.
     """
-    linear, delay, dt = LinearPlant.of(given.linear[0]), float(given.delays[0]), plants.dt
+    plants, linear = task.plants, LinearPlant.of(given.linear[0])
+    delay, lag, dt = float(given.delays[0]), given.actuator_lag, plants.dt
     tables: dict[str, Any] = {"title": "Tuned controller", "dt": dt} | dict(known or {})
+    if linear.disturbances == 0:
+        linear = LinearPlant(linear.A, linear.B, linear.C)
+    plant: Any = written.plant if isinstance(written, Written) else None
+    scenario = written.scenario if isinstance(written, Written) else None
+    if plant is None:
+        plant = late_plant(linear, lag, delay, dt)
     if "plant" not in tables:
-        if linear.disturbances == 0:
-            linear = LinearPlant(linear.A, linear.B, linear.C)
         rest = None if rest is None or not any(rest[:2]) else rest_of_linear(linear, rest)
-        tables["plant"], waiting = plant_table(linear, given.actuator_lag, delay, dt)
+        tables["plant"], waiting = plant_table(linear, lag, delay, dt)
         if rest is not None:
             rest = rest._replace(x0=(*rest.x0, *[rest.u] * waiting))
     if "scenario" not in tables:
         step = load_step(plants)
         last = float(f"{step.r.size * step.distance * dt:.2g}")
         rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
-        assert design.solution is not None
-        peak = peak_of_u(plants, design.solution.controller)
-        sizes = held_sizes(linear, rest, limits, peak)
+        analysis = _analysis(given, plants, design)
+        tau = time_constant(analysis, plants)
+        axis = axis_of(linear, tau, plants)
+        needed = 0.0 if axis is None else axis.needs(tau)
+        sizes = held_sizes(linear, rest, limits, needed)
         tables |= scenario_tables(last, linear.disturbances, rest, sizes)
     elif "metrics" not in tables:
         tables["metrics"] = windows_of(tables["scenario"])
-    return tables
+    if scenario is None and known is not None and "scenario" in known:
+        return tables, None
+    file = Written(plant, scenario or scenario_of(tables["scenario"]), dt)
+    at = 0.0 if rest is None else rest.u
+    shaped = task.objective != "tracking" and written is not False and not file.moves
+    return tables, Loop(file, linear, task.model, plants, limits, at, shaped)
+
+
+def _of_axis(given: Given, written: Written | bool) -> Feedforward | None:
+    """Return the feedforward of an axis, which needs no u at rest; None for another plant.
+
+    Of a plant with zeros it is the rigid part: the series of its inverse would not end.
+    """
+    linear = LinearPlant.of(given.linear[0])
+    if np.linalg.matrix_rank(linear.A) == linear.order:
+        return None
+    plant = written.plant if isinstance(written, Written) else linear
+    rigid = 2 if canonical(linear).zeros.size else min(linear.order, 3)
+    try:
+        found = Feedforward.of(plant, terms=rigid, derivatives=3)
+    except ValueError:
+        return None
+    late = 0.0 if isinstance(written, Written) else float(given.delays[0]) + given.actuator_lag
+    late += found.delay or 0.0
+    return replace(found, delay=late) if late > 0.0 else found
+
+
+# A design that is not accepted at the limits gives way to one with this multiple of its objective.
+_WORSE = 1.5
+
+
+def _accepted(
+    first: Design,
+    designs: Mapping[str, Design],
+    structure: str,
+    task: Task,
+    given: Given,
+    loop: Loop,
+) -> tuple[Design, Judged, str]:
+    """Return the design that is accepted at the limits of u, with what it does, and what is not.
+
+    Of a structure that is named it is the only one.
+    """
+    judged = judge(loop, _controller(first), _analysis(given, task.plants, first))
+    if not judged.failures or structure != SIMPLEST:
+        return first, judged, ""
+    able = STRUCTURES if task.feedforward is None else FEEDING_FORWARD
+    others = [
+        each
+        for name, each in designs.items()
+        if name in able and each is not first and each.controller is not None
+        if each.undamped <= first.undamped
+        if relative(first, each, task.objective) <= _WORSE
+    ]
+    for each in sorted(others, key=lambda each: -relative(each, first, task.objective)):
+        other = judge(loop, _controller(each), _analysis(given, task.plants, each))
+        if not other.failures:
+            return each, other, f"{first.name} is left out: {judged.failures[0]}"
+    return first, judged, ""
+
+
+def _controller(design: Design) -> Any:
+    assert design.controller is not None
+    return design.controller

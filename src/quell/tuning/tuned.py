@@ -24,14 +24,16 @@ from quell.records.plotting import given_axes
 from quell.sweeping.runs import latin_hypercube
 from quell.sweeping.sweep import share_interval
 from quell.tuning import report
+from quell.tuning.acceptance import Judged, Loop, judge, prefilter_table
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, tradeoff
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.requirements import all_peaks, beside_poles, closed_loop_poles, counted
 from quell.tuning.optimiser.search import Problem, Solution
-from quell.tuning.report import Design, ReferenceStep, draw, reference_step, toml_text
+from quell.tuning.report import Design, draw, toml_text
 from quell.tuning.simulated import Checked, Search
 from quell.tuning.structures.base import resonances
+from quell.tuning.written import StepFigures
 from quell.types import Matrix, Vector
 
 # With more parameters, the corners of their box are not all in the set.
@@ -214,6 +216,12 @@ class Tuned:
     doubts : tuple
         why the plant may differ from the model of a record that it was tuned for (``doubts`` of
         ``quell.tuning.plants``); they are in ``summary()``, JSON and the setup file.
+    loop : Loop or None
+        plant and scenario of the setup file that is written, in which the controller is judged.
+    judged_at_limits : Judged or None
+        what it does there, if u has limits: it decided on the design and the prefilter.
+    refused : str
+        why a design that the objective alone prefers was left out; empty if none was.
     """
 
     design: Design
@@ -229,6 +237,9 @@ class Tuned:
     simulated_check: Mapping[str, Checked] | None = None
     signals: Signals = UNKNOWN
     doubts: tuple[str, ...] = ()
+    loop: Loop | None = None
+    judged_at_limits: Judged | None = None
+    refused: str = ""
 
     @property
     def nots(self) -> tuple[str, ...]:
@@ -237,10 +248,11 @@ class Tuned:
 
     @property
     def controller(self) -> Controller:
-        """The tuned controller."""
+        """The tuned controller, behind its prefilter if it has one."""
         controller = self.design.controller
         assert controller is not None  # ``tune`` raises an error instead
-        return controller
+        judged = self.judged_at_limits
+        return controller if judged is None else judged.controller
 
     @property
     def plants(self) -> PlantSet:
@@ -259,14 +271,19 @@ class Tuned:
             return tradeoff(self.task, self.design)
 
     @cached_property
-    def reference_step(self) -> ReferenceStep:
-        """Overshoot and settling time of a step of the reference, and a prefilter if it needs one.
+    def judged(self) -> Judged | None:
+        """What the controller does in the file that is written; None without a file.
 
-        That of the linear loop with the first plant, without the controller's feedforward.
+        Its step of the reference, a prefilter, overloads, and lines that begin with NOT.
         """
-        solution = self.design.solution
-        controller = self.controller if solution is None else solution.controller
-        return reference_step(self.plants, controller)
+        if self.judged_at_limits is not None or self.loop is None:
+            return self.judged_at_limits
+        return judge(self.loop, self.controller, self.analysis)
+
+    @property
+    def reference_step(self) -> StepFigures | None:
+        """What the written loop does after the largest step of the reference in its scenario."""
+        return None if self.judged is None else self.judged.step
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -292,6 +309,16 @@ class Tuned:
         )
 
     @property
+    def in_the_file(self) -> list[str]:
+        """What the written loop does, as lines: step, overloads, what is not as it should be."""
+        judged = self.judged
+        lines = [] if judged is None else str(judged).splitlines()
+        low, high = self.analysis.margins.gain
+        if low > 0.0 and self.analysis.stable:
+            lines.append(f"conditionally stable: it bears {low:.3g} to {high:.3g} times its gain")
+        return [*([self.refused] if self.refused else []), *lines]
+
+    @property
     def costs(self) -> list[str]:
         """The chosen structure against the best one tried, PI and PID, as sentences.
 
@@ -315,7 +342,7 @@ class Tuned:
             lines.append(f"{name}: {quantity} {value}; " + _measures(second, rest))
         lines += [self.left_out] if self.left_out else []
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
-        lines += [self.damping, str(self.reference_step)]
+        lines += [self.damping, *self.in_the_file]
         forward = getattr(self.design.controller, "feedforward", False)
         if isinstance(forward, Feedforward):
             lines.append(f"feedforward: {forward.describe()}")
@@ -339,15 +366,23 @@ class Tuned:
         drawn = self.plants, chosen | others, self.constraints, self.signals
         return draw(*drawn, given_axes(axes, ax))
 
+    @property
+    def tables(self) -> dict[str, Mapping[str, Any]]:
+        """Tables of a setup file for the controller: observer, controller, prefilter."""
+        judged = self.judged_at_limits
+        shaped = judged is not None and judged.prefilter is not None
+        more = {"prefilter": prefilter_table(judged.prefilter)} if judged and shaped else {}
+        return {**more, **self.design.tables}
+
     def toml(self) -> str:
         """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``."""
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
-        comment += f"active: {', '.join(self.active) or 'none'}\n{self.reference_step}"
+        comment += "\n".join([f"active: {', '.join(self.active) or 'none'}", *self.in_the_file])
         comment += f"\n{self.left_out}" if self.left_out else ""
         comment += "".join(f"\n{line}" for line in self.nots)
         replaced = ("observer", "controller")
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
-        return toml_text({**tables, **self.design.tables}, comment)
+        return toml_text({**tables, **self.tables}, comment)
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
@@ -371,11 +406,7 @@ class Tuned:
                 "designs": {name: each.to_json() for name, each in self.designs.items()},
                 "costs": self.costs,
                 "damping": self.damping,
-                "reference_step": {
-                    "overshoot": self.reference_step.overshoot,
-                    "settling": self.reference_step.settling,
-                    "prefilter_omega": getattr(self.reference_step.prefilter, "omega", None),
-                },
+                **self._judged_to_json(),
                 "tradeoff": [
                     {"constraint": name, "limit": limit, "objective": value}
                     for name, limit, value in self.tradeoff
@@ -390,6 +421,20 @@ class Tuned:
             }
         )
         return found
+
+    def _judged_to_json(self) -> dict[str, Any]:
+        judged = self.judged
+        if judged is None:
+            return {"reference_step": None, "overloads": [], "not": list(self.nots)}
+        step = judged.step
+        found = None if step is None else {**step._asdict(), "prefilter": None}
+        if found is not None:
+            del found["signals"]
+            if judged.prefilter is not None:
+                found["prefilter"] = prefilter_table(judged.prefilter)
+            found["prefilter_omega"] = getattr(judged.offered, "omega", None)
+        loads = [each._asdict() for each in judged.overloads]
+        return {"reference_step": found, "overloads": loads, "not": list(judged.failures)}
 
 
 def _measures(second: str, cells: list[str]) -> str:

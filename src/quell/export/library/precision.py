@@ -13,15 +13,24 @@ from quell import checks
 from quell.controllers.prefilters import without_prefilters
 from quell.export.controller_source import in_double_precision
 from quell.learners.gaussian_process import SINGLE_NOVELTY, GaussianProcess
+from quell.records.metrics import WORSE
 from quell.simulation.driver import Scenario
 from quell.simulation.simulate import simulate
 from quell.types import Status
 
+# Single precision is accepted where u is the same to ``LIMIT``, or where what a user sees is: the
+# RMS error of y, and the activity of u, Σ|Δu|. With a coarse encoder one count that flips early
+# makes another u in each sample from there on, of the same loop.
+#
 # Largest RMS difference of u that is accepted, relative to the RMS of u. Rounding acts on
 # u as noise does. One per cent of it is what a 6-bit converter adds, and does not show in y
 # (a torsional axis: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
 # unless the rounding of y itself, times omega_o^(n+1), is too much for u.
 LIMIT = 0.01
+# Largest increase of the RMS error of y: an RMS of 200 independent samples is known to
+# 1/√(2 · 200), 5 %, so a record hardly shows less. And of the activity of u: the share from which
+# on a measure counts as worse where two loops are compared.
+MOST_ERROR, MOST_ACTIVITY = 0.05, WORSE
 # Share of samples at limits beyond which nothing is compared: there u is the limit itself, whatever
 # the precision is, and the others may be few or far from where the plant works. Chosen by hand.
 _MOST_LIMITED = 0.5
@@ -85,6 +94,9 @@ class Comparison(NamedTuple):
         of controllers of several signals, each u, v and y; else empty.
     limited
         share of the samples in which u lies at its limits, of several signals the least.
+    error, activity
+        largest relative increase of the RMS of r − y of an axis, and of Σ|Δu| of an actuator.
+        Below the rounding of y and u to single precision nothing counts.
     """
 
     u: float
@@ -94,6 +106,8 @@ class Comparison(NamedTuple):
     diverged: bool
     each: tuple[Difference, ...] = ()
     limited: float = 0.0
+    error: float = math.inf
+    activity: float = math.inf
 
     @property
     def signals(self) -> tuple[Difference, ...]:
@@ -109,9 +123,12 @@ class Comparison(NamedTuple):
     def check(self, controller: Any) -> None:
         """Raise a ``ValueError`` if single precision differs too much for ``controller``.
 
-        Also if it is not compared, because u lies at its limits.
+        That is if u differs by more than ``LIMIT``, and besides the RMS error of y is larger by
+        more than ``MOST_ERROR``, or the activity of u by more than ``MOST_ACTIVITY``. Also if it is
+        not compared, because u lies at its limits.
         """
-        if not self.diverged and self.u <= LIMIT:
+        seen = self.error <= MOST_ERROR and self.activity <= MOST_ACTIVITY
+        if not self.diverged and (self.u <= LIMIT or (seen and not math.isnan(self.u))):
             return
         if not self.diverged and math.isnan(self.u):
             raise ValueError(
@@ -119,11 +136,17 @@ class Comparison(NamedTuple):
                 "accept=True (--accept) writes it all the same"
             )
         signal = next((own.name for own in self.each if own.single == self.u), "u")
-        what = "diverges" if self.diverged else f"changes {signal} by {100 * self.u:.2g} % RMS"
+        what = (
+            "the run diverges, or y runs away, in this scenario, and not in double precision"
+            if self.diverged
+            else f"changes {signal} by {100 * self.u:.2g} % RMS in this scenario, the RMS error of "
+            f"y by {100 * self.error:+.2g} %, the activity of u by {100 * self.activity:+.2g} %; "
+            f"{100 * LIMIT:g} % is the limit, or {100 * MOST_ERROR:g} % of the error together with "
+            f"{100 * MOST_ACTIVITY:g} % of the activity"
+        )
         raise ValueError(
-            f"precision = 'single': {what} in this scenario, and {100 * LIMIT:g} % is the limit; "
-            f"{self._remedy(in_double_precision(controller))}, or double precision would help; "
-            "accept=True (--accept) writes it all the same"
+            f"precision = 'single': {what}; {self._remedy(in_double_precision(controller))}, or "
+            "double precision would help; accept=True (--accept) writes it all the same"
         )
 
     def _remedy(self, controller: Any) -> str:
@@ -159,7 +182,7 @@ def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
     controller = in_double_precision(controller)
     double = simulate(plant, controller, scenario)
     single = simulate(plant, controller, scenario, precision="single")
-    diverged, quiet = single.diverged and not double.diverged, None
+    diverged, quiet = single.lost and not double.lost, None
     given: Any = scenario.noise
     noises = given if checks.is_sequence(given) else (given,)
     if not all(isinstance(each, int | float) and each == 0.0 for each in noises):
@@ -187,7 +210,24 @@ def compared(plant: Any, controller: Any, scenario: Scenario) -> Comparison:
     ]
     u, y = (math.nan if least > _MOST_LIMITED else own.single or 0.0 for own in worst)
     several = tuple(each) if hasattr(controller, "inputs") else ()
-    return Comparison(u, y, worst[0].noise, worst[1].noise, diverged, several, least)
+    seen = _increases(double, single)
+    return Comparison(u, y, worst[0].noise, worst[1].noise, diverged, several, least, *seen)
+
+
+def _increases(double: Any, single: Any) -> tuple[float, float]:
+    """Return the largest relative increases of the RMS of r − y and of Σ|Δu|."""
+    count = min(len(double), len(single))
+    of_y, of_u = [], []
+    for run in (double, single):
+        r, y, u = (run[name][:count].reshape(count, -1) for name in ("r", "y", "u"))
+        error = r - y if r.shape == y.shape else y  # other outputs have no reference
+        of_y.append(np.maximum(_rms(error), _ROUNDED * np.max(np.abs(y), axis=0)))
+        moves = np.sum(np.abs(np.diff(u, axis=0)), axis=0)
+        of_u.append(np.maximum(moves, count * _ROUNDED * np.max(np.abs(u), axis=0)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = (np.nan_to_num(two / one, nan=1.0) - 1.0 for one, two in (of_y, of_u))
+        error, activity = (float(np.max(each)) for each in found)
+    return error, activity
 
 
 def _limited(one: Any, two: Any, controller: Any) -> NDArray[np.bool_]:

@@ -82,15 +82,17 @@ function send(task) {
   return server.send({ ...task, setup: store.state.setup, columns: picture.columns });
 }
 
+const axisOf = (setup) => Math.min(picture.axis, (setup.axis?.length ?? 1) - 1);
+
 function askRun(setup, local) {
-  const axis = Math.min(picture.axis, (setup.axis?.length ?? 1) - 1);
-  server.run({ do: "run", setup, axis, columns: picture.columns, local });
+  server.run({ do: "run", setup, axis: axisOf(setup), columns: picture.columns, local });
 }
 
 function ask() {
   if (picture.watching || !store) return;
   const { setup, band } = store.state;
   askRun(setup, { input: asking.input });
+  picture.want({ setup, axis: axisOf(setup) });
   asking.input = null;
   clearTimeout(asking.bandTimer);
   if (band) asking.bandTimer = setTimeout(askBand, PAUSE);
@@ -115,10 +117,10 @@ function onFrame(header, arrays, bytes, asked) {
     askPins();
   } else if (header.kind === "band" && header.id === asking.bandId) picture.takeBand(header, arrays);
   else if (header.kind === "wait") {
-    picture.age();
     home("state").textContent = header.compiles ? "compiling this kind of loop, once …" : "working …";
+    if (!picture.watching) picture.late(header.compiles ? "this kind of loop is compiled, once" : "the new one is on its way");
   } else if (header.kind === "error") {
-    picture.age();
+    if (asked && !asked.local?.pin) picture.late("the present one does not run, as said above");
     picture.message(header.text.join("\n"));
     if (asked?.local?.pin) asked.local.pin.failed = true;
   } else if (header.kind === "texts") files.take(header, store.state.setup.title ?? "setup");
@@ -178,9 +180,7 @@ const record = new MachineRecord(
 
 const watch = new Watch(
   (arrays, values, units) => {
-    picture.age(false);
-    picture.views.showRun({ ...arrays, watched: true }, [], null, null);
-    picture.caption(units);
+    picture.drawWatched(arrays, units);
     home("watch-values").replaceChildren(
       ...Object.entries(values).map(([name, value]) => {
         const box = element("div");
@@ -201,10 +201,10 @@ function chooseTab(name) {
   document.querySelector(".choices").hidden = name === "watch";
   home("numbers").hidden = name === "watch";
   picture.watching = name === "watch";
-  if (picture.watching) picture.age(); // until rows come, the curves are those of the design
+  if (picture.watching) picture.want(null); // until rows come, the curves are those of the design
   else {
     watch.stop();
-    if (store) picture.draw();
+    if (store) picture.drawAgain();
     ask();
   }
 }

@@ -299,8 +299,8 @@ class Problem:
             what they run through; one for each plant, or one for all. Then run i has the seed
             ``scenario.seed + i``, so that noise differs between the samples.
         objectives
-            what is minimised, by name; or one objective, or its score. A run that diverged has an
-            infinite score.
+            what is minimised, by name; or one objective, or its score. A run that diverged, or
+            whose y ran away from r, has an infinite score, and so has one without the measure.
         limit
             ``|y|`` at which a run ends; see ``simulate``.
         """
@@ -384,7 +384,7 @@ class _Runs:
         options: dict[str, Any] = {"limit": self.limit, "workers": 1, "record": channels}
         runs = simulate(plants, controller, scenarios, **options)
         found = np.full((len(self.functions), len(samples)), np.inf)
-        for i in np.flatnonzero(~runs.diverged).tolist():
+        for i in np.flatnonzero(~runs.lost).tolist():
             run = runs.run(i)
             found[:, i] = [_scored(function, run) for function in self.functions]
         return found

@@ -4,7 +4,7 @@ import uPlot from "../vendor/uPlot.js";
 import { home } from "../dom.js";
 import { palette } from "../plots/palette.js";
 import { labels, short } from "../plots/plots.js";
-import { numbersOf, sideBySide, worse } from "./numbers.js";
+import { beyond, numbersOf, sideBySide } from "./numbers.js";
 import { takesNumber } from "./typed.js";
 
 const BOUNDS = [["tune-ms", "m_s"], ["tune-mt", "m_t"], ["tune-mks", "m_ks"], ["tune-noise", "noise_std"], ["tune-resolution", "resolution"]];
@@ -83,6 +83,7 @@ export class Designs {
     if (header.kind === "progress") home("progress").value = header.share;
     else if (header.kind === "tuned") this.tuned(header);
     else if (header.kind === "tradeoff") this.point(header);
+    else if (header.kind === "verdict") this.judge(header.worse);
     else if (header.kind === "run" || header.kind === "loop") this.curves(header, arrays);
     else if (header.kind === "note") home("tune-result").textContent += ` ${header.text}`;
     else if (header.kind === "done") this.end("");
@@ -102,7 +103,6 @@ export class Designs {
       const part = (this.found[pin] ??= { arrays: {} });
       part[header.kind] = header.kind === "run" ? header : header.loop;
       Object.assign(part.arrays, arrays);
-      if (pin === TUNED && header.kind === "loop") this.judge();
     } else this.pin(pin, header.kind === "run", arrays);
   }
 
@@ -116,13 +116,16 @@ export class Designs {
     this.found = { setup: { ...header.setup, plant, dt } };
   }
 
-  // Show both designs side by side, and use the tuned one where it is not worse.
-  judge() {
+  // Show both designs side by side, and use the tuned one where nothing is worse by the server's
+  // verdict, {key, text} of each, or beyond its bounds.
+  judge(worse) {
     const { bounds } = this.state();
     const [before, now] = [BEFORE, TUNED].map((pin) => numbersOf(this.found[pin]?.run, this.found[pin]?.loop, bounds, this.found.setup.dt));
-    sideBySide(home("tune-rows"), before, now);
+    const keys = new Set(worse.map((each) => each.key));
+    sideBySide(home("tune-rows"), before, now, keys);
     home("tune-compare").hidden = false;
-    const names = worse(before, now);
+    const further = now.filter(([name, , , , key]) => !keys.has(key) && beyond(before, now).includes(name)).map(([name]) => name);
+    const names = [...worse.map((each) => each.text), ...further];
     if (names.length) {
       home("tune-use").hidden = false;
       this.tell(`NOT applied: worse in ${names.join("; ")}. Its curves are pinned as “${TUNED}”.`);
@@ -130,7 +133,7 @@ export class Designs {
       return;
     }
     this.use(this.found.setup);
-    this.tell("Applied: nothing that you look at is worse. Undo takes it back.");
+    this.tell("Applied: no number is worse by more than 10 %. Undo takes it back.");
   }
 
   tell(text) {

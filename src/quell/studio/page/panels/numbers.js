@@ -13,8 +13,6 @@ export const BOUNDS = {
   samples: { name: "least delay margin [samples]", value: 2 },
   overshoot: { name: "largest overshoot [%]", value: 20 },
 };
-const MUCH = 0.01; // an error that is larger by less than this share is not worse
-
 export function usual() {
   return Object.fromEntries(Object.entries(BOUNDS).map(([key, bound]) => [key, bound.value]));
 }
@@ -33,8 +31,8 @@ export function boundFields(home, bounds, change) {
   );
 }
 
-// Return all numbers as [name, text, whether it is outside of its bound, about, error]: an error is a
-// number that the user looks at and that should be small, undefined for the others.
+// Return all numbers as [name, text, whether it is outside of its bound, about, key]: the key is the
+// name that the server gives the number in a verdict; it begins with loop or run, its figure.
 export function numbersOf(run, loop, bounds, dt) {
   return [...margins(loop, bounds, dt), ...metrics(run, bounds)];
 }
@@ -47,8 +45,9 @@ export function showNumbers(home, entries) {
     box.append(element("dt"), element("dd"));
     home.append(box);
   }
-  entries.forEach(([name, value, bad, about], i) => {
+  entries.forEach(([name, value, bad, about, key], i) => {
     const box = home.children[i];
+    box.dataset.part = key.split(".")[0];
     write(box, { className: bad ? "bad" : "", title: [name, about].filter(Boolean).join(": ") });
     write(box.firstChild, { textContent: name });
     write(box.lastChild, { textContent: value, ariaLabel: bad ? `${value}, outside of its bound` : null });
@@ -64,22 +63,16 @@ export function inWords(entries) {
   return first + good.join("; ");
 }
 
-// Return the names of what is worse than before: numbers that are outside of their bounds now and were
-// not, and errors that are larger.
-export function worse(before, now) {
+// Return the names of the numbers that are outside of their bounds now and were not before.
+export function beyond(before, now) {
   const was = new Map(before.map((entry) => [entry[0], entry]));
-  return now
-    .filter(([name, , bad, , error]) => {
-      const old = was.get(name);
-      if (!old) return bad;
-      return (bad && !old[2]) || (error !== undefined && old[4] !== undefined && error > old[4] * (1 + MUCH));
-    })
-    .map(([name]) => name);
+  return now.filter(([name, , bad]) => bad && !was.get(name)?.[2]).map(([name]) => name);
 }
 
-// Write the numbers of two designs side by side into a table; those that are worse are marked.
-export function sideBySide(home, before, now) {
-  const marked = new Set(worse(before, now));
+// Write the numbers of two designs side by side into a table; those with the given keys are marked,
+// as are those that have gone beyond their bounds.
+export function sideBySide(home, before, now, keys) {
+  const marked = new Set([...beyond(before, now), ...now.filter((entry) => keys.has(entry[4])).map(([name]) => name)]);
   const names = [...new Set([...now, ...before].map(([name]) => name))];
   const text = (entries, name) => entries.find((entry) => entry[0] === name)?.[1] ?? "–";
   home.replaceChildren(
@@ -96,19 +89,19 @@ export function sideBySide(home, before, now) {
 function margins(loop, bounds, dt) {
   if (!loop) return [];
   if (loop.reason) return [];
-  if (!loop.stable) return [["loop", "unstable", true, `largest pole at |z| = ${short(loop.largest_pole)}`]];
+  if (!loop.stable) return [["loop", "unstable", true, `largest pole at |z| = ${short(loop.largest_pole)}`, "loop.stable"]];
   const [low, high] = loop.gain_margin.map((each) => each ?? Infinity);
   const b = loop.b_range?.map((each) => each ?? Infinity);
   const delay = loop.delay_margin ?? Infinity;
   const phase = loop.phase_margin ?? Infinity;
   return [
-    ["M_s", short(loop.m_s), loop.m_s > bounds.m_s, "largest sensitivity: the least distance from −1 is 1/M_s"],
-    ["gain margin", low > 0 ? range(low, high) : short(high), high < bounds.gain || low > 1 / bounds.gain, "factor of the gain up to which the loop is stable"],
-    ["phase margin", `${short(phase)}°`, phase < bounds.phase, ""],
-    ["delay margin", delay >= 1 ? `${short(delay)} s` : `${short(1e3 * delay)} ms`, delay < bounds.samples * dt, "additional dead time up to which the loop is stable"],
-    ...(b ? [["stable for b/b0", range(...b), false, "range of the plant's gain over b0"]] : []),
-    ...(loop.noise_to_control === undefined ? [] : [["noise → u", short(loop.noise_to_control), false, "RMS of u for white noise of RMS 1 in y"]]),
-    ...(loop.gains_at_once ? [["all inputs at once", range(...loop.gains_at_once.map((each) => each ?? Infinity)), false, "gains of all actuators, each for itself, with which the loop is stable (disk margin)"]] : []),
+    ["M_s", short(loop.m_s), loop.m_s > bounds.m_s, "largest sensitivity: the least distance from −1 is 1/M_s", "loop.m_s"],
+    ["gain margin", low > 0 ? range(low, high) : short(high), high < bounds.gain || low > 1 / bounds.gain, "factor of the gain up to which the loop is stable", "loop.gain_margin"],
+    ["phase margin", `${short(phase)}°`, phase < bounds.phase, "", "loop.phase_margin"],
+    ["delay margin", delay >= 1 ? `${short(delay)} s` : `${short(1e3 * delay)} ms`, delay < bounds.samples * dt, "additional dead time up to which the loop is stable", "loop.delay_margin"],
+    ...(b ? [["stable for b/b0", range(...b), false, "range of the plant's gain over b0", "loop.b_range"]] : []),
+    ...(loop.noise_to_control === undefined ? [] : [["noise → u", short(loop.noise_to_control), false, "RMS of u for white noise of RMS 1 in y", "loop.noise_to_control"]]),
+    ...(loop.gains_at_once ? [["all inputs at once", range(...loop.gains_at_once.map((each) => each ?? Infinity)), false, "gains of all actuators, each for itself, with which the loop is stable (disk margin)", "loop.gains_at_once"]] : []),
   ];
 }
 
@@ -124,24 +117,25 @@ function range(low, high) {
 function metrics(run, bounds) {
   if (!run) return [];
   const found = [];
-  if (run.diverged) found.push(["run", "diverged", true, run.message]);
+  if (run.diverged) found.push(["run", run.ran_away ? "ran away" : "diverged", true, run.message, "run.stable"]);
   const [y, u] = ["y", "u"].map((name) => unit(run, name));
-  for (const window of run.metrics) {
+  run.metrics.forEach((window, i) => {
     const where = `t ≥ ${short(window.start ?? 0)} s`;
+    const add = (name, value, bad, about, key) => found.push([`${name}, ${where}`, value, bad, about, `run.${i}.${key}`]);
     if (window.reason) {
-      found.push([where, "–", false, window.reason]);
-      continue;
+      found.push([where, "–", false, window.reason, `run.${i}`]);
+      return;
     }
-    if (window.overshoot != null) {
-      found.push([`overshoot, ${where}`, `${short(100 * window.overshoot)} %`, 100 * window.overshoot > bounds.overshoot, where]);
-    }
+    const { missing } = window;
+    if (window.overshoot != null) add("overshoot", `${short(100 * window.overshoot)} %`, 100 * window.overshoot > bounds.overshoot, where, "overshoot");
+    else if (window.overshoot === null) add("overshoot", "–", true, missing.overshoot ?? where, "overshoot");
     if (window.settling_time !== undefined) {
-      found.push([`settling, ${where}`, window.settling_time == null ? "never" : `${short(window.settling_time)} s`, window.settling_time == null, where]);
+      add("settling", window.settling_time == null ? "never" : `${short(window.settling_time)} s`, window.settling_time == null, missing.settling_time ?? where, "settling_time");
     }
-    found.push([`peak e, ${where}`, `${short(window.peak_error)} ${y}`, false, `largest |r − y|, ${where}`, window.peak_error]);
-    found.push([`IAE, ${where}`, `${brief(window.iae)} ${y && `${y} s`}`, false, `integral of |r − y| ${where}`, window.iae]);
-    found.push([`TV of u, ${where}`, `${short(window.control_variation)} ${u}`, false, `sum of |Δu| ${where}`]);
-  }
+    add("peak e", `${short(window.peak_error)} ${y}`, false, `largest |r − y|, ${where}`, "peak_error");
+    add("IAE", `${brief(window.iae)} ${y && `${y} s`}`, false, `integral of |r − y| ${where}`, "iae");
+    add("TV of u", `${short(window.control_variation)} ${u}`, false, `sum of |Δu| ${where}`, "control_variation");
+  });
   return found;
 }
 

@@ -1,0 +1,256 @@
+"""The prefilter of the reference of a tuned file: within the limits of u, a step overshoots little.
+
+An axis, whose position needs no u at rest, gets a ``ProfileGenerator``. With the rigid part
+``u = c_1 y' + c_2 y''`` of the plant's inverse and the room for u that loads of the scenario leave,
+
+    |c_1| v_max + |c_2| a_max ≤ share · room,        j_max = a_max / t_j
+
+and of the v_max those are taken with which the largest step of the scenario takes the least time.
+``share`` and the ramp t_j of the acceleration are tried in simulations of the file: the quickest
+move that keeps u within its limits and overshoots by 5 % at most.
+
+Another plant gets a ``ReferenceModel``, the fastest with which u keeps within its limits and the
+step overshoots by 5 % at most. So does an axis with a resonance: a small step behind a generator is
+quicker than its mode, and feedforward of the whole inertia then moves the motor alone. A reference
+model is as slow for a small step as for a large one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell.controllers.base import Controller
+from quell.controllers.feedforward import Feedforward
+from quell.controllers.prefilters import Prefiltered, ReferenceModel
+from quell.controllers.shaping import ProfileGenerator
+from quell.plants.linear import LinearPlant
+from quell.signals import LimitedMove
+from quell.tuning.optimiser import loops
+from quell.tuning.optimiser.loops import PlantSet, law_of, response
+from quell.tuning.written import MOST_OVERSHOOT, StepFigures, Written, held_load, held_step
+from quell.types import Vector
+
+# A step that needs less than this share of the u that the loop's own gain makes of it needs none.
+_NO_U = 1e-6
+# Shares of the room for u that a move uses, what a load may take of it at most, and the ramps of
+# the acceleration: in samples and in time constants of the loop. Chosen by hand; each is simulated.
+_SHARES, _MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
+_SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
+# Steps of v_max between nothing and what the room allows. Without viscous friction u bounds no
+# speed: then v_max is this multiple of the one that the largest step reaches.
+_SPEEDS, _FASTER = 40, 10.0
+# A move that settles within this multiple of its own duration is quick, and no other is looked for.
+_QUICK = 1.1
+# A slower move: factors of the acceleration, and how many are tried.
+_SLOWER, _TRIES = 0.5, 8
+# Share of the move in which u may be at a limit, and samples that are always allowed.
+_LIMITED, _FEW = 0.02, 2
+# The move is looked at for this multiple of the duration, and so many time constants of the loop.
+_LOOKED, _AFTER = 4.0, 60.0
+# Order of a reference model, steps of the bisection for its bandwidth, and its range in 1/dt.
+_ORDER, _BISECTIONS, _SLOWEST = 2, 30, 1e-6
+_LARGEST_ORDER = 8
+ORDER_OF_AXIS = 4
+"""Order of the reference model of an axis: with the same largest acceleration a step settles in
+2.9, 1.8 and 1.6 times the quickest time for the orders 2, 3 and 4."""
+# At limits it is made slower by this factor, so often at most.
+_BANDWIDTHS, _MOST_LAGS = 0.85, 32
+# Slower ones are looked at until the step takes this multiple of the quickest one.
+_SLOWER_THAN_BEST = 1.2
+
+
+class Shaped(NamedTuple):
+    """A prefilter, and the step of the file with it."""
+
+    prefilter: Any  # None for none
+    step: StepFigures | None
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The rigid part ``u = c_1 y' + c_2 y''`` of a plant that needs no u at rest."""
+
+    viscous: float
+    inertia: float
+
+    @classmethod
+    def of(cls, linear: LinearPlant, gain: float) -> Axis | None:
+        """Return it, or None for a plant that needs u at rest.
+
+        ``gain`` is that of the loop's controller [u-unit/y-unit], beside which u is small.
+        """
+        if not abs(held_step(linear)) <= _NO_U * gain:
+            return None
+        try:
+            _, viscous, inertia = Feedforward.of(linear, terms=2).coefficients
+        except ValueError:  # a zero at s = 0
+            return None
+        return cls(abs(viscous), abs(inertia)) if viscous or inertia else None
+
+    def needs(self, tau: float) -> float:
+        """Return the largest u of a move by 1 in 20 time constants [u-unit/y-unit]."""
+        half = 10.0 * tau
+        return self.inertia / half**2 + self.viscous / half
+
+    def profile(self, size: float, room: float, ramp: float) -> ProfileGenerator:
+        """Return the generator that needs ``room`` of u at most, for a largest step ``size``."""
+        inertia = max(self.inertia, self.viscous * ramp)  # an axis of order 1 follows the ramp
+        if inertia == 0.0 or self.viscous * math.sqrt(size * room / inertia) < 1e-6 * room:
+            a = room / inertia
+            return ProfileGenerator(_FASTER * math.sqrt(size * a), a, a / ramp)
+        speeds = room / self.viscous * (np.arange(_SPEEDS) + 0.5) / _SPEEDS
+        times = []
+        for v in speeds.tolist():
+            a = (room - self.viscous * v) / inertia
+            reached = size >= v * v / a
+            times.append((size / v + v / a if reached else 2.0 * math.sqrt(size / a)) + ramp)
+        v = float(speeds[int(np.argmin(times))])
+        a = (room - self.viscous * v) / inertia
+        return ProfileGenerator(v, a, a / ramp)
+
+
+def room_of_u(
+    written: Written, linear: LinearPlant, limits: tuple[float, float], u: float
+) -> float:
+    """Return what u may do on both sides of ``u`` at rest, less the loads of the scenario."""
+    room = min(limits[1] - u, u - limits[0])
+    loads = written.scenario.seeded_signals(written.plant.disturbances)[1]
+    if loads:
+        values = loads[0](np.arange(round(written.scenario.duration / written.dt)) * written.dt)
+        reserved = abs(held_load(linear)) * float(np.max(np.abs(values - values[0]), initial=0.0))
+        room -= min(reserved, _MOST_RESERVED * room)
+    return room
+
+
+def profile_for(
+    written: Written,
+    controller: Controller,
+    axis: Axis,
+    tau: float,
+    room: float,
+) -> Shaped:
+    """Return the quickest profile generator with which the step of the file keeps to its limits.
+
+    ``tau`` is the time constant of the closed loop [s].
+    """
+    if written.largest is None:
+        size = 1.0 / axis.needs(tau) * room
+        return Shaped(
+            axis.profile(size, _SHARES[0] * room, max(_SAMPLES[0] * written.dt, tau)), None
+        )
+    first, end, step = written.largest
+    size, found = abs(step), list[tuple[float, Shaped]]()
+    for generator in _profiles(axis, size, room, tau, written.dt):
+        own = _duration(generator, size)
+        last = min(end, first + math.ceil((_LOOKED * own + _AFTER * tau) / written.dt))
+        shown = _with(written, controller, generator, last)
+        most = max(_LIMITED * own, _FEW * written.dt)
+        if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
+            continue
+        # One that reaches a limit comes behind all that do not.
+        rank = shown.settling if shown.limited <= most else math.inf
+        found.append((rank, Shaped(generator, shown)))
+        if rank <= _QUICK * own:
+            break
+    if found:
+        return min(found, key=lambda pair: pair[0])[1]
+    generator = axis.profile(size, _SHARES[-1] * room, max(_SAMPLES[0] * written.dt, tau))
+    for i in range(_TRIES):
+        share = _SHARES[-1] * _SLOWER ** (i + 1)
+        generator = axis.profile(size, share * room, tau / math.sqrt(share))
+        shown = _with(written, controller, generator, end)
+        if shown.overshoot <= MOST_OVERSHOOT and not math.isnan(shown.settling):
+            return Shaped(generator, shown)
+    return Shaped(generator, None)
+
+
+def _profiles(
+    axis: Axis, size: float, room: float, tau: float, dt: float
+) -> Iterator[ProfileGenerator]:
+    """Yield the generators to try, quick ones first."""
+    ramps = [*(n * dt for n in _SAMPLES), *(n * tau for n in _CONSTANTS)]
+    made = [axis.profile(size, share * room, ramp) for share in _SHARES for ramp in ramps]
+    yield from sorted(made, key=lambda each: _duration(each, size))
+
+
+def _duration(generator: ProfileGenerator, size: float) -> float:
+    """Return how long a move from rest takes [s]."""
+    v, a, j = generator.v_max, generator.a_max, generator.j_max
+    return LimitedMove(size, v, a, j).duration
+
+
+def _with(written: Written, controller: Controller, prefilter: Any, last: int) -> StepFigures:
+    """Return the step of the file with a prefilter, up to a sample."""
+    shaped = Prefiltered(controller, prefilter)
+    run = written.run(shaped, written.until_settled(last * written.dt))
+    found = written.figures(shaped, run)
+    assert found is not None
+    return found
+
+
+def reference_model_for(
+    written: Written, controller: Controller, omega: float, order: int = _ORDER
+) -> Shaped:
+    """Return the reference model with which the step of the file settles soonest within its limits.
+
+    It overshoots by 5 % at most.
+
+    The first one tried has the bandwidth ``omega`` [rad/s], the next ones are slower.
+    """
+    assert written.largest is not None
+    order = max(order, min(int(getattr(controller, "derivatives", 0)), _LARGEST_ORDER))
+    end, at_limits, best = written.largest[1], Shaped(None, None), None
+    omega = min(omega, 1.0 / written.dt)
+    for _ in range(_MOST_LAGS):
+        model = ReferenceModel(omega, order)
+        shown = _with(written, controller, model, end)
+        omega *= _BANDWIDTHS
+        if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
+            continue
+        if shown.limited > max(_LIMITED * shown.looked, _FEW * written.dt):
+            at_limits = Shaped(model, shown) if at_limits.step is None else at_limits
+            continue
+        # A slower one may excite a mode less.
+        if best is None or shown.settling < best[1].settling:
+            best = model, shown
+        elif shown.settling > _SLOWER_THAN_BEST * best[1].settling:
+            break
+    return at_limits if best is None else Shaped(*best)
+
+
+def model_of_linear_step(plants: PlantSet, controller: Controller) -> ReferenceModel | None:
+    """Return the fastest reference model with which the linear loop overshoots by 5 % at most.
+
+    None where it does so without one.
+    """
+    inputs, law = loops.reference_step(plants), law_of(controller)
+    y, dt = response(plants.scaled()[0], law, inputs), plants.dt * inputs.distance
+    if not np.all(np.isfinite(y)) or np.max(y) - 1.0 <= MOST_OVERSHOOT:
+        return None
+    # With the pulse response any prefilter is a convolution.
+    pulse = np.diff(y, prepend=0.0)
+    low, high, best = _SLOWEST / dt, 1.0 / dt, None
+    for _ in range(_BISECTIONS):
+        omega = math.sqrt(low * high)
+        if np.max(_behind(ReferenceModel(omega, _ORDER), pulse, dt)) - 1.0 <= MOST_OVERSHOOT:
+            low, best = omega, ReferenceModel(omega, _ORDER)
+        else:
+            high = omega
+    return best
+
+
+def _behind(model: ReferenceModel, pulse: Vector, dt: float) -> Vector:
+    """Return the response to a step through a prefilter (k,)."""
+    from scipy.signal import lfilter
+
+    # All its poles are at the same place: r_f is the step through that many equal lags.
+    lag = math.exp(-model.omega * dt)
+    found = np.cumsum(pulse)
+    for _ in range(model.order):
+        found = lfilter([1.0 - lag], [1.0, -lag], found)
+    return np.asarray(found, dtype=np.float64)
