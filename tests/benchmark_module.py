@@ -14,6 +14,8 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 @cache
 def benchmark(name: str) -> Any:
     """Return the module of a script, by its name without suffix."""
+    if str(BENCHMARKS) not in sys.path:  # scripts import each other by name
+        sys.path.append(str(BENCHMARKS))
     spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None

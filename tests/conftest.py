@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import math
 import os
+import re
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -25,7 +27,12 @@ import quell as ql
 from quell.kernels import dispatch
 from quell.simulation.driver import Loop
 
+from . import budget
 from .scheduling import FromBothEnds, compiled_first
+
+# pytest rewrites the assertions of each file, half of the time that collection takes: keep the result
+# in __pycache__, also where Python is told to write none.
+sys.dont_write_bytecode = False
 
 # The same examples in every run, and no stop-watch: the machines that test are shared.
 settings.register_profile("quell", deadline=None, derandomize=True)
@@ -53,18 +60,56 @@ event.register("numba:compile", _FrozenCode())
 gc.unfreeze = lambda: None
 
 
+# What test files make while they are collected is not worth a compilation.
+dispatch.interpret_all = True
+
+
+_ONLY_TRIALS = re.compile(r"^pytestmark = (\[\s*)?pytest\.mark\.trial", re.M)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not even import the files that have only trials, in a run without trials."""
+    if collection_path.suffix != ".py" or config.option.markexpr != "not trial":
+        return None
+    if any(collection_path.name in each for each in config.args):
+        return None  # a file that is named is shown with all its tests deselected
+    return True if _ONLY_TRIALS.search(collection_path.read_text(encoding="utf-8")) else None
+
+
 def pytest_collection_finish() -> None:
     """Spare the garbage collector all that was imported."""
     gc.freeze()
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options of these tests."""
+    budget.add_options(parser)
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    """Say how long the tests take."""
+    return budget.announcement(config)
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Start no more workers than there are files to run, and no more than four."""
+    files = [each for each in config.args if each.partition("::")[0].endswith(".py")]
+    return min(os.cpu_count() or 1, 4, len(files) or 4)
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the markers."""
+    """Declare the markers, and let tests keep their budget."""
+    config.pluginmanager.register(budget.Budget(config))
     config.addinivalue_line(
         "markers", "compiled: what it runs is compiled; all other tests run it as plain Python"
     )
     config.addinivalue_line(
-        "markers", "slow: a trial of more than some seconds; pytest -m '' runs these, too"
+        "markers",
+        "trial(cases='...'): it takes more than half a second, or these cases of it do (a regular "
+        "expression); pytest -m '' runs trials, too, and so does .ci/run, in parts",
+    )
+    config.addinivalue_line(
+        "markers", "lost: it has runs that fail, diverge or run away, of which quell warns"
     )
 
 
@@ -83,9 +128,16 @@ def _run_short(loop: Loop, *arguments: Any) -> int:
 Loop.run = _run_short  # type: ignore[method-assign]
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the files with compiled tests first."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Choose a part, compiled files first; let runs diverge where that is the subject."""
+    budget.choose(config, items)
     compiled_first(items)
+    for item in items:
+        if item.get_closest_marker("lost") is not None:
+            item.add_marker(
+                pytest.mark.filterwarnings(r"ignore:.*(diverged|went beyond|ran away|runs failed)")
+            )
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> FromBothEnds | None:

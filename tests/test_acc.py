@@ -24,6 +24,8 @@ from quell.experiments.acc.loops import BOX, MB, MF, boxed, free_poles, generate
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
 
+from .cases import cases
+
 HEADER = "m1,m2,k_lin,k_nonlin,lambda,tau\n"
 SOFT = (0.9, 1.1, 1.05, -0.25, 0.95, 0.03)
 
@@ -71,7 +73,7 @@ def test_without_its_cubic_part_the_spring_makes_a_linear_plant() -> None:
     np.testing.assert_allclose(one, other, atol=1e-7)
 
 
-@pytest.mark.parametrize("argument", ["m1", "m2", "k", "effectiveness", "lag"])
+@cases("argument", ["m1", "m2", "k", "effectiveness", "lag"])
 def test_what_must_be_positive_in_the_plant_is_named(argument: str) -> None:
     """One line with argument and value."""
     with pytest.raises(
@@ -92,7 +94,7 @@ def test_samples_are_read_by_name_whatever_their_order(tmp_path: Path) -> None:
         np.testing.assert_array_equal(acc.read(tmp_path / name), [[1.0, 2.0, 3.0, -4.0, 5.0, 6.0]])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("text", "told"),
     [
         ("m1,m2,k_lin,lambda,tau\n1,1,1,1,0.01\n", r"column k_nonlin \(or theta_4\) is missing"),
@@ -229,6 +231,7 @@ def test_a_case_that_is_lost_is_called_unstable_and_one_that_does_not_settle_nev
     assert "3never" not in told
 
 
+@pytest.mark.trial
 def test_the_command_writes_what_programs_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -314,6 +317,7 @@ def test_the_search_for_the_box_begins_at_mf_eso_and_may_reach_its_result() -> N
     assert np.max(np.abs(poles)) < 0.5
 
 
+@pytest.mark.trial
 def test_the_score_of_the_search_counts_failures_and_ranks_by_late_motion() -> None:
     """A plant that fails scores about 1, another about 0, and more where it moves more late; ``.ci/run`` has 60 plants."""
     samples = boxed(6, 9)[1::2]

@@ -15,6 +15,7 @@ import pytest
 import quell as ql
 from quell.types import Status
 
+from .cases import cases
 from .commands import run_python
 from .contracts.python_models import (
     CHAIN,
@@ -52,6 +53,7 @@ def test_a_late_model_is_told_of_and_not_waited_for() -> None:
     assert learner.trained(controller._state.learner).theta.size == 2
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("interpret", [pytest.param(False, marks=pytest.mark.compiled), True])
 @pytest.mark.parametrize("budget", [None, 30.0])
 @pytest.mark.parametrize(
@@ -80,6 +82,7 @@ def test_a_model_that_fails_is_said_to_and_the_loop_goes_on(
     assert np.max(np.abs(run["y"])) < 2.0
 
 
+@pytest.mark.trial
 def test_a_model_starts_anew_after_a_failure_and_is_disabled_after_three_in_a_row() -> None:
     """One that fails at its sixth call each time goes on for ever; one that always fails is asked three times."""
     again, never = PythonModel(Broken(5, math.nan)), PythonModel(Broken(2, math.nan))
@@ -113,6 +116,7 @@ def test_where_warnings_are_errors_a_failure_still_stays_inside(
     assert "learner Broken raised" in capsys.readouterr().err
 
 
+@pytest.mark.trial
 def test_an_interrupted_model_interrupts_the_simulation() -> None:
     """Control-C while the model runs comes out of ``simulate``, once the loop can be left."""
     script = """
@@ -143,7 +147,7 @@ except KeyboardInterrupt:
     assert shown.stdout.strip() == "interrupted"
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: PythonModel(3.0), r"model = 3.0: must be an object with learn"),

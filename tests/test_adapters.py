@@ -20,6 +20,7 @@ import quell as ql
 from quell.learners.python_model import INSTANCES, finite_number
 from quell.types import Status
 
+from .cases import cases
 from .contracts.python_models import (
     CHAIN,
     HARD_SPRING,
@@ -62,7 +63,7 @@ def plain_deviation() -> float:
     return deviation(driven(HARD_SPRING, None, 20.0), 10.0, 20.0)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("name", [name for name in LEARNERS if name not in LINEAR])
 def test_a_python_model_learns_a_hard_spring(name: str) -> None:
     """It takes two thirds of what the plain ESO leaves of a spring and drag it was told nothing of."""
@@ -71,6 +72,7 @@ def test_a_python_model_learns_a_hard_spring(name: str) -> None:
     assert deviation(run, 20.0, 30.0) < plain_deviation() / 3.0
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("library", "form"),
     [("none", "current"), ("none", "predictor"), ("sklearn", "current"), ("river", "current")],
@@ -137,7 +139,7 @@ def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
         assert len(np.unique(run["f_learned"])) <= len(batches) + 1
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("name", LEARNERS)
 def test_the_loop_of_ones_own_is_the_simulated_loop(name: str) -> None:
     """``controller.step`` gives what ``simulate`` gives."""
@@ -150,6 +152,7 @@ def test_the_loop_of_ones_own_is_the_simulated_loop(name: str) -> None:
     np.testing.assert_allclose(u, run["u"], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.trial
 def test_a_model_within_its_budget_does_as_without() -> None:
     """The same numbers, when the loop waits long enough."""
     waited = ql.simulate(CHAIN, law(PythonModel(LeastMeanSquares(), budget=30.0)), SHORT)
@@ -175,6 +178,7 @@ def test_an_optimiser_of_torch_is_copied_with_its_module(kind: str) -> None:
     assert any(not torch.equal(before[key], value) for key, value in after.items())
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("name", LEARNERS)
 def test_same_seed_same_bits(name: str) -> None:
     """Also in two threads at once, and after another run of the same controller."""
@@ -186,7 +190,8 @@ def test_same_seed_same_bits(name: str) -> None:
         np.testing.assert_array_equal(run.log, first.log)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.trial
+@cases("name", LEARNERS)
 def test_a_saved_state_goes_on_without_a_trace(name: str, rng: np.random.Generator) -> None:
     """Into another controller, twice from the same state; and so do copies and what was pickled."""
     one, other = law(LEARNERS[name]), law(LEARNERS[name])
@@ -208,6 +213,7 @@ def test_a_saved_state_goes_on_without_a_trace(name: str, rng: np.random.Generat
     assert [one.step(0.5, y[k]) for k in range(200)] == [fresh.step(0.5, y[k]) for k in range(200)]
 
 
+@pytest.mark.trial
 def test_a_state_that_does_not_fit_changes_nothing() -> None:
     """A number where the model should be is refused."""
     controller = law(PythonModel(LeastMeanSquares()))
@@ -226,6 +232,7 @@ def test_a_state_that_does_not_fit_changes_nothing() -> None:
             np.testing.assert_array_equal(array, before[name])
 
 
+@pytest.mark.trial
 def test_the_model_passed_in_is_not_changed() -> None:
     """Nor does changing it later change the learner."""
     model = Counter()
@@ -237,6 +244,7 @@ def test_the_model_passed_in_is_not_changed() -> None:
     np.testing.assert_array_equal(ql.simulate(CHAIN, law(learner), SHORT).log, first.log)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("budget", [None, 30.0])
 def test_nothing_is_left_behind(budget: float | None) -> None:
     """With the last state goes its copy of the model, and its thread."""
@@ -256,9 +264,7 @@ def test_nothing_is_left_behind(budget: float | None) -> None:
     assert threading.active_count() <= threads
 
 
-@pytest.mark.parametrize(
-    "value", [1.5, np.float32(1.5), np.array([1.5]), np.array([[1.5]]), np.array(1.5)]
-)
+@cases("value", [1.5, np.float32(1.5), np.array([1.5]), np.array([[1.5]]), np.array(1.5)])
 def test_one_number_may_come_in_any_form(value: Any) -> None:
     """As libraries return it."""
     assert finite_number(value) == 1.5

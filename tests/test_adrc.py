@@ -15,6 +15,8 @@ from quell.controllers.law import law_gains
 from quell.observers.eso import ESO
 from quell.plants.base import advance, measure
 
+from .cases import cases
+
 OBSERVER = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01)
 
 
@@ -39,6 +41,7 @@ def test_the_law_puts_all_poles_of_the_ideal_loop_at_minus_omega_c() -> None:
         np.testing.assert_allclose([*law_gains(n, 3.0), 1.0][::-1], np.poly([-3.0] * n), rtol=1e-4)
 
 
+@pytest.mark.trial
 def test_a_known_plant_answers_a_step_as_the_ideal_loop_does() -> None:
     """With MB-ESO, ``y = 1 − e^(−ω t)(1 + ω t)`` for a plant of order 2, as the sample time goes to zero."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.4]], [0.0, 2.0], [1.0, 0.0])
@@ -89,6 +92,7 @@ def test_the_control_signal_respects_magnitude_and_rate() -> None:
     assert run["y"][-1] == pytest.approx(3.0, abs=0.02)
 
 
+@pytest.mark.trial
 def test_saturation_does_not_wind_up_the_observer() -> None:
     """It is told the applied u: after 50 s against a wall of a limit, f is still estimated right, and release is immediate."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 2.0], [1.0, 0.0])
@@ -282,7 +286,7 @@ def test_the_estimate_says_what_is_known() -> None:
     np.testing.assert_allclose(known.x, [0.5, 0.0])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (

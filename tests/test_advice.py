@@ -15,6 +15,8 @@ from quell import analysis
 from quell.controllers import warn_if_unwise
 from quell.controllers.adrc import sampling_findings
 
+from .cases import cases
+
 
 def adrc(
     omega_o: float,
@@ -94,6 +96,7 @@ def test_a_slow_sample_time_is_warned_of_with_its_number() -> None:
     assert sampling_findings(adrc(30.0, 10.0, 0.01, form="predictor").observer, 10.0) == []
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_noise_is_judged_by_the_range_of_u() -> None:
     """By the RMS that a simulation shows; the omega_o it names passes, and without a range there is nothing to judge by."""
@@ -162,7 +165,7 @@ SPRING = ([2.0, 6.0], [1.0, 0.4, 9.0, 0.0])
 WITH_ZEROS = ql.ESO.model_based(SPRING, omega_o=40.0, dt=1e-3)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("observer", "plant"),
     [
         (WITH_ZEROS, SPRING),
@@ -212,7 +215,7 @@ def test_a_delay_that_the_observer_knows_of_is_in_the_plant_that_it_assumes() ->
     assert lag.value == pytest.approx(analysis.analyse(ideal(2), calm, delay=0.3).margins.modulus)
 
 
-@pytest.mark.parametrize("order", [1, 2, 3, 4, 8])
+@cases("order", [1, 2, 3, 4, 8])
 def test_the_ideal_loop_settles_when_asked(order: int) -> None:
     """The step response of ``omega_c^n/(s + omega_c)^n``, summed, enters the band at that time."""
     for band in (0.02, 0.002):
@@ -227,6 +230,7 @@ def test_herbst_s_rules_are_rounded_up() -> None:
         assert 0.97 * rule < ql.omega_c_for(1.0, order) < rule
 
 
+@pytest.mark.trial
 def test_a_loop_with_a_model_and_a_fast_observer_settles_when_asked() -> None:
     """To 1 %, for a plant of order 3."""
     plant = ql.plants.LinearPlant(
@@ -252,7 +256,7 @@ CHAIN = ([1.0], [1.0, 0.0, 0.0])
 
 
 @pytest.mark.filterwarnings("ignore::quell.DesignWarning")
-@pytest.mark.parametrize(
+@cases(
     ("plant", "poor", "advice", "better"),
     [
         (CHAIN, {"b0": -1.0}, "b = 1 and b0 = -1 differ in sign: correct b0", {}),
@@ -329,6 +333,7 @@ def test_the_summary_of_a_loop_that_needs_no_phase_margin_says_so() -> None:
     assert loop.margins.phase == math.inf
 
 
+@pytest.mark.trial
 def test_a_law_that_is_faster_than_its_observer_is_found() -> None:
     """At ten times omega_o the loop keeps its margins, but a wrong b0 makes it ten times as slow as the law says."""
     (finding,) = analysis.advise(adrc(20.0, 200.0, 1e-3))

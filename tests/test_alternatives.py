@@ -44,7 +44,7 @@ def mass(seed: int, friction: float) -> tuple[Any, Any]:
     return u, y + 1e-3 * rng.standard_normal(u.size)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_friction_is_suggested_where_it_is_and_its_model_is_the_decision() -> None:
     """A mass with friction, fitted without: the report suggests it, by far more than chance."""
     u, y = mass(0, friction=1.0)
@@ -57,6 +57,7 @@ def test_friction_is_suggested_where_it_is_and_its_model_is_the_decision() -> No
     assert chosen.den.size == 3
 
 
+@pytest.mark.trial
 def test_no_friction_is_suggested_where_there_is_none() -> None:
     """A mass without friction under a load that the model lacks: the error is not white, but friction does not explain it."""
     u = excitation("prbs", (0.5, 10.0), 30.0, DT, -1.0, 1.0).u
@@ -91,6 +92,7 @@ def test_a_pole_too_few_is_worse_and_not_mentioned() -> None:
     assert other.describe(found) == ""
 
 
+@pytest.mark.trial
 def test_a_flexible_axis_with_its_encoder_at_the_motor_gets_two_zeros() -> None:
     """Four poles without zeros do not explain it; three have one that is faster than samples show, and are not advised."""
     dt, plant = 2.5e-4, ([8333.0, 3.7e5, 6.4e9], [1.0, 69.7, 1.281e6, 1.281e6, 0.0])
@@ -128,6 +130,7 @@ def test_another_record_validates_the_model() -> None:
         ql.identify(*records[0], DT, order=2, validation=(np.arange(5.0), np.arange(5.0)))
 
 
+@pytest.mark.trial
 def test_the_command_validates_and_suggests(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """``quell identify data.csv --validate other.csv``: fit, suggestion, and alternatives in JSON."""
     for name, seed in (("data", 0), ("other", 5)):
@@ -149,6 +152,7 @@ def test_the_command_validates_and_suggests(quell: Callable[..., Shown], tmp_pat
     assert "fits better" not in shown.out
 
 
+@pytest.mark.trial
 @pytest.mark.skipif(not RECORDS.is_dir(), reason="the public records are not on this machine")
 def test_a_positioning_system_with_friction_gets_the_published_parameters() -> None:
     """EMPS in means of 20 ms: friction is suggested; pole, gain and friction are near to those of Janot, Gautier & Brunot 2019."""

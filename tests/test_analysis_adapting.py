@@ -38,7 +38,7 @@ def run(learner: Any, omega: float, size: float, level: float = 0.0) -> ql.Traje
     return ql.simulate(LOADED, controller(learner), scenario)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("make", "level"),
     [
@@ -116,6 +116,7 @@ def test_a_guard_without_authority_leaves_the_loop_of_the_observer() -> None:
     assert analysis.analyse(LOADED, guarded).margins.modulus == plain.margins.modulus
 
 
+@pytest.mark.trial
 def test_the_authority_is_that_of_the_instant() -> None:
     """Early in a run a guard has granted less of it than at the end; that multiplies the bias, too."""
     observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=12.0, dt=DT)
@@ -153,6 +154,7 @@ def test_a_learner_whose_adaptation_is_not_known_is_named() -> None:
     assert "NOT" not in repr(analysis.analyse(LOADED, repetitive, at=still))
 
 
+@pytest.mark.trial
 def test_advise_tells_what_a_bias_takes_of_the_margin() -> None:
     """With the bandwidth that it names M_s is at its limit; below the limit nothing is said."""
     plant = ql.plants.two_mass_spring()

@@ -61,6 +61,7 @@ def test_what_the_record_says_of_a_learner_is_what_its_state_says(learner: Any) 
     assert recorded.gain[0] == pytest.approx(-1.0, abs=0.6)
 
 
+@pytest.mark.trial
 def test_a_guard_s_authority_scales_what_is_fed_back() -> None:
     """At 8 s the learner is only half heard."""
     controller = ql.ADRC(
@@ -76,6 +77,7 @@ def test_a_guard_s_authority_scales_what_is_fed_back() -> None:
     assert not np.any(analysis.frozen(controller, run, 0.0).gain)
 
 
+@pytest.mark.trial
 def test_a_network_is_what_it_is_for_small_motions() -> None:
     """Its gains are the slope of its own prediction, and asking for them leaves it as it was."""
     controller = adrc(2, learner=ql.learners.MLP(hidden=4))
@@ -108,6 +110,7 @@ def test_a_learner_that_knows_the_plant_leaves_the_poles_of_the_design() -> None
     )
 
 
+@pytest.mark.trial
 def test_margins_over_time_are_those_of_each_instant() -> None:
     """From the record; the same from the scenario, simulated up to there."""
     controller = adrc(2, learner=ql.learners.Kalman())

@@ -164,6 +164,7 @@ class Python:
         return 0.0
 
 
+@pytest.mark.trial
 def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
     """By name, value and rule."""
     controller = adrc(2, learner=ql.learners.MLP(hidden=2))

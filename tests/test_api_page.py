@@ -10,6 +10,8 @@ import pytest
 
 import quell as ql
 
+from .cases import cases
+
 FOLDER = Path(__file__).parents[1] / "docs" / "api"
 PAGES = sorted(FOLDER.glob("*.rst"))
 ROOMS = (
@@ -45,7 +47,7 @@ def listed() -> set[str]:
     return {part for target in targets for part in target.split(".")} | set(members)
 
 
-@pytest.mark.parametrize("room", ROOMS)
+@cases("room", ROOMS)
 def test_every_public_name_of_a_room_is_on_a_page(room: str) -> None:
     """By a directive of its own, or among a module's members."""
     names = set(importlib.import_module(f"quell.{room}").__all__)
@@ -71,7 +73,7 @@ def test_every_name_of_the_package_is_on_a_page_and_every_target_exists() -> Non
             assert hasattr(thing, member) or member in annotated, f"{target} has no {member}"
 
 
-@pytest.mark.parametrize("room", [room for room in ROOMS if "." not in room])
+@cases("room", [room for room in ROOMS if "." not in room])
 def test_a_room_has_a_page_with_names_of_its_own(room: str) -> None:
     """Readers find a folder's names under the folder's name, and no page is empty."""
     page = (FOLDER / f"{room}.rst").read_text(encoding="utf-8")

@@ -21,6 +21,8 @@ from quell.controllers.allocation import (
 )
 from quell.plants.multibody import rotor_levers
 
+from .cases import cases
+
 DT = 1e-3
 NAMES = ("x", "y", "z")
 
@@ -44,6 +46,7 @@ REFERENCES = (ql.signals.Step(1.0, 0.1), ql.signals.Sinusoid(0.5, 3.0))
 class TestDecoupledAxes:
     """Axes that nothing couples are single loops."""
 
+    @pytest.mark.trial
     @pytest.mark.parametrize("limit", [math.inf, 20.0])
     def test_are_the_single_loops(self, limit: float) -> None:
         """With the unit matrix for B0 and limits of each actuator, the runs are equal."""
@@ -62,6 +65,7 @@ class TestDecoupledAxes:
             np.testing.assert_allclose(own["u"], alone["u"], rtol=0.0, atol=1e-8)
             assert own["x_hat"].shape == alone["x_hat"].shape
 
+    @pytest.mark.trial
     def test_with_the_right_matrix_coupled_actuators_are_no_coupling(self) -> None:
         """A force that moves both masses is divided by B0, so the axes do not feel each other."""
         plant = two_masses(coupling=0.4)
@@ -75,6 +79,7 @@ class TestDecoupledAxes:
 class TestObserversAndLimits:
     """Observers receive what was applied."""
 
+    @pytest.mark.trial
     @pytest.mark.parametrize("saturation", ["each", "direction", ["axis2", "axis1"]])
     def test_a_limit_of_one_actuator_is_no_disturbance(self, saturation: object) -> None:
         """The estimates of f stay right while actuators are at their limits."""
@@ -164,8 +169,8 @@ def allocation(B0: object, saturation: object = "each", high: float = 1.0, **kw:
 class TestAllocation:
     """From what the axes ask for to the actuators."""
 
-    @pytest.mark.parametrize("seed", range(20))
-    @pytest.mark.parametrize("saturation", ["each", "direction", "order"])
+    @cases("seed", range(20))
+    @cases("saturation", ["each", "direction", "order"])
     def test_what_is_possible_is_done(self, seed: int, saturation: str) -> None:
         """Within the limits B0 u is what the axes ask for."""
         rng = np.random.default_rng(seed)
@@ -193,7 +198,7 @@ class TestAllocation:
         assert np.max(np.abs(u)) == pytest.approx(1.0)
         assert flags == int(ql.Status.SATURATED)
 
-    @pytest.mark.parametrize("seed", range(60))
+    @cases("seed", range(60))
     def test_priority_is_least_squares_with_weights_of_the_axes(self, seed: int) -> None:
         """SciPy's solver finds the same v; an axis counts 100 times as much as the next one."""
         rng = np.random.default_rng(seed)
@@ -225,7 +230,7 @@ class TestAllocation:
         assert (B0 @ u)[2] == pytest.approx(2.0 * 5.8 * 0.015, rel=1e-5)
         assert flags == int(ql.Status.SATURATED)
 
-    @pytest.mark.parametrize("much", [1.0, 30.0, 1e6, 1e300])
+    @cases("much", [1.0, 30.0, 1e6, 1e300])
     def test_an_axis_that_asks_for_more_than_there_is_takes_no_more(self, much: float) -> None:
         """Whatever yaw asks for, roll before it gets what it needs within 1 % of its reach."""
         B0 = rotor_levers(0.17, 0.015)
@@ -239,7 +244,7 @@ class TestAllocation:
         assert u[0] == 1.0
         assert u[1] == pytest.approx(-0.5, abs=0.15)
 
-    @pytest.mark.parametrize("seed", range(60))
+    @cases("seed", range(60))
     def test_more_actuators_solve_least_squares_within_limits(self, seed: int) -> None:
         """SciPy's solver finds the same u, with weights and a wished u."""
         rng = np.random.default_rng(seed)
@@ -265,8 +270,8 @@ class TestAllocation:
         np.testing.assert_allclose(B0 @ u, [0.1, -0.05, 0.01], atol=1e-12)
         assert flags == 0
 
-    @pytest.mark.parametrize("saturation", ["each", "direction", "order"])
-    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    @cases("saturation", ["each", "direction", "order"])
+    @cases("bad", [np.nan, np.inf, -np.inf])
     def test_no_v_makes_a_u_that_is_no_number(self, saturation: str, bad: float) -> None:
         """Whatever the axes ask for, u is finite and within the limits."""
         rule = ["x", "y"] if saturation == "order" else saturation
@@ -279,6 +284,7 @@ class TestAllocation:
 class TestFunctionOfTheEstimates:
     """B0, or its inverse M, as a function."""
 
+    @pytest.mark.trial
     def test_a_function_that_is_constant_is_the_matrix(self) -> None:
         """B0 as a matrix, as a function, and M as a function give one run."""
 
@@ -301,6 +307,7 @@ class TestFunctionOfTheEstimates:
         for run in runs[1:]:
             np.testing.assert_allclose(run["y"], runs[0]["y"], atol=1e-11)
 
+    @pytest.mark.trial
     def test_a_matrix_that_is_not_good_is_not_used(self) -> None:
         """NaN and a singular matrix leave the last good one, and set a flag."""
 
@@ -318,6 +325,7 @@ class TestFunctionOfTheEstimates:
             assert (ql.Status.GAIN_HELD in axes.status) == (y > 1.0)
             assert u[0] == pytest.approx(2.0 * u[1], rel=1e-6)
 
+    @pytest.mark.trial
     def test_an_arm_with_its_mass_matrix_follows_better(self) -> None:
         """The arm's M(q) leaves a part of the error of its diagonal at rest."""
         arm = ql.plants.arm(gravity=0.0)
@@ -386,6 +394,7 @@ class TestOperation:
         twin.step([0.1, 0.2], [0.5, 0.0])
         assert np.array_equal(axes.estimates["axis1"].x, before)
 
+    @pytest.mark.trial
     def test_feedforward_follows_without_lag(self) -> None:
         """With the references' derivatives each axis follows a sine far better."""
         scenario = ql.Scenario(reference=(ql.signals.Sinusoid(0.5, 3.0),) * 2, duration=4.0)
@@ -400,6 +409,7 @@ class TestOperation:
 class TestRuns:
     """``simulate`` and its record."""
 
+    @pytest.mark.trial
     def test_interpreted_is_compiled(self) -> None:
         """The same functions as Python give the same run, with learner, guard and a function."""
         arm = ql.plants.arm()
@@ -413,6 +423,7 @@ class TestRuns:
         other = ql.simulate(arm, axes, scenario, interpret=True)
         np.testing.assert_allclose(one.log, other.log, rtol=1e-7, atol=1e-7)
 
+    @pytest.mark.trial
     def test_record_is_saved_whole(self, tmp_path) -> None:  # type: ignore[no-untyped-def]
         """Channels, names and status come back; an axis is a record with metrics and plot."""
         axes = ql.Axes({"shoulder": joint(learner=ql.learners.RLS()), "elbow": joint()})
@@ -432,6 +443,7 @@ class TestRuns:
         head = (tmp_path / "run.csv").read_text().partition("\n")[0]
         assert "elbow.x_hat[1]" in head
 
+    @pytest.mark.lost
     def test_a_loop_that_diverges_ends(self) -> None:
         """The wrong sign of B0 is reported with a time."""
         axes = ql.Axes([joint(), joint()], -np.eye(2))
@@ -500,7 +512,7 @@ BAD: tuple[tuple[object, str], ...] = (
 )
 
 
-@pytest.mark.parametrize(("wrong", "message"), BAD, ids=range(len(BAD)))
+@cases(("wrong", "message"), BAD, ids=range(len(BAD)))
 def test_what_does_not_fit_is_named(wrong, message: str) -> None:  # type: ignore[no-untyped-def]
     """Errors name the axis, the shapes and the rule."""
     with pytest.raises(ValueError, match=message):

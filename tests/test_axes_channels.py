@@ -17,6 +17,7 @@ from quell.realtime.channels import checked_channels
 from quell.realtime.recordings import Event
 from quell.setup import made_axes
 
+from .cases import cases
 from .commands import Shown
 from .rig_bench import PlainRig
 from .scripted import PLANT as ONE
@@ -106,6 +107,7 @@ class Scripted:
         """Do nothing."""
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(("make", "most"), [(gantry, 1e-12), (compensated, 0.2)])
 def test_after_a_brake_an_axis_moves_as_after_a_start(make: Any, most: float) -> None:
     """Neither observer nor drive winds up under a channel; without one they do.
@@ -174,7 +176,7 @@ def test_a_replay_uses_the_channels_of_a_recording(tmp_path: Path) -> None:
         replay(record, gantry(), channels=["y.held"])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("names", "message"),
     [
         (("z.held",), "'z.held' must be small .*it may be an axis and a dot, x.held"),

@@ -21,6 +21,7 @@ from quell.export.library.vectors import golden_vectors
 from quell.kernels.dispatch import as_python
 
 from . import gain_functions
+from .cases import cases
 from .contracts.python_models import python_learners
 from .in_c import InC, built, needs_gcc
 
@@ -154,6 +155,7 @@ def outcome(folder: Path, *arguments: str) -> tuple[int, str]:
     return done.returncode, done.stdout
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize(
     ("name", "precision"),
@@ -169,6 +171,7 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
     assert "largest difference 0 ulp" in text
 
 
+@pytest.mark.trial
 def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
     """Held values, limits of magnitude and rate, a brake, and learners that learn."""
     axes = ROWS["each, with rates"]()
@@ -184,6 +187,7 @@ def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
         at += width
 
 
+@pytest.mark.trial
 def test_the_run_of_the_golden_vectors_has_bands_that_are_kept_and_left() -> None:
     """Samples in which the safe sets act and all is well, and some where the limits are too narrow."""
     axes = ROWS["safe sets, more actuators, direction"]()
@@ -194,6 +198,7 @@ def test_the_run_of_the_golden_vectors_has_bands_that_are_kept_and_left() -> Non
     assert any(ql.Status.UNSAFE not in each for each in acted)
 
 
+@pytest.mark.trial
 @needs_gcc
 def test_golden_vectors_find_a_wrong_number(tmp_path: Path) -> None:
     """Another entry of B0's inverse is a difference; so is a wrong flag of one axis."""
@@ -254,6 +259,7 @@ def taught(axes: ql.Axes, samples: int = 150) -> ql.Axes:
 class TestMemory:
     """What axes have learned outlives the process and the target."""
 
+    @pytest.mark.trial
     @needs_gcc
     def test_images_of_python_and_c_are_the_same_bytes(self, tmp_path: Path) -> None:
         """And each continues the loop of the other, bit by bit."""
@@ -308,7 +314,7 @@ class TestMemory:
             other.restore(image, running=True)
         other.restore(image)
 
-    @pytest.mark.parametrize(
+    @cases(
         "other",
         [
             lambda: ql.Axes(two(), [[1.0, 0.3], [0.3, 1.0]], **LIMITS),
@@ -326,6 +332,7 @@ class TestMemory:
         with pytest.raises(ValueError, match="of another controller"):
             other().restore(taught(learning(), 10).memory())
 
+    @pytest.mark.trial
     @needs_gcc
     def test_an_image_of_equal_axes_in_another_order_is_refused(self, tmp_path: Path) -> None:
         """In Python as in C: only their names say which is which."""
@@ -372,6 +379,7 @@ class TestMemory:
 class TestOperationsInC:
     """Operations besides a step."""
 
+    @pytest.mark.trial
     @needs_gcc
     def test_a_start_holds_the_machine(self, tmp_path: Path) -> None:
         """The next u is that of the start, as in Python; what is no number changes nothing."""
@@ -383,6 +391,7 @@ class TestOperationsInC:
         assert robot.call("status", ctypes.c_int) & int(ql.Status.CONTROL_HELD)
         np.testing.assert_allclose(robot.step(y, y, 2), u, rtol=1e-6)
 
+    @pytest.mark.trial
     @needs_gcc
     def test_manual_operation_ends_without_a_bump(self, tmp_path: Path) -> None:
         """``hand_over`` needs a sample, and then u continues."""
@@ -394,6 +403,7 @@ class TestOperationsInC:
         assert robot.call("hand_over", ctypes.c_bool)
         np.testing.assert_allclose(robot.step(r, y, 2), u, atol=1e-9)
 
+    @pytest.mark.trial
     @needs_gcc
     def test_one_axis_is_held_by_its_place(self, tmp_path: Path) -> None:
         """A place that no axis has changes nothing."""
@@ -403,6 +413,7 @@ class TestOperationsInC:
             robot.step([0.1, 0.1], [0.0, 0.0], 2)
             assert robot.call("status", ctypes.c_int) & int(ql.Status.HELD) == flag
 
+    @pytest.mark.trial
     @needs_gcc
     def test_the_estimate_has_each_axis_by_name(self, tmp_path: Path) -> None:
         """Members of the struct are those of the estimates in Python."""
@@ -466,6 +477,7 @@ def test_what_has_no_counterpart_is_named(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.trial
 @needs_gcc
 def test_files_have_no_placeholder_and_compile_as_cpp(tmp_path: Path) -> None:
     """Also the loop in the description."""

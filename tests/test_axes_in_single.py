@@ -42,6 +42,7 @@ def scenario(controller: Any, duration: float = 0.12, **parts: Any) -> ql.Scenar
     return ql.Scenario(moves, duration=duration, rest_at=(0.08,), noise=noise, **parts)
 
 
+@pytest.mark.trial(cases="drives, direction|more actuators, least squares")
 @pytest.mark.parametrize("name", SINGLE)
 def test_axes_in_single_precision_do_what_they_do_in_double(name: str) -> None:
     """Their state and u are single throughout; ``precision`` of ``simulate`` is the same run."""
@@ -104,6 +105,7 @@ def test_axes_in_single_precision_start_are_tracked_and_get_other_limits() -> No
         in_single_precision(axes).hand_over()
 
 
+@pytest.mark.trial
 def test_state_feedback_in_single_precision_does_what_it_does_in_double() -> None:
     """In a loop, with a start; it has no axes to track."""
     law = feedback(u_max=0.5)
@@ -144,6 +146,7 @@ def test_a_function_b0_is_refused_in_single_precision() -> None:
         in_single_precision(ql.Axes([joint(), joint()], gain_functions.nested_tuples))
 
 
+@pytest.mark.trial
 def test_the_code_of_axes_in_single_precision_is_that_of_the_axes_in_single() -> None:
     """``quell.export`` takes both, and what has no counterpart in another form is refused."""
     axes = ROWS["priority"]()
@@ -153,6 +156,7 @@ def test_the_code_of_axes_in_single_precision_is_that_of_the_axes_in_single() ->
         c_source(single, resolution=1e-3)
 
 
+@pytest.mark.trial
 def test_the_comparison_has_figures_of_each_axis_and_actuator(tmp_path: Path) -> None:
     """The largest decides; a few units of the last digit are written."""
     axes = ROWS["priority"]()
@@ -235,6 +239,7 @@ class _Run(dict[str, Any]):
         return 10
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(("precision", "parts", "message"), [
     ("double", ("plant", "scenario"), "are compared in single precision only"),
     ("single", ("plant",), "a comparison needs both"),
@@ -254,6 +259,7 @@ def test_a_plant_or_scenario_without_effect_is_refused(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.trial
 def test_single_precision_that_changes_u_of_one_actuator_too_much_is_refused(
     tmp_path: Path,
 ) -> None:
@@ -279,7 +285,7 @@ def test_single_precision_that_changes_u_of_one_actuator_too_much_is_refused(
 
 
 @pytest.mark.compiled
-@pytest.mark.slow
+@pytest.mark.trial
 def test_compiled_axes_in_single_precision_differ_from_interpreted_ones_by_rounding() -> None:
     """Compiled code uses fused operations."""
     axes = ql.Axes([joint(), joint()], [[1.0, 0.3], [0.2, 2.0]], u_min=-20.0, u_max=20.0)

@@ -18,6 +18,7 @@ from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.online import infer, learn
 from quell.types import Status
 
+from .cases import cases
 from .contracts.python_models import CHAIN, OBSERVER, Broken, law
 
 
@@ -146,7 +147,7 @@ MODELS: dict[str, tuple[Callable[[], Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", MODELS)
+@cases("name", MODELS)
 def test_a_model_that_does_not_fit_is_named(name: str) -> None:
     """With its class and the rule, before anything is compiled."""
     make, message = MODELS[name]
@@ -187,7 +188,7 @@ def looks_up(model: Any, memory: Any, features: Any, target: float) -> None:
     memory.weight[0] = float(str(target).strip("x").format(target))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize(
     ("learns", "message"),
@@ -261,14 +262,14 @@ def three(features: Any, x: Any, u: float, out: Any) -> None:
     out[0] = out[1] = out[2] = x[0]
 
 
-@pytest.mark.parametrize(
+@cases(
     "around",
     [
         lambda block: ql.learners.Online(model_with(), block),
         lambda block: ql.learners.RLS(ql.features.Bias() + block),
     ],
 )
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (
@@ -351,7 +352,7 @@ def learner_with(
     return Whole()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (
@@ -537,6 +538,7 @@ BUILT_IN: dict[str, Callable[[], Any]] = {
 }
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_a_learner_around_one_of_quell_is_that_learner(name: str) -> None:
     """With all of its output the controls are those of the other to the bit; with a half they are not, and a saved state continues.

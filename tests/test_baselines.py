@@ -25,6 +25,8 @@ from quell.controllers.baselines.state_feedback import stationary_gain
 from quell.lti.models import gramian
 from quell.observers import continuous_gain
 
+from .cases import cases
+
 TWO_MASS = ql.plants.two_mass_spring()
 LAG = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -1.5]], [0.0, 2.0], [1.0, 0.0])
 
@@ -115,6 +117,7 @@ def test_a_linear_adrc_is_a_filtered_pid_controller(order: int) -> None:
         assert at(pid, omega) == pytest.approx((gains[0] + from_r, from_y), rel=1e-12)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("order", [1, 2])
 def test_sampled_adrc_and_its_pid_controller_approach_each_other(order: int) -> None:
     """In a loop with step and load: their difference halves with dt, and is a thousandth at 1 ms."""
@@ -241,6 +244,7 @@ def test_the_load_sees_a_motor_of_another_inertia() -> None:
 
 
 @pytest.mark.compiled
+@pytest.mark.trial
 @pytest.mark.parametrize("measured", ["load", "motor"])
 def test_either_mass_may_be_measured(measured: str) -> None:
     """What is measured goes to the reference under a force on the load, and the loop has the poles it should."""
@@ -316,7 +320,7 @@ BLIND = ql.plants.LinearPlant(np.diag([1.0, -1.0]), [1.0, 1.0], [0.0, 1.0])
 WASHED_OUT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [0.0, 1.0])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         (lambda: PID(1.0, 0.0, 1.0, dt=0.1), "kd = 1.0, tf = 0.0: a derivative needs a filter"),

@@ -17,6 +17,8 @@ from quell.parallel import in_parallel, one_blas_thread
 from quell.plants import PlantBatch, batch, two_mass_spring
 from quell.simulation import driver
 
+from .cases import cases
+
 pytestmark = pytest.mark.compiled
 
 MASSES = np.array([0.9, 1.0, 1.1])
@@ -46,6 +48,7 @@ def as_it_is() -> ql.ADRC:
     return ql.ADRC(ql.ESO.model_free(order=1, b0=1e6, omega_o=1.0, dt=0.01), omega_c=1.0)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("learner", [None, ql.learners.Kalman()])
 def test_each_run_of_a_batch_is_the_run_alone(
     learner: object, two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch
@@ -87,6 +90,7 @@ def test_only_what_is_asked_for_is_recorded() -> None:
     np.testing.assert_array_equal(some["f_hat"], some["f_residual"])
 
 
+@pytest.mark.lost
 def test_a_run_that_diverges_ends_alone() -> None:
     """The others go on; it is NaN from its end, which is where exp(rate t) passes the limit."""
     rates = np.array([0.0, 5.0, 0.1, 20.0])
@@ -113,6 +117,7 @@ def test_a_run_that_diverges_ends_alone() -> None:
     assert "first to diverge was run 3, at 0.24 s" in runs.message
 
 
+@pytest.mark.lost
 def test_metrics_are_arrays_that_miss_what_ended_before() -> None:
     """Each entry is that of the run alone; what diverged before the window is NaN."""
     runs = ql.simulate(
@@ -137,6 +142,7 @@ def test_metrics_are_arrays_that_miss_what_ended_before() -> None:
         runs.metrics(70.0)
 
 
+@pytest.mark.lost
 def test_metrics_of_a_batch_that_diverged_as_a_whole_say_so() -> None:
     """Rather than return nothing."""
     runs = ql.simulate(PLANTS, diverging(), ql.Scenario(1.0, duration=200.0))
@@ -165,6 +171,7 @@ def test_any_part_of_the_loop_may_differ_from_run_to_run() -> None:
     np.testing.assert_array_equal(other.run(2).log, alone.log)
 
 
+@pytest.mark.trial
 def test_a_controller_that_feeds_derivatives_forward_may_be_one_of_a_batch() -> None:
     """Each run is given the derivatives that its controller wants, of the one reference."""
     laws = [controller(feedforward=on) for on in (True, False, True)]
@@ -190,7 +197,8 @@ def test_scenarios_of_a_batch_may_rest_at_different_times() -> None:
         )
 
 
-@pytest.mark.slow
+@pytest.mark.trial
+@pytest.mark.lost
 def test_nonlinear_plants_run_in_batches_compiled_and_as_python() -> None:
     """One that Numba can't compile too, and where its function leaves the numbers, that run diverges alone."""
 
@@ -226,6 +234,7 @@ def test_nonlinear_plants_run_in_batches_compiled_and_as_python() -> None:
     np.testing.assert_allclose(python["y"][0], compiled["y"][0], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.lost
 def test_poor_integration_is_told_apart_from_loops_that_diverge() -> None:
     """Each run has its own check: one is stiff with one sub-step, one loop is unstable, one is fine."""
     stiff = lambda t, x, u, w: (x[1], u - 1e5 * x[1])  # noqa: E731
@@ -278,6 +287,8 @@ def test_progress_is_told_and_ends_at_one() -> None:
     assert shares[-1] == 1.0
 
 
+@pytest.mark.trial
+@pytest.mark.lost
 def test_a_saved_batch_is_loaded_back_whole(tmp_path: Path) -> None:
     """Channels, parameters, also one that is called as a channel, and each run's status."""
 
@@ -320,6 +331,7 @@ def test_a_saved_batch_is_loaded_back_whole(tmp_path: Path) -> None:
         ql.Trajectory.load(tmp_path / "runs.nc")
 
 
+@pytest.mark.trial
 def test_parameters_may_be_called_as_channels_and_coordinates_are(tmp_path: Path) -> None:
     """They are told apart by a prefix."""
     runs = ql.simulate(
@@ -336,6 +348,7 @@ def test_parameters_may_be_called_as_channels_and_coordinates_are(tmp_path: Path
 
 
 @pytest.mark.parametrize("law", [controller(), diverging()])
+@pytest.mark.lost
 def test_a_plot_has_two_axes_and_draws_into_given_ones(law: ql.ADRC) -> None:
     """With bands of the runs that went through, also where none did."""
     import matplotlib
@@ -350,7 +363,7 @@ def test_a_plot_has_two_axes_and_draws_into_given_ones(law: ql.ADRC) -> None:
     plt.close("all")
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (

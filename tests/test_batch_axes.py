@@ -14,6 +14,8 @@ import pytest
 import quell as ql
 from quell.plants import MultivariableLinearPlant, PlantBatch, batch
 
+from .cases import cases
+
 DT = 1e-3
 SINES = (ql.signals.Sinusoid(0.1, 5.0), ql.signals.Sinusoid(0.2, 3.0))
 NOISE = ql.signals.BandLimitedNoise(1e-11, DT)
@@ -63,7 +65,7 @@ def check_run(runs: ql.AxesBatch, i: int, alone: ql.AxesTrajectory) -> None:
         assert getattr(mine, name) == getattr(alone, name)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_each_run_of_a_batch_is_the_run_alone() -> None:
     """In all channels, with rests, noise, a learner and a thinned record; how many threads work leaves no trace."""
@@ -79,7 +81,7 @@ def test_each_run_of_a_batch_is_the_run_alone() -> None:
         check_run(runs, i, ql.simulate(plant, law, SCENARIO, record_every=3))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_arms_with_their_own_inertia_are_batches_too() -> None:
     """Nonlinear plants and a B0 that is a function: bit for bit, in two threads."""
@@ -104,6 +106,7 @@ def test_any_part_of_the_loop_may_differ_from_run_to_run() -> None:
     assert np.any(runs["y"][0] != runs["y"][1])
 
 
+@pytest.mark.trial
 def test_an_axis_of_all_runs_is_a_batch_of_one_axis(tmp_path: Path) -> None:
     """Its measures are those of the single runs, also from a file; the parameters of the plants stay."""
     short = replace(SCENARIO, duration=0.2, rest_at=())
@@ -140,6 +143,7 @@ def test_batches_run_in_single_precision_too() -> None:
     assert np.any(runs["u"] != ql.simulate(PLANTS, law, short)["u"])
 
 
+@pytest.mark.lost
 def test_a_run_that_diverges_ends_alone() -> None:
     """The others reach the end; its samples are NaN from there on, and its measures those up to there."""
     laws = [axes(learner=False), axes(sign=-1.0, learner=False)]
@@ -185,7 +189,7 @@ def test_a_plot_has_two_rows_of_axes() -> None:
     plt.close("all")
 
 
-@pytest.mark.parametrize(
+@cases(
     ("call", "message"),
     [
         (partial(ql.simulate, [gantry()] * 2, [axes(), axes()], [SCENARIO] * 3), "controller has 2 entries, plant 2|scenario has 3 entries"),

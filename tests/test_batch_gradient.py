@@ -10,6 +10,8 @@ from quell.learners.base import adapt, coefficients, predict, restart
 from quell.learners.batch_gradient import outputs
 from quell.observers.eso import ESO
 
+from .cases import cases
+
 
 def literal_algorithm_1(seen: np.ndarray, u: np.ndarray, rate: float, batch: int) -> np.ndarray:
     """Algorithm 1 as printed: three lists, popped and pushed, the whole batch labelled anew; O(n) a sample."""
@@ -36,7 +38,7 @@ def literal_algorithm_1(seen: np.ndarray, u: np.ndarray, rate: float, batch: int
     return np.array(history)
 
 
-@pytest.mark.parametrize("batch", [1, 2, 7, 50])
+@cases("batch", [1, 2, 7, 50])
 def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(
     batch: int, rng: np.random.Generator
 ) -> None:

@@ -17,6 +17,8 @@ from quell.lti.models import System, peak_gain
 from quell.observers.forms import observe
 from tests.injected import Injected
 
+from .cases import cases
+
 DT = 0.02
 RAMPING = ([1.3], [1.0, 0.0, 0.0])
 
@@ -133,6 +135,7 @@ def largest_q(run: ql.Trajectory) -> float:
     return float(np.max(np.abs(run["theta"][:, 0])))
 
 
+@pytest.mark.trial
 def test_the_worst_learner_attains_the_bound_and_none_exceeds_it() -> None:
     """Whatever stays within κ e: with a constant q_0 it comes within 5 % of the bound on q, so no smaller one holds."""
     plant = ([1.6], [1.0, 0.0, 0.0])
@@ -146,6 +149,8 @@ def test_the_worst_learner_attains_the_bound_and_none_exceeds_it() -> None:
     assert deviation <= found.output_gain * kappa * bound
 
 
+@pytest.mark.trial
+@pytest.mark.lost
 def test_a_loop_without_certificate_can_be_lost() -> None:
     """At order 4 with b 60 % too large κΓ is 2 for κ = 1.2: the error grows without end."""
     plant = ([1.6], [1.0, 0.0, 0.0, 0.0, 0.0])
@@ -156,7 +161,7 @@ def test_a_loop_without_certificate_can_be_lost() -> None:
     assert np.max(np.abs(run["y"])) > 20.0 * np.max(np.abs(plain["y"]))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_no_learner_that_a_search_finds_exceeds_the_bound_of_its_guard() -> None:
     """It knows plant and load, earns trust with f under a load that grows steadily, and then pushes as is worst for q."""
     plant = ([1.6], [1.0, 0.0, 0.0])
@@ -294,7 +299,8 @@ def test_an_analysis_has_a_certificate_where_a_guarded_learner_is() -> None:
     assert "no certificate: controller" in analyse(plant, curved).summary()
 
 
-@pytest.mark.parametrize(
+@pytest.mark.trial
+@cases(
     ("observer", "invertible"),
     [
         (ql.ESO.model_free(8, 1.0, 10.0, 1e-2), True),
@@ -320,6 +326,7 @@ def test_which_observers_answer_a_bounded_correction_with_bounded_states(
     assert (largest[1] < 1.5 * largest[0]) is invertible
 
 
+@pytest.mark.trial
 def test_a_clipped_learner_does_not_run_away_where_the_states_would() -> None:
     """An observer that does not keep the plant's zero: a learner that was trusted, then pushes to both sides, moves y by little."""
     plant = ([2.0, 2.0], [1.0, 0.9, 1.5])
@@ -339,7 +346,7 @@ def test_a_clipped_learner_does_not_run_away_where_the_states_would() -> None:
 UNSTABLE = ([3.0], [1.0, 0.0, 0.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         (lambda: certify({"heavy": UNSTABLE}, controller(4)), "heavy: the loop without learner is"),

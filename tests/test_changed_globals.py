@@ -139,6 +139,7 @@ def as_gain(name: str) -> Callable[..., Any]:
     return made[name]
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(("function", "change"), CHANGES)
 def test_b0_follows_what_its_function_takes_from_outside(
     function: Callable[..., Any], change: Callable[[], None]
@@ -153,6 +154,7 @@ def test_b0_follows_what_its_function_takes_from_outside(
     assert found[0, 1] in (7.0 * 0.2, 7.0 * 0.2 + 1.0)
 
 
+@pytest.mark.trial
 def test_b0_follows_a_variable_of_the_enclosing_function() -> None:
     """Changed by nonlocal, while the function stays the same object."""
     scale = 1.0
@@ -165,6 +167,7 @@ def test_b0_follows_a_variable_of_the_enclosing_function() -> None:
     assert gain_of(own_gain)[1][0, 1] == 7.0 * 0.2
 
 
+@pytest.mark.trial
 def test_b0_follows_its_defaults_and_its_instructions() -> None:
     """Tools that load a changed file again exchange both in the function that is there."""
 
@@ -182,6 +185,7 @@ def test_b0_follows_its_defaults_and_its_instructions() -> None:
     assert gain_of(bound)[1][0].tolist() == [3.0, 7.0 * 0.2]
 
 
+@pytest.mark.trial
 def test_twenty_axes_of_one_function_compile_once(compiled_functions: list[Any]) -> None:
     """As long as nothing changes, and for other numbers that are bound by name."""
     helper(1.0)  # compiled by its user, for other globals than now
@@ -197,6 +201,7 @@ def test_twenty_axes_of_one_function_compile_once(compiled_functions: list[Any])
     assert len(compiled_functions) == 2
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("function", "change", "offset", "several", "parametric"),
     [
@@ -264,6 +269,7 @@ def test_features_follow_what_their_function_takes_from_outside() -> None:
     assert found == [0.5, 3.5]
 
 
+@pytest.mark.trial
 def test_a_helper_that_numba_can_not_compile_again_is_not_used_with_old_numbers() -> None:
     """A plant goes on as Python and says so; B0 is refused, with what to do."""
 
@@ -287,6 +293,7 @@ def test_a_helper_that_numba_can_not_compile_again_is_not_used_with_old_numbers(
         gain_of(B0)
 
 
+@pytest.mark.trial
 def test_exported_code_is_that_of_the_controller_or_there_is_none(tmp_path: Any) -> None:
     """C is made of the function as it is now: after a change that is not what the controller computes."""
     axes = ql.Axes([joint(), joint()], B0=lopsided)
@@ -341,6 +348,7 @@ def rate(t, x, u, w):  # type: ignore[no-untyped-def]
     return (u - GAIN * x[0],)
 
 
+@pytest.mark.trial
 def test_a_plant_that_was_compiled_can_be_sent_to_another_process() -> None:
     """Without its code."""
     plant = ql.plants.NonlinearPlant(rate, 1)
@@ -376,6 +384,7 @@ def _advance_lag(plant: LagDesign, x: Any, scratch: Any, t: float, u: float, w: 
     x[0] += plant.dt * (GAIN * u - x[0])
 
 
+@pytest.mark.trial
 def test_a_kernel_of_the_users_that_has_changed_is_not_run_with_old_numbers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 SCRIPT = Path(__file__).parents[1] / "docs" / "check_pages.py"
 pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.trial,
     pytest.mark.skipif(
         not SCRIPT.exists() or not Path("/usr/bin/chromium").exists(),
         reason="the script is in the repository, and needs a browser",

@@ -34,6 +34,7 @@ def test_help_and_version_answer(quell: Callable[..., Shown]) -> None:
     assert quell("--version").out.strip() == __import__("quell").__version__
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_study_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
@@ -79,7 +80,7 @@ def test_the_torsional_experiment_has_a_longest_sample_time(quell: Callable[...,
     )
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_guards_trial_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
@@ -251,6 +252,7 @@ def test_a_figure_is_written_as_png_svg_and_pdf(tmp_path: Path) -> None:
     assert "the-line" in svg.read_text(encoding="utf-8")
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_command_can_be_run_twice_and_replaces_where_asked(
     quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -278,6 +280,7 @@ def test_a_command_can_be_run_twice_and_replaces_where_asked(
     assert (tmp_path / "u.csv").read_bytes() != old
 
 
+@pytest.mark.trial
 def test_neither_importing_quell_nor_simulating_imports_what_it_does_not_need() -> None:
     """Numba, scipy, xarray, matplotlib and python-control come when they are used; plots and files cost a second."""
     code = (
@@ -292,7 +295,7 @@ def test_neither_importing_quell_nor_simulating_imports_what_it_does_not_need() 
     assert ended.stdout.splitlines() == ["[]", "[] True"]
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_an_experiment_does_not_wait_for_the_others() -> None:
     """Neither theirs nor what they import is loaded; each is found as an attribute."""
     code = (
@@ -337,6 +340,7 @@ run()
     assert ("ZeroDivisionError" in ended.stderr) == (code == 1)
 
 
+@pytest.mark.trial
 def test_a_command_whose_reader_has_ended_does_its_work(tmp_path: Path) -> None:
     """As after ``| head``: the file is written, nothing is printed as an error, and the code is 0."""
     reading, writing = os.pipe()

@@ -19,6 +19,7 @@ from quell.cli.rig import rig as run_rig
 from quell.realtime import wire_device
 from quell.realtime.registry import listen, open_device
 
+from .cases import cases
 from .commands import Shown
 from .rig_bench import connect
 
@@ -72,7 +73,7 @@ def free_port() -> int:
         return int(free.getsockname()[1])
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_rig_that_is_killed_is_noticed_and_its_successor_runs_until_it_is_told_to_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,6 +112,7 @@ def test_a_rig_that_is_killed_is_noticed_and_its_successor_runs_until_it_is_told
     assert np.nanmax(rows["command"]) == 1.0
 
 
+@pytest.mark.trial
 def test_a_loop_that_is_killed_leaves_u_at_zero(tmp_path: Path) -> None:
     """The watchdog sees to it, within the ticks it was given; the next loop is served."""
     log = tmp_path / "wire.csv"
@@ -153,7 +155,7 @@ def test_bad_input_is_a_line_and_exit_code_2(quell: Callable[..., Shown]) -> Non
     assert "must be udp://HOST:PORT" in shown.err
 
 
-@pytest.mark.parametrize(
+@cases(
     ("changed", "message"),
     [
         ({"device": "tcp://x"}, "must be like udp://"),

@@ -45,6 +45,7 @@ start = 8.0
 )
 
 
+@pytest.mark.trial
 def test_a_setup_is_simulated_printed_written_drawn_and_saved(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -101,6 +102,7 @@ def test_each_mistake_gives_a_line_and_exit_code_two(
     assert [path.name for path in tmp_path.iterdir()] == ["wrong.toml"]
 
 
+@pytest.mark.trial
 def test_a_run_that_diverges_has_its_own_exit_code_and_no_metrics(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -149,7 +151,9 @@ def test_dashes_have_their_reason_and_the_band_is_printed(
     assert "…  " not in shown.out, "a column is cut"
     windows = json.loads((tmp_path / "out.json").read_text())["metrics"]
     assert [window["settling_band"] for window in windows] == [0.02, 0.02, 0.1]
-    assert [set(window["missing"]) for window in windows] == [set(STEP_MEASURES)] * 2 + [set()]
+    # In the third window y comes into the wide band, but still rises at the end.
+    missing = [set(window["missing"]) for window in windows]
+    assert missing == [set(STEP_MEASURES)] * 2 + [{"overshoot"}]
     assert windows[2]["settling_time"] > 0.0
     assert windows[0]["total_variation"] >= windows[0]["control_variation"]
 
@@ -200,7 +204,7 @@ def test_all_exit_codes_are_in_one_table_that_help_shows(quell: Callable[..., Sh
     codes = {code.name: code.value for code in ExitCode}
     assert codes == {
         "DONE": 0, "INTERNAL": 1, "ERROR": 2, "ENDED_BY_SAFETY": 3, "DIVERGED": 4, "NOT_PROVED": 5,
-        "ALARM": 6, "BROKEN": 7, "INTERRUPTED": 130, "TERMINATED": 143,
+        "ALARM": 6, "BROKEN": 7, "RUNS_FAILED": 8, "NOT_VALID": 9, "INTERRUPTED": 130, "TERMINATED": 143,
     }  # fmt: skip
     told = " ".join(quell("--help").out.split())
     assert all(f"{code.value} {code.about}" in told for code in ExitCode)
@@ -230,6 +234,7 @@ duration = 0.5
 """
 
 
+@pytest.mark.trial
 def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """From a twin in this process to tables, JSON, figures and a recording, and from that through the controller once more."""
     (tmp_path / "rig.toml").write_text(RIG)

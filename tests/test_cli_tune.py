@@ -33,7 +33,7 @@ def quell(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     return lambda *arguments: in_this_process(arguments, monkeypatch, capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_transfer_function_is_tuned_and_written_as_a_setup(quell: object, tmp_path: Path) -> None:
     """With the references in the JSON file; nothing that exists is replaced."""
     out, results = tmp_path / "tuned.toml", tmp_path / "tuned.json"
@@ -50,7 +50,7 @@ def test_a_transfer_function_is_tuned_and_written_as_a_setup(quell: object, tmp_
     assert "exists" in again.err
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_setup_with_ranges_is_tuned_for_them(quell: object, tmp_path: Path) -> None:
     """And checked on fresh samples; the result keeps plant, ranges, [tune] and feedforward."""
     path, out = tmp_path / "lag.toml", tmp_path / "tuned.toml"
@@ -145,6 +145,7 @@ def _tuned(quell: object, path: Path, text: str, *more: str) -> tuple[Shown, Any
     return shown, json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.trial
 def test_operating_points_of_a_setup_become_a_schedule(quell: object, tmp_path: Path) -> None:
     """With the delay in its plant. The tuned file runs, and tuned again it gives the same."""
     text = POINTS.format(options="", more=TABLES)
@@ -166,6 +167,7 @@ def test_operating_points_of_a_setup_become_a_schedule(quell: object, tmp_path: 
     assert all(one["iae"] == pytest.approx(other["iae"], rel=1e-6) for one, other in pairs)
 
 
+@pytest.mark.trial
 def test_the_example_of_an_extending_axis_keeps_its_bounds(quell: object, tmp_path: Path) -> None:
     """``examples/extending_axis.toml``, as docs/schedule shows it."""
     example = Path(__file__).parents[1] / "examples" / "extending_axis.toml"
@@ -175,6 +177,7 @@ def test_the_example_of_an_extending_axis_keeps_its_bounds(quell: object, tmp_pa
     assert load(tmp_path / "tuned.toml").controller.external_signals == 1
 
 
+@pytest.mark.trial
 def test_points_that_are_values_of_a_parameter_are_judged_in_between(
     quell: object, tmp_path: Path
 ) -> None:

@@ -3,12 +3,13 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from quell.realtime import transports, wire
 from quell.realtime.transports import FRAME_BITS
+
+from .cases import cases
 
 
 def encoded(data):
@@ -34,7 +35,7 @@ def plainly_decoded(packet):
     return data
 
 
-@pytest.mark.parametrize(
+@cases(
     ("data", "packet"),
     [
         # The head of an IP packet, as in figure 3 of Cheshire and Baker.

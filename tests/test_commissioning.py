@@ -185,7 +185,7 @@ def test_the_deviations_of_a_model_are_plants_around_it() -> None:
         identified_plants(quiet)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_record_is_identified_and_tuned(
     quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

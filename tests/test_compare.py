@@ -16,11 +16,13 @@ from quell.cli.app import app
 from quell.experiments import compare
 from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
 
+from .cases import cases
 from .commands import Shown
 
 LAG = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
 
 
+@pytest.mark.trial
 def test_any_controllers_on_any_plant_are_judged_alike() -> None:
     """Each run is that of ``simulate``; the scores are what closed forms say: PI that cancels the lag leaves a lag of 1/4 s."""
     scenario = ql.Scenario(
@@ -70,7 +72,7 @@ def test_a_run_that_diverges_is_shown_as_one() -> None:
     assert axes[0].get_ylim()[1] < 1e5
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() -> None:
     """At 5 ms. No model: MF-ESO rejects the load to a fiftieth of PID. LQG and MB-ESO alike. PID is slow."""
@@ -88,7 +90,7 @@ def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() 
     assert "r_shaped" in result.runs["zv+lqg"].names
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         (
@@ -126,11 +128,12 @@ def test_a_mistake_is_named(wrong: object, message: str) -> None:
         wrong()  # type: ignore[operator]
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On 80 columns with a spring of half the stiffness: PI + notch grows too slowly to be lost within 100 s, LQG is lost."""
+    """On 80 columns with a spring of half the stiffness: PI + notch is far from r after 100 s, LQG is lost."""
     monkeypatch.setenv("COLUMNS", "80")
     names = ["lqg", "pid", "pi-notch", "resonance-ratio", "zvd+lqg"]
     where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
@@ -146,7 +149,7 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     assert "[%]" in shown
     assert "[m]" in shown, "a unit is taken for markup"
     assert all(len(line) >= 7 for line in lines.values())
-    assert lines["pi-notch"][-1] == "unstable"
+    assert lines["pi-notch"][-2:] == ["ran", "away"]
     assert lines["pid"][-1] == "ok"
     assert "diverged" in lines["lqg"]
     stable = {
@@ -158,6 +161,7 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     }
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -178,6 +182,7 @@ def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
     assert "guarded-l-eso: no certificate" in shown
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_comparison_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
@@ -228,6 +233,7 @@ def test_the_gains_of_a_loop_are_the_largest_ones_of_its_responses() -> None:
     assert compare.sensitivities(DOUBLE_LAG, ql.baselines.PID(-1.0, dt=0.002)) is None
 
 
+@pytest.mark.trial
 def test_a_reference_model_takes_the_overshoot_out_of_a_step() -> None:
     """It settles sooner than with half of its bandwidth; a loop without overshoot gets none."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
@@ -260,6 +266,7 @@ disturbances = [{ kind = "step", height = -2.0, at = 4.0 }]
 """
 
 
+@pytest.mark.trial
 def test_tuned_controllers_keep_to_the_gains_of_the_setups_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -293,6 +300,7 @@ def test_tuned_controllers_keep_to_the_gains_of_the_setups_own(
             app(["compare", *arguments])
 
 
+@pytest.mark.trial
 def test_all_controllers_of_a_setup_are_compared_alike(tmp_path: Path) -> None:
     """Behind the delay of [tune], under its bounds, and without feedforward, which PID does not have; a note says so."""
     text = SETUP.replace("omega_c = 3.0,", "omega_c = 3.0, feedforward = true,")

@@ -13,6 +13,8 @@ from quell.analysis.linearise import linear_law
 from quell.controllers.law import law_gains
 from quell.types import Status
 
+from .cases import cases
+
 DT = 0.01
 PLANT = ([2.0], [1.0, 1.0, 0.0])
 PID = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT)
@@ -54,7 +56,7 @@ def test_without_a_disturbance_it_adds_nothing_to_a_plant_that_its_model_describ
     np.testing.assert_allclose(run["u"], run["r"], atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_it_rejects_a_load_that_the_controller_leaves_and_with_a_guarded_learner_nearly_all() -> (
     None
 ):
@@ -122,7 +124,7 @@ def test_a_missing_u_0_is_the_last_one_and_zero_before_the_first() -> None:
     assert compensator.step(math.inf, -3.0) == 0.0
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: ql.Compensator(PID), "must be an ESO"),
@@ -174,6 +176,7 @@ def test_what_does_not_go_together_is_refused_with_the_reason(make: Any, message
         make()
 
 
+@pytest.mark.trial
 def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
     """M_s, M_t and M_ks by ``analyse`` are those of the report, at the plant and where all its poles are elsewhere."""
     tuned = ql.tuning.tune_compensator(PLANT, PID)
@@ -190,6 +193,7 @@ def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
         assert 1.0 / elsewhere.margins.modulus <= 1.01 * tuned.after.m_s_elsewhere
 
 
+@pytest.mark.trial
 def test_the_integral_of_the_error_beside_a_gentle_controller_has_its_end() -> None:
     """A loop far slower than its plant: the report has what the simulation has, until y is at rest."""
     lags = ([1.0], [1.0, 3.0, 3.0, 1.0])
@@ -201,6 +205,7 @@ def test_the_integral_of_the_error_beside_a_gentle_controller_has_its_end() -> N
         assert iae == pytest.approx(0.1 * np.sum(np.abs(run["y"])), rel=1e-6)
 
 
+@pytest.mark.trial
 def test_the_integral_of_an_error_that_stays_is_without_end() -> None:
     """A PD controller leaves a constant error under a load, which no time ends; the compensator removes it."""
     pd = ql.baselines.PID(kp=4.0, ki=0.0, kd=3.0, tf=0.05, dt=0.01)
@@ -219,7 +224,7 @@ def test_the_integral_of_an_error_that_stays_is_without_end() -> None:
     assert tuned.after.iae == pytest.approx(0.01 * np.sum(np.abs(run["y"])), rel=1e-6)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("controller", "options", "message"),
     [
         (
@@ -245,6 +250,7 @@ def test_tuning_names_the_argument_that_is_wrong(
         ql.tuning.tune_compensator(PLANT, controller, **options)
 
 
+@pytest.mark.trial
 def test_where_the_controller_uses_the_margin_itself_no_compensator_is_sold() -> None:
     """Below its own peak tuning refuses; a noise bound that leaves nothing makes the report say NOT."""
     peak = 1.0 / ql.analysis.analyse(PLANT, PID).margins.modulus

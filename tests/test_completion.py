@@ -72,6 +72,7 @@ def test_bash_completes(
     assert len(found) <= len(expected) + 3  # --help and the like
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("shell", SHELLS)
 def test_the_program_of_each_shell_knows_all_commands(
     program: Callable[[str], str], shell: str

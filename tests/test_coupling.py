@@ -15,6 +15,8 @@ from quell.lti.models import zero_order_hold
 from quell.plants.multivariable import MultivariableLinear
 from quell.types import Matrix
 
+from .cases import cases
+
 
 def sampled(A: Any, B: Any, C: Any) -> MultivariableLinear:
     """Return a sampled plant without disturbances."""
@@ -78,8 +80,8 @@ def test_a_wood_berry_column_has_its_published_array() -> None:
     assert found.advice.startswith("axis 1 and axis 2 are coupled by 2 at rest: use B0 (an error")
 
 
-@pytest.mark.parametrize("order", [1, 2, 4])
-@pytest.mark.parametrize("delays", [(), (3, 5, 0)])
+@cases("order", [1, 2, 4])
+@cases("delays", [(), (3, 5, 0)])
 def test_a_plant_that_integrates_is_judged_by_b0(order: int, delays: Any) -> None:
     """Inertias of 2e-4, dead times of several samples that differ: Λ of B0 to rounding."""
     M = np.array([[2.0, 0.8, 0.1], [0.8, 1.0, 0.3], [0.1, 0.3, 0.5]]) * 2e-4

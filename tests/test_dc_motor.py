@@ -14,6 +14,8 @@ import quell as ql
 from quell.plants.base import advance, measure
 from quell.plants.testbeds import cogging_torque
 
+from .cases import cases
+
 RECORD = Path(__file__).resolve().parents[2] / "shared" / "data" / "cogging_a.csv"
 K, R, J, C = 0.05, 0.5, 2e-4, 1e-4
 IDEAL: dict[str, Any] = {"coulomb": 0.0, "counts": None}
@@ -121,7 +123,7 @@ def test_a_measured_map_is_felt_at_every_angle() -> None:
         assert free[-1, 0] > angle
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         ({"resistance": 0.0}, "resistance = 0.0: must be finite and greater than zero"),

@@ -31,6 +31,7 @@ from quell.realtime.rig import LAST_WORDS, Rig
 from quell.realtime.wire import MOST_CHANNELS
 from quell.records.record import columns_of
 
+from .cases import cases
 from .rig_bench import Bench, PlainRig, packed
 from .scripted import DT, PLANT, adrc, run
 
@@ -117,7 +118,7 @@ def test_b0_is_looked_at_by_a_channel_of_a_recording(quell: Callable[..., Any]) 
     assert "by = 'mass': must be a channel of run.csv, one of k, " in shown.err
 
 
-@pytest.mark.parametrize(
+@cases(
     ("controller", "names", "message"),
     [
         (scheduled(), (), "follows 1 external signal; name the device's channels"),
@@ -163,7 +164,7 @@ class InPython:
         """Do nothing."""
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_run_records_its_channels_and_a_replay_uses_them(tmp_path: Path) -> None:
     """With a device in Python: what fails there is a missing value, and the run says so."""

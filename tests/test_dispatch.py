@@ -173,7 +173,7 @@ def test_compiled_code_cannot_allocate() -> None:
         allocates(np.ones(3))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_code_of_ones_own_is_not_taken_from_the_disk_cache(tmp_path: Path) -> None:
     """A plant in the user's module is compiled anew in each process: the cache would not notice that it was edited."""
     module = """
@@ -213,6 +213,7 @@ print(abs(runs[0]["y"] - runs[1]["y"]).max() < 1e-9, runs[0]["y"][-1])
     assert shown[0][1] != shown[1][1]
 
 
+@pytest.mark.trial
 def test_without_numbas_compiler_a_controller_steps_and_simulates_as_python(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -327,6 +328,7 @@ def test_an_older_numba_is_refused_and_a_newer_one_is_warned_about() -> None:
         assert numba_internals.is_tested(version)
 
 
+@pytest.mark.trial
 def test_a_numba_that_lacks_what_kernels_need_is_named_at_the_import() -> None:
     """One of another version, whose private modules have moved, is no riddle of a missing name."""
     program = (

@@ -35,6 +35,7 @@ def told(
     return of
 
 
+@pytest.mark.trial
 def test_it_finds_what_is_here(told: Callable[..., Any]) -> None:
     """Versions, the folder of compiled code, a loop that was run, rights of a loop, and no NOT."""
     shown, found = told()
@@ -50,6 +51,7 @@ def test_it_finds_what_is_here(told: Callable[..., Any]) -> None:
     assert "NOT " not in shown.out
 
 
+@pytest.mark.trial
 def test_an_unusable_cache_is_missing_and_quell_works(
     told: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,6 +64,7 @@ def test_an_unusable_cache_is_missing_and_quell_works(
     assert "gcc" in found
 
 
+@pytest.mark.trial
 def test_a_library_that_cannot_be_imported_is_named(
     told: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,8 @@ from quell.envs.loops import Stacked, member
 from quell.plants import batch, two_mass_spring
 from quell.plants.base import advance, measure
 
+from .cases import cases
+
 gymnasium = pytest.importorskip("gymnasium", reason="gymnasium (extra envs) is not installed")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
@@ -187,7 +189,7 @@ def test_a_lost_loop_is_terminated_and_costs_more_than_any_other() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * name.startswith("arm")) for name in NAMES],
+    [pytest.param(name, marks=[pytest.mark.trial] * name.startswith("arm")) for name in NAMES],
 )
 def test_gymnasium_finds_nothing_wrong_with_the_librarys_environments(name: str) -> None:
     """Its checker raises no error and gives no warning; seeds decide all."""
@@ -274,7 +276,7 @@ def test_scenarios_are_drawn_from_the_generator_of_the_episode() -> None:
         env.reset(seed=0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("problem", "changes"),
     [
         ("must be a quell.ADRC with learner=quell.envs.Policy()", {"controller": law()}),
@@ -334,6 +336,7 @@ def test_members_of_a_stack_are_copies_side_by_side() -> None:
     assert member(stack.members, stack.stride, 1)[1] == 1.5
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_compiled_loops_in_threads_agree_with_plain_python() -> None:
     """To rounding, as products may be fused; in two threads exactly as in one."""
@@ -356,6 +359,7 @@ def test_compiled_loops_in_threads_agree_with_plain_python() -> None:
     assert np.allclose(observation, observations[129], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.trial
 def test_without_gymnasium_the_error_names_the_extra() -> None:
     """And the rest of the folder works."""
     code = (
@@ -375,6 +379,7 @@ def test_the_import_that_registers_the_environments_does_not_load_the_compiler()
     assert shown.stdout == "False\n"
 
 
+@pytest.mark.trial
 def test_gymnasium_finds_the_environments_by_their_module() -> None:
     """And, once it is imported, by their names alone; the vector environment, too."""
     code = (

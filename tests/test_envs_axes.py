@@ -16,6 +16,8 @@ pytest.importorskip("gymnasium")
 
 from quell.envs import Env, Policy, VectorEnv
 
+from .cases import cases
+
 DT = 1e-3
 SINES = (ql.signals.Sinusoid(0.1, 5.0), ql.signals.Sinusoid(0.2, 3.0))
 SCENARIO = ql.Scenario(
@@ -127,6 +129,7 @@ def test_without_controller_the_actions_are_the_control_signals() -> None:
     assert env.observation_space.contains(seen[-1])
 
 
+@pytest.mark.trial
 def test_loops_side_by_side_are_single_ones() -> None:
     """With plants of their own and noise of their own: bit for bit, over the begin of a second episode."""
     gains = [4.0, 5.0, 6.0]
@@ -176,7 +179,7 @@ def test_a_lost_axis_ends_the_episode_at_the_largest_cost() -> None:
     assert -rewards[-1] == pytest.approx(left * (4 * 0.25 * 3.0 + 1e-3 * 2 * 500.0**2), rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_compiled_loops_are_those_of_simulate() -> None:
     """With the action zero, from the same seed: to rounding, as compiled entry points may differ in the last bit."""
@@ -190,7 +193,7 @@ def test_compiled_loops_are_those_of_simulate() -> None:
         )
 
 
-@pytest.mark.parametrize(
+@cases(
     ("call", "message"),
     [
         (partial(Env, gantry(), SCENARIO, axes()), "no axis has learner=quell.envs.Policy"),
@@ -207,7 +210,7 @@ def test_compiled_loops_are_those_of_simulate() -> None:
         (partial(Env, gantry(), SCENARIO, axes(Policy()), render_mode="ansi"), "render_mode = 'ansi': NOT for several axes yet"),
         (partial(Env, gantry(), SCENARIO, axes(Policy()), observe=("x_hat",)), "observe = 'x_hat'"),
         (partial(Env, ql.plants.two_mass_spring(), ql.Scenario(), dt=0.01, u_min=-1.0, u_max=1.0, weights=[1.0]), "are those of several axes"),
-        (partial(Env, ql.plants.arm(), ql.Scenario(), axes(Policy(), B0=None, M=ql.plants.arm().inertia)), "axis x: Policy.most=None.: B0 is a function"),
+        (lambda: Env(ql.plants.arm(), ql.Scenario(), axes(Policy(), B0=None, M=ql.plants.arm().inertia)), "axis x: Policy.most=None.: B0 is a function"),
         (lambda: (env := Env(gantry(), SCENARIO, axes(Policy(), Policy())), env.reset(seed=1), env.step([0.0])), "must be 2 numbers"),
     ],
 )  # fmt: skip

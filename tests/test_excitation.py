@@ -12,8 +12,10 @@ from quell import signals as s
 from quell.identification import excitation
 from quell.signals.excitation import schroeder_phases
 
+from .cases import cases
 
-@pytest.mark.parametrize("bits", range(2, 15))
+
+@cases("bits", range(2, 15))
 def test_a_prbs_correlates_as_a_sequence_of_greatest_length(bits: int) -> None:
     """One at lag 0, −1/L at all others, with L = 2^bits − 1: so the register goes through all its states."""
     length = 2**bits - 1
@@ -158,7 +160,7 @@ def test_a_design_is_written_as_csv(tmp_path: Path) -> None:
     assert design.describe().startswith("PRBS of ")
 
 
-@pytest.mark.parametrize(
+@cases(
     ("arguments", "message"),
     [
         (

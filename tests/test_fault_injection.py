@@ -11,10 +11,11 @@ import pytest
 from quell.realtime import wire, wire_device
 from quell.realtime.relay import KINDS, Fault, FaultInjector, Relay, random_faults
 
+from .cases import cases
 from .rig_bench import DT, Bench, packed
 
 
-@pytest.mark.parametrize(
+@cases(
     ("fault", "expected"),
     [
         (Fault("drop", "rig", 1, 2), [1, 4, 5, 6]),
@@ -32,7 +33,7 @@ def test_a_fault_does_what_its_name_says(fault: Fault, expected: list[int]) -> N
     assert [struct.unpack_from("<I", frame, 8)[0] for frame in out] == expected
 
 
-@pytest.mark.parametrize(
+@cases(
     ("kind", "rule"),
     [
         ("nan", "not_finite"),

@@ -26,6 +26,8 @@ from quell.features import (
 from quell.features.base import unit, write, write_physical
 from quell.learners.base import adapt, coefficients, commit, lag_push, predict
 
+from .cases import cases
+
 STATE, U = np.array([0.3, -0.7, 0.5]), 0.2
 
 
@@ -72,7 +74,8 @@ def compiled_write(design: Any, x: np.ndarray, u: float, out: np.ndarray) -> Non
     write_physical(design, x, u, out)
 
 
-@pytest.mark.parametrize("name", BLOCKS)
+@pytest.mark.trial
+@cases("name", BLOCKS)
 def test_a_block_has_as_many_values_and_units_as_names(name: str) -> None:
     """And each name once; compiled it writes the same."""
     block = BLOCKS[name]
@@ -86,7 +89,7 @@ def test_a_block_has_as_many_values_and_units_as_names(name: str) -> None:
     np.testing.assert_allclose(again, values, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["state", "polynomial", "polynomial of some", "input", "bias"])
+@cases("name", ["state", "polynomial", "polynomial of some", "input", "bias"])
 def test_a_unit_undoes_the_scale(name: str, rng: np.random.Generator) -> None:
     """θ·unit times the raw feature is θ times the scaled one."""
     block, scale = BLOCKS[name], 2.0 ** rng.integers(-5, 5, size=5)
@@ -97,7 +100,7 @@ def test_a_unit_undoes_the_scale(name: str, rng: np.random.Generator) -> None:
     )
 
 
-@pytest.mark.parametrize("name", BLOCKS)
+@cases("name", BLOCKS)
 def test_a_block_can_be_copied_and_sent(name: str) -> None:
     """What comes out writes the same."""
     for other in (copy.deepcopy(BLOCKS[name]), pickle.loads(pickle.dumps(BLOCKS[name]))):
@@ -167,6 +170,7 @@ def learned(
     return dict(zip(learner.feature_names(2), theta.tolist(), strict=True)), outputs
 
 
+@pytest.mark.trial
 def test_a_custom_feature_is_a_function_of_y_in_its_unit() -> None:
     """The coefficient of sin(3 y) is found, whatever the amplitude of y is."""
     block = Custom(lambda x, u: (math.sin(3.0 * x[0]), x[1] * abs(x[1])), names=("sin", "drag"))
@@ -177,6 +181,7 @@ def test_a_custom_feature_is_a_function_of_y_in_its_unit() -> None:
         assert found == pytest.approx({"sin": 7.0, "drag": -0.2}, rel=1e-3)
 
 
+@pytest.mark.trial
 def test_the_size_of_a_custom_feature_changes_nothing_but_its_coefficient() -> None:
     """A factor of 2⁶⁰ gives the same output, to the last bit, through all growing scales."""
     force = lambda x: 0.3 * x[0] ** 3 - x[0]  # noqa: E731
@@ -189,6 +194,7 @@ def test_the_size_of_a_custom_feature_changes_nothing_but_its_coefficient() -> N
     assert plain["a"] != 0.0
 
 
+@pytest.mark.trial
 def test_a_custom_feature_that_is_not_defined_everywhere_is_zero_elsewhere() -> None:
     """√y, where y is negative: what is learned stays finite, and right."""
     root = Custom(lambda x, u: (math.sqrt(x[0]) if x[0] > 0.0 else math.nan,), names=("root",))
@@ -214,6 +220,7 @@ def test_periodic_features_learn_a_force_once_for_all_speeds() -> None:
     assert {name: found[name] for name in expected} == pytest.approx(expected, abs=0.02)
 
 
+@pytest.mark.trial
 def test_random_fourier_features_approximate_a_gaussian_kernel(rng: np.random.Generator) -> None:
     """φ(x)·φ(x') → exp(−|x − x'|²/2 length²), with an error of 1/sqrt(p)."""
     block = RandomFourier(20_000, length=0.6, states=(1, 3))
@@ -273,7 +280,7 @@ class Callable:
         return (x[0],)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: Polynomial(1), "degree = 1: must be a whole number of at least 2"),

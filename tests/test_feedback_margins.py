@@ -12,6 +12,7 @@ from quell.analysis import analyse_feedback, law_of_feedback, observer_within
 from quell.controllers import StateFeedback, quadratic_feedback, state_feedback
 
 from .benchmark_module import benchmark
+from .cases import cases
 from .test_state_space import AT_LOAD, AT_MOTOR, DT, ENCODERS, JL, JM, NOISE, A
 
 WEIGHT = np.outer(ENCODERS[1], ENCODERS[1])
@@ -63,6 +64,7 @@ class TestBound:
         assert found.factor == 1.0
         assert found.m_s.value <= 2.5
 
+    @pytest.mark.trial
     @pytest.mark.parametrize(
         ("bound", "options"), [(1.85, {"drift": [0.01]}), (1.6, {"omega_o": 400.0})],
         ids=["noise", "poles"],
@@ -82,6 +84,7 @@ class TestBound:
         near = StateFeedback(ql.ESO.state_space(**given), GAIN, controlled=ENCODERS[1:])
         assert analyse_feedback(near).m_s("inputs").value > bound
 
+    @pytest.mark.trial
     def test_where_no_gain_meets_it_a_line_says_not(self) -> None:
         """With the load's encoder alone the resonance leaves no margin, whatever the observer."""
         with pytest.raises(
@@ -89,7 +92,7 @@ class TestBound:
         ):
             observer_within(2.0, GAIN, **of_load([1], drift=[1.0]), controlled=ENCODERS[1:])
 
-    @pytest.mark.parametrize(
+    @cases(
         ("wrong", "message"),
         [
             ({"m_s": 1.0}, "m_s = 1.0: must be above 1"),

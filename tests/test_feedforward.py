@@ -14,6 +14,7 @@ from quell.controllers.feedforward import inverse_series, shifted
 from quell.setup import load
 
 from .benchmark_module import benchmark
+from .cases import cases
 from .in_c import needs_gcc
 
 DT = 1e-3
@@ -36,8 +37,9 @@ def error(run: ql.Trajectory) -> float:
     return float(np.max(np.abs(run["y"] - run["r"])) / MOVE.distance)
 
 
-@pytest.mark.parametrize("plant", [AXIS, SPRING], ids=["axis", "spring"])
-@pytest.mark.parametrize("b0", [B, 5.0 * B])
+@pytest.mark.trial
+@cases("plant", [AXIS, SPRING], ids=["axis", "spring"])
+@cases("b0", [B, 5.0 * B])
 def test_with_the_exact_model_the_feedback_has_nothing_to_do(plant: Any, b0: float) -> None:
     """Whatever b0 is: y = r, u = u_ff and no disturbance, up to what a held u leaves of (dt/T)²."""
     run = follow(plant, ql.Feedforward.of(plant), b0)
@@ -54,6 +56,7 @@ def test_the_laws_own_feedforward_misses_by_the_factor_of_b0() -> None:
     assert error(follow(AXIS, True)) > 0.05
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("known", [False, True])
 def test_a_delay_is_compensated_whether_or_not_the_observer_knows_it(known: bool) -> None:
     """By derivatives of the reference; one more of them brings the error down by far."""
@@ -71,6 +74,7 @@ def test_a_delay_is_compensated_whether_or_not_the_observer_knows_it(known: bool
     assert more < 0.1 * ahead
 
 
+@pytest.mark.trial
 def test_friction_and_gravity_of_the_model_are_no_disturbance() -> None:
     """A plant with both, at constant speed: f̂ without them holds both, with them neither."""
     force, weight = 0.02, 0.05
@@ -201,7 +205,7 @@ def test_a_retuned_or_handed_over_loop_keeps_what_the_model_knows() -> None:
     assert abs(controller.estimate.f) < 1e-3 * B
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "rule"),
     [
         (lambda: ql.Feedforward(()), "coefficients has 0 numbers"),
@@ -240,6 +244,7 @@ def test_a_delay_of_part_of_a_sample_is_the_feedforwards_too() -> None:
     )
 
 
+@pytest.mark.trial
 def test_the_tuner_writes_the_feedforward_of_the_model(tmp_path: Path) -> None:
     """Into controller, summary and setup; a PID has none; no margin changes."""
     late = ql.plants.delayed(SPRING, DT, DT)
@@ -256,6 +261,7 @@ def test_the_tuner_writes_the_feedforward_of_the_model(tmp_path: Path) -> None:
         ql.tune(late, DT, **how | {"structure": "pi"}, feedforward=True)
 
 
+@pytest.mark.trial
 def test_the_simplest_structure_is_one_that_can_feed_forward() -> None:
     """Where that is asked for; PID, which is simpler, has no feedforward."""
     how: dict[str, Any] = {"compare": ("pid", "bandwidths"), "objective": "load"}
@@ -266,7 +272,7 @@ def test_the_simplest_structure_is_one_that_can_feed_forward() -> None:
     assert tuned.controller.feedforward == ql.Feedforward.of(lags)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("structure", ["bandwidths", "p-pi-notch"])
 def test_tracking_is_optimised_with_the_feedforward_that_runs(structure: str) -> None:
     """The objective is the RMS of the simulated error, for a plant that is not the model."""
@@ -292,7 +298,7 @@ controller = { omega_c = 20.0, feedforward = GIVEN }
 """
 
 
-@pytest.mark.parametrize(
+@cases(
     ("given", "expected"),
     [
         ("true", True),
@@ -328,7 +334,7 @@ def test_a_setup_file_with_another_one_is_refused(tmp_path: Path, given: str, ru
         load(tmp_path / "setup.toml")
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_tuned_servo_axis_moves_by_a_quarter_turn_within_its_bars() -> None:
     """90° in 0.12 s with a model-based observer: 0.3° with the right inertia, 0.8° with 30 % more."""
     move = benchmark("servo_move")
@@ -338,6 +344,7 @@ def test_a_tuned_servo_axis_moves_by_a_quarter_turn_within_its_bars() -> None:
         assert move.error_of(run) < move.BARS[factor]
 
 
+@pytest.mark.trial
 @needs_gcc
 def test_the_exported_servo_has_the_feedforward_bit_for_bit() -> None:
     """All derivatives are arguments of its step."""

@@ -22,6 +22,7 @@ from quell.files import TooLargeError
 from quell.realtime.devices import TwinDevice
 
 from . import fmus
+from .cases import cases
 from .in_c import needs_gcc
 from .mutations import mutated
 
@@ -64,6 +65,7 @@ def test_an_fmu_runs_as_the_plant_that_it_computes(version: int, files: dict[int
         np.testing.assert_allclose(run[channel], wanted[channel], rtol=0, atol=1e-9)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_compiled_loop_calls_an_fmu_as_python_does(files: dict[int, Path]) -> None:
     """Both loops call the same instances, so only their own rounding differs."""
@@ -153,7 +155,7 @@ def test_a_copy_and_a_pickle_of_a_plant_unpack_the_file_again(files: dict[int, P
         np.testing.assert_array_equal(*runs)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("arguments", "words"),
     [
         ({"u": "force"}, "u = 'force': no variable of it; must be one of|did you mean"),
@@ -212,7 +214,7 @@ def added(name: str, content: bytes = b"") -> Callable[[dict[str, bytes]], None]
     return lambda files: files.update({name: content})
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "words"),
     [
         (without("modelDescription.xml"), "is no FMU: it has no modelDescription.xml"),

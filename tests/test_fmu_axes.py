@@ -51,6 +51,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     return {n: fmus.packed(folder / f"arm{n}.fmu", fmus.contents(n, "arm")) for n in VERSIONS}
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("version", VERSIONS)
 def test_an_fmu_of_an_arm_runs_as_the_arm(version: int, files: dict[int, Path]) -> None:
     """Both take a step of Runge-Kutta in a sample, so only rounding differs; each torque and each push has its joint."""
@@ -63,6 +64,7 @@ def test_an_fmu_of_an_arm_runs_as_the_arm(version: int, files: dict[int, Path]) 
     run.axis("axis2")
 
 
+@pytest.mark.trial
 def test_the_arm_is_met_to_the_tolerance_of_the_integrator(files: dict[int, Path]) -> None:
     """With other steps of Runge-Kutta they differ by its error, 16 times less for half of the step."""
     found = []
@@ -74,7 +76,7 @@ def test_the_arm_is_met_to_the_tolerance_of_the_integrator(files: dict[int, Path
     assert found[1] < found[0] / 8.0
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_compiled_loop_calls_an_fmu_of_several_signals_as_python_does(
     files: dict[int, Path],
@@ -86,6 +88,7 @@ def test_a_compiled_loop_calls_an_fmu_of_several_signals_as_python_does(
     np.testing.assert_allclose(runs[0]["u"], runs[1]["u"], rtol=0, atol=1e-9)
 
 
+@pytest.mark.trial
 def test_encoders_and_delays_stand_at_single_channels(files: dict[int, Path]) -> None:
     """As at the arm itself: the second torque comes two samples late, the first angle is rounded."""
 

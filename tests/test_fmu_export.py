@@ -25,6 +25,7 @@ from quell.export.fmi.parts import bandwidths, gain_coefficients
 from quell.kernels.dispatch import as_python
 from quell.simulation.driver import SampledScenario
 
+from .cases import cases
 from .contracts.test_controllers import SEVERAL
 from .fmus import Driven
 from .in_c import STRICT, needs_gcc
@@ -109,7 +110,7 @@ def inputs(law: Any) -> Iterator[dict[str, float]]:
         yield values | {f"w[{i + 1}]": w for i, w in enumerate(segment.w[k])}
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("name", ["servo", "learner", "mass", "loop"])
 def test_fmpy_finds_no_fault(name: str, files: dict[str, Path]) -> None:
     """In the two descriptions: schema, names, structure, start values and units."""
@@ -118,6 +119,7 @@ def test_fmpy_finds_no_fault(name: str, files: dict[str, Path]) -> None:
     assert validate_fmu(str(files[name])) == []
 
 
+@pytest.mark.trial
 def test_a_controller_with_a_plant_and_a_loop_are_the_simulation(made: Maker) -> None:
     """Called in turn, controller first, both FMUs give y, u and the estimates of ``simulate``; so does the loop."""
     law = learning()
@@ -201,6 +203,7 @@ def test_limits_and_bandwidths_change_while_the_fmu_runs(name: str, made: Maker)
         assert running.step(DT, r=r, y=y) == pytest.approx(law.step(r, y), abs=1e-9)
 
 
+@pytest.mark.trial
 def test_a_held_plant_is_a_boolean_input(made: Maker, tmp_path: Path) -> None:
     """As ``set_held`` in Python, behind a prefilter and under a compensator, too; a PID has none."""
     pid = ql.baselines.PID(kp=4.0, ki=2.0, kd=1.0, tf=0.05, dt=DT, u_min=-4.0, u_max=4.0)
@@ -241,6 +244,7 @@ def several_signals() -> dict[str, Any]:
     }
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("name", ["axes", "feedback"])
 def test_several_signals_have_a_variable_each(name: str, made: Maker, tmp_path: Path) -> None:
     """U, estimates and flags are the bits of the kernels, also with a missing y and other limits."""
@@ -274,6 +278,7 @@ def test_several_signals_have_a_variable_each(name: str, made: Maker, tmp_path: 
         assert running.get("d_hat[1]") == law.estimate[1][0]
 
 
+@pytest.mark.trial
 def test_compensators_take_u_0_of_each_actuator(made: Maker, tmp_path: Path) -> None:
     """With three actuators for two axes; u has the bits of the kernels."""
     observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=30.0, dt=DT)
@@ -296,7 +301,7 @@ def test_compensators_take_u_0_of_each_actuator(made: Maker, tmp_path: Path) -> 
     assert text.count('description="control signal of another controller"') == 3
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("name", ["axes", "feedback"])
 def test_fmpy_finds_no_fault_in_several_signals(name: str, tmp_path: Path) -> None:
     """Names, structure and start values."""
@@ -337,7 +342,7 @@ def test_parameters_are_checked_when_they_act(made: Maker) -> None:
     assert running.step(DT, r=1.0, y=0.0) == plain().step(1.0, 0.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("observer", "others"),
     [
         (lambda omega: ql.ESO.model_free(5, 2.0, omega, 0.001), (5.0, 80.0)),
@@ -482,7 +487,7 @@ def test_what_an_fmu_cannot_do_is_refused_with_a_reason(made: Maker) -> None:
     one.instantiate()
 
 
-@pytest.mark.parametrize(
+@cases(
     "plant",
     [
         ql.plants.arm(),
@@ -529,6 +534,7 @@ def test_an_fmu_in_single_precision_is_the_controller_in_single_precision(
     np.testing.assert_allclose(found, run["u"], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.trial
 def test_the_same_parts_give_the_same_file(files: dict[str, Path], tmp_path: Path) -> None:
     """Bit for bit, so that a build can be repeated."""
     fmu(plain(), tmp_path / "servo.fmu")
@@ -547,6 +553,7 @@ def pendulum(t: float, x: Any, u: float, w: Any) -> tuple[float, float]:
     return x[1], u + w[0] * math.cos(t) - 9.81 * math.sin(x[0])
 
 
+@pytest.mark.trial
 def test_a_plant_of_the_user_is_translated_and_integrated(tmp_path: Path, made: Maker) -> None:
     """With the sub-steps of ``simulate``; the time of the FMU is that of f."""
     plant = ql.plants.NonlinearPlant(pendulum, order=2, substeps=3)
@@ -558,6 +565,7 @@ def test_a_plant_of_the_user_is_translated_and_integrated(tmp_path: Path, made: 
     np.testing.assert_allclose(found, run["y"], rtol=0, atol=1e-9)
 
 
+@pytest.mark.trial
 def test_functions_in_c_come_along(tmp_path: Path, made: Maker) -> None:
     """A feature that the user has in C: without its file it is missing, with it the FMU is that of Python."""
 
@@ -589,7 +597,7 @@ def test_functions_in_c_come_along(tmp_path: Path, made: Maker) -> None:
         fmu(law, tmp_path / "other.fmu", sources=[3])  # type: ignore[list-item]
 
 
-@pytest.mark.parametrize(
+@cases(
     ("part", "file", "options", "words"),
     [
         (plain, "servo.zip", {}, "must end in .fmu"),

@@ -26,6 +26,7 @@ from quell.realtime.wire import (
     write_next_frame,
 )
 
+from .cases import cases
 from .rig_bench import TIME, packed
 
 SESSION = 0x5EED0001
@@ -117,7 +118,7 @@ def test_numbers_go_on_behind_the_largest() -> None:
     assert counts_by_name(own.counters)["reordered"] == 1
 
 
-@pytest.mark.parametrize(
+@cases(
     ("data", "rule"),
     [
         (b"", "malformed"),

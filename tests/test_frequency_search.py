@@ -137,6 +137,7 @@ def test_the_motion_of_the_loop_does_not_hide_a_load(states: int, found: bool) -
     assert (abs(omega[0] - 3.0) < 0.03) == found
 
 
+@pytest.mark.trial
 def test_frequencies_are_found_where_the_state_contains_them_alone() -> None:
     """In the steady state a combination of state and u is f_plain itself, and says nothing."""
     search = room.frequency_search(OBSERVER, 4.0, OSCILLATORS, 3)
@@ -170,6 +171,7 @@ def test_a_scan_correlates_what_is_left_with_all_lines() -> None:
             np.testing.assert_allclose(memory.score.reshape(-1, 2), expected, atol=1e-9)
 
 
+@pytest.mark.trial
 def test_frequencies_are_adopted_from_a_window_that_resolves_them_and_it_grows() -> None:
     """Exactly, without noise; the deviation is that of the least squares for what the fit leaves."""
     memory, omega = started()
@@ -202,6 +204,7 @@ def test_frequencies_are_adopted_from_a_window_that_resolves_them_and_it_grows()
     np.testing.assert_allclose(memory.adopted, np.sqrt(np.diag(covariance)[-2:]), rtol=1e-4)
 
 
+@pytest.mark.trial
 def test_a_changed_load_is_found_and_takes_the_place_of_the_old_one() -> None:
     """A fit with both does not go on; the first good one after it has the new frequencies alone."""
     memory, omega = started()
@@ -214,6 +217,7 @@ def test_a_changed_load_is_found_and_takes_the_place_of_the_old_one() -> None:
     assert entries - window >= 70.0  # nothing of the old load
 
 
+@pytest.mark.trial
 def test_without_an_oscillation_nothing_is_adopted() -> None:
     """Of noise a fit leaves too much: the window is 1.5 times as long, up to the longest, then the shortest."""
     memory, omega = started()

@@ -7,10 +7,13 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy import signal
 
 import quell as ql
 from quell.features import Bias, Friction, Polynomial, State
+
+pytestmark = pytest.mark.trial
 
 OMEGA_C = 5.0
 LEARNERS: dict[str, Any] = {

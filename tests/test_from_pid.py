@@ -16,6 +16,8 @@ from quell.analysis.linearise import linear_law
 from quell.controllers import PidEqual, equal_to_pid
 from quell.setup import made as made_setup
 
+from .cases import cases
+
 # kp, ki, kd, tf and dt: a plain PI, PI with a filter, an oven at 1 Hz, PIDs of a servo of
 # 2e-4 kg m² with a filter of the derivative, of the whole, and none.
 PIDS: dict[str, tuple[float, float, float, Any, float]] = {
@@ -99,7 +101,7 @@ def test_the_response_is_that_of_the_controller(name: str) -> None:
     assert np.all(found.difference(omega, "backward") < 1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @given(
     kp=st.floats(1e-3, 1e3),
     times=st.tuples(st.floats(1.5, 1e4), st.floats(0.0, 0.5), st.floats(0.0, 0.5)),
@@ -158,6 +160,7 @@ def test_a_pi_controller_has_bandwidths_alone_from_a_ratio_of_nine_on(
     assert np.max(found.difference(np.geomspace(0.01, 100.0, 50), "no")) < 0.02
 
 
+@pytest.mark.trial
 def test_no_adrc_is_equal_where_the_filter_is_slower_than_the_integral_time() -> None:
     """It is refused, with a filter that is possible: one with that is made, one above is not."""
     with pytest.raises(ValueError, match="no ADRC is equal") as refused:
@@ -207,6 +210,7 @@ PLANTS: dict[str, tuple[Any, str, float, float]] = {
 }
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("plant", PLANTS)
 def test_in_a_loop_y_differs_from_that_of_the_pid_by_no_more_than_the_bound(plant: str) -> None:
     """The PID is that of ``baselines``, sampled by Tustin's rule; the load steps and swings."""
@@ -234,6 +238,7 @@ def test_in_a_loop_y_differs_from_that_of_the_pid_by_no_more_than_the_bound(plan
     assert 0.02 * bound < apart <= bound < 0.1
 
 
+@pytest.mark.trial
 def test_the_bound_holds_for_the_worst_load_nearly() -> None:
     """A sinusoid at the worst frequency comes near to it: the bound is not a loose one."""
     model, name, _, _ = PLANTS["DC motor"]
@@ -275,7 +280,7 @@ def test_the_report_says_what_is_equal_what_is_not_and_what_comes_next() -> None
     assert "ESO.model_free(2" in made("servo", b0=found.b0).describe()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("gains", "options", "message"),
     [
         ((2.0, 0.0), {}, "ki = 0.0: must not be zero, an ADRC integrates"),

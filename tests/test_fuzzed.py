@@ -69,6 +69,7 @@ def put(value: Any, path: tuple[Any, ...], new: Any) -> Any:
 MESSAGE = {"do": "run", "id": 7, "setup": TABLES, "columns": 300, "percent": 10.0}
 
 
+@pytest.mark.trial
 @fuzzed
 @given(st.sampled_from(places(MESSAGE)), VALUES, st.sampled_from(messages.TASKS))
 def test_a_changed_message_to_the_studio_is_taken_or_refused(

@@ -20,6 +20,7 @@ from quell.observers.design import f_learned_response, response
 from quell.studio.messages import Granted, forms
 from quell.tuning.report import toml_text
 
+from .cases import cases
 from .in_c import InC, needs_gcc
 from .setups import TWO_MASS
 
@@ -54,8 +55,8 @@ def errors(plant: Any, controller: Any, degree: int, duration: float = 40.0) -> 
 # ---- closed forms
 
 
-@pytest.mark.parametrize("m", [1, 2, 3])
-@pytest.mark.parametrize("order", [1, 2, 4])
+@cases("m", [1, 2, 3])
+@cases("order", [1, 2, 4])
 def test_the_gain_of_a_chain_is_binomial(order: int, m: int) -> None:
     """``l_i = C(n + m, i) ω_o^i``, and the sampled gain over dt goes there with dt."""
     size = order + m
@@ -79,8 +80,8 @@ def test_the_gain_with_a_model_puts_all_poles_in_one_place(m: int) -> None:
     np.testing.assert_allclose(observer.model.gain / 1e-6, gain, rtol=1e-3)
 
 
-@pytest.mark.parametrize("m", [2, 3])
-@pytest.mark.parametrize("form", ["current", "predictor", "reduced"])
+@cases("m", [2, 3])
+@cases("form", ["current", "predictor", "reduced"])
 def test_the_poles_are_where_they_are_asked_for(form: str, m: int) -> None:
     """All at ``exp(−ω_o dt)``, one at zero in the reduced form; the characteristic polynomial shows it."""
     found = response(chain(m, form=form).model, 2 + m, 2).transition
@@ -95,8 +96,8 @@ def test_the_poles_are_where_they_are_asked_for(form: str, m: int) -> None:
     )
 
 
-@pytest.mark.parametrize("m", [1, 2, 3])
-@pytest.mark.parametrize("order", [1, 2, 3])
+@cases("m", [1, 2, 3])
+@cases("order", [1, 2, 3])
 def test_the_estimate_of_f_has_its_transfer_function(order: int, m: int) -> None:
     """``Σ_{i>n} C(N, i) ω_o^i s^(N−i) / (s + ω_o)^N``, sampled fast; what is missed begins with s^m."""
     dt, size = 1e-4, order + m
@@ -139,7 +140,7 @@ FORMS: dict[str, Any] = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("m", [2, 3])
 def test_a_ramp_leaves_no_error_with_two_extended_states_and_a_parabola_none_with_three(
@@ -154,6 +155,7 @@ def test_a_ramp_leaves_no_error_with_two_extended_states_and_a_parabola_none_wit
     assert abs(before[-1]) > 1e-3 * largest
 
 
+@pytest.mark.trial
 def test_a_plant_with_a_zero_follows_too() -> None:
     """The law cancels f where it enters, zeros included."""
     plant = ([1.5, 6.0], [1.0, 0.5, 2.0, 1.0])
@@ -163,6 +165,7 @@ def test_a_plant_with_a_zero_follows_too() -> None:
         assert np.max(np.abs(y[-100:])) < 1e-7 * np.max(np.abs(y))
 
 
+@pytest.mark.trial
 def test_with_one_extended_state_a_ramp_leaves_its_rate_over_k_i() -> None:
     """The reference of the other tests: ``y = f'/(b0 k_i)``, from low frequencies of the loop."""
     controller = ql.ADRC(chain(1), OMEGA_C)
@@ -172,6 +175,7 @@ def test_with_one_extended_state_a_ramp_leaves_its_rate_over_k_i() -> None:
     assert y[-1] == pytest.approx(0.2 / k_i, rel=1e-3)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("samples", [1, 4])
 def test_behind_a_known_delay_a_ramp_leaves_its_rate_times_the_delay(samples: int) -> None:
     """``y = b f' τ/k_1``: the law cancels the f of now, which arrives late; with one state more than that."""
@@ -271,7 +275,7 @@ def test_a_start_at_rest_has_no_rate_of_f_and_continues_u() -> None:
 # ---- refusals
 
 
-@pytest.mark.parametrize("wrong", [0, 4, -1, 1.5, "two", True, None])
+@cases("wrong", [0, 4, -1, 1.5, "two", True, None])
 def test_another_number_of_states_is_refused(wrong: Any) -> None:
     """It is a whole number from 1 to 3."""
     makers = (
@@ -286,6 +290,7 @@ def test_another_number_of_states_is_refused(wrong: Any) -> None:
             make()
 
 
+@pytest.mark.trial
 def test_what_needs_one_extended_state_refuses_more_and_says_why() -> None:
     """Guard, certificate, the equivalent PID controller, tuning for k_i; poles, starts, other observers."""
     more, learner = chain(2), ql.learners.Kalman()
@@ -342,7 +347,7 @@ def test_a_comparison_has_no_k_i_with_two_integrators() -> None:
     assert k_i[1:] == [math.inf, math.inf]
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_tuned_controller_has_its_states_and_its_k_i_is_infinite() -> None:
     """The loop keeps its bounds; the controller of the file is the tuned one."""
     plant, bounds = ([B0], [1.0, 0.3, 2.0]), ql.tuning.Constraints(m_s=1.7, m_ks=60.0)

@@ -12,6 +12,8 @@ import quell as ql
 from quell.plants.base import advance
 from quell.plants.multivariable import measure_all
 
+from .cases import cases
+
 DT = 1e-3
 B0 = np.array([[1.0, 0.4], [0.2, 2.0]])
 WIDE = np.hstack([B0, [[0.5], [0.3]]])
@@ -62,6 +64,7 @@ class TestFromOutside:
             np.testing.assert_allclose(u, u_0 - np.linalg.pinv(B) @ f, atol=1e-9)
         assert np.max(np.abs(f)) > 0.1
 
+    @pytest.mark.trial
     def test_decoupled_axes_are_the_single_compensators(self) -> None:
         """With the unit matrix each axis is a ``Compensator``, with learner and guard, to rounding."""
         axes, single = ql.Axes([learning(), compensator()]), (learning(), compensator())
@@ -98,6 +101,7 @@ class TestFromOutside:
         f = [each.f for each in axes.estimates.values()]
         np.testing.assert_allclose(f, [0.5, -0.5], rtol=1e-3)
 
+    @pytest.mark.trial
     def test_a_drive_in_front_follows_as_without_loads(self) -> None:
         """Two PID controllers of somebody, around a coupled machine: the load is all but gone."""
         errors = []
@@ -133,6 +137,7 @@ class TestFromOutside:
 class TestDrives:
     """Controllers in the loop give u_0."""
 
+    @pytest.mark.trial
     @pytest.mark.parametrize("band", [None, ql.SafeSet(-0.8, 0.8, alpha=8.0, f_rate=10.0)])
     def test_one_axis_is_compensated(self, band: Any) -> None:
         """``Axes`` of one axis is ``Compensated``: limits, learner, guard, safe set, and a brake."""
@@ -155,6 +160,7 @@ class TestDrives:
             else:
                 x[1] = 0.0
 
+    @pytest.mark.trial
     def test_loads_are_cancelled_and_learned(self) -> None:
         """RMS over that of the drives alone, with a spring that couples: the learner leaves less."""
         plant = masses(spring=20.0)
@@ -167,6 +173,7 @@ class TestDrives:
             rms.append(np.sqrt(np.mean((run["y"] - run["r"])[6000:] ** 2, axis=0)))
         assert np.all(rms[1] < 0.5 * rms[0])
 
+    @pytest.mark.trial
     @pytest.mark.parametrize("saturation", ["each", "direction"])
     def test_integrators_do_not_wind_up_at_limits(self, saturation: Any) -> None:
         """After a long time at the limits, y overshoots by little."""
@@ -189,6 +196,7 @@ class TestDrives:
         axes.start([0.2, 0.1], [0.4, 0.5])
         np.testing.assert_allclose(axes.step([0.0, 0.0], [0.2, 0.1]), [0.4, 0.5], atol=1e-9)
 
+    @pytest.mark.trial
     def test_a_safe_set_holds_above_drives(self) -> None:
         """A reference far outside: y stays in its band."""
         safe = ql.SafeSet(-1.0, 1.0, alpha=12.0, f_rate=5.0)
@@ -228,7 +236,7 @@ class TestDrives:
 TWO = [compensator(), compensator()]
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: ql.Axes([compensator(), ql.ADRC(TWO[0].observer, 8.0)]), "axis2 is of another kind"),

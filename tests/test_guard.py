@@ -15,7 +15,10 @@ from quell.guard.kernels import CORRECTED, respond
 from quell.learners.base import lag_of, lag_push
 from tests.guarded_samples import OBSERVER, bounds, trusted
 
+from .cases import cases
 
+
+@pytest.mark.trial
 def test_the_correction_lies_within_its_bound(rng: np.random.Generator) -> None:
     """``|f_L − f_L^F| ≤ β κ e``, without authority κe, with e never above the largest |q|, whatever comes."""
     design = ql.Guard(bound=0.8).design(OBSERVER)
@@ -45,8 +48,8 @@ def test_the_correction_lies_within_its_bound(rng: np.random.Generator) -> None:
     assert heard > 2000, "hardly anything was permitted: the test says nothing"
 
 
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-@pytest.mark.parametrize("e", [1.0, 1e-3])
+@cases("side", [-1.0, 1.0])
+@cases("e", [1.0, 1e-3])
 def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None:
     """f_L follows g up to κ_0 e from f_L^F, scaled by the authority; beyond it the slope is zero."""
     for credit in (1.0, 0.25):
@@ -122,6 +125,7 @@ def test_a_change_of_the_authority_over_a_constant_does_nothing() -> None:
         assert limit(design, memory, 50.0, 7.0, 50.0, 0.0, 0.0)[0] == pytest.approx(7.0)
 
 
+@pytest.mark.trial
 def test_what_the_bound_took_is_made_up_for() -> None:
     """After a short pulse of twice the bound f_L still reaches g, and later the target comes to f_L."""
     design, memory = trusted()
@@ -163,7 +167,7 @@ def test_an_output_is_cut_off_where_it_is_a_hundred_times_larger_than_f() -> Non
                 assert memory.sample[0].output == math.copysign(300.0, output)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("removed", "left", "widest"),
     [
         (0.5, 0.0, 3.0),  # κe
@@ -185,8 +189,8 @@ def test_a_learner_that_explains_nearly_everything_has_a_wider_bound(
     assert bounds(design, memory) == pytest.approx((-widest, widest))
 
 
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-@pytest.mark.parametrize(("left", "share"), [(1.0, 1.0), (1.5, 1.0), (2.25, 0.5), (3.0, 0.3)])
+@cases("side", [-1.0, 1.0])
+@cases(("left", "share"), [(1.0, 1.0), (1.5, 1.0), (2.25, 0.5), (3.0, 0.3)])
 def test_a_learner_that_is_wrong_has_less_where_it_pushes_and_may_take_it_back(
     left: float, share: float, side: float
 ) -> None:
@@ -199,7 +203,7 @@ def test_a_learner_that_is_wrong_has_less_where_it_pushes_and_may_take_it_back(
     assert bounds(design, memory) == pytest.approx(expected)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order: int) -> None:
     """ℓ e_L decays as n lags of 2/3 of the observer's do, whatever the learner says, unless κ_0 e is too small."""
@@ -281,6 +285,7 @@ def test_a_guard_that_starts_again_is_a_new_one(rng: np.random.Generator) -> Non
         np.testing.assert_array_equal(array, fresh)
 
 
+@pytest.mark.trial
 def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() -> None:
     """After a NaN it is unheard for T_C/8, the least time in which credit is earned, though it is right; what it did is undone."""
     design = ql.Guard(time=2.0).design(OBSERVER)

@@ -13,6 +13,8 @@ from quell.guard.kernels import CORRECTED, removed_share, update_bound
 from quell.learners.base import lag_push
 from tests.guarded_samples import OBSERVER, feed, settle, trusted
 
+from .cases import cases
+
 
 def test_the_bound_grows_slowly_while_the_learner_acts() -> None:
     """By a factor of e in five lags at most; without authority as quickly as P, which it never exceeds."""
@@ -42,7 +44,7 @@ def test_rest_before_a_disturbance_changes_nothing() -> None:
     assert np.all(averages[0][1:3] > 0.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("credit", "removed", "loudness", "authority", "reason"),
     [
         (-1.0, 0.5, 0.5, 0.0, ql.Reason.UNPROVEN),
@@ -69,7 +71,7 @@ def test_the_authority_is_what_a_learner_has_earned(
     assert memory.sample[0].reason == reason
 
 
-@pytest.mark.parametrize(
+@cases(
     ("square", "left", "before", "authority"),
     [
         (4.1, 0.21, 1.0, 0.0),
@@ -79,7 +81,7 @@ def test_the_authority_is_what_a_learner_has_earned(
         (1.68, 0.0, 0.0, 1.0),  # without authority before, but not withheld
     ],
 )
-@pytest.mark.parametrize("o", [1.0, 1e-3])
+@cases("o", [1.0, 1e-3])
 def test_authority_is_withheld_while_q_may_be_the_learner_s_own_doing(
     square: float, left: float, before: float, authority: float, o: float
 ) -> None:
@@ -156,6 +158,7 @@ def test_a_learner_that_turns_is_seen_within_five_lags() -> None:
     assert averages.newest_left > 2.0 * averages.newest_error
 
 
+@pytest.mark.trial
 def test_the_account_is_the_share_of_the_squared_error_that_was_removed() -> None:
     """With a correction of x times what is missed it tends to ``2 x − 1.5 x²``, and to −0.02 at least."""
     for share in (0.0, 0.5, 2.0 / 3.0, 1.0, 1.34, 3.0, -0.5):
@@ -201,6 +204,7 @@ def test_what_a_learner_does_to_a_load_that_begins_is_compared_with_that_load() 
         assert (memory.sample[0].credit == -1.0) == (removed < -0.01)
 
 
+@pytest.mark.trial
 def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
     """M, S, C, C_y, J, A, P, o, c_L and e by the module's equations, with outliers and small samples."""
     guard = ql.Guard(time=0.4)
@@ -294,6 +298,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
     assert quick > 5, "nothing was ever explained: the test says nothing"
 
 
+@pytest.mark.trial
 def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
     """For a perfect learner p = q: all is explained, and e is the peak of q where it was measured."""
     guard, observer = ql.Guard(time=2.0), ql.ESO.model_free(4, b0=1.0, omega_o=10.0, dt=1e-2)
@@ -311,6 +316,7 @@ def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
     assert 0.8 * missed < memory.sample[0].typical_error < 1.01 * missed
 
 
+@pytest.mark.trial
 def test_a_learner_that_adds_to_slow_errors_is_hardly_heard_however_well_it_explains_quick_ones() -> (
     None
 ):
@@ -331,7 +337,7 @@ def test_a_learner_that_adds_to_slow_errors_is_hardly_heard_however_well_it_expl
         assert authority > 0.99 if heard else authority < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_learner_is_heard_in_noise_that_y_hardly_shows(rng: np.random.Generator) -> None:
     """The disturbance has noise of a measurement, differentiated; q is noise, ℓ q is the load, which the learner knows, and C_y alone gives it authority."""
     design = ql.Guard().design(OBSERVER)

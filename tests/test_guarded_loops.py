@@ -59,7 +59,7 @@ def error(run: ql.Trajectory) -> float:
     return float(np.sqrt(np.mean((run["y"][part] - 1.0) ** 2)))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_learner_does_no_harm(name: str) -> None:
@@ -73,7 +73,7 @@ def test_a_hostile_learner_does_no_harm(name: str) -> None:
     assert error(run) <= 1.1 * error(plain)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_an_honest_learner_is_heard() -> None:
     """It has full authority once it has proved itself, and nothing is lost to having no guard."""
@@ -92,6 +92,7 @@ def test_an_honest_learner_is_heard() -> None:
     assert error(guarded) < 2.0 * error(free) + 0.01 * error(plain)
 
 
+@pytest.mark.trial
 def test_a_learner_without_authority_leaves_the_loop_as_it_is_without() -> None:
     """Not about: to the bit."""
     scenario = dataclasses.replace(LOOP.scenario, duration=10.0)
@@ -103,6 +104,7 @@ def test_a_learner_without_authority_leaves_the_loop_as_it_is_without() -> None:
     np.testing.assert_array_equal(silenced["u"], plain["u"])
 
 
+@pytest.mark.trial
 def test_the_bound_holds_for_the_u_of_the_sample() -> None:
     """With u as a feature the correction that the observer receives is within its bounds, too."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2)
@@ -129,6 +131,7 @@ def test_the_bound_holds_for_the_u_of_the_sample() -> None:
     assert largest > 0.0, "nothing was permitted: the test says nothing"
 
 
+@pytest.mark.trial
 def test_status_and_reason_say_what_happened() -> None:
     """On the estimate, in the record and in its picture."""
     controller = law(Adversary(NAN, 1.0, time=2.0), ql.Guard())
@@ -159,6 +162,7 @@ def test_without_a_guard_nothing_is_said_of_it() -> None:
     assert law(ql.learners.Kalman()).estimate.authority == 1.0
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_the_unit_of_y_does_not_matter_to_the_guard(unit: float) -> None:
@@ -187,6 +191,7 @@ def test_a_guard_without_a_learner_is_reported() -> None:
     np.testing.assert_array_equal(plain["u"], same["u"])
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("bad", "learner"),
     [(1.7e308, ql.learners.Kalman()), (1e160, ql.learners.Harmonic(state=False))],
@@ -211,6 +216,7 @@ def test_a_measurement_beyond_all_numbers_is_got_over(bad: float, learner: objec
         assert np.all(np.isfinite(array))
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_bad_measurement_does_not_open_the_bounds() -> None:
     """A learner that turns after one sample that was off by a kilometre does little more harm than MF-ESO suffers itself."""

@@ -19,6 +19,7 @@ from quell.observers.eso import ESO
 from quell.observers.forms import expected_measurement
 from quell.plants.base import advance, measure
 
+from .cases import cases
 from .python_step import interpreted
 
 DT = 0.01
@@ -90,6 +91,7 @@ def test_a_start_towards_another_reference_goes_on_from_u() -> None:
     assert rig.y == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.trial
 def test_a_start_keeps_what_was_learned_and_still_makes_no_bump() -> None:
     """The learner's share of f and the observer's add up to what holds u."""
     rig, controller = Rig(), ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman())
@@ -226,7 +228,7 @@ def test_a_model_that_comes_later_changes_nothing_at_rest() -> None:
         assert controller.estimate.f == pytest.approx(f, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize(
     "compiled", [pytest.param(True, marks=pytest.mark.compiled), False], ids=["compiled", "Python"]
 )
@@ -323,7 +325,7 @@ def test_a_wrapper_prepares_a_retuning_too(kind: str, new_limits: bool) -> None:
     assert len(set(us[0])) > 100
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("kind", ["prefiltered", "compensated in single"])
 def test_a_prepared_retuning_of_a_wrapper_is_compiled(kind: str) -> None:
@@ -417,6 +419,7 @@ def test_of_a_plant_with_zeros_only_the_bandwidth_may_change() -> None:
     assert controller.observer.omega_o == 30.0
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("zero", [-0.5, -0.1])
 @pytest.mark.parametrize("keep_zeros", [False, True])
 def test_a_start_makes_no_bump_whatever_the_zeros(zero: float, keep_zeros: bool) -> None:
@@ -482,6 +485,7 @@ def test_derivatives_are_fed_forward_in_manual_operation_too() -> None:
     )
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_retuning_does_not_compile_again() -> None:
     """The types stay, so the step stays."""
@@ -541,6 +545,7 @@ def test_an_actuator_that_did_otherwise_is_believed() -> None:
     assert np.max(np.abs(ends["untold"] - ends["own"])) > 0.01
 
 
+@pytest.mark.trial
 def test_the_reference_fed_forward_is_followed_without_lag() -> None:
     """Y = r up to the observer's error, where the lag without derivatives is 2/omega_c."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])
@@ -569,7 +574,7 @@ def test_derivatives_reach_a_loop_of_ones_own() -> None:
     np.testing.assert_allclose(u, run["u"], atol=1e-10)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda c: c.start(math.nan), "y = nan: must be a finite number"),
@@ -665,8 +670,8 @@ def test_without_a_reference_a_started_loop_keeps_the_one_it_was_started_with() 
         assert controller._state.loop[0].r == r
 
 
-@pytest.mark.parametrize("learner", [None, ql.learners.Kalman()])
-@pytest.mark.parametrize("delay", [0.0, 0.02])
+@cases("learner", [None, ql.learners.Kalman()])
+@cases("delay", [0.0, 0.02])
 def test_a_start_in_motion_goes_on_from_the_estimates(learner: object, delay: float) -> None:
     """With the estimates and u of another controller, every later u is that controller's; with a delay, after a constant u."""
     observer = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT, delay=delay)

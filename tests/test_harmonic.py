@@ -21,6 +21,8 @@ from quell.learners.oscillators import (
     write_deviations,
 )
 
+from .cases import cases
+
 pytestmark = pytest.mark.compiled
 
 
@@ -62,7 +64,7 @@ def test_phases_turn_at_their_frequency() -> None:
     assert np.all((phase >= 0.0) & (phase < 2.0 * math.pi))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("start", [0.2, 2.5])
 @pytest.mark.parametrize("truth", [0.4, 1.2])
 def test_an_unknown_frequency_is_found_and_the_load_rejected(start: float, truth: float) -> None:
@@ -109,6 +111,7 @@ def bounded_run(noise: object) -> ql.Trajectory:
     return run
 
 
+@pytest.mark.trial
 def test_it_stays_bounded_without_excitation() -> None:
     """A constant reference for 1e5 samples: nothing winds up, drifts or leaves the numbers."""
     run = bounded_run(ql.signals.BandLimitedNoise(1e-12, 0.01))
@@ -117,6 +120,7 @@ def test_it_stays_bounded_without_excitation() -> None:
         assert np.all(np.abs(array) < 1e6), name
 
 
+@pytest.mark.trial
 def test_it_stays_bounded_whatever_it_is_shown(rng: np.random.Generator) -> None:
     """1e5 measurements with errors of very different size: state and output stay finite and repeatable."""
     size = np.repeat(10.0 ** rng.uniform(-6.0, 3.0, 100), 1000)
@@ -128,7 +132,7 @@ def test_it_stays_bounded_whatever_it_is_shown(rng: np.random.Generator) -> None
     assert np.max(np.abs(first["f_learned"])) > 1.0, "it said nothing: the test says nothing"
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_sinusoids_closer_than_a_line_width_are_separated_by_the_search() -> None:
     """A factor of 1.2, one minute of load, 0.57 of a beat period before it is judged: 1/50 of MF-ESO's error.
 
@@ -246,7 +250,7 @@ def test_behind_a_law_that_is_faster_than_the_observer_slow_loads_are_found() ->
     np.testing.assert_allclose(found.omega, [10.0, 6.0])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"count": 0}, "count = 0"),

@@ -77,6 +77,7 @@ def overshoot(y: Any, step: float = 1.0) -> float:
     return 100.0 * max(float(np.max(y)) / step - 1.0, 0.0)
 
 
+@pytest.mark.trial
 def test_a_hold_of_two_seconds_makes_no_overshoot_with_nothing_set_by_hand() -> None:
     """At most 0.5 %, as with the signal and by hand; without detection u is at its limit and y overshoots by more than half."""
     found = {
@@ -89,6 +90,7 @@ def test_a_hold_of_two_seconds_makes_no_overshoot_with_nothing_set_by_hand() -> 
     assert max(found[name] for name in ("detected", "signal", "by hand")) < 0.5
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("hold", [(0.12, 0.3), (0.14, 2.2), (0.0, 1.0)])
 def test_a_hold_in_mid_move_or_from_the_start_is_detected_too(hold: tuple[float, float]) -> None:
     """Of 0.18 s, of 2 s, and one that began before the first sample."""
@@ -99,6 +101,7 @@ def test_a_hold_in_mid_move_or_from_the_start_is_detected_too(hold: tuple[float,
     assert np.any(status & ql.Status.HELD)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("gain", [0.5, 2.0])
 def test_a_wrong_b0_costs_what_it_costs_without_a_hold(gain: float) -> None:
     """With half and twice the gain, compared with a step without a hold."""
@@ -107,6 +110,7 @@ def test_a_wrong_b0_costs_what_it_costs_without_a_hold(gain: float) -> None:
     assert held < free + 1.0
 
 
+@pytest.mark.trial
 def test_a_compensator_detects_as_an_adrc_does() -> None:
     """Under a controller that holds the position with a plain P-D law of its own."""
     u_0 = 60.0**2 / B0
@@ -137,6 +141,7 @@ def test_the_signal_keeps_the_load_and_the_learned() -> None:
     assert "brake" in ql.Status.HELD.message
 
 
+@pytest.mark.trial
 def test_a_load_that_is_compensated_changes_nothing() -> None:
     """A load ramp regulated to standstill may look held; the run is the same as without detection, to the last bit."""
     load = 3000.0 * np.sin(2.0 * np.pi * 0.5 * DT * np.arange(6000))
@@ -146,6 +151,7 @@ def test_a_load_that_is_compensated_changes_nothing() -> None:
     np.testing.assert_array_equal(plain[1], detecting[1])
 
 
+@pytest.mark.trial
 def test_an_axis_that_sticks_breaks_loose_as_without_detection() -> None:
     """EMPS's dry friction, moves and rests: the error is the same within 1 %."""
     plant = ql.plants.dc_motor(
@@ -161,6 +167,7 @@ def test_an_axis_that_sticks_breaks_loose_as_without_detection() -> None:
     assert errors[1] == pytest.approx(errors[0], rel=0.01)
 
 
+@pytest.mark.trial
 def test_a_load_instead_of_a_brake_is_not_taken_for_one() -> None:
     """A load of −b0 u that goes on after y began to move: f̂ is not set back, and the flag ends."""
     controller = adrc(ql.HeldPlant())
@@ -175,6 +182,7 @@ def test_a_load_instead_of_a_brake_is_not_taken_for_one() -> None:
     assert controller.estimate.f == pytest.approx(-B0 * 3.5, rel=0.05)
 
 
+@pytest.mark.trial
 def test_missing_measurements_do_not_end_a_hold() -> None:
     """With every tenth one missing the release still makes no overshoot."""
     controller = adrc(ql.HeldPlant())
@@ -188,6 +196,7 @@ def test_missing_measurements_do_not_end_a_hold() -> None:
     assert top < 1.005
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     "observer",
     [
@@ -216,6 +225,7 @@ def test_every_form_of_the_observer_takes_part(observer: ESO) -> None:
     assert signal < free + 1.0
 
 
+@pytest.mark.trial
 def test_a_safe_set_knows_of_the_release() -> None:
     """Its own observer is at rest with the signal, so the band holds from the first sample on."""
     safe = ql.SafeSet(y_max=1.02, alpha=60.0, f_rate=100.0, noise=COUNT)
@@ -298,6 +308,7 @@ def _released(kind: str, samples: int, wrap: Any) -> Any:
     return np.array(found)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("wrap", [lambda law: law, in_single_precision], ids=["double", "single"])
 @pytest.mark.parametrize("kind", SERVO)
 def test_a_controller_under_a_compensator_does_not_wind_up(kind: str, wrap: Any) -> None:
@@ -308,6 +319,7 @@ def test_a_controller_under_a_compensator_does_not_wind_up(kind: str, wrap: Any)
         assert np.max(np.abs(held[:-20] - free[20:])) < 0.02
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("kind", ["adrc", "pid", "two integrators"])

@@ -52,6 +52,8 @@ def test_a_histogram_as_text_and_plot() -> None:
     assert scale.index("|10 ") == len(lowest) - 1
     ax = histogram.plot()
     assert ax.get_xlabel() == "duration [µs]"
+    # Of 1000 all, then 10 took longer, and none: half a one stands for it on this scale.
+    assert set(ax.lines[0].get_ydata()) == {1.0, 0.01, 0.0005}
     empty = Histogram.of(empty_counts())
     assert math.isnan(empty.p50)
     assert empty.text().endswith("of 0")

@@ -35,6 +35,7 @@ def hostile() -> Any:
     return benchmark("hostile_exports")
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 @pytest.mark.parametrize(
@@ -55,6 +56,7 @@ def test_any_calls_with_any_bits_leave_u_a_number_within_its_limits(
     assert hostile.run(hostile.built(tmp_path, shown, source), 2e5) == ("0", "0", "0")
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 def test_any_calls_of_axes_leave_all_u_numbers_within_their_limits(
@@ -84,6 +86,7 @@ WRONG = [
 ]  # fmt: skip
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize(("changes", "expected"), WRONG)
 def test_a_hostile_program_finds_what_is_wrong(
@@ -112,7 +115,7 @@ def test_the_program_calls_every_function(hostile: Any) -> None:
         hostile.hostile_program(ADRC, more)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is missing")
 @pytest.mark.parametrize("controller", [ADRC, LEARNING, MOVING], ids=["ADRC", "Kalman", "moves"])

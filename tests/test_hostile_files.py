@@ -30,6 +30,8 @@ from quell.setup import load as load_setup
 from quell.setup import load_axes
 from tests.mutations import mutated, write_seeds
 
+from .cases import cases
+
 HEADER = Header(row_channels((("status", 1),)), dt=0.01)
 LOADERS: dict[str, Callable[..., Any]] = {
     "recording": load,
@@ -86,7 +88,7 @@ def changed(saved: Path, path: Path, change: Callable[[h5py.File], None]) -> Pat
     return path
 
 
-@pytest.mark.parametrize("name", LOADERS)
+@cases("name", LOADERS)
 def test_a_file_that_is_not_there_or_no_file_gives_a_line_with_its_name(
     name: str, tmp_path: Path
 ) -> None:
@@ -241,6 +243,7 @@ def test_shapes_and_attributes_of_a_netcdf_file_are_checked_before_its_data(
         assert "\n" not in str(refused.value)
 
 
+@pytest.mark.trial
 def test_a_record_is_larger_than_its_limit_or_is_read(saved: Path, tmp_path: Path) -> None:
     """Recompressed by another tool it is the same record."""
     import xarray
@@ -276,7 +279,7 @@ def test_the_reader_imports_nothing_from_the_folder_that_files_are_in(
     assert len(ql.Trajectory.load(saved)) == 10
 
 
-@pytest.mark.parametrize(
+@cases(
     "text",
     [
         "a" + ".a" * 3000 + " = 1",
@@ -304,6 +307,7 @@ def test_numbers_that_no_float_holds_are_refused_by_name() -> None:
         ql.plants.LinearPlant([[10**400]], [1.0], [1.0])
 
 
+@pytest.mark.trial
 def test_long_lines_and_long_files_of_numbers_are_refused(tmp_path: Path) -> None:
     """Both kinds of tables, before they are in memory."""
     path = tmp_path / "data.csv"
@@ -321,6 +325,7 @@ def test_long_lines_and_long_files_of_numbers_are_refused(tmp_path: Path) -> Non
         read_record(path, max_size=0.5)
 
 
+@pytest.mark.trial
 def test_random_changes_of_files_are_read_or_refused_in_a_line(tmp_path: Path) -> None:
     """A short version of ``benchmarks/mutated_files.py``, without processes and commands."""
     valid = tmp_path / "valid"

@@ -21,6 +21,7 @@ from quell.identification.model import Structure, output, output_gradient, poles
 from quell.identification.output_error import refine
 from quell.quantities import Signals
 
+from .cases import cases
 from .commands import Shown
 
 pytestmark = pytest.mark.compiled
@@ -79,7 +80,8 @@ def off(found: Identified) -> np.ndarray:
     return np.abs(nearest - truth) / np.where(np.abs(truth) > 1e-6, np.abs(truth), 1.0)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.trial
+@cases(
     ("plant", "order", "zeros"),
     [
         (([3.0], [1.0, 2.0]), 1, 0),
@@ -115,6 +117,7 @@ def test_the_testbed_is_found_through_its_encoder() -> None:
     assert found.resolution == pytest.approx(QUANTUM, rel=1e-6)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(("band", "amplitude"), [((0.2, 20.0), 2.0), ((0.2, 60.0), 5.0)])
 def test_the_twin_is_found_with_its_friction(band: tuple[float, float], amplitude: float) -> None:
     """Open loop, all friction and quantisation: held-out fit ≥ 99.9 %, poles within 0.5 %, friction within 3 %."""
@@ -126,6 +129,7 @@ def test_the_twin_is_found_with_its_friction(band: tuple[float, float], amplitud
     assert found.friction == pytest.approx((0.01 + 0.001) / gain, rel=0.03)
 
 
+@pytest.mark.trial
 def test_the_twin_is_found_in_a_closed_loop() -> None:
     """With an ADRC around it, and friction: held-out fit ≥ 99 %, poles within 2 %."""
     found = ql.identify(*twin_loop(), DT, friction=True)
@@ -133,6 +137,7 @@ def test_the_twin_is_found_in_a_closed_loop() -> None:
     assert np.max(off(found)) < 2e-2
 
 
+@pytest.mark.trial
 def test_where_it_never_turns_back_friction_is_a_constant_force() -> None:
     """A positive u: the linear plant is exact to 1e-4 without any model of friction, and the friction is the bias."""
     found = ql.identify(*twin_record((0.3, 60.0), 1.0, 1.5), DT)
@@ -141,6 +146,7 @@ def test_where_it_never_turns_back_friction_is_a_constant_force() -> None:
     assert -found.bias == pytest.approx((0.01 + 0.001) / (3.0 * 0.09617 * 2.0), rel=0.02)
 
 
+@pytest.mark.trial
 def test_without_a_model_of_friction_the_slow_pole_is_wrong() -> None:
     """Coulomb friction is taken for viscous friction: 3 % and more, where with it there is a thousandth."""
     record = twin_record((0.2, 20.0), 2.0)
@@ -148,6 +154,7 @@ def test_without_a_model_of_friction_the_slow_pole_is_wrong() -> None:
     assert np.max(off(found_twin((0.2, 20.0), 2.0))) < 2e-3
 
 
+@pytest.mark.trial
 def test_friction_of_a_single_inertia_is_found() -> None:
     """Order 2: mass, viscous and Coulomb friction, which sticks; from a simulation of small steps."""
     dt, fine = 0.01, 50
@@ -166,6 +173,7 @@ def test_friction_of_a_single_inertia_is_found() -> None:
     assert found.fits["held out"] > 99.0
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("friction", [False, True])
 def test_the_delay_is_found(friction: bool) -> None:
     """Of up to ten samples, by itself."""
@@ -180,6 +188,7 @@ def test_the_delay_is_found(friction: bool) -> None:
     assert found.delay == pytest.approx(7 * DT)
 
 
+@pytest.mark.trial
 def test_the_deviations_of_poles_are_those_of_many_records() -> None:
     """Thirty records with other coloured noise: the spread of the poles is what each record says it is, within a third.
 
@@ -212,7 +221,7 @@ def test_the_deviations_of_poles_are_those_of_many_records() -> None:
     assert abs(np.mean(real) + 0.3) < 3.0 * spread[0] / np.sqrt(30)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_reference_frees_a_closed_loop_of_bias() -> None:
     """A slow strong force in the loop: output error is far off, instrumental variables from the reference are not."""
     dt, plant = 0.02, ql.plants.LinearPlant.of(([3.0], [1.0, 0.6, 4.0]))
@@ -233,6 +242,7 @@ def test_a_reference_frees_a_closed_loop_of_bias() -> None:
     assert np.mean(freed) == pytest.approx(0.6, abs=0.15)
 
 
+@pytest.mark.trial
 def test_in_its_loop_an_unstable_plant_is_found_with_the_reference() -> None:
     """Its pole is not mirrored, and the report names it as unstable."""
     dt, plant = 0.01, ql.plants.LinearPlant.of(([2.0], [1.0, -0.3, 0.0]))
@@ -322,6 +332,7 @@ def test_the_empirical_response_is_the_plants_and_says_where_it_is_not() -> None
     assert np.median(frequency_response(u, noise, 0.005).coherence) < 0.4
 
 
+@pytest.mark.trial
 def test_prediction_beats_simulation_and_both_are_told() -> None:
     """With a force that the model does not know, ten samples ahead y is known better than from u alone."""
     dt, rng = 0.01, np.random.default_rng(2)
@@ -333,6 +344,7 @@ def test_prediction_beats_simulation_and_both_are_told() -> None:
     assert "white: no" in str(found)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(("order", "noise"), [(2, 0.0), (6, 0.01)])
 def test_a_higher_order_than_the_plants_finds_it_too(order: int, noise: float) -> None:
     """A lag by a model of up to six poles: it is fitted as well as by one, and the report says which poles no sample shows."""
@@ -369,6 +381,7 @@ def test_a_slow_lag_is_no_integrator() -> None:
     assert ql.identify(u, y, 0.01, order=2).poles[0].value == pytest.approx(-2.0, rel=0.02)
 
 
+@pytest.mark.trial
 def test_the_report_says_what_speaks_against_the_model() -> None:
     """A pole and a zero that can't be told apart, and a pole in the right half plane, are named; a good model has nothing of it."""
     u = excitation("prbs", (0.2, 40.0), 40.0, 0.01, seed=3).u
@@ -434,7 +447,7 @@ GOOD = "\n".join(f"{0.1 * k:.1f},{k % 3},{k % 5}" for k in range(20))
 U = np.sign(np.sin(0.05 * np.arange(2000.0) ** 1.1))
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"u": np.append(U[:-1], np.nan)}, "u: entry (1999,) is nan"),
@@ -523,7 +536,7 @@ def test_the_commands_refuse_in_a_line_and_design(
     assert read_record("u.csv", ("t", "u", "1")).u.size == 2000
 
 
-@pytest.mark.parametrize(
+@cases(
     ("text", "columns", "dt", "message"),
     [
         ("", ("t", "u", "y"), None, "is empty"),

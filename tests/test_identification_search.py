@@ -45,6 +45,7 @@ def test_a_resonance_is_found_in_strong_noise(samples: int) -> None:
     assert found.poles[0].damping == pytest.approx(0.05, rel=0.1)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("seed", [48, 111, 10243])
 def test_a_model_in_the_set_is_not_missed(seed: int) -> None:
     """Cases of the trial that were missed before: wrong delays, and two poles so equal that one was put at s = 0."""
@@ -53,6 +54,7 @@ def test_a_model_in_the_set_is_not_missed(seed: int) -> None:
     assert not row["misleading"], row
 
 
+@pytest.mark.trial
 def test_a_larger_model_never_fits_worse() -> None:
     """A nonlinear plant, so that each order leaves something: with a pole and a zero more the fit does not fall."""
     rng = np.random.default_rng(3)
@@ -196,6 +198,7 @@ def rows(name: str, columns: tuple[str, ...], dt: float | None = None) -> Any:
     return read_record(RECORDS / name, columns, dt)
 
 
+@pytest.mark.trial
 def test_a_flexible_robot_arm_is_fitted_better_by_a_larger_model() -> None:
     """DaiSy's record: from order 4/3 to 5/4 the fit does not fall."""
     record = rows("robot_arm.csv", ("u", "y"), 1.0)

@@ -111,6 +111,7 @@ def place(module: str) -> int:
     return ORDER.index(max(folders, key=len))
 
 
+@pytest.mark.trial
 def test_a_file_imports_only_what_stands_before_it(imports: dict[str, set[str]]) -> None:
     """Its own folder, and folders that come earlier in the table."""
     wrong = [
@@ -137,6 +138,7 @@ def test_every_folder_says_what_it_may_import() -> None:
     assert not silent, silent
 
 
+@pytest.mark.trial
 def test_one_file_imports_the_private_modules_of_numba() -> None:
     """A new version of Numba can move them: then one file has to change, with a check of versions."""
     public = {"numba", "numba.extending"}

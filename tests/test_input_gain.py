@@ -18,10 +18,11 @@ import quell as ql
 from quell.controllers.baselines import PID
 from quell.identification import InputGain, identify_b0, identify_b0_by
 from quell.identification.bandwidth import Candidate, bandwidth
-from quell.identification.input_gain import MarginError, seconds_text, white_where
+from quell.identification.input_gain import MarginError, mixture, seconds_text, white_where
 from quell.identification.running_loop import Form, Inputs, linear_columns, placed, predicted
 
 from .benchmark_module import benchmark
+from .cases import cases
 from .commands import Shown
 from .python_step import interpreted
 
@@ -66,6 +67,7 @@ def adrc(order: int = 2, b0: float = 25.0) -> Any:
     return ql.ADRC(ql.ESO.model_free(order, b0, omega_o=20.0, dt=DT), omega_c=5.0)
 
 
+@pytest.mark.trial
 def test_without_noise_gain_lag_and_delay_are_exact() -> None:
     """Also a delay that is no whole number of samples, under an ADRC whose b0 is 1.6 times too small."""
     u, y = record([1.0, 2.0, 3.0], adrc(), 0.0, t=T[:1000], lag=0.03, delay=0.01375)
@@ -76,6 +78,7 @@ def test_without_noise_gain_lag_and_delay_are_exact() -> None:
     assert found.delay == pytest.approx(0.01375, rel=2e-3)
 
 
+@pytest.mark.trial
 def test_a_load_does_not_bias_the_gain() -> None:
     """A drifting load in the loop: the output error is wrong by far more than the stated deviation, this is not."""
     u, y = record([1.0, 2.0, 0.0], adrc(), 2e-3, load=1e-3, delay=0.02)
@@ -86,6 +89,7 @@ def test_a_load_does_not_bias_the_gain() -> None:
     assert abs(biased.num[0] - 40.0) > 5.0 * found.b0_std
 
 
+@pytest.mark.trial
 def test_an_unstable_plant_is_found_in_its_loop_under_any_controller() -> None:
     """A pendulum that falls with 3 rad/s under a PID, which the function does not know."""
     pid = PID(kp=1.2, ki=1.0, kd=0.15, tf=0.02, dt=DT)
@@ -109,6 +113,7 @@ def unstable_record(pole: float, dt: float, samples: int, **plant: float) -> tup
     return u, y + noise
 
 
+@pytest.mark.trial
 @pytest.mark.filterwarnings("ignore::quell.DesignWarning")
 @pytest.mark.parametrize(
     ("pole", "dt", "samples", "plant"),
@@ -151,6 +156,7 @@ def test_the_predictor_of_an_unstable_plant_without_loads_is_the_stationary_kalm
     assert found == pytest.approx(by_hand, abs=1e-6)
 
 
+@pytest.mark.trial
 def test_u_before_the_record_does_not_matter() -> None:
     """A record that begins in motion: the u that still acts in its first samples is not in it."""
     u, y = record([1.0, 2.0, 3.0], adrc(), 0.0, delay=0.04375)
@@ -178,6 +184,7 @@ def test_poor_excitation_is_said() -> None:
     assert "the excitation is too poor" in str(found)
 
 
+@pytest.mark.trial
 def test_a_u_that_is_not_recorded_is_asked_for() -> None:
     """Noise in the place of u says nothing of b0."""
     u, y = record([1.0, 2.0, 0.0], adrc(), 1e-4)
@@ -187,6 +194,7 @@ def test_a_u_that_is_not_recorded_is_asked_for() -> None:
     assert "is it u that was recorded?" in found.shortcomings[0]
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("seed", [1, 5])
 def test_the_interval_holds_the_gain_in_draws_of_the_trial(
     seed: int, monkeypatch: pytest.MonkeyPatch
@@ -242,6 +250,7 @@ def test_the_bandwidth_keeps_the_phase_margin_and_no_larger_one_does() -> None:
     assert margins[1] < 59.95
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("kind", ["unstable", "integrating", "resonant", "negative"])
 def test_the_interval_holds_the_gain_of_plants_of_each_kind(
     kind: str, monkeypatch: pytest.MonkeyPatch
@@ -276,7 +285,7 @@ def phase_of(found: InputGain, omega_c: float, ratio: float) -> float:
     return ql.analysis.analyse(plant, controller, delay=found.delay).margins.phase
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_ratio_is_chosen_where_the_usual_one_cannot_keep_the_margin() -> None:
     """An inertia with a delay of 1 ms has 41° with omega_o = 5 omega_c, however slow the loop."""
     inertia = result(30.0, [1.0, 0.0, 0.0], 0.001, 0.001)
@@ -289,6 +298,7 @@ def test_the_ratio_is_chosen_where_the_usual_one_cannot_keep_the_margin() -> Non
     assert caught.value.phase_margin == pytest.approx(41.2, abs=0.1)
 
 
+@pytest.mark.trial
 def test_the_range_of_an_unstable_plant_is_found_between_its_ends() -> None:
     """A slower loop than the pole is unstable, a faster one than the delay allows, too."""
     found = result(-30.0, [1.0, 0.0, -9.0], 0.002, 0.001)
@@ -298,6 +308,7 @@ def test_the_range_of_an_unstable_plant_is_found_between_its_ends() -> None:
     assert phase_of(found, 1.02 * omega_c, ratio) < 45.0
 
 
+@pytest.mark.trial
 def test_a_plant_that_no_adrc_stabilises_has_no_bandwidth() -> None:
     """A pole of 38.7 rad/s behind a delay of 100 ms: the error says that no loop is stable."""
     found = result(-30.0, [1.0, 0.0, -(38.7**2)], 0.1, 0.005)
@@ -323,6 +334,7 @@ def servo_record(inertias: list[float], stiffnesses: list[float]) -> tuple[Any, 
     return u, np.round(y[:, 0] / (2.0 * np.pi) * count) * 2.0 * np.pi / count
 
 
+@pytest.mark.trial
 def test_where_the_record_rejects_the_form_no_interval_and_no_bandwidth_is_given(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -385,10 +397,12 @@ def test_a_wrong_phase_margin_is_refused_before_the_search(
 def test_a_time_has_one_unit_for_value_and_deviation() -> None:
     """A dead time of an oven in s, that of a servo in ms; the digits are those that the deviation leaves."""
     assert seconds_text(19.968, 0.0543) == "19.968 ± 0.054 s"
+    assert seconds_text(1.0, 0.1) == "1 ± 0.1 s"
+    assert seconds_text(0.999, 0.1) == "999 ± 1e+02 ms"
     assert seconds_text(0.0123456, 0.0012) == "12.35 ± 1.2 ms"
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"y": 1e200 * np.cos(T)}, "y has values up to 1e\\+200"),
@@ -406,6 +420,7 @@ def test_a_wrong_argument_is_named(change: dict[str, Any], message: str) -> None
         identify_b0(**arguments)
 
 
+@pytest.mark.trial
 def test_the_command_reads_a_saved_run_and_the_setup_of_its_loop(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -432,7 +447,7 @@ def test_the_command_reads_a_saved_run_and_the_setup_of_its_loop(
     assert "order: missing; give --order, or with --loop" in refused.err
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_command_succeeds_where_no_bandwidth_keeps_the_margin(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -453,7 +468,7 @@ def test_the_command_succeeds_where_no_bandwidth_keeps_the_margin(
     assert told["omega_c"] > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_b0_by_a_signal_is_that_of_each_bin(tmp_path: Path) -> None:
     """On a loop whose gain changes with a signal; a bin without samples is NOT known, and says what to do."""
     t = np.arange(6000) * 0.01
@@ -479,3 +494,29 @@ def test_b0_by_a_signal_is_that_of_each_bin(tmp_path: Path) -> None:
             identify_b0_by(u, y, speed, 0.01, 1, bins=bins)
     with pytest.raises(ValueError, match="nothing to divide"):
         identify_b0_by(u, y, np.ones(u.size), 0.01, 1)
+
+
+def test_the_deviation_of_a_mixture_has_the_spread_of_its_means() -> None:
+    """The closed form: the mean of the variances, and the variance of the means."""
+    mean, std = mixture([(0.0, 1.0), (2.0, 3.0)], np.array([0.75, 0.25]))
+    assert mean == 0.5
+    assert std**2 == pytest.approx((0.75 * 1.0 + 0.25 * 9.0) + 0.75 * 0.25 * 2.0**2)
+
+
+@pytest.mark.parametrize(
+    ("lag", "delay", "share", "expected"),
+    [
+        (True, True, None, (3.0, 5.0)),
+        (True, False, None, (3.0, 0.0)),
+        (False, True, None, (0.0, 3.0)),
+        (False, False, None, (0.0, 0.0)),
+        (True, True, 0.25, (0.75, 2.25)),
+    ],
+)
+def test_what_a_model_does_not_have_is_zero(
+    lag: bool, delay: bool, share: float | None, expected: tuple[float, float]
+) -> None:
+    """Lag and delay, of their places in the parameters; a share divides their sum."""
+    form = Form(2, lag, delay, False, share=share)
+    phi = np.concatenate([np.full(form.times.start, 7.0), [3.0, 5.0]])[: form.size]
+    assert (form.lag_of(phi), form.delay_of(phi)) == expected

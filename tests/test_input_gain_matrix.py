@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from quell.identification import (
     interleaved_excitations,
     save_excitations,
 )
-from quell.identification.gain_matrix import _excitation
+from quell.identification.gain_matrix import _balanced, _excitation
 
 from .benchmark_module import benchmark
+from .cases import cases
 from .commands import Shown
 
 pytestmark = pytest.mark.compiled
@@ -42,6 +44,7 @@ def record(samples: int = 700, noise: float = 1e-6) -> tuple[Any, Any]:
     return u, y + noise * np.random.default_rng(3).standard_normal(y.shape)
 
 
+@pytest.mark.trial
 def test_the_matrix_is_right_in_a_loop_with_friction_that_couples() -> None:
     """A gantry under PD control with a wrong inertia: that the axes brake each other is no error."""
     rng = np.random.default_rng(2)
@@ -61,6 +64,7 @@ def test_the_matrix_is_right_in_a_loop_with_friction_that_couples() -> None:
     assert np.all(found.condition < 5.0)
 
 
+@pytest.mark.trial
 def test_a_single_axis_is_that_of_the_other_function() -> None:
     """With one u and one y the entry, lag and delay are those of ``identify_b0``; the deviation is enlarged by the other u, which is not given."""
     u, y = record(400)
@@ -73,6 +77,7 @@ def test_a_single_axis_is_that_of_the_other_function() -> None:
     assert matrix.total_delay[0] == pytest.approx(one.total_delay, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.trial
 def test_the_result_is_the_matrix_of_axes_and_its_intervals_hold_the_truth() -> None:
     """``ql.Axes(…, B0=found.B0)``; the report has all entries, JSON all numbers."""
     u, y = record(noise=1e-3)
@@ -106,8 +111,13 @@ def test_actuators_that_moved_together_are_named() -> None:
     assert "excite each actuator at frequencies of its own" in first
     assert found.poor.tolist() == [[True, True, False]]
     assert found.may_be_singular
+    assert found.enlarged[0] == 1.0  # the noise is white
+    assert "as the error is not white" not in str(found)
+    coloured = replace(found, enlarged=np.array([1.5]))
+    assert "; deviations enlarged by 1.5, as the error is not white" in coloured.describe_rest()
 
 
+@pytest.mark.trial
 def test_an_actuator_that_is_not_recorded_leaves_no_entry_known() -> None:
     """The other actuator's entries, too, are not known: what moved the axes is not in the record."""
     u, y = record(300)
@@ -119,6 +129,7 @@ def test_an_actuator_that_is_not_recorded_leaves_no_entry_known() -> None:
     assert "u2 recorded, in the right column, as applied?" in first
 
 
+@pytest.mark.trial
 def test_an_actuator_that_moves_one_axis_only_is_recorded() -> None:
     """Its entry of the other axis is zero within its deviation, and known."""
     u, y = record(500, noise=1e-3)
@@ -132,7 +143,7 @@ def test_an_actuator_that_moves_one_axis_only_is_recorded() -> None:
     assert not found.is_poor
 
 
-@pytest.mark.parametrize("actuators", range(2, 7))
+@cases("actuators", range(2, 7))
 def test_never_a_single_actuator_moved_together(actuators: int) -> None:
     """At least two are named, of covariances of u that hardly can be told apart, in any units."""
     rng = np.random.default_rng(actuators)
@@ -149,6 +160,7 @@ def test_never_a_single_actuator_moved_together(actuators: int) -> None:
         assert len(together) != 1
 
 
+@pytest.mark.trial
 def test_a_lag_that_is_not_known_is_not_a_matter_of_the_actuators() -> None:
     """A machine of order 2 that is taken for order 1: the gains and the lag are not told apart, the actuators are."""
     u, _ = record(300)
@@ -163,7 +175,7 @@ def test_a_lag_that_is_not_known_is_not_a_matter_of_the_actuators() -> None:
     assert "moved together" not in str(found)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("machine", ["gantry", "arm", "craft"])
 def test_the_intervals_hold_the_truth(machine: str) -> None:
     """A draw of benchmarks/input_gain_matrix.py: a gantry, an arm under gravity, a craft."""
@@ -189,7 +201,7 @@ def test_interleaved_excitations_have_no_line_in_common() -> None:
         interleaved_excitations(3, (1.0, 1.4), 10.0, DT)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"u": np.zeros(700)}, r"u has the shape \(700,\): must have a row for each sample"),
@@ -210,6 +222,7 @@ def test_a_wrong_argument_is_named(change: dict[str, Any], message: str) -> None
         identify_b0_matrix(**arguments)
 
 
+@pytest.mark.trial
 def test_the_command_reads_a_table_of_several_axes(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -244,6 +257,7 @@ def test_the_command_reads_a_table_of_several_axes(
     assert "actuators: missing; give the column of the u of each actuator" in refused.err
 
 
+@pytest.mark.trial
 def test_a_saved_run_of_axes_is_read(tmp_path: Path) -> None:
     """With the names of its axes and all of its u."""
     from quell.commissioning import measured_axes
@@ -272,3 +286,13 @@ def test_designs_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     np.testing.assert_allclose(table[:, 1:], np.column_stack([d.u for d in designs]), atol=1e-8)
     with pytest.raises(ValueError, match=r"u\.csv"):
         save_excitations(designs, tmp_path / "u.csv")
+
+
+def test_rows_and_columns_of_a_balanced_matrix_have_the_largest_size_1() -> None:
+    """In whatever units axes and actuators are; the signs stay."""
+    values = np.array([[1.0, -0.5], [0.25, 1.0], [0.1, -1.0]])
+    scaled = values * np.array([[1e3], [2e-4], [7.0]]) * np.array([[5.0, 1e-6]])
+    found = _balanced(np.abs(scaled), scaled)
+    assert np.max(np.abs(found), axis=0) == pytest.approx(1.0)
+    assert np.max(np.abs(found), axis=1) == pytest.approx(1.0)
+    np.testing.assert_array_equal(np.sign(found), np.sign(values))

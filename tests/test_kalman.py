@@ -11,6 +11,8 @@ import quell as ql
 from quell.learners.base import adapt, commit, predict, restart
 from quell.observers.eso import ESO
 
+from .cases import cases
+
 pytestmark = pytest.mark.compiled
 
 
@@ -63,6 +65,7 @@ def test_the_bias_follows_with_its_bandwidth_whatever_the_sample_time(dt: float)
     assert memory.theta[0] == pytest.approx(1.0 - math.exp(-1.0), rel=0.02)
 
 
+@pytest.mark.trial
 def test_the_kalman_learner_finds_the_plant(two_mass_scenario: ql.Scenario) -> None:
     """After 20 s of sin t it knows f = −2 y'' of the benchmark, from noisy y alone, and the prior does not matter."""
     for prior in (3.0, 100.0):
@@ -83,6 +86,7 @@ def test_the_kalman_learner_finds_the_plant(two_mass_scenario: ql.Scenario) -> N
         np.testing.assert_allclose(learned, [0.0, 0.0, -2.0, 0.0, 0.0], atol=0.4)
 
 
+@pytest.mark.trial
 def test_the_kalman_learner_finds_a_wrong_gain() -> None:
     """With u among its features and enough excitation, b0 + θ_u is the plant's gain, though b0 was half of it."""
     s = ql.signals
@@ -119,8 +123,8 @@ def test_the_effective_gain_stays_in_its_interval(rng: np.random.Generator) -> N
             commit(design, memory, seen, u, 0.0)
 
 
-@pytest.mark.parametrize("b0", [2.0, -2.0])
-@pytest.mark.parametrize(("sign", "edge"), [(1.0, 1.5), (-1.0, 0.4)])
+@cases("b0", [2.0, -2.0])
+@cases(("sign", "edge"), [(1.0, 1.5), (-1.0, 0.4)])
 def test_data_that_ask_for_more_leave_the_effective_gain_at_its_edge(
     b0: float, sign: float, edge: float
 ) -> None:
@@ -137,6 +141,7 @@ def test_data_that_ask_for_more_leave_the_effective_gain_at_its_edge(
     assert (b0 + slope) / b0 == pytest.approx(edge, rel=1e-12)
 
 
+@pytest.mark.trial
 def test_rounding_is_not_data() -> None:
     """At rest and without noise the learner stays where it is: nothing winds up."""
     controller = ql.ADRC(
@@ -150,6 +155,7 @@ def test_rounding_is_not_data() -> None:
     assert np.max(np.abs(run["y"] - 1.0)) < 1e-9
 
 
+@pytest.mark.trial
 def test_what_was_learned_is_kept_through_hours_of_rest() -> None:
     """At rest the features are noise and teach nothing: after three hours the next step is what it was."""
     s = ql.signals
@@ -167,6 +173,7 @@ def test_what_was_learned_is_kept_through_hours_of_rest() -> None:
     assert run.metrics(10_000.0, target=2.0)["overshoot"] < 1e-3
 
 
+@pytest.mark.trial
 def test_at_rest_a_learner_is_as_quiet_as_no_learner() -> None:
     """Its gain does not follow the noise, which would fold the noise's high frequencies down to where the loop is sensitive."""
     plant = chain(4, -0.5)
@@ -182,6 +189,7 @@ def test_at_rest_a_learner_is_as_quiet_as_no_learner() -> None:
     assert np.std(learned["y"][late]) < 3.0 * np.std(plain["y"][late])
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(("order", "u"), [(2, True), (4, False), (6, False)])
 def test_where_nothing_is_left_to_learn_nothing_is_learned(order: int, u: bool) -> None:
     """A chain of integrators without noise: what is left is rounding, P stays positive, the loop goes on.
@@ -245,6 +253,7 @@ def test_a_load_that_comes_before_anything_was_learned_is_taken_by_the_bias() ->
     assert learned["iae"] < plain["iae"]
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("scale", [0.01, 0.1])
 def test_a_first_motion_out_of_friction_does_not_settle_what_is_learned(scale: float) -> None:
     """Near standstill Coulomb friction looks like strong damping; later, larger motions outweigh what was learned there."""
@@ -324,7 +333,7 @@ def test_a_sample_whose_square_overflows_leaves_a_learner_as_before_the_first() 
             np.testing.assert_array_equal(array, fresh)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: ql.learners.Kalman(state=False, bias=False), "keep at least one feature"),

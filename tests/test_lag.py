@@ -13,6 +13,7 @@ from quell.observers.design import FORMS
 from quell.observers.eso import ESO
 from quell.observers.forms import begin, observe
 
+from .cases import cases
 from .contracts.examples import EXTENDED
 
 LINEAR = {
@@ -85,7 +86,7 @@ def test_the_lag_filter_of_an_observer_with_more_extended_states_is_its_shadow(
     np.testing.assert_allclose(shown, missed, atol=1e-8 * np.max(np.abs(missed)))
 
 
-@pytest.mark.parametrize("order", range(1, 9))
+@cases("order", range(1, 9))
 def test_a_constant_passes_the_lag_filter_unchanged(order: int) -> None:
     """Its gain at rest is one: the observer finds a constant disturbance."""
     lag = lag_of(ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=1e-3))
@@ -112,7 +113,7 @@ def test_what_a_plain_eso_would_have_estimated_is_known_exactly(
         assert seen[-1] + shown == pytest.approx(plainly[-1], rel=1e-9, abs=1e-6)
 
 
-@pytest.mark.parametrize(
+@cases(
     "observer",
     [
         *(ql.ESO.model_free(order=3, b0=1.0, omega_o=20.0, dt=2e-3, form=form) for form in FORMS),

@@ -25,6 +25,8 @@ from quell.guard import nearest_permitted
 from quell.learners.base import commit, restart
 from quell.types import Status
 
+from .cases import cases
+
 DT = 0.01
 OBSERVER = ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT)
 LEARNING = ql.ADRC(OBSERVER, 3.0, learner=ql.learners.Kalman(), guard=ql.Guard())
@@ -251,7 +253,7 @@ LIMITS = Limits(-1.0, 2.0, 0.5, -0.25)
 BOTH = int(Status.SATURATED | Status.RATE_LIMITED)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wish", "before", "expected"),
     [
         (0.25, 0.0, (0.25, 0)),

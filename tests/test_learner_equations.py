@@ -311,6 +311,7 @@ def test_rounding_of_a_large_measurement_counts_as_its_noise() -> None:
     assert memory.noise[0] == pytest.approx(gate.forget * 5e-5**2, rel=1e-12)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("bias_bandwidth", [None, 0.0, 1e9])
 def test_a_learner_around_a_model_follows_its_equations(
     bias_bandwidth: float | None, rng: np.random.Generator

@@ -12,11 +12,13 @@ import quell as ql
 from quell.controllers.base import Limits, apply_limits, checked_limits
 from quell.types import Status
 
+from .cases import cases
+
 OK, SATURATED, RATE_LIMITED = 0, int(Status.SATURATED), int(Status.RATE_LIMITED)
 OBSERVER = ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wished", "before", "u", "status"),
     [
         (0.3, 0.0, 0.3, OK),
@@ -56,6 +58,7 @@ def test_a_rate_may_differ_by_direction() -> None:
             checked_limits(-1.0, 1.0, wrong, 0.1)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_limits_change_while_the_loop_runs_and_nothing_is_compiled_again() -> None:
     """From then on every u is that of a controller made with the new limits and the same state; a copy and a retuned one keep them."""

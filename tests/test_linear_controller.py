@@ -13,6 +13,7 @@ from quell.controllers import LinearController, LinearLaw, Prefiltered
 from quell.controllers.baselines import PID
 from quell.controllers.linear import anti_windup, as_state_space, realised, tustin
 
+from .cases import cases
 from .contracts.python_models import LeastMeanSquares
 
 LAG = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -1.5]], [0.0, 2.0], [1.0, 0.0])
@@ -127,7 +128,7 @@ def test_an_integrator_does_not_wind_up() -> None:
     assert run["u_wished"][100] > 1.0
 
 
-@pytest.mark.parametrize(
+@cases(
     "controller",
     [
         LinearController.from_transfer_function([2.0, 1.0], [0.1, 1.0, 0.0], dt=0.01),
@@ -254,7 +255,7 @@ LAW = LinearLaw(np.eye(2), np.zeros(2), np.zeros(2), np.zeros(2), np.ones(2), 0.
 make = LinearController.from_transfer_function
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         (

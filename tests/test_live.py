@@ -27,6 +27,8 @@ from quell.realtime.recordings import (
 from quell.realtime.telemetry import TelemetryWriter, push
 from quell.types import Matrix
 
+from .cases import cases
+
 HEADER = Header(row_channels((("status", 1),)), dt=1e-3, device="a lift", started=10**18)
 SUBSCRIBE = json.dumps({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": 1}]})
 REQUEST = (
@@ -224,7 +226,7 @@ def test_a_slow_viewer_loses_the_oldest_rows() -> None:
     assert viewer._rows[-1] == b"\x01\x07\x00\x00\x00999"
 
 
-@pytest.mark.parametrize(
+@cases(
     "message",
     [
         "",

@@ -21,6 +21,7 @@ from quell.realtime.supervisor import Cause
 from quell.realtime.system import now, pass_time, virtual_clock
 from quell.realtime.telemetry import drain, ring
 
+from .cases import cases
 from .scripted import DT, PLANT, ScriptedDevice, adrc, run
 
 SAMPLE = round(1e9 * DT)
@@ -117,6 +118,7 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
     return drain(rows), loop
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("drift", [-50e-6, 50e-6, 1e-3])
 def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     """For slower and faster clocks each cycle gets the next tick, and none is old."""
@@ -271,6 +273,7 @@ class ThroughPython:
         """Do nothing."""
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_controller_is_stepped_compiled_though_the_device_is_python() -> None:
     """Plain Python and a compiled step agree; errors of the driver count as missed samples."""
@@ -288,6 +291,7 @@ def test_a_controller_is_stepped_compiled_though_the_device_is_python() -> None:
     assert int(half["EVENTS"][90]) & Event.UNSENT
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_plain_python_does_what_compiled_code_does() -> None:
     """Missed samples, a stall, an unsent command and a trip: same modes, same numbers."""
@@ -308,6 +312,7 @@ def test_plain_python_does_what_compiled_code_does() -> None:
     np.testing.assert_allclose(plain.rows, compiled.rows, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> None:
     """No cycle runs, a second loop compiles nothing, the controller's own state is unchanged."""
@@ -342,7 +347,7 @@ def test_loops_of_any_duration_are_the_same_code() -> None:
         assert len(layouts) == 1
 
 
-@pytest.mark.parametrize(
+@cases(
     ("scenario", "duration", "message"),
     [
         (1.0, None, "duration = None: give the duration"),

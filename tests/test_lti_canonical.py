@@ -19,6 +19,8 @@ from quell.observers.design import place_poles, scaled_response
 from quell.observers.eso import ESO, noise_gains
 from quell.observers.forms import begin, observe
 
+from .cases import cases
+
 
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
     """Return the transfer function ``num/den`` as a plant in badly scaled, rotated coordinates."""
@@ -33,7 +35,7 @@ def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
 NUM, DEN = 3.0 * np.poly([-0.8, -2.0]), np.poly([0.3, -0.4 + 1.0j, -0.4 - 1.0j, -3.0])
 
 
-@pytest.mark.parametrize(
+@cases(
     "plant",
     [
         hidden(NUM, DEN),
@@ -186,6 +188,7 @@ def test_a_record_is_mapped_like_a_sample() -> None:
             observer.states_of(wrong)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("num", "den"),
     [
@@ -233,6 +236,7 @@ def test_noise_in_f_is_as_much_as_its_gain_says(rng: np.random.Generator) -> Non
     np.testing.assert_allclose(np.var(told[400:], axis=0), noise_gains(observer), rtol=0.1)
 
 
+@pytest.mark.trial
 def test_a_learner_learns_on_a_plant_with_zeros() -> None:
     """f̂ is what lag compensation computes, with and without zeros: a wrong coefficient is found."""
     observer = ESO.model_based(([1.0, 4.0], [1.0, 0.5, 2.0, 1.0]), omega_o=20.0, dt=5e-3)
@@ -248,7 +252,7 @@ TWO_MASS = ql.plants.two_mass_spring()
 BESIDE = ql.plants.two_mass_spring(c1=1.0, c2=0.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("plant", "E", "message"),
     [
         (
@@ -333,9 +337,7 @@ def test_the_condition_says_how_near_a_plant_is_to_unobservable() -> None:
     assert far < 10.0 < 1e5 < near
 
 
-@pytest.mark.parametrize(
-    "zeros", [[-0.1], [-0.5 + 1.0j, -0.5 - 1.0j], [-0.3, -4.0], [-300.0, -1.0]]
-)
+@cases("zeros", [[-0.1], [-0.5 + 1.0j, -0.5 - 1.0j], [-0.3, -4.0], [-300.0, -1.0]])
 def test_with_its_poles_at_the_zeros_the_observer_shows_f_as_if_there_were_none(
     zeros: list[complex],
 ) -> None:
@@ -379,6 +381,7 @@ def test_a_zero_at_rest_hides_f_only_where_f_enters_through_it() -> None:
     np.testing.assert_allclose(seen, [1.5, 0.0, 3.0], atol=1e-6)
 
 
+@pytest.mark.trial
 def test_poles_at_slow_zeros_spare_noise_and_learn_where_the_other_observer_cannot() -> None:
     """A zero at −0.1 rad/s, omega_o = 20: f̂ has a hundredth of the noise, and a learner helps."""
     plant = hidden(3.0 * np.poly([-0.1]), np.poly([-1.0, -0.3, 0.5]))

@@ -14,6 +14,8 @@ from quell.analysis import analyse
 from quell.lti.models import leading_gain
 from quell.plants import LinearPlant, two_mass_spring
 
+from .cases import cases
+
 NUM, DEN = [2.0, 3.0], [1.0, 1.5, 4.0, 0.5]
 LAW = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=1e-2), omega_c=2.0)
 STEP = ql.Scenario(reference=1.0, disturbances=(ql.signals.Step(at=1.0),), duration=2.0)
@@ -153,7 +155,7 @@ def test_the_leading_gain_is_the_first_markov_parameter() -> None:
 A2, B2, C2 = [[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0]
 
 
-@pytest.mark.parametrize(
+@cases(
     ("model", "message"),
     [
         (

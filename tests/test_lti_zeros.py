@@ -10,6 +10,8 @@ import pytest
 from quell.lti.zeros import invariant_zeros, observer_exists, unobservable_modes
 from quell.types import Matrix
 
+from .cases import cases
+
 
 class Built(NamedTuple):
     """A system that was built around its zeros."""
@@ -137,7 +139,7 @@ def test_a_repeated_zero_at_rest_is_found_as_exactly_zero() -> None:
     assert found.values.tolist() == [0.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@cases("seed", range(20))
 def test_zeros_of_a_system_with_more_inputs_than_outputs_are_those_of_its_transpose(
     seed: int,
 ) -> None:
@@ -175,7 +177,7 @@ def test_disturbances_that_one_combination_hides_are_refused_with_their_rank() -
     assert "for 3 disturbances and 2 outputs; keep 2 columns of E" in str(few)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@cases("seed", range(40))
 def test_each_unobservable_mode_is_named(seed: int) -> None:
     """Modes that no output shows, in random coordinates and units, and none where all are shown."""
     rng = np.random.default_rng([54, seed])

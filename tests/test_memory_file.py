@@ -50,7 +50,7 @@ def theta(file: Path) -> dict[str, float]:
     return dict(controller.estimate.theta)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_second_run_begins_with_what_the_first_has_learned(tmp_path: Path) -> None:
     """Its file is what the first run ended with; the notes say so, and the controller is as before."""
@@ -70,6 +70,7 @@ def test_a_second_run_begins_with_what_the_first_has_learned(tmp_path: Path) -> 
     assert [each.name for each in tmp_path.iterdir()] == ["servo.qllm"]
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="there is no SIGUSR1 here")
 def test_it_is_saved_on_command_while_the_loop_runs(tmp_path: Path) -> None:
@@ -90,6 +91,7 @@ def test_it_is_saved_on_command_while_the_loop_runs(tmp_path: Path) -> None:
     assert sizes[0] == 0
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_after_a_fault_the_file_is_as_before(tmp_path: Path) -> None:
     """What was learned may have contributed to it; a note says NOT."""
@@ -125,7 +127,7 @@ def test_a_file_that_can_not_be_written_is_refused_at_the_start(tmp_path: Path) 
         run(3)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_command_keeps_what_was_learned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

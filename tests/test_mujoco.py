@@ -119,6 +119,7 @@ def check_estimate(found: Run, controller: ql.ADRC) -> None:
     assert np.max(np.abs(found.f_hat - f)) > closer
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("learner", [None, ql.learners.Kalman()])
 def test_two_masses_of_mujoco_move_as_those_of_quell(learner: Any) -> None:
     """With ``step`` in the loop y and u agree with ``simulate``, with a guarded learner, too: 0.1 m under a force to 1e-9 m."""
@@ -155,6 +156,7 @@ def test_f_of_two_masses_is_that_of_mujoco() -> None:
     check_estimate(found, controller)
 
 
+@pytest.mark.trial
 def test_f_of_a_flexible_joint_is_that_of_mujoco() -> None:
     """A link that swings in gravity, driven through a spring: f contains sin(q), the motor's friction and the spring."""
     dt, gravity = 1e-3, 9.81
@@ -176,6 +178,7 @@ def test_f_of_a_flexible_joint_is_that_of_mujoco() -> None:
     check_estimate(found, controller)
 
 
+@pytest.mark.trial
 def test_f_of_a_cart_pole_is_that_of_mujoco() -> None:
     """The pole upright, unstable without control: f contains gravity, the cart's friction, and the change of the input gain."""
     dt = 1e-3

@@ -47,6 +47,7 @@ def in_control(loop: MultivariableLoop) -> tuple[Any, Any]:
     return plant, control.ss(law.A, law.B_y, -law.C, -law.D_y, loop.dt)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("seed", range(8))
 def test_sensitivities_are_those_of_python_control_and_of_a_dense_grid(seed: int) -> None:
     """S and T at both places to 1e-8; the largest singular value of S to 1e-6 of a dense grid."""
@@ -116,6 +117,7 @@ def satellite() -> MultivariableLoop:
     )
 
 
+@pytest.mark.trial
 def test_the_spinning_satellite_has_margins_in_each_channel_and_none_in_both() -> None:
     """Closed forms: each channel 1/s; M_s = √(1 + a²), α = 4/(2a + √(4a² + 4)) for both."""
     loop = satellite()
@@ -131,6 +133,7 @@ def test_the_spinning_satellite_has_margins_in_each_channel_and_none_in_both() -
     assert "all inputs at once: disk margin 0.100, gains 0.905 … 1.1 or phases ±5.7°" in str(loop)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("seed", range(3))
 def test_disk_margins_hold_and_their_factors_put_a_pole_on_the_unit_circle(seed: int) -> None:
     """With the factors that are given the loop has a pole at ω; inside of α it is stable."""
@@ -169,6 +172,7 @@ def test_disk_margins_hold_and_their_factors_put_a_pole_on_the_unit_circle(seed:
             assert np.max(np.abs(poles(turn))) < 1.0
 
 
+@pytest.mark.trial
 def test_structured_margins_do_not_depend_on_units_and_singular_values_on_the_sizes_given() -> None:
     """Newtons and millinewton metres, metres and microradians: what is given, is taken out."""
     loop = lqg(np.random.default_rng(5), 2, 2)
@@ -194,6 +198,7 @@ def test_structured_margins_do_not_depend_on_units_and_singular_values_on_the_si
         assert raw.disk_margin(at).alpha == pytest.approx(loop.disk_margin(at).alpha, rel=1e-6)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("c", [1, 2, 3, 4, 6])
 def test_the_bound_on_mu_is_attained_for_up_to_three_channels(c: int) -> None:
     """Both bounds agree in any units; for more channels the upper one is above the lower one."""
@@ -370,6 +375,7 @@ def test_the_margins_of_axes_with_the_true_b0_are_those_of_one_axis() -> None:
     assert loop.channel_margins("u2").delay == pytest.approx(single.delay, rel=1e-6)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_an_arm_is_linearised_at_its_pose_and_b0_taken_there() -> None:
     """With M(q) the loop is that of one axis in every pose; with that of one pose it is not."""
@@ -431,6 +437,7 @@ def test_the_bias_of_a_learner_of_all_axes_is_in_the_margins(each: bool) -> None
     assert not loop.remark
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("each", [False, True])
 def test_a_learner_of_all_axes_at_rest_is_the_loop_that_a_run_shows(each: bool) -> None:
     """One that may learn no θ: the closed loop is that of ``ql.simulate``, the bias included."""
@@ -447,6 +454,7 @@ def test_a_learner_of_all_axes_at_rest_is_the_loop_that_a_run_shows(each: bool) 
     np.testing.assert_allclose(run["y"][:1200], y, atol=1e-6)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("each", [False, True])
 def test_what_was_learned_of_other_axes_is_named_as_not_in_the_margins(each: bool) -> None:
     """A learner that has learned nothing is all in them; after motion the summary says what lacks."""

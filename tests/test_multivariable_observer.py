@@ -17,6 +17,7 @@ from quell.observers.multivariable import MultivariableESO
 from quell.observers.multivariable_forms import begin_signals, observe_signals
 from quell.types import Matrix, Vector
 
+from .cases import cases
 from .in_c import InC, needs_gcc
 
 # A motor and a load behind a coupling, 2e-4 kg m² in all, with encoders of 2²⁰ counts.
@@ -133,7 +134,8 @@ def draw(random: np.random.Generator) -> tuple[Any, ...]:
 
 @pytest.mark.compiled
 @pytest.mark.parametrize("time_varying", [False, True])
-@pytest.mark.parametrize("plants", [30, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.trial
+@pytest.mark.parametrize("plants", [200])
 def test_it_is_the_kalman_filter_of_the_extended_model(plants: int, time_varying: bool) -> None:
     """200 random plants with m, p, q to 3, 500 samples each: to 1e-9 of a state's largest value.
 
@@ -248,6 +250,7 @@ def test_all_poles_of_a_servo_with_two_encoders_lie_in_one_place(omega_o: float)
     np.testing.assert_allclose(error_polynomial(observer, 3), wanted, atol=1e-4)
 
 
+@pytest.mark.trial
 def test_all_poles_of_random_plants_lie_in_one_place() -> None:
     """So they do in 100 random plants, and with the sensors that are left if these observe all."""
     random = np.random.default_rng(3)
@@ -266,6 +269,7 @@ def test_all_poles_of_random_plants_lie_in_one_place() -> None:
             assert np.max(error) < 1e-5 * np.max(wanted)
 
 
+@pytest.mark.trial
 def test_units_do_not_matter() -> None:
     """States, outputs, disturbances and time in units of 1e-6 to 1e6: the same observers."""
     random = np.random.default_rng(11)
@@ -400,6 +404,7 @@ def test_what_is_not_measured_has_no_effect() -> None:
         assert np.all(np.array(results) == results[0])
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_covariance_survives_years_without_measurements() -> None:
     """A million samples without any, then a hundred with: it is positive, and as it was before."""
@@ -524,6 +529,7 @@ def test_in_c_it_calculates_the_same_bits(kind: str, tmp_path: Path) -> None:
         assert in_c.run("run", a, b) == take(observer.model, state, a, b)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_compiled_and_interpreted_agree() -> None:
     """To rounding errors, for all kinds of gains."""
@@ -573,7 +579,7 @@ def test_a_mode_that_no_disturbance_moves_has_no_steady_gain() -> None:
         ESO.state_space(A, E, C, E, 0.01, noise_variance=[1e-6, 1e-6], drift=[1.0])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"noise_variance": None, "drift": None}, "give omega_o for gains by poles"),
@@ -611,7 +617,7 @@ def test_options_without_effect_are_refused() -> None:
         _ = servo(omega_o=800.0).standard_deviations
 
 
-@pytest.mark.parametrize(
+@cases(
     ("call", "message"),
     [
         (lambda r: r.step([0.0], [0.0]), "y has 1 entries: must have 2"),

@@ -15,6 +15,8 @@ from quell.plants.base import advance, measure
 from quell.plants.multivariable import measure_all
 from quell.plants.nonlinear import derivatives
 
+from .cases import cases
+
 
 def moved(plant, x, u, w, dt: float, samples: int = 1):  # type: ignore[no-untyped-def]
     """Return state and outputs after some samples under constant signals."""
@@ -27,7 +29,7 @@ def moved(plant, x, u, w, dt: float, samples: int = 1):  # type: ignore[no-untyp
     return x, y
 
 
-@pytest.mark.parametrize("seed", range(5))
+@cases("seed", range(5))
 def test_linear_plant_is_the_matrix_exponential(seed: int) -> None:
     """x(dt) follows from exp of the plant with its held inputs."""
     rng = np.random.default_rng(seed)
@@ -101,6 +103,7 @@ class TestArm:
         M = [[a1 + 2 * a2 * c, a3 + a2 * c], [a3 + a2 * c, a3]]
         np.testing.assert_allclose(arm.mass_matrix([0.4, elbow]), M, rtol=1e-12)
 
+    @pytest.mark.trial
     def test_energy_stays_without_friction(self) -> None:
         """A swinging arm of three links with an elastic joint keeps its energy."""
         k = 300.0
@@ -125,6 +128,7 @@ class TestArm:
         assert np.linalg.norm(x - x0) > 1.0
         assert energy(x) == pytest.approx(energy(x0), abs=1e-6)
 
+    @pytest.mark.trial
     def test_moves_as_in_mujoco(self) -> None:
         """A second under gravity, with friction and motors, as another program solves it."""
         mujoco = pytest.importorskip("mujoco")
@@ -227,7 +231,7 @@ class TestChannels:
         np.testing.assert_allclose(run["y"][-1], [1.0, 0.5], atol=1.5e-3)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         (lambda: ql.plants.MultivariableLinearPlant(np.eye(2), np.eye(3), np.eye(2)),
@@ -271,6 +275,7 @@ def joint() -> ql.ADRC:
     return ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3), omega_c=8.0)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_hundred_drawn_arms_compile_once(compiled_functions: list[Any]) -> None:
     """Their equation and their M(q) are the same code with other numbers; each computes its own values."""
@@ -301,6 +306,7 @@ def combined(x, H, gain):  # type: ignore[no-untyped-def]
     return H[0, 0] * x[0] + H[0, 1] * x[1], gain * x[1]
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_parameters_are_numbers_vectors_and_matrices() -> None:
     """Compiled code reads them in their order, and other numbers compile nothing; a default is data, too."""
@@ -331,7 +337,7 @@ def test_parameters_are_numbers_vectors_and_matrices() -> None:
             assert np.all(np.array(values[0][:3]) != 0.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         (lambda p: ql.plants.MultivariableNonlinearPlant(rates, 2, 1, np.eye(2), parameters=p),

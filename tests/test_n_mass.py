@@ -11,6 +11,8 @@ from scipy.integrate import solve_ivp
 import quell as ql
 from quell.plants.base import advance, measure
 
+from .cases import cases
+
 J, K, D, GROUND = [3e-4, 2e-4, 9e-4], [300.0, 180.0], [0.02, 0.01], [1e-3, 0.0, 2e-3]
 
 
@@ -125,7 +127,7 @@ def test_one_inertia_is_a_rigid_axis() -> None:
     assert plant.B.ravel().tolist() == [0.0, 100.0]
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"inertias": []}, r"inertias = \[\]: must have at least one"),

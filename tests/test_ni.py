@@ -134,6 +134,7 @@ def test_the_output_is_zero_before_and_after(rack):
     ]
 
 
+@pytest.mark.trial
 def test_the_output_is_zero_when_python_ends():
     """Also where nobody closed the device: here the program ends by an exception."""
     program = (
@@ -321,6 +322,7 @@ def test_addresses_that_are_none_are_refused(rack, address, says):
         ni_device(address, 1e-3)
 
 
+@pytest.mark.trial
 def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
     """The testbed without encoder and converter behind the cards is the one with them."""
     dt = 1e-3

@@ -11,6 +11,8 @@ from quell.controllers import NonlinearFeedback
 from quell.controllers.base import control
 from quell.setup import made
 
+from .cases import cases
+
 OBSERVER = ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01)
 OMEGA_C = 4.0
 
@@ -96,7 +98,7 @@ def test_a_setup_file_can_have_it() -> None:
         made("han.toml", tables)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("feedback", "message"),
     [
         (lambda: NonlinearFeedback((0.0, 1.0), 0.1), "alpha = .*must be positive"),

@@ -24,6 +24,7 @@ from quell.observers.forms import (
     state_for,
 )
 
+from .cases import cases
 from .python_step import interpreted
 
 DT = 5e-3
@@ -108,8 +109,8 @@ def test_half_gain_is_half_of_the_bandwidth_design_and_less_noise() -> None:
     assert noise[4] > 1.0
 
 
-@pytest.mark.parametrize("order", [1, 2, 5, 8])
-@pytest.mark.parametrize("dt", [1e-3, 1e-2])
+@cases("order", [1, 2, 5, 8])
+@cases("dt", [1e-3, 1e-2])
 def test_kalman_gains_for_a_drifting_f_put_the_poles_in_a_butterworth_pattern(
     order: int, dt: float
 ) -> None:
@@ -232,6 +233,7 @@ def rejection_and_noise(observer: ESO) -> tuple[float, float]:
     )
 
 
+@pytest.mark.trial
 def test_a_cascade_rejects_the_same_load_with_half_the_noise_in_u() -> None:
     """The claim of Łakomy & Madonski: ratio 3 against the plain ESO of the same bandwidth."""
     cascade = ESO.cascade(2, 1.5, 30.0, 2e-3, ratio=3.0)
@@ -241,6 +243,7 @@ def test_a_cascade_rejects_the_same_load_with_half_the_noise_in_u() -> None:
     assert cascade_noise < 0.6 * noise
 
 
+@pytest.mark.trial
 def test_half_gain_in_observer_rejects_the_same_load_with_less_noise_in_u() -> None:
     """The claim of Herbst et al., measured: the load's effect within 2 %, noise three quarters."""
     half = ESO.model_free(2, 1.5, 30.0, 2e-3, half_gain=True)
@@ -344,6 +347,7 @@ def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(
         observe(late_one.model, z, seen, y[k], u[k - 1], 0.0)
 
 
+@pytest.mark.trial
 @pytest.mark.filterwarnings(
     "ignore::quell.DesignWarning"
 )  # a delay of that size is unwise, and said to be
@@ -417,7 +421,7 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("name", FORMS)
+@cases("name", FORMS)
 def test_noise_gains_are_what_noise_does(name: str, rng: np.random.Generator) -> None:
     """White noise in y of a hundred observers, for a thousand samples from their steady state on, to 10 % in variance."""
     observer = FORMS[name]
@@ -430,7 +434,7 @@ def test_noise_gains_are_what_noise_does(name: str, rng: np.random.Generator) ->
     np.testing.assert_allclose(variance, noise_gains(observer), rtol=0.1)
 
 
-@pytest.mark.parametrize("name", FORMS)
+@cases("name", FORMS)
 def test_an_observer_begins_at_y_whatever_its_state_was(name: str) -> None:
     """At rest: x̂_1 = y and all else zero, for any later sample as well while y and u = 0 stay."""
     observer = FORMS[name]
@@ -442,7 +446,7 @@ def test_an_observer_begins_at_y_whatever_its_state_was(name: str) -> None:
         np.testing.assert_allclose(seen, [2.0, 0.0, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", FORMS)
+@cases("name", FORMS)
 def test_states_for_given_estimates_show_them(name: str) -> None:
     """After a sample with the expected y they are the estimates that the model moves."""
     observer = FORMS[name]
@@ -475,7 +479,7 @@ def test_an_observer_says_what_it_is() -> None:
         assert based.pole == pytest.approx(math.exp(-0.1))
 
 
-@pytest.mark.parametrize("name", FORMS)
+@cases("name", FORMS)
 def test_the_response_of_an_observer_is_its_update_as_matrices(
     name: str, rng: np.random.Generator
 ) -> None:
@@ -498,7 +502,7 @@ SUMMED = {name: observer for name, observer in FORMS.items() if not observer.has
 }
 
 
-@pytest.mark.parametrize("name", SUMMED)
+@cases("name", SUMMED)
 def test_noise_gains_are_those_of_the_lyapunov_equation(name: str) -> None:
     """``P = M P Mᵀ + g gᵀ`` and ``diag (C P Cᵀ + d dᵀ)``, where no formula is known."""
     observer = SUMMED[name]
@@ -524,6 +528,7 @@ def test_learners_that_must_tell_noise_from_motion_refuse_the_reduced_form(learn
     ql.ADRC(FORMS["reduced"], omega_c=2.0, learner=ql.learners.BatchGradient(), guard=ql.Guard())
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("name", ["half gain", "half gain, predictor", "Kalman", "cascade"])
 def test_a_guarded_learner_serves_other_forms(name: str) -> None:
     """The loop ends where it should, and the learner has found the spring."""
@@ -546,8 +551,9 @@ def test_time_scales_are_those_of_the_poles() -> None:
     assert FORMS["cascade"].lag_time == pytest.approx(3 / 20.0 + 3 / 10.0, rel=0.02)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", ["half gain", "cascade", "Kalman", "delay", "nonlinear"])
+@cases("name", ["half gain", "cascade", "Kalman", "delay", "nonlinear"])
 def test_a_hand_over_is_bumpless_in_every_form(name: str) -> None:
     """From somebody else's u at rest, with a load: u goes on from there, and y stays."""
     observer = ESO.nonlinear(2, 1.5, 20.0, DT, delta=0.05) if name == "nonlinear" else FORMS[name]
@@ -575,7 +581,7 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
         ql.ADRC(ESO.nonlinear(2, 1.5, 20.0, DT, delta=0.1), omega_c=2.0, **extra)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (

@@ -16,6 +16,8 @@ from quell.observers import continuous_gain
 from quell.observers.eso import ESO
 from quell.observers.forms import begin, observe
 
+from .cases import cases
+
 
 def error_polynomial(observer: ESO) -> np.ndarray:
     """Return the characteristic polynomial of (I − L C) Φ about z = 1, in scaled coordinates.
@@ -197,7 +199,7 @@ def test_the_canonical_form_does_not_depend_on_the_coordinates(a: list[float], s
 UNOBSERVABLE = ql.plants.LinearPlant(np.diag([-1.0, -2.0]), [1.0, 1.0], [1.0, 0.0])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"order": 0}, "order = 0: must be a whole number from 1 to 8"),
@@ -217,7 +219,7 @@ def test_a_mistake_in_a_model_free_design_is_named(change: dict[str, object], me
         ESO.model_free(**({"order": 4, "b0": 1.0, "omega_o": 10.0, "dt": 1e-3} | change))
 
 
-@pytest.mark.parametrize(
+@cases(
     ("plant", "message"),
     [
         (

@@ -16,6 +16,8 @@ from quell.learners.online import Network, infer, learn
 from quell.learners.rls import RlsRule, least_squares_gain
 from quell.types import Matrix, Vector
 
+from .cases import cases
+
 OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=2e-3)
 
 
@@ -90,6 +92,7 @@ def learned(delay: int | None) -> np.ndarray:
     return memory.model.theta * memory.scale[-1] / np.array([memory.scale[0], memory.scale[1], 1.0])
 
 
+@pytest.mark.trial
 def test_pairs_without_lag_teach_without_bias() -> None:
     """Delayed by the observer's group delay the features give the plant; paired with the newest features they do not."""
     np.testing.assert_allclose(learned(None), [-3.0, -0.4, 0.5], atol=0.1)
@@ -122,6 +125,7 @@ def fitted(model: Any, samples: int, rng: np.random.Generator) -> tuple[Any, Any
     )
 
 
+@pytest.mark.trial
 def test_a_network_fits_a_nonlinear_function(rng: np.random.Generator) -> None:
     """From a thousand pairs; its gradient is the derivative of what it infers."""
     design, memory, left = fitted(Network(8, 0, 1, math.inf, 0.05, 1e-3), 1000, rng)
@@ -172,6 +176,7 @@ def test_a_network_says_nothing_before_it_has_learned() -> None:
     assert np.any(one.memory(design).theta != other.memory(other.design(2, 1.0)).theta)
 
 
+@pytest.mark.trial
 def test_a_process_fits_a_nonlinear_function_on_its_budget(rng: np.random.Generator) -> None:
     """Far from its points it says nothing."""
     design, memory, left = fitted(GaussianProcessModel(30, 0.5, 1, math.inf, 0.05, 1e-3), 400, rng)
@@ -370,7 +375,7 @@ def test_what_a_model_learned_is_kept_unless_it_is_no_number(rng: np.random.Gene
     assert np.shares_memory(memory.model.theta, memory.flat)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: ql.learners.Online(Plain), "model = .*: must have design"),

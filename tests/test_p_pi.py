@@ -11,6 +11,8 @@ import quell as ql
 from quell.controllers.baselines import PPI, Notch
 from quell.setup import load
 
+from .cases import cases
+
 DT = 2.5e-4
 JM, JL = 3.2e-4, 9.5e-4
 GAINS: dict[str, Any] = {"kv": 50.0, "kp": 0.1, "tn": 0.02, "tf": 1e-3, "dt": DT}
@@ -57,7 +59,7 @@ def test_feedforward_follows_a_smooth_move_of_a_rigid_axis() -> None:
     assert errors[1] < 0.01 * errors[0]
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"kv": 0.0}, "kv = 0"),
@@ -76,7 +78,7 @@ def test_arguments_out_of_range_are_refused(change: dict[str, Any], message: str
         PPI(**GAINS | change)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("sensor", [1, 2])
 def test_it_is_tuned_within_its_bounds_on_a_flexible_axis(sensor: int, tmp_path: Any) -> None:
     """The whole loop has the M_s asked for, and more k_i than PID, which has no notch.
@@ -107,6 +109,7 @@ def test_it_is_tuned_within_its_bounds_on_a_flexible_axis(sensor: int, tmp_path:
     np.testing.assert_array_equal(again.law.B_r, controller.law.B_r)
 
 
+@pytest.mark.trial
 def test_a_plant_without_resonance_gets_no_notch() -> None:
     """It is then the plain cascade, with the friction of a motor as its feedforward."""
     motor = ([50.0], [1.0, 4.0, 0.0])

@@ -15,6 +15,8 @@ import pytest
 
 import quell as ql
 
+from .cases import cases
+
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
 ADRC = ql.ADRC(OBSERVER, 1.5, u_min=-2.0, u_max=3.0)
 AXIS = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=0.01), 1.5)
@@ -115,6 +117,7 @@ def arduino_findings(folder: Path) -> Iterator[str]:
     yield from (rule for rule, holds in rules.items() if not holds)
 
 
+@pytest.mark.trial(cases="learner and guard|axes")
 @pytest.mark.parametrize("controller", CONTROLLERS.values(), ids=CONTROLLERS)
 def test_the_folder_keeps_the_rules_of_the_library_manager(tmp_path: Path, controller: Any) -> None:
     """The rules of arduino-lint that apply to a library to be submitted, with strict compliance."""
@@ -200,8 +203,9 @@ def test_the_manifests_have_one_version_and_the_needed_fields(tmp_path: Path) ->
     assert all(re.fullmatch(r"[a-z\d\-_+. ]{1,50}", word) for word in library["keywords"])
 
 
+@pytest.mark.trial
 @pytest.mark.skipif(PACKERS["pio"] is None, reason="pio, of PlatformIO, is missing")
-@pytest.mark.parametrize("controller", CONTROLLERS.values(), ids=CONTROLLERS)
+@cases("controller", CONTROLLERS.values(), ids=CONTROLLERS)
 def test_platformio_packs_the_folder(tmp_path: Path, controller: Any) -> None:
     """``pio pkg pack`` checks library.json with its schema; all files are in the package."""
     folder, package = exported(tmp_path, controller), tmp_path / "servo.tar.gz"
@@ -212,8 +216,9 @@ def test_platformio_packs_the_folder(tmp_path: Path, controller: Any) -> None:
         assert {"library.json", "src/servo.c", "src/servo.h", "LICENSE"} <= set(packed.getnames())
 
 
+@pytest.mark.trial
 @pytest.mark.skipif(PACKERS["compote"] is None, reason="compote, for ESP-IDF, is missing")
-@pytest.mark.parametrize("controller", CONTROLLERS.values(), ids=CONTROLLERS)
+@cases("controller", CONTROLLERS.values(), ids=CONTROLLERS)
 def test_the_component_manager_packs_the_folder(tmp_path: Path, controller: Any) -> None:
     """``compote component pack`` checks idf_component.yml with its schema."""
     folder = exported(tmp_path, controller)
@@ -241,6 +246,7 @@ add_subdirectory(servo)
 """
 
 
+@pytest.mark.trial
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="cmake is missing")
 def test_a_project_of_esp_idf_builds_the_folder_as_a_component(tmp_path: Path) -> None:
     """With a stand-in for idf_component_register, whose arguments are those of ESP-IDF."""

@@ -15,6 +15,8 @@ from quell.cli.app import app
 from quell.setup.description import describe
 from quell.setup.schema import PLANTS, immutable, plant_of
 
+from .cases import cases
+
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
 pytestmark = pytest.mark.skipif(
@@ -45,7 +47,7 @@ def resolved(name: str) -> Any:
     return value, first
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@cases("page", PAGES, ids=lambda page: page.stem)
 def test_every_name_of_the_package_on_a_page_exists(page: Path) -> None:
     """Each ``ql.x.y`` and ``quell.x.y`` in text and code, as it is written."""
     text = page.read_text(encoding="utf-8")
@@ -60,7 +62,7 @@ def test_every_name_of_the_package_on_a_page_exists(page: Path) -> None:
     assert not missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@cases("page", PAGES, ids=lambda page: page.stem)
 def test_every_import_of_the_package_in_a_block_exists(page: Path) -> None:
     """Also in blocks that are not run when the pages are built, which have to be Python."""
     for code in blocks(page, "python", "{code-cell}"):
@@ -78,7 +80,7 @@ def test_every_import_of_the_package_in_a_block_exists(page: Path) -> None:
                         importlib.import_module(f"{node.module}.{alias.name}")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@cases("page", PAGES, ids=lambda page: page.stem)
 def test_every_setup_on_a_page_is_accepted(page: Path) -> None:
     """Each block of TOML as it is; of several plants one after the other, of a part the rest is added."""
     for code in blocks(page, "toml"):

@@ -18,6 +18,8 @@ from quell.plants.base import advance, measure
 from quell.plants.linearise import linear_part
 from quell.plants.nonlinear import CompiledNonlinear, PythonNonlinear
 
+from .cases import cases
+
 pytestmark = pytest.mark.compiled
 
 
@@ -100,6 +102,7 @@ def test_a_nonlinear_plant_follows_its_equation_with_order_four() -> None:
         assert 11.0 < coarse / fine < 22.0
 
 
+@pytest.mark.trial
 def test_a_nonlinear_plant_with_a_linear_equation_is_the_linear_plant() -> None:
     """The limit case: the same run, to the accuracy of Runge-Kutta."""
     linear = ql.plants.two_mass_spring()
@@ -118,6 +121,7 @@ def test_a_nonlinear_plant_with_a_linear_equation_is_the_linear_plant() -> None:
     np.testing.assert_allclose(one["y"], other["y"], atol=1e-8)
 
 
+@pytest.mark.trial
 def test_functions_that_return_tuples_lists_or_arrays_are_compiled() -> None:
     """And so is an output function; compiled and interpreted steps agree."""
     for f in (
@@ -153,6 +157,8 @@ def test_a_function_numba_cannot_compile_runs_as_python_and_says_so() -> None:
     assert run["y"][-1] == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.trial
+@pytest.mark.lost
 def test_a_division_by_zero_in_compiled_code_ends_the_run() -> None:
     """It gives inf, as in numpy; the run diverged, and a warning says where; nothing is swallowed."""
     plant = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - 1.0 / (x[0] - 0.5)), order=2)
@@ -217,7 +223,7 @@ def test_methods_and_callable_objects_are_served_too() -> None:
         assert not ql.plants.NonlinearPlant(Spring().rate, order=2).compiled
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (

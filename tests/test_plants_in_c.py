@@ -22,6 +22,7 @@ DT = 0.01
 TRANSLATED = {name: plant for name, plant in PLANTS.items() if name != "fmu"}
 
 
+@pytest.mark.trial(cases="NonlinearPlant")
 @needs_gcc
 @pytest.mark.parametrize("name", TRANSLATED)
 def test_a_plant_in_c_moves_as_in_the_simulation(tmp_path: Path, name: str) -> None:
@@ -70,6 +71,7 @@ def learner_on(features: Custom) -> ql.ADRC:
     return ql.ADRC(observer, omega_c=2.0, learner=learner, u_min=-5.0, u_max=5.0)
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize(
     ("features", "more"),

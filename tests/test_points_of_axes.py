@@ -11,6 +11,8 @@ import quell as ql
 from quell.analysis import LoopsAtPoints, analyse_axes, analyse_points
 from quell.plants.linearise import held_at
 
+from .cases import cases
+
 POSES = [[0.2, q, 0.0, 0.0] for q in (0.3, 1.5, 3.0)]
 
 
@@ -26,6 +28,7 @@ def analysed(constant: bool, points: list[list[float]]) -> LoopsAtPoints:
     return analyse_points(robot, axes(robot, constant), points)
 
 
+@pytest.mark.trial
 def test_the_worst_point_is_that_of_single_analyses() -> None:
     """With a constant M the pose in which it is wrong is the worst one, by disk margin and by M_s of a channel."""
     robot = ql.plants.arm(gravity=0.0, viscous=0.1)
@@ -41,6 +44,7 @@ def test_the_worst_point_is_that_of_single_analyses() -> None:
     assert f"worst of 3 points: M_s {value:.3f} of {name}" in found.summary()
 
 
+@pytest.mark.trial
 def test_b0_as_a_function_keeps_the_margins_at_all_points() -> None:
     """M(q) decouples each pose, so that the worst is hardly worse than the best; a constant M loses half."""
     margins = [analysed(constant, POSES).disk_margin("inputs")[0] for constant in (False, True)]
@@ -48,6 +52,7 @@ def test_b0_as_a_function_keeps_the_margins_at_all_points() -> None:
     assert margins[1] < 0.5
 
 
+@pytest.mark.trial
 def test_what_was_not_looked_at_is_told() -> None:
     """One point of a B0 that is a function begins with NOT, several do not; a constant B0 has no such line."""
     robot = ql.plants.arm(gravity=0.0, viscous=0.1)
@@ -74,6 +79,7 @@ def test_an_unstable_point_is_named() -> None:
     assert json.loads(json.dumps(found.to_json()))["points"][0]["m_s"] is None
 
 
+@pytest.mark.trial
 def test_a_load_that_is_held_is_told_where_it_moves_the_margins() -> None:
     """Slow axes of an arm that gravity pulls: B0 changes under the load. Without gravity nothing is held."""
     robot = ql.plants.arm(viscous=0.1)
@@ -99,7 +105,7 @@ def test_the_input_that_holds_a_pose_is_found() -> None:
         analyse_points(robot, axes(robot), [])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("points", "message"),
     [
         (5, "points = 5: must be a list of operating points"),
@@ -128,6 +134,7 @@ def test_what_is_no_list_of_points_is_refused(points: object, message: str) -> N
         analyse_points(robot, axes(robot), points)  # type: ignore[arg-type]
 
 
+@pytest.mark.trial
 def test_points_may_be_the_rows_of_an_array() -> None:
     """As they come from a grid."""
     robot = ql.plants.arm(gravity=0.0, viscous=0.1)

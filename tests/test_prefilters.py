@@ -52,6 +52,7 @@ def test_each_derivative_is_the_slope_of_the_one_before() -> None:
         )
 
 
+@pytest.mark.trial
 def test_a_loop_that_feeds_forward_answers_as_its_reference_model() -> None:
     """Whatever omega_c is: two degrees of freedom. Without derivatives the loop's own lag is added."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])

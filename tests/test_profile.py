@@ -19,6 +19,7 @@ from quell.export.library.vectors import Action, Player
 from quell.kernels.dispatch import as_python
 from quell.signals.moves import PARTS, moved, plan
 
+from .cases import cases
 from .in_c import InC, needs_gcc
 
 DT = 2e-3
@@ -67,6 +68,7 @@ class Moving:
             assert np.max(column) <= most * dt * (1.0 + 1e-6) + 1e-12
 
 
+@pytest.mark.trial
 @settings(max_examples=60, deadline=None)
 @given(changes=targets, limits=st.tuples(positive, positive, positive))
 def test_a_target_at_any_moment_is_reached_within_the_limits(
@@ -82,6 +84,7 @@ def test_a_target_at_any_moment_is_reached_within_the_limits(
     run.check(0.01)
 
 
+@pytest.mark.trial
 @settings(max_examples=40, deadline=None)
 @given(distance=st.floats(-3.0, 3.0), later=st.integers(1, 400), further=st.floats(0.0, 2.0))
 def test_a_move_has_no_overshoot(distance: float, later: int, further: float) -> None:
@@ -155,7 +158,7 @@ def test_a_later_plan_along_the_way_is_the_rest_of_the_first_one(seed: int) -> N
         way, gone = way + more, gone + time
 
 
-@pytest.mark.parametrize("after", [1, 20, 60, 150, 250])
+@cases("after", [1, 20, 60, 150, 250])
 def test_it_stops_at_the_stopping_point_in_the_shortest_time(after: int) -> None:
     """The speed goes to zero at once and never turns; there is no nearer point to stop at."""
     run = Moving()
@@ -231,6 +234,7 @@ def controller() -> Prefiltered:
     return Prefiltered(inner, ProfileGenerator(*LIMITS))
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_exported_moves_are_the_same_bit_for_bit(tmp_path: Path, precision: str) -> None:
@@ -281,6 +285,7 @@ def test_settled_at_a_value_it_rests_there() -> None:
     assert run.step(0.3).tolist() == [0.3, 0.0, 0.0, 0.0]
 
 
+@pytest.mark.trial
 def test_the_library_says_what_r_is_and_how_to_stop(tmp_path: Path) -> None:
     """In header, description and sketch; the interrupt hands over a target, without derivatives."""
     ql.export.c(controller(), tmp_path, name="servo")

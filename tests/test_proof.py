@@ -16,6 +16,7 @@ from quell.export.library.exported import Exported
 from quell.export.proof import proof_files, prove, read_findings, structure
 from quell.features import Custom
 
+from .cases import cases
 from .commands import in_this_process
 from .contracts.test_controllers import SEVERAL
 from .in_c import needs_gcc
@@ -38,7 +39,7 @@ def exported(folder: Path, controller: Any = ADRC, **options: Any) -> Exported:
     return ql.export.c(controller, folder / "out", name="servo", accept=True, proof=True, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_frama_c
 @pytest.mark.parametrize(
     ("controller", "options"),
@@ -80,7 +81,7 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_frama_c
 @pytest.mark.parametrize(("old", "new", "function"), MUTANTS)
 def test_the_proof_fails_for_a_wrong_controller(
@@ -100,6 +101,7 @@ def test_the_proof_fails_for_a_wrong_controller(
     assert "# Proof of servo\n\nNOT proved" in report
 
 
+@pytest.mark.trial
 @needs_gcc
 def test_the_report_tells_the_stack_and_the_code_of_each_function(tmp_path: Path) -> None:
     """The stack of a step is that of ``sizes``; what calls more has more of both."""
@@ -114,6 +116,7 @@ def test_the_report_tells_the_stack_and_the_code_of_each_function(tmp_path: Path
     assert found["start"][1] > 20
 
 
+@pytest.mark.trial
 @needs_frama_c
 def test_the_script_comes_to_the_same_result(tmp_path: Path) -> None:
     """It ends with 0 if all is proved; with 1 if something is not, which it prints, or if the code does not compile."""
@@ -130,6 +133,7 @@ def test_the_script_comes_to_the_same_result(tmp_path: Path) -> None:
         assert (ran.returncode, shown in ran.stdout) == (status, True), ran.stdout
 
 
+@pytest.mark.trial
 @needs_frama_c
 def test_an_analysis_that_does_not_end_proves_nothing(tmp_path: Path) -> None:
     """After the time that it has, or with code that is no C, the report says NOT."""
@@ -140,6 +144,7 @@ def test_an_analysis_that_does_not_end_proves_nothing(tmp_path: Path) -> None:
     assert (proof.proved, proof.summary.startswith("NOT proved: frama-c ended")) == (False, True)
 
 
+@pytest.mark.trial
 def test_without_frama_c_nothing_is_proved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,6 +167,7 @@ def test_without_frama_c_nothing_is_proved(
     assert (fmu.code, "--prove: only with --to c" in fmu.err) == (2, True)
 
 
+@pytest.mark.trial
 def test_the_contract_of_several_signals_has_each_actuator() -> None:
     """Each u is a number within its own limits, for arrays of the right lengths."""
     text = proof_files(AXES, ql.export.c_source(AXES, "servo"))["proof/servo_contract.h"]
@@ -172,6 +178,7 @@ def test_the_contract_of_several_signals_has_each_actuator() -> None:
     assert text.count("ensures") == 4
 
 
+@pytest.mark.trial
 def test_the_program_of_the_proof_calls_everything(tmp_path: Path) -> None:
     """Each function of the header is in it, so the proof is for all of them."""
     move = ql.controllers.ProfileGenerator(0.5, 2.0, 5.0)
@@ -182,6 +189,7 @@ def test_the_program_of_the_proof_calls_everything(tmp_path: Path) -> None:
         assert all(f"servo_{operation}(" in text for operation in source.operations)
 
 
+@pytest.mark.trial
 def test_a_function_in_c_can_not_be_proved(tmp_path: Path) -> None:
     """Nobody knows what it does: nothing is written."""
     feature = Custom(lambda x, u: (x[0] * x[1],), ["product"], c_function="product")
@@ -293,7 +301,7 @@ def test_an_argument_that_the_call_tells_is_counted() -> None:
     assert found.passes["a_step"] == 4 + 16 + 16 * 5 + 4
 
 
-@pytest.mark.parametrize(
+@cases(
     ("old", "new", "problem"),
     [
         ("a += 1.0;", "a_step(state, a);", "recursion is possible"),

@@ -18,6 +18,8 @@ from quell.monitoring.rank import correlation_time, period_of
 from quell.records.axes import AxesTrajectory, one_gain
 from tests.commands import in_this_process
 
+from .cases import cases
+
 DT = 0.01
 
 
@@ -40,6 +42,7 @@ def log(
     return Measured(mean - slow + 0.01 * gain * error, reference - error, DT, reference)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.97])
 def test_tunings_that_are_alike_are_not_decided(memory: float) -> None:
     """In 95 of 100 draws at least, but for the chance of the draws; whatever the correlation."""
@@ -51,6 +54,7 @@ def test_tunings_that_are_alike_are_not_decided(memory: float) -> None:
     assert wrong <= 11  # of 120: at 5 % more in 1 of 100 cases (binomial)
 
 
+@pytest.mark.trial
 def test_three_tunings_that_are_alike_are_not_decided_either() -> None:
     """The level is shared by the pairs."""
     wrong = 0
@@ -60,6 +64,7 @@ def test_three_tunings_that_are_alike_are_not_decided_either() -> None:
     assert wrong <= 7
 
 
+@pytest.mark.trial
 def test_a_better_tuning_is_found_and_its_interval_holds() -> None:
     """Errors of 0.8 of the other's: found in most draws, never the wrong way round."""
     found = [rank({"A": log(seed), "B": log(seed + 500, 0.8)}) for seed in range(60)]
@@ -74,6 +79,7 @@ def test_a_better_tuning_is_found_and_its_interval_holds() -> None:
     assert sum(held) >= 0.9 * len(held)
 
 
+@pytest.mark.trial
 def test_the_time_asked_for_is_enough() -> None:
     """Logs that are longer by it decide a difference as large as the one that was seen, mostly."""
     enough = tried = 0
@@ -128,7 +134,7 @@ def test_batches_are_whole_periods_of_a_reference_that_repeats() -> None:
     assert ranking.comparisons[0].lower == pytest.approx(0.1, abs=0.03)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "reason"),
     [
         ({"r": np.full(8000, 2.0)}, "the reference is 2 and 0"),
@@ -158,6 +164,7 @@ def test_a_load_behind_moves_that_repeat_is_seen() -> None:
     assert rank(same).comparisons[0].reasons == ()
 
 
+@pytest.mark.trial
 def test_the_same_load_under_another_tuning_is_comparable() -> None:
     """False alarms of the tests of reference and load: one in 100 at most."""
     alarms = 0
@@ -207,7 +214,7 @@ def test_the_overshoot_is_that_of_the_steps() -> None:
     assert math.isnan(found.scores["B"].overshoot)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("logs", "message"),
     [
         ({"A": log(1)}, "give logs of two or more"),
@@ -237,6 +244,7 @@ def written(path: Path, measured: Measured) -> str:
     return str(path)
 
 
+@pytest.mark.trial
 def test_the_command_names_the_best_and_takes_parts_of_logs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -273,6 +281,7 @@ def axes_log(
     return str(path)
 
 
+@pytest.mark.trial
 def test_tunings_of_several_axes_are_judged_for_each(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -307,6 +316,7 @@ def test_tunings_of_several_axes_are_judged_for_each(
     )
 
 
+@pytest.mark.trial
 def test_efforts_and_loads_of_axes_are_those_of_the_actuators_whatever_b0_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -367,3 +377,28 @@ def test_v_of_one_b0_is_taken_as_it_is_and_another_b0_needs_all_actuators_to_hav
     assert same.describe()[0].startswith("NOT protected against another B0: it follows the state")
     with pytest.raises(ValueError, match="B0 of a, b is not one, and follows the state"):
         found(a=(free, other), b=(free, 1.2 * other))
+
+
+def test_a_tuning_with_which_y_runs_away_has_no_rank() -> None:
+    """Its u lies at a limit, so its effort is the lowest of all; it stands last, in a line with NOT."""
+    good = [log(seed, r=np.zeros(8000)) for seed in (1, 2)]
+    away = Measured(np.full(8000, -10.0), -0.1 * DT * np.arange(8000.0), DT, np.ones(8000))
+    found = rank({"A": away, "B": good[0], "C": good[1]}, criterion="effort")
+    assert list(found.scores)[-1] == "A"
+    assert found.lost == ("A",)
+    assert math.isnan(found.scores["A"].overshoot)
+    assert "NOT ranked: A: y ran away from r in 1 of 1 logs" in found.describe()
+    assert all("A" not in (each.better, each.worse) for each in found.comparisons)
+    assert found.to_json()["lost"] == ["A"]
+    both = rank({"A": away, "B": away})
+    assert both.best is None
+    assert both.describe().startswith("NOT ranked: A")
+
+
+def test_the_best_tuning_says_in_what_it_is_worse() -> None:
+    """A better RMS error that costs ten times the effort."""
+    found = rank({"A": log(1, memory=0.0), "B": log(2, 0.7, memory=0.0, gain=30.0)})
+    assert found.best == "B"
+    assert re.search(
+        r"^B is worse than A in mean \|du/dt\| [\d.]+ → [\d.]+$", found.describe(), re.M
+    )

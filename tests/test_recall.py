@@ -21,6 +21,8 @@ from quell.learners.regression import (
 )
 from quell.learners.rls import RlsMemory, RlsRule
 
+from .cases import cases
+
 ORDERS = np.array([2, 5, 9])
 RULE = recall_rule(RlsRule(1.0, 1e-3, 100.0), 0, 6, ORDERS, 0.02)
 MAP = np.array([0.5, -0.3, 0.2, 0.25, -0.1, 0.15])
@@ -69,6 +71,7 @@ def learned() -> tuple[RecallMemory, Any]:
     return memory, theta
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("shift", [0.0, 0.3, 1.7, 3.1, 4.4, 6.2])
 def test_a_shifted_map_is_found_within_half_a_period(shift: float) -> None:
     """Also under another constant load; the coefficients are those of the addition theorem."""
@@ -84,6 +87,7 @@ def test_a_shifted_map_is_found_within_half_a_period(shift: float) -> None:
     assert abs(away) < 0.2 or memory.loop[0].left == -1.0
 
 
+@pytest.mark.trial
 def test_nothing_is_accepted_before_a_quarter_of_a_period() -> None:
     """A short part fits many maps."""
     memory, theta = learned()
@@ -92,6 +96,7 @@ def test_nothing_is_accepted_before_a_quarter_of_a_period() -> None:
     assert memory.loop[0].searching == 1.0
 
 
+@pytest.mark.trial
 def test_another_map_is_not_used_and_is_learned_anew() -> None:
     """Same amplitudes, other phases: after half a period the old map is gone, and θ is that of least squares alone."""
     memory, theta = learned()
@@ -109,6 +114,7 @@ def test_another_map_is_not_used_and_is_learned_anew() -> None:
     np.testing.assert_allclose(theta[:6], other, atol=0.05)
 
 
+@pytest.mark.trial
 def test_noise_as_large_as_the_map_decides_nothing() -> None:
     """The map is not used on a guess."""
     memory, theta = learned()
@@ -117,6 +123,7 @@ def test_noise_as_large_as_the_map_decides_nothing() -> None:
     assert not np.allclose(theta[:6], turned(1.0), atol=0.02)
 
 
+@pytest.mark.trial
 def test_the_search_survives_a_second_start_and_a_change_of_scale() -> None:
     """What is set aside stays, in the units of the scaled f; what is forgotten does not."""
     memory, theta = learned()
@@ -142,7 +149,7 @@ def test_a_learner_without_a_map_has_nothing_to_recall() -> None:
     assert theta[6] == 1.0
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"features": State() + Bias()}, "must have one block Periodic"),

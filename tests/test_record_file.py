@@ -12,6 +12,8 @@ import pytest
 from quell.cli.app import main
 from quell.identification import Measured, read_record
 
+from .cases import cases
+
 
 def record_of(path: Path, lines: list[str], **options: object) -> Measured:
     """Write lines to a file, and read it."""
@@ -24,8 +26,8 @@ def timed(step: float, start: float = 0.0, count: int = 12, end: str = "") -> li
     return [f"{start + k * step:.15g},{k % 3},{k % 5}{end}" for k in range(count)]
 
 
-@pytest.mark.parametrize("names", [[], ["t,u,y,"], ["t,u,y"]])
-@pytest.mark.parametrize("mark", [",", ";", "\t"])
+@cases("names", [[], ["t,u,y,"], ["t,u,y"]])
+@cases("mark", [",", ";", "\t"])
 def test_a_delimiter_at_the_end_of_lines_costs_no_sample(
     names: list[str], mark: str, tmp_path: Path
 ) -> None:
@@ -42,7 +44,7 @@ def test_a_first_line_that_lacks_a_number_is_no_line_of_names(tmp_path: Path) ->
         record_of(tmp_path / "data.csv", ["0.0,,1.0", *timed(0.1, 0.1)])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("name", "unit"),
     [("t [ms]", "ms"), ("time_ms", "ms"), ("Time (us)", "us"), ("t/ns", "ns"), ("time [µs]", "us")],
 )
@@ -57,7 +59,7 @@ def test_a_column_of_times_in_another_unit_is_not_taken_for_seconds(
     assert record.dt == pytest.approx(5.0 * {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("step", "start", "message"),
     [
         (5.0, 0.0, "are whole numbers, 5 apart, and are read as seconds: if they are milliseconds"),

@@ -260,6 +260,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
     return benchmark("hostile_steps")
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("name", ["NLMS", "Kalman, guarded", "order 1", "PID"])
 def test_after_hostile_samples_a_loop_settles_as_a_new_one_does(name: str, trial: Any) -> None:
     """U is a number within its limits all the time; see benchmarks/hostile_steps.py for the rest."""

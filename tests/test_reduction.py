@@ -12,6 +12,8 @@ import quell as ql
 from quell.lti.canonical import canonical, design_models, reduced_model, without_far_zeros
 from quell.types import DesignWarning
 
+from .cases import cases
+
 DT, LATE = 2.5e-4, 2.5e-4
 BOUNDS = ql.tuning.Constraints(noise_over_pi=None)
 
@@ -58,7 +60,7 @@ def test_with_no_limit_nothing_is_left_out() -> None:
     assert str(found) == ""
 
 
-@pytest.mark.parametrize(
+@cases(
     ("model", "below", "message"),
     [
         (([1.0, 1.0], [1.0, 50.0, 0.0]), 10.0, "leaves 1 poles and 1 zeros"),
@@ -103,7 +105,7 @@ def test_all_zeros_stay_where_they_are_near_or_wanted(recwarn: Any) -> None:
     assert not recwarn.list
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("plant", [axis(2), three(1)], ids=["load encoder", "three inertias"])
 def test_a_flexible_axis_is_tuned_with_a_model_of_reduced_order(plant: Any) -> None:
     """M_s of the whole plant keeps its bound; the report says what is left out; the file runs."""

@@ -23,6 +23,8 @@ from quell.learners.rls import (
     selection_memory,
 )
 
+from .cases import cases
+
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
 
 
@@ -124,6 +126,7 @@ def test_the_rules_take_their_times_from_the_controllers_bandwidth() -> None:
     assert ql.learners.NLMS().rule(OBSERVER, 4.0, 3).gain == pytest.approx(5e-3 * 4.0, rel=1e-12)
 
 
+@pytest.mark.trial
 def test_the_strongest_features_are_found_and_the_others_have_no_coefficient() -> None:
     """Four of 60 waves in position, at a speed that changes; later one is gone and one is new."""
     rule = SelectionRule(RlsRule(2.0, 1e-2, 9.0), 0.1, 50)
@@ -240,7 +243,7 @@ def test_the_uncertainty_of_rls_does_not_grow_beyond_that_of_the_prior() -> None
     assert memory.covariance[0, 0] == pytest.approx(9.0 / 0.99, rel=1e-4)
 
 
-@pytest.mark.parametrize("covariance", [-9.0, -0.01, 0.0, 1e100, math.nan])
+@cases("covariance", [-9.0, -0.01, 0.0, 1e100, math.nan])
 def test_rls_learns_nothing_with_what_is_no_covariance(covariance: float) -> None:
     """θ and P stay as they are; without features, too."""
     rule, memory = rls(2, forget=0.01)
@@ -319,6 +322,7 @@ def loop(
     return run, controller.read(run.final_state).theta
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("unit", [2.0**-17, 2.0**17])  # scales are powers of two
 def test_coefficients_are_in_the_plants_units(unit: float) -> None:
     """What is learned is the plant, whatever the unit of y."""
@@ -334,6 +338,7 @@ def test_coefficients_are_in_the_plants_units(unit: float) -> None:
     assert theta["bias"] / unit == pytest.approx(0.7, abs=0.05)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("make", [ql.learners.RLS, ql.learners.NLMS])
 def test_the_effective_gain_stays_in_its_interval(make: Any, rng: np.random.Generator) -> None:
     """Whatever the data say, for either sign of b0."""
@@ -350,6 +355,7 @@ def test_the_effective_gain_stays_in_its_interval(make: Any, rng: np.random.Gene
         assert (b0 + slope) / b0 < 0.6
 
 
+@pytest.mark.trial
 def test_a_wrong_gain_is_found() -> None:
     """With u among the features and enough excitation, b0 + θ_u is the plant's gain."""
     s = ql.signals
@@ -416,7 +422,7 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
     reset_uncertainty(NlmsRule(1.0, 1.0), np.zeros(0))
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: ql.learners.NLMS(rate=0.0), "rate = 0.0: must be finite and greater than zero"),
@@ -457,7 +463,7 @@ def test_a_mistake_is_named(make: Any, message: str) -> None:
         make()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: ql.learners.Kalman(bias=False, bias_bandwidth=1.0), "bias_bandwidth = 1.0: has"),

@@ -22,6 +22,8 @@ from quell.learners.base import (
 from quell.learners.repetitive import correction_weights
 from quell.types import Vector
 
+from .cases import cases
+
 DT = 0.01
 OBSERVER = ql.ESO.model_free(2, 1.0, 40.0, DT)
 
@@ -92,7 +94,7 @@ def test_nothing_is_learned_where_there_is_no_measurement() -> None:
     assert np.max(np.abs(tables[-1])) < 1.5
 
 
-@pytest.mark.parametrize(
+@cases(
     "observer",
     [
         ql.ESO.model_free(1, 1.0, 20.0, 1e-2),
@@ -136,7 +138,7 @@ def test_a_start_from_rest_begins_a_cycle_and_keeps_the_table() -> None:
     assert not memory.table.any()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"period": 0.0}, "period = 0.0"),
@@ -153,6 +155,7 @@ def test_mistakes_are_named(options: dict[str, float], message: str) -> None:
         Repetitive(**options).design(OBSERVER, 4.0)
 
 
+@pytest.mark.trial
 def test_twenty_five_repeats_of_a_move_leave_a_twentieth_of_the_error() -> None:
     """A trapezoid on an arm with gravity and friction, with b0 a quarter too large.
 

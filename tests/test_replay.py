@@ -36,6 +36,7 @@ def check_same_estimates(again: ql.Trajectory, run: ql.Trajectory, tolerance: fl
         )
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     "options",
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from quell.realtime.registry import listen
 from quell.realtime.rig import Rig, serve
 from quell.realtime.system import virtual_clock
 
+from .cases import cases
 from .rig_bench import DT, PLANT, Bench, law, url_of
 
 
@@ -115,16 +117,34 @@ def test_a_rig_with_long_ticks_need_not_be_waited_for(bench: Callable[..., Bench
         assert not thread.is_alive()
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is full")
-def test_a_rig_goes_on_without_its_log_where_the_disk_is_full() -> None:
-    """And says so."""
+def test_a_rig_goes_on_without_its_log_where_the_disk_is_full(tmp_path: Path) -> None:
+    """It says so, counts the ticks that are not in the log, and leaves no half line."""
+    log = tmp_path / "log.csv"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
     with (
         closing(listen(url_of("udp"))) as listener,
-        Rig(PLANT, DT, listener, log="/dev/full") as rig,
+        Rig(PLANT, DT, listener, log=log) as rig,
     ):
-        notes = rig.run(10 * DT)
-        assert rig.counters["ticks"] == 10
-    assert "the log was given up: No space left on device" in notes
+        resource.setrlimit(resource.RLIMIT_FSIZE, (130, before[1]))
+        try:
+            notes = rig.run(20 * DT)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert rig.counters["ticks"] == 20
+    text = log.read_text()
+    assert "the log was given up: File too large" in notes
+    assert text.endswith("\n")
+    assert 0 < rig.unlogged == 20 - (text.count("\n") - 1) < 20
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is full")
+def test_no_rig_starts_with_a_log_that_can_not_be_written() -> None:
+    """As a recording."""
+    with (
+        closing(listen(url_of("udp"))) as listener,
+        pytest.raises(ValueError, match="/dev/full': can't be written .No space left on device"),
+    ):
+        Rig(PLANT, DT, listener, log="/dev/full")
 
 
 def test_a_rig_replaces_a_log_only_where_asked(tmp_path: Path) -> None:
@@ -222,7 +242,7 @@ def test_a_destroyed_plant_comes_back_to_rest_for_the_next_session(
     assert here.rig.counters["restored"] == destroyed
 
 
-@pytest.mark.parametrize(
+@cases(
     ("settings", "message"),
     [
         ({"watchdog": 0}, "watchdog = 0"),

@@ -33,6 +33,7 @@ from quell.realtime.supervisor import Cause, Mode
 from quell.records.axes import AxesTrajectory
 from quell.setup import made_axes
 
+from .cases import cases
 from .commands import Shown
 from .rig_bench import TIME
 from .scripted_axes import (
@@ -59,7 +60,7 @@ def _written(out: Any, own: Any, values: Any) -> None:
     wire.write_next_numbers(out, own, wire.MEASUREMENT, TIME, values, 0)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, wire.MOST_SIGNALS])
+@cases("count", [1, 2, 3, wire.MOST_SIGNALS])
 def test_a_frame_has_eight_bytes_more_for_each_signal(count: int) -> None:
     """State and CRC stand behind the last number; with one number it is the frame of one signal."""
     values = np.arange(count) + 0.25
@@ -73,6 +74,7 @@ def test_a_frame_has_eight_bytes_more_for_each_signal(count: int) -> None:
     assert (one.bytes[: wire.LENGTH].tobytes() == expected) == (count == 1)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_compiled_frames_of_several_numbers_are_the_same() -> None:
     """Written and accepted by compiled code."""
@@ -237,7 +239,7 @@ def test_devices_without_a_wire_say_how_many_signals_they_have() -> None:
             open_device("udp://127.0.0.1:1", DT, signals=wrong)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("given", [[0.5], [0.5, 0.5, 0.5], [], 0.5])
+@cases("given", [[0.5], [0.5, 0.5, 0.5], [], 0.5])
 def test_a_device_in_python_that_gives_another_number_of_y_has_made_an_error(given: Any) -> None:
     """One number is not the y of both axes: nothing was measured, and the error is kept."""
     device = Scripted()
@@ -270,6 +272,7 @@ def test_compensators_alone_take_no_reference() -> None:
 # ---- The loop ----
 
 
+@pytest.mark.trial
 def test_a_run_is_that_of_a_simulation() -> None:
     """From when the controller takes over: at rest it has learned nothing, and u acts at once."""
     found = Outcome(controller=gantry(learning=True))
@@ -320,7 +323,8 @@ def test_all_u_go_to_zero_in_straight_lines() -> None:
     assert np.all(np.abs(u[ramp - 1]) > 1e-3)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.trial
+@cases(
     ("options", "script", "cause", "signal"),
     [
         ({"most_error": [9.0, 0.3]}, {}, Cause.TRACKING_ERROR, "y"),
@@ -364,6 +368,7 @@ def test_one_missing_measurement_holds_all_u() -> None:
     assert int(run["y.status"][60]) & ql.Status.MEASUREMENT_HELD
 
 
+@pytest.mark.trial
 def test_a_wrong_sign_of_one_axis_is_found() -> None:
     """An encoder that counts backwards: the run ends, and names the axis."""
     turned = ql.plants.MultivariableLinearPlant(PLANT.A, PLANT.B, [[1, 0, 0, 0], [0, 0, -1, 0]])
@@ -407,7 +412,7 @@ def test_limits_are_numbers_for_all_or_one_for_each() -> None:
     assert "x: |r − y| up to 0.5" in text
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"u_max": [1.0, 2.0, 3.0]}, "u_max = .*there are 2 actuators; must be one number for all"),
@@ -453,6 +458,7 @@ def test_the_first_motion_is_checked_only_where_b0_is_known() -> None:
 # ---- Records ----
 
 
+@pytest.mark.trial
 def test_a_replay_gives_the_estimates_again() -> None:
     """Bit by bit, of each axis, until the loop has stopped; the u that were wished are beside them."""
     found = Outcome(controller=gantry(learning=True), references=(ql.signals.Sinusoid(), -0.5))
@@ -484,8 +490,8 @@ def test_a_replay_needs_as_many_axes(run: str, controller: Any, message: str) ->
         replay(Outcome(duration=0.2).run, controller)
 
 
-@pytest.mark.parametrize("names", [("y", "x"), ("x", "z")])
-@pytest.mark.parametrize("kind", [".csv", ".mcap", "a table alone"])
+@cases("names", [("y", "x"), ("x", "z")])
+@cases("kind", [".csv", ".mcap", "a table alone"])
 def test_a_replay_refuses_axes_of_other_names_or_order(
     tmp_path: Path, kind: str, names: tuple[str, str]
 ) -> None:
@@ -571,6 +577,7 @@ def test_gaps_are_filled_in_all_columns() -> None:
     assert int(run["events"][5]) == Event.GAP
 
 
+@pytest.mark.trial
 def test_names_and_units_of_signals_are_in_files_and_views(tmp_path: Path) -> None:
     """Of axes and actuators; a name with signs that separate columns stays one column."""
     signals = AxesSignals.of(["x", "y"], ["way [mm]", "angle [rad]"], ["f [N]", "m [N m]"])
@@ -604,7 +611,7 @@ def test_names_and_units_of_signals_are_in_files_and_views(tmp_path: Path) -> No
     assert odd.columns[5] == "r[a__b_]"
 
 
-@pytest.mark.parametrize(
+@cases(
     "axes",
     [["x", "y"], {"x": 1, "y": []}, {"x": []}, {"x": [], "y": [], "z": []}],
 )
@@ -630,6 +637,7 @@ def test_a_run_of_missing_measurements_says_what_came() -> None:
 # ---- Commands ----
 
 
+@pytest.mark.trial
 def test_a_simulated_run_is_written_as_csv_or_netcdf(quell: Callable[..., Shown]) -> None:
     """By the suffix, with names and units for each signal; a text that is no unit is refused."""
     text = GANTRY.replace('name = "x"', 'name = "x"\nsignal = "way [mm]"')
@@ -666,6 +674,7 @@ def slow_gantry(**rig: Any) -> str:
     return "\n".join([text, "", "[rig]", *lines, ""])
 
 
+@pytest.mark.trial
 def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None:
     """``quell run-rig`` prints each axis, records all, and ``quell replay`` and ``b0`` read it."""
     Path("gantry.toml").write_text(slow_gantry(), encoding="utf-8")
@@ -734,6 +743,7 @@ def test_a_replay_refuses_actuators_in_another_order(quell: Callable[..., Shown]
     assert quell("replay", "run.csv", "gantry.toml", "--no-figures").code == 0
 
 
+@pytest.mark.trial
 def test_a_served_rig_of_axes_is_run_over_udp(quell: Callable[..., Shown]) -> None:
     """``quell rig --plant gantry.toml`` on one side, ``quell run-rig gantry.toml`` on the other."""
     import os

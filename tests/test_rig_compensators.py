@@ -59,7 +59,7 @@ def test_a_run_is_that_of_a_simulation() -> None:
     assert found.changes[1][1:3] == (Mode.RAMP, Cause.COMPLETED)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_compiled_loop_takes_the_same_steps() -> None:
     """As the one in Python, to rounding."""
@@ -72,6 +72,7 @@ def test_a_compiled_loop_takes_the_same_steps() -> None:
         )
 
 
+@pytest.mark.trial
 def test_the_drives_are_told_what_limits_take() -> None:
     """Of the rules of safety, too: u stays at them, and no integrator winds up meanwhile."""
     limits = Safety(settle=10, ramp=10, u_max=[0.3, 0.2], u_min=[-0.3, -0.2])
@@ -87,6 +88,7 @@ def test_the_drives_are_told_what_limits_take() -> None:
     np.testing.assert_allclose(found.run["u"], inside.run["u"], atol=1e-9)
 
 
+@pytest.mark.trial
 def test_a_replay_gives_the_estimates_again() -> None:
     """Bit by bit, of learning axes, where a measurement was missing and u was held."""
     missing = {60: (0.0, math.nan), 61: (math.nan, 0.0), 100: (math.nan, math.nan)}

@@ -37,7 +37,12 @@ def _try_all(out: Any, row: Any, count: int) -> int:
     return went
 
 
-@pytest.fixture(params=[_produce, interpreted(_produce)], ids=["compiled", "interpreted"])
+@pytest.fixture(
+    params=[
+        pytest.param(_produce, id="compiled", marks=pytest.mark.trial),
+        pytest.param(interpreted(_produce), id="interpreted"),
+    ]
+)
 def produce(request: pytest.FixtureRequest) -> Any:
     """The producer, compiled and interpreted."""
     return request.param
@@ -67,6 +72,7 @@ def test_a_full_ring_drops_the_newest_rows_and_counts_them(attempt: Any) -> None
     np.testing.assert_array_equal(drain(shared)[:, 0], [0, 1, 2, 3])
 
 
+@pytest.mark.trial
 def test_no_row_is_torn_lost_or_repeated_between_two_threads() -> None:
     """A compiled producer at full speed on a small ring."""
     count, shared, pushed = 20_000, ring(61, WIDTH), []

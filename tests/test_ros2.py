@@ -13,6 +13,7 @@ import pytest
 
 import quell as ql
 
+from .cases import cases
 from .commands import in_this_process
 from .setups import GANTRY, TWO_MASS
 
@@ -192,6 +193,7 @@ def bits(further: int, first: str) -> str:
     return program.replace("ARGUMENTS", ", k < 500 ? NOTHING : 0.0" * further)
 
 
+@pytest.mark.trial
 @needs_gpp
 def test_the_commands_have_the_bits_of_the_c_code(tmp_path: Path) -> None:
     """3000 samples with noise, NaN, a locked interface, and references before and after they come.
@@ -205,7 +207,7 @@ def test_the_commands_have_the_bits_of_the_c_code(tmp_path: Path) -> None:
 
 
 @needs_gpp
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("controller", "further", "first"),
     [
@@ -223,7 +225,7 @@ def test_other_controllers_have_the_bits_of_their_c_code(
 
 
 @needs_gpp
-@pytest.mark.slow
+@pytest.mark.trial
 def test_several_axes_have_the_bits_of_the_c_code_in_chained_mode(tmp_path: Path) -> None:
     """Two axes, one with derivatives of its reference, which another controller writes."""
     program = """
@@ -265,6 +267,7 @@ int main()
     ran(exported(tmp_path, ROBOT, "robot"), program, "robot")
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("actuators", [2, 3])
 def test_compensators_of_axes_have_a_reference_for_each_actuator(
     tmp_path: Path, actuators: int
@@ -283,7 +286,7 @@ def test_compensators_of_axes_have_a_reference_for_each_actuator(
 
 
 @needs_gpp
-@pytest.mark.slow
+@pytest.mark.trial
 def test_compensators_of_axes_have_the_bits_of_the_c_code(tmp_path: Path) -> None:
     """Two axes with three actuators, whose u_0 come as a message."""
     program = """
@@ -316,6 +319,7 @@ int main()
     ran(exported(tmp_path, ADDING_WIDE, "robot"), program, "robot")
 
 
+@pytest.mark.trial
 @needs_gpp
 def test_the_package_has_the_golden_vectors(tmp_path: Path) -> None:
     """They pass with 0 ulp."""
@@ -328,6 +332,7 @@ def test_the_package_has_the_golden_vectors(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.trial
 def test_the_descriptions_name_the_class_that_the_code_exports(tmp_path: Path) -> None:
     """package.xml, the description for pluginlib, CMakeLists.txt and the parameters fit each other."""
     folder = exported(tmp_path, ROBOT, "two_arms")
@@ -376,6 +381,7 @@ set(${CMAKE_FIND_PACKAGE_NAME}_FOUND TRUE)
 """
 
 
+@pytest.mark.trial
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="cmake is missing")
 def test_cmake_builds_the_golden_vectors_of_the_package(tmp_path: Path) -> None:
     """With stand-ins for the packages of ROS; the test of the package passes."""
@@ -395,7 +401,7 @@ def test_cmake_builds_the_golden_vectors_of_the_package(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
+@cases(
     ("controller", "name", "rule"),
     [
         (SERVO, "Servo", "lower-case letters"),
@@ -421,6 +427,7 @@ def test_what_ros_does_not_take_is_refused_and_nothing_is_written(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.trial
 def test_the_command_writes_the_package_of_one_axis_and_of_several(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -23,6 +23,7 @@ from quell.realtime.run import ModeChange
 from quell.realtime.supervisor import Cause, Mode
 from quell.realtime.system import checked_cpu, enter_real_time, real_time_process
 
+from .cases import cases
 from .scripted import DT, PLANT, adrc
 
 # A machine that is busy with other things may make the loop as late as it likes.
@@ -314,7 +315,7 @@ def test_a_run_may_be_made_from_another_thread() -> None:
     assert found[0].completed
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"priority": 100}, "priority = 100: must be a whole number from 0 to 99"),

@@ -16,6 +16,8 @@ from quell.controllers.allocation import GainMemory
 from quell.controllers.safe_axes import SafeAxesDesign, nearest, safe_axes_memory
 from quell.kernels.dispatch import as_python
 
+from .cases import cases
+
 DT = 1e-3
 
 
@@ -199,6 +201,7 @@ FAR = ql.Scenario(
 class TestLoop:
     """Axes with bands, and actuators that are short of what they are asked for."""
 
+    @pytest.mark.trial
     @pytest.mark.parametrize("saturation", ["each", "direction", ["axis2", "axis1"]])
     def test_actuators_at_their_limits_leave_no_band(self, saturation: Any) -> None:
         """Without the actuators in common an axis leaves its band, in the same run."""
@@ -221,6 +224,7 @@ class TestLoop:
         assert 0.99 < reached[0] <= 1.0 + 1e-9
         assert reached[1] > 1.1
 
+    @pytest.mark.trial
     def test_a_band_that_is_far_changes_no_bit(self) -> None:
         """The run is that without safe sets, at limits of the actuators, too."""
         wide = ql.SafeSet(-1e3, 1e3, alpha=12.0)
@@ -249,6 +253,7 @@ class TestLoop:
         assert ql.Status.UNSAFE in found
         assert ql.Status.UNSAFE in axes.status
 
+    @pytest.mark.trial
     def test_bands_of_the_rate_hold_beside_those_of_y(self) -> None:
         """At the limits of the actuators, y' and y of both axes stay in their bands."""
         safe = ql.SafeSet(-1.0, 1.0, -2.0, 2.0, alpha=12.0, f_rate=1.0)
@@ -295,6 +300,7 @@ class TestLoop:
         other = ql.simulate(masses(), axes, short, interpret=True)
         np.testing.assert_allclose(one.log, other.log, rtol=1e-7, atol=1e-7)
 
+    @pytest.mark.trial
     def test_errors_of_b0_are_in_the_margin(self) -> None:
         """With a B0 that is 2 % off, nothing surprises a set that knows it; another one says ``UNSAFE``."""
         wrong = B0 * (1.0 + 0.02 * np.array([[1.0, -1.0], [-1.0, 1.0]]))
@@ -361,7 +367,7 @@ def _axes_with(**safe: Any) -> ql.Axes:
     return ql.Axes({"x": joint(bands), "y": joint()}, B0, u_min=-90.0, u_max=90.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: _axes_with(largest_u=20.0), "axes: x: safe_set.largest_u = 20.0: must be at least 144"),

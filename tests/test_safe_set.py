@@ -12,6 +12,8 @@ import quell as ql
 from quell.controllers.law import law_gains
 from quell.types import Status
 
+from .cases import cases
+
 DT = 1e-3
 
 
@@ -48,7 +50,7 @@ def farthest(controller: Any, order: int, f_rate: float, seed: int, b0: float = 
     return most
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_a_hostile_u_0_and_disturbance_do_not_leave_the_band(order: int) -> None:
     """With full force towards the border and f at its largest rate; and the band is used to within a few per cent."""
@@ -60,6 +62,7 @@ def test_a_hostile_u_0_and_disturbance_do_not_leave_the_band(order: int) -> None
         assert 0.85 < most <= 1.0
 
 
+@pytest.mark.trial
 def test_without_the_margin_it_would_leave_it() -> None:
     """F' that the set was not told of takes y outside, and the set says so."""
     observer = ql.ESO.model_free(2, 2.0, omega_o=150.0, dt=DT)
@@ -82,6 +85,7 @@ def test_its_bound_is_the_law_of_adrc_with_the_border_for_reference() -> None:
     assert controller._state.safe_set.loop[0].high == pytest.approx(bound, rel=2e-3)
 
 
+@pytest.mark.trial
 def test_a_learner_cannot_break_it() -> None:
     """One that feeds forward a thousand times the disturbance changes nothing in what the set knows."""
     observer = ql.ESO.model_free(2, 2.0, omega_o=150.0, dt=DT)
@@ -111,6 +115,7 @@ def test_it_returns_from_outside() -> None:
     assert plant.x[0] <= 1.0 + 1e-6
 
 
+@pytest.mark.trial
 def test_limits_that_make_it_impossible_are_reported() -> None:
     """U at its limit cannot stop a plant that is too fast: the nearest u, and UNSAFE."""
     observer = ql.ESO.model_free(2, 2.0, omega_o=150.0, dt=DT)
@@ -124,6 +129,7 @@ def test_limits_that_make_it_impossible_are_reported() -> None:
     assert flags & Status.UNSAFE
 
 
+@pytest.mark.trial
 def test_a_rate_band_holds_beside_that_of_y() -> None:
     """Y' stays below its border in every sample, and where both are at odds y wins."""
     observer = ql.ESO.model_free(2, 2.0, omega_o=150.0, dt=DT)
@@ -139,7 +145,7 @@ def test_a_rate_band_holds_beside_that_of_y() -> None:
     assert most <= 1.0
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: ql.SafeSet(), "no border is finite"),

@@ -25,6 +25,7 @@ from quell.realtime.supervisor import (
 )
 from quell.setup import load
 
+from .cases import cases
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
 
 CONSTANT = ql.Scenario(1.0, 3.0)
@@ -86,7 +87,7 @@ def test_y_may_lie_at_its_bound_but_not_beyond(sign: float) -> None:
         assert (Cause.IMPLAUSIBLE in [cause for _, cause in found]) == ends
 
 
-@pytest.mark.parametrize(
+@cases(
     ("dt", "counts"),
     [
         (1e-4, (50, 50, 500, 2000)),
@@ -146,7 +147,7 @@ def test_rules_are_told_in_a_line() -> None:
     assert "saturated" not in bare
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"y_min": 2.0, "y_max": 1.0}, "y_min must be less than y_max"),
@@ -206,8 +207,8 @@ def memory(**fields: float) -> Any:
     return record
 
 
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-@pytest.mark.parametrize(
+@cases("direction", [1.0, -1.0])
+@cases(
     ("fields", "r", "watching"),
     [
         ({"y": 9.976, "u": 1.0}, 10.5, ARMED),  # less than 2 % of the reach of u
@@ -243,7 +244,7 @@ def test_the_first_motion_is_judged(
     assert record.watching == watching
 
 
-@pytest.mark.parametrize(
+@cases(
     ("fields", "r", "trips"),
     [
         ({"y": 7.49, "u": 2.0}, 10.5, True),  # twice the reach of u

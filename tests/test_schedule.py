@@ -15,6 +15,9 @@ from quell.controllers import LinearController, in_single_precision
 from quell.controllers.baselines import PID, ZV
 from quell.controllers.law import law_gains
 from quell.setup import load
+from quell.tuning.schedules import _points
+
+from .cases import cases
 
 DT = 1e-3
 OBSERVER = ql.ESO.model_free(order=2, b0=2000.0, omega_o=200.0, dt=DT)
@@ -88,6 +91,7 @@ def _point() -> Any:
     return Point(OBSERVER.b0, 40.0, OBSERVER.omega_o)
 
 
+@pytest.mark.trial
 def test_u_does_not_jump_when_the_signal_jumps_at_rest_under_a_load() -> None:
     """A jump over all cells, of b0 by 10 and of the bandwidths, changes u by less than 1e-6 of the load's share."""
     tables = {"b0": B0, "omega_c": (30.0, 40.0, 60.0), "omega_o": (150.0, 200.0, 300.0)}
@@ -204,7 +208,7 @@ def test_feedforward_of_derivatives_follows_b0() -> None:
     assert law.step(0.0, 0.0, 0.0, 100.0) == pytest.approx(100.0 / 500.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     "make",
     [
         lambda: ql.Schedule((0.0, 1.0)),
@@ -341,6 +345,7 @@ schedule = {schedule}
         load(file)
 
 
+@pytest.mark.trial
 def test_the_exported_library_hands_its_signals_over(tmp_path: Any) -> None:
     """As the last arguments of a step, in the header and in both examples."""
     law = ql.ADRC(OBSERVER, 40.0, schedule=ql.Schedule(POINTS, b0=B0), u_min=-1.0, u_max=1.0)
@@ -356,6 +361,7 @@ def test_the_exported_library_hands_its_signals_over(tmp_path: Any) -> None:
 # ---- Tuning ----
 
 
+@pytest.mark.trial
 def test_a_quantile_is_that_of_all_points_together() -> None:
     """Of one table of b0; three tables have a tuning for each point, where it has no effect."""
     how = {"points": (1e-3, 2e-3), "between": 0, "quantile": 0.5}
@@ -365,6 +371,7 @@ def test_a_quantile_is_that_of_all_points_together() -> None:
         ql.tune_schedule(axis, DT, tables="all", **how)
 
 
+@pytest.mark.trial
 def test_a_tuned_schedule_keeps_the_constraints_at_and_between_its_points(tmp_path: Any) -> None:
     """On an axis with friction whose inertia changes by 5; the file that it writes runs."""
     bounds = ql.tuning.Constraints(resolution=6e-6)
@@ -386,7 +393,7 @@ def test_a_tuned_schedule_keeps_the_constraints_at_and_between_its_points(tmp_pa
     assert ql.Status.DIVERGED not in found.status
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_of_plants_that_are_known_at_points_only_the_summary_says_so() -> None:
     """They are given as a mapping. Where they are a function, it tells where M_s is above its bound between them."""
     tuned = ql.tune_schedule({0.0: axis(1e-3), 1.0: axis(2e-3)}, DT)
@@ -414,6 +421,7 @@ def _online(b: float, load: Any, reference: Any = MOVES, duration: float = 8.0) 
     return ONLINE.read(found.final_state.schedule)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("b", [600.0, 1000.0, 1800.0])
 def test_b0_follows_the_inertia_where_the_reference_moves(b: float) -> None:
     """Within 5 %, with friction and a constant load that a regression would take for the plant's."""
@@ -423,6 +431,7 @@ def test_b0_follows_the_inertia_where_the_reference_moves(b: float) -> None:
     assert abs(found.estimate - b) <= 3.0 * found.deviation
 
 
+@pytest.mark.trial
 def test_b0_stays_where_the_data_do_not_decide() -> None:
     """At rest under loads, however large, and where loads drown the motion."""
     rng = np.random.default_rng(1)
@@ -434,6 +443,7 @@ def test_b0_stays_where_the_data_do_not_decide() -> None:
         assert found.b0 == 1000.0
 
 
+@pytest.mark.trial
 def test_b0_stays_within_its_limits() -> None:
     """A plant outside of them leaves b0 at the end; the estimate tells."""
     found = _online(4000.0, 0.0)
@@ -441,6 +451,7 @@ def test_b0_stays_within_its_limits() -> None:
     assert found.estimate == pytest.approx(4000.0, rel=0.1)
 
 
+@pytest.mark.trial
 def test_the_certificate_is_that_of_the_loops_at_the_ends() -> None:
     """Stability and M_s of each b and b0 in the limits, found by ``analyse`` for plants of this b."""
     observer = ql.ESO.model_free(order=2, b0=1000.0, omega_o=200.0, dt=DT)
@@ -475,3 +486,12 @@ def test_a_linear_controller_has_no_schedule() -> None:
     """Only controllers with an observer have one: others take no such argument."""
     with pytest.raises(TypeError):
         LinearController(PID(kp=1.0, dt=DT).law, schedule=ONLINE)  # type: ignore[call-arg]
+
+
+def test_plants_at_points_are_not_known_between_them_and_a_function_is() -> None:
+    """The axes are sorted; keys may be numbers or pairs."""
+    plants = {3.0: axis(3e-3), 1.0: axis(1e-3)}
+    axes, at, between = _points(plants, None)
+    assert (axes, at((3.0,)), between) == ([[1.0, 3.0]], plants[3.0], False)
+    axes, at, between = _points(lambda e, m: (e, m), [[0.0, 1.0], [2.0, 5.0]])
+    assert (axes, at((1.0, 5.0)), between) == ([[0.0, 1.0], [2.0, 5.0]], (1.0, 5.0), True)

@@ -55,6 +55,7 @@ def run(
 # ---- At a fixed signal ----
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("name", "guarded"),
     [*((name, False) for name in LEARNERS), ("Kalman", True), ("Harmonic", True)],
@@ -90,6 +91,7 @@ def test_a_model_s_feedforward_at_a_fixed_signal_has_the_inertia_there(delay: fl
             np.testing.assert_allclose(found[channel], expected[channel], atol=1e-9 * size)
 
 
+@pytest.mark.trial
 def test_a_safe_set_at_a_fixed_signal_is_the_one_for_the_b0_there() -> None:
     """With bounds for b0(σ) u; the margin is that of the largest b0, in units of an acceleration."""
     safe = ql.SafeSet(y_max=0.5, alpha=15.0, f_rate=60.0, noise=1e-6)
@@ -125,6 +127,7 @@ def _held(law: Any, signals: Any, brake: tuple[int, int], load: float, samples: 
     return np.array(rows)
 
 
+@pytest.mark.trial(cases=r"0\.0")
 @pytest.mark.parametrize("delay", [0.0, DT])
 def test_a_detection_of_holds_at_a_fixed_signal_is_the_one_for_the_b0_there(delay: float) -> None:
     """It sees the brake, and its release, in the same samples; u is the same."""
@@ -145,6 +148,7 @@ def test_a_detection_of_holds_at_a_fixed_signal_is_the_one_for_the_b0_there(dela
 # ---- While the signal moves ----
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("guarded", [True, False])
 def test_at_rest_under_a_load_that_is_learned_u_does_not_jump(guarded: bool) -> None:
     """When signal and inertia jump by 10 the learner's share of f jumps with b0, and u stays."""
@@ -161,6 +165,7 @@ def test_at_rest_under_a_load_that_is_learned_u_does_not_jump(guarded: bool) -> 
     assert total[-1] == pytest.approx(0.5 * 500.0, rel=1e-4)
 
 
+@pytest.mark.trial
 def test_what_was_learned_at_one_inertia_is_right_at_another() -> None:
     """A periodic load, learned at the smallest inertia: the jump to the largest leaves no error."""
     load = ql.signals.Sinusoid(amplitude=0.2, omega=25.0)
@@ -176,6 +181,7 @@ def test_what_was_learned_at_one_inertia_is_right_at_another() -> None:
     assert rms(5.0) < 1e-6 * float(np.sqrt(np.mean(plain["y"][plain.t > 1.0] ** 2)))
 
 
+@pytest.mark.trial
 def test_a_learner_that_knows_the_load_stays_right_while_the_inertia_moves() -> None:
     """By a factor of 10 in a tenth of a second, to and fro: the error is a hundredth of that without learner."""
     signal = ql.signals.Constant(0.5) + ql.signals.Sinusoid(amplitude=0.5, omega=30.0)
@@ -188,6 +194,7 @@ def test_a_learner_that_knows_the_load_stays_right_while_the_inertia_moves() -> 
     assert errors[1] < 0.01 * errors[0]
 
 
+@pytest.mark.trial
 def test_a_gain_that_is_wrong_by_one_factor_is_one_coefficient_at_all_inertias() -> None:
     """θ_u of ``Kalman(u=True)`` is (b/b0(σ) − 1) b0, that of the observer, while b0(σ) moves by 10."""
     law = ql.ADRC(
@@ -215,6 +222,7 @@ def test_the_law_solves_for_u_with_the_learner_s_coefficient_at_any_b0() -> None
     assert abs(float(state.loop[0].slope)) > 1.0
 
 
+@pytest.mark.trial
 def test_an_inertia_that_jumps_in_a_move_leaves_no_error_where_a_model_is_fed_forward() -> None:
     """Nor does its friction: what is left are the errors of a load, with which it begins."""
     model = ql.Feedforward.rigid(1 / 2000.0, viscous=2e-3)
@@ -241,6 +249,7 @@ def test_at_rest_on_a_spring_that_the_model_knows_u_does_not_jump() -> None:
     np.testing.assert_allclose(u, 0.3, atol=1e-9)
 
 
+@pytest.mark.trial
 def test_y_stays_in_its_band_while_the_inertia_moves() -> None:
     """Under loads within the bound that the safe set was given, for b0 that moves by 10 in 0.2 s."""
     safe = ql.SafeSet(y_min=-0.5, y_max=0.5, alpha=15.0, f_rate=130.0, noise=1e-6)
@@ -263,6 +272,7 @@ def test_y_stays_in_its_band_while_the_inertia_moves() -> None:
         assert float(np.max(np.abs(found["y"]))) <= 0.5
 
 
+@pytest.mark.trial
 def test_a_load_from_before_a_hold_is_right_after_it_at_another_inertia() -> None:
     """Seen by itself or said: y does not move further than it does where the inertia stays."""
     for said in (False, True):

@@ -34,7 +34,7 @@ print(json.dumps([during, sorted(set(seen))]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_importing_every_module_touches_no_network_and_starts_or_unpickles_nothing() -> None:
     """In a fresh interpreter, as Python itself reports it; the same hook sees each of these."""
     done = run_python(AUDIT, timeout=120)
@@ -43,6 +43,7 @@ def test_importing_every_module_touches_no_network_and_starts_or_unpickles_nothi
     assert {"pickle.find_class", "socket.__new__", "subprocess.Popen"} <= set(control)
 
 
+@pytest.mark.trial
 def test_no_module_can_unpickle_data() -> None:
     """None imports what could, and numpy's and torch's loaders are not used."""
     found = []

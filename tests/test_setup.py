@@ -15,6 +15,7 @@ from quell.setup import EXAMPLES, SetupError, load, made, varied
 from quell.setup.loading import changed, keys, markdown
 from quell.setup.registry import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 
+from .cases import cases
 from .setups import TWO_MASS
 
 
@@ -34,6 +35,7 @@ def setup(more: str = "", *, without: tuple[str, ...] = ()) -> Any:
     return made("rig.toml", data)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_example_is_the_python_of_the_first_example() -> None:
     """The same run, bit for bit, as from the objects of examples/01_step.py."""
@@ -59,7 +61,7 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@cases(
     ("text", "message"),
     [
         ("[observer]\nomega_0 = 1.0", "observer.omega_0: unknown; did you mean omega_o?"),
@@ -174,7 +176,7 @@ def test_a_mistake_gives_a_line_with_file_key_and_rule(text: str, message: str) 
     assert caught.value.mistakes[0].startswith(f"rig.toml: {message}")
 
 
-@pytest.mark.parametrize(
+@cases(
     ("changes", "message"),
     [
         (
@@ -327,7 +329,7 @@ def test_signals_add_up_and_follow_each_other() -> None:
     assert set(SIGNALS) == set(shapes.KINDS)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("text", "expected"),
     [
         ("kind = 'pid'\nkp = 2.0\nu_max = 3.0", ql.baselines.PID),
@@ -413,7 +415,7 @@ def test_a_setup_with_other_values_is_that_of_a_file_with_them(tmp_path: Path) -
     assert varied(setup, {"learner": None}).controller.features == ()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("path", "value", "message"),
     [
         ("plant.m3", 1.0, "plant.m3: unknown; must be one of kind, m1"),

@@ -16,6 +16,7 @@ import quell as ql
 from quell.setup import EXAMPLES, SetupError, load, load_axes, made, made_axes
 from quell.tuning.report import toml_text
 
+from .cases import cases
 from .commands import Shown
 from .setups import GANTRY
 
@@ -26,6 +27,7 @@ def gantry(**changes: Any) -> dict[str, Any]:
     return {key: value for key, value in (data | changes).items() if value is not None}
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_run_of_a_file_is_that_of_the_objects_in_python() -> None:
     """Plant, B0, limits of the actuators, references, noise and disturbances."""
@@ -131,7 +133,7 @@ def test_b0_of_the_plant_is_that_of_each_kind() -> None:
     np.testing.assert_allclose(B0, expected)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"controller": {"omega_c": 1.0}}, "controller: belongs into each"),
@@ -162,7 +164,7 @@ def test_a_mistake_is_named(change: dict[str, Any], message: str) -> None:
         made_axes("a.toml", gantry(**change))
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"observer": {"kind": "model-free", "order": 2, "omega_o": 9.0, "b0": 2.0}}, r"axis\[1\].observer.b0: is 1 for an axis"),
@@ -210,6 +212,7 @@ def test_a_command_of_one_axis_says_so(quell: Callable[..., Shown], tmp_path: Pa
     assert {path.name for path in tmp_path.iterdir()} == {"gantry.toml", "run.csv"}
 
 
+@pytest.mark.trial
 def test_the_controller_of_several_axes_is_exported_as_an_fmu(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -240,6 +243,7 @@ def test_what_is_missing_is_shown_as_a_setup_of_axes_has_it() -> None:
         setup.needed("plant")
 
 
+@pytest.mark.trial
 def test_the_controller_of_several_axes_is_exported_to_c(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -256,6 +260,7 @@ def test_the_controller_of_several_axes_is_exported_to_c(
     assert "the measurement noise changes it by" in single.out
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_command_simulates_several_axes(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """Metrics of each axis, figure, record and JSON; the record is read back with its names."""

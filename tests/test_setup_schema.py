@@ -14,6 +14,9 @@ from quell.setup import EXAMPLES, registry
 from quell.setup.json_schema import json_schema
 
 from .benchmark_module import benchmark
+from .cases import cases
+
+pytestmark = pytest.mark.trial
 
 trial = benchmark("setup_schema")
 
@@ -38,7 +41,7 @@ def test_200_changed_setups_are_judged_as_by_loading() -> None:
     assert verdicts["taken by the schema, taken by quell"] > 30
 
 
-@pytest.mark.parametrize(
+@cases(
     ("where", "value", "message"),
     [
         (("observer", "omega_0"), 9.0, "'omega_0' was unexpected"),

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from quell import signals as s
 
+from .cases import cases
+
 T = np.linspace(0.0, 12.0, 1201)
 
 
@@ -273,7 +275,7 @@ NEEDED: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("kind", s.KINDS)
+@cases("kind", s.KINDS)
 def test_a_signal_of_each_kind_has_the_same_bits_in_blocks_and_alone(kind: str) -> None:
     """A run makes its signals in blocks; whoever plots them asks for all times at once."""
     signal = s.make(kind, **NEEDED.get(kind, {}))
@@ -322,7 +324,7 @@ def test_a_seed_gives_the_same_draws_for_ever() -> None:
         assert noise(2.0 * k) == pytest.approx(0.5 * draws[k % 4096], rel=1e-15)
 
 
-@pytest.mark.parametrize("bits", range(2, 15))
+@cases("bits", range(2, 15))
 def test_a_prbs_of_each_length_has_the_longest_period(bits: int) -> None:
     """Its autocorrelation over a period is 1 at lag zero and ``−1/(2^bits − 1)`` at all others."""
     size = 2**bits - 1
@@ -357,7 +359,7 @@ def test_every_kind_is_made_by_its_name() -> None:
         assert isinstance(s.make(kind, **NEEDED.get(kind, {})), cls)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: s.make("sine"), "signal = 'sine': must be one of constant, step, ramp"),
@@ -398,7 +400,7 @@ def test_a_mistake_is_named_with_its_value_and_the_rule(make: object, message: s
         make()  # type: ignore[operator]
 
 
-@pytest.mark.parametrize(
+@cases(
     "signal",
     [
         s.Constant(3.0),
@@ -447,7 +449,7 @@ def test_a_signal_without_a_known_derivative_says_so() -> None:
         s.Chirp().derivative()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("distance", "v_max", "a_max", "j_max"),
     [
         (1.6, 20.0, 500.0, 2e4),  # all seven parts

@@ -11,6 +11,8 @@ from quell.plants.nonlinear import PythonNonlinear
 from quell.simulation import driver
 from quell.simulation.driver import LARGEST_ERROR, IntegrationCheck, Samples, chosen_samples
 
+from .cases import cases
+
 PLANT = ql.plants.two_mass_spring()
 
 
@@ -53,6 +55,7 @@ def test_a_thinned_record_holds_every_so_many_th_sample(
     assert thin.log.nbytes == whole.log[::every].nbytes
 
 
+@pytest.mark.trial
 def test_the_loop_starts_from_rest_when_the_scenario_says_so() -> None:
     """Plant at x0, observer at its first measurement, θ as learned."""
     scenario = ql.Scenario(
@@ -66,6 +69,7 @@ def test_the_loop_starts_from_rest_when_the_scenario_says_so() -> None:
     assert abs(run["theta"][k][2]) > 1.0
 
 
+@pytest.mark.lost
 def test_a_run_that_diverges_ends_early_and_keeps_what_it_has() -> None:
     """The status says that it did, when, and what to do; nothing recorded is NaN."""
     wrong = ql.ADRC(ql.ESO.model_free(order=4, b0=-1.0, omega_o=10.0, dt=5e-3), omega_c=1.0)
@@ -98,6 +102,7 @@ def interpreted_run(
     )
 
 
+@pytest.mark.lost
 def test_too_few_substeps_are_the_cause_that_is_named() -> None:
     """Not b0; the warning has a number of sub-steps, and with it the run does not diverge."""
     with pytest.warns(ql.DesignWarning, match="mass: with 1 .* at least substeps = 64"):
@@ -117,6 +122,7 @@ def test_too_few_substeps_are_the_cause_that_is_named() -> None:
     np.testing.assert_allclose(chosen["y"], exact["y"], rtol=1e-2, atol=1e-9)
 
 
+@pytest.mark.lost
 def test_a_loop_that_diverges_is_the_cause_though_its_integration_fails_at_last() -> None:
     """The force grows the faster, the further it goes: the repetition with more sub-steps tells."""
     escape = interpreted_run(lambda t, x, u, w: (x[1], u + 500.0 * np.exp(x[0])), b0=-1.0)
@@ -217,6 +223,7 @@ def test_samples_are_checked_all_over_a_segment_and_where_states_turn() -> None:
     assert len(chosen_samples(x[:33], np.ones(2))) <= 32
 
 
+@pytest.mark.lost
 def test_the_check_gets_the_samples_that_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Times, u, w and states, over all segments of a thinned record; only the usual range of a run that diverged."""
     monkeypatch.setattr(driver, "_SEGMENT", 10)
@@ -243,6 +250,7 @@ def test_the_check_gets_the_samples_that_are_recorded(monkeypatch: pytest.Monkey
     assert sum(part.t.size for part in seen) == usual.sum()
 
 
+@pytest.mark.lost
 def test_the_integration_is_checked_behind_a_delay_and_an_encoder() -> None:
     """With the u that arrives."""
     plant = ql.plants.NonlinearPlant(drag, order=2, substeps=1)
@@ -265,6 +273,7 @@ def test_nothing_given_to_the_driver_is_changed(two_mass_scenario: ql.Scenario) 
         np.testing.assert_array_equal(array, before[name])
 
 
+@pytest.mark.lost
 def test_disturbances_that_are_not_given_are_zero_and_the_rest_are_in_order() -> None:
     """w1 then w2, as the plant has them."""
     run = ql.simulate(PLANT, controller(), ql.Scenario(duration=0.1, disturbances=(2.0,)))
@@ -292,6 +301,7 @@ def test_a_run_of_ten_million_samples_needs_the_memory_of_its_record() -> None:
     assert owner.nbytes < 50_000
 
 
+@pytest.mark.lost
 def test_the_limit_follows_the_size_of_what_is_asked_for() -> None:
     """A loop in encoder counts is not taken for one that diverges."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
@@ -313,6 +323,7 @@ def test_a_plant_that_varies_in_time_gets_the_time_of_each_sample(
     np.testing.assert_allclose(run["y"], 0.5 * run.t**2, rtol=1e-12)
 
 
+@pytest.mark.lost
 def test_an_output_that_is_no_number_ends_the_run_at_its_sample() -> None:
     """``√(0.25 − t)`` from 0.3 s on; what is recorded is finite; a warning names time and state."""
     plant = ql.plants.NonlinearPlant(
@@ -385,7 +396,7 @@ def test_the_last_sample_is_there_whatever_the_sample_time() -> None:
         assert run.ended == pytest.approx(400 * dt, rel=1e-12)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (
@@ -442,3 +453,57 @@ def test_a_mistake_is_named(make: object, message: str) -> None:
     """With the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message):
         make()  # type: ignore[operator]
+
+
+def wrong_sign(b0: float = -50.0) -> ql.ADRC:
+    """A controller of a motor 50/(s² + 4 s) with limits; b0 = 50 is right."""
+    observer = ql.ESO.model_free(order=2, b0=b0, omega_o=20.0, dt=0.01)
+    return ql.ADRC(observer, omega_c=4.0, u_min=-10.0, u_max=10.0)
+
+
+def test_a_loop_that_runs_away_says_so_at_the_line_of_the_user() -> None:
+    """Once, in the status, in the message and in what is missing; the loop that works says nothing."""
+    motor = ql.plants.LinearPlant.of(([50.0], [1.0, 4.0, 0.0]))
+    step = ql.Scenario(reference=ql.signals.Step(at=0.5), duration=4.0)
+    with pytest.warns(
+        ql.DesignWarning, match="The output ran away from r: .* sign and size of b0"
+    ) as seen:
+        run = ql.simulate(motor, wrong_sign(), step)
+    assert [each.filename for each in seen] == [__file__]
+    assert ql.Status.RAN_AWAY in run.status
+    assert run.lost
+    assert not run.diverged
+    found = run.metrics(start=0.5)
+    assert np.isnan([found["overshoot"], found["settling_time"], found["rise_time"]]).all()
+    assert not ql.simulate(motor, wrong_sign(50.0), step).lost
+    with pytest.warns(ql.DesignWarning, match="1 of 2 runs: The output ran away") as seen:
+        runs = ql.simulate(motor, [wrong_sign(50.0), wrong_sign()], step)
+    assert [each.filename for each in seen] == [__file__]
+    assert runs.lost.tolist() == [False, True]
+    assert runs.run(1).status == run.status
+
+
+def test_an_axis_that_runs_away_says_so() -> None:
+    """One of two; the status is that of the whole run."""
+    plant = ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2))
+    made = [
+        ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
+        for _ in range(2)
+    ]
+    step = ql.Scenario(reference=(ql.signals.Step(at=0.5), 0.0), duration=4.0)
+    limits = {"u_min": [-10.0, -10.0], "u_max": [10.0, 10.0]}
+    assert not ql.simulate(plant, ql.Axes(made, np.eye(2), **limits), step).lost
+    away = ql.Axes(made, np.diag([-1.0, 1.0]), **limits)
+    with pytest.warns(ql.DesignWarning, match="The output ran away from r"):
+        run = ql.simulate(plant, away, step)
+    assert ql.Status.RAN_AWAY in run.status
+    assert np.isnan(run.metrics(start=0.5)["axis1"]["overshoot"])
+
+
+def test_a_run_that_diverges_warns() -> None:
+    """With the message of the run."""
+    plant = ql.plants.LinearPlant.of(([1.0], [1.0, 0.0, 0.0]))
+    observer = ql.ESO.model_free(order=2, b0=-1.0, omega_o=60.0, dt=0.01)
+    with pytest.warns(ql.DesignWarning, match="went beyond limit = 1e"):
+        run = ql.simulate(plant, ql.ADRC(observer, omega_c=20.0), ql.Scenario(1.0, 3.0))
+    assert run.diverged

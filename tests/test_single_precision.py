@@ -24,6 +24,8 @@ from quell.learners.frequency_search import ENTRIES, advance_search
 from quell.learners.rls import multiply_lower, reduce_row
 from quell.observers.forms import begin, delta_form, expected_measurement, observe
 
+from .cases import cases
+
 DT = 0.01
 ORDER_2 = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.1, dt=DT)
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
@@ -61,7 +63,7 @@ class Some(NamedTuple):
     number: float
 
 
-@pytest.mark.parametrize("name", OBSERVERS)
+@cases("name", OBSERVERS)
 def test_the_delta_form_is_the_same_observer(name: str, rng: np.random.Generator) -> None:
     """In double precision, where nothing is lost, all estimates agree but for rounding; so does the expected measurement."""
     model = OBSERVERS[name].model
@@ -173,6 +175,7 @@ def test_rounded_parameters_keep_shared_memory_and_kinds() -> None:
     assert in_single(Some(values, np.array([1e-39]), 3, math.inf)).first[0] == 0.0
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("learner", "rests"),
     [
@@ -303,7 +306,7 @@ def test_coefficients_learn_below_their_last_digit() -> None:
     np.testing.assert_allclose(moved[1], moved[0], atol=2.0**-21)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_compiled_code_computes_in_single_precision_too() -> None:
     """It is the interpreted run but for fused operations, in a loop and by steps; ``.ci/run`` has it with a guarded learner."""

@@ -22,6 +22,8 @@ from quell.kernels.dispatch import (
 from quell.kernels.sized import Constant, ConstantFlag, Flag, Size, SizedArray, layout_of, type_of
 from quell.simulation.driver import run_block
 
+from .cases import cases
+
 pytestmark = pytest.mark.compiled
 
 
@@ -48,7 +50,8 @@ def output(design: Filter) -> float:
     return -total if design.negative else total
 
 
-@pytest.mark.parametrize(
+@pytest.mark.trial
+@cases(
     "design",
     [
         FILTER,
@@ -65,6 +68,7 @@ def test_compiled_and_interpreted_code_agree(design: Filter) -> None:
     assert call_specialised(output, design) == interpreted(output)(design)
 
 
+@pytest.mark.trial
 def test_other_values_are_not_compiled_for_but_other_shapes_and_constants_are() -> None:
     """Only fields that are annotated as constants are."""
     same = FILTER._replace(gains=FILTER.gains + 1.0, offset=2.0, shift=3)
@@ -129,6 +133,7 @@ def test_overlaps_are_found_where_something_is_written() -> None:
     assert not overlap([np.frombuffer(buffer)[:7]], [b, np.frombuffer(buffer)[7:]])
 
 
+@pytest.mark.trial
 def test_new_parameters_of_a_loop_are_not_compiled_for() -> None:
     """Neither by a simulation nor by a step; a loop of another order is."""
 
@@ -146,7 +151,7 @@ def test_new_parameters_of_a_loop_are_not_compiled_for() -> None:
     assert smaller._step != step
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_loops_are_compiled_once_for_all_that_share_code(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

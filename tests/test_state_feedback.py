@@ -13,6 +13,7 @@ from quell.controllers import quadratic_feedback, regulator, state_feedback
 from quell.observers.eso import ESO
 
 from .benchmark_module import benchmark
+from .cases import cases
 from .test_multivariable_observer import DT, ENCODERS, JL, JM, LOAD, SERVO, TORQUE, K
 
 AT_LOAD = ENCODERS[1:]
@@ -87,8 +88,8 @@ def test_all_poles_of_a_servos_loop_lie_in_one_place(omega_c: float, dt: float) 
     np.testing.assert_allclose(found, [1, 4, 6, 4, 1], atol=1e-3)
 
 
-@pytest.mark.parametrize("dt", [DT, 1e-3])
-@pytest.mark.parametrize("omega_c", [30.0, 120.0, 400.0])
+@cases("dt", [DT, 1e-3])
+@cases("omega_c", [30.0, 120.0, 400.0])
 def test_the_quadratic_feedback_is_that_of_the_riccati_equation(omega_c: float, dt: float) -> None:
     """SciPy's solution for a servo, and the rigid axis' bandwidth where that is slow."""
     weight, control = AT_LOAD.T @ AT_LOAD, 1.0 / ((JM + JL) ** 2 * omega_c**4)
@@ -111,7 +112,7 @@ def test_axes_that_are_not_coupled_have_gains_of_their_own() -> None:
     np.testing.assert_allclose(gain, wanted, rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("call", "message"),
     [
         (lambda: state_feedback(SERVO, [0.0] * 4, 20.0, DT), "u must move all states"),
@@ -129,6 +130,7 @@ def test_bad_arguments_of_a_state_feedback_are_named(call: Any, message: str) ->
         call()
 
 
+@pytest.mark.trial
 def test_a_servo_under_a_load_comes_back_to_its_reference() -> None:
     """Observer, regulator and state feedback together: no error remains under a load of 0.2 N m.
 
@@ -173,6 +175,7 @@ def test_a_second_encoder_brings_margins_to_a_known_linear_axis_and_no_more() ->
     assert both.peak_sensitivity < 2.0 < 10.0 < alone.peak_sensitivity
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_two_encoders_hold_a_load_behind_play_and_friction() -> None:
     """With a disturbance at each side the load rests within a fifth of the motor encoder's error."""

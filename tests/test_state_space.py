@@ -13,6 +13,7 @@ from quell.controllers import StateFeedback, quadratic_feedback, state_feedback
 from quell.controllers.several import control_all
 from quell.kernels.dispatch import as_python
 
+from .cases import cases
 from .in_c import InC, built, needs_gcc
 
 JM, JL, K, C, DT = 1.2e-4, 0.8e-4, 60.0, 0.005, 0.25e-3
@@ -48,6 +49,7 @@ def controller(**limits: object) -> StateFeedback:
 class TestLoop:
     """A servo with a second encoder."""
 
+    @pytest.mark.trial
     def test_the_load_stands_under_constant_torques_on_both_sides(self) -> None:
         """Z comes to r whatever constant torques act, and the estimates are these torques."""
         torques = (ql.signals.Step(0.2, 0.2), ql.signals.Step(-0.3, 0.4))
@@ -63,6 +65,7 @@ class TestLoop:
         assert np.max(np.abs(run["y"][late, 1] - 0.5)) < 2 * 6e-6
         np.testing.assert_allclose(run["d_hat"][late].mean(axis=0), [0.2, -0.3], atol=3e-3)
 
+    @pytest.mark.trial
     def test_limits_do_not_reach_the_estimates(self) -> None:
         """The observer receives the torque that was applied, so its d stays zero."""
         run = ql.simulate(drive(), controller(u_min=-0.4, u_max=0.4), ql.Scenario(1.0, 0.3))
@@ -77,6 +80,7 @@ class TestLoop:
         other = ql.simulate(drive(), controller(u_max=0.5), scenario, interpret=True)
         np.testing.assert_allclose(one.log, other.log, rtol=1e-6, atol=1e-9)
 
+    @pytest.mark.trial
     def test_a_missing_encoder_is_flagged_and_the_other_corrects(self) -> None:
         """Half a second without the load's encoder keeps the loop at its reference."""
         law = controller()
@@ -89,6 +93,7 @@ class TestLoop:
             x = plant.transition @ x + plant.input @ u
         assert x[2] == pytest.approx(0.3, abs=1e-6)
 
+    @pytest.mark.trial
     def test_a_record_is_plotted_and_saved(self, tmp_path) -> None:  # type: ignore[no-untyped-def]
         """It has outputs, control signals and disturbances, but no axes."""
         run = ql.simulate(drive(), controller(), ql.Scenario(0.5, duration=0.1))
@@ -140,6 +145,7 @@ class TestOperation:
 class TestC:
     """The same law in C; ``tests/contracts`` has each option of law and observer."""
 
+    @pytest.mark.trial
     @needs_gcc
     @pytest.mark.parametrize("precision", ["double", "single"])
     def test_the_c_code_repeats_the_kernels_bit_for_bit(
@@ -154,6 +160,7 @@ class TestC:
         assert done.returncode == 0, done.stdout
         assert "largest difference 0 ulp" in done.stdout
 
+    @pytest.mark.trial
     @needs_gcc
     def test_a_run_with_missing_encoders_is_that_of_python(self, tmp_path: Path) -> None:
         """In a loop in which each encoder is away for a while, and an image is handed over."""
@@ -189,7 +196,8 @@ class TestC:
         assert law.step([np.nan], [0.2, 0.2])[0] == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.trial
+@cases(
     ("wrong", "message"),
     [
         (lambda: StateFeedback(3, [1.0]), "observer = 3: must be one of"),

@@ -19,7 +19,11 @@ from quell.experiments.stress import study
 from quell.experiments.stress.adversaries import FEATURES
 from quell.kernels.sized import layout_of
 
+from .cases import cases
 
+
+@pytest.mark.trial
+@pytest.mark.lost
 @pytest.mark.parametrize("kind", stress.KINDS[10:])
 def test_without_a_guard_the_other_kinds_wreck_a_loop_too(kind: str) -> None:
     """A turncoat, once it has turned, and random features; as Python: the loop does not last."""
@@ -35,6 +39,7 @@ def test_without_a_guard_the_other_kinds_wreck_a_loop_too(kind: str) -> None:
     assert not plain.diverged
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_the_same_seed_gives_the_same_trial() -> None:
     """All that is random is drawn from it."""
@@ -43,6 +48,7 @@ def test_the_same_seed_gives_the_same_trial() -> None:
     assert [o.guarded for o in one.outcomes] != [o.guarded for o in other.outcomes]
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_results_are_plain_data(monkeypatch: pytest.MonkeyPatch) -> None:
     """For ``json.dump``, with counts for each kind, quantiles of the ratios and of what chance does; here with one draw of the noise."""
@@ -156,7 +162,7 @@ def test_every_kind_of_adversary_runs_as_it_was_drawn(kind: str, rng: np.random.
     assert not run.diverged
 
 
-@pytest.mark.parametrize(
+@cases(
     ("arguments", "message"),
     [
         ((-1, 0, 0), "runs = -1"),

@@ -19,7 +19,7 @@ from quell.plants.base import advance
 from tests.commands import Shown
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("structure", axes.STRUCTURES)
 def test_axes_are_drawn_within_their_ranges(structure: str, rng: np.random.Generator) -> None:
     """Each has the margin that it states, the model that its structure asks for, and the same loop again for the same seed."""
@@ -42,7 +42,7 @@ def test_axes_are_drawn_within_their_ranges(structure: str, rng: np.random.Gener
     assert one.describe() == again.describe()
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_trial_is_paired_and_plain_data(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short runs: without learner in both loops the ratios are one to the bit; results are for ``json.dump``."""
     monkeypatch.setattr(axes, "_RUN_LAGS", 4.0)
@@ -146,7 +146,7 @@ def test_the_arm_moves_as_two_rods_do() -> None:
     assert energy(x) == pytest.approx(first, abs=1e-6 * drawn.gravity)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_step_of_the_paper_settles_as_published(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without learner after 16.6 s with 4.5 ‰ of overshoot (docs/theory); the learner of the trial settles sooner."""

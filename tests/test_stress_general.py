@@ -33,6 +33,8 @@ from quell.learners.base import adapt, commit, predict
 from quell.plants import LinearPlant
 from quell.plants.base import advance, measure
 
+from .cases import cases
+
 DT = 0.01
 POINTS = 300
 
@@ -94,7 +96,7 @@ def one(family: str, order: int | None = None, seed: int = 0) -> GeneralLoop:
     return draw_loop(np.random.default_rng(seed), family, order)
 
 
-@pytest.mark.parametrize("family", ["unstable", "lagged", "delayed", "two masses"])
+@cases("family", ["unstable", "lagged", "delayed", "two masses"])
 def test_a_loop_states_its_modulus_margin(family: str) -> None:
     """That of the full analysis, within the grid of frequencies."""
     loop = one(family)
@@ -115,6 +117,7 @@ def test_an_unstable_loop_has_no_margin() -> None:
     assert modulus_margin(wrong, loop.controller()) == 0.0
 
 
+@pytest.mark.trial
 def test_loops_repeat_and_are_of_all_kinds() -> None:
     """The same seed gives the same loop; families, orders, loads and references all occur."""
     drawn = [draw_loop(np.random.default_rng(seed)) for seed in range(150)]
@@ -129,7 +132,7 @@ def test_loops_repeat_and_are_of_all_kinds() -> None:
         assert np.array_equal(mine, again)
 
 
-@pytest.mark.parametrize("kind", loops.LOADS)
+@cases("kind", loops.LOADS)
 def test_a_load_keeps_its_level_and_size(kind: str, rng: np.random.Generator) -> None:
     """From rest to the level, then what varies, of about the amplitude."""
     t = DT * np.arange(60_000)
@@ -175,6 +178,7 @@ def spender() -> tuple[Watched, np.ndarray]:
     return watched(weights, (0.9, -1.0, 0.0, 1e9), load), load
 
 
+@pytest.mark.trial
 def test_a_program_earns_trust_with_the_load_itself_and_then_spends_it() -> None:
     """It sees the guard's own memory, and changes its mode by the authority there."""
     controller, load = spender()
@@ -201,6 +205,7 @@ def follow(learner: Any, memory: Any, seen: Any, u: Any, authority: Any, said: A
         commit(learner, memory, seen[k], u[k], said[k])
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_program_says_the_same_compiled_and_interpreted(rng: np.random.Generator) -> None:
     """With weights of all its inputs, in both modes, which the authority changes."""
@@ -230,6 +235,7 @@ def test_exact_weights_are_those_of_f() -> None:
     assert weights["load"] == 1.0
 
 
+@pytest.mark.trial
 @pytest.mark.usefixtures("one_draw")
 def test_a_perfect_learner_removes_the_load(monkeypatch: pytest.MonkeyPatch) -> None:
     """All but a thousandth without guard; with it, more than half; from 50 to 80 of the trial's 100 to 300 lags."""
@@ -256,6 +262,7 @@ def short_runs(monkeypatch: pytest.MonkeyPatch, one_draw: None) -> None:
     monkeypatch.setattr("quell.experiments.stress.loops._LEAST_DURATION", 0.0)
 
 
+@pytest.mark.trial
 @pytest.mark.usefixtures("short_runs")
 def test_a_search_finds_learners_that_do_harm() -> None:
     """Without guard their errors are several times as large, so the trial can fail."""
@@ -266,6 +273,7 @@ def test_a_search_finds_learners_that_do_harm() -> None:
     assert found.point.shape == (general.SIZE,)
 
 
+@pytest.mark.trial
 @pytest.mark.usefixtures("short_runs")
 def test_a_loop_is_fragile_if_u_hardly_suffices_for_the_load() -> None:
     """With limits at the load itself, not with twice as much, and never without limits."""
@@ -287,6 +295,7 @@ def test_another_draw_changes_the_noise_only() -> None:
     assert np.std(other) == pytest.approx(np.std(noise), rel=0.1)
 
 
+@pytest.mark.trial
 @pytest.mark.usefixtures("short_runs")
 def test_other_noise_moves_the_ratios_of_mf_eso_a_little() -> None:
     """In a loop without friction."""
@@ -339,6 +348,7 @@ def test_a_figure_beyond_its_bar_is_not_printed_as_equal_to_it() -> None:
     assert shown == ["1.0000015", "1", "1.235", "–"]
 
 
+@pytest.mark.trial
 @pytest.mark.usefixtures("short_runs")
 def test_the_command_runs_all_loops(quell: Callable[..., Any], tmp_path: Path) -> None:
     """With its own table and its own JSON."""

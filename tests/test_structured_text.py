@@ -18,6 +18,7 @@ from quell.export.structured_text.c_reader import CFile
 from quell.export.structured_text.places import Node, Whole
 from quell.export.structured_text.translator import Translator
 
+from .cases import cases
 from .commands import Shown, in_this_process
 from .in_c import InC, needs_gcc
 from .setups import TWO_MASS
@@ -62,7 +63,7 @@ CONTROLLERS = {
 QUICK = ("order 2", "PID")
 ROWS = [
     pytest.param(each, precision, id=f"{name}, {precision}",
-                 marks=() if name in QUICK and precision == "double" else pytest.mark.slow)
+                 marks=() if name in QUICK and precision == "double" else pytest.mark.trial)
     for name, each in CONTROLLERS.items() for precision in ("double", "single")
 ]  # fmt: skip
 
@@ -88,6 +89,7 @@ def samples(count: int, further: int) -> Any:
         y = 1e9 if k % 190 == 189 else 0.0 if k % 190 == 0 else y + 0.02 * v
 
 
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize(("controller", "precision"), ROWS)
 def test_the_text_read_as_python_has_the_bits_of_the_c_code(
@@ -245,6 +247,7 @@ def test_the_text_compiled_by_matiec_has_the_bits_of_the_c_code(
 # ---- What is written, and what is refused ----
 
 
+@pytest.mark.trial
 def test_the_files_have_no_placeholder_and_names_are_those_of_the_standard(tmp_path: Path) -> None:
     """No name has two _ in a row or one at its end; the README names every input."""
     files, comparison = ql.export.st(adrc(feedforward=True), tmp_path / "out", name="axis")
@@ -258,7 +261,8 @@ def test_the_files_have_no_placeholder_and_names_are_those_of_the_standard(tmp_p
     assert not re.search(r"@\w+@", readme)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.trial
+@cases(
     ("controller", "name", "rule"),
     [
         (
@@ -318,7 +322,7 @@ double f(double x, double y, double z)
 """
 
 
-@pytest.mark.parametrize(
+@cases(
     ("expression", "value"),
     [
         ("sq(x + y) + sq(x - y)", 50.0),
@@ -345,9 +349,7 @@ def test_calls_of_small_functions_in_one_expression_keep_their_arguments(
     assert block.v["u"] == value
 
 
-@pytest.mark.parametrize(
-    ("text", "number"), [("0x1F", 31), ("0xfU", 15), ("31UL", 31), ("0", 0), ("1", 1)]
-)
+@cases(("text", "number"), [("0x1F", 31), ("0xfU", 15), ("31UL", 31), ("0", 0), ("1", 1)])
 def test_whole_numbers_are_read_with_their_base(text: str, number: int) -> None:
     """Hexadecimal ones, too."""
     writer = Translator(CFile("", f"int f(int x)\n{{\n    return {text};\n}}\n"), False, ())
@@ -356,7 +358,7 @@ def test_whole_numbers_are_read_with_their_base(text: str, number: int) -> None:
     assert found.text() == str(number)
 
 
-@pytest.mark.parametrize("text", ["017", "0x1.8p3", "12ab", "1.5x", "0b11", "0x"])
+@cases("text", ["017", "0x1.8p3", "12ab", "1.5x", "0b11", "0x"])
 def test_numbers_that_have_no_text_are_refused(text: str) -> None:
     """Octal and binary ones, and what is no number."""
     file = CFile("", f"double f(double x)\n{{\n    return {text};\n}}\n")
@@ -380,6 +382,7 @@ def test_c_that_the_reader_does_not_know_is_refused(body: str, rule: str) -> Non
         file.function("f")
 
 
+@pytest.mark.trial
 def test_the_command_writes_the_block_and_compares_single_precision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -136,7 +136,7 @@ def test_only_the_page_with_the_token_is_answered(url: str) -> None:
         Client(host + "/wrong/")
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_connections_that_ask_for_nothing_are_closed_and_lock_out_no_page(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -165,7 +165,7 @@ def test_connections_that_ask_for_nothing_are_closed_and_lock_out_no_page(
     assert len(lines) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_large_plant_is_analysed_apart_and_for_a_limited_time(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,7 +186,7 @@ def test_a_large_plant_is_analysed_apart_and_for_a_limited_time(
     other.close()
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_process_of_its_own_gives_the_same_frames() -> None:
     """A list beyond the limit makes a setup large; errors are the same sentence; a stop ends it."""
     den = np.poly(-np.linspace(1.0, 1.5, 45)).tolist()
@@ -221,7 +221,7 @@ def test_a_malformed_message_gives_an_error_and_no_more(client: Client, text: st
     assert "texts" in client.ask("texts", do="toml", setup=TABLES)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
@@ -308,6 +308,7 @@ def test_the_script_analyses_what_the_page_does(tmp_path: Path) -> None:
         assert found == loop_of(setup).summary()
 
 
+@pytest.mark.trial
 def test_exported_c_is_that_of_the_command_line(client: Client, tmp_path: Path) -> None:
     """Each file in the archive has the bytes of ``quell export``."""
     from quell.cli.run import export
@@ -415,19 +416,21 @@ def test_a_page_may_name_only_the_files_of_the_command_line(tmp_path: Path) -> N
         messages.checked(other)
 
 
+@pytest.mark.trial
 def test_tuning_uses_the_noise_of_y_and_keeps_the_feedforward(client: Client) -> None:
     """The noise may use 2 % of the range of u; the controller of the form feeds its model forward."""
     tables = TABLES | {"controller": TABLES["controller"] | {"feedforward": "model"}}
     task = {"do": "tune", "structure": "bandwidths", "resolution": 1e-3, "setup": tables}
     tuned = client.ask("tuned", **task)["tuned"][0]
     assert tuned["noise_bound"].startswith("std(u): 2 % of half the range of u, 10")
-    assert tuned["step"].startswith("Step of the reference: overshoots by")
+    assert tuned["step"].startswith("Step of the reference by 1 at ")
     found = tuned["setup"]["controller"]["feedforward"]
     assert found["coefficients"] == pytest.approx([0.0, 4.0 / 50.0, 1.0 / 50.0])
     without = client.ask("tuned", **task | {"structure": "pid"})["tuned"][0]
     assert "feedforward" not in without["setup"]["controller"]
 
 
+@pytest.mark.trial
 def test_tuning_sends_the_runs_of_before_and_after(client: Client) -> None:
     """Run and loop of the setup as it was, and of the tuned one; the tuned one is not applied."""
     number = client.send(do="tune", structure="pi", setup=TABLES)
@@ -445,6 +448,15 @@ def test_tuning_sends_the_runs_of_before_and_after(client: Client) -> None:
     assert "--" not in tuned["noise_bound"]
     loops = [each["loop"]["m_s"] for each in frames if each["kind"] == "loop"]
     assert loops[1] == pytest.approx(1.6, rel=2e-3)  # the default bound, which is active
+    kinds = [each["kind"] for each in frames]
+    (verdict,) = (each["worse"] for each in frames if each["kind"] == "verdict")
+    assert kinds.index("verdict") > max(i for i, kind in enumerate(kinds) if kind == "loop")
+    texts = {each["key"]: each["text"] for each in verdict}
+    assert all("→" in text for text in texts.values())
+    margins = [each["loop"]["delay_margin"] for each in frames if each["kind"] == "loop"]
+    assert ("loop.delay_margin" in texts) == (margins[1] < 0.9 * margins[0])
+    of_u = [each["metrics"][0]["control_variation"] for each in frames if each["kind"] == "run"]
+    assert ("run.0.control_variation" in texts) == (of_u[1] > 1.1 * of_u[0])
 
 
 def test_an_identified_model_is_opened_with_its_file(client: Client, tmp_path: Path) -> None:
@@ -478,6 +490,7 @@ def test_an_identified_model_is_opened_with_its_file(client: Client, tmp_path: P
         messages.with_models({"plant": {"kind": "identified", "path": str(path) + "x"}})
 
 
+@pytest.mark.trial
 def test_of_several_axes_one_is_shown_with_all_actuators(client: Client) -> None:
     """Its curves are those of ``simulate``, its margins those of its channel; tuning says NOT."""
     setup = made_axes("two", AXES)
@@ -503,6 +516,7 @@ def test_of_several_axes_one_is_shown_with_all_actuators(client: Client) -> None
     assert reason == "axis = 2: must be a whole number from 0 to 1"
 
 
+@pytest.mark.trial
 def test_texts_and_c_of_several_axes_are_those_of_the_setup(client: Client) -> None:
     """The TOML opens again as it was, the script runs, and the archive has the C files."""
     texts = client.ask("texts", do="toml", setup=AXES)["texts"][0]

@@ -27,7 +27,10 @@ OPTIONS = [
     "--disable-sync",
     "--no-first-run",
 ]
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"there is no browser at {CHROMIUM}")
+pytestmark = [
+    pytest.mark.trial,
+    pytest.mark.skipif(not CHROMIUM.exists(), reason=f"there is no browser at {CHROMIUM}"),
+]
 OMEGA_O = 'input[type=range][data-path="observer.omega_o"]'
 
 
@@ -155,6 +158,35 @@ def test_a_wrong_value_is_explained_and_the_next_one_works(page: Any) -> None:
     wait_for(lambda: page.is_hidden("#message"))
 
 
+def test_what_belongs_to_an_earlier_setup_is_dim_until_the_new_one_is_there(page: Any) -> None:
+    """Curves and tiles of run and loop alike, with the reason; also beside a loop that does not run."""
+    b0 = 'input[type=text][data-path="observer.b0"]'
+    dim = "document.querySelectorAll('.stale').length"
+    tiles = page.locator("#numbers > div").count()
+    assert page.evaluate(dim) == 0
+    page.fill(b0, "0")
+    page.keyboard.press("Tab")
+    wait_for(lambda: "the present one does not run" in page.inner_text("#stale"))
+    assert page.locator("#numbers > .stale").count() == tiles
+    assert page.locator(".grid.stale").count() == 2
+    wait_for(lambda: float(page.evaluate(
+        "getComputedStyle(document.querySelector('#numbers > .stale')).opacity")) < 0.5)  # fmt: skip
+    wait_for(lambda: page.text_content("#said").startswith("Of an earlier setup"))
+    page.fill(b0, "60")
+    page.keyboard.press("Tab")
+    wait_for(lambda: page.evaluate(dim) == 0)
+    assert page.inner_text("#stale") == ""
+    page.evaluate("window.studio.picture.want({ setup: {}, axis: 0 })")
+    page.evaluate("window.studio.picture.of.run = window.studio.picture.wanted")
+    page.evaluate("window.studio.picture.mark()")  # the run of a plant is there, its loop is not
+    assert page.locator(".time.grid.stale").count() == 0
+    assert page.locator(".loop.grid.stale").count() == 1
+    parts = page.evaluate(
+        "[...document.querySelectorAll('#numbers > .stale')].map((e) => e.dataset.part)"
+    )
+    assert set(parts) == {"loop"}
+
+
 def test_a_lost_connection_recovers(browser: Any) -> None:
     """The server is killed and started again: the page goes on with what it had."""
     context = browser.new_context()
@@ -212,7 +244,6 @@ def test_tours_set_the_sliders(page: Any) -> None:
     assert page.locator(".pin").count() == 1
 
 
-@pytest.mark.slow
 def test_all_tours_run_through_all_their_steps(page: Any) -> None:
     """Without an error, which would leave the curves pale, and with the curves of the pins."""
     page.click("#tab-learn")
@@ -318,7 +349,6 @@ def test_the_numbers_are_said_when_they_are_at_rest(page: Any) -> None:
     wait_for(lambda: page.text_content("#said").startswith("Outside of bounds: M_s "))
 
 
-@pytest.mark.slow
 def test_a_tuned_controller_that_is_worse_is_shown_and_not_applied(page: Any) -> None:
     """Before and after stand side by side; a better one is applied; another plant's result goes."""
     omega_c = 'input[type=text][data-path="controller.omega_c"]'
@@ -337,8 +367,9 @@ def test_a_tuned_controller_that_is_worse_is_shown_and_not_applied(page: Any) ->
     wait_for(lambda: page.input_value('select[data-path="controller.kind"]') == "pid")
     page.select_option("#tune-structure", "bandwidths")
     page.click("#tune")
-    wait_for(lambda: page.inner_text("#tune-verdict").startswith("Applied"), 120.0)
-    assert page.locator("#tune-rows .worse").count() == 0
+    wait_for(lambda: page.inner_text("#tune-verdict").startswith(("Applied", "NOT applied")), 120.0)
+    is_worse = page.locator("#tune-rows .worse").count() > 0
+    assert page.inner_text("#tune-verdict").startswith("NOT applied" if is_worse else "Applied")
     wait_for(lambda: page.is_enabled("#tune"), 120.0)
     page.fill('input[type=text][data-path="plant.den"]', "[1, 5, 0]")
     assert page.inner_text("#tune-result") == ""
@@ -367,7 +398,6 @@ def drop(page: Any, *files: tuple[str, bytes]) -> None:
     page.dispatch_event("body", "drop", {"dataTransfer": transfer})
 
 
-@pytest.mark.slow
 def test_a_record_that_is_opened_is_shown_and_tuned_for(page: Any) -> None:
     """Plots, report and set of plants; the form has the model; a dropped one replaces it."""
     page.click("#record-box summary")

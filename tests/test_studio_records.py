@@ -47,7 +47,7 @@ def nothing(part: str, share: float) -> None:
     """Take progress."""
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_record_is_identified_as_on_the_command_line_and_tuned_for(
     client: Client, tmp_path: Path
 ) -> None:
@@ -77,7 +77,7 @@ def test_a_record_is_identified_as_on_the_command_line_and_tuned_for(
     assert client.ask("done", **task, setup=setup)["tuned"][0]["plants"] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_nothing_is_tuned_for_a_record_that_does_not_decide(client: Client) -> None:
     """Noise: the line with NOT is shown, there is no setup, and tuning is refused with its text."""
     random = np.random.default_rng(1)
@@ -148,6 +148,7 @@ def test_the_file_of_a_record_is_removed_whether_it_can_be_read_or_not(
     assert not (tmp_path.parent.parent / "evil.csv").exists()
 
 
+@pytest.mark.trial
 def test_a_page_that_leaves_or_cancels_ends_the_identification(client: Client) -> None:
     """Between the parts of the search; the next message is answered."""
     steps: list[float] = []
@@ -219,6 +220,7 @@ def test_options_of_the_command_line_are_named_as_fields_of_the_page() -> None:
     )
 
 
+@pytest.mark.trial
 def test_a_double_integrator_gets_a_first_controller_with_damping() -> None:
     """A PI controller cannot stabilise it: the next structure is taken."""
     random = np.random.default_rng(0)

@@ -17,6 +17,7 @@ from quell.realtime.recordings import Event
 from quell.realtime.run import mode_changes
 from quell.realtime.supervisor import FLUSH, Cause, Mode, Request
 
+from .cases import cases
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
 
 HOLD, RAMP, SETTLE = 5, 10, 10
@@ -274,6 +275,7 @@ faults = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.trial
 @settings(max_examples=30)
 @given(scripts=faults)
 def test_under_any_faults_u_is_within_limits_and_ends_at_zero(
@@ -297,7 +299,7 @@ def test_under_any_faults_u_is_within_limits_and_ends_at_zero(
     assert (began >= SETTLE) == bool(np.any(mode == Mode.RUN))
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         (

@@ -25,6 +25,8 @@ from quell.realtime.supervisor import (
 from quell.records.trajectory import Trajectory
 from quell.types import Status
 
+from .cases import cases
+
 RULES = Rules(
     *(-2.0, 4.0),
     most_error=3.0,
@@ -66,7 +68,7 @@ def updated(k: int = 10, y: float = 0.0, **fields: Any) -> tuple[Mode, Cause] | 
     return last_change(made)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("fields", "cause"),
     [
         ({"missed_in_row": 5}, None),
@@ -131,7 +133,7 @@ def test_settling_takes_good_samples_in_a_row_and_has_an_end() -> None:
     assert updated(k=51) is None
 
 
-@pytest.mark.parametrize("mode", [Mode.START, Mode.RUN, Mode.HOLD, Mode.RAMP])
+@cases("mode", [Mode.START, Mode.RUN, Mode.HOLD, Mode.RAMP])
 def test_requests_come_first(mode: Mode) -> None:
     """A ramp before any fault, but not twice; zero at once in every mode but the last."""
     made = state(mode, missed_in_row=9, tripped=1)
@@ -156,7 +158,7 @@ def output(
     return u, None if change is None else change[1]
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "cause"),
     [
         ({"r": 3.0}, None),
@@ -227,6 +229,7 @@ def test_u_is_held_ramped_and_then_zero() -> None:
     assert supervised_output(RULES, state(Mode.START), 10, 3.0, 0.0, 0.0) == 0.0
 
 
+@pytest.mark.trial
 def test_the_first_changes_and_the_end_are_kept_of_more_than_4092() -> None:
     """A device that misses every other sample: the list ends, the loop goes on, the end is told."""
     made = state(Mode.RUN)
@@ -250,6 +253,21 @@ def test_the_first_changes_and_the_end_are_kept_of_more_than_4092() -> None:
     assert lost_changes(few, 1.0) == ()
 
 
+def test_the_last_places_of_the_list_of_changes_are_for_the_end() -> None:
+    """Four of them; a change in operation is kept before them only."""
+    made = state(Mode.RUN)
+    kept = made.changes.shape[0]
+    made.changed[0] = kept - 5
+    change_mode(made, 7, Mode.HOLD, Cause.MISSED)
+    assert made.changed[0] == kept - 4
+    assert made.changes[kept - 5, :3].tolist() == [7, Mode.HOLD, Cause.MISSED]
+    change_mode(made, 8, Mode.RUN, Cause.RECOVERED)
+    assert made.changed[0] == kept - 4
+    change_mode(made, 9, Mode.RAMP, Cause.LOST)
+    assert made.changed[0] == kept - 3
+    assert made.changes[kept - 4, :3].tolist() == [9, Mode.RAMP, Cause.LOST]
+
+
 def test_every_cause_says_how_it_ends_the_run() -> None:
     """Numbers are those of the record's format; all but a few are faults."""
     assert [int(cause) for cause in Cause] == list(range(len(Cause)))
@@ -259,6 +277,8 @@ def test_every_cause_says_how_it_ends_the_run() -> None:
         **dict.fromkeys((Cause.STOP_REQUESTED, Cause.ZERO_REQUESTED), "REQUESTED"),
         Cause.COMPLETED: "COMPLETED",
         Cause.RAMPED: "NO",
+        Cause.HOST_LEFT: "REQUESTED",
+        Cause.WAITING: "NO",
     }
     assert all(cause.text for cause in Cause)
     assert [int(mode) for mode in Mode] == [0, 1, 2, 3, 4]

@@ -24,6 +24,7 @@ from quell.setup.description import read
 from quell.setup.loading import sweep_of
 from quell.sweeping import Measure, Normal, Plan, Range, Sweep, sweep
 
+from .cases import cases
 from .commands import Shown
 from .setups import TWO_MASS
 
@@ -116,6 +117,8 @@ def test_steps_are_a_grid_and_random_draws_are_independent() -> None:
     assert not np.any(drawn == other)
 
 
+@pytest.mark.trial
+@pytest.mark.lost
 def test_each_run_of_a_sweep_is_the_run_alone_and_failing_ones_are_recorded(tmp_path: Path) -> None:
     """Controllers of three types in one sweep; each draw has its noise, and its runs share it."""
     metrics = {"iae": Measure("iae"), "late": Measure("peak_error", start=0.2), "end": last_u}
@@ -165,6 +168,7 @@ def last_u(run: ql.Trajectory) -> float:
     return float(run["u"][-1])
 
 
+@pytest.mark.lost
 def test_errors_of_measures_and_of_whole_batches_are_those_of_single_runs(tmp_path: Path) -> None:
     """Runs beside them are complete; an unstable run has its status."""
 
@@ -193,6 +197,7 @@ def test_errors_of_measures_and_of_whole_batches_are_those_of_single_runs(tmp_pa
     assert np.array_equal(result.failed, three | far | wrong)
 
 
+@pytest.mark.trial
 def test_threads_processes_and_parts_of_any_size_give_the_same_bits(tmp_path: Path) -> None:
     """And so does a given executor."""
     found = [
@@ -211,6 +216,8 @@ def test_threads_processes_and_parts_of_any_size_give_the_same_bits(tmp_path: Pa
     assert found[0] == found[1] == found[2]
 
 
+@pytest.mark.trial
+@pytest.mark.lost
 def test_a_sweep_that_stopped_goes_on_with_what_is_missing(tmp_path: Path) -> None:
     """What is done stays as it is; until then the results have what is done."""
     whole = sweep(build, PARAMETERS, folder=tmp_path / "whole", draws=4, runs_per_file=2)
@@ -248,7 +255,7 @@ def test_a_sweep_that_stopped_goes_on_with_what_is_missing(tmp_path: Path) -> No
     assert calls == []
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_killed_process_leaves_whole_files_and_its_sweep_goes_on(tmp_path: Path) -> None:
     """With SIGKILL, in the middle of the sweep, so that nothing can be cleaned up."""
     setup = setup_of(tmp_path, SETUP.replace("draws = 4", "draws = 12"))
@@ -329,7 +336,7 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     assert sweep(build, {"m1": [1.0, 2.0]}, folder=tmp_path / "runs").missing == 0
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         (
@@ -401,7 +408,7 @@ def test_a_setup_in_a_sweep_is_the_one_with_these_values(tmp_path: Path) -> None
     assert not np.any(result.failed)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("old", "new", "message"),
     [
         ("plant.m1", "plant.m3", "sweep.parameters, case mine: plant.m3: unknown; must be one of"),
@@ -464,6 +471,7 @@ def test_draws_need_something_that_is_drawn_or_random(tmp_path: Path) -> None:
     sweep(seeded, {}, folder=tmp_path / "c", **options)
 
 
+@pytest.mark.trial
 def test_the_command_does_a_sweep_and_repeats_a_run(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -521,6 +529,7 @@ def test_what_varies_dt_is_told_as_not_comparable(
     assert [note[:22] for note in notes] == ["NOT comparable over dt"] * told
 
 
+@pytest.mark.trial
 def test_a_cluster_that_loses_a_worker_finds_what_this_machine_finds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -554,3 +563,52 @@ def test_a_cluster_that_loses_a_worker_finds_what_this_machine_finds(
     assert killed
     assert remote.missing == 0
     assert values_of(remote) == values_of(local)
+
+
+def counted(n: Any, gain: float) -> Any:
+    """A loop with a whole number as a parameter, of which 3 has no plant and 2 the wrong sign."""
+    assert type(n) is int, f"n = {n!r}"
+    if n == 3:
+        raise ValueError("there is no plant with n = 3")
+    plant = ql.plants.LinearPlant.of(([50.0 * gain], [1.0, 4.0, 0.0]))
+    observer = ql.ESO.model_free(order=2, b0=-50.0 if n == 2 else 50.0, omega_o=20.0, dt=0.01)
+    controller = ql.ADRC(observer, omega_c=4.0, u_min=-10.0, u_max=10.0)
+    return plant, controller, ql.Scenario(reference=ql.signals.Step(at=0.2), duration=3.0)
+
+
+def test_whole_numbers_stay_whole_and_failed_runs_are_named(tmp_path: Path) -> None:
+    """0 as 0, not 0.0; the warning has counts, parameters and reasons, and stands at the caller."""
+    options: dict[str, Any] = {"folder": tmp_path / "runs", "workers": 1}
+    options |= {"metrics": ["overshoot", "rms"], "limits": {"overshoot": 0.5}}
+    options |= {"parameters": {"n": [0, 1, 2, 3], "gain": 1.0}}
+    with pytest.warns(RuntimeWarning, match="2 of 4 runs failed: run 2: n = 2, gain = 1") as seen:
+        found = sweep(counted, **options)
+    assert [each.filename for each in seen] == [__file__]
+    text = str(seen[0].message)
+    assert "y ran away from r" in text
+    assert "run 3: n = 3" in text
+    assert text.endswith("there is no plant with n = 3")
+    assert found.failed.tolist() == [False, False, True, True]
+    assert found.complete.tolist() == [True, True, False, False]
+    assert found.errors.tolist() == [3]
+    assert [bool(found.reason(run)) for run in range(4)] == [False, False, True, True]
+    assert np.isnan(found.dataset["overshoot"].values).tolist() == [False, False, True, True]
+    assert found.worst("rms", 2) == [2, 3]
+
+
+def test_the_command_names_failed_runs_and_its_exit_code_does_so(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """An order of 0 is refused by the observer; b0 of the wrong sign makes y run away."""
+    text = SETUP.partition("[sweep]")[0].replace("duration = 0.5", "duration = 0.2")
+    more = '[sweep]\nmetrics = ["rms"]\n[sweep.parameters]\n"observer.order" = [4, 0]\n'
+    setup_of(tmp_path, text + more)
+    shown = quell("sweep", "drive.toml", "--workers", "1", "--no-figures", "--json", "a.json")
+    assert shown.code == 8
+    assert "2 runs, 1 fail" in shown.out
+    assert "NOT done: run 1: observer.order = 0" in shown.out
+    found = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
+    assert found["errors"] == 1
+    (failed,) = found["failed_runs"]
+    assert failed["run"] == 1
+    assert "order = 0:" in failed["reason"]

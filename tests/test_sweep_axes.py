@@ -20,6 +20,7 @@ from quell.sweeping.measures import Measure, as_measures
 from quell.sweeping.runs import Plan
 from quell.tuning.report import toml_text
 
+from .cases import cases
 from .commands import Shown
 from .setups import GANTRY
 
@@ -37,10 +38,14 @@ def gantry(**changes: Any) -> dict[str, Any]:
     return data | {"sweep": SWEEP} | changes
 
 
+@pytest.mark.trial
 def test_each_run_is_that_of_simulate(tmp_path: Path) -> None:
     """Measures of both axes, bit for bit; a run that cannot be built is recorded, and the others are done."""
     setup = made_axes("gantry.toml", gantry())
-    found = ql.sweep(**sweep_of_axes(setup), folder=tmp_path / "sweep", workers=1)
+    with pytest.warns(
+        RuntimeWarning, match=r"1 of 3 runs failed: run 2: axis\[1\]\.controller\.omega_c"
+    ):
+        found = ql.sweep(**sweep_of_axes(setup), folder=tmp_path / "sweep", workers=1)
     assert sorted(sweep_of_axes(setup)["metrics"]) == [
         "x.peak_error",
         "x.rms",
@@ -77,7 +82,7 @@ def test_a_measure_names_its_axis() -> None:
         sweep_of_axes(made_axes("a.toml", {k: v for k, v in gantry().items() if k != "sweep"}))
 
 
-@pytest.mark.parametrize(
+@cases(
     ("metrics", "message"),
     [
         ([".rms"], r"metrics: '.rms': has no axis before the point; give rms, or AXIS.rms"),
@@ -116,11 +121,12 @@ def test_an_unknown_axis_is_refused_before_anything_is_simulated(
     assert not (tmp_path / "sweep").exists()
 
 
+@pytest.mark.trial
 def test_the_command_sweeps_and_repeats_a_run(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """Of two axes; the run that is repeated has the stored measures."""
     (tmp_path / "gantry.toml").write_text(toml_text(gantry()))
     shown = quell("sweep", "gantry.toml", "--workers", "1", "--no-figures", "--json", "a.json")
-    assert shown.code == 0, shown.err
+    assert shown.code == 8, shown.err  # one of the runs cannot be built
     assert "y.rms" in shown.out
     assert json.loads((tmp_path / "a.json").read_text())["setup"]["axis"]
     again = quell("sweep", "gantry.toml", "--repeat", "1", "--no-figures")
@@ -128,6 +134,7 @@ def test_the_command_sweeps_and_repeats_a_run(quell: Callable[..., Shown], tmp_p
     assert "the same, bit for bit" in again.out
 
 
+@pytest.mark.trial
 def test_the_variation_of_v_over_another_b0_is_told_as_not_comparable(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:

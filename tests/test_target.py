@@ -17,6 +17,7 @@ from quell.signals import Sinusoid, Step
 from quell.types import Status
 
 from .benchmark_module import BENCHMARKS, benchmark
+from .cases import cases
 
 pytest.importorskip("serial")
 DT = 1e-3
@@ -102,7 +103,7 @@ def test_lost_telemetry_is_no_number():
     assert run.status == Status.SATURATED
 
 
-@pytest.mark.parametrize(
+@cases(
     ("target", "error", "message"),
     [
         ({"extra": 1}, ValueError, "5 numbers are named, and it has sent one with the index 5"),
@@ -117,7 +118,7 @@ def test_a_record_that_can_not_be_made_is_an_error(target, error, message):
         recorded(Target(**target), 1.0, 0.1, timeout=0.2)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "message"),
     [
         ({"channels": (("r", 1),)}, "must have r and u"),
@@ -170,7 +171,7 @@ def moving():
 def built(table, folder, board, precision, parts, *flags, controller=None):
     """The path of a program of the examples with a controller."""
     table.export(controller or servo(), precision, "servo", folder)
-    table.write(plant_source(DRIVE, DT), folder)
+    table.write_source(plant_source(DRIVE, DT), folder)
     sources = [*(table.emulator.HERE / part for part in parts), folder / "plant.c"]
     program = folder / "servo.elf"
     flags = (f"-I{folder}", *flags)
@@ -178,6 +179,7 @@ def built(table, folder, board, precision, parts, *flags, controller=None):
     return program
 
 
+@pytest.mark.trial
 def test_the_emulator_counts_instructions(table, tmp_path):
     """A thousand of them as a thousand; u is that of the simulation; stack and state are small."""
     scenario = ql.Scenario(reference=Sinusoid(), duration=0.2)
@@ -190,6 +192,7 @@ def test_the_emulator_counts_instructions(table, tmp_path):
     assert found["difference"] < 1e-4
 
 
+@pytest.mark.trial
 def test_a_second_extended_state_takes_a_third_more_instructions_at_most(table, tmp_path):
     """Of a step of order 2 in single precision, 1.35 times as many; u is still that of the simulation."""
     scenario = ql.Scenario(reference=Sinusoid(), duration=0.2)
@@ -204,6 +207,7 @@ def test_a_second_extended_state_takes_a_third_more_instructions_at_most(table, 
     assert instructions[0] < instructions[1] <= 1.35 * instructions[0]
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("board", "precision"), [("Cortex-M4F", "single"), ("Cortex-M7", "double")]
 )
@@ -216,6 +220,7 @@ def test_golden_vectors_hold_on_the_target(table, tmp_path, board, precision):
     assert table.golden(case, tmp_path / "c") < 16.0  # an error if the test in C has failed
 
 
+@pytest.mark.trial
 def test_a_timer_interrupt_controls_a_drive(table, tmp_path):
     """Under load from the start, through manual operation, and off when the sensor has failed."""
     board = table.emulator.BOARDS["Cortex-M4F"]
@@ -233,6 +238,7 @@ def test_a_timer_interrupt_controls_a_drive(table, tmp_path):
     assert np.all(u[-75:] == 0.0)
 
 
+@pytest.mark.trial
 def test_a_target_in_double_precision_equals_the_simulation(table, tmp_path):
     """Target, output, control signal, move, feedforward and estimates over the serial line, bit for bit.
 
@@ -254,6 +260,7 @@ def test_a_target_in_double_precision_equals_the_simulation(table, tmp_path):
         assert np.array_equal(run[name], simulated[name]), name
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("board", "precision"), [("Cortex-M4F", "single"), ("Cortex-M7", "double")]
 )
@@ -277,6 +284,7 @@ def test_a_servo_axis_moves_on_the_target_as_in_simulation(table, board, precisi
     assert np.degrees(np.max(error[: move.TORQUE_AT])) < move.BARS[1.0]
 
 
+@pytest.mark.trial
 def test_a_tick_never_sees_half_of_a_command(table, tmp_path):
     """Wherever the timer interrupts the receiver, if it masks the timer; else ticks do see it."""
     emulator, wrong = table.emulator, []

@@ -18,6 +18,7 @@ import pytest
 
 import quell as ql
 from quell.realtime import CsvSink, McapSink
+from quell.realtime.mcap_reader import whole_part
 from quell.realtime.recordings import (
     EVENTS,
     LOOP_WIDTH,
@@ -36,6 +37,8 @@ from quell.realtime.recordings import (
 from quell.realtime.telemetry import Delivery, TelemetryWriter, push
 from quell.types import Matrix
 from tests.recordings import DT, controller, header_of, rows_of, simulated
+
+from .cases import cases
 
 NARROW = Header(row_channels((("status", 1),)), dt=DT)
 
@@ -157,9 +160,7 @@ def test_a_csv_file_is_a_line_of_names_and_lines_of_numbers(
     np.testing.assert_array_equal(table[:, 0], np.arange(len(rows)) * DT)
 
 
-@pytest.mark.parametrize(
-    "dt", [1e-3, 1.0 / 3.0, 0.1, 1.0 / 44100.0, 2.2675736961451248e-05 * (1 + 2**-52)]
-)
+@cases("dt", [1e-3, 1.0 / 3.0, 0.1, 1.0 / 44100.0, 2.2675736961451248e-05 * (1 + 2**-52)])
 def test_a_csv_file_without_its_header_still_knows_its_sample_time(
     dt: float, tmp_path: Path
 ) -> None:
@@ -173,7 +174,7 @@ def test_a_csv_file_without_its_header_still_knows_its_sample_time(
     assert run.dt == pytest.approx(dt, rel=1e-15)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "rule"),
     [
         (
@@ -227,7 +228,7 @@ def with_times(path: Path, change: Callable[[float], str]) -> None:
     path.write_text("\n".join([first, *changed]) + "\n")
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "expected"),
     [
         (lambda text: text, True),
@@ -365,6 +366,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.trial
 def test_what_is_a_second_old_survives_the_end_of_the_process(tmp_path: Path) -> None:
     """At 1 kHz and 10 Hz: no buffer waits until it is full."""
     ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], timeout=120)
@@ -428,7 +430,14 @@ def test_a_full_disk_ends_a_recording_and_nothing_else(
     read = load(tmp_path / f"run.{suffix}").log
     assert 300 < len(read) < len(rows)
     np.testing.assert_array_equal(read, rows[: len(read)])
-    assert "File too large" in telemetry.problems[0]
+    assert telemetry.problems[0].endswith(f"File too large; closed after {len(read)} rows")
+    assert telemetry.lost - telemetry.dropped == 2 * len(rows) - len(read)
+    whole = (tmp_path / f"run.{suffix}").read_bytes()
+    if suffix == "csv":
+        assert whole.endswith(b"\n")  # no half line
+        assert whole.count(b"\n") == 1 + len(read)
+    else:
+        assert whole_part(tmp_path / "run.mcap") == (len(whole), len(read))
 
 
 @pytest.mark.parametrize("suffix", ["csv", "mcap"])
@@ -442,6 +451,7 @@ def test_no_recording_begins_on_a_full_disk(header: Header, suffix: str, tmp_pat
             telemetry.start()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [*tmp_path.iterdir()] == []
     again = TelemetryWriter(header, [file_sink(tmp_path / f"run.{suffix}", overwrite=True)])
     again.start()
     again.stop()
@@ -499,7 +509,7 @@ def test_a_sink_that_does_not_end_is_given_up_and_the_others_are_complete(tmp_pa
     stuck.freed.set()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "rule"),
     [
         (lambda folder: CsvSink(folder / "no" / "run.csv"), "folder .* must exist"),
@@ -594,8 +604,8 @@ def test_files_that_are_no_recordings_are_refused_in_one_line(
         assert path.name in str(refused.value)
 
 
-@pytest.mark.parametrize("permitted", [True, False])
-@pytest.mark.parametrize("urgent", [True, False])
+@cases("permitted", [True, False])
+@cases("urgent", [True, False])
 def test_the_writer_has_the_priority_that_it_should(
     urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

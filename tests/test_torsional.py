@@ -15,6 +15,8 @@ from quell.experiments.common import Claim
 from quell.kernels.dispatch import compiled
 from quell.plants.base import advance, measure
 
+from .cases import cases
+
 DT = 1e-3
 IDEAL: dict[str, Any] = {
     "lower_coulomb": 0.0,
@@ -147,6 +149,7 @@ def test_a_steady_speed_costs_coulomb_and_viscous_friction() -> None:
     np.testing.assert_allclose(states[-1, 2:], speed, rtol=1e-5)
 
 
+@pytest.mark.trial
 def test_its_friction_agrees_with_an_independent_solution() -> None:
     """Against Runge-Kutta on ``C tanh(ω/ε)`` with a tiny ε, through several reversals."""
     twin = ql.plants.torsional(dac_bits=None, counts=None)
@@ -247,7 +250,7 @@ def test_u_can_be_late(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(y, expected)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("wrong", "message"),
     [
         ({"stiffness": 0.0}, "stiffness = 0.0: must be finite and greater than zero"),
@@ -285,6 +288,7 @@ def test_a_figure_is_judged_against_anothers() -> None:
     assert judged == [True, False, True, False]
 
 
+@pytest.mark.lost
 def test_a_record_that_ends_early_has_no_score() -> None:
     """Rather None than the figures of a part."""
     law, course = (

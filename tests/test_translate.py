@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from quell.export.c_files import CFiles, translated
 from quell.export.translate.program import Program
-from quell.export.translate.structs import Findings, ascii_text
-from quell.export.translate.text import TranslationError
+from quell.export.translate.structs import Findings, ascii_text, whole_kind
+from quell.export.translate.text import TranslationError, function_name
 from quell.kernels.dispatch import generic, kernel
 from quell.kernels.sized import Flag, Scalars, Scratch, Size, clear
 from quell.types import Matrix, Vector
 
+from .cases import cases
 from .in_c import InC, needs_gcc
 
 NUMBERS = (0.0, -0.0, 1.0, -2.5, 1e300, 1e-300, math.inf, -math.inf, math.nan)
@@ -236,7 +237,7 @@ def unread(design: Design, state: State, a: float, b: float) -> float:
 
 
 @needs_gcc
-@pytest.mark.parametrize("function", [extremes, branches, loops, numbers, states, unread])
+@cases("function", [extremes, branches, loops, numbers, states, unread])
 def test_a_kernel_calculates_the_same_in_c(tmp_path: Path, function: Callable[..., Any]) -> None:
     """For all pairs of ordinary and of extreme numbers, bit for bit."""
     check_equal(tmp_path, function)
@@ -335,7 +336,7 @@ def unregistered(design: Design, state: State, a: float, b: float) -> float:
     return measured(design, a)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("function", "rule"),
     [
         (recursive, "while a > b"),
@@ -356,3 +357,17 @@ def test_symbols_become_words() -> None:
     assert ascii_text("Φ z + Γ_u u ≤ 2⁻⁴⁰, x̂_1, β̄ → √λ") == (
         "Phi z + Gamma_u u <= 2^-40, x_hat_1, beta_bar -> sqrt lamda"
     )
+
+
+def test_names_of_functions_are_none_that_c_reserves() -> None:
+    """A name with an underscore at its start is reserved at file scope, and keywords are taken."""
+    assert function_name("_advance") == "advance"
+    assert function_name("__advance") == "advance"
+    assert function_name("_while") == "while_"
+
+
+def test_whole_numbers_are_integers_as_far_as_every_int_of_c_holds_them() -> None:
+    """``int`` may have 16 bits; 0 and 1 may be truth values."""
+    kinds = [whole_kind(value).name for value in (0.0, 1.0, 2.0, 32767.0, -32767.0)]
+    assert kinds == ["BOOL", "BOOL", "INT", "INT", "INT"]
+    assert {whole_kind(value).name for value in (0.5, 32768.0, -32768.0)} == {"REAL"}

@@ -30,7 +30,7 @@ def quell(
 
 
 # The rule of thumb that warns of bandwidths beside a delay is more careful than M_s.
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")
 @pytest.mark.parametrize("delay", [0.0, 0.12])
 @pytest.mark.parametrize("structure", STRUCTURES)
@@ -57,7 +57,7 @@ def test_the_file_of_every_structure_is_the_tuned_loop(
     assert load_window["peak_error"] > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_gain_is_printed_with_its_sign(quell: object) -> None:
     """Of ADRC and of PI, as text and in the JSON; K is positive for a positive plant."""
     for structure, name in (("bandwidths", "b0"), ("pi", "K")):
@@ -94,7 +94,7 @@ def record(path: Path) -> None:
     np.savetxt(path, np.column_stack([t, u, y]), delimiter=",", header="t,u,y", comments="")
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("route", ["numbers", "setup", "record", "model"])
 def test_limits_of_u_reach_the_file_by_every_route(
     quell: object, tmp_path: Path, route: str
@@ -120,7 +120,7 @@ def test_limits_of_u_reach_the_file_by_every_route(
     assert (setup.controller.limits.low, setup.controller.limits.high) == (0.5, 4.5)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_noise_of_a_record_bounds_what_noise_does_to_u(quell: object, tmp_path: Path) -> None:
     """Its white part: 1e-4 of y was drawn; half the range of u is 2, of which it may use 2 %."""
     record(tmp_path / "record.csv")
@@ -133,7 +133,7 @@ def test_the_noise_of_a_record_bounds_what_noise_does_to_u(quell: object, tmp_pa
     assert "2 % of half the range of u, 2," in line
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_scenario_begins_at_the_operating_point_of_the_record(
     quell: object, tmp_path: Path
 ) -> None:
@@ -152,7 +152,7 @@ def test_the_scenario_begins_at_the_operating_point_of_the_record(
     assert "overshoot" not in load_window
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_an_operating_point_that_is_given_is_where_the_scenario_begins(quell: object) -> None:
     """By numbers, with a delay and a lag whose states are at rest, too; half of one is refused, and one beside a setup."""
     at = ("--u-rest", "3", "--y-rest", "-2.5", "--delay", "0.12")
@@ -180,6 +180,7 @@ HEATER = ([0.7], np.polymul([142.0, 1.0], [19.0, 1.0]).tolist())
 MOTOR = ([45_000.0], [1.0, 3.3, 0.0])
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("plant", "dt", "limits", "expected"),
     [
@@ -197,7 +198,7 @@ def test_step_and_load_of_the_file_can_be_held_within_the_limits_of_u(
     limits: dict[str, float],
     expected: tuple[float | None, float],
 ) -> None:
-    """With 40 % each of what the limits leave at rest: of a heater at zero the load is negative, and limits beside zero have their rest in the middle. A step that needs no u at rest, as a motor's, just reaches a limit on the way."""
+    """With 40 % each of what the limits leave at rest: of a heater at zero the load is negative, and limits beside zero have their rest in the middle. A step that needs no u at rest, as a motor's, keeps within the limits on the way and overshoots by 5 % at most."""
     tuned = ql.tune(plant, dt, structure="bandwidths", order=2, compare=(), **limits)
     tuned.save(tmp_path / "tuned.toml")
     setup = load(tmp_path / "tuned.toml")
@@ -209,7 +210,8 @@ def test_step_and_load_of_the_file_can_be_held_within_the_limits_of_u(
     run = ql.simulate(setup.plant, setup.controller, setup.scenario)
     if expected[0] is None:
         during = run.window(0.0, 0.5 * setup.scenario.duration)
-        assert np.max(np.abs(run["u"][during])) == pytest.approx(limits["u_max"], rel=0.06)
+        assert 0.4 * limits["u_max"] < np.max(np.abs(run["u"][during])) < limits["u_max"]
+        assert np.max(run["y"][during]) <= 1.05 * sizes[0]
     assert run["y"][-1] == pytest.approx(run["r"][-1], abs=0.02 * abs(sizes[0]))
     least, most = limits["u_min"], limits.get("u_max", math.inf)
     inside = run["u"][-(run["u"].size // 10) :]
@@ -229,6 +231,7 @@ def test_a_rest_that_u_cannot_hold_is_refused(given: dict[str, object], message:
         ql.tune(MOTOR, 1e-3, structure="bandwidths", compare=(), u_min=1.0, u_max=4.0, **given)
 
 
+@pytest.mark.trial
 def test_a_nonlinear_plant_is_judged_at_its_operating_point(tmp_path: Path) -> None:
     """A tank: outflow with the root of its level, a tenth of a volt to a centimetre."""
     tank = ql.plants.NonlinearPlant(
@@ -246,7 +249,7 @@ def test_a_nonlinear_plant_is_judged_at_its_operating_point(tmp_path: Path) -> N
     assert run.metrics(**setup.windows[0])["overshoot"] < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_delay_of_the_table_tune_is_in_the_plant_of_the_file(
     quell: object, tmp_path: Path
 ) -> None:
@@ -264,7 +267,7 @@ def test_a_delay_of_the_table_tune_is_in_the_plant_of_the_file(
     assert other.controller.ki == pytest.approx(setup.controller.ki, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_table_of_a_tuning_is_not_cut_in_80_columns(
     quell: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,6 +287,7 @@ def test_the_table_of_a_tuning_is_not_cut_in_80_columns(
     assert rows, shown.out
 
 
+@pytest.mark.trial
 def test_what_the_record_does_not_show_stands_behind_the_margins(
     quell: object, tmp_path: Path
 ) -> None:

@@ -16,11 +16,13 @@ from quell.analysis import analyse
 from quell.quantities import Signals
 from quell.setup import load
 from quell.tuning import Constraints, designs, report
-from quell.tuning.optimiser import loops, requirements
+from quell.tuning.optimiser import loops, requirements, search
 from quell.tuning.optimiser.requirements import sizes
 from quell.tuning.plants import given_plants, model_of, plant_set
 from quell.tuning.structures.adrc import equivalents
 from quell.tuning.structures.registry import make_structure
+
+from .cases import cases
 
 LAGS = ([1.0], [1.0, 3.0, 3.0, 1.0])
 DT = 0.02
@@ -65,7 +67,7 @@ def test_the_response_of_a_structure_is_that_of_the_controller_it_builds(
         np.testing.assert_allclose(response, loop.response("C_y", omega), rtol=1e-7)
 
 
-@pytest.mark.parametrize(("name", "order"), ALL_STRUCTURES)
+@cases(("name", "order"), ALL_STRUCTURES)
 def test_the_integral_gain_is_the_residue_at_zero_frequency(name: str, order: int) -> None:
     """``C_y → k_i dt/(z − 1)`` for ω → 0, its real part counts; infinite with two integrators."""
     _, model = loop_of(LAGS, DT, 10 * DT)
@@ -131,7 +133,7 @@ def test_a_freed_adrc_has_the_feedback_of_a_filtered_pi_or_pid_controller(order:
 # ---- optima
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_constraints_hold_on_a_grid_a_hundred_times_finer(tuned: ql.Tuned) -> None:
     """Within 0.1 %, and each active one is reached."""
     x = np.log(tuned.plants.omega)
@@ -196,6 +198,24 @@ def test_unstable_loops_have_the_worst_cost_without_a_warning() -> None:
         assert cost(structure, stable)[0] < 2.0
 
 
+def test_a_bound_of_the_delay_margin_is_exceeded_by_a_smaller_one() -> None:
+    """The ratio is that of the bound to the margin, which a loop's analysis gives as well."""
+    given = ([1.0], [2e-4, 2e-3, 0.0])
+    plants = plant_set(given_plants(given, 1e-3), 1e-3)
+    over = loops.SetResponses(plants, loops.load_step(plants))
+    structure = make_structure("pid", loop_of(given, 1e-3)[1], None)
+    values = structure.shapes()[:3]
+    margins = search.delay_margin(plants, structure, values)
+    assert np.all(margins > 0.0)
+    for least in (1e-4, 5e-3):
+        (bound,) = [
+            each
+            for each in search.extras_of(Constraints(delay_margin=least), over)
+            if each.name == "delay margin"
+        ]
+        np.testing.assert_allclose(bound.ratio(structure, values) * margins, least)
+
+
 def test_a_structure_for_resonances_that_is_not_tried_is_named(tuned: ql.Tuned) -> None:
     """For a plant with a resonance, until it is among the designs."""
     assert "NOT tried: model-based-poles" in report.not_tried(tuned.designs, True)[0]
@@ -203,7 +223,7 @@ def test_a_structure_for_resonances_that_is_not_tried_is_named(tuned: ql.Tuned) 
     assert report.not_tried({**tuned.designs, "model-based-poles": tuned.design}, True) == []
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_result_does_not_depend_on_what_it_is_compared_with(tuned: ql.Tuned) -> None:
     """An ADRC with free poles starts at the optimal PID controller also if that is not shown."""
     alone = ql.tune(LAGS, DT, order=2, structure="poles", objective="load", compare=())
@@ -211,6 +231,7 @@ def test_a_result_does_not_depend_on_what_it_is_compared_with(tuned: ql.Tuned) -
     assert alone.design.k_i == pytest.approx(tuned.design.k_i, rel=1e-3)
 
 
+@pytest.mark.trial
 def test_the_integral_gain_of_a_design_with_a_model_stands_for_its_load_response() -> None:
     """Without a bound a second slow pole gave a motor k_i = 19 000, with y swinging."""
     motor = ([50.0], [1.0, 22.0, 40.0, 0.0])
@@ -229,7 +250,7 @@ def by_default() -> ql.Tuned:
     return ql.tune(LAGS, DT)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_default_is_as_good_as_the_best_structure_that_was_tried(by_default: ql.Tuned) -> None:
     """Its IAE is within 5 % of the least one; no simpler structure's is."""
     iae = {name: design.measures["iae"] for name, design in by_default.designs.items()}
@@ -239,6 +260,7 @@ def test_the_default_is_as_good_as_the_best_structure_that_was_tried(by_default:
     assert all(iae[name] > 1.05 * min(iae.values()) for name in simpler)
 
 
+@pytest.mark.trial
 def test_the_default_does_not_ring(by_default: ql.Tuned) -> None:
     """All poles of its closed loop have a damping of 0.4 or more, as those of the plant have."""
     z = np.asarray(by_default.analysis.poles, dtype=complex)
@@ -247,12 +269,13 @@ def test_the_default_does_not_ring(by_default: ql.Tuned) -> None:
     assert np.min(-slow.real / np.abs(slow)) > 0.4
 
 
+@pytest.mark.trial
 def test_a_prefilter_is_offered_where_the_step_overshoots(by_default: ql.Tuned) -> None:
     """With it a simulated step overshoots by 5 % and settles when the report says."""
-    found = by_default.reference_step
+    found, judged = by_default.reference_step, by_default.judged
     assert found.overshoot > 0.05
-    assert "[prefilter]" in str(found)
-    controller = ql.controllers.Prefiltered(by_default.controller, found.prefilter)
+    assert "[prefilter]" in str(judged)
+    controller = ql.controllers.Prefiltered(by_default.controller, judged.offered)
     scenario = ql.Scenario(reference=ql.signals.Step(), duration=60.0)
     plant = ql.plants.LinearPlant.of(LAGS)
     for one, overshoot in ((controller, 0.05), (by_default.controller, found.overshoot)):
@@ -260,6 +283,7 @@ def test_a_prefilter_is_offered_where_the_step_overshoots(by_default: ql.Tuned) 
         assert np.max(y) - 1.0 == pytest.approx(overshoot, abs=2e-3)
 
 
+@pytest.mark.trial
 def test_the_worst_case_of_a_set_is_that_of_all_its_plants() -> None:
     """The search looks at few plants at a time; the objective is that of the worst one."""
     gains = np.linspace(0.8, 1.2, 7)
@@ -268,6 +292,7 @@ def test_the_worst_case_of_a_set_is_that_of_all_its_plants() -> None:
     assert found.design.objective == pytest.approx(found.design.measures["iae"], rel=1e-9)
 
 
+@pytest.mark.trial
 def test_noise_and_limits_of_u_give_the_bound_of_noise() -> None:
     """std(u) is at most 2 % of half the range of u, for the rounding of the encoder."""
     motor, step = ([45_000.0], [1.0, 3.3, 0.0]), 360.0 / 2**16
@@ -279,7 +304,7 @@ def test_noise_and_limits_of_u_give_the_bound_of_noise() -> None:
     assert "2 % of half the range of u" in found.noise_bound
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("late", [False, True])
 def test_the_resolution_of_a_plants_encoder_is_known(late: bool) -> None:
     """Counts and y of a turn, as 360 degrees, give the same design as the resolution; also behind a delay."""
@@ -293,6 +318,7 @@ def test_the_resolution_of_a_plants_encoder_is_known(late: bool) -> None:
     assert found.noise_bound == given.noise_bound
 
 
+@pytest.mark.trial
 def test_an_encoder_does_not_replace_a_bound_that_is_given() -> None:
     """M_ks bounds what noise does to u, and without limits of u the noise bounds nothing."""
     seen = ql.plants.encoded(ql.plants.LinearPlant.of(([1.0], [1.0, 1.0, 1.0])), 4096)
@@ -326,6 +352,7 @@ def test_limits_of_u_in_the_wrong_order_are_named() -> None:
         ql.tune(([1.0], [1.0, 1.0]), 0.1, constraints=Constraints(resolution=0.01), **how)
 
 
+@pytest.mark.trial
 def test_without_a_pi_controller_of_use_the_bound_of_noise_is_that_of_a_pid_controller() -> None:
     """An integrated inertia has no PI controller, a damped one a bad one: k_i of 1e-4 for 1."""
     for den, least in (([1.0, 0.0, 0.0], 100.0), ([1.0, 3.3, 0.0], 30.0)):
@@ -335,6 +362,7 @@ def test_without_a_pi_controller_of_use_the_bound_of_noise_is_that_of_a_pid_cont
         assert found.design.k_i > least
 
 
+@pytest.mark.trial
 def test_without_any_pid_controller_of_use_noise_is_not_bounded_and_the_report_says_so() -> None:
     """Three integrators have none, so nothing tells how much of u noise may use."""
     found = ql.tune(([1.0], [1.0, 0, 0, 0]), 0.01, structure="bandwidths", order=3, compare=())
@@ -349,6 +377,7 @@ def test_the_law_of_a_freed_adrc_is_well_damped(tuned: ql.Tuned) -> None:
     assert np.min(-poles.real / np.abs(poles)) >= 0.6 - 1e-9
 
 
+@pytest.mark.trial
 def test_the_tradeoff_is_monotone(tuned: ql.Tuned) -> None:
     """A lower limit costs integral gain, a higher one gives some; of the damping the reverse."""
     for name in {name for name, _, _ in tuned.tradeoff}:
@@ -358,6 +387,7 @@ def test_the_tradeoff_is_monotone(tuned: ql.Tuned) -> None:
         assert low < tuned.design.k_i < high
 
 
+@pytest.mark.trial
 def test_limits_of_noise_and_delay_are_kept() -> None:
     """std(u) and the delay margin, as ``analyse`` finds them."""
     how: dict[str, Any] = {"structure": "pi", "compare": ()}
@@ -369,6 +399,7 @@ def test_limits_of_noise_and_delay_are_kept() -> None:
     assert 0.1 * loop.noise_to_control <= 1.002 * noise
 
 
+@pytest.mark.trial
 def test_the_integral_of_the_error_is_that_of_a_simulation() -> None:
     """``load-iae``; and it is less than that of the loop with the largest integral gain."""
     how: dict[str, Any] = {"structure": "pi", "compare": ()}
@@ -382,6 +413,7 @@ def test_the_integral_of_the_error_is_that_of_a_simulation() -> None:
     assert integral["load-iae"] <= integral["load"]
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("plant", "dt", "how"),
     [
@@ -412,6 +444,7 @@ def test_the_integral_of_the_error_has_the_end_of_a_slow_response(
     assert tuned.design.measures["iae"] >= (1.0 - 1e-3) / tuned.design.k_i
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     "how",
     [
@@ -459,6 +492,7 @@ def test_a_profile_is_tracked_within_limits_of_u() -> None:
     assert error == pytest.approx(tuned.design.objective, rel=0.01)
 
 
+@pytest.mark.trial
 def test_a_number_is_a_reference_that_is_followed_from_rest() -> None:
     """As in a scenario: 2.0 is what a step of 2 from the start on is, with and without feedforward."""
     how: dict[str, Any] = {"objective": "tracking", "structure": "bandwidths", "order": 1}
@@ -502,6 +536,7 @@ def test_a_bound_of_u_below_that_at_rest_is_refused_at_once(
 # ---- sets of plants
 
 
+@pytest.mark.trial
 def test_constraints_hold_for_all_plants_and_on_fresh_ones() -> None:
     """A range of a lag and of the gain; without the set the same structure exceeds M_s."""
 
@@ -524,6 +559,7 @@ def test_constraints_hold_for_all_plants_and_on_fresh_ones() -> None:
 # ---- results
 
 
+@pytest.mark.trial
 def test_the_setup_of_a_result_has_the_same_controller(tuned: ql.Tuned, tmp_path: Path) -> None:
     """To the last digit, through TOML; an existing file is not replaced."""
     path = tmp_path / "tuned.toml"
@@ -563,6 +599,7 @@ def test_the_bode_diagram_has_the_phase_of_the_margin(tuned: ql.Tuned) -> None:
 # ---- bad input
 
 
+@pytest.mark.trial
 def test_where_no_start_keeps_to_the_limits_the_optima_of_other_limits_are_starts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -582,7 +619,7 @@ def test_where_no_start_keeps_to_the_limits_the_optima_of_other_limits_are_start
     assert limits[-1] == pytest.approx(0.85 * 1.6)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_contradicting_constraints_are_named_with_their_excess() -> None:
     """An unstable plant needs more gain than M_ks allows at so small an M_t."""
     unstable = ([1.0], [1.0, -1.0])
@@ -591,7 +628,7 @@ def test_contradicting_constraints_are_named_with_their_excess() -> None:
         ql.tune(unstable, DT, structure="pi-unfiltered", constraints=bounds, compare=())
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_bound_of_u_near_that_at_rest_is_named_with_the_least_that_was_found() -> None:
     """With a PI controller the speed of an inertia makes u overshoot the load, for any gains."""
     speed = ([1.0], [2e-4, 0.0])  # rad/s for N m
@@ -608,6 +645,7 @@ def test_a_plant_that_no_controller_of_the_structure_stabilises_is_said() -> Non
         ql.tune(([1.0], [1.0, 0.0, 0.0]), DT, structure="pi", compare=())
 
 
+@pytest.mark.trial
 def test_a_set_may_have_plants_of_different_relative_degree() -> None:
     """One pole, or two: the controller keeps its limits for both."""
     plants = [([1.0], [1.0, 1.0]), ([1.0], [0.1, 1.1, 1.0])]
@@ -629,7 +667,7 @@ def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
         ql.tune(plant, DT)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("arguments", "message"),
     [
         ({"M_s": 1.4}, r"M_s = 1.4: .*give constraints=quell.tuning.Constraints\(m_s=1.4\)"),
@@ -664,7 +702,7 @@ U_MAX = Constraints(u_max=9.0)
 RUN = ql.Scenario(duration=1.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("arguments", "message"),
     [
         (
@@ -731,6 +769,7 @@ def test_options_without_effect_are_refused(arguments: dict[str, Any], message: 
         ql.tune(arguments.pop("plant", ([1.0], [1.0, 1.0])), 0.01, **{"compare": (), **arguments})
 
 
+@pytest.mark.trial
 def test_the_constraints_of_a_result_can_be_given_again() -> None:
     """The bound of noise that a share or a ratio made takes their place, and is the same again."""
     how: dict[str, Any] = {"structure": "pi", "compare": (), "u_min": -1.0, "u_max": 1.0}
@@ -742,7 +781,7 @@ def test_the_constraints_of_a_result_can_be_given_again() -> None:
         assert again.design.objective == pytest.approx(found.design.objective, rel=1e-3)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("bounds", "message"),
     [
         ({"m_s": 1.0}, "m_s = 1.0: must be above 1"),
@@ -785,7 +824,7 @@ def test_a_law_has_the_poles_that_it_is_given_and_retunes_with_omega_c() -> None
     np.testing.assert_allclose(controller.parameters.law, [1.0, 1.2], rtol=1e-12)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("poles", "message"),
     [
         ([-1.0, -1.0], "has 2 poles, must have 3"),

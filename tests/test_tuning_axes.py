@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import math
 import tomllib
@@ -21,10 +22,19 @@ from quell.lti.models import System, zero_order_hold
 from quell.setup import SetupError, load_axes, made_axes
 from quell.tuning import Constraints, TunedAxes, tune_axes
 from quell.tuning.axes import _exact, _given_gain, _made, _nominal, diagonal_entry
-from quell.tuning.optimiser.coupled import CoupledLoops, Law, Limits, Plant, integral_gain
+from quell.tuning.optimiser.coupled import (
+    CoupledLoops,
+    Law,
+    Limits,
+    Measured,
+    Plant,
+    integral_gain,
+    starts,
+)
 from quell.tuning.optimiser.loops import area_of_step, pulse_in_blocks
 
 from .benchmark_module import benchmark
+from .cases import cases
 from .commands import Shown
 from .setups import GANTRY
 from .test_coupling import tanks
@@ -60,6 +70,7 @@ def channels(loop: MultivariableLoop) -> tuple[float, float]:
     return max(np.max(np.abs(s)) for s in S), max(np.max(np.abs(1.0 - s)) for s in S)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("own", [False, True])
 def test_the_bounds_hold_for_the_coupled_loop(own: bool) -> None:
     """M_s and M_t of each channel with the others closed, and the disk margins of all at once, by ``analyse_axes``."""
@@ -77,6 +88,7 @@ def test_the_bounds_hold_for_the_coupled_loop(own: bool) -> None:
     assert max(m_s / 1.6, m_t / 1.6, found.disk / least, *m_ks) > 0.98
 
 
+@pytest.mark.trial
 def test_with_the_right_b0_the_coupling_costs_nothing_and_without_it_does() -> None:
     """Behind B0 the axes are two chains of integrators, and each is as good as alone."""
     assert all(each.ratio == pytest.approx(1.0, abs=0.02) for each in tuned().axes)
@@ -89,7 +101,7 @@ def test_with_the_right_b0_the_coupling_costs_nothing_and_without_it_does() -> N
     )
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_bandwidths_are_no_worse_than_those_of_a_grid() -> None:
     """Of equal bandwidths of both axes, which are the best here by symmetry: none within the bounds is better by 2 %."""
     found = tuned()
@@ -117,7 +129,7 @@ def test_the_bandwidths_are_no_worse_than_those_of_a_grid() -> None:
     assert found.axes[0].cost <= 1.02 * best
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_b0_that_is_off_is_designed_for_and_checked() -> None:
     """Drawn errors keep the bounds, the loop is slower than with the exact B0, and no line asks for B0_off."""
     found = tune_axes(machine(), axes(), B0_off=0.03, check_samples=50)
@@ -133,6 +145,7 @@ def test_b0_that_is_off_is_designed_for_and_checked() -> None:
     assert "NOT known for another B0" not in found.summary()
 
 
+@pytest.mark.trial
 def test_steps_that_the_limits_of_u_do_not_allow_are_named() -> None:
     """A larger step of the reference meets the limits at once, a smaller one does not."""
     made = copy.copy(tuned().controller)
@@ -153,7 +166,7 @@ def test_steps_that_the_limits_of_u_do_not_allow_are_named() -> None:
             assert bool(np.max(np.abs(u)) < 3.0) == (share < 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_what_cannot_be_met_is_told_with_what_to_do() -> None:
     """A B0 with the wrong sign of a coupling that all but inverts the machine."""
     strong = np.array([[1.0, 0.97], [0.97, 1.0]]) * 1e-3
@@ -170,6 +183,7 @@ def of_tanks(B0: Any) -> ql.Axes:
     return ql.Axes({"h1": level, "h2": level}, B0=B0)
 
 
+@pytest.mark.trial
 def test_a_zero_in_the_right_half_plane_is_named_and_the_given_b0_not_asked_for_again() -> None:
     """Tanks with their exact B0: no bandwidths are stable, and the inputs to pair are told."""
     plant = tanks((0.43, 0.34))
@@ -188,7 +202,7 @@ def test_a_zero_in_the_right_half_plane_is_named_and_the_given_b0_not_asked_for_
     assert zeros == [[pytest.approx(0.0208, abs=1e-4), 0.0]]
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_pairs_that_are_proposed_meet_the_bounds() -> None:
     """The same tanks with the other inputs; the B0 of the plant, which is worse, is not asked for."""
     plant = tanks((0.43, 0.34))
@@ -227,7 +241,7 @@ def test_a_b0_is_compared_with_that_of_the_plant() -> None:
     assert judged(lagging, axes(np.diag(np.diag(M)))) == (False, None)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_learners_and_limits_stay_and_are_not_in_the_bounds() -> None:
     """The axes keep their learner and guard; the margin with them is told beside the others."""
     given = axes(learner=ql.learners.Kalman(), guard=ql.Guard())
@@ -239,7 +253,7 @@ def test_learners_and_limits_stay_and_are_not_in_the_bounds() -> None:
     assert "with the learners at rest the disk margin is" in found.summary()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("how", "message"),
     [
         ({"B0_off": 1.0}, "B0_off = 1.0: must be a share from 0 to below 1"),
@@ -288,6 +302,7 @@ def of_all() -> Any:
     return ql.learners.RLS(ql.features.AllAxes(ql.features.State()))
 
 
+@pytest.mark.trial
 def test_learners_of_all_axes_are_designed_for_the_tuned_bandwidths_and_told() -> None:
     """Parameters are those of axes that are made with these bandwidths; the margins don't have what they learn."""
     values = np.array([[20.0, 300.0], [30.0, 150.0]])
@@ -309,6 +324,7 @@ def test_learners_of_all_axes_are_designed_for_the_tuned_bandwidths_and_told() -
     assert told not in tuned().summary()
 
 
+@pytest.mark.trial
 def test_what_the_margin_with_learners_does_not_have_is_told() -> None:
     """Remarks of that loop on learners; those on other operating points are told in other words."""
     loop = copy.copy(tuned().loops[0])
@@ -342,6 +358,7 @@ def gantry(**changes: Any) -> dict[str, Any]:
     return data | changes
 
 
+@pytest.mark.trial
 def test_the_command_tunes_all_axes_of_a_setup(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """Its file runs, and has what the results say; options of the command come before those of [tune]."""
     from quell.tuning.report import toml_text
@@ -380,7 +397,7 @@ def test_the_command_refuses_what_is_for_one_axis(
         made_axes("a.toml", gantry(tune={"structure": "pid"}))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_drawn_machine_keeps_its_bounds() -> None:
     """The benchmark's own measures, for one machine with a B0 that is off."""
     trial = benchmark("tune_axes")
@@ -391,9 +408,7 @@ def test_a_drawn_machine_keeps_its_bounds() -> None:
     assert max(worst.values()) <= 1.002
 
 
-@pytest.mark.parametrize(
-    "bandwidths", [(5.0, 50.0), (0.5, 5.0), (0.05, 5.0), (0.05, 0.5), (1e-3, 1e-3)]
-)
+@cases("bandwidths", [(5.0, 50.0), (0.5, 5.0), (0.05, 5.0), (0.05, 0.5), (1e-3, 1e-3)])
 def test_the_cost_of_a_slow_loop_with_fast_samples_is_its_whole_response(
     bandwidths: tuple[float, float],
 ) -> None:
@@ -418,6 +433,7 @@ def test_distances_that_double_change_no_sum_of_an_oscillation() -> None:
         assert area_of_step(system, 1_000_000) == pytest.approx(np.sum(np.abs(y)), rel=1e-4)
 
 
+@pytest.mark.trial
 def test_a_bound_of_damping_is_judged_as_the_others_are() -> None:
     """Its value is that of the poles of ``analyse_axes``, its ratio decides, and the line with NOT names it alone."""
     values = np.array([[30.0, 60.0], [60.0, 40.0]])
@@ -443,7 +459,7 @@ def test_a_bound_of_damping_is_judged_as_the_others_are() -> None:
     assert "M_s" not in line
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_result_without_enough_damping_does_not_meet_its_bounds() -> None:
     """Though its M_s is kept, or all but kept."""
     B0 = np.array([[1.0, 0.4], [0.4, 1.0]])
@@ -455,3 +471,24 @@ def test_a_result_without_enough_damping_does_not_meet_its_bounds() -> None:
     assert not found.met
     assert "damping of the poles is" in found.summary()
     assert found.to_json()["bounds"][-1]["name"] == "damping of the poles"
+
+
+def test_a_search_starts_in_as_many_valleys_as_are_wanted() -> None:
+    """The best of each come first, and no two of them are neighbours on the grid."""
+
+    class Valleys:
+        def measured(self, values: np.ndarray) -> Measured:
+            place = math.log10(values[0, 0])
+            cost = min(abs(place + 2.4), abs(place - 1.2) + 0.1)
+            return Measured(cost, np.array([cost]), np.zeros((1, 1)), True)
+
+    loops: Any = Valleys()
+    values, low, high = np.ones((1, 2)), np.full(2, 1e-9), np.full(2, 1e9)
+    found = starts(loops, values, low, high, 1000)  # all that there are
+    assert [each.rank for each in found] == sorted(each.rank for each in found)
+    apart = [np.log(one.values / two.values) for one, two in itertools.combinations(found, 2)]
+    assert min(np.max(np.abs(each)) for each in apart) > math.log(10.0**0.4)  # no neighbours
+    assert found[0].measured.cost == pytest.approx(0.0, abs=1e-12)
+    for count in (1, 2, 7):
+        some = starts(loops, values, low, high, count)
+        assert [each.rank for each in some] == [each.rank for each in found[:count]]

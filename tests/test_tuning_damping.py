@@ -42,6 +42,7 @@ def axis(count: int, damping: float, sensor: int) -> Any:
 # ---- damping
 
 
+@pytest.mark.trial
 def test_no_pole_of_a_tuned_loop_rings() -> None:
     """With the largest integral gain a PID controller had 0.29; it is 0.4 by default."""
     how: dict[str, Any] = {"structure": "pid", "objective": "load", "compare": ()}
@@ -56,6 +57,7 @@ def test_no_pole_of_a_tuned_loop_rings() -> None:
     assert free.design.k_i > tuned.design.k_i
 
 
+@pytest.mark.trial
 def test_the_poles_of_an_observer_do_not_ring_either() -> None:
     """While u is at a limit they show: an oven had a pair of damping 0.07."""
     oven = [0.7], np.polymul([142.0, 1.0], [19.0, 1.0]).tolist()
@@ -67,6 +69,7 @@ def test_the_poles_of_an_observer_do_not_ring_either() -> None:
     assert np.min(-law.real / np.abs(law)) >= 0.6 - 1e-9
 
 
+@pytest.mark.trial
 def test_the_poles_of_a_dead_time_do_not_count() -> None:
     """Feedback cannot damp an oscillation whose half period is shorter than the dead time."""
     plant = [1.0], np.polymul([0.3, 1.0], [0.3, 1.0]).tolist()
@@ -77,6 +80,7 @@ def test_the_poles_of_a_dead_time_do_not_count() -> None:
     assert tuned.design.measures["damping"] == pytest.approx(np.min(dampings(s, top)), abs=1e-6)
 
 
+@pytest.mark.trial
 def test_a_mode_of_the_plant_may_stay_and_keeps_half_of_its_damping() -> None:
     """The report tells it apart from the other poles, whose damping is 0.4 or more."""
     how: dict[str, Any] = {"structure": "p-pi-notch", "objective": "load", "compare": ()}
@@ -92,7 +96,7 @@ def test_a_mode_of_the_plant_may_stay_and_keeps_half_of_its_damping() -> None:
     assert "mode of the plant: damping 0.0" in tuned.damping
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_structure_that_cannot_keep_the_bound_of_damping_says_so() -> None:
     """A PI controller rings on a lag with an integrator at this M_s; the default takes another."""
     bounds = Constraints(m_s=2.5, m_t=2.5, m_ks=30.0, damping=0.9)
@@ -115,6 +119,7 @@ def test_a_damping_that_no_pair_of_poles_has_is_refused(damping: float) -> None:
         Constraints(damping=damping)
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(("name", "order"), [("pid", 0), ("bandwidths", 2)])
 def test_followed_poles_are_those_of_controllers_nearby(name: str, order: int) -> None:
     """Up to the third power of the distance: parameters 1 % off, poles exact to 1e-4."""
@@ -156,6 +161,7 @@ def test_a_search_by_simulation_keeps_the_bound_of_damping() -> None:
     assert bounds(calm) <= 0.0
 
 
+@pytest.mark.trial
 def test_the_bound_of_damping_is_an_option_of_setup_files(tmp_path: Any) -> None:
     """[tune] damping; the objective of a lower one is better."""
     text = "dt = 0.02\nplant = { kind = 'linear', num = [1.0], den = [1.0, 3.0, 3.0, 1.0] }\n"
@@ -173,7 +179,7 @@ def test_the_bound_of_damping_is_an_option_of_setup_files(tmp_path: Any) -> None
 # ---- peaks
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("count", [2, 3])
 def test_constraints_hold_at_the_narrow_peaks_of_undamped_axes(count: int) -> None:
     """Within 0.1 %, at frequencies as dense as the poles ask for; the grid alone missed 0.7 %."""
@@ -192,7 +198,7 @@ def test_constraints_hold_at_the_narrow_peaks_of_undamped_axes(count: int) -> No
 # ---- more freedom
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("removed", ["m_t", "m_ks", "delay_margin"])
 def test_without_a_constraint_the_objective_is_not_worse(removed: str) -> None:
     """Within the tolerance of the constraints."""
@@ -206,6 +212,7 @@ def test_without_a_constraint_the_objective_is_not_worse(removed: str) -> None:
     assert k_i[1] >= 0.999 * k_i[0]
 
 
+@pytest.mark.trial
 def test_the_search_also_goes_by_optima_of_tighter_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it ended in a worse valley, they lead to the better one."""
     how: dict[str, Any] = {"structure": "pid", "objective": "load", "compare": ()}

@@ -31,6 +31,8 @@ from quell.tuning.simulated import (
 from quell.tuning.simulated.problem import Statistic
 from quell.types import Matrix
 
+from .cases import cases
+
 pytest.importorskip("optuna")
 
 SPACE = {"a": SearchRange(0.1, 10.0), "b": SearchRange(-3.0, 3.0)}
@@ -57,7 +59,7 @@ def two_bowls(values: Any, samples: Sequence[float]) -> Matrix:
     return np.array([[at + (values["b"] + s) ** 2 + x for x in samples] for s in (1.0, -1.0)])
 
 
-@pytest.mark.parametrize(
+@cases(
     ("statistic", "scores", "value"),
     [
         (Mean(), [1.0, 2.0, 6.0], 3.0),
@@ -75,6 +77,7 @@ def test_a_statistic_has_the_value_of_its_definition(
     assert statistic.value(np.array(scores, dtype=float)) == value
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("statistic", "truth"),
     [(Mean(), 0.5), (Quantile(0.8), 0.8), (FailureRate(limit=0.7), 0.3)],
@@ -117,6 +120,7 @@ def test_a_search_finds_the_minimum_whatever_the_sampler_and_the_workers(sampler
     assert search(build, SPACE, BOWL, **options, workers=3) == found
 
 
+@pytest.mark.trial
 def test_cma_finds_a_valley_that_is_not_along_an_axis() -> None:
     """Rosenbrock's, in three parameters: after 300 candidates far below what random ones find."""
 
@@ -306,6 +310,7 @@ def test_a_run_that_diverges_has_an_infinite_score() -> None:
     assert scores[0, 1] == math.inf
 
 
+@pytest.mark.trial
 def test_a_search_beats_its_start_on_fresh_samples_too() -> None:
     """The IAE of a limited loop on plants of uncertain gain, checked on plants that were not used."""
 
@@ -326,7 +331,7 @@ def test_a_search_beats_its_start_on_fresh_samples_too() -> None:
     assert after.samples == 6
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"space": {}}, "at least one SearchRange, by name"),
@@ -383,6 +388,7 @@ BOUNDS = ql.tuning.Constraints(m_s=1.6, m_t=1.6, m_ks=20.0, omega_o_dt=0.4)
 REST = ql.Scenario(duration=2.0, disturbances=(ql.signals.Step(height=0.8),))
 
 
+@pytest.mark.trial
 def test_tune_goes_on_by_simulation_within_the_bounds_of_the_linear_loop() -> None:
     """With limited u and a criterion of the user's it beats the optimum of the linear loop, on fresh plants too."""
 
@@ -444,7 +450,7 @@ def test_tune_by_simulation_takes_plants_that_are_not_linear() -> None:
     assert len(front) > 1
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "message"),
     [
         ({"objective": "rms"}, "objective = 'rms': must be load, load-iae or tracking; any other"),
@@ -475,6 +481,7 @@ m_ks = 10.0
 """
 
 
+@pytest.mark.trial
 def test_a_setup_is_tuned_by_simulation_with_its_friction_and_encoder(tmp_path: Path) -> None:
     """``quell tune --trials``: the result is a setup, and its journal another search's start."""
     file, out, told = (tmp_path / name for name in ("motor.toml", "out.toml", "out.json"))

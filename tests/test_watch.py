@@ -18,6 +18,8 @@ from tests.commands import in_this_process
 from tests.recordings import controller, header_of, rows_of, simulated
 from tests.scripted_axes import Outcome, gantry
 
+from .cases import cases
+
 NAMES = ("a", "b", "c")
 
 
@@ -33,6 +35,7 @@ def fed(watch: Watch, values: Any) -> list[Alarm]:
 # ---- Evidence ----
 
 
+@pytest.mark.trial
 def test_false_alarms_are_as_rare_as_alpha_says_whatever_the_distribution() -> None:
     """Of 150 runs of 150 windows at alpha = 0.1: 15 on average at most; heavy tails, steps, ties."""
     wrong = 0
@@ -301,7 +304,7 @@ def test_a_state_goes_on_where_it_was(tmp_path: Path) -> None:
         np.testing.assert_array_equal(parts.watch.values(name), whole.watch.values(name))
 
 
-@pytest.mark.parametrize(
+@cases(
     "damage",
     [
         lambda state: state.pop("labels"),
@@ -357,6 +360,7 @@ def written(path: Path, signals: list[Signals]) -> str:
     return str(path)
 
 
+@pytest.mark.trial
 def test_the_command_is_run_day_by_day_and_ends_with_6_where_there_is_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -412,6 +416,7 @@ def test_the_sink_of_a_running_loop_sees_what_its_recording_has(tmp_path: Path) 
     assert told == []
 
 
+@pytest.mark.trial
 def test_the_sink_leaves_out_windows_with_gaps_and_goes_on_with_a_state(tmp_path: Path) -> None:
     """A skipped deadline, a missing measurement; cycles before the scenario are no window at all."""
     run, design = simulated(12.0), controller()
@@ -463,6 +468,7 @@ def signals_of_rows(run: ql.Trajectory) -> Signals:
 # ---- Several axes ----
 
 
+@pytest.mark.trial
 def test_each_axis_is_judged_by_its_own_numbers() -> None:
     """The alarm names the axis; axes that change together may have one cause, which is said."""
     for changed, told in ((("y",), "y"), (("x", "y"), "x, y")):
@@ -520,6 +526,7 @@ def test_a_window_that_lacks_too_much_of_one_axis_is_left_out() -> None:
     assert (machine.left_out, machine.watch.labels) == (1, [])
 
 
+@pytest.mark.trial
 def test_a_recording_of_axes_is_watched_as_the_running_loop_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,6 +29,7 @@ from quell.realtime.wire import (
 )
 
 from .benchmark_module import benchmark
+from .cases import cases
 from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed
 
 HOSTILE = Path(__file__).parents[1] / "benchmarks" / "hostile_wire.py"
@@ -290,8 +291,8 @@ def test_a_stranger_who_knows_the_session_can_not_use_it(bench: Callable[..., Be
 
 
 @pytest.mark.skipif(not HOSTILE.exists(), reason="the trial is in the repository only")
-@pytest.mark.parametrize("several", [False, True])
-@pytest.mark.parametrize("wire", WIRES)
+@cases("several", [False, True])
+@cases("wire", WIRES)
 def test_hostile_packets_bytes_and_files_do_nothing(wire: str, several: bool) -> None:
     """The trial of ``benchmarks/hostile_wire.py``, six hundred attacks; with three signals, too."""
     if wire == "serial":

@@ -29,6 +29,7 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
     "linear": {"num": [1.5], "den": [1.0, 1.0]},
     "delayed": {"plant": _LAG, "delay": 0.02, "dt": 0.01},
     "encoded": {"plant": _LAG, "counts": 16_000},
+    "lagged": {"plant": _LAG, "lag": 0.02},
     "n-mass": {"inertias": [1.0, 0.5, 2.0], "stiffnesses": [3.0, 2.0], "sensor": 3},
 }
 
@@ -51,6 +52,7 @@ PLANTS: dict[str, Any] = {
     if name not in FROM_FILES
 } | {
     "delayed, by part of a sample": ql.plants.delayed(_LAG, delay=0.0125, dt=0.01),
+    "lagged, not linear": ql.plants.lagged(ql.plants.torsional(late=2), lag=0.003),
     "torsional, late": ql.plants.torsional(late=2),
     "torsional, not rounded": ql.plants.torsional(dac_bits=None, counts=None),
     "n-mass, play": ql.plants.n_mass(

@@ -44,6 +44,7 @@ from quell.plants import registry
 from quell.plants.base import advance, begin_run, measure
 from quell.plants.multivariable import measure_all
 from quell.simulation.driver import run_block
+from tests.cases import cases
 
 from .examples import (
     CHAIN,
@@ -148,7 +149,7 @@ def move_all(model: Any, x: Any, scratch: Any, u: Any, w: Any, y: Any) -> None:
         advance(model, x, scratch, 0.01 * k, u[k], w[k])
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", PLANTS_OF_AXES)
 def test_a_plant_of_several_signals_moves_the_same_again_and_interpreted(name: str) -> None:
@@ -180,6 +181,7 @@ def move(model: Any, x: Any, scratch: Any, u: Any, w: Any, y: Any) -> None:
         advance(model, x, scratch, 0.01 * k, u[k], w[k])
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_plant_moves_the_same_again_and_interpreted(name: str) -> None:
@@ -202,7 +204,8 @@ def test_a_plant_moves_the_same_again_and_interpreted(name: str) -> None:
     np.testing.assert_allclose(moved(True), first, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.trial
+@cases("name", PLANTS)
 def test_a_plant_changes_nothing_but_its_state(name: str, rng: np.random.Generator) -> None:
     """Parameters and inputs stay; measuring changes nothing."""
     plant = PLANTS[name]
@@ -273,8 +276,9 @@ TO_COMPILE = [
 ]
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", TO_COMPILE)
+@cases("name", TO_COMPILE)
 def test_an_observer_estimates_the_same_again_and_interpreted(
     name: str, rng: np.random.Generator
 ) -> None:
@@ -311,6 +315,7 @@ def test_an_observer_runs_the_same_again(name: str) -> None:
     assert np.all(np.isfinite(first.log))
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 def test_a_guarded_learner_runs_the_same_again_and_interpreted() -> None:
     """In a loop: same seed, same output; no second compilation; interpreted = compiled.
@@ -377,7 +382,7 @@ def test_a_learner_does_not_see_the_derivatives_of_f(name: str, rng: np.random.G
     assert said[0] == said[1]
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@cases("name", LEARNERS)
 def test_a_learner_names_its_coefficients(name: str) -> None:
     """Each once, and as many as it writes."""
     learner = LEARNERS[name]
@@ -504,7 +509,7 @@ OTHER_FEATURES = ("with u", "on the strongest", "radial features", "random featu
 IN_LOOPS = [name for name in LEARNERS if not name.endswith(OTHER_FEATURES)]
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", TO_DRIVE)
 def test_a_learner_says_the_same_interpreted(name: str, rng: np.random.Generator) -> None:
@@ -522,6 +527,7 @@ def test_a_learner_says_the_same_interpreted(name: str, rng: np.random.Generator
     np.testing.assert_allclose(plain_theta, theta, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", TO_DRIVE)
 def test_a_learner_stays_bounded_without_excitation(name: str, rng: np.random.Generator) -> None:
@@ -533,6 +539,7 @@ def test_a_learner_stays_bounded_without_excitation(name: str, rng: np.random.Ge
         assert np.all(np.abs(array) < 1e6), label
 
 
+@pytest.mark.trial
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", TO_DRIVE)
 def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.Generator) -> None:
@@ -559,6 +566,7 @@ def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.
     np.testing.assert_array_equal(said[0], said[1])
 
 
+@pytest.mark.trial(cases="MLP")
 @pytest.mark.parametrize("name", [name for name in LEARNERS if name != "NoLearner"])
 def test_a_learner_that_forgets_is_a_new_one(name: str, rng: np.random.Generator) -> None:
     """Whatever it was shown before: from there on it predicts what a new one does."""
@@ -637,6 +645,7 @@ def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
             np.testing.assert_array_equal(arrays[label], array, err_msg=label)
 
 
+@pytest.mark.trial(cases="MLP")
 @pytest.mark.parametrize("name", IN_LOOPS)
 @pytest.mark.parametrize("form", ["current", "predictor"])
 def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
@@ -650,7 +659,7 @@ def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
 
 
-@pytest.mark.parametrize("name", PYTHON_LEARNERS)
+@cases("name", PYTHON_LEARNERS)
 def test_a_model_in_python_is_refused_by_name_in_single_precision(name: str) -> None:
     """Its functions take double arrays by address."""
     observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)

@@ -22,10 +22,9 @@ from quell.controllers.schedule import control_as_observed
 from quell.controllers.stateful import named_arrays
 from quell.observers.forms import acting_control, expected_measurement
 from quell.tuning.optimiser.loops import law_of
+from tests.cases import cases
 
 from .test_contracts import CHAIN, SCENARIO, check_run
-
-pytestmark = pytest.mark.compiled
 
 DT = 0.01
 ESO = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT)
@@ -155,7 +154,8 @@ SEVERAL: dict[str, Any] = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.trial
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", SEVERAL)
 def test_several_signals_step_as_they_are_simulated(name: str) -> None:
     """Compiled ``step`` with what was measured gives the u of an interpreted run but for rounding."""
@@ -175,7 +175,8 @@ def test_several_signals_step_as_they_are_simulated(name: str) -> None:
 WITHOUT_REST = ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
+@pytest.mark.compiled
 def test_a_loop_runs_the_same_again_and_interpreted() -> None:
     """Same seed, same output; no second compilation; interpreted = compiled; ``step`` gives the same u and state.
 
@@ -196,7 +197,8 @@ def test_a_loop_runs_the_same_again_and_interpreted() -> None:
 IN_LOOPS = [name for name in CONTROLLERS if name != "Prefiltered ADRC"]
 
 
-@pytest.mark.slow
+@pytest.mark.trial
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", IN_LOOPS)
 def test_a_step_at_a_time_is_the_simulated_run_and_interpreted(name: str) -> None:
     """Compiled ``step`` with what was measured gives the u of an interpreted run but for rounding, and its state; again, the same bits."""
@@ -224,7 +226,7 @@ NOT_LINEAR = {
 }
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@cases("name", CONTROLLERS)
 def test_the_closed_form_of_a_law_is_the_measured_one(name: str) -> None:
     """The responses of u to pulses of r, y and u agree; what is not linear, or changes, is refused."""
     controller = CONTROLLERS[name]
@@ -257,7 +259,8 @@ def awaited(controller: Any, y: float) -> float:
     return expected_measurement(design.eso, state.z, observed, known)
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.trial
+@cases("name", CONTROLLERS)
 def test_a_bad_sample_is_held_and_limits_hold(name: str) -> None:
     """As if the last good ones had come again, or what an observer expects; u always a number within its limits."""
     one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
@@ -274,7 +277,8 @@ def test_a_bad_sample_is_held_and_limits_hold(name: str) -> None:
         before = u
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.trial
+@cases("name", CONTROLLERS)
 def test_a_controller_that_is_told_of_limits_is_one_that_has_them(name: str) -> None:
     """Told sample after sample what narrower limits behind it leave of u, it does what it does with those limits of its own."""
     told, own = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
@@ -301,7 +305,8 @@ def _narrow(controller: Any, low: float, high: float) -> None:
         controller._initialise()
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.trial
+@cases("name", CONTROLLERS)
 def test_a_controller_takes_over_without_a_bump(name: str) -> None:
     """It watched a plant that rests where u = 0 holds it, with its reference there; what it then applies itself begins at zero."""
     controller = copy.deepcopy(CONTROLLERS[name])
@@ -312,7 +317,7 @@ def test_a_controller_takes_over_without_a_bump(name: str) -> None:
     assert controller.step(0.7, 0.7) == pytest.approx(0.0, abs=0.02)
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@cases("name", CONTROLLERS)
 def test_a_controller_waits_for_its_first_measurement(name: str) -> None:
     """Nothing moves, and then it is as if nothing had been."""
     one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
@@ -320,7 +325,8 @@ def test_a_controller_waits_for_its_first_measurement(name: str) -> None:
     assert [one.step(1.0, y) for y in (0.5, 0.4)] == [other.step(1.0, y) for y in (0.5, 0.4)]
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.trial
+@cases("name", CONTROLLERS)
 def test_a_controller_goes_on_without_a_trace(name: str) -> None:
     """Saved and restored by named arrays, copied, or sent: the same bits from there on; reset, it begins anew."""
     one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
@@ -338,7 +344,9 @@ def test_a_controller_goes_on_without_a_trace(name: str) -> None:
         one.state = {}
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.trial
+@pytest.mark.compiled
+@cases("name", CONTROLLERS)
 def test_a_step_allocates_nothing(name: str) -> None:
     """Once compiled, a thousand steps ask Numba's runtime for no memory; preparing is no step."""
     controller = copy.deepcopy(CONTROLLERS[name])

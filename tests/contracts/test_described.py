@@ -15,6 +15,7 @@ from quell import observers as observer_room
 from quell import plants as plant_room
 from quell.controllers import baselines as baseline_room
 from quell.controllers.single import in_single_precision
+from tests.cases import cases
 
 from .examples import LEARNERS, OBSERVERS, PLANTS
 from .test_controllers import CONTROLLERS, SEVERAL
@@ -78,7 +79,7 @@ def test_every_public_class_has_an_example() -> None:
     assert public_classes() - _WITHOUT - made <= shown
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@cases("name", EXAMPLES)
 def test_an_object_prints_its_numbers_and_no_address(name: str) -> None:
     """In one line, with the name of its class."""
     shown = repr(EXAMPLES[name])
@@ -101,7 +102,7 @@ def test_the_numbers_are_those_the_object_was_made_with() -> None:
         assert part in repr(adrc)
 
 
-@pytest.mark.parametrize("name", [name for name in learner_room.__all__ if name not in _WITHOUT])
+@cases("name", [name for name in learner_room.__all__ if name not in _WITHOUT])
 def test_features_are_the_first_argument_of_every_learner_that_takes_them(name: str) -> None:
     """By the name ``features``; behind the model where a learner is made of one."""
     thing = getattr(learner_room, name)

@@ -26,6 +26,7 @@ from quell.realtime.devices import (
 from quell.realtime.registry import SCHEMES, listen, open_device
 from quell.realtime.rig import Rig
 from quell.realtime.system import system_clock
+from tests.cases import cases
 from tests.rig_bench import DT, PLANT, WIRES, Bench, PlainRig
 
 DOCS = Path(__file__).parents[2] / "docs" / "devices.md"
@@ -177,7 +178,7 @@ def test_it_is_a_device_and_opened_by_its_url(example: Any) -> None:
     assert example.sample(device, 0.0) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.compiled
 @every
 def test_it_measures_the_plant_that_u_moves(example: Any) -> None:
@@ -315,7 +316,7 @@ URLS = [
 ]
 
 
-@pytest.mark.parametrize("url", URLS)
+@cases("url", URLS)
 def test_a_url_of_no_device_is_refused_in_a_line(url: str) -> None:
     """Before anything is opened, at both ends."""
     ends = [lambda: open_device(url, DT)]
@@ -327,7 +328,8 @@ def test_a_url_of_no_device_is_refused_in_a_line(url: str) -> None:
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.trial
+@cases("scheme", SCHEMES)
 def test_it_is_named_wherever_devices_are(scheme: str, capsys: pytest.CaptureFixture[str]) -> None:
     """In the message about an unknown one, in the commands' help and on the page."""
     with pytest.raises(ValueError, match=re.escape(SCHEMES[scheme].example)):

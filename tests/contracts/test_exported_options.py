@@ -30,6 +30,7 @@ from quell.kernels.sized import constant_fields
 from quell.kernels.user_functions import origin_of
 from quell.observers.design import FORMS
 from tests import gain_functions
+from tests.cases import cases
 from tests.in_c import built, needs_gcc
 
 from .examples import OwnModel
@@ -350,7 +351,7 @@ def test_every_part_is_here() -> None:
     assert not {*NO_PARTS, *IN_PYTHON} - public_classes()
 
 
-@pytest.mark.parametrize("name", PARTS)
+@cases("name", PARTS)
 def test_every_option_has_another_value(name: str) -> None:
     """An option that is added to a part fails here until it has a row."""
     part = PARTS[name]
@@ -408,7 +409,7 @@ def programs() -> dict[str, dict[str, Any]]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("name", PARTS)
 @pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")
@@ -425,6 +426,7 @@ def test_every_program_repeats_the_kernels_bit_for_bit(tmp_path: Path, name: str
         assert "largest difference 0 ulp" in done.stdout, row
 
 
+@pytest.mark.trial
 @pytest.mark.filterwarnings("ignore::quell.types.DesignWarning")
 def test_what_changes_the_code_is_seen() -> None:
     """A number alone is no program of its own; a search for frequencies, another feature and another order are."""

@@ -40,6 +40,7 @@ REFUSED = {
 INSTEAD = {"ros2": "quell.export.c", "st": "export each axis by itself as an ADRC|use --to c"}
 
 
+@pytest.mark.trial
 def test_there_are_examples_of_all_kinds() -> None:
     """Axes, state feedback, compensators, functions of B0, and files."""
     kinds = {type(make()).__name__ for make in EVERY.values()}
@@ -47,6 +48,7 @@ def test_there_are_examples_of_all_kinds() -> None:
     assert len(FILES) >= 1
 
 
+@pytest.mark.trial(cases="ros2|M-st|actuators-st")
 @pytest.mark.parametrize("form", ["ros2", "st"])
 @pytest.mark.parametrize("name", EVERY)
 def test_a_controller_of_several_signals_is_written_or_refused_by_name(

@@ -169,7 +169,7 @@ def drawn_axes(returned: Any) -> list[Any]:
     return list(np.ravel(np.asarray(returned, dtype=object)))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str, Case]) -> None:
     """A new figure is pyplot's current one; given axes come back; another number is an error."""
     for name, (draw, count) in cases.items():
@@ -227,6 +227,7 @@ _INSIDE = {
 }
 
 
+@pytest.mark.trial
 def test_no_function_that_draws_is_forgotten(cases: dict[str, Case]) -> None:
     """All public functions ``plot``, ``plot_…`` and ``draw`` of the package are in the list."""
     found = set()

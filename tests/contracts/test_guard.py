@@ -19,6 +19,7 @@ from quell.guard.kernels import F_L
 from quell.learners.base import lag_memory, lag_of, lag_push
 from quell.observers.design import FORMS
 from quell.plants import delayed, n_mass
+from tests.cases import cases
 
 from .examples import EXTENDED
 
@@ -135,7 +136,7 @@ def test_every_observer_form_is_among_them() -> None:
         ql.Guard().design(nonlinear)
 
 
-@pytest.mark.parametrize("name", EXTENDED)
+@cases("name", EXTENDED)
 def test_a_guard_refuses_every_observer_with_more_extended_states(name: str) -> None:
     """And says why: a ramp of f_L moves nothing, and would have to leak away."""
     if "nonlinear" not in name:
@@ -171,7 +172,7 @@ def rms(loop: Loop, controller: ql.ADRC) -> float:
     return float(np.sqrt(np.mean(run["y"][run.t >= 0.25 * LAGS * lag] ** 2)))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize(("name", "plant"), PAIRS)
 def test_a_guarded_learner_does_no_harm(name: str, plant: str) -> None:
     """Its error is at most 1.02 times that without learner, whether the model is right or its load is 30 % off.
@@ -192,6 +193,7 @@ def test_a_guarded_learner_does_no_harm(name: str, plant: str) -> None:
     assert rms(loop, guarded) <= 1.02 * rms(loop, plain)
 
 
+@pytest.mark.trial(cases="cascade")
 @pytest.mark.parametrize(("name", "sensor"), {(o, PLANTS[p].sensor): 0 for o, p in PAIRS})
 def test_without_authority_nothing_acts_after_ten_lags(name: str, sensor: str) -> None:
     """A learner that had full authority and pushed has none any more: f_L is f_L^F, to the bit, whatever it says."""

@@ -14,6 +14,7 @@ import quell as ql
 from quell.controllers import in_single_precision
 from quell.controllers.memory import CHECK, HEADER, check_of
 from quell.export import c_source
+from tests.cases import cases
 from tests.in_c import InC, needs_gcc
 
 from .examples import LEARNERS, OBSERVERS, PYTHON_LEARNERS
@@ -69,7 +70,7 @@ def saved(in_c: InC, size: int) -> bytes:
     return image.raw
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 @pytest.mark.parametrize("name", CASES)
@@ -98,7 +99,7 @@ def test_python_and_c_continue_each_others_loops(tmp_path: Path, name: str, sing
         assert again.step(r, y, *more) == in_c.run("step", r, y, *more)
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize(
     "name", [f"learner: {each}" for each in ("Kalman", "RLS", "Harmonic", "Repetitive", "MLP")]
@@ -121,7 +122,7 @@ def test_what_was_learned_begins_from_rest(tmp_path: Path, name: str) -> None:
         assert found[0] == found[1] == found[2]
 
 
-@pytest.mark.parametrize("name", PYTHON_LEARNERS)
+@cases("name", PYTHON_LEARNERS)
 def test_a_learner_in_python_has_no_image_and_says_what_to_do(name: str) -> None:
     """Nothing is pickled."""
     controller = ql.ADRC(_CHAIN, 1.5, learner=PYTHON_LEARNERS[name])
@@ -130,7 +131,7 @@ def test_a_learner_in_python_has_no_image_and_says_what_to_do(name: str) -> None
             attempt()
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 def test_damaged_images_are_refused_and_change_nothing(tmp_path: Path, single: bool) -> None:
@@ -157,7 +158,7 @@ def test_damaged_images_are_refused_and_change_nothing(tmp_path: Path, single: b
     assert saved(in_c, len(image)) == controller.memory() == image
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @needs_gcc
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -191,7 +192,7 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize(("change", "fits"), CHANGES)
+@cases(("change", "fits"), CHANGES)
 def test_an_image_fits_where_its_numbers_mean_the_same(change: dict[str, Any], fits: bool) -> None:
     """Gains may change between two starts; b0, dt and what is learned may not. A running loop needs all."""
 
@@ -224,6 +225,7 @@ def test_an_image_fits_where_its_numbers_mean_the_same(change: dict[str, Any], f
             second.restore(first.memory(), running=True)
 
 
+@pytest.mark.trial
 @needs_gcc
 def test_an_image_that_was_forged_in_manual_operation_is_refused(tmp_path: Path) -> None:
     """The u of manual operation has no limits; between two samples there is none."""

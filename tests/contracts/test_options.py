@@ -157,7 +157,7 @@ CASES: dict[str, dict[str, Case]] = {
     },
     "proxy": {
         "SETUP": ("slow.toml", "--host", "udp://127.0.0.1:0"), "--host": (("proxy.toml", "--host", "udp://127.0.0.1:0"), ("proxy.toml", "--host", "udp://127.0.0.2:0")), "--device": ("--device", "twin:two-mass"),
-        "--watchdog": ("--watchdog", "9"), "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
+        "--seconds": ("--seconds", "2"), "--log": ("--log", "log.csv"), "--priority": ("--priority", "0"), "--cpu": ("--cpu", "0"),
     },
     "setup": {"FILES": ("other.toml",), "--schema": (_SETUP, ("--schema",))},
     "run": {"SETUP": ("--no-figures",), "--example": (("--example",), _SETUP), "--save": ("--save", "run.nc")},
@@ -307,7 +307,7 @@ def test_every_option_has_a_case() -> None:
         assert covered <= {f"--{each.lstrip('-').lower()}" for each in options}, command
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of a dt that contradicts the times
 @pytest.mark.parametrize(
     ("command", "option"),

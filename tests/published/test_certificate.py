@@ -9,6 +9,7 @@ from quell.analysis import certify
 from quell.guard.guard import plain_loop
 from quell.lti.models import peak_gain
 from quell.plants.linear import sampled_plant
+from tests.cases import cases
 
 # From a correction that is added in the law alone, at b/b0 = 0.7, 1.1, 1.3 and 1.6.
 LAW_ALONE = {
@@ -42,7 +43,7 @@ def test_gains_in_the_law_alone_are_the_ones_of_the_table(order: int) -> None:
         assert f"{peak_gain(to_error):.{digits}f}" == given
 
 
-@pytest.mark.parametrize(("order", "b"), THROUGH_OBSERVER)
+@cases(("order", "b"), THROUGH_OBSERVER)
 def test_gains_through_the_observer_are_the_ones_of_the_table(order: int, b: float) -> None:
     """The estimates of the state move, too, which costs little at orders 1 and 2."""
     found = certify(chain(order, b), design(order))

@@ -11,6 +11,7 @@ import quell as ql
 from quell import analysis
 from quell.controllers import adrc_for_dead_time, dead_time_tuning
 from quell.setup import made
+from tests.cases import cases
 
 DT = 0.01
 HALF = 0.5 * DT
@@ -41,8 +42,8 @@ def test_robustness_is_skogestads(
     assert m.phase == pytest.approx(phase_margin, abs=3.2)
 
 
-@pytest.mark.parametrize("rule", ["simc", "amigo"])
-@pytest.mark.parametrize("T", [0.1, 1.0, 3.0, 30.0])
+@cases("rule", ["simc", "amigo"])
+@cases("T", [0.1, 1.0, 3.0, 30.0])
 def test_the_adrc_is_the_pi_of_the_rule(rule: str, T: float) -> None:
     """Its equivalent PID has K_c and T_i as the rules print them, and a filter of a tenth of L or T_i."""
     K, L = -2.0, 0.7
@@ -69,6 +70,7 @@ def test_loops_of_all_ratios_are_robust(rule: str, ratio: float) -> None:
     assert analysis.analyse(([3.9], [ratio, 1.0]), controller, delay=1.3).stable
 
 
+@pytest.mark.trial
 def test_a_late_plant_follows_and_rejects_a_load() -> None:
     """Without visible overshoot, with the integral of the error under a load that theory gives: T_i/K_c."""
     K, T, L = 2.0, 4.0, 1.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
 import quell as ql
 from quell.controllers.law import law_gains
+from tests.cases import cases
 
 OMEGA_O = 20.0
 
@@ -33,9 +33,9 @@ def predictor(order: int, dt: float) -> list[float]:
     ]
 
 
-@pytest.mark.parametrize("half_gain", [False, True])
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("dt", [1e-3, 5e-3, 5e-2])
+@cases("half_gain", [False, True])
+@cases("order", [1, 2])
+@cases("dt", [1e-3, 5e-3, 5e-2])
 def test_observer_gains_are_the_published_ones(order: int, dt: float, half_gain: bool) -> None:
     """Both forms, and half of them (Herbst, Hempel, Göhrt & Streif 2020); the predictor's gain is Φ L in the form used here."""
     share = 0.5 if half_gain else 1.0

@@ -29,7 +29,7 @@ def continuous(A: np.ndarray) -> complex:
     return complex(poles[np.argmax(poles.imag)])
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_nfoursid_finds_the_same_pole_and_gain(record: tuple[np.ndarray, np.ndarray]) -> None:
     """Within 1 %; output error is the nearer one, as it should be with white noise, and within its own deviations of the truth."""
     pandas = pytest.importorskip("pandas")

@@ -18,6 +18,7 @@ import quell as ql
 from quell.experiments import two_mass_spring as study
 from quell.experiments.two_mass_spring import Range, all_controllers, range_of
 from quell.experiments.two_mass_spring import ranges as ranges_of_study
+from tests.cases import cases
 
 pytestmark = pytest.mark.compiled
 
@@ -34,7 +35,7 @@ def scores(name: str, dt: float, seed: int, reset: bool = True) -> dict[str, flo
     return dict(study.score(run) | study.margins(law, run))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("dt", DTS)
 def test_mf_eso_overshoots_by_four_and_a_half_per_mille_and_settles_in_16_6_seconds(
     dt: float,
@@ -47,6 +48,7 @@ def test_mf_eso_overshoots_by_four_and_a_half_per_mille_and_settles_in_16_6_seco
         assert 16.4 <= found["settling_time"] <= 16.8
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("dt", DTS)
 def test_mb_eso_does_not_overshoot_and_settles_in_12_seconds(dt: float) -> None:
     """Paper: 0 and 12 s."""
@@ -56,7 +58,7 @@ def test_mb_eso_does_not_overshoot_and_settles_in_12_seconds(dt: float) -> None:
         assert 12.0 <= found["settling_time"] <= 12.4
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize("reset", [True, False])
 @pytest.mark.parametrize("dt", DTS)
 def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_bandwidth(
@@ -71,7 +73,7 @@ def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_band
         assert found["control_variation"] <= 1.1 * scores(study.MF, dt, seed)["control_variation"]
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.parametrize(
     ("name", "overshoot", "settling", "peak", "variation"),
     [
@@ -97,6 +99,7 @@ def test_the_reference_figures_are_met(
     assert found["control_variation"] == pytest.approx(variation, rel=0.02)
 
 
+@pytest.mark.trial
 def test_without_the_reset_mf_eso_has_the_rms_error_of_the_reference() -> None:
     """docs/paper: 0.178 m over [110, 250] s."""
     assert scores(study.MF, 1e-3, 0, reset=False)["rms_from_step"] == pytest.approx(
@@ -104,7 +107,7 @@ def test_without_the_reset_mf_eso_has_the_rms_error_of_the_reference() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_whatever_the_batch() -> (
     None
 ):
@@ -118,6 +121,7 @@ def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_wha
             assert stable or run.ended > study.FORCE_AT
 
 
+@pytest.mark.trial
 def test_what_is_learned_is_the_plant() -> None:
     """θ after training is (0, 0, −2, 0), to 0.06."""
     settings = study.Settings()
@@ -129,7 +133,8 @@ def test_what_is_learned_is_the_plant() -> None:
     )
 
 
-@pytest.mark.parametrize(
+@pytest.mark.trial
+@cases(
     ("learner", "reference"),
     [
         (ql.learners.NoLearner(), 2.62),
@@ -151,6 +156,7 @@ def test_the_margins_with_a_learner_are_those_of_the_running_loop(
     assert 1.0 / loop.margins.modulus == pytest.approx(reference, rel=0.01)
 
 
+@pytest.mark.trial
 def test_the_ranges_are_those_of_single_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean and interval over three seeds; the peaks under the other forces those of runs with them."""
     settings = study.Settings(dt=1e-2, seeds=3)

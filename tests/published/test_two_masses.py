@@ -12,6 +12,8 @@ from quell.analysis import analyse
 
 from . import two_masses
 
+pytestmark = pytest.mark.trial
+
 figures, algorithm_1 = cache(two_masses.figures), cache(two_masses.algorithm_1)
 PRINTED = {
     (False, 1, 10.0): ("2.63", "1.04e+04", "0.236", "4.50", "16.6"),
@@ -39,7 +41,6 @@ ROWS = {
 README = Path(__file__).parents[2] / "README.md"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", PRINTED)
 def test_the_independent_program_gives_the_printed_figures(case: tuple[bool, int, float]) -> None:
     """MF-ESO with two extended states at 7 and 7.5 rad/s among them, to the printed digits."""
@@ -48,7 +49,6 @@ def test_the_independent_program_gives_the_printed_figures(case: tuple[bool, int
     assert (*first, f"{1e3 * found.overshoot:.2f}", f"{found.settling:.1f}") == PRINTED[case]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS)
 def test_the_rows_of_the_readme_are_those_of_the_independent_program(row: str) -> None:
     """To the printed digits, with f held over a sample as in quell; the control variation within twice its interval."""

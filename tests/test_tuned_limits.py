@@ -1,0 +1,242 @@
+"""Tuned loops as they are written: what a report says is what the file does, at the limits of u."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.controllers.baselines import PID
+from quell.controllers.prefilters import Prefiltered
+from quell.controllers.shaping import ProfileGenerator
+from quell.plants.linear import LaggedPlant
+from quell.setup import load
+from quell.setup.loading import tuning_task
+from quell.tuning.acceptance import Loop, judge
+from quell.tuning.reference import Axis, _profiles
+from quell.tuning.written import StepFigures, Written, late_tables
+
+MOTOR = ([50.0], [1.0, 4.0, 0.0])
+DT = 1e-3
+SETUP = """dt = 0.001
+[plant]
+kind = "linear"
+num = [50.0]
+den = [1.0, 4.0, 0.0]
+[controller]
+u_min = -10.0
+u_max = 10.0
+[scenario]
+duration = 0.8
+reference = {{ kind = "step", height = 0.5, at = 0.1 }}
+disturbances = [{{ kind = "step", height = 3.0, at = 0.5 }}]
+noise = {{ kind = "noise", power = 1e-10, sample_time = 0.001 }}
+[tune]
+structure = "{structure}"
+compare = []
+{more}
+"""
+
+
+def tuned(path: Path, structure: str = "bandwidths", more: str = "") -> Any:
+    """Return the result for the setup."""
+    path.write_text(SETUP.format(structure=structure, more=more), encoding="utf-8")
+    task = tuning_task(path)
+    return ql.tune(task.plant, task.dt, **task.options)
+
+
+@pytest.mark.trial
+@pytest.mark.parametrize(
+    ("structure", "more"),
+    [("bandwidths", ""), ("pid", ""), ("p-pi-notch", ""), ("bandwidths", "actuator_lag = 0.004")],
+)
+def test_the_step_that_is_printed_is_that_of_the_file(
+    tmp_path: Path, structure: str, more: str
+) -> None:
+    """The file is loaded and run: overshoot and settling time are those of the report, to rounding, with prefilter, limits, noise and the lag of the actuator."""
+    found = tuned(tmp_path / "motor.toml", structure, more)
+    found.save(tmp_path / "tuned.toml")
+    setup = load(tmp_path / "tuned.toml")
+    assert repr(setup.controller) == repr(found.controller)
+    run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    step = found.reference_step
+    measures = run.metrics(0.1, 0.5, band=step.band)
+    assert (step.size, step.at) == (0.5, pytest.approx(0.1))
+    assert measures["overshoot"] == pytest.approx(step.overshoot, abs=1e-9)
+    assert measures["settling_time"] == pytest.approx(step.settling, abs=1e-9)
+    assert str(step) in found.toml()
+    if more:
+        assert setup.plant.order == 3
+        assert "actuator_lag" not in setup.tune
+
+
+@pytest.mark.trial
+@pytest.mark.parametrize("structure", ["bandwidths", "pid"])
+def test_a_step_of_an_axis_overshoots_little_at_the_limits(tmp_path: Path, structure: str) -> None:
+    """By 5 % at most, without u at a limit for long; with feedforward within 1.3 times the fastest move, 2 √(h/(b u_max))."""
+    found = tuned(tmp_path / "motor.toml", structure)
+    step = found.reference_step
+    assert step.overshoot <= 0.05
+    assert step.limited <= 0.005
+    assert not found.judged.failures
+    if structure == "bandwidths":
+        assert step.settling <= 1.3 * 2.0 * math.sqrt(0.5 / 500.0)
+
+
+@pytest.mark.trial
+def test_the_noise_of_a_setup_bounds_the_loop(tmp_path: Path) -> None:
+    """That of its scenario, 3.2e-4 in a sample, with the limits of u: nothing is guessed."""
+    found = tuned(tmp_path / "motor.toml")
+    assert found.constraints.noise == pytest.approx(math.sqrt(1e-10 / DT), rel=0.1)
+    assert found.noise_bound.startswith("std(u): 2 % of half the range of u, 10")
+
+
+@pytest.mark.trial
+def test_where_no_noise_is_known_the_bound_is_called_a_guess() -> None:
+    """By a line that begins with NOT and says what to give."""
+    found = ql.tune(([1.0], [1.0, 1.0]), 0.05, structure="pi", compare=())
+    assert found.noise_bound.startswith("NOT known what noise does to u, so a guess")
+
+
+def written(scenario: ql.Scenario) -> Written:
+    """Return the motor, 30 ms late, in a scenario."""
+    plant = ql.plants.delayed(ql.plants.LinearPlant.of(MOTOR), 0.03, DT)
+    return Written(plant, scenario, DT)
+
+
+def cascade(gain: float) -> PID:
+    """Return a controller of the motor, which is well damped with a gain of 1."""
+    return PID(kp=1.0 * gain, ki=0.0, kd=0.15 * gain, tf=2e-3, dt=DT, u_min=-10.0, u_max=10.0)
+
+
+def test_a_loop_that_cycles_between_the_limits_is_seen() -> None:
+    """A gain with which the linear loop is unstable: u goes from limit to limit, and the step never settles; with a lower gain it does."""
+    file = written(ql.Scenario(reference=ql.signals.Step(0.5, 0.01), duration=2.0))
+    for gain, fails in ((1.0, False), (40.0, True)):
+        controller = cascade(gain)
+        run = file.run(controller)
+        figures = file.figures(controller, run)
+        assert figures is not None
+        assert file.cycles(controller, run) is fails
+        assert str(figures).startswith("NOT settled" if fails else "step of the reference by 0.5")
+
+
+def test_the_largest_step_is_looked_at_up_to_the_next_event() -> None:
+    """Of two steps and a load between them; a reference that moves has none."""
+    steps = ql.signals.Step(0.2, 0.1) + ql.signals.Step(-0.6, 0.3)
+    file = written(
+        ql.Scenario(reference=steps, duration=0.9, disturbances=[ql.signals.Step(1.0, 0.5)])
+    )
+    assert file.largest == (300, 500, pytest.approx(-0.6))
+    moving = written(ql.Scenario(reference=ql.signals.Sinusoid(1.0, 2.0), duration=0.2))
+    assert moving.largest is None
+    assert moving.stepping(0.3, 0.2, 10).largest == (10, 211, pytest.approx(0.3))
+
+
+def test_the_band_grows_with_the_noise_and_says_so() -> None:
+    """2 % and three standard deviations; a small one changes no digit."""
+    figures = StepFigures(0.3, 0.5, 0.021, 0.093, 0.0201, 1.0, 0.0)
+    text = (
+        "step of the reference by 0.3 at 0.5 s: overshoots by 2.1 %, settles within 2 % in 0.093 s"
+    )
+    assert str(figures) == text
+    assert "within 5 % (with three deviations of the noise)" in str(figures._replace(band=0.05))
+    assert str(figures._replace(settling=math.nan)).startswith("NOT settled: step of the")
+    assert str(figures._replace(overshoot=math.inf)).startswith("NOT stable: step of the")
+
+
+@pytest.mark.parametrize("viscous", [0.0, 0.08])
+def test_a_profile_keeps_to_the_room_for_u(viscous: float) -> None:
+    """|c_1 v + c_2 a| along its move, also of one ten times as long, is what it may be at most."""
+    axis = Axis(viscous, 0.02)
+    profile = axis.profile(0.5, 8.0, 0.01)
+    for size in (0.05, 0.5, 5.0):
+        move = ql.signals.LimitedMove(size, profile.v_max, profile.a_max, profile.j_max)
+        t, speed = np.linspace(0.0, move.duration, 2000), move.derivative()
+        u = viscous * speed(t) + 0.02 * speed.derivative()(t)
+        assert np.max(np.abs(u)) <= 8.0 * (1.0 + 1e-9)
+    assert profile.a_max / profile.j_max == pytest.approx(0.01)
+
+
+def test_an_overload_lasts_as_long_as_it_says() -> None:
+    """An integrator runs away at what u lacks of the load; then it comes back as slowly as u lets it."""
+    dt = 5e-3
+    file = Written(
+        ql.plants.LinearPlant.of(([1.0], [1.0, 0.0])), ql.Scenario(0.0, duration=1.0), dt
+    )
+    controller = PID(kp=10.0, dt=dt, u_min=-1.0, u_max=1.0)
+    short, long = file.overloads(controller, None, 0.1, -1.0)
+    assert (short.load, long.load) == (-1.4, -1.4)
+    assert (short.duration, long.duration) == pytest.approx((0.5, 2.0))
+    assert long.peak - short.peak == pytest.approx(0.4 * 1.5, rel=1e-3)
+    # Until u leaves its limit at an error of 0.1 y comes back at a rate of 1, then with 1/kp.
+    for each in (short, long):
+        after = 0.1 * math.log(0.1 / (0.02 * each.peak))
+        assert each.back == pytest.approx(each.peak - 0.1 + after, abs=2.0 * dt)
+        assert each.passes
+
+
+def test_profiles_ramp_the_acceleration_in_samples_and_in_time_constants() -> None:
+    """Four samples, one and three time constants of the loop; quick ones come first."""
+    found = list(_profiles(Axis(0.0, 0.02), 0.5, 8.0, tau=0.03, dt=1e-3))
+    ramps = {round(each.a_max / each.j_max, 9) for each in found}
+    assert ramps == {0.004, 0.03, 0.09}
+    moves = [ql.signals.LimitedMove(0.5, each.v_max, each.a_max, each.j_max) for each in found]
+    times = [move.duration for move in moves]
+    assert times == sorted(times)
+    rigid = 2.0 * math.sqrt(0.5 * 0.02 / 8.0)
+    assert rigid < times[0] < 1.1 * rigid
+
+
+def test_a_lag_of_the_actuator_stands_before_the_delay_in_a_file() -> None:
+    """Its state comes behind those of the plant; ranges and points keep their place."""
+    plant = ql.plants.delayed(ql.plants.LinearPlant.of(MOTOR), 2e-3, DT)
+    inner = {"kind": "linear", "num": [50.0], "den": [1.0, 4.0, 0.0], "uncertain": {"num": [1, 2]}}
+    tables = {
+        "plant": {"kind": "delayed", "delay": 2e-3, "plant": inner},
+        "scenario": {"x0": [1.0, 2.0, 3.0, 4.0]},
+    }
+    found = late_tables(tables, plant, DT, 1e-3, 0.01)
+    assert found["plant"]["kind"] == "delayed"
+    assert found["plant"]["plant"]["kind"] == "lagged"
+    assert found["scenario"]["x0"] == [1.0, 2.0, 0.0, 3.0, 4.0, 0.0]
+    late = ql.plants.lagged(plant, 0.01)
+    assert isinstance(late, type(plant))
+    assert late.plant.A[2, 2] == pytest.approx(-100.0)
+
+
+def test_a_plant_that_is_not_linear_gets_the_mean_of_the_lag() -> None:
+    """Beside the exact lag of the same plant the error is of the second order in dt."""
+    linear, scenario = ql.plants.LinearPlant.of(([1.0], [1.0, 1.0])), ql.Scenario(1.0, duration=0.5)
+    errors = []
+    for dt in (0.01, 0.005):
+        controller = PID(kp=2.0, dt=dt)
+        exact = ql.simulate(ql.plants.lagged(linear, 0.05), controller, scenario)["y"]
+        mean = ql.simulate(LaggedPlant(linear, 0.05), controller, scenario)["y"]
+        errors.append(float(np.max(np.abs(mean - exact))))
+    assert errors[1] < 0.35 * errors[0] < 0.35 * 2e-3
+
+
+def test_a_wrapper_has_the_numbers_of_its_controller() -> None:
+    """As kp of a PID behind a profile generator; objects and methods stay inside."""
+    shaped = Prefiltered(cascade(1.0), ProfileGenerator(1.0, 10.0, 100.0))
+    assert shaped.kp == 1.0
+    with pytest.raises(AttributeError, match="no attribute 'polynomials'"):
+        _ = shaped.polynomials
+
+
+@pytest.mark.trial
+def test_a_design_that_fails_at_the_limits_gives_a_line_with_not() -> None:
+    """A loop that is unstable as soon as u is limited, beside one that is accepted."""
+    found = ql.tune(MOTOR, DT, structure="bandwidths", compare=(), u_min=-10.0, u_max=10.0)
+    assert isinstance(found.loop, Loop)
+    assert not found.judged.failures
+    assert found.judged.overloads
+    late = found.loop.written.plant, found.loop.written.scenario
+    file = Written(ql.plants.delayed(late[0], 0.03, DT), late[1], DT)
+    bad = judge(found.loop._replace(shaped=False, written=file), cascade(40.0), found.analysis)
+    assert bad.failures[0].startswith("NOT settled")
