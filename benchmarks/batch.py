@@ -1,6 +1,6 @@
 """Speed of batch simulation in runs per second.
 
-    python benchmarks/batch.py [--runs 1000] [--axes]
+    python benchmarks/batch.py [--runs 1000] [--trials 5] [--axes]
 
 Random two-mass plants, 30 s at 10 ms, with an ADRC and a model-based ESO, or (--axes) gantries of
 two coupled axes, 2 s at 1 ms: as a batch on all cores
@@ -10,12 +10,12 @@ best of several interleaved trials, because single times on a shared machine var
 
 from __future__ import annotations
 
-import argparse
 import os
 import timeit
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 
@@ -56,12 +56,11 @@ def gantries(runs: int) -> tuple[Any, ...]:
 
 def main() -> None:
     """Print runs per second, and the ratio to a loop over ``simulate``."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--runs", type=int, default=1000)
     parser.add_argument("--axes", action="store_true", help="machines of two axes")
-    given = parser.parse_args()
+    parser.add_argument("--trials", type=int, default=5, help="of which the best counts")
+    given = options_of(parser, runs=20, trials=1)
     runs = given.runs
     plants, controller, scenario = (gantries if given.axes else two_masses)(runs)
     result = ql.simulate(plants, controller, scenario)
@@ -77,7 +76,11 @@ def main() -> None:
         lambda: [ql.simulate(plant, controller, scenario) for plant in plants],
     )
     times = np.min(
-        [[timeit.timeit(candidate, number=1) for candidate in candidates] for _ in range(5)], axis=0
+        [
+            [timeit.timeit(candidate, number=1) for candidate in candidates]
+            for _ in range(given.trials)
+        ],
+        axis=0,
     ).tolist()
     labels = (
         "making the plants",
@@ -85,11 +88,14 @@ def main() -> None:
         "batch on one core",
         "loop over simulate",
     )
+    figures: dict[str, Any] = {"runs": runs, "diverged": np.count_nonzero(result.diverged)}
     for label, time in zip(labels, times, strict=True):
         print(
             f"{label:26s} {time:7.3f} s {runs / time:9.0f} runs/s {times[-1] / time:7.1f} × "
             f"the loop"
         )
+        figures[label] = {"runs/s": runs / time, "times the loop": times[-1] / time}
+    write(given, figures)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -106,18 +105,20 @@ def best(*candidates: Callable[[], object], trials: int) -> list[float]:
     return found
 
 
-def row(what: str, ratio: float, bar: str, times: str) -> dict[str, object]:
-    """Return a row of the table."""
-    return {"what": what, "ratio": ratio, "bar": bar, "times": times}
+def row(what: str, ratio: float, bar: str, times: str, **more: float) -> dict[str, object]:
+    """Return a row of the table; ``more`` are figures that it does not show as numbers."""
+    return {"what": what, "ratio": ratio, "bar": bar, "times": times, **more}
 
 
-def show(rows: Sequence[dict[str, object]], file: Path | None, title: str | None = None) -> None:
-    """Print a table, and write its rows to ``file`` unless it is None."""
+def show(rows: Sequence[dict[str, object]], title: str | None = None) -> dict[str, object]:
+    """Print a table; return its figures by their names."""
     table = Table("what", "measured", "bar", "times", title=title)
     for line in rows:
         table.add_row(
             str(line["what"]), f"{line['ratio']:.2f}", str(line["bar"]), str(line["times"])
         )
     Console().print(table)
-    if file:
-        file.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return {
+        str(line["what"]): {key: line[key] for key in line if key not in ("what", "bar")}
+        for line in rows
+    }

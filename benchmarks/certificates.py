@@ -22,11 +22,11 @@ python benchmarks/certificates.py --honest 100
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from numba import njit
 from rich.console import Console
 from rich.table import Table
@@ -162,14 +162,17 @@ class Attacked:
 
 def main() -> None:
     """Print bound over worst, by load and by order."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--loops", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--honest", type=int, help="only what certificates cost, in so many loops")
-    options = parser.parse_args()
+    options = options_of(parser, loops=1, honest=1)
+    figures: dict[str, Any] = {}
     if options.honest:
-        honest(options.honest)
-        return
+        figures["honest"] = honest(options.honest)
+        if not options.quick:
+            write(options, figures)
+            return
     rng = np.random.default_rng(options.seed)
     rows = []
     while len({row[0] for row in rows}) < options.loops:
@@ -185,17 +188,19 @@ def main() -> None:
             rows.append(
                 (loop.seed, loop.order, load, attacked.kappa, growth, growth / q, bound_y / y)
             )
-    show(rows)
+    figures["bound over worst"] = show(rows)
+    write(options, figures)
 
 
-def honest(count: int) -> None:
-    """Print what a certificate costs an honest learner in random two-mass loops."""
+def honest(count: int) -> dict[str, Any]:
+    """Print what a certificate costs an honest learner in random two-mass loops; return it."""
     loops = draw_loops(count, np.random.default_rng(21))
     plain = np.array(in_parallel([partial(errors, loop, None, None) for loop in loops]))
     table = Table(title=f"Harmonic() in {count} two-mass loops, RMS errors over MF-ESO's")
     for heading in ("guard", "κ: least, median", "run: median, most", "load: median, 99 %, most"):
         table.add_column(heading)
     table.add_column("late: median")
+    figures: dict[str, Any] = {}
     certified = [Guard(certified_for=loop.plant) for loop in loops]
     for name, guards in (
         ("none", [None] * count),
@@ -217,11 +222,25 @@ def honest(count: int) -> None:
             f"{np.nanmedian(load):.3f}, {np.nanquantile(load, 0.99):.3f}, {np.nanmax(load):.3f}",
             f"{np.nanmedian(late):.4f}",
         )
+        figures[name] = {
+            "kappa": "without a guard there is none"
+            if guards[0] is None
+            else {"least": np.min(kappas), "median": np.median(kappas)},
+            "run": {"median": np.nanmedian(run), "largest": np.nanmax(run)},
+            "load": {
+                "median": np.nanmedian(load),
+                "99 %": np.nanquantile(load, 0.99),
+                "largest": np.nanmax(load),
+            },
+            "late": {"median": np.nanmedian(late)},
+        }
     Console(width=110).print(table)
+    return {"loops": count} | figures
 
 
-def show(rows: list[Any]) -> None:
-    """Print the table."""
+def show(rows: list[Any]) -> dict[str, Any]:
+    """Print the table, and return it."""
+    figures: dict[str, Any] = {}
     table = Table(title="Bound over worst found")
     for heading in ("", "loops", "κ", "bound on q", "q: median, least, most", "y: the same"):
         table.add_column(heading)
@@ -243,7 +262,12 @@ def show(rows: list[Any]) -> None:
             f"{median[2]:.2f}, {least[2]:.3f}, {most[2]:.2f}",
             f"{median[3]:.2f}, {least[3]:.3f}, {most[3]:.2f}",
         )
+        figures[name] = {"loops": len({row[0] for row in part}), "bound on q": median[1]}
+        for label, i in (("q", 2), ("y", 3)):
+            spread = {"median": median[i], "least": least[i], "largest": most[i]}
+            figures[name][label] = spread
     Console(width=110).print(table)
+    return figures
 
 
 if __name__ == "__main__":

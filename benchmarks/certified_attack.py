@@ -16,11 +16,11 @@ python benchmarks/certified_attack.py [--loops 40] [--seed 1] [--generations 5] 
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -118,12 +118,12 @@ def spent(order: int, load: str, rng: Any, count: int) -> tuple[Case, Any]:
 
 def main() -> None:
     """Attack, and print the worst scores of each family."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--loops", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--generations", type=int, default=5)
     parser.add_argument("--population", type=int, default=24)
-    options = parser.parse_args()
+    options = options_of(parser, loops=7, generations=1, population=2)
     rng, names = np.random.default_rng(options.seed), FAMILIES + CHAINS
     rows: dict[str, list[Any]] = {name: [] for name in names}
     for i in range(options.loops):
@@ -138,11 +138,12 @@ def main() -> None:
             case = general_case(loop)
             worst = searched(loop, case, rng, options.generations, options.population)
         rows[name].append([case.proof.kappa, case.proof.error_factor, *worst])
-    show(rows, options.generations * options.population)
+    write(options, show(rows, options.generations * options.population))
 
 
-def show(rows: dict[str, list[Any]], each: int) -> None:
-    """Print the table."""
+def show(rows: dict[str, list[Any]], each: int) -> dict[str, Any]:
+    """Print the table, and return it."""
+    figures: dict[str, Any] = {"learners a loop": each}
     table = Table(title=f"Worst of {each} learners a loop, over the bound: must be below 1")
     headings = (
         "",
@@ -167,7 +168,16 @@ def show(rows: dict[str, list[Any]], each: int) -> None:
                 f"{median[3]:.3f}, {worst[3]:.3f}",
                 f"{np.mean(values[:, 4] > 0.5):.0%}",
             )
+            figures[name] = {
+                "loops": len(part),
+                "kappa": {"least": values[:, 0].min(), "largest": worst[0]},
+                "bound on q": {"median": median[1]},
+                "q": {"median": median[2], "largest": worst[2]},
+                "y": {"median": median[3], "largest": worst[3]},
+                "trusted": np.mean(values[:, 4] > 0.5),
+            }
     Console(width=110).print(table)
+    return figures
 
 
 if __name__ == "__main__":

@@ -16,11 +16,12 @@ largest errors, over those of MF-ESO. Seed 123 was for tuning.
 
 from __future__ import annotations
 
-import argparse
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -108,8 +109,9 @@ def other_errors(
     return float(np.sqrt(np.mean(error**2))), float(np.max(error))
 
 
-def print_other_loads(loops: int, seed: int) -> None:
-    """Print a table of the loads that are not two sinusoids."""
+def print_other_loads(loops: int, seed: int) -> dict[str, Any]:
+    """Print a table of the loads that are not two sinusoids; return it."""
+    rows: dict[str, Any] = {}
     rng = np.random.default_rng([seed, 0])
     table = Table(
         *("load", "learner", "guard", "RMS: median", "largest", "peak: median", "largest"),
@@ -122,26 +124,33 @@ def print_other_loads(loops: int, seed: int) -> None:
             for guard in (False, True):
                 errors = np.array([other_errors(*case, learner, guard) for case in cases])
                 ratios = errors / plain
-                figures = (f(ratios[:, i]) for i in range(2) for f in (np.median, np.max))
+                figures = [f(ratios[:, i]) for i in range(2) for f in (np.median, np.max)]
                 words = (kind, name, "yes" if guard else "no")
                 table.add_row(*words, *(f"{value:.2f}" for value in figures))
+                names = ("RMS: median", "RMS: largest", "peak: median", "peak: largest")
+                row = rows.setdefault(kind, {})
+                row[f"{name}, guarded" if guard else name] = dict(zip(names, figures, strict=True))
     Console(width=100).print(table)
+    return rows
 
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--loops", type=int, default=50)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--other-loads", action="store_true")
-    options = parser.parse_args()
+    options = options_of(parser, loops=1)
     if options.loops < 1:
         parser.error(f"--loops {options.loops}: must be 1 or more")
     if options.seed < 0:
         parser.error(f"--seed {options.seed}: must be 0 or more")
-    if options.other_loads:
-        print_other_loads(options.loops, options.seed)
-        return
+    figures: dict[str, Any] = {"loops": options.loops}
+    if options.other_loads or options.quick:
+        figures["other loads"] = print_other_loads(options.loops, options.seed)
+        if not options.quick:
+            write(options, figures)
+            return
     table = Table(
         *("factor", "learner", "guard", "median", "90 %", "largest", f"at most {BAR:g}"),
         title=f"peak over MF-ESO's, {options.loops} loops a row, seed {options.seed}",
@@ -154,7 +163,13 @@ def main() -> None:
                 *(f"{value:.4f}" for value in quantiles),
                 f"{np.mean(values <= BAR):.0%}",
             )
+            row = figures.setdefault(f"factor {factor:g}", {})
+            row[f"{name}, guarded" if guard else name] = {
+                **dict(zip(("median", "90 %", "largest"), quantiles, strict=True)),
+                f"share at most {BAR:g}": np.mean(values <= BAR),
+            }
     Console(width=100).print(table)
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,14 @@
 """A servo with the measured cogging of a real motor: learners over time and over position.
 
-    python benchmarks/cogging.py FILE [--only LEARNER]
+    python benchmarks/cogging.py [FILE] [--only LEARNER] [--share 1]
 
-FILE is a record of the current that holds a motor at each encoder count over a revolution, with
-columns count and current [A] (gchenfc/ODrive, analysis/cogging_torque, MIT). Its orders 7, 28, 14,
-36, 12 and 84 hold 99.6 % of the power. The motor is ``plants.dc_motor`` with its defaults, torque
-constant 0.05 N m/A, so up to 0.1 N m of cogging beside 0.01 N m of Coulomb friction and J = 2e-4
-kg m². The loop: dt = 1 ms, model-free ESO of 150 rad/s, omega_c = 30 rad/s, feedforward of the
-reference's derivatives, encoder of 8192 counts. Scenarios, with the time that is judged:
+FILE, ``../shared/data/cogging_a.csv`` by default, is a record of the current that holds a motor at
+each encoder count over a revolution, with columns count and current [A] (gchenfc/ODrive,
+analysis/cogging_torque, MIT). Its orders 7, 28, 14, 36, 12 and 84 hold 99.6 % of the power. The
+motor is ``plants.dc_motor`` with its defaults, torque constant 0.05 N m/A, so up to 0.1 N m of
+cogging beside 0.01 N m of Coulomb friction and J = 2e-4 kg m². The loop: dt = 1 ms, model-free ESO
+of 150 rad/s, omega_c = 30 rad/s, feedforward of the reference's derivatives, encoder of 8192
+counts. Scenarios, with the time that is judged:
 
 =============  ====================================================================================
 0.03 rev/s     100 s, from 50 s on
@@ -22,18 +23,18 @@ restart        the same, by a restart: at 60 s the motor stands at angle zero, w
 =============  ====================================================================================
 
 All figures are RMS errors of the position over that of MF-ESO (learner none, in mrad), with and
-without guard.
+without guard. ``--share`` makes all runs shorter by this factor, 0.3 at least.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import check_present, options_of, parser_of, shared_data, write
 from rich.console import Console
 from rich.table import Table
 
@@ -148,61 +149,85 @@ STEADY = {
 }
 
 
-def steady(plant: Any, learner: Any, guard: Any, name: str) -> float:
+def steady(plant: Any, learner: Any, guard: Any, name: str, share: float = 1.0) -> float:
     """Return the RMS error of a scenario without shift [rad]."""
-    reference, seconds, since = STEADY[name]
+    reference, seconds, since = STEADY[name][0], *(share * t for t in STEADY[name][1:])
     return rms(error(plant, learner, guard, reference, seconds, ())[round(since / DT) :])
 
 
-def shifted(plant: Any, learner: Any, guard: Any, restart: bool) -> tuple[float, float]:
+def shifted(
+    plant: Any, learner: Any, guard: Any, restart: bool, share: float = 1.0
+) -> tuple[float, float]:
     """Return the worst window after the shift [rad], and the revolutions until as good as before.
 
     These are infinite if it is never as good within the run.
     """
-    moved, reference = ql.signals.Step(math.pi, at=SHIFT_AT), turning(SHIFT_SPEED)
+    at, end = share * SHIFT_AT, share * END
+    moved, reference = ql.signals.Step(math.pi, at=at), turning(SHIFT_SPEED)
     if restart:
-        again = ql.signals.Ramp(slope=math.tau * SHIFT_SPEED, start=SHIFT_AT)
-        reference = reference.until(SHIFT_AT, then=math.pi + again)
-        options: dict[str, Any] = {"noise": moved, "rest_at": (SHIFT_AT,)}
-        e = error(plant, learner, guard, reference, END, (), **options)
+        again = ql.signals.Ramp(slope=math.tau * SHIFT_SPEED, start=at)
+        reference = reference.until(at, then=math.pi + again)
+        options: dict[str, Any] = {"noise": moved, "rest_at": (at,)}
+        e = error(plant, learner, guard, reference, end, (), **options)
     else:
-        e = error(plant, learner, guard, reference, END, (0.0, moved))
-    first, revolution = round(SHIFT_AT / DT), 1.0 / SHIFT_SPEED
+        e = error(plant, learner, guard, reference, end, (0.0, moved))
+    first, revolution = round(at / DT), 1.0 / SHIFT_SPEED
     worst = float(np.max(moving_rms(e, 10.0 * LAG)[first:]))
     last = moving_rms(e, revolution)
     good = np.flatnonzero(last[first + round(revolution / DT) :] <= 1.1 * last[first - 1])
     return worst, 1.0 + good[0] * DT / revolution if good.size else math.inf
 
 
-def shown(value: float, plain: float, learner: Any) -> str:
+def ratio(value: float, plain: float, learner: Any) -> float:
     """Return an error over that of MF-ESO; without learner, in mrad."""
-    return f"{1e3 * value:.1f}" if learner is None else f"{value / plain:.3f}"
+    return 1e3 * value if learner is None else value / plain
+
+
+def shown(value: float, plain: float, learner: Any) -> str:
+    """Return the same as a text."""
+    return f"{ratio(value, plain, learner):.{1 if learner is None else 3}f}"
 
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(description="Learners on a servo with measured cogging.")
-    parser.add_argument("file", help="record with columns count and current")
+    parser = parser_of(__doc__)
+    measured = shared_data("cogging_a.csv")
+    parser.add_argument("file", nargs="?", type=Path, default=measured, help="count and current")
     parser.add_argument("--only", choices=[*LEARNERS], help="this learner and none alone")
-    options = parser.parse_args()
+    parser.add_argument("--share", type=float, default=1.0, help="of the length of the runs")
+    options = options_of(parser, only="the same, relearn=4", share=0.3)
+    if not 0.3 <= options.share <= 1.0:
+        parser.error(f"--share {options.share}: must be from 0.3 to 1")
+    check_present(options, files=[options.file])
     plant = motor(options.file)
     title = "RMS error over MF-ESO's; for it, in mrad"
     shifts = {"shift": False, "restart": True}
     columns = [name for shift in shifts for name in (f"{shift}: worst", "revolutions")]
     table = Table("learner", "guard", *STEADY, *columns, title=title)
     plain: dict[str, float] = {}
+    figures: dict[str, dict[str, Any]] = {}
     for label, learner in LEARNERS.items():
         if options.only and label not in ("none", options.only):
             continue
         for guard in (None, ql.Guard()) if learner is not None else (None,):
-            found = {name: steady(plant, learner, guard, name) for name in STEADY}
-            worst = {n: shifted(plant, learner, guard, restart) for n, restart in shifts.items()}
+            found = {n: steady(plant, learner, guard, n, options.share) for n in STEADY}
+            worst = {
+                name: shifted(plant, learner, guard, restart, options.share)
+                for name, restart in shifts.items()
+            }
             plain = plain or found | {n: value for n, (value, _) in worst.items()}
             cells = [shown(value, plain[name], learner) for name, value in found.items()]
+            row = {name: ratio(value, plain[name], learner) for name, value in found.items()}
+            figures[f"{label}, guarded" if guard else label] = row
             for name, (value, revolutions) in worst.items():
+                row[f"{name}: worst"] = ratio(value, plain[name], learner)
+                row[f"{name}: revolutions"] = (
+                    revolutions if math.isfinite(revolutions) else "not within the run"
+                )
                 cells += [shown(value, plain[name], learner), f"{revolutions:.1f}"]
             table.add_row(label, "yes" if guard else "no", *cells)
     Console(width=170).print(table)
+    write(options, figures)
 
 
 if __name__ == "__main__":

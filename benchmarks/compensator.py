@@ -23,6 +23,7 @@ import math
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -38,11 +39,11 @@ def axis(share: float = 1.0) -> Any:
     return ql.plants.n_mass([share * MOTOR, share * LOAD], [STIFFNESS], [DAMPING], loads=[2])
 
 
-def on_the_axis() -> None:
+def on_the_axis(quick: bool) -> dict[str, Any]:
     """Print the error of PID, compensator and learners under loads of several frequencies."""
     nominal = axis()
     limits = {"u_min": -3.5, "u_max": 3.5}
-    pid = ql.tune(nominal, DT, structure="pid", delay=DT, compare=(), **limits).controller
+    pid = ql.tune(nominal, DT, structure="pid", delay=DT, compare=(), **limits).design.controller
     found = ql.tuning.tune_compensator(nominal, pid, delay=DT)
     CONSOLE.print(str(found))
     observer = found.compensator.observer
@@ -56,27 +57,33 @@ def on_the_axis() -> None:
         damping=None,
     )  # fmt: skip
     how: dict[str, Any] = {"structure": "pid", "delay": DT, "compare": (), **limits}
-    anew = ql.tune(nominal, DT, constraints=bounds, **how).controller
+    anew = ql.tune(nominal, DT, constraints=bounds, **how).design.controller
     headings = ("plant", "load", "PID tuned anew", *learners)
     table = Table(*headings, title="Error over that of the PID alone")
-    for share in (1.0, 0.7, 1.3):
+    figures: dict[str, Any] = {
+        "M_s of the tuned compensator": found.after.m_s,
+    }
+    for share in (1.0,) if quick else (1.0, 0.7, 1.3):
         plant = ql.plants.delayed(ql.plants.encoded(axis(share), 2**20), DT, DT)
-        for frequency in (1.0, 4.0, 10.0):
+        for frequency in (10.0,) if quick else (1.0, 4.0, 10.0):
             load = ql.signals.Sinusoid(0.4, 2.0 * math.pi * frequency)
-            scenario = ql.Scenario(duration=6.0, disturbances=[load])
+            scenario = ql.Scenario(duration=0.15 if quick else 6.0, disturbances=[load])
 
             def late(controller: Any, plant: Any = plant, scenario: Any = scenario) -> float:
-                y = ql.simulate(plant, controller, scenario)["y"]
+                y = ql.simulate(plant, controller, scenario, interpret=quick)["y"]
                 return float(np.sqrt(np.mean(y[2 * y.size // 3 :] ** 2)))
 
             alone = late(pid)
-            row = [f"{late(anew) / alone:.3f}"]
-            for options in learners.values():
+            ratios = {"PID tuned anew": late(anew) / alone}
+            for name, options in learners.items():
                 more = {"omega_c": 60.0, **options} if options else {}
                 both = ql.Compensated(pid, ql.Compensator(observer, **more))
-                row.append(f"{late(both) / alone:.3f}")
+                ratios[name] = late(both) / alone
+            row = [f"{ratio:.3f}" for ratio in ratios.values()]
             table.add_row(f"inertias × {share:g}", f"{frequency:g} Hz", *row)
+            figures[f"inertias times {share:g}, {frequency:g} Hz"] = ratios
     CONSOLE.print(table)
+    return figures
 
 
 KV, J0, LENGTH, LINK, G = 12.0, 0.9, 0.45, 1.5, 9.81
@@ -90,19 +97,20 @@ def joint(t: float, x: Any, u: float, w: Any) -> tuple[float, float]:
     return x[1], torque / inertia
 
 
-def on_the_joint() -> None:
+def on_the_joint(quick: bool) -> dict[str, Any]:
     """Print the tracking error with and without compensator, and what the safe set keeps."""
+    end = 3.0 if quick else 60.0
     dt, kp, tf = 2e-3, 4.0, 0.02
     plant = ql.plants.NonlinearPlant(joint, order=2, substeps=4, name="joint")
     from_r = np.polyadd(kp * np.array([tf, 1.0]), [1.0, 0.0])
     system = realised([from_r.tolist(), (-kp * np.array([tf, 1.0])).tolist()], [tf, 1.0])
     outer = ql.controllers.LinearController(sampled_law(system, dt), dt, u_min=-4.0, u_max=4.0)
-    payload = ql.signals.Samples([0.0, 20.0, 20.5, 60.0], [0.0, 0.0, 2.0, 2.0])
+    payload = ql.signals.Samples([0.0, end / 3.0, end / 3.0 + 0.5, end], [0.0, 0.0, 2.0, 2.0])
 
     def errors(controller: Any, amplitude: float) -> tuple[float, float, float, Any]:
         reference = ql.signals.Sinusoid(amplitude, 2.0 * math.pi * 0.25)
-        scenario = ql.Scenario(reference, 60.0, disturbances=[payload])
-        run = ql.simulate(plant, controller, scenario)
+        scenario = ql.Scenario(reference, end, disturbances=[payload])
+        run = ql.simulate(plant, controller, scenario, interpret=quick)
         error, half = run["r"] - run["y"], len(run) // 3
         late = [
             float(np.sqrt(np.mean(part**2)))
@@ -124,11 +132,13 @@ def on_the_joint() -> None:
         title="Joint: RMS error [rad]",
     )  # fmt: skip
     alone = errors(outer, 0.8)
+    figures: dict[str, Any] = {}
     for name, controller in rows.items():
         light, heavy, _, _ = errors(controller, 0.8)
         ratio = f"{light / alone[0]:.3f}; {heavy / alone[1]:.3f}"
         most = errors(controller, 1.0)[2]
         table.add_row(name, f"{light:.4f}", f"{heavy:.4f}", ratio, f"{most:.3f}")
+        figures[name] = joint_figures(light, heavy, alone, most)
     b0 = 0.5 * (KV / J0 + KV / (J0 + 2.0 * LENGTH**2))
     model = ql.ESO.model_based(([b0], [1.0, b0, 0.0]), 80.0, dt)
     band = ql.SafeSet(-0.85, 0.85, alpha=8.0, f_rate=100.0, gain_error=0.2)
@@ -140,8 +150,26 @@ def on_the_joint() -> None:
     name = "model-based, with a safe set, r = 0.5"
     table.add_row(name, f"{light:.4f}", f"{heavy:.4f}", ratio, f"{most:.3f} ({status.name})")
     CONSOLE.print(table)
+    return figures | {name: joint_figures(light, heavy, plain, most)}
+
+
+def joint_figures(light: float, heavy: float, alone: Any, most: float) -> dict[str, float]:
+    """Return the figures of a controller of the joint."""
+    return {
+        "RMS without payload [rad]": light,
+        "RMS with payload [rad]": heavy,
+        "without payload, over alone": light / alone[0],
+        "with payload, over alone": heavy / alone[1],
+        "max |y| at r = 1.0": most,
+    }
+
+
+def main() -> None:
+    """Measure both."""
+    options = options_of(parser_of(__doc__))
+    on_axis, on_joint = on_the_axis(options.quick), on_the_joint(options.quick)
+    write(options, {"axis": on_axis, "joint": on_joint})
 
 
 if __name__ == "__main__":
-    on_the_axis()
-    on_the_joint()
+    main()

@@ -2,7 +2,6 @@
 
     python benchmarks/default_structure.py                 all 133 plants: about an hour
     python benchmarks/default_structure.py --every 11      each eleventh plant
-    python benchmarks/default_structure.py --json file     the rows as JSON, too
 
 Each plant is tuned with its dead time as the only option. A row has the structure that was chosen,
 its integral of ``|y|`` after a step of the load, from a simulation, over that of the best of all
@@ -11,14 +10,12 @@ structures that were tried, and overshoot and settling of a step of the referenc
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from tuning import batch, sample_time
 
 import quell as ql
@@ -65,11 +62,10 @@ def trial(plant: tuple[str, list[float], list[float], float]) -> dict[str, Any]:
 
 def main() -> None:
     """Print a row for each plant, and the worst."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    given = options_of(parser, first=100, every=1000)
     warnings.simplefilter("ignore")
     rows = []
     for plant in batch()[given.first :: given.every]:
@@ -81,13 +77,19 @@ def main() -> None:
             f"{row['settling']:.0f} samples, {row['cpu']:.1f} s",
             flush=True,
         )
-        if given.json is not None:
-            given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     ratios = np.array([row["ratio"] for row in rows])
+    cpu = np.median([row["cpu"] for row in rows])
     print(
         f"{ratios.size} plants: IAE over the best at most {np.max(ratios):.3f} (bar {BAR}), median "
-        f"{np.median(ratios):.3f}; CPU {np.median([r['cpu'] for r in rows]):.1f} s in the median"
+        f"{np.median(ratios):.3f}; CPU {cpu:.1f} s in the median"
     )
+    figures = {
+        "plants": ratios.size,
+        "IAE over the best": {"median": np.median(ratios), "largest": np.max(ratios)},
+        "above the bar": np.count_nonzero(ratios > BAR),
+        "CPU [s]": {"median": cpu},
+    }
+    write(given, figures | {"rows": rows})
 
 
 if __name__ == "__main__":

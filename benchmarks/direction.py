@@ -16,14 +16,15 @@ loads of 5 to 90 % of u's limit that step, grow or oscillate, at any time; noise
 
 from __future__ import annotations
 
-import argparse
 import math
 import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
+from quell.kernels import dispatch
 from quell.kernels.dispatch import call_specialised, compiled
 from quell.realtime import Safety
 from quell.realtime.supervisor import ARMED, initial_state, runs_away
@@ -175,20 +176,19 @@ def trial(draw: Draw, wrong: bool) -> Loop:
 
 def main() -> None:
     """Run the loops and print the answers."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--loops", type=int, default=3000)
     parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = options_of(parser, loops=9)
+    dispatch.interpret_all = options.quick  # few loops are quicker so than to compile
     warnings.simplefilter("ignore", ql.DesignWarning)
     draw = Draw(options.seed)
     loops = [trial(draw, wrong=i % 3 == 2) for i in range(options.loops)]
-    print_table(loops)
+    write(options, print_table(loops))
 
 
-def print_table(loops: list[Loop]) -> None:
-    """Print counts, times and distances."""
+def print_table(loops: list[Loop]) -> dict[str, Any]:
+    """Print counts, times and distances; return them."""
     print(f"{'loops':<38} {'number':>6} {'ended':>6} {'omega_c t: median':>18} {'90 %':>6}")
     honest = [one for one in loops if not one.wrong]
     stable = [one for one in honest if one.stable]
@@ -205,10 +205,13 @@ def print_table(loops: list[Loop]) -> None:
     rows |= {
         f"wrong sign, it moves, {kind}": [o for o in moving if o.kind == kind] for kind in KINDS
     }
+    figures: dict[str, Any] = {}
     for name, group in rows.items():
         times = [one.ended for one in group if not math.isnan(one.ended)]
         median, most = np.quantile(times, [0.5, 0.9]) if times else (math.nan, math.nan)
         print(f"{name:<38} {len(group):>6} {len(times):>6} {median:>18.1f} {most:>6.1f}")
+        ended = {"median": median, "90 %": most} if times else "none was ended"
+        figures[name] = {"loops": len(group), "ended": len(times), "omega_c t": ended}
     far = sorted(one.beyond for one in stable)
     print(
         f"y of stable loops beyond the reference, in units of range plus reach: 99 % below "
@@ -216,6 +219,12 @@ def print_table(loops: list[Loop]) -> None:
     )
     late = [o for o in wrong if math.isnan(o.ended) and o.beyond > 10.0]
     print(f"wrong sign, not ended by the first motion, but by the bounds of y: {len(late)}")
+    return figures | {
+        "y of stable loops beyond the reference": {
+            "99 %": np.quantile(far, 0.99), "largest": far[-1],
+        },
+        "wrong sign, ended by the bounds of y": len(late),
+    }  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -13,12 +13,12 @@ are two coupled axes, with a residual action for each.
 
 from __future__ import annotations
 
-import argparse
 import time
 from typing import Any
 
 import gymnasium
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 import quell.envs
@@ -27,7 +27,7 @@ FIXED = ql.Scenario(ql.signals.Step(), disturbances=(0.0, ql.signals.Sinusoid())
 NAMES = ("quell/two-mass-v0", "quell/two-mass-residual-v0")
 
 
-def measured(env: Any, seconds: float) -> tuple[float, float]:
+def timed(env: Any, seconds: float) -> tuple[float, float]:
     """Return steps a second and CPU time a step [s]."""
     rng = np.random.default_rng(0)
     actions = rng.uniform(-0.1, 0.1, (64, *env.action_space.shape))
@@ -58,10 +58,11 @@ def two_axes(lanes: int, repeat: int) -> Any:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--lanes", type=int, default=1000, help="loops at once")
     parser.add_argument("--seconds", type=float, default=5.0, help="for each environment")
-    options = parser.parse_args()
+    options = options_of(parser, lanes=20, seconds=0.1)
+    figures: dict[str, Any] = {"loops": options.lanes}
     print(f"{options.lanes} loops")
     head = ("environment", "signals", "repeat", "steps/s", "samples/s", "CPU ns/step", "/sample")
     print("{:28} {:>8} {:>7} {:>12} {:>12} {:>12} {:>8}".format(*head))
@@ -70,22 +71,26 @@ def main() -> None:
             for repeat in (1, 10):
                 given = {"action_repeat": repeat, "limit": 10.0} | changes
                 env = gymnasium.make_vec(name, num_envs=options.lanes, **given)
-                show(name, signals, repeat, *measured(env, options.seconds))
+                row = show(name, signals, repeat, *timed(env, options.seconds))
+                figures[f"{name}, {signals}, repeat {repeat}"] = row
                 env.close()
     for repeat in (1, 10):
         env = two_axes(options.lanes, repeat)
-        show("two axes, residual", "fixed", repeat, *measured(env, options.seconds))
+        row = show("two axes, residual", "fixed", repeat, *timed(env, options.seconds))
+        figures[f"two axes, residual, fixed, repeat {repeat}"] = row
         env.close()
+    write(options, figures)
 
 
-def show(name: str, signals: str, repeat: int, rate: float, cpu: float) -> None:
-    """Print a row."""
+def show(name: str, signals: str, repeat: int, rate: float, cpu: float) -> dict[str, float]:
+    """Print a row, and return it."""
     row = (rate, rate * repeat, 1e9 * cpu, 1e9 * cpu / repeat)
     print(
         f"{name:28} {signals:>8} {repeat:7d} {row[0]:12.3g} {row[1]:12.3g} "
         f"{row[2]:12.0f} {row[3]:8.0f}",
         flush=True,
     )
+    return dict(zip(("steps/s", "samples/s", "CPU ns/step", "CPU ns/sample"), row, strict=True))
 
 
 if __name__ == "__main__":

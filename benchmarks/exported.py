@@ -35,6 +35,7 @@ from typing import Any
 
 import numpy as np
 from c_reference import c_design
+from measured import check_present, options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -42,6 +43,7 @@ import quell as ql
 from quell.controllers import in_single_precision
 from quell.controllers.base import reset_loop
 from quell.controllers.compensator import samples_to_settle
+from quell.controllers.prefilters import without_prefilters
 from quell.experiments import two_mass_spring as study
 from quell.export import TranslationError
 from quell.export.controller_source import limits_path
@@ -68,6 +70,7 @@ COMPILERS = {
     ),
     "coverage": ("gcc", "-std=c99", "-O0", "-ffp-contract=off", "--coverage"),
 }  # fmt: skip
+QUICK = ("gcc", "coverage")  # the others take seconds each
 NAMES = ("r", "y", "given", "u", "status")
 
 
@@ -219,7 +222,7 @@ def judged(name: str, controller: Any, precision: str, options: argparse.Namespa
         folder = Path(place) / "servo"
         done = ql.export.c(controller, folder, name="servo", precision=precision, accept=True)
         names, path = set(done.source.operations), limits_path(shown)
-        inner = ql.controllers.prefilters.prefilter.without_prefilters(controller)
+        inner = without_prefilters(controller)
         if "start" in names and samples_to_settle(inner.observer) > 20_000:
             names.discard("start")  # interpreted it would take minutes
         defines = tuple(
@@ -230,7 +233,8 @@ def judged(name: str, controller: Any, precision: str, options: argparse.Namespa
                 f"HALVES(x)={', x' * done.source.derivatives}",
             )
         )
-        runs = {each: played(build(folder, each, defines), rows, single) for each in COMPILERS}
+        chosen = QUICK if options.quick else COMPILERS
+        runs = {each: played(build(folder, each, defines), rows, single) for each in chosen}
         taken = branches(folder / "coverage")
     given = runs["gcc"]
     others = sum(not same_bits(each, given) for each in runs.values())
@@ -244,10 +248,11 @@ def judged(name: str, controller: Any, precision: str, options: argparse.Namespa
     return [*cells, f"{difference:.0e}", f"{rounding:.0e}", taken, f"{int(flags)}"]
 
 
-def bits(options: argparse.Namespace, console: Console) -> None:
-    """Print the table of all combinations."""
-    heads = ("controller", "precision", "replayed", "differ", "compilers that differ")
-    table = Table(*heads, "compiled", "1 ulp of y", "branches taken", "flags seen")
+def bits(options: argparse.Namespace, console: Console) -> dict[str, Any]:
+    """Print the table of all combinations; return its numbers."""
+    heads = ("controller", "precision", "replayed", "differ", "compilers that differ",
+             "compiled", "1 ulp of y", "branches taken", "flags seen")  # fmt: skip
+    table, rows = Table(*heads), []
     known, wrong = earlier_rows(options.results), 0
     for name, controller in cases():
         if options.only not in name:
@@ -258,10 +263,12 @@ def bits(options: argparse.Namespace, console: Console) -> None:
             wrong += cells[2] != "refused" and cells[3:5] != ["0", "0"]
             console.print(" | ".join(cells), highlight=False)
             table.add_row(*cells)
+            rows.append(cells)
             if cells[2] == "refused":  # what has Python parts does not work in single precision
                 break
     console.print(table)
     console.print(f"{wrong} rows have an error" if wrong else "all rows are as they must be")
+    return {"bad rows": wrong, **counted(heads, rows)}
 
 
 def row_of(name: str, controller: Any, precision: str, options: argparse.Namespace) -> list[str]:
@@ -272,6 +279,21 @@ def row_of(name: str, controller: Any, precision: str, options: argparse.Namespa
         return [name, precision, "refused", str(error)[:40], "", "", "", "", ""]
     except (RuntimeError, ValueError) as error:
         return [name, precision, "FAILED", str(error)[:200], "", "", "", "", ""]
+
+
+def counted(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> dict[str, Any]:
+    """Return the number of rows, and their cells, as numbers where they are some, by name."""
+    found: dict[str, Any] = {}
+    for name, precision, *cells in rows:
+        row = found[f"{name}, {precision}"] = {}
+        for head, cell in zip(heads[2:], cells, strict=True):
+            try:
+                row[head] = float(cell)
+            except ValueError:  # of a row that was refused, for instance
+                row[head] = cell
+    return {"rows": len(found), "of them refused": sum(
+        "refused" in row.values() for row in found.values()
+    ), "row": found}  # fmt: skip
 
 
 def earlier_rows(file: Path | None) -> dict[tuple[str, str], list[str]]:
@@ -299,14 +321,13 @@ def ready_row(
 
 
 def chosen_rows(
-    text: str, part: str, precision: str | None = None, more: Iterable[tuple[str, Any]] = ()
+    text: str, part: slice, precision: str | None = None, more: Iterable[tuple[str, Any]] = ()
 ) -> list[tuple[str, Any, str]]:
-    """Return controllers whose name has a text, in one precision or both; ``part`` is I/N."""
+    """Return controllers whose name has a text, in one precision or both."""
     precisions = [precision] if precision else ["double", "single"]
     known = [*cases(), *more]
     rows = [(name, each, kind) for name, each in known for kind in precisions if text in name]
-    first, step = map(int, part.split("/"))
-    return rows[first - 1 :: step]
+    return rows[part]
 
 
 def shown_rows(
@@ -326,8 +347,9 @@ def shown_rows(
     return done
 
 
-def speed(console: Console) -> None:
+def speed(console: Console, quick: bool) -> dict[str, Any]:
     """Print the time of a step of the exported learner over that of ``reference.c``."""
+    figures: dict[str, Any] = {}
     settings = study.Settings()
     controller = study.controllers(settings)[study.L]
     run = ql.simulate(ql.plants.two_mass_spring(), controller, study.scenario(settings))
@@ -341,7 +363,7 @@ def speed(console: Console) -> None:
         for flags in (
             ("gcc", "-O2"), ("gcc", "-O3"), ("gcc", "-O3", "-march=native", "-std=gnu11"),
             ("clang", "-O2"), ("clang", "-O3", "-march=native"),
-        ):  # fmt: skip
+        )[: 1 if quick else None]:  # fmt: skip
             program = Path(place) / "timing"
             sources = (HERE / "exported_speed.c", folder / "src/servo.c")
             include = (f"-I{HERE}", f"-I{folder / 'src'}")
@@ -350,10 +372,14 @@ def speed(console: Console) -> None:
             exported, by_hand = map(float, text.split())
             cells = (f"{exported:.0f}", f"{by_hand:.0f}", f"{exported / by_hand:.2f}")
             table.add_row(" ".join(flags), *cells)
+            figures[" ".join(flags)] = {
+                "exported [ns]": exported, "by hand [ns]": by_hand, "ratio": exported / by_hand,
+            }  # fmt: skip
     console.print(table)
+    return figures
 
 
-def long_runs(samples: float, console: Console) -> None:
+def long_runs(samples: float, console: Console, quick: bool) -> dict[str, Any]:
     """Print what both precisions do in very many samples, at rest and in motion."""
     observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=30.0, dt=1e-3)
     limits = {"u_min": -20.0, "u_max": 20.0}
@@ -365,9 +391,11 @@ def long_runs(samples: float, console: Console) -> None:
         "RLS, guard": ql.ADRC(observer, 3.0, learner=ql.learners.RLS(), guard=ql.Guard(), **limits),
         "PID": ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits),
     }
-    heads = ("controller", "plant", "precision", "RMS r - y: first, ninth, last tenth")
-    table = Table(*heads, "mean u of each", "learned", "flags", "not finite")
-    for name, controller in laws.items():
+    parts = ("RMS r - y: first, ninth, last tenth", "mean u of each", "learned", "flags",
+             "not finite")  # fmt: skip
+    table = Table("controller", "plant", "precision", *parts)
+    figures: dict[str, Any] = {"samples": samples}
+    for name, controller in list(laws.items())[: 1 if quick else None]:
         with tempfile.TemporaryDirectory() as place:
             programs = {
                 precision: long_program(Path(place) / precision, controller, precision)
@@ -377,8 +405,24 @@ def long_runs(samples: float, console: Console) -> None:
                 for precision, program in programs.items():
                     command = [program, f"{samples:.0f}", "1" if plant == "in motion" else "0"]
                     done = subprocess.run(command, capture_output=True, check=True, text=True)
-                    table.add_row(name, plant, precision, *done.stdout.split("|"))
+                    cells = done.stdout.split("|")
+                    table.add_row(name, plant, precision, *cells)
+                    figures[f"{name}, {plant}, {precision}"] = dict(
+                        zip(parts, map(numbers_of, cells), strict=True)
+                    )
     console.print(table)
+    return figures
+
+
+def numbers_of(text: str) -> list[float | str]:
+    """Return the words of a text, as numbers where they are some."""
+    found: list[float | str] = []
+    for word in text.split():
+        try:
+            found.append(float(word.rstrip(",")))
+        except ValueError:
+            found.append(word)
+    return found
 
 
 def long_program(folder: Path, controller: Any, precision: str) -> Path:
@@ -394,14 +438,15 @@ def long_program(folder: Path, controller: Any, precision: str) -> Path:
 
 def main() -> None:
     """Run the parts."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--samples", type=int, default=100_000, help="samples of each run in C")
     parser.add_argument("--only", default="", help="controllers whose name has this text")
     parser.add_argument("--part", choices=("bits", "speed", "long"), help="one part only")
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
     parser.add_argument("--long", type=float, default=1e8, help="samples of the long runs")
     parser.add_argument("--without-fma", action="store_true", help="compile kernels without FMA")
-    options = parser.parse_args()
+    options = options_of(parser, samples=300, only="PPI", long=1e4)
+    check_present(options, tools=("gcc", "g++", "clang", "gcov"))
     if options.without_fma:
         arguments = [each for each in sys.argv[1:] if each != "--without-fma"]
         with tempfile.TemporaryDirectory() as cache:
@@ -410,12 +455,14 @@ def main() -> None:
             sys.exit(subprocess.run(command, env=environment, check=False).returncode)
     console = Console(width=max(160, int(os.environ.get("COLUMNS", "0"))))
     warnings.simplefilter("ignore")
+    figures: dict[str, Any] = {}
     if options.part in (None, "bits"):
-        bits(options, console)
+        figures["bits"] = bits(options, console)
     if options.part in (None, "speed"):
-        speed(console)
+        figures["speed"] = speed(console, options.quick)
     if options.part in (None, "long"):
-        long_runs(options.long, console)
+        figures["long"] = long_runs(options.long, console, options.quick)
+    write(options, figures)
 
 
 if __name__ == "__main__":

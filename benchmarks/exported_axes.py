@@ -13,19 +13,19 @@ run has taken (gcov).
 
 from __future__ import annotations
 
-import argparse
 import math
 import shutil
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from exported import COMPILERS, branches, earlier_rows, ready_row
+from exported import COMPILERS, QUICK, branches, counted, earlier_rows, ready_row
+from measured import check_present, options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -193,7 +193,9 @@ def replayed(
     return same.size, int(np.sum(~same)), flags, authority
 
 
-def judged(name: str, axes: ql.Axes, precision: str, samples: int) -> list[str]:
+def judged(
+    name: str, axes: ql.Axes, precision: str, samples: int, compilers: Iterable[str]
+) -> list[str]:
     """Return a row of the table."""
     single = precision == "single"
     try:
@@ -208,7 +210,7 @@ def judged(name: str, axes: ql.Axes, precision: str, samples: int) -> list[str]:
         (folder / "src/robot.c").write_text(source.source, encoding="utf-8")
         runs = {
             each: played(build(folder, each, axes, source.derivatives), rows, axes, single)
-            for each in COMPILERS
+            for each in compilers
         }
         taken = branches(folder / "coverage", "robot")
     given = runs["gcc"]
@@ -233,15 +235,16 @@ def judged(name: str, axes: ql.Axes, precision: str, samples: int) -> list[str]:
 
 def main() -> None:
     """Run the rows and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--samples", type=int, default=20_000, help="samples of each run in C")
     parser.add_argument("--only", default="", help="rows whose name has this text")
     parser.add_argument("--precision", choices=("double", "single"), help="one precision only")
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
-    options = parser.parse_args()
+    options = options_of(parser, samples=300, only="no learner", precision="double")
+    check_present(options, tools=("gcc", "g++", "clang", "gcov"))
     warnings.simplefilter("ignore")
     console, known, bad = Console(width=160), earlier_rows(options.results), 0
-    table = Table(
+    heads = (
         "axes",
         "precision",
         "replayed",
@@ -251,16 +254,20 @@ def main() -> None:
         "authority",
         "flags seen",
     )
+    table, rows = Table(*heads), []
+    chosen = QUICK if options.quick else COMPILERS
     for name, axes in cases().items():
         for precision in [options.precision] if options.precision else ["double", "single"]:
             if options.only in name:
-                make = partial(judged, name, axes, precision, options.samples)
+                make = partial(judged, name, axes, precision, options.samples, chosen)
                 cells = ready_row(known, (name, precision), make, options.results)
                 bad += cells[3:5] != ["0", "0"]
                 console.print(" | ".join(cells), highlight=False)
                 table.add_row(*cells)
+                rows.append(cells)
     console.print(table)
     print(f"{bad} rows differ" if bad else "all rows are as they must be")
+    write(options, {"bad rows": bad, **counted(heads, rows)})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ that is not in ``DEVIATIONS`` ends the script with 1, so does any report of the 
 
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from collections import Counter
 from pathlib import Path
 
 from hostile_exports import exported_source
+from measured import check_present, options_of, parser_of, part_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -91,10 +91,11 @@ def main() -> None:
     """Read the rows and print a table of rules."""
     from exported import chosen_rows
 
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--rows", default="", help="controllers whose name has this text")
-    parser.add_argument("--part", default="1/1", help="I/N: each N-th row from the I-th on")
-    options = parser.parse_args()
+    parser.add_argument("--part", type=part_of, default="1/1", help="K/N: each N-th row from K on")
+    options = options_of(parser, rows="PID", part="1/100")
+    check_present(options, tools=("gcc", "cppcheck"))
     warnings.simplefilter("ignore")
     places: Counter[str] = Counter()
     having: Counter[str] = Counter()
@@ -116,6 +117,11 @@ def main() -> None:
         reason = DEVIATIONS.get(rule, "")
         table.add_row(rule, f"{number}", f"{having[rule]}", f"{count}", reason)
     Console(width=150).print(table)
+    figures = {
+        rule: {"places": number, "rows": having[rule], "a deviation": DEVIATIONS.get(rule, "no")}
+        for rule, number in places.items()
+    }
+    write(options, {"rows": count, **figures})
     sys.exit(1 if bad else 0)
 
 

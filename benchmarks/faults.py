@@ -1,10 +1,10 @@
 """Test of the real-time loop with random faults: on the wire, of processes, disks and clients.
 
     python benchmarks/faults.py                # 1000 trials over both wires: about an hour
-    python benchmarks/faults.py --trials 30 --seed 7 --wires udp --json faults.json
+    python benchmarks/faults.py --trials 30 --seed 7 --wires udp --results faults.json
 
-Results are written after each trial; trials that the JSON file has already are not repeated, so
-the same command goes on where it was stopped.
+With ``--results`` the file is written after each trial; trials that it has already are not
+repeated, so the same command goes on where it was stopped.
 
 Each trial runs a loop in one process, a twin in another, and a relay between them. It checks:
 
@@ -21,7 +21,6 @@ Each trial runs a loop in one process, a twin in another, and a relay between th
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import math
@@ -40,11 +39,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fault_judges import DT, LIMIT, SAFETY, WATCHDOG, judged
+from fault_judges import DELAY, DT, LIMIT, SAFETY, WATCHDOG, judged
 from fault_relay import WIRES, relay, rig_url
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.files import nonfinite_to_none, write_json
+from quell.kernels import dispatch
 from quell.realtime import LiveSink, open_device, run_rig
 from quell.realtime.relay import KINDS, Fault
 from quell.realtime.rig import LOG
@@ -155,7 +156,7 @@ def trial(
 ) -> dict[str, Any]:
     """Run and check one trial."""
     first, many = draw.randint(120, 600), max(round(500 ** draw.random()), 1)
-    towards, late = draw.choice(("loop", "rig")), draw.randint(1, 10)
+    towards, late = draw.choice(("loop", "rig")), draw.randint(1, DELAY)
     faults = [Fault(kind, towards, first, many, late)] if kind in KINDS else []
     about = {"trial": number, "wire": wire, "kind": kind, "at": first, "length": many}
     about["towards"] = towards if faults else ""
@@ -275,19 +276,19 @@ def fill_disk(folder: Path, free: int) -> list[Path]:
 
 def main() -> None:
     """Run the trials and print how they ended."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--trials", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--wires", nargs="+", choices=WIRES, default=WIRES)
     parser.add_argument("--kinds", nargs="+", choices=TROUBLES, default=TROUBLES)
     parser.add_argument("--minutes", type=float, default=60.0, help="longest time for a wire")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    parser.add_argument("--results", type=Path, help="file of trials that are done")
+    options = options_of(parser, trials=1, wires=["udp"])
+    if options.quick:  # a trial is quicker interpreted than to compile, the rig's process as well
+        dispatch.interpret_all, os.environ["NUMBA_DISABLE_JIT"] = True, "1"
     results: list[dict[str, Any]] = []
-    if options.json is not None and options.json.exists():
-        results = json.loads(options.json.read_text("utf-8"))
+    if options.results is not None and options.results.exists():
+        results = json.loads(options.results.read_text("utf-8"))
     with tempfile.TemporaryDirectory() as place, small_disk(Path(place) / "full"):
         for i, wire in enumerate(options.wires):
             done = {found["trial"] for found in results if found["wire"] == wire}
@@ -297,9 +298,11 @@ def main() -> None:
             found = trials(wire, numbers, kinds, Path(place), options.seed, 60.0 * options.minutes)
             for one in found:
                 results.append(one)
-                if options.json is not None:
-                    write_json(options.json, nonfinite_to_none(results), overwrite=True)
-    sys.exit(1 if print_table(results) else 0)
+                if options.results is not None:
+                    write_json(options.results, nonfinite_to_none(results), overwrite=True)
+    figures = print_table(results)
+    write(options, figures)
+    sys.exit(1 if figures["with errors"] else 0)
 
 
 def trials(
@@ -335,24 +338,28 @@ def trials(
         rig.end()
 
 
-def print_table(results: list[dict[str, Any]]) -> int:
-    """Print how the trials ended; return the number with errors."""
+def print_table(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """Print how the trials ended; return the numbers."""
     counts = Counter(found["wire"] for found in results)
     print(", ".join(f"{wire}: {count} trials" for wire, count in counts.items()))
+    figures: dict[str, Any] = {"trials": len(results), "by wire": counts, "kinds": {}}
     print(f"{'fault':<24} {'trials':>6} {'errors':>6}  ended")
     for kind in TROUBLES:
         mine = [found for found in results if found["kind"] == kind]
         ends = Counter(found["ended"] for found in mine).most_common()
         wrong = sum(bool(found["wrong"]) for found in mine)
         text = ", ".join(f"{name} {count}" for name, count in ends)
+        figures["kinds"][kind] = {"trials": len(mine), "with errors": wrong}
         print(f"{kind:<24} {len(mine):>6} {wrong:>6}  {text}")
     lost = [part for found in results for part in found.get("lost", ())]
+    lost = [part for part in lost if part is not None and math.isfinite(part)]
+    figures["lost by a killed loop [s]"] = max(lost, default="no loop was killed")
     if lost:
-        most = np.nanmax(np.array(lost, dtype=float))
+        most = max(lost)
         print(f"telemetry lost by a killed loop: at most {most:.3f} s")
     bad = sum(bool(found["wrong"]) for found in results)
     print(f"{len(results)} trials, {bad} with errors")
-    return bad
+    return figures | {"with errors": bad}
 
 
 if __name__ == "__main__":

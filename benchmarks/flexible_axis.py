@@ -12,18 +12,17 @@ checked to be stable with the whole plant. With --free M_ks has no bound for any
 The first two tables are M_s of an ADRC of order 2 with omega_o = 4 omega_c, the encoder at the
 motor: b0 = 1/(J_m + J_l), and then 1/J_m.
 
-Usage: python benchmarks/flexible_axis.py [--free] [--ringing] [--quick] [--json FILE]
+Usage: python benchmarks/flexible_axis.py [--free] [--ringing]
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import time
 import warnings
-from pathlib import Path
 from typing import Any, NamedTuple
+
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.tuning import Constraints
@@ -56,7 +55,9 @@ class Axis(NamedTuple):
 
 def axes(quick: bool) -> list[Axis]:
     """Return the cases: sensor, number of inertias and ratio; more damping at the load."""
-    ratios = (3.0,) if quick else RATIOS
+    if quick:
+        return [Axis(2, "motor", 1.0, 0.02)]
+    ratios = RATIOS
     found = [Axis(n, s, r, 0.02) for n in (2, 3) for s in ("motor", "load") for r in ratios]
     return found + [Axis(2, "load", ratio, 0.1) for ratio in ratios]
 
@@ -127,26 +128,34 @@ def model_free(ratio: float, omega_c: float, inertia: float) -> float | None:
 
 def main() -> None:
     """Run the trial and print its tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--free", action="store_true", help="no bound of M_ks")
     parser.add_argument("--ringing", action="store_true", help="no bound of damping")
-    parser.add_argument("--quick", action="store_true", help="the ratio 3 only")
-    parser.add_argument("--json", type=Path, help="file for all numbers")
-    options = parser.parse_args()
+    options = options_of(parser)
+    at_motor: dict[str, Any] = {}
     warnings.simplefilter("ignore")
     for of in ("both inertias", "the motor alone"):
         print(f"ADRC of order 2 at the motor, omega_o = 4 omega_c, b0 of {of}: M_s")
         print("J_l/J_m  " + "".join(f"omega_c = {w:<6g}" for w in BANDWIDTHS))
         for ratio in RATIOS:
             inertia = MOTOR * (1.0 + ratio) if of == "both inertias" else MOTOR
-            cells = (model_free(ratio, w, inertia) for w in BANDWIDTHS)
+            cells = [model_free(ratio, w, inertia) for w in BANDWIDTHS]
+            at_motor[f"b0 of {of}, J_l/J_m {ratio:g}"] = {
+                f"omega_c = {w:g}": "unstable" if m_s is None else m_s
+                for w, m_s in zip(BANDWIDTHS, cells, strict=True)
+            }
             text = "".join(f"{'unstable' if m is None else f'{m:.2f}':16s}" for m in cells)
             print(f"{ratio:<9g}{text}")
     results = []
     print(f"\nk_i over that of the tuned {REFERENCE}, M_s and M_t <= {BOUND:g}", end="")
     print(", no bound of M_ks" if options.free else ", its M_ks")
     for axis in axes(options.quick):
-        found = tuned(axis, options.free, damping=None if options.ringing else 0.4)
+        found = tuned(
+            axis,
+            options.free,
+            others=("bandwidths",) if options.quick else OTHERS,
+            damping=None if options.ringing else 0.4,
+        )
         results.append((axis, found))
         reference = found[REFERENCE]
         cells = [
@@ -161,9 +170,8 @@ def main() -> None:
     print(f" of {figures['axes']} axes, none found for {figures['none']}")
     for name, (count, least, median) in figures["each"].items():
         print(f"  {name}: found for {count}, least {least:.2f}, median {median:.2f}")
-    if options.json is not None:
-        rows = [{**axis._asdict(), "found": found} for axis, found in results]
-        options.json.write_text(json.dumps({"axes": rows, "summary": figures}, indent=1))
+    rows = [{**axis._asdict(), "found": found} for axis, found in results]
+    write(options, {"M_s at the motor": at_motor, "axes": rows, "summary": figures})
 
 
 if __name__ == "__main__":

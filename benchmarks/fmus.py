@@ -1,19 +1,18 @@
 """FMUs of every controller and plant of the contract tests, against the interpreted kernels.
 
-    python benchmarks/fmus.py [--part all|axes] [--samples 1000] [--out fmus.json]
+    python benchmarks/fmus.py [--part all|axes] [--samples 1000] [--most 3]
 
 Each controller becomes an FMU, which FMPy validates and runs with a sine as reference, noise, and
 NaN now and then; its u is compared with that of ``step``, interpreted. Each plant becomes an FMU
 that is a plant again by ``quell.plants.FMU``, in a loop with a controller; y is compared with that
 of the plant itself. An arm in C (``tests/fmu_plant.c``) is the plant of two axes, beside
 ``quell.plants.arm``. At last the time of a sample in which ``simulate`` calls an FMU is measured,
-of one signal and of two axes. ``--part axes`` does only what is about axes.
+of one signal and of two axes. ``--part axes`` does only what is about axes, ``--most`` takes so
+many controllers and plants.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import check_present, options_of, parser_of, write
 
 import quell as ql
 from quell.export import TranslationError, fmu
@@ -76,10 +76,10 @@ def plant_deviation(plant: Any, path: Path, samples: int) -> float:
     return float(np.max(np.abs(runs[1][:length] - y))) / scale
 
 
-def sample_time(path: Path) -> float:
+def sample_time(path: Path, seconds: float) -> float:
     """Return the processor time of a sample of a compiled loop that calls an FMU [s]."""
     law = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT), omega_c=3.0)
-    plant, scenario = ql.plants.FMU(path, w=["w[1]"]), ql.Scenario(1.0, 200.0)
+    plant, scenario = ql.plants.FMU(path, w=["w[1]"]), ql.Scenario(1.0, seconds)
     ql.simulate(plant, law, ql.Scenario(1.0, 1.0))
     times = []
     for _ in range(5):  # the machine may be busy with other things
@@ -118,18 +118,23 @@ def axes_of_arm(path: Path, duration: float) -> tuple[float, float, float]:
 
 def main() -> None:
     """Run the trial."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--part", choices=("all", "axes"), default="all")
     parser.add_argument("--samples", type=int, default=1000)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    parser.add_argument("--seconds", type=float, default=20.0, help="run of the arm")
+    parser.add_argument("--most", type=int, help="controllers, and plants")
+    options = options_of(parser, samples=50, seconds=0.5, most=1)
+    check_present(options, tools=["gcc"])
     warnings.simplefilter("ignore")
+    invalid = 0
     found: dict[str, Any] = {"controllers": {}, "refused": [], "plants": {}}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         dispatch.interpret_all = True
         both = options.part == "all"
-        for i, (label, law) in enumerate(controllers().items() if both else ()):
+        for i, (label, law) in enumerate(
+            list(controllers().items())[: options.most] if both else ()
+        ):
             path = folder / f"c{i}.fmu"
             try:
                 fmu(law, path)
@@ -141,28 +146,44 @@ def main() -> None:
             worst = deviation(law, running, options.samples)
             running.free()
             found["controllers"][label] = worst
+            invalid += bool(problems)
             print(f"{label:45} {worst:8.1e} {' '.join(problems)}")
-        for i, (label, plant) in enumerate(PLANTS.items() if both else ()):
+        for i, (label, plant) in enumerate(list(PLANTS.items())[: options.most] if both else ()):
             path = folder / f"p{i}.fmu"
             fmu(plant, path, dt=DT)
             worst = plant_deviation(plant, path, options.samples)
             found["plants"][label] = worst
             print(f"plant: {label:38} {worst:8.1e} {' '.join(validate_fmu(str(path)))}")
-        dispatch.interpret_all = False
+        # A short run is quicker interpreted than to compile.
+        dispatch.interpret_all = options.quick
         fmu(ql.plants.LinearPlant.of(([1.0], [1.0, 0.0, 0.0])), folder / "mass.fmu", dt=DT)
-        found["sample_time"] = sample_time(folder / "mass.fmu")
-        found["axes"] = axes_of_arm(folder / "arm.fmu", 20.0)
+        found["sample_time"] = sample_time(folder / "mass.fmu", 10.0 * options.seconds)
+        found["axes"] = axes_of_arm(folder / "arm.fmu", options.seconds)
     if both:
         print(f"refused: {', '.join(found['refused'])}")
         for kind in ("controllers", "plants"):
             worst = max(found[kind].values())
             print(f"{len(found[kind])} {kind}: largest deviation {worst:.1e}")
     worst, own, other = found["axes"]
-    print(f"an arm of two axes over 20 s: largest deviation {worst:.1e}")
+    print(f"an arm of two axes over {options.seconds:g} s: largest deviation {worst:.1e}")
     print(f"a sample of simulate with an FMU: {1e6 * found['sample_time']:.1f} µs; of two axes "
           f"{1e6 * other:.1f} µs, with a plant of quell {1e6 * own:.1f} µs")  # fmt: skip
-    if options.out:
-        options.out.write_text(json.dumps(found, indent=2) + "\n")
+    figures = {
+        "sample with an FMU [us]": 1e6 * found["sample_time"],
+        "axes": {
+            "deviation of the arm [rad]": worst,
+            "sample with an FMU [us]": 1e6 * other,
+            "sample with a plant of quell [us]": 1e6 * own,
+        },
+    }
+    if both:
+        figures |= {"invalid": invalid, "refused": found["refused"]}
+        for kind in ("controllers", "plants"):
+            figures[kind] = {
+                "number": len(found[kind]),
+                "largest deviation": max(found[kind].values()),
+            }
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -17,18 +17,19 @@ servo with learners.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from typing import Any
 
 import numpy as np
 import stiction
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
 import quell as ql
 from quell.controllers.base import control
+from quell.kernels import dispatch
 from quell.kernels.dispatch import compiled
 
 # Sub-steps of a sample, in which friction may stick.
@@ -158,8 +159,9 @@ def run(
     return y, u, flags
 
 
-def releases(given: Any) -> None:
-    """Print the overshoot after a release."""
+def releases(given: Any) -> dict[str, Any]:
+    """Print the overshoot after a release; return it."""
+    figures: dict[str, Any] = {}
     rows: dict[tuple[str, str], list[list[float]]] = {}
     random = np.random.default_rng(given.seed)
     held = ql.HeldPlant()
@@ -208,15 +210,20 @@ def releases(given: Any) -> None:
     title = "overshoot by the hold, %: median, 90 %, largest; share above 0.5 %"
     table = Table("machine", "hold", "runs", *names, title=title)
     for (kind, case), values in sorted(rows.items()):
-        columns = (spread(column) for column in zip(*values, strict=True))
+        spreads = [spread(column) for column in zip(*values, strict=True)]
+        columns = ("{:.2f} {:.2f} {:.2f}; {:.0%}".format(*each.values()) for each in spreads)
         table.add_row(kind, case, str(len(values)), *columns)
+        row = {"runs": len(values), **dict(zip(names, spreads, strict=True))}
+        figures[f"{kind}, {case}"] = row
     Console(width=150).print(table)
+    return figures
 
 
-def spread(values: Any) -> str:
-    """Return median, 90 % and largest, and the share above 0.5."""
+def spread(values: Any) -> dict[str, float]:
+    """Return median, 90 % and largest [%], and the share above 0.5."""
     a = np.array(values)
-    return f"{np.median(a):.2f} {np.quantile(a, 0.9):.2f} {np.max(a):.2f}; {np.mean(a > 0.5):.0%}"
+    sizes = {"median": np.median(a), "90 %": np.quantile(a, 0.9), "largest": np.max(a)}
+    return sizes | {"share above 0.5 %": np.mean(a > 0.5)}
 
 
 def disturbed(m: dict[str, Any], case: str, random: np.random.Generator) -> dict[str, Any]:
@@ -262,8 +269,9 @@ CASES = (
 )  # fmt: skip
 
 
-def alarms(given: Any) -> None:
-    """Print what the detection costs where nothing is held."""
+def alarms(given: Any) -> dict[str, Any]:
+    """Print what the detection costs where nothing is held; return it."""
+    figures: dict[str, Any] = {}
     random = np.random.default_rng(given.seed + 1000)
     rows: dict[str, list[tuple[float, float]]] = {}
     for number in range(given.setups):
@@ -291,25 +299,39 @@ def alarms(given: Any) -> None:
         text = f"{np.min(ratios):.3f} {np.median(ratios):.3f} {np.max(ratios):.3f}"
         counts = (str(int(np.sum(beyond))) for beyond in (ratios > 1.02, ratios < 0.98))
         table.add_row(case, str(len(values)), text, *counts, f"{np.mean(shares):.1%}")
+        figures[case] = {
+            "runs": len(values),
+            "RMS over that without": {
+                "least": np.min(ratios), "median": np.median(ratios), "largest": np.max(ratios),
+            },
+            "above 1.02": np.sum(ratios > 1.02),
+            "below 0.98": np.sum(ratios < 0.98),
+            "share of samples with HELD": np.mean(shares),
+        }  # fmt: skip
     Console(width=140).print(table)
+    return figures
 
 
-def learners(given: Any) -> None:
+def learners(given: Any) -> dict[str, Any]:
     """Print the cost with learners where plants stick, and the overshoot of a servo with them."""
     title = "free plants that stick: RMS error over that without HeldPlant()"
     table = Table("plant", "reference", "learner", "guard", "ratio", title=title)
+    figures: dict[str, Any] = {}
+    seconds = 0.2 if given.quick else stiction.SECONDS
+    dispatch.interpret_all = given.quick  # short runs are quicker so than to compile
     for twin in stiction.TWINS:
         *_, size, speed = stiction.TWINS[twin]
         found = stiction.learners(speed)
-        for label in ("none", "Kalman", "RLS, tanh"):
+        for label in ("none",) if given.quick else ("none", "Kalman", "RLS, tanh"):
             for guard in (None, ql.Guard()) if label != "none" else (None,):
-                for name, reference in stiction.references(size).items():
+                for name, reference in stiction.references(size, seconds).items():
                     plain, detecting = (
-                        stiction.error(twin, found[label], guard, reference, held=held)
+                        stiction.error(twin, found[label], guard, reference, held, seconds)
                         for held in (None, ql.HeldPlant())
                     )
-                    ratio = f"{detecting / plain:.4f}"
-                    table.add_row(twin, name, label, str(guard is not None), ratio)
+                    ratio = detecting / plain
+                    table.add_row(twin, name, label, str(guard is not None), f"{ratio:.4f}")
+                    figures[f"{twin}, {name}, {of(label, guard)}"] = ratio
     Console(width=140).print(table)
     title = "a servo after 2 s, with a load: overshoot in %; RMS error of later moves over by hand"
     names = ("nothing", "HeldPlant()", "set_held", "by hand", "never held")
@@ -322,12 +344,23 @@ def learners(given: Any) -> None:
         "NLMS": ql.learners.NLMS(),
     }
     ways = ((None, NOTHING), (ql.HeldPlant(), NOTHING), (None, SIGNAL), (None, BY_HAND))
-    for label, learner in kinds.items():
+    dispatch.interpret_all = False
+    for label, learner in list(kinds.items())[: 1 if given.quick else None]:
         for guard in (None, ql.Guard()) if learner is not None else (None,):
             cells = [_held_servo(learner, guard, *way) for way in (*ways, (None, NEVER))]
             texts = (f"{over:.2f}; {rms / cells[3][1]:.3f}" for over, rms in cells)
             table.add_row(label, str(guard is not None), *texts)
+            figures[f"servo, {of(label, guard)}"] = {
+                name: {"overshoot [%]": over, "RMS over by hand": rms / cells[3][1]}
+                for name, (over, rms) in zip(names, cells, strict=True)
+            }
     Console(width=140).print(table)
+    return figures
+
+
+def of(label: str, guard: Any) -> str:
+    """Return the name of a learner with or without guard."""
+    return label if guard is None else f"{label}, guarded"
 
 
 def _held_servo(learner: Any, guard: Any, held: Any, mode: int) -> tuple[float, float]:
@@ -353,17 +386,19 @@ def _held_servo(learner: Any, guard: Any, held: Any, mode: int) -> tuple[float, 
 
 def main() -> None:
     """Run the parts."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--setups", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--part", choices=["releases", "alarms", "learners"])
     parser.add_argument("--verbose", action="store_true")
-    given = parser.parse_args()
+    given = options_of(parser, setups=1)
     began = time.perf_counter()
+    figures = {}
     for name, part in {"releases": releases, "alarms": alarms, "learners": learners}.items():
         if given.part in (None, name):
-            part(given)
+            figures[name] = part(given)
     print(f"{time.perf_counter() - began:.0f} s")
+    write(given, figures)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import Any
 
 import hostile_exports
 from hostile_exports import SANITIZERS, SHARES, run, words_of_type
+from measured import check_present, options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -162,20 +163,21 @@ def row_of(name: str, axes: Any, precision: str, options: argparse.Namespace) ->
 
 def main() -> None:
     """Run the rows and print a table."""
-    from exported import earlier_rows, ready_row
+    from exported import counted, earlier_rows, ready_row
     from exported_axes import cases, feedback
 
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--calls", type=float, default=1e6, help="calls of each row")
     parser.add_argument("--rows", default="", help="axes whose name has this text")
     parser.add_argument("--precision", choices=("double", "single"), help="one precision only")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sanitizer", choices=tuple(SANITIZERS), default="address")
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
-    options = parser.parse_args()
+    options = options_of(parser, calls=2000, rows="no learner", precision="double")
+    check_present(options, tools=[SANITIZERS[options.sanitizer][0]])
     warnings.simplefilter("ignore")
     console, known, bad = Console(width=160), earlier_rows(options.results), 0
-    table = Table(*HEADS)
+    table, rows = Table(*HEADS), []
     for name, axes in (cases() | feedback()).items():
         for precision in [options.precision] if options.precision else ["double", "single"]:
             if options.rows in name:
@@ -184,8 +186,10 @@ def main() -> None:
                 bad += cells[4:7] != ["0", "0", "0"]
                 console.print(" | ".join(cells), highlight=False)
                 table.add_row(*cells)
+                rows.append(cells)
     console.print(table)
     print(f"{bad} rows have a report or a bad u" if bad else "no report, no bad u")
+    write(options, {"bad rows": bad, **counted(HEADS, rows)})
     sys.exit(1 if bad else 0)
 
 

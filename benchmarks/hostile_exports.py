@@ -31,6 +31,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from measured import check_present, options_of, parser_of, part_of, write
+
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.export import CSource
@@ -431,22 +433,24 @@ def is_good(cells: list[str]) -> bool:
 
 def main() -> None:
     """Run the rows and print a table."""
-    from exported import chosen_rows, shown_rows
+    from exported import chosen_rows, counted, shown_rows
 
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--calls", type=float, default=1e7, help="calls of each row")
     parser.add_argument("--rows", default="", help="controllers whose name has this text")
     parser.add_argument("--precision", choices=("double", "single"), help="one precision only")
-    parser.add_argument("--part", default="1/1", help="I/N: each N-th row from the I-th on")
+    parser.add_argument("--part", type=part_of, default="1/1", help="K/N: each N-th row from K on")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sanitizer", choices=tuple(SANITIZERS), default="address")
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
-    options = parser.parse_args()
+    options = options_of(parser, calls=2000, rows="PPI", precision="double")
+    check_present(options, tools=[SANITIZERS[options.sanitizer][0]])
     warnings.simplefilter("ignore")
     rows = chosen_rows(options.rows, options.part, options.precision)
     done = shown_rows(rows, HEADS, partial(row_of, options=options), options.results)
     bad = sum(not is_good(cells) for cells in done)
     print(f"{bad} rows have a report or a bad u" if bad else "no report, no bad u")
+    write(options, {"bad rows": bad, **counted(HEADS, done)})
     sys.exit(1 if bad else 0)
 
 

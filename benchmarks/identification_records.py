@@ -1,6 +1,6 @@
 """Fits of ``identify`` to public records, next to an independent search from many starts.
 
-    python benchmarks/identification_records.py FOLDER [--starts N] [--only RECORD]
+    python benchmarks/identification_records.py [FOLDER] [--starts N] [--only RECORD]
 
 FOLDER has robot_arm.csv (DaISy), cascaded_tanks.csv and emps.csv (nonlinear benchmarks), buck.csv
 (sysidentpy). The independent search minimises the same output error by scipy's ``least_squares``,
@@ -11,12 +11,13 @@ poles on the negative real axis are excluded. The fit is NRMSE on the whole reco
 
 from __future__ import annotations
 
-import argparse
 import time
 from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from measured import check_present, options_of, parser_of, shared_data, write
 from scipy import signal
 from scipy.optimize import least_squares
 
@@ -97,18 +98,18 @@ def read(folder: Path, name: str) -> Measured:
 
 def main() -> None:
     """Fit all records and print one table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folder", type=Path)
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", type=Path, nargs="?", default=shared_data(""))
     parser.add_argument("--starts", type=int, default=20, help="starts of the independent search")
     parser.add_argument("--only", choices=RECORDS)
-    arguments = parser.parse_args()
+    options = options_of(parser, starts=1, only="buck")
+    figures: dict[str, Any] = {}
     print(f"{'record':15} order/zeros  identify [%]  converged  CPU [s]  independent [%]")
     for name, (_, _, orders) in RECORDS.items():
-        if arguments.only not in (None, name):
+        if options.only not in (None, name):
             continue
-        record = read(arguments.folder, name)
+        check_present(options, files=[options.folder / f"{name}.csv"])
+        record = read(options.folder, name)
         for order in orders:
             began = time.process_time()
             found = ql.identify(
@@ -116,12 +117,19 @@ def main() -> None:
             )
             taken = time.process_time() - began
             fit = found.fits["estimation"]
-            other = independent_fit(order, record.u, record.y, arguments.starts)
+            other = independent_fit(order, record.u, record.y, options.starts)
             print(
                 f"{name:15} {order:5}/{order - 1:<5} {fit:13.3f}  {found.converged!s:9} "
                 f"{taken:8.2f} {other:16.3f}",
                 flush=True,
             )
+            figures.setdefault(name, {})[f"order {order}"] = {
+                "identify": fit,
+                "converged": found.converged,
+                "cpu": taken,
+                "independent": other,
+            }
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -12,13 +12,11 @@ The time is processor time. Seeds below 20000 served to find faults: judge with 
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from numpy.typing import NDArray
 from scipy import signal
 
@@ -182,14 +180,11 @@ def judged(seed: int) -> dict[str, object]:
 
 def main() -> None:
     """Run the cases, print those that are missed, and the counts."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--cases", type=int, default=300)
     parser.add_argument("--seconds", type=float, help="end after this time, not after --cases")
     parser.add_argument("--seed", type=int, default=20000, help="seed of the first case")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    arguments = parser.parse_args()
+    arguments = options_of(parser, cases=1)
     ends = None if arguments.seconds is None else time.monotonic() + arguments.seconds
     rows: list[dict[str, object]] = []
     while len(rows) < arguments.cases if ends is None else time.monotonic() < ends:
@@ -204,8 +199,22 @@ def main() -> None:
         f"{silent} without convergence; processor time {np.median(taken):.2f} s (median), "
         f"{np.quantile(taken, 0.9):.2f} s (90 %), {np.max(taken):.1f} s (most)"
     )
-    if arguments.json:
-        arguments.json.write_text(json.dumps(rows, indent=2, default=float) + "\n")
+    seconds = {
+        "median": np.median(taken),
+        "90 %": np.quantile(taken, 0.9),
+        "most": np.max(taken),
+    }
+    write(
+        arguments,
+        {
+            "cases": len(rows),
+            **counts,
+            "without convergence": silent,
+            "within 1 %": len(rows) - counts["missed"],
+            "cpu": seconds,
+            "rows": rows,
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -14,14 +14,12 @@ excitation of roll, pitch and yaw through the mixer, so that no record can tell 
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 import warnings
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from scipy.linalg import expm
 
 import quell as ql
@@ -185,15 +183,13 @@ MACHINES = {
 
 def main() -> None:
     """Draw machines and print how the intervals hold."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--machine", choices=[*MACHINES], default="gantry")
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--samples", type=int, help="use no more of each record")
     parser.add_argument("--verbose", action="store_true")
-    given = parser.parse_args()
+    given = options_of(parser, draws=1, samples=1000)
     warnings.simplefilter("ignore")
     scores: list[float] = []
     silent: list[float] = []  # of axes without a line with NOT
@@ -204,7 +200,9 @@ def main() -> None:
     for draw in range(given.draws):
         record = MACHINES[given.machine](np.random.default_rng([given.seed, draw]))
         begin = time.perf_counter()
-        found = identify_b0_matrix(record.u, record.y, record.dt, 2)
+        found = identify_b0_matrix(
+            record.u[: given.samples], record.y[: given.samples], record.dt, 2
+        )
         seconds += time.perf_counter() - begin
         z = ((found.B0 - record.B0) / found.std).ravel()
         scores += z.tolist()
@@ -237,8 +235,7 @@ def main() -> None:
     }
     for name, value in result.items():
         print(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
-    if given.json:
-        given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(given, result)
 
 
 if __name__ == "__main__":

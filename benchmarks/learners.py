@@ -1,6 +1,6 @@
 """Cost of the learners and of the guard.
 
-    python benchmarks/learners.py [--json FILE]
+    python benchmarks/learners.py [--quick] [--json FILE]
 
 The first 60 s of the study's two-mass loop at 1 ms, without recording, as ratios of the best of
 several interleaved trials. The reference is the same loop with the Kalman learner in C
@@ -11,7 +11,6 @@ from Python.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import dataclasses
 import tempfile
@@ -20,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from c_reference import best, c_reference, row, show
+from measured import check_present, options_of, parser_of, write
 
 import quell as ql
 from quell.controllers.base import control
@@ -28,7 +28,6 @@ from quell.features import RBF, Bias, Input, RandomFourier, State
 from quell.kernels.dispatch import call_specialised, compiled
 from quell.learners.online import infer, learn
 
-TRIALS = 11
 DURATION = 60.0
 SETTINGS = study.Settings()
 SAMPLES = round(DURATION / SETTINGS.dt) + 1
@@ -156,14 +155,14 @@ def nanoseconds(*runs: float, of: str) -> str:
     return " / ".join(f"{run / SAMPLES * 1e9:.0f}" for run in runs) + f" ns a {of}"
 
 
-def learners(rows: list[dict[str, object]]) -> None:
+def learners(rows: list[dict[str, object]], only: list[str], trials: int) -> None:
     """Time the loop with each learner and the loop in C."""
     with tempfile.TemporaryDirectory() as folder:
         reference = c_reference(Path(folder), SETTINGS, DURATION)
-        laws = {name: law(learner) for name, learner in LEARNERS.items()}
+        laws = {name: law(learner) for name, learner in LEARNERS.items() if name in only}
         for controller in laws.values():
             loop(controller)()  # compiles
-        c, *ours = best(lambda: reference(False), *map(loop, laws.values()), trials=TRIALS)
+        c, *ours = best(lambda: reference(False), *map(loop, laws.values()), trials=trials)
     for name, took in zip(laws, ours, strict=True):
         bar = "≤ 2" if name == "Kalman" else ""
         rows.append(
@@ -176,18 +175,18 @@ def learners(rows: list[dict[str, object]]) -> None:
         )
 
 
-def guard(rows: list[dict[str, object]]) -> None:
+def guard(rows: list[dict[str, object]], only: list[str], trials: int) -> None:
     """Time the guard and the exact lag filter, in the loop and alone."""
     run = ql.simulate(PLANT, law(LEARNERS["Kalman"]), SCENARIO)
     r, y = run["r"].copy(), run["y_measured"].copy()
-    for name in GUARDED:
+    for name in (each for each in GUARDED if each in only):
         plain, guarded = law(LEARNERS[name]), law(LEARNERS[name], ql.Guard())
         candidates = [guarded, plain, with_one_tap(plain)]
         for what, made in (("loop sample", loop), ("step", lambda c: stepping(c, r, y))):
             runs = [made(candidate) for candidate in candidates]
             for run in runs:
                 run()  # compiles
-            both, learner, bare = best(*runs, trials=3 * TRIALS)
+            both, learner, bare = best(*runs, trials=3 * trials)
             for label, one, other, bar in (
                 ("with guard / without", both, learner, "≤ 1.4"),
                 ("exact lag filter / one tap", learner, bare, ""),
@@ -203,7 +202,7 @@ def guard(rows: list[dict[str, object]]) -> None:
                 )
 
 
-def from_python(rows: list[dict[str, object]]) -> None:
+def from_python(rows: list[dict[str, object]], only: list[str], trials: int) -> None:
     """Time ``controller.step`` with and without guard."""
     run = ql.simulate(PLANT, law(LEARNERS["Kalman"]), SCENARIO)
     r, y = run["r"].tolist(), run["y_measured"].tolist()
@@ -217,10 +216,10 @@ def from_python(rows: list[dict[str, object]]) -> None:
         controller.prepare()
         return call
 
-    for name in GUARDED:
+    for name in (each for each in GUARDED if each in only):
         both, learner = best(
             *(stepping_from_python(law(LEARNERS[name], guard)) for guard in (ql.Guard(), None)),
-            trials=TRIALS,
+            trials=trials,
         )
         times = nanoseconds(both, learner, of="controller.step")
         rows.append(
@@ -230,16 +229,15 @@ def from_python(rows: list[dict[str, object]]) -> None:
 
 def main() -> None:
     """Run all benchmarks and print one table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    arguments = parser.parse_args()
+    parser = parser_of(__doc__)
+    parser.add_argument("--trials", type=int, default=11, help="of which the best counts")
+    parser.add_argument("--only", nargs="+", choices=LEARNERS, default=[*LEARNERS])
+    options = options_of(parser, trials=1, only=["none", "Kalman"])
+    check_present(options, ["gcc"])
     rows: list[dict[str, object]] = []
-    learners(rows)
-    guard(rows)
-    from_python(rows)
-    show(rows, arguments.json)
+    for measure in (learners, guard, from_python):
+        measure(rows, options.only, options.trials)
+    write(options, show(rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Rows that clients of the live port cost, how long they delay the end of a run, what they use up.
 
-    python benchmarks/live_clients.py [seconds] [--count N]
+    python benchmarks/live_clients.py [seconds] [--count N] [--kinds KIND ...]
 
 For each kind of client a process pushes rows at 1 kHz through the telemetry writer to an MCAP file,
 a CSV file and the live port, while N clients of that kind, in another process, connect. Printed are
@@ -23,6 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 from quell.realtime import CsvSink, LiveSink, McapSink
 from quell.realtime.recordings import Header, load, row_channels
@@ -156,12 +157,13 @@ def run_case(kind: str, seconds: float, count: int) -> None:
 
 def main() -> None:
     """Run a case for each kind and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("seconds", type=float, nargs="?", default=5.0)
     parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=[*KINDS])
     for hidden in ("--case", "--connect", "--port"):
         parser.add_argument(hidden, help=argparse.SUPPRESS)
-    given = parser.parse_args()
+    given = options_of(parser, seconds=0.5, count=20, kinds=["none", "deaf", "foreign page"])
     if given.connect:
         connect(given.connect, int(given.port), given.count, given.seconds)
     elif given.case:
@@ -169,12 +171,13 @@ def main() -> None:
     else:
         heading = f"{given.count} clients that are"
         print(f"{heading:24s} rows  lost (MCAP, CSV)  end [s]  descriptors  stderr [B]  let in")
-        for kind in KINDS:
+        figures: dict[str, object] = {}
+        for kind in given.kinds:
             command = [sys.executable, __file__, str(given.seconds), "--count", str(given.count)]
             done = subprocess.run([*command, "--case", kind], capture_output=True, check=False)
             if done.returncode:
                 print(f"{kind:20s} ended with {done.returncode}: {done.stderr[-300:]!r}")
-                continue
+                sys.exit(1)
             found = json.loads(done.stdout)
             print(
                 f"{kind:20s} {found['rows']:8d} {found['lost'][0]:8d}, {found['lost'][1]:6d} "
@@ -182,6 +185,16 @@ def main() -> None:
                 f"{found['let_in']:7d}",
                 flush=True,
             )
+            figures[kind] = {
+                "rows": found["rows"],
+                "lost, MCAP": found["lost"][0],
+                "lost, CSV": found["lost"][1],
+                "end [s]": found["end"],
+                "descriptors": found["descriptors"],
+                "stderr [B]": len(done.stderr),
+                "let in": found["let_in"],
+            }
+        write(given, figures)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """A servo whose encoder has no index pulse finds its map of cogging again after a restart.
 
-    python benchmarks/lost_index.py FILE [--starts 12] [--seed 1] [--speed 0.1] [--only LEARNER]
+    python benchmarks/lost_index.py [FILE] [--starts 12] [--seed 1] [--speed 0.1] [--only LEARNER]
 
 FILE is the record of ``cogging.py``, and so are motor and gains. A drive turns and learns for a
 minute, and its memory is saved. Then the power is off: another controller takes the memory over,
@@ -16,13 +16,13 @@ learner does, after a quarter and after half of a revolution.
 
 from __future__ import annotations
 
-import argparse
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from cogging import DRY, DT, HIGHEST, OMEGA_C, OMEGA_O, ORDERS, TORQUE_CONSTANT, rms
+from measured import check_present, options_of, parser_of, shared_data, write
 from rich.console import Console
 from rich.table import Table
 
@@ -32,7 +32,7 @@ from quell.learners import RLS
 from quell.realtime import TwinDevice
 from quell.types import Vector
 
-LEARNING, REVOLUTIONS = 60.0, 3.0  # [s], after the start
+REVOLUTIONS = 3.0  # after the start
 LEARNERS: dict[str, Any] = {
     "7 orders": Periodic(orders=ORDERS) + DRY + Bias(),
     "all orders to 90": Periodic(highest=HIGHEST) + DRY + Bias(),
@@ -89,11 +89,11 @@ def parts(before: Vector, after: Vector, speed: float) -> dict[str, float]:
 
 
 def restarted(
-    first: Any, second: Any, learner: Any, guard: Any, starts: Vector, speed: float
+    first: Any, second: Any, learner: Any, guard: Any, starts: Vector, options: Any
 ) -> list[dict[str, float]]:
     """Return the errors for each angle of a start on ``second`` after learning on ``first``."""
-    law = controller(first, learner, guard)
-    before, found = drive(first, law, LEARNING, speed), []
+    law, speed = controller(first, learner, guard), options.speed
+    before, found = drive(first, law, options.learning, speed), []
     image = law.memory()
     for start in starts.tolist():
         again = controller(second, learner, guard)
@@ -130,18 +130,30 @@ def chance(cogging: Vector, draws: int, rng: np.random.Generator) -> dict[float,
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description="A map of cogging after a lost index.")
-    parser.add_argument("file", help="record with columns count and current")
+    parser = parser_of(__doc__)
+    parser.add_argument(
+        "file", type=Path, nargs="?", default=shared_data("cogging_a.csv"),
+        help="record with columns count and current",
+    )  # fmt: skip
     parser.add_argument("--starts", type=int, default=12)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--speed", type=float, default=0.1, help="[rev/s]")
     parser.add_argument("--only", choices=[*LEARNERS], help="this learner alone")
-    options = parser.parse_args()
+    parser.add_argument("--learning", type=float, default=60.0, help="before the stop [s]")
+    parser.add_argument("--draws", type=int, default=4000, help="maps by chance")
+    options = options_of(parser, starts=1, learning=2.0, speed=2.0, draws=20, only="7 orders")
+    check_present(options, files=[options.file])
+    figures: dict[str, Any] = {}
     rng, cogging = np.random.default_rng(options.seed), measured(options.file)
-    for span, left in chance(cogging, 4000, rng).items():
+    for span, left in chance(cogging, options.draws, rng).items():
         quantiles = ", ".join(f"{q:g} %: {np.percentile(left, q):.4f}" for q in (0.1, 1.0, 10.0))
         passed = int(np.sum(left <= 0.02))
         print(f"chance after {span:g} revolutions: {quantiles}; {passed} of {left.size} below 0.02")
+        figures[f"chance after {span:g} revolutions"] = {
+            "draws": left.size,
+            "below 0.02": passed,
+            **{f"{q:g} %": np.percentile(left, q) for q in (0.1, 1.0, 10.0)},
+        }
     starts = rng.uniform(0.0, math.tau, options.starts)
     other = motor(other_phases(cogging, rng))
     first = motor(cogging)
@@ -150,7 +162,7 @@ def main() -> None:
         "learner", "guard", "motor", *names, title="RMS error over MF-ESO's: median / worst"
     )
     for motor_name, second in (("the same", first), ("another", other)):
-        plain = restarted(first, second, None, None, starts, options.speed)
+        plain = restarted(first, second, None, None, starts, options)
         for name, features in LEARNERS.items():
             if options.only and options.only != name:
                 continue
@@ -158,12 +170,18 @@ def main() -> None:
                 learner = RLS(features, relearn=4.0, recall=recall)
                 label = f"{name}, {'recall' if recall else 'anew'}"
                 for guard in (None, ql.Guard()):
-                    runs = restarted(first, second, learner, guard, starts, options.speed)
+                    runs = restarted(first, second, learner, guard, starts, options)
                     pairs = [*zip(runs, plain, strict=True)]
                     ratios = {each: [run[each] / own[each] for run, own in pairs] for each in names}
                     cells = [f"{np.median(r):.3f} / {max(r):.3f}" for r in ratios.values()]
+                    row = f"{label}{', guard' if guard else ''}, {motor_name} motor"
+                    figures[row] = {
+                        each: {"median": np.median(r), "worst": max(r)}
+                        for each, r in ratios.items()
+                    }
                     table.add_row(label, "yes" if guard else "no", motor_name, *cells)
     Console(width=140).print(table)
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ sign, and the same noise, gives the response to the sinusoid: ``|S| = |u/d|`` at
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.analysis import LoopAnalysis, analyse
@@ -104,11 +104,11 @@ def peak(loop: LoopAnalysis) -> tuple[float, float]:
 
 def main() -> None:
     """Print a row for each loop and learner, and the largest difference of each learner."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--loops", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--learner", choices=LEARNERS)
-    given = parser.parse_args()
+    given = options_of(parser, loops=1, learner="Kalman")
     warnings.simplefilter("ignore")
     names = [given.learner] if given.learner else [*LEARNERS]
     missed: dict[str, list[float]] = {name: [] for name in names}
@@ -135,12 +135,21 @@ def main() -> None:
                 f"{m_s:.3f}, measured {max(sizes):.3f} ({100.0 * missed[name][-1]:+.2f} %)",
                 flush=True,
             )
+    figures: dict[str, object] = {}
     for name, each in missed.items():
         within = sum(abs(value) <= BAR for value in each)
+        most = max(map(abs, each), default=0.0)
+        figures[name] = {
+            "loops": len(each),
+            "within 2 %": within,
+            "largest difference [%]": 100.0 * most,
+            "median difference [%]": 100.0 * float(np.median(np.abs(each))) if each else "no loop",
+        }
         print(
             f"{name:12} {within} of {len(each)} within {100.0 * BAR:.0f} %, largest difference "
-            f"{100.0 * max(map(abs, each), default=0.0):.2f} %"
+            f"{100.0 * most:.2f} %"
         )
+    write(given, figures)
 
 
 if __name__ == "__main__":

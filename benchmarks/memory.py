@@ -5,9 +5,10 @@ python benchmarks/memory.py [--samples N]
 
 from __future__ import annotations
 
-import argparse
 import resource
 import time
+
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.experiments import two_mass_spring as study
@@ -15,11 +16,10 @@ from quell.experiments import two_mass_spring as study
 
 def main() -> None:
     """Run the loop with the Kalman learner for a long time, recording every 10 000th sample."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--samples", type=float, default=1e8)
-    samples = int(parser.parse_args().samples)
+    options = options_of(parser, samples=1e6)
+    samples = int(options.samples)
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     controller = study.controllers(settings)[study.L]
     ql.simulate(plant, controller, ql.Scenario(duration=1.0))
@@ -39,6 +39,16 @@ def main() -> None:
         f"{len(run)} rows recorded"
     )
     print(f"memory: {before:.0f} MB before, {after - before:.0f} MB more at the most (bar: 200 MB)")
+    write(
+        options,
+        {
+            "samples": samples,
+            "rows": len(run),
+            "time of a sample [ns]": took / samples * 1e9,
+            "memory before [MB]": before,
+            "memory more [MB]": after - before,
+        },
+    )
 
 
 if __name__ == "__main__":

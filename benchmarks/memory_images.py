@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import check_present, options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -117,8 +118,8 @@ def in_another_process(folder: Path, image: bytes, single: bool, samples: int, f
     return np.load(folder / "next.npy"), (folder / "next").read_bytes()
 
 
-def bits(single: bool, samples: int, folder: Path) -> list[str]:
-    """Return a row: which u are the same after each step of Python → Python → C → Python."""
+def bits(single: bool, samples: int, folder: Path) -> dict[str, Any]:
+    """Return which u are the same after each step of Python → Python → C → Python."""
     law = controller(single)
     stepped(law, samples, 0)
     image = law.memory()
@@ -137,13 +138,15 @@ def bits(single: bool, samples: int, folder: Path) -> list[str]:
         plain.restore(saved, running=True)
         after = interpreted(plain, samples, 2 * samples)
     more = np.array([in_c.run("step", *row) for row in signals(samples, 2 * samples).tolist()])
-    return [
-        "single" if single else "double",
-        f"{len(image)}",
-        f"{np.sum(mine != other)}, {later == law.memory()}",
-        f"{loaded}, {np.sum(u_c != u_python)}, {same_image}",
-        f"{np.sum(after != more)}",
-    ]
+    return {
+        "image [B]": len(image),
+        "Python to Python: other u": int(np.sum(mine != other)),
+        "Python to Python: same image": later == law.memory(),
+        "to C: loaded": loaded,
+        "to C: other u": int(np.sum(u_c != u_python)),
+        "to C: same image": same_image,
+        "to Python: other u": int(np.sum(after != more)),
+    }
 
 
 def interpreted(law: Any, samples: int, first: int) -> np.ndarray:
@@ -175,8 +178,8 @@ def compiled(single: bool, folder: Path) -> Any:
     return Loaded(c_source(controller(single), "servo"), folder, declared + _CODE)
 
 
-def damage(single: bool, count: int, folder: Path) -> list[str]:
-    """Return a row: images that were taken though they are damaged, in C and in Python."""
+def damage(single: bool, count: int, folder: Path) -> dict[str, Any]:
+    """Return what was found: images that were taken though they are damaged, in C and in Python."""
     law = controller(single)
     stepped(law, 300, 0)
     older = law.memory()
@@ -202,20 +205,27 @@ def damage(single: bool, count: int, folder: Path) -> list[str]:
         except ValueError:
             pass
     unchanged = law.memory() == image
-    row = ["single" if single else "double", f"{count}", f"{wrong}", f"{count // 100}", f"{taken}"]
-    return [*row, f"{unchanged}", f"{seconds:.1f}"]
+    return {
+        "damaged, C": count,
+        "taken or changed": wrong,
+        "damaged, Python": count // 100,
+        "taken, Python": taken,
+        "unchanged": unchanged,
+        "seconds": seconds,
+    }
 
 
 def main() -> None:
     """Print the tables; end with 1 if something is wrong."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--samples", type=int, default=10_000)
     parser.add_argument("--damaged", type=float, default=1e6)
     parser.add_argument("--child", help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = options_of(parser, samples=200, damaged=2000.0)
     if options.child:
         child(*json.loads(options.child))
         return
+    check_present(options, ["gcc"])
     heads = (
         "precision",
         "image [B]",
@@ -226,17 +236,23 @@ def main() -> None:
     other = Table(
         "precision", "damaged, C", "taken or changed", "Python", "taken", "unchanged", "[s]"
     )
-    right = True
+    right, figures = True, {}
     with tempfile.TemporaryDirectory() as place:
         for single in (False, True):
+            name = "single" if single else "double"
             row = bits(single, options.samples, Path(place))
             hurt = damage(single, round(options.damaged), Path(place))
-            right = right and row[2:] == ["0, True", "True, 0, True", "0"]
-            right = right and (hurt[2], *hurt[4:6]) == ("0", "0", "True")
-            table.add_row(*row)
-            other.add_row(*hurt)
+            size, *found = row.values()
+            right = right and found == [0, True, True, 0, True, 0]
+            right = right and hurt["taken or changed"] == hurt["taken, Python"] == 0
+            right = right and hurt["unchanged"]
+            cells = ["{}, {}".format(*found[:2]), "{}, {}, {}".format(*found[2:5]), f"{found[5]}"]
+            table.add_row(name, f"{size}", *cells)
+            other.add_row(name, *map(str, [*hurt.values()][:-1]), f"{hurt['seconds']:.1f}")
+            figures[name] = row | hurt
     for each in (table, other):
         Console(width=140).print(each)
+    write(options, figures)
     sys.exit(0 if right else 1)
 
 

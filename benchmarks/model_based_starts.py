@@ -10,18 +10,19 @@ gains; the search goes on from the 25 best that keep to the bounds, and the 25 b
 
 from __future__ import annotations
 
-import argparse
+import sys
 import time
 import warnings
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.tuning import Constraints, designs
 from quell.tuning.optimiser.search import limits, search, starts
 
-SHAPES, STARTS, ROUNDS = 28, 50, 8
+STARTS, ROUNDS = 50, 8
 
 
 def drawn_plant(seed: int) -> tuple[list[float], list[float], float]:
@@ -56,10 +57,10 @@ def sample_time(num: list[float], den: list[float]) -> float:
     return 0.02 / float(fast)
 
 
-def reference(problem: Any, structure: Any) -> float:
+def reference(problem: Any, structure: Any, count: int) -> float:
     """Return the largest k_i of the searches from a grid."""
     low, high = limits(structure)
-    axes = [np.geomspace(low[i], high[i], SHAPES) for i in (1, 2)]
+    axes = [np.geomspace(low[i], high[i], count) for i in (1, 2)]
     b0 = structure.shapes()[0, 0]
     shapes = np.array([[b0, *pair] for pair in np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)])
     best = 0.0
@@ -72,12 +73,11 @@ def reference(problem: Any, structure: Any) -> float:
 
 def main() -> None:
     """Tune for the plants, and print those whose optimum was missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--first", type=int, default=0, help="seed of the first plant")
     parser.add_argument("--plants", type=int, default=40)
-    arguments = parser.parse_args()
+    parser.add_argument("--shapes", type=int, default=28, help="of the reference, on each axis")
+    arguments = options_of(parser, plants=1, shapes=6)
     warnings.simplefilter("ignore")
     given: list[Any] = []
     original = designs._best
@@ -99,7 +99,7 @@ def main() -> None:
         except ValueError:
             k_i = 0.0
         seconds += time.process_time() - began
-        best = max(reference(*given[-1]), k_i)
+        best = max(reference(*given[-1], arguments.shapes), k_i)
         if best == 0.0:
             continue  # neither has found any
         shares.append(k_i / best)
@@ -107,11 +107,22 @@ def main() -> None:
             print(
                 f"{seed}: {num}/{den}, M_s = {m_s}: k_i = {k_i:.4g}, {shares[-1]:.3f} of the best"
             )
+    if not shares:
+        sys.exit("none of these plants can be controlled")
     found = np.array(shares)
     share, each = np.mean(found >= 0.98), seconds / arguments.plants
     print(
         f"{found.size} plants that can be controlled: k_i at least 0.98 of the best for "
         f"{share:.1%}, least {np.min(found):.3f}; {each:.2f} s of CPU for each"
+    )
+    write(
+        arguments,
+        {
+            "plants": found.size,
+            "share with 0.98 of the best": share,
+            "least of the best": np.min(found),
+            "cpu of each": each,
+        },
     )
 
 

@@ -19,7 +19,6 @@ it changes nothing.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import random
 import re
@@ -28,11 +27,13 @@ import sys
 import tempfile
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from hostile_exports import SANITIZERS, built, traced
+from measured import check_present, options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -41,7 +42,6 @@ from quell.export.library import Exported
 from quell.export.proof import prove
 
 LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
-CALLS = 1e6
 # Changes that make no difference, and the reason.
 SAME = {
     "if (is_usable(unlimited)) { -> if (true || (is_usable(unlimited))) {": "between limits of u "
@@ -155,7 +155,9 @@ def changed(text: str, mutant: Mutant) -> str:
     return "".join(lines)
 
 
-def judge(done: Exported, controller: Any, mutant: Mutant, right: str, proves: bool) -> str:
+def judge(
+    done: Exported, controller: Any, mutant: Mutant, right: str, calls: float, proves: bool
+) -> str:
     """Return who finds a mutant; "compiler" where it is no program.
 
     ``right`` is the hash that the hostile program gives for the unchanged code.
@@ -176,7 +178,7 @@ def judge(done: Exported, controller: Any, mutant: Mutant, right: str, proves: b
         if subprocess.run([test], capture_output=True, check=False, timeout=120).returncode:
             return "golden vectors"
         try:
-            *found, trace = traced(program, CALLS, 120.0)
+            *found, trace = traced(program, calls, 120.0)
         except subprocess.TimeoutExpired:
             return "hostile calls"
         if found != ["0", "0", "0"]:
@@ -205,22 +207,25 @@ def why_same(mutant: Mutant) -> str:
     return SAME.get(f"{mutant.before} -> {mutant.after}", "")
 
 
-def right_trace(controller: Any, done: Exported) -> str:
+def right_trace(controller: Any, done: Exported, calls: float) -> str:
     """Return the hash of the unchanged code in its hostile program."""
     with tempfile.TemporaryDirectory() as place:
-        return traced(built(Path(place), controller, done.source), CALLS)[3]
+        return traced(built(Path(place), controller, done.source), calls)[3]
 
 
 def main() -> None:
     """Draw mutants, judge them and print a table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--without-proof", action="store_true", help="the tests alone")
-    options = parser.parse_args()
+    parser.add_argument("--calls", type=float, default=1e6, help="of the hostile program")
+    parser.add_argument("--only", default="", help="controllers whose name contains this")
+    options = options_of(parser, count=1, calls=1e5, only="PID", without_proof=True)
+    check_present(options, ["gcc"] if options.without_proof else ["gcc", "frama-c"])
     warnings.simplefilter("ignore")
     chance, table = random.Random(options.seed), Table("kind", "change", "found by", "time [s]")
-    missed = 0
+    missed, found = 0, Counter[str]()
     with tempfile.TemporaryDirectory() as place:
         made = {
             name: (
@@ -228,13 +233,14 @@ def main() -> None:
                 ql.export.c(controller, Path(place) / f"c{i}", name="servo", proof=False),
             )
             for i, (name, controller) in enumerate(controllers().items())
+            if options.only in name
         }
         for controller, done in made.values():  # the files of the proof, without a proof
             for path, text in ql.export.proof.proof_files(controller, done.source).items():
                 target = done.folder / path
                 target.parent.mkdir(exist_ok=True)
                 target.write_text(text, encoding="utf-8")
-        right = {name: right_trace(*each) for name, each in made.items()}
+        right = {name: right_trace(*each, options.calls) for name, each in made.items()}
         code = {name: done.source.source for name, (_, done) in made.items()}
         judged = 0
         for mutant in drawn(code, 3 * options.count, chance):
@@ -242,20 +248,22 @@ def main() -> None:
                 break
             begin = time.monotonic()
             controller, done = made[mutant.controller]
-            by = judge(
-                done, controller, mutant, right[mutant.controller], not options.without_proof
-            )
+            trace, proves = right[mutant.controller], not options.without_proof
+            by = judge(done, controller, mutant, trace, options.calls, proves)
             if by == "compiler":
                 continue
             judged += 1
             if by == "NOBODY" and (reason := why_same(mutant)):
                 by = f"nobody: {reason}"
             missed += by == "NOBODY"
+            found[by.partition(":")[0]] += 1
             seconds = f"{time.monotonic() - begin:.0f}"
             print(f"{mutant.kind} | {mutant.name} | {by} | {seconds}", flush=True)
             table.add_row(mutant.kind, mutant.name, by, seconds)
     Console(width=170).print(table)
     print(f"{judged - missed} of {judged} are found")
+    figures = {"judged": judged, "found": judged - missed, "found by": found, "missed": missed}
+    write(options, figures)
     sys.exit(1 if missed else 0)
 
 

@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 
@@ -100,6 +101,10 @@ def run(step: Step) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> None:
     """Print the table; what is not installed is named."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--repeat", type=int, default=300, help="times, of which the least counts")
+    options = options_of(parser, repeat=5)
+    figures: dict[str, object] = {}
     others: dict[str, Callable[[], Step]] = {"quell": ours}
     forms = ("StateSpace", "TransferFunction", "FeedbackTF")
     others |= {f"pyadrc, {form}": pyadrc(form) for form in forms}
@@ -116,13 +121,23 @@ def main() -> None:
             y, u = run(make())
         except ModuleNotFoundError as error:
             print(f"{name:32} NOT run: {error}")
+            figures[name] = f"NOT run: {error}"
             continue
         step = make()
-        time = min(timeit.repeat(partial(step, 1.0, 0.5), number=CALLS, repeat=300)) / CALLS
+        time = (
+            min(timeit.repeat(partial(step, 1.0, 0.5), number=CALLS, repeat=options.repeat)) / CALLS
+        )
         peak = np.max(np.abs(y[LOAD_AT:] - 1.0))
         over = max(0.0, np.max(y[:LOAD_AT]) - 1.0)
         differs = np.max(np.abs(u - reference))
         print(f"{name:32} {differs:10.1e} {100 * over:9.2f}% {peak:9.4f} {1e6 * time:9.2f}")
+        figures[name] = {
+            "u differs": differs,
+            "overshoot [%]": 100.0 * over,
+            "load [m]": peak,
+            "step [us]": 1e6 * time,
+        }
+    write(options, figures)
 
 
 if __name__ == "__main__":

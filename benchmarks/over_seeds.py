@@ -7,10 +7,10 @@ counted; it should be 5 %.
     python benchmarks/over_seeds.py --seeds 2000
 """
 
-import argparse
 import math
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.experiments.over_seeds import over_seeds
@@ -34,16 +34,17 @@ def axes(omega_c):
 
 def main():
     """Print the shares."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser = parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=2000)
-    seeds = parser.parse_args().seeds
+    options = options_of(parser, seeds=20)
+    seeds = options.seeds
     load = ql.signals.BandLimitedNoise(1e-2, 0.05)
     noise = ql.signals.BandLimitedNoise(1e-11, DT)
     scenario = ql.Scenario((0.1, 0.1), 1.0, (load, load), noise)
     found = over_seeds(gantry(), {"8": axes(8.0), "9": axes(9.0)}, scenario, seeds=seeds)
     d = np.log(found.values["rms"][0, 0]) - np.log(found.values["rms"][1, 0])
     d = np.vstack([d, d.mean(axis=0)])
+    figures = {}
     for axis, row in zip(("x", "y", "all axes"), d, strict=True):
         true = float(row.mean())
         for size in (3, 5, 10, 20):
@@ -54,6 +55,12 @@ def main():
             missed = np.mean([not low <= true <= high for _, low, high in ends])
             share = f"{100.0 * missed:.1f} % of {len(groups)} intervals"
             print(f"{axis:8} {size:2} seeds: {share} miss the mean, {true:.4f}")
+            figures[f"{axis}, {size} seeds"] = {
+                "missed [%]": 100.0 * missed,
+                "intervals": len(groups),
+                "mean of the logarithm": true,
+            }
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ takes each N-th row from the I-th on.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import warnings
@@ -20,6 +19,7 @@ from typing import Any
 
 from exported import chosen_rows, shown_rows
 from exported_axes import cases, feedback
+from measured import check_present, options_of, parser_of, part_of, write
 
 import quell as ql
 from quell.export import TranslationError
@@ -51,18 +51,31 @@ def row_of(name: str, controller: Any, precision: str) -> list[str]:
 
 def main() -> None:
     """Prove the rows."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--only", default="", help="controllers whose name has this text")
     parser.add_argument("--precision", choices=("double", "single"), help="one precision only")
-    parser.add_argument("--part", default="1/1", help="I/N: each N-th row from the I-th on")
+    parser.add_argument("--part", type=part_of, default="1/1", help="K/N: each N-th row from K on")
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
-    options = parser.parse_args()
+    options = options_of(parser, only="PID", precision="double", part="1/100")
+    check_present(options, ["frama-c"])
     warnings.simplefilter("ignore")
     several = [*(cases() | feedback()).items()]
     rows = chosen_rows(options.only, options.part, options.precision, several)
     done = shown_rows(rows, HEADS, row_of, options.results)
     bad = any(cells[2] not in ("yes", "refused") and cells[0] not in OPEN for cells in done)
+    figures: dict[str, Any] = {"rows": len(done)}
+    for verdict in ("yes", "refused", "NOT"):
+        figures[verdict] = sum(cells[2].startswith(verdict) for cells in done)
+    figures["each"] = {
+        f"{cells[0]}, {cells[1]}": dict(zip(HEADS[2:], map(_number, cells[2:]), strict=True))
+        for cells in done
+    }
+    write(options, figures)
     sys.exit(1 if bad else 0)
+
+
+def _number(text: str) -> float | str:
+    return float(text) if text.isdigit() else text
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ lower by the share that is shown. *Another load* are logs of one tuning under tw
 
 from __future__ import annotations
 
-import argparse
 import time
 import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.identification import Measured
@@ -104,15 +104,19 @@ def log(case: Case, omega_c: float, seed: int, load: float = 1.0, length: float 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    parser.add_argument("--only", default="", help="cases whose name contains this")
+    given = options_of(parser, draws=2, only="oven")
     warnings.simplefilter("ignore")
     began, n = time.perf_counter(), given.draws
     heads = ("A best", "B best", "NOT decided", "NOT comparable")
     print(f"{'share of the draws [%]':44}" + "".join(f"{head:>15}" for head in heads))
+    figures: dict[str, Any] = {"draws": n}
     for number, (name, case) in enumerate(CASES.items()):
+        if given.only not in name:
+            continue
         seeds = given.seed + 100_000 * number + 10 * np.arange(n)
         truth = [
             np.std(part.reference - part.y)
@@ -136,6 +140,8 @@ def main() -> None:
             shares = [100.0 * value / n for value in found.values()]
             row = "".join(f"{share:15.1f}" for share in shares)
             print(f"{name + ': ' + kind:44}{row}", flush=True)
+            figures[f"{name}: {kind}"] = dict(zip(heads, shares, strict=True))
+    write(given, figures)
     print(f"{n} draws, {time.perf_counter() - began:.0f} s")
 
 

@@ -17,11 +17,11 @@ shares of quantities that are within their 95 % intervals (±1.96 of the stated 
 
 from __future__ import annotations
 
-import argparse
 import time
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from scipy import signal
 
 import quell as ql
@@ -192,12 +192,13 @@ def judged(one: Drawn) -> dict[str, Any]:
 
 def main() -> None:
     """Print the shares by kind."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--draws", type=int, default=200, help="of each kind")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--verbose", action="store_true")
-    args = parser.parse_args()
+    args = options_of(parser, draws=1, kinds=("steps", "friction"))
+    figures: dict[str, Any] = {}
     for kind in args.kinds:
         results = []
         for i in range(args.draws):
@@ -214,11 +215,19 @@ def main() -> None:
         }
         text = ", ".join(f"{k} {np.mean(v):.1%} of {len(v)}" for k, v in shares.items() if v)
         seconds = np.mean([one["seconds"] for one in results])
+        figures[kind] = {
+            "records": len(results),
+            "NOT [%]": 100.0 * (1.0 - len(told) / len(results)),
+            "inside [%]": {k: 100.0 * np.mean(v) if v else "none" for k, v in shares.items()},
+            "of": {k: len(v) for k, v in shares.items()},
+            "seconds of a record": seconds,
+        }
         print(
             f"{kind}: {len(results)} records, NOT {1.0 - len(told) / len(results):.1%}; "
             f"inside: {text}; {seconds:.2f} s a record",
             flush=True,
         )
+    write(args, figures)
 
 
 if __name__ == "__main__":

@@ -10,14 +10,15 @@ errors ``y − r`` of a repetition.
 
 from __future__ import annotations
 
-import argparse
 import math
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
 import quell as ql
+from quell.kernels import dispatch
 from quell.learners import Kalman, Learner, Repetitive
 from quell.signals import BandLimitedNoise, Repeated, Trapezoid
 from quell.types import Vector
@@ -70,24 +71,31 @@ def errors(
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--repeats", type=int, default=50)
-    repeats = parser.parse_args().repeats
+    parser.add_argument("--b0", type=float, nargs="+", default=[16.0, 20.0, 26.0])
+    parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=[*LEARNERS])
+    options = options_of(parser, repeats=2, b0=[16.0], learners=["Repetitive"])
+    dispatch.interpret_all |= options.quick  # the plant is a user's: compiled in each process
+    repeats, figures = options.repeats, {}
+    shown = {
+        f"{k + 1}{'st' if k == 0 else 'nd' if k == 1 else 'th'}": k
+        for k in (0, 1, 4, 9, repeats - 1)
+        if k < repeats
+    }
     table = Table(
         "b0/b",
         "feedforward",
         "learner",
         "guard",
-        "1st",
-        "2nd",
-        "5th",
-        "10th",
-        f"{repeats}th [mrad]",
+        *shown,
         "last/first",
+        title="RMS errors [mrad]",
     )
-    for b0 in (16.0, 20.0, 26.0):
+    for b0 in options.b0:
         for feedforward in (True, False):
-            for name, learner in LEARNERS.items():
+            for name in options.learners:
+                learner = LEARNERS[name]
                 for guard in (False, True)[: 1 if learner is None else 2]:
                     rms = errors(learner, repeats, guard=guard, feedforward=feedforward, b0=b0)
                     table.add_row(
@@ -97,10 +105,15 @@ def main() -> None:
                             name,
                             "yes" if guard else "no",
                         ),
-                        *(f"{1e3 * rms[k]:.4f}" for k in (0, 1, 4, 9, -1)),
+                        *(f"{1e3 * rms[k]:.4f}" for k in shown.values()),
                         f"{rms[-1] / rms[0]:.4f}",
                     )
+                    label = f"b0/b {b0 / 20.0:g}, {name}{', guard' * guard}"
+                    label += ", feedforward" * feedforward
+                    figures[label] = {each: 1e3 * rms[k] for each, k in shown.items()}
+                    figures[label]["last/first"] = rms[-1] / rms[0]
     Console(width=120).print(table)
+    write(options, figures)
 
 
 if __name__ == "__main__":

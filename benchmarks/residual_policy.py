@@ -23,7 +23,6 @@ guard forbids from what CMA-ES has not found.
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from typing import Any
@@ -31,6 +30,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from cmaes import CMA
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 from scipy.signal import lsim
@@ -43,7 +43,7 @@ from quell.types import Vector
 NAME, OBSERVED = "torsional-residual", ("r", "y_measured", "x_hat", "f_residual")
 INPUTS, HIDDEN = 7, 4
 SIZE = HIDDEN * (INPUTS + 2) + 1
-POPULATION, EPISODES, UNSEEN, FIRST_UNSEEN = 16, 6, 64, 1_000_000
+EPISODES, FIRST_UNSEEN = 6, 1_000_000
 SPREAD = 0.3  # standard deviation with which CMA-ES begins; a weight of 1 is that of an RMS
 BAR = 0.32  # of the cost without policy, with the guard
 
@@ -109,14 +109,15 @@ def idle(observations: Any) -> Any:
 class Trained:
     """A policy that was trained, and what the training saw."""
 
-    def __init__(self, guard: ql.Guard | None, seed: int, generations: int, seconds: float) -> None:
-        loops = Loops(POPULATION * EPISODES, guard, seconds)
-        seeds = [EPISODES * seed + i for i in range(EPISODES)] * POPULATION
+    def __init__(self, guard: ql.Guard | None, seed: int, given: Any) -> None:
+        population, generations = given.population, given.generations
+        loops = Loops(population * EPISODES, guard, given.seconds)
+        seeds = [EPISODES * seed + i for i in range(EPISODES)] * population
         _, _, self.scale = loops.run(idle, seeds)
         self.unit, self.lost = float(self.scale[-1]) / loops.most, 0
-        strategy = CMA(np.zeros(SIZE), SPREAD, seed=seed, population_size=POPULATION)
+        strategy = CMA(np.zeros(SIZE), SPREAD, seed=seed, population_size=population)
         for _ in range(generations):
-            points = np.array([strategy.ask() for _ in range(POPULATION)])
+            points = np.array([strategy.ask() for _ in range(population)])
             policy = network(np.repeat(points, EPISODES, axis=0), self.scale, self.unit)
             costs, lost, _ = loops.run(policy, seeds)
             self.lost += lost
@@ -124,23 +125,18 @@ class Trained:
         loops.env.close()
         self.point, self.share = strategy.mean, self.lost / (generations * len(seeds))
 
-    def on(self, loops: Loops) -> tuple[float, int]:
-        """Return the mean cost of the unseen episodes, and how many are lost."""
-        policy = network(np.tile(self.point, (UNSEEN, 1)), self.scale, self.unit)
-        costs, lost, _ = loops.run(policy, unseen())
+    def on(self, loops: Loops, seeds: list[int]) -> tuple[float, int]:
+        """Return the mean cost of episodes, and how many are lost."""
+        policy = network(np.tile(self.point, (len(seeds), 1)), self.scale, self.unit)
+        costs, lost, _ = loops.run(policy, seeds)
         return float(costs.mean()), lost
 
 
-def unseen() -> list[int]:
-    """Return the seeds of the episodes that judge."""
-    return list(range(FIRST_UNSEEN, FIRST_UNSEEN + UNSEEN))
-
-
-def design_cost(seconds: float) -> float:
+def design_cost(seconds: float, seeds: list[int]) -> float:
     """Return the mean cost of the response that the controller is designed for."""
     omega_c, costs = arguments(NAME, {})["controller"].omega_c, []
     t: Vector = 1e-3 * np.arange(round(seconds / 1e-3) + 1)
-    for seed in unseen():
+    for seed in seeds:
         r = episode(seconds)(np.random.default_rng(seed)).reference(t)
         asked = lsim(([omega_c**4], np.poly([-omega_c] * 4)), r, t)[1]
         costs.append(float(np.sum((r - asked) ** 2)) * 1e-3)
@@ -149,51 +145,67 @@ def design_cost(seconds: float) -> float:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="duration of an episode")
     parser.add_argument("--generations", type=int, default=90)
     parser.add_argument("--trainings", type=int, default=2)
-    options = parser.parse_args()
-    generations, seconds = options.generations, options.seconds
-    guarded, unguarded = Loops(UNSEEN, ql.Guard(), seconds), Loops(UNSEEN, None, seconds)
-    none = float(guarded.run(idle, unseen())[0].mean())
+    parser.add_argument("--unseen", type=int, default=64, help="episodes that judge")
+    parser.add_argument("--population", type=int, default=16)
+    options = options_of(parser, seconds=0.3, generations=1, trainings=1, unseen=4, population=4)
+    count, seconds = options.unseen, options.seconds
+    unseen = list(range(FIRST_UNSEEN, FIRST_UNSEEN + count))
+    guarded, unguarded = Loops(count, ql.Guard(), seconds), Loops(count, None, seconds)
+    none = float(guarded.run(idle, unseen)[0].mean())
     rows: dict[str, list[tuple[float, int]]] = {}
     lost: dict[str, list[float]] = {}
     for seed in range(options.trainings):
         began = time.process_time()
-        with_guard = Trained(ql.Guard(), seed, generations, seconds)
-        without = Trained(None, seed, generations, seconds)
+        with_guard = Trained(ql.Guard(), seed, options)
+        without = Trained(None, seed, options)
         for name, trained, loops in (
             ("guarded", with_guard, guarded),
             ("unguarded", without, unguarded),
             ("trained unguarded, then guarded", without, guarded),
         ):
-            rows.setdefault(name, []).append(trained.on(loops))
+            rows.setdefault(name, []).append(trained.on(loops, unseen))
             lost.setdefault(name, []).append(trained.share)
         print(f"training {seed}: {time.process_time() - began:.0f} s of CPU", flush=True)
-    title = f"Mean cost of {UNSEEN} unseen episodes, {SIZE} numbers, {options.trainings} trainings"
+    title = f"Mean cost of {count} unseen episodes, {SIZE} numbers, {options.trainings} trainings"
     table = Table(title=title)
     for heading in ("policy", "cost: mean, least, most", "over none", "lost", "lost in training"):
         table.add_column(heading)
-    design = design_cost(seconds)
+    design = design_cost(seconds, unseen)
     table.add_row("none", f"{none:.4g}", "1", "0", "")
     table.add_row("(design)", f"{design:.4g}", f"{design / none:.3f}", "", "")
-    forward = float(Loops(UNSEEN, None, seconds, feedforward=True).run(idle, unseen())[0].mean())
+    forward = float(Loops(count, None, seconds, feedforward=True).run(idle, unseen)[0].mean())
     table.add_row("none, feedforward=True", f"{forward:.4g}", f"{forward / none:.3f}", "", "")
+    figures: dict[str, Any] = {
+        "episodes": count,
+        "cost without policy": none,
+        "design over none": design / none,
+        "feedforward over none": forward / none,
+    }
     for name, found in rows.items():
         costs, gone = np.array([cost for cost, _ in found]), sum(count for _, count in found)
         table.add_row(
             name,
             f"{costs.mean():.4g}, {costs.min():.4g}, {costs.max():.4g}",
             f"{costs.mean() / none:.3f}",
-            f"{gone} of {UNSEEN * len(found)}",
+            f"{gone} of {count * len(found)}",
             f"{100.0 * np.mean(lost[name]):.2g} %",
         )
+        figures[name] = {
+            "cost": costs.mean(),
+            "least": costs.min(),
+            "most": costs.max(),
+            "over none": costs.mean() / none,
+            "lost": gone,
+            "lost in training [%]": 100.0 * np.mean(lost[name]),
+        }
     Console(width=110).print(table)
     share = float(np.mean([cost for cost, _ in rows["guarded"]])) / none
     verdict = "met" if share <= BAR else "NOT met"
+    write(options, figures)
     print(f"Guarded over none: {share:.3f}, bar {BAR:g}: {verdict}.")
 
 

@@ -14,26 +14,36 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 
-DT, CALLS = 1e-3, 1000
+DT = 1e-3
 
 
-def times(call: Callable[[], Any], between: Callable[[], Any]) -> str:
-    """Return median and 99 % quantile of a call, with another call in between, as text."""
-    found = np.empty(CALLS)
-    for i in range(CALLS):
+def times(call: Callable[[], Any], between: Callable[[], Any], count: int) -> dict[str, float]:
+    """Return median and 99 % quantile of a call [µs], with another call in between."""
+    found = np.empty(count)
+    for i in range(count):
         began = time.perf_counter()
         call()
         found[i] = time.perf_counter() - began
         between()
     median, most = 1e6 * np.quantile(found, [0.5, 0.99])
-    return f"{median:8.1f} {most:8.1f}"
+    return {"median": median, "99 %": most}
 
 
 def main() -> None:
     """Print the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--calls", type=int, default=1000)
+    options = options_of(parser, calls=20)
+    figures: dict[str, dict[str, float]] = {}
+
+    def show(name: str, call: Callable[[], Any], between: Callable[[], Any]) -> None:
+        figures[name] = times(call, between, options.calls)
+        print(f"{name:28}{figures[name]['median']:8.1f} {figures[name]['99 %']:8.1f}")
+
     print(f"{'':28}{'median':>8} {'99 %':>8}  [µs]")
     slow = ql.ESO.model_free(order=2, b0=5.0, omega_o=100.0, dt=DT)
     fast = ql.ESO.model_free(order=2, b0=5.0, omega_o=120.0, dt=DT)
@@ -52,7 +62,7 @@ def main() -> None:
             controller.retune(omega_c=20.0, observer=slow)
 
         for what, call in (("step", step), ("retune", retune), ("prepared", prepared)):
-            print(f"{name + ': ' + what:28}{times(call, step)}")
+            show(f"{name}: {what}", call, step)
     law = ql.ADRC(slow, omega_c=20.0, u_min=-5.0, u_max=5.0)
     pid = ql.baselines.PID(kp=9.0, ki=5.0, kd=1.0, tf=0.01, dt=DT, u_min=-5.0, u_max=5.0)
     wrappers: dict[str, Any] = {
@@ -70,7 +80,8 @@ def main() -> None:
             controller.retune(observer=slow)
 
         for what, call in (("step", step_of), ("retune", retune_of), ("prepared", prepared)):
-            print(f"{name + ': ' + what:28}{times(call, step_of)}")
+            show(f"{name}: {what}", call, step_of)
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ check of the first motion. The same machines with one encoder turned round are t
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.kernels import dispatch
@@ -162,51 +162,73 @@ def first_motion(seed: int) -> tuple[bool, bool, bool]:
 
 def main() -> None:
     """Print step times, or how often the check of signs ends a run."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--udp", action="store_true")
     parser.add_argument("--loops", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    if options.loops:
-        dispatch.interpret_all = True  # quicker than to compile for two and for three axes
-        rows = []
-        for i in range(options.loops):
-            rows.append(first_motion(options.seed + i))
-            if rows[-1][0]:
-                print(f"seed {options.seed + i}: an honest run was ended", flush=True)
-        found = np.array(rows)
-        honest, stable, wrong = found.T
-        print(
-            f"honest and at rest at the end: {np.sum(stable)}, of which ended by the check "
-            f"{np.sum(honest & stable)}; other honest ones {np.sum(~stable)}, ended "
-            f"{np.sum(honest & ~stable)}; one encoder turned round: {wrong.size}, ended "
-            f"{np.sum(wrong)}"
-        )
-        return
+    options = options_of(parser, seconds=1.0, rounds=1)
+    figures: dict[str, Any] = {}
+    if options.quick or not options.loops:
+        figures["times"] = times(options.rounds, options.seconds, options.udp)
+    if options.quick or options.loops:
+        figures["first motions"] = first_motions(options.loops or 1, options.seed)
+    write(options, figures)
+
+
+def first_motions(loops: int, seed: int) -> dict[str, int]:
+    """Print and return how often the check of signs ends a run."""
+    dispatch.interpret_all = True  # quicker than to compile for two and for three axes
+    rows = []
+    for i in range(loops):
+        rows.append(first_motion(seed + i))
+        if rows[-1][0]:
+            print(f"seed {seed + i}: an honest run was ended", flush=True)
+    honest, stable, wrong = np.array(rows).T
+    print(
+        f"honest and at rest at the end: {np.sum(stable)}, of which ended by the check "
+        f"{np.sum(honest & stable)}; other honest ones {np.sum(~stable)}, ended "
+        f"{np.sum(honest & ~stable)}; one encoder turned round: {wrong.size}, ended "
+        f"{np.sum(wrong)}"
+    )
+    return {
+        "loops": loops,
+        "at rest at the end": int(np.sum(stable)),
+        "of these ended": int(np.sum(honest & stable)),
+        "others ended": int(np.sum(honest & ~stable)),
+        "turned round, ended": int(np.sum(wrong)),
+    }
+
+
+def times(rounds: int, seconds: float, udp: bool) -> dict[str, Any]:
+    """Print and return step times and lateness of one axis and of three."""
+    figures: dict[str, Any] = {}
     runs: dict[str, list[RigRun]] = {"one": [], "three": []}
-    for _ in range(options.rounds):
+    for _ in range(rounds):
         for name, kept in runs.items():
-            kept.append(timed(name, options.seconds, options.udp))
+            kept.append(timed(name, seconds, udp))
     medians = {}
     for name, kept in runs.items():
         steps = [run.timing.step.summary() for run in kept]
         late = [run.timing.lateness.summary() for run in kept]
         medians[name] = float(np.median([each["p50"] for each in steps]))
         for what, all_of in (("step time", steps), ("lateness", late)):
-            values = ", ".join(
-                f"{key} {1e6 * np.median([each[key] for each in all_of]):.1f}" for key in all_of[0]
-            )
+            medians_of = {
+                key: 1e6 * float(np.median([each[key] for each in all_of])) for key in all_of[0]
+            }
+            figures[f"{name}, {what} [us]"] = medians_of
+            values = ", ".join(f"{key} {value:.1f}" for key, value in medians_of.items())
             print(f"{name:6} {what:10} [us], medians of {len(kept)}: {values}")
         cycles, overruns = (
             sum(getattr(run.tally, key) for run in kept) for key in ("cycles", "overruns")
         )
         print(f"{name:6} {cycles} cycles, {overruns} overruns")
-    print(f"median step time of three axes over one: {medians['three'] / medians['one']:.2f}")
+        figures |= {f"{name}, cycles": cycles, f"{name}, overruns": overruns}
+    figures["three over one"] = medians["three"] / medians["one"]
+    print(f"median step time of three axes over one: {figures['three over one']:.2f}")
     assert Mode.RUN in [change.mode for change in runs["three"][0].changes]
+    return figures
 
 
 if __name__ == "__main__":

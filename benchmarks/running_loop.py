@@ -23,15 +23,13 @@ above, or behind it.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import time
 import warnings
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from scipy import signal
 
 import quell as ql
@@ -255,17 +253,14 @@ def disturbed(
 
 def main() -> None:
     """Run the draws; print those that are far off, and the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--seed", type=int, default=40000, help="seed of the first draw")
     parser.add_argument("--snr", type=float, default=30.0, help="signal-to-noise ratio of y [dB]")
     parser.add_argument("--controller", choices=("adrc", "pid", "unknown"))
     parser.add_argument("--plants", choices=(*KINDS, "negative"))
     parser.add_argument("--orders", type=int, nargs="+", default=[1, 2], help="with --plants")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    arguments = parser.parse_args()
+    arguments = options_of(parser, draws=1, controller="adrc")
     warnings.simplefilter("ignore", ql.DesignWarning)
     rows: list[dict[str, Any]] = []
     kind = {"adrc": "ADRC", "pid": "PID", "unknown": "other", None: ""}[arguments.controller]
@@ -309,6 +304,7 @@ def main() -> None:
     refused = [row for row in rows if "refused" in row]
     rows = [row for row in rows if "refused" not in row]
     print(f"refused: {len(refused)}")
+    figures: dict[str, Any] = {"refused": len(refused)}
     for name, part in (
         ("all", rows),
         ("noise alone", [row for row in rows if row["text"].endswith("noise")]),
@@ -325,6 +321,16 @@ def main() -> None:
             continue
         off = np.abs([row["error"] for row in part])
         delays = np.abs([row["total_error"] / row["dt"] for row in part])
+        figures[name] = {
+            "draws": len(part),
+            "within 5 % [%]": 100.0 * np.mean(off <= 0.05),
+            "covered [%]": 100.0 * np.mean([row["covered"] for row in part]),
+            "b0 off, median [%]": 100.0 * np.median(off),
+            "b0 off, 90 % [%]": 100.0 * np.quantile(off, 0.9),
+            "lag and delay off [samples]": np.median(delays),
+            "no reservation [%]": 100.0 * np.mean([row["good"] for row in part]),
+            "cpu": np.median([row["seconds"] for row in part]),
+        }
         print(
             f"{name:12} {len(part):4} draws: within 5 % {np.mean(off <= 0.05):6.1%}, covered "
             f"{np.mean([row['covered'] for row in part]):6.1%}; b0 off by {np.median(off):.2%} "
@@ -333,8 +339,7 @@ def main() -> None:
             f"{np.mean([row['good'] for row in part]):.0%}; "
             f"CPU {np.median([row['seconds'] for row in part]):.1f} s"
         )
-    if arguments.json:
-        arguments.json.write_text(json.dumps(rows + refused, indent=2, default=float) + "\n")
+    write(arguments, figures | {"rows": rows + refused})
 
 
 if __name__ == "__main__":

@@ -18,12 +18,12 @@ leave a band while the same run with both together is safe.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 from scipy.linalg import expm
@@ -32,6 +32,7 @@ import quell as ql
 from quell.controllers.base import status_flags
 from quell.controllers.safe_axes import NoSafeAxes, NoSafeAxesMemory
 from quell.controllers.several import control_all
+from quell.kernels import dispatch
 from quell.kernels.dispatch import compiled
 
 DT, SUBSTEPS, SAMPLES = 1e-3, 4, 2500
@@ -211,7 +212,7 @@ def run(setup: Setup, design: Any, state: Any, seed: Any) -> tuple[bool, int, fl
     size, m = int(np.sum(orders)), setup.axes.inputs
     reached, fastest = np.zeros(n), np.zeros(n)
     room = [np.zeros(each) for each in (n, n, m, n, n, n)]
-    unsafe = play(
+    unsafe = (play.plain if dispatch.interpret_all else play)(
         design, state, setup.steps, setup.axes.first_gain * (1.0 + setup.error), first, setup.asked,
         setup.rates, setup.most_f, setup.noise,
         np.stack([source.integers(0, 4, n), source.integers(0, 3, n)]),
@@ -225,12 +226,14 @@ def run(setup: Setup, design: Any, state: Any, seed: Any) -> tuple[bool, int, fl
 
 def main() -> None:
     """Run the rows and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--setups", type=int, default=150)
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="rows whose name has this text")
-    given = parser.parse_args()
+    given = options_of(parser, setups=2, runs=1, only="2 axes of order 2, each")
+    dispatch.interpret_all |= given.quick  # to compile the loop for each setup takes minutes
+    figures: dict[str, Any] = {}
     began = time.perf_counter()
     table = Table(
         "structure", "runs", "UNSAFE", "outside", "max |y|/y_max", "max |y'|/rate_max",
@@ -267,8 +270,14 @@ def main() -> None:
             str(alone), str(left), f"{far:.2f}",
         )  # fmt: skip
         print(" | ".join(cells), flush=True)
+        figures[name] = {
+            "runs": total, "UNSAFE": unsafe, "outside": outside, "most of the band": most,
+            "most of the rate": quick, "apart: runs": alone, "apart: outside": left,
+            "apart: most": far,
+        }  # fmt: skip
         table.add_row(*cells)
     Console(width=150).print(table)
+    write(given, figures)
     print(f"{time.perf_counter() - began:.0f} s")
 
 

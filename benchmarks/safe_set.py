@@ -12,18 +12,19 @@ the margin is for.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 from scipy.linalg import expm
 
 import quell as ql
 from quell.controllers.base import control
+from quell.kernels import dispatch
 from quell.kernels.dispatch import compiled
 
 SUBSTEPS = 4
@@ -146,11 +147,13 @@ def without_margin(design: Any) -> Any:
 
 def main() -> None:
     """Run the trial and print a table by order."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--setups", type=int, default=1000)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
+    given = options_of(parser, setups=3, runs=1)
+    dispatch.interpret_all |= given.quick  # to compile the loop for each setup takes minutes
+    played = play.plain if dispatch.interpret_all else play
     random, began = np.random.default_rng(given.seed), time.perf_counter()
     rows: dict[tuple[int, str], list[float]] = {}
     narrow = 0
@@ -174,7 +177,7 @@ def main() -> None:
                     30.0 * setup["f_size"] / abs(setup["b0"]), setup["f_rate"], dt,
                     3.0 * setup["f_size"], lags,
                 ])  # fmt: skip
-                most, fastest, unsafe = play(
+                most, fastest, unsafe = played(
                     design, controller.initial_state(), setup["b0"] * (1.0 + error), steps, kinds,
                     sizes, noises, setup["noise"], setup["b0"],
                     np.zeros(n), np.zeros(n),
@@ -193,12 +196,19 @@ def main() -> None:
         "order", "margin", "runs", "outside", "max |y|/y_max", "limits of u in the way",
         "max |y'|/rate_max", title=f"{given.setups} setups, {narrow} with a band that is refused",
     )  # fmt: skip
+    figures: dict[str, Any] = {"setups": given.setups, "refused": narrow}
     for (n, margin), row in sorted(rows.items()):
+        names = ("runs", "outside", "most of the band", "limits in the way", "most of the rate")
+        figures[f"order {n}, margin {margin}"] = dict(zip(names, map(float, row), strict=True))
         table.add_row(
             str(n), margin, f"{row[0]:.0f}", f"{row[1]:.0f}", f"{row[2]:.6f}", f"{row[3]:.0f}",
             f"{row[4]:.4f}",
         )  # fmt: skip
     Console(width=110).print(table)
+    of_margin = [row for (_, margin), row in rows.items() if margin == "δ"]
+    figures["runs with margin"] = sum(row[0] for row in of_margin)
+    figures["of these outside"] = sum(row[1] for row in of_margin)
+    write(given, figures)
     print(f"{time.perf_counter() - began:.0f} s")
 
 

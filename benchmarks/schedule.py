@@ -1,6 +1,6 @@
 """A rotary axis whose inertia changes by a factor of 10: gains that follow it, or one ADRC.
 
-    python benchmarks/schedule.py [--online | --loads] [--json FILE]
+    python benchmarks/schedule.py [--online | --loads] [--quick] [--json FILE]
 
 The inertia is 2e-4 … 2e-3 kg m² over an extension e from 0 to 1, ``J = 2e-4 + 1.8e-3 e²``, with
 ``d(J y')/dt = u + d − c y'``, 0.5 ms, u a sample late, a 20-bit encoder, |u| ≤ 2 Nm.
@@ -35,20 +35,21 @@ a model's feedforward (the inertia at its b0, and the friction), and the table w
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
+from quell.kernels import dispatch
 
 DT, LATE, STEP = 5e-4, 5e-4, 2.0 * np.pi / 2**20
 POINTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 JUDGED = (0.06, 0.17, 0.31, 0.44, 0.57, 0.69, 0.83, 0.94)
 VISCOUS = (2e-4, 2e-3)  # [N m s/rad]
+# Extension at the start, and duration of the move [s]; the slowest one first.
+MOVES = [(start, duration) for start in (0.0, 1.0) for duration in (2.0, 0.2, 0.05)]
 HOW: dict[str, Any] = {"constraints": ql.tuning.Constraints(resolution=STEP), "delay": LATE}
 HOW |= {"u_min": -2.0, "u_max": 2.0}
 
@@ -271,29 +272,38 @@ def show_loads(seeds: range) -> dict[str, Any]:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser = parser_of(__doc__)
     parser.add_argument("--online", action="store_true", help="only the trial of OnlineGain")
     parser.add_argument("--loads", action="store_true", help="only the trial of loads that repeat")
-    arguments = parser.parse_args()
+    parser.add_argument("--points", nargs="+", type=float, default=POINTS)
+    parser.add_argument("--judged", nargs="+", type=float, default=JUDGED, help="extensions")
+    parser.add_argument("--moves", type=int, default=len(MOVES), help="how many of the moves")
+    parser.add_argument("--viscous", nargs="+", type=float, default=VISCOUS, help="[N m s]")
+    parser.add_argument("--tables", nargs="+", choices=("b0", "all"), default=["b0", "all"])
+    arguments = options_of(
+        parser, points=[0.0, 1.0], judged=[0.44], moves=1, viscous=[2e-3], tables=["b0"]
+    )
+    dispatch.interpret_all |= arguments.quick  # the plant is a user's: compiled in each process
     results: dict[str, Any] = {}
     if arguments.online:
         results["learners"] = show_learners()
         results["online"] = show_online(range(100, 108))
     if arguments.loads:
         results["loads"] = show_loads(range(100, 108))
-    for viscous in () if arguments.online or arguments.loads else VISCOUS:
+    for viscous in () if arguments.online or arguments.loads else arguments.viscous:
         at, plant = linear(viscous), machine(viscous)
         scheduled: dict[str, Any] = {}
         print(f"viscous friction {viscous:g} N m s/rad")
-        for tables in ("b0", "all"):
-            tuned = ql.tune_schedule(at, DT, points=POINTS, tables=tables, between=0, **HOW)
+        for tables in arguments.tables:
+            tuned = ql.tune_schedule(
+                at, DT, points=arguments.points, tables=tables, between=0, **HOW
+            )
             scheduled[tables] = tuned.controller
         how: dict[str, Any] = {"structure": "bandwidths", "order": 2, "compare": (), **HOW}
-        one = ql.tune([at(e) for e in POINTS], DT, **how).controller
+        one = ql.tune([at(e) for e in arguments.points], DT, **how).controller
         heavy = ql.tune(at(1.0), DT, **how).controller
         rows = []
-        for e in JUDGED:
+        for e in arguments.judged:
             own = fixed(plant, ql.tune(at(e), DT, **how).controller, e)
             row = {"e": e, "J": inertia(e), "one": fixed(plant, one, e) / own}
             for tables, controller in scheduled.items():
@@ -312,30 +322,30 @@ def main() -> None:
                 f"  tables {tables}: IAE {worst[0]:.3f} <= 1.15, M_s {worst[1]:.3f} <= 1.8: {kept}"
             )
         moves, slow = [], dict[str, float]()
-        for start in (0.0, 1.0):
-            for duration in (2.0, 0.2, 0.05):
-                found = {name: moving(plant, c, start, duration) for name, c in scheduled.items()}
-                found |= {"one": moving(plant, one, start, duration)}
-                found |= {"heavy": moving(plant, heavy, start, duration)}
-                row = {"start": start, "duration": duration}
-                row |= {f"{k}/one": v / found["one"] for k, v in found.items() if k != "one"}
-                slow = {**found} if duration == 2.0 else slow
-                row |= {f"{k}/{k} in 2 s": found[k] / slow[k] for k in scheduled}
-                moves.append(row)
-                print("  " + ", ".join(f"{name} {value:.4g}" for name, value in row.items()))
+        for start, duration in MOVES[: arguments.moves]:
+            found = {name: moving(plant, c, start, duration) for name, c in scheduled.items()}
+            found |= {"one": moving(plant, one, start, duration)}
+            found |= {"heavy": moving(plant, heavy, start, duration)}
+            row = {"start": start, "duration": duration}
+            row |= {f"{k}/one": v / found["one"] for k, v in found.items() if k != "one"}
+            slow = {**found} if duration == 2.0 else slow
+            row |= {f"{k}/{k} in 2 s": found[k] / slow[k] for k in scheduled}
+            moves.append(row)
+            print("  " + ", ".join(f"{name} {value:.4g}" for name, value in row.items()))
         jumps = {
             f"{tables}, {'in motion' if is_moving else 'at rest'}": jump(plant, c, is_moving)
             for tables, c in scheduled.items()
             for is_moving in (False, True)
         }
-        b0 = scheduled["b0"].schedule.b0
-        without = 0.3 * (b0[0] / b0[2] - 1.0)
+        of_b0 = scheduled[arguments.tables[0]].schedule.b0
+        before, after = np.interp((0.0, 0.5), arguments.points, of_b0)
+        without = 0.3 * (before / after - 1.0)
         print(
             f"  change of u at a jump of the signal [Nm]: {jumps}; without conversion {without:.3g}"
         )
         results[f"{viscous:g}"] = {"fixed": rows, "moves": moves, "jumps": jumps}
-    if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+        results[f"{viscous:g}"]["jump without conversion"] = without
+    write(arguments, results)
 
 
 if __name__ == "__main__":

@@ -25,16 +25,17 @@ of the estimated angle of the load, for each way to choose the gain.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
 from quell.controllers import quadratic_feedback, regulator
+from quell.kernels import dispatch
 from quell.kernels.dispatch import compiled, kernel
 from quell.lti.models import zero_order_hold
 from quell.observers import ESO, MultivariableESO
@@ -158,21 +159,25 @@ OMEGAS = (30.0, 50.0, 80.0, 120.0, 160.0, 240.0, 400.0)
 DRIFTS = tuple((10.0 ** np.arange(-4.0, 5.0, 1.0)).tolist())
 
 
-def print_linear(console: Console) -> None:
+def print_linear(console: Console, given: Any) -> dict[str, Any]:
     """Print three loops for eight decades of the drift, and the best of each design."""
     table = Table("drift", "encoders", "peak [mrad/(N m)]", "RMS u of noise [mN m]", "M_s")
-    for drift in DRIFTS:
+    figures: dict[str, Any] = {}
+    for drift in given.drifts:
         for name in ("motor's encoder, d on the load", "load's encoder, d on the load",
                      "both, d on the load", "both, d at both"):  # fmt: skip
             found = linear(law_of(*DESIGNS[name], 80.0, drift))
             numbers = f"{1e3 * found.peak:.3f}", f"{1e3 * found.noise:.4f}"
             table.add_row(f"{drift:g}", name, *numbers, f"{found.peak_sensitivity:.2f}")
+            figures[f"drift {drift:g}, {name}"] = _figures(found)
     console.print("omega_c = 80 rad/s, a torque of 1 N m steps on the load", table)
     table = Table(
         "design", "RMS u of noise at most", "peak [mrad/(N m)]", "omega_c", "drift", "M_s"
     )
-    for name, design in DESIGNS.items():
-        grid = {each: linear(law_of(*design, *each)) for each in itertools.product(OMEGAS, DRIFTS)}
+    for name in given.designs:
+        design = DESIGNS[name]
+        pairs = itertools.product(given.omegas, given.drifts)
+        grid = {each: linear(law_of(*design, *each)) for each in pairs}
         for noise in NOISES:
             fit = {
                 each: found
@@ -181,13 +186,28 @@ def print_linear(console: Console) -> None:
             }
             if not fit:
                 table.add_row(name, f"{noise:g} mN m", "none has M_s <= 2")
+                figures[f"{name}, noise {noise:g}"] = "none has M_s <= 2"
                 continue
             best = min(fit, key=lambda each: fit[each].peak)
+            figures[f"{name}, noise {noise:g}"] = {
+                "omega_c": best[0], "drift": best[1], **_figures(fit[best])
+            }  # fmt: skip
             table.add_row(
                 name, f"{noise:g} mN m", f"{1e3 * fit[best].peak:.2f}",
                 *(f"{number:g}" for number in best), f"{fit[best].peak_sensitivity:.2f}",
             )  # fmt: skip
     console.print("The smallest peak with M_s <= 2", table)
+    return figures
+
+
+def _figures(found: Linear) -> dict[str, Any]:
+    if not found.is_stable:
+        return {"stable": "no"}
+    return {
+        "peak [mrad/(N m)]": 1e3 * found.peak,
+        "noise [mN m]": 1e3 * found.noise,
+        "M_s": found.peak_sensitivity,
+    }
 
 
 # ---- The loop with play and friction ----
@@ -298,7 +318,7 @@ def run(law: Law, machine: Machine, seconds: float = 4.0, seed: int = 0) -> Run:
     gains = np.array(law.sensors), law.gain, law.of_d, law.of_r
     x, measured = np.zeros(4), np.zeros(len(law.sensors))
     known, applied = np.zeros(law.of_d.size), np.zeros(1)
-    play_loop(
+    (play_loop.plain if dispatch.interpret_all else play_loop)(
         *(model, z, estimate, gains, numbers, r, loads, phases),
         *(x, measured, applied, known, y, u),
     )
@@ -317,39 +337,47 @@ def run(law: Law, machine: Machine, seconds: float = 4.0, seed: int = 0) -> Run:
 CALM = 25.0
 
 
-def tuned(name: str, machines: list[Machine]) -> tuple[float, float]:
+def tuned(name: str, machines: list[Machine], given: Any) -> tuple[float, float]:
     """Return omega_c and drift of the best design by the mean RMS error at rest."""
     best, found = math.inf, (math.nan, math.nan)
-    for omega_c, drift in itertools.product(OMEGAS, DRIFTS):
+    for omega_c, drift in itertools.product(given.omegas, given.drifts):
         law = law_of(*DESIGNS[name], omega_c, drift)
         if not linear(law).peak_sensitivity <= 2.0:
             continue
-        runs = [run(law, machine) for machine in machines]
+        runs = [run(law, machine, given.seconds) for machine in machines]
         score = float(np.mean([each.resting for each in runs]))
         if score < best and np.median([each.calm for each in runs]) <= CALM:
             best, found = score, (omega_c, drift)
     return found
 
 
-def print_play(console: Console, draws: int, seed: int) -> None:
+def print_play(console: Console, given: Any) -> dict[str, Any]:
     """Tune each design on ten machines and judge it on others."""
     tuning = np.random.default_rng(1)
-    machines = [draw(tuning) for _ in range(10)]
-    random = np.random.default_rng(seed)
-    judged = [draw(random) for _ in range(draws)]
+    machines = [draw(tuning) for _ in range(given.tuning_draws)]
+    random, figures = np.random.default_rng(given.seed), dict[str, Any]()
+    judged = [draw(random) for _ in range(given.draws)]
     table = Table(
         *("design", "omega_c", "drift", "M_s", "RMS at rest [mrad]", "largest at rest"),
         *("RMS over play/2", "RMS in moves [mrad]", "change of u [mN m]"),
     )
-    for name in DESIGNS:
-        omega_c, drift = tuned(name, machines)
+    for name in given.designs:
+        omega_c, drift = tuned(name, machines, given)
         if math.isnan(omega_c):
             table.add_row(name, "NOT found: no design within M_s <= 2 and calm")
+            figures[name] = "NOT found: no design within M_s <= 2 and calm"
             continue
         law = law_of(*DESIGNS[name], omega_c, drift)
-        runs = [run(law, machine, seed=i) for i, machine in enumerate(judged)]
+        runs = [run(law, machine, given.seconds, i) for i, machine in enumerate(judged)]
         ratio = [each.resting / (500.0 * m.play) for each, m in zip(runs, judged, strict=True)]
         columns = [np.array(part) for part in zip(*runs, strict=True)]
+        figures[name] = {
+            "omega_c": omega_c, "drift": drift, "M_s": linear(law).peak_sensitivity,
+            "at rest [mrad]": np.median(columns[1]),
+            "at rest, 90 % [mrad]": np.percentile(columns[1], 90),
+            "largest at rest [mrad]": np.median(columns[2]), "over half the play": np.median(ratio),
+            "in moves [mrad]": np.median(columns[0]), "change of u [mN m]": np.median(columns[3]),
+        }  # fmt: skip
         table.add_row(
             name, f"{omega_c:g}", f"{drift:g}", f"{linear(law).peak_sensitivity:.2f}",
             f"{np.median(columns[1]):.3f} ({np.percentile(columns[1], 90):.3f})",
@@ -357,7 +385,8 @@ def print_play(console: Console, draws: int, seed: int) -> None:
             f"{np.median(columns[0]):.2f}", f"{np.median(columns[3]):.1f}",
         )  # fmt: skip
     console.print(table)
-    console.print(f"{draws} machines, seed {seed}: medians, 90 % in brackets")
+    console.print(f"{given.draws} machines, seed {given.seed}: medians, 90 % in brackets")
+    return figures
 
 
 # ---- Samples of the load's encoder that are missing ----
@@ -365,9 +394,9 @@ def print_play(console: Console, draws: int, seed: int) -> None:
 SHARES = (0.0, 0.1, 0.5, 0.9)
 
 
-def print_missing(console: Console, seed: int) -> None:
+def print_missing(console: Console, samples: int, seed: int) -> dict[str, Any]:
     """Print the error of the load's angle where samples of its encoder do not arrive."""
-    random, samples = np.random.default_rng(seed), 40_000
+    random, figures = np.random.default_rng(seed), dict[str, Any]()
     phi, (gamma, enter) = zero_order_hold(A, [AT_MOTOR, BOTH], DT)
     torques = np.cumsum(math.sqrt(DT) * random.normal(size=(samples, 2)), axis=0)
     u = 0.1 * np.sin(20.0 * DT * np.arange(samples))[:, None] - torques.sum(axis=1, keepdims=True)
@@ -385,36 +414,48 @@ def print_missing(console: Console, seed: int) -> None:
     table = Table("missing", *kinds)
     for share in SHARES:
         for burst in (1, 20):
-            there, row = y.copy(), []
+            there, row = y.copy(), list[Any]()
             gone = np.repeat(random.random(samples // burst) < share, burst)
             there[gone, 1] = math.nan
             for options in kinds.values():
                 observer = ESO.state_space(A, AT_MOTOR, ANGLES, BOTH, DT, **options)
                 error = observer.filter(there, u)[2000:, 2] - angles[2000:, 1]
                 lost = not np.max(np.abs(error)) < 1.0
-                row.append("diverges" if lost else f"{1e6 * np.sqrt(np.mean(error**2)):.3g}")
+                row.append("diverges" if lost else 1e6 * float(np.sqrt(np.mean(error**2))))
             name = f"{share:.0%}" + (f" in bursts of {burst}" if burst > 1 else "")
             if share > 0.0 or burst == 1:
-                table.add_row(name, *row)
+                table.add_row(name, *(x if isinstance(x, str) else f"{x:.3g}" for x in row))
+                figures[name] = dict(zip(kinds, row, strict=True))
     console.print("RMS error of the load's angle [µrad], while both torques wander", table)
+    return figures
 
 
 def main() -> None:
     """Run the parts."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--part", choices=("linear", "play", "missing", "all"), default="all")
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--seed", type=int, default=2)
-    given = parser.parse_args()
+    parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=[*DESIGNS])
+    parser.add_argument("--omegas", type=float, nargs="+", default=OMEGAS, help="[rad/s]")
+    parser.add_argument("--drifts", type=float, nargs="+", default=DRIFTS, help="[(N m)²/s]")
+    parser.add_argument("--tuning-draws", type=int, default=10, help="machines to tune with")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of a run with play")
+    parser.add_argument("--samples", type=int, default=40_000, help="of a run with missing ones")
+    given = options_of(
+        parser, draws=1, designs=["both, d on the load"], omegas=[80.0], drifts=[1.0],
+        tuning_draws=1, seconds=1.0, samples=3000,
+    )  # fmt: skip
+    dispatch.interpret_all |= given.quick  # to compile the loops of all designs takes minutes
+    figures: dict[str, Any] = {}
     console = Console(width=150)
     if given.part in ("linear", "all"):
-        print_linear(console)
+        figures["linear"] = print_linear(console, given)
     if given.part in ("play", "all"):
-        print_play(console, given.draws, given.seed)
+        figures["play"] = print_play(console, given)
     if given.part in ("missing", "all"):
-        print_missing(console, given.seed)
+        figures["missing"] = print_missing(console, given.samples, given.seed)
+    write(given, figures)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ counts at the motor, 3.5 N m, and torque that acts one sample late at 4 kHz. It 
 * how a rigid servo, 45 000/(s (s + 3.3)) degrees for N m with 2 ms of delay, arrives at 45°, with
   friction and without.
 
-    python benchmarks/servo_move.py
+    python benchmarks/servo_move.py [--structures STRUCTURE ...] [--parts PART ...]
 
 A cascaded P-PI controller with notch and torque feedforward that was tuned by hand has 0.77° with
 the right inertia, 1.20° with one that is 30 % off, and 0.64° after the load.
@@ -21,17 +21,18 @@ the right inertia, 1.20° with one that is 30 % off, and 0.64° after the load.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import math
 import shutil
 import subprocess
 import sys
 import tempfile
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.controllers import Prefiltered, ProfileGenerator
@@ -77,6 +78,7 @@ def as_built(plant: Any) -> Any:
     return ql.plants.encoded(ql.plants.delayed(plant, DT, DT), COUNTS)
 
 
+@cache
 def tuned(structure: str, feedforward: bool | ql.Feedforward = True) -> Any:
     """Return the controller that the tuner makes for the axis."""
     limits = {"u_min": -TORQUE, "u_max": TORQUE}
@@ -87,6 +89,7 @@ def tuned(structure: str, feedforward: bool | ql.Feedforward = True) -> Any:
         feedforward=feedforward,
         constraints=ql.tuning.Constraints(resolution=math.tau / COUNTS),
         compare=None if structure == DEFAULT else (),
+        written=False,  # the moves are planned here, without a generator in front
         **limits,
     )
     return found.controller
@@ -237,6 +240,7 @@ def tuned_rigid(friction_known: bool) -> ql.ADRC:
         constraints=ql.tuning.Constraints(resolution=math.tau / RIGID_COUNTS),
         u_min=-RIGID_TORQUE,
         u_max=RIGID_TORQUE,
+        written=False,
     )
     controller = found.controller
     assert isinstance(controller, ql.ADRC)
@@ -264,11 +268,11 @@ def arrival(plant: Any, controller: Any) -> Arrival:
     return Arrival(settling, float(np.max(error[end])) / count, moving)
 
 
-def moves() -> bool:
+def moves(figures: dict[str, Any], structures: list[str]) -> bool:
     """Print the errors of the move by 90°; return whether all bars are met."""
     met = True
     print("largest error in degrees with J_load of the model, 30 % more, 30 % less")
-    for structure in STRUCTURES:
+    for structure in structures:
         controller = tuned(structure)
         rows = [("model", controller)]
         if isinstance(controller, ql.ADRC):
@@ -280,27 +284,32 @@ def moves() -> bool:
             errors = {factor: error_of(run_of(each, factor)) for factor in FACTORS}
             text = ", ".join(f"{error:.3f}" for error in errors.values())
             print(f"{structure} ({about}), {name}: {text}")
+            figures[f"{structure}, {name}"] = {f"{k:g}": error for k, error in errors.items()}
             if structure == DEFAULT and each is controller:
                 met = all(errors[factor] <= BARS[factor] for factor in FACTORS)
     return met
 
 
-def loads() -> bool:
+def loads(figures: dict[str, Any], structures: list[str]) -> bool:
     """Print the errors after a step of the load; return whether the default meets its bar."""
-    found = {name: load_peak(tuned(name)) for name in (DEFAULT, "model-based")}
+    names = [name for name in (DEFAULT, "model-based") if name in structures]
+    found = {name: load_peak(tuned(name)) for name in names}
     for name, peak in found.items():
         print(f"largest error after a load of {STEP} N m, {name}: {peak:.3f} degrees")
-    return found[DEFAULT] <= LOAD_BAR
+    figures |= found
+    return found.get(DEFAULT, 0.0) <= LOAD_BAR
 
 
-def c_code() -> bool:
+def c_code(figures: dict[str, Any], structures: list[str]) -> bool:
     """Print how far exported C is from the simulation; return whether it is the same."""
     controller, same = tuned("model-based"), True
     if shutil.which("gcc"):
         difference = in_c(controller, run_of(controller, 1.0, interpret=True))
         print(f"largest difference of u between simulation and exported C: {difference:g} N m")
+        figures["u, on this machine [N m]"] = difference
         same = difference == 0.0
     if tool := emulator.missing_tool():
+        figures["emulator"] = f"NOT run: {tool} is not installed"
         print(f"NOT run on the emulator: {tool} is not installed; {emulator.INSTALL}")
         return same
     generator, double = moving(controller), None
@@ -314,12 +323,18 @@ def c_code() -> bool:
             f"{max(here.values()):g}, to the one in double {there['u']:.2g} N m and "
             f"{there['y'] / math.tau * COUNTS:.2g} counts"
         )
+        figures[f"{board}, {precision}"] = {
+            "to this precision": max(here.values()),
+            "u to double [N m]": there["u"],
+            "y to double [counts]": there["y"] / math.tau * COUNTS,
+        }
     error = np.abs(double["y"] - np.ravel(double["r_shaped"]))[:TORQUE_AT]
     print(f"move within limits of jerk, planned on line: {np.degrees(np.max(error)):.3f} degrees")
+    figures["planned move [deg]"] = np.degrees(np.max(error))
     return same
 
 
-def rigid_servo() -> bool:
+def rigid_servo(figures: dict[str, Any], structures: list[str]) -> bool:
     """Print how the rigid servo arrives at 45°; return whether it meets its bars."""
     met = True
     frictions = {"none": (0.0, 0.0), "Coulomb": (COULOMB, COULOMB), "stiction": (COULOMB, STICTION)}
@@ -336,15 +351,25 @@ def rigid_servo() -> bool:
                     f"settles in {found.settling:.3f} s; in the last second within "
                     f"{found.error:.1f} counts, moving by {found.moving:.1f}"
                 )
+                figures[f"{way}, friction {name}, known {known}"] = {
+                    "settling [s]": found.settling if found.settling < math.inf else "never",
+                    "error [counts]": found.error,
+                    "moving [counts]": found.moving,
+                }
                 met = met and found.settling <= SETTLING_BAR and found.error <= MOST_COUNTS
     return met
 
 
 def main() -> int:
     """Print the tables; return 1 if a bar is missed."""
-    argparse.ArgumentParser(description=__doc__).parse_args()
-    parts = {"move": moves, "load": loads, "exported C": c_code, "rigid servo": rigid_servo}
-    missed = [name for name, part in parts.items() if not part()]
+    parts = {"move": moves, "load": loads, "exported-C": c_code, "rigid-servo": rigid_servo}
+    parser = parser_of(__doc__)
+    parser.add_argument("--structures", nargs="+", choices=STRUCTURES, default=STRUCTURES)
+    parser.add_argument("--parts", nargs="+", choices=parts, default=[*parts])
+    options = options_of(parser, structures=["model-based"], parts=[*parts][:3])
+    figures: dict[str, Any] = {name: {} for name in options.parts}
+    missed = [name for name in options.parts if not parts[name](figures[name], options.structures)]
+    write(options, figures)
     print(f"bars are missed: {', '.join(missed)}" if missed else "all bars are met")
     return int(bool(missed))
 

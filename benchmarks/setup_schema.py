@@ -13,7 +13,6 @@ between values and the like, which a schema cannot express.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import random
 import re
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+from measured import options_of, parser_of, write
 
 from quell.setup import EXAMPLES, SetupError, made, made_axes, registry
 from quell.setup.description import is_of_axes
@@ -223,11 +223,11 @@ def run(count: int, seed: int) -> tuple[Counter[str], list[str], dict[str, list[
 
 def main() -> None:
     """Print the counts."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--show", help="print the messages of this class")
-    given = parser.parse_args()
+    given = options_of(parser, count=60)
     verdicts, faults, only_quell = run(given.count, given.seed)
     for verdict, times in verdicts.most_common():
         print(f"{times:6d}  {verdict}")
@@ -236,6 +236,9 @@ def main() -> None:
         if given.show is not None and given.show in name:
             print(*(f"        {message}" for message in messages), sep="\n")
     print(*(f"FAULT {fault}" for fault in faults), sep="\n")
+    classes = {name: len(messages) for name, messages in only_quell.items()}
+    figures = {"files": given.count, **verdicts, "only quell": classes, "faults": len(faults)}
+    write(given, figures)
     sys.exit(bool(faults))
 
 

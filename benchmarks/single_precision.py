@@ -17,7 +17,6 @@ the final covariance shows whether the learner still learns.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import time
@@ -25,6 +24,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -108,10 +108,13 @@ def rms(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def show_table(console: Console) -> None:
-    """Print the differences between the precisions."""
+def show_table(console: Console, only: str) -> dict[str, Any]:
+    """Print and return the differences between the precisions."""
     table = Table("", "straight", "single", "prototype", "y", "step of u", title="RMS, relative")
+    found: dict[str, Any] = {}
     for case in cases():
+        if only not in case.name:
+            continue
         arguments = case.plant, case.controller, case.scenario
         double, single = (
             ql.simulate(*arguments, precision=precision) for precision in ("double", "single")
@@ -125,12 +128,19 @@ def show_table(console: Console) -> None:
             rms(np.diff(u)) / rms(u),
         )
         table.add_row(case.name, *(f"{number:.1e}" for number in numbers))
+        names = ("straight", "single", "prototype", "y", "step of u")
+        found[case.name] = {
+            name: number if math.isfinite(number) else "not measured"
+            for name, number in zip(names, numbers, strict=True)
+        }
     console.print(table)
+    return found
 
 
-def show_long_runs(console: Console, samples: int, dt: float = 1e-3) -> None:
-    """Print the errors of both precisions in each tenth of a long run."""
+def show_long_runs(console: Console, samples: int, dt: float = 1e-3) -> dict[str, Any]:
+    """Print and return the errors of both precisions in each tenth of a long run."""
     table = Table("run", "s", "status", *(f"{i + 1}/10" for i in range(10)), "authority", "trace P")
+    found: dict[str, Any] = {}
     for name, reference in (("motion", ql.signals.Sinusoid()), ("rest", ql.signals.Constant(0.0))):
         scenario = ql.Scenario(
             reference=reference,
@@ -148,26 +158,39 @@ def show_long_runs(console: Console, samples: int, dt: float = 1e-3) -> None:
             wall = time.perf_counter() - start
             errors = [rms(part) for part in np.array_split(run["r"] - run["y"], 10)]
             finite = "" if np.all(np.isfinite(run.log)) else ", not finite"
+            authority = float(np.mean(run["authority"][-1000:]))
+            trace = float(np.trace(run.final_state.learner.covariance))
+            found[f"{name}, {precision}"] = {
+                "samples": samples,
+                "seconds": wall,
+                "status": int(run.status),
+                "rms of each tenth": errors,
+                "authority": authority,
+                "trace of P": trace,
+            }
             table.add_row(
                 f"{name}, {precision}",
                 f"{wall:.0f}",
                 f"{int(run.status)}{finite}",
                 *(f"{error:.3g}" for error in errors),
-                f"{np.mean(run['authority'][-1000:]):.2f}",
-                f"{np.trace(run.final_state.learner.covariance):.4g}",
+                f"{authority:.2f}",
+                f"{trace:.4g}",
             )
     console.print(table)
+    return found
 
 
 def main() -> None:
     """Run what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--samples", type=float, default=0.0, help="length of the long runs")
-    arguments = parser.parse_args()
+    parser.add_argument("--only", default="", help="rows whose name contains this")
+    arguments = options_of(parser, only="two-mass, 1 ms, noise 0.0001", samples=1e4)
     console = Console(width=160)
-    show_table(console)
+    figures: dict[str, Any] = {"table": show_table(console, arguments.only)}
     if arguments.samples:
-        show_long_runs(console, int(arguments.samples))
+        figures["long runs"] = show_long_runs(console, int(arguments.samples))
+    write(arguments, figures)
 
 
 if __name__ == "__main__":

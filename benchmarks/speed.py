@@ -1,6 +1,6 @@
 """Speed of quell, as ratios to references timed in the same run.
 
-    python benchmarks/speed.py [--json FILE]
+    python benchmarks/speed.py [--quick] [--json FILE]
 
 The ratios use the best of several interleaved trials, because times on a shared machine vary. The
 references are the same loop in C (``reference.c``, which must give the same trajectory), pyadrc on
@@ -10,18 +10,18 @@ the learners.
 
 from __future__ import annotations
 
-import argparse
+import importlib.util
 import tempfile
 import timeit
 from pathlib import Path
 
 import numpy as np
 from c_reference import best, c_reference, row, show
+from measured import check_present, not_run, options_of, parser_of, write
 
 import quell as ql
 from quell.experiments import two_mass_spring as study
 
-TRIALS = 15
 SAMPLES = round(study.END / study.Settings().dt) + 1
 
 
@@ -30,7 +30,7 @@ def each(*runs: float) -> str:
     return " / ".join(f"{run / SAMPLES * 1e9:.0f}" for run in runs) + " ns a sample"
 
 
-def against_c(rows: list[dict[str, object]]) -> None:
+def against_c(rows: list[dict[str, object]], trials: int) -> None:
     """Time the whole closed loop with the Kalman learner."""
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     controller, scenario = study.controllers(settings)[study.L], study.scenario(settings)
@@ -44,7 +44,7 @@ def against_c(rows: list[dict[str, object]]) -> None:
             lambda: ql.simulate(plant, controller, scenario),
             lambda: reference(False),
             lambda: ql.simulate(plant, controller, scenario, record_every=SAMPLES),
-            trials=TRIALS,
+            trials=trials,
         )
     for label, c, ours, bar in (
         ("every sample recorded", c_all, ours_all, "≤ 1.4"),
@@ -56,11 +56,12 @@ def against_c(rows: list[dict[str, object]]) -> None:
                 ours / c,
                 bar,
                 f"{each(ours, c)}, apart by {apart:.0e}",
+                apart=apart,
             )
         )
 
 
-def algorithm_1(rows: list[dict[str, object]]) -> None:
+def algorithm_1(rows: list[dict[str, object]], trials: int) -> None:
     """Time Algorithm 1 with a small and a large batch."""
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     scenario = study.scenario(settings)
@@ -71,14 +72,14 @@ def algorithm_1(rows: list[dict[str, object]]) -> None:
     few, many = best(
         lambda: ql.simulate(plant, small, scenario),
         lambda: ql.simulate(plant, large, scenario),
-        trials=TRIALS,
+        trials=trials,
     )
     rows.append(
         row("Algorithm 1: batch of 10 000 / batch of 10", many / few, "≤ 1.3", each(many, few))
     )
 
 
-def one_call(rows: list[dict[str, object]]) -> None:
+def one_call(rows: list[dict[str, object]], trials: int) -> None:
     """Time ``step`` from Python and pyadrc's ``StateSpace``, after checking that both agree."""
     import pyadrc
 
@@ -102,7 +103,7 @@ def one_call(rows: list[dict[str, object]]) -> None:
             lambda: timeit.timeit(lambda: ours.step(1.0, 0.5), number=calls),
             lambda: timeit.timeit(lambda: learned.step(1.0, 0.5), number=calls),
             lambda: timeit.timeit(lambda: theirs(0.5, 0.1, 1.0), number=calls // 10),
-            trials=9,
+            trials=min(trials, 9),
         )
     )
     peer = 10 * peer - empty
@@ -118,7 +119,7 @@ def one_call(rows: list[dict[str, object]]) -> None:
     rows.append(row("one call, second order: pyadrc / quell", peer / plain, "> 1", times))
 
 
-def against_python_control(rows: list[dict[str, object]]) -> None:
+def against_python_control(rows: list[dict[str, object]], trials: int) -> None:
     """Time MF-ESO and python-control's ``input_output_response``, and check that both agree."""
     import control as ct
 
@@ -150,9 +151,10 @@ def against_python_control(rows: list[dict[str, object]]) -> None:
         )
     )
     assert apart < 1e-9, f"quell and python-control differ by {apart}"
-    (theirs,) = best(lambda: ct.input_output_response(loop, t, np.ones(samples)), trials=3)
+    few = min(trials, 3)
+    (theirs,) = best(lambda: ct.input_output_response(loop, t, np.ones(samples)), trials=few)
     longer = ql.Scenario(reference=1.0, duration=100.0)
-    (ours,) = best(lambda: ql.simulate(plant, law, longer), trials=TRIALS)
+    (ours,) = best(lambda: ql.simulate(plant, law, longer), trials=trials)
     ours /= 100_001
     theirs /= samples
     times = f"{theirs * 1e6:.0f} µs / {ours * 1e9:.0f} ns a sample, apart by {apart:.0e}"
@@ -163,15 +165,17 @@ def against_python_control(rows: list[dict[str, object]]) -> None:
 
 def main() -> None:
     """Run all benchmarks and print one table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    arguments = parser.parse_args()
+    parser = parser_of(__doc__)
+    parser.add_argument("--trials", type=int, default=15, help="of which the best counts")
+    options = options_of(parser, trials=1)
+    check_present(options, ["gcc"])
+    for module in ("pyadrc", "control"):
+        if importlib.util.find_spec(module) is None:
+            not_run(options, f"no package {module} here")
     rows: list[dict[str, object]] = []
     for measure in (against_c, algorithm_1, one_call, against_python_control):
-        measure(rows)
-    show(rows, arguments.json)
+        measure(rows, options.trials)
+    write(options, show(rows))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -42,16 +43,20 @@ def first_step(trials: int) -> float:
 
 
 def main() -> None:
-    """Time all three and print one table."""
+    """Time all of them and print one table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--trials", type=int, default=7, help="of which the best counts")
+    options = options_of(parser, trials=1)
+    trials = options.trials
     python = [sys.executable, "-c"]
-    bare = best([*python, "pass"], 7)
+    bare = best([*python, "pass"], trials)
     rows = [
-        ("import quell", best([*python, "import quell"], 7) - bare, 0.3),
-        ("first step of an ADRC of order 2, cache warm", first_step(7), 0.3),
-        ("quell --help", best([sys.executable, "-m", "quell", "--help"], 7), 0.6),
+        ("import quell", best([*python, "import quell"], trials) - bare, 0.3),
+        ("first step of an ADRC of order 2, cache warm", first_step(trials), 0.3),
+        ("quell --help", best([sys.executable, "-m", "quell", "--help"], trials), 0.6),
         (
             "quell reproduce two-mass, cache warm, with figures",
-            best([sys.executable, "-m", "quell", "reproduce", "two-mass"], 4),
+            best([sys.executable, "-m", "quell", "reproduce", "two-mass"], min(trials, 4)),
             5.0,
         ),
     ]
@@ -59,6 +64,7 @@ def main() -> None:
     for what, took, bar in rows:
         table.add_row(what, f"{took:.3f}", f"≤ {bar:g}")
     Console().print(table)
+    write(options, {f"{what} [s]": took for what, took, _ in rows})
 
 
 if __name__ == "__main__":

@@ -18,14 +18,12 @@ and put around the true plant: whether the loop is stable, and its M_s over the 
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 from scipy import signal
 
 import quell as ql
@@ -167,15 +165,18 @@ def _z(found: Any, step: Step) -> float:
 
 def main() -> None:
     """Print shares of right, undecided and wrong results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--set", action="store_true")
     parser.add_argument("--tune", help="structure, for example bandwidths")
-    args = parser.parse_args()
-    cases = list(itertools.product((1, 2, 3), (False, True), RESTS, NOISES))
+    parser.add_argument("--orders", type=int, nargs="+", choices=(1, 2, 3), default=[1, 2, 3])
+    parser.add_argument("--noises", type=float, nargs="+", default=NOISES)
+    parser.add_argument("--late", type=int, nargs="+", choices=(0, 1), default=[0, 1])
+    parser.add_argument("--rests", type=int, nargs="+", default=RESTS, help="samples of rest")
+    args = options_of(parser, orders=[1], noises=[0.005], rests=[5], late=[1])
+    cases = list(itertools.product(args.orders, map(bool, args.late), args.rests, args.noises))
     each = max(args.draws // len(cases), 1)
     results = []
     for order, late, rest, noise in cases:
@@ -188,55 +189,63 @@ def main() -> None:
             wrong = result["inside"] is False if args.set else _is_wrong(result)
             if args.verbose and wrong:
                 print(results[-1])
-    if args.set:
-        _summary_of_sets(results)
-    else:
-        _summary(results)
-    if args.json is not None:
-        args.json.write_text(json.dumps(results))
+    write(args, _summary_of_sets(results) if args.set else _summary(results))
 
 
 def _is_wrong(result: dict[str, Any]) -> bool:
     return not result["covered"] and not result["said_not"]
 
 
-def _summary_of_sets(results: list[dict[str, Any]]) -> None:
+def _summary_of_sets(results: list[dict[str, Any]]) -> dict[str, Any]:
     used = [one for one in results if not one["refused"]]
     print(f"{len(results)} records, {len(results) - len(used)} refused:")
+    figures: dict[str, Any] = {"records": len(results), "refused": len(results) - len(used)}
     for reason in sorted({one["refused"] for one in results if one["refused"]}):
         print(f"  {sum(one['refused'] == reason for one in results)} × {reason}")
     for name in ("inside", "gain_inside", "stable"):
         values = [one[name] for one in used if one[name] is not None]
         if values:
             print(f"{name}: {np.mean(values):.1%} of {len(values)}")
+            figures[name] = {"share [%]": 100.0 * np.mean(values), "of": len(values)}
     off = np.array([one["off"] for one in used if one["inside"] is not None])
     if off.size:
         size, phase = np.quantile(off, 0.95, axis=0)
         print(f"outside by at most a factor of {size:.3f} in 95 %, by {phase:.2f} degrees in 95 %")
-        print(f"within 2 % and 2 degrees: {np.mean((off[:, 0] <= 1.02) & (off[:, 1] <= 2.0)):.1%}")
+        near = np.mean((off[:, 0] <= 1.02) & (off[:, 1] <= 2.0))
+        print(f"within 2 % and 2 degrees: {near:.1%}")
+        figures |= {"size, 95 %": size, "phase, 95 % [deg]": phase, "near [%]": 100.0 * near}
     ratios = [one["M_s"] for one in used if one["M_s"] is not None]
     if ratios:
         within = np.mean(np.array(ratios) <= 1.2)
         print(f"M_s over the promised one: at most 1.2 in {within:.1%}, largest {max(ratios):.3f}")
-    print(f"{np.mean([one['seconds'] for one in results]):.2f} s of identification a record")
+        figures |= {"M_s within 1.2 [%]": 100.0 * within, "M_s, largest": max(ratios)}
+    figures["seconds of a record"] = np.mean([one["seconds"] for one in results])
+    print(f"{figures['seconds of a record']:.2f} s of identification a record")
+    return figures
 
 
-def _summary(results: list[dict[str, Any]]) -> None:
+def _summary(results: list[dict[str, Any]]) -> dict[str, Any]:
+    figures: dict[str, Any] = {}
     for name in ("all", "order", "late", "rest_samples", "noise"):
         for value in sorted({one.get(name) for one in results}, key=str):
             part = [one for one in results if one.get(name) == value]
             told = [one for one in part if not one["said_not"]]
-            covered = np.mean([one["covered"] for one in told]) if told else np.nan
             widths = [one["width"] for one in told if one["width"] is not None]
-            print(
-                f"{name} {value}: {len(part)} records, NOT {1 - len(told) / len(part):.0%}, "
-                f"gain covered {covered:.1%} of the others, "
-                f"sign wrong without NOT {sum(one['wrong_sign'] for one in told)}, "
-                f"median width {np.median(widths) if widths else np.nan:.3f}, "
-                f"delay covered {np.mean([one['delay_covered'] for one in told]):.1%}, "
-                f"slow pole within 2 {np.mean([one['z'] < 2.0 for one in told]):.1%}, "
-                f"{np.mean([one['seconds'] for one in part]):.2f} s"
-            )
+            row = {
+                "records": len(part),
+                "NOT [%]": 100.0 * (1.0 - len(told) / len(part)),
+                "gain covered [%]": 100.0 * np.mean([one["covered"] for one in told]),
+                "sign wrong without NOT": sum(one["wrong_sign"] for one in told),
+                "median width": np.median(widths) if widths else np.nan,
+                "delay covered [%]": 100.0 * np.mean([one["delay_covered"] for one in told]),
+                "slow pole within 2 [%]": 100.0 * np.mean([one["z"] < 2.0 for one in told]),
+                "seconds": np.mean([one["seconds"] for one in part]),
+            }
+            print(f"{name} {value}: " + ", ".join(f"{key} {row[key]:.4g}" for key in row))
+            figures[f"{name} {value}"] = {
+                key: each if np.isfinite(each) else "nothing is told" for key, each in row.items()
+            }
+    return figures
 
 
 if __name__ == "__main__":

@@ -14,11 +14,11 @@ RMS error of the second half of 80 s over that of MF-ESO (in µm or µrad), with
 
 from __future__ import annotations
 
-import argparse
 import math
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -30,20 +30,20 @@ SECONDS = 80.0
 s = ql.signals
 
 
-def moves(distance: float) -> ql.signals.Signal:
+def moves(distance: float, seconds: float) -> ql.signals.Signal:
     """Return moves to and fro of 2 s with rests of 2 s."""
     first: ql.signals.Signal = s.SmoothMove(distance=distance, duration=2.0)
-    for k in range(1, round(SECONDS / 4.0)):
+    for k in range(1, round(seconds / 4.0)):
         first = first + s.SmoothMove(distance=(-1) ** k * distance, duration=2.0, start=4.0 * k)
     return first
 
 
-def references(size: float) -> dict[str, ql.signals.Signal]:
+def references(size: float, seconds: float = SECONDS) -> dict[str, ql.signals.Signal]:
     """Return the references of a ``size`` [y-unit]."""
     return {
         "sinusoid, 1.5 rad/s": size * s.Sinusoid(omega=1.5),
         "sinusoid, 0.2 rad/s": size * s.Sinusoid(omega=0.2),
-        "moves and rests": moves(2.0 * size),
+        "moves and rests": moves(2.0 * size, seconds),
         "a move, then rest": s.SmoothMove(distance=size, duration=2.0),
     }
 
@@ -85,7 +85,9 @@ def learners(speed: float) -> dict[str, Any]:
     }
 
 
-def error(twin: str, learner: Any, guard: Any, reference: Any, held: Any = None) -> float:
+def error(
+    twin: str, learner: Any, guard: Any, reference: Any, held: Any = None, seconds: float = SECONDS
+) -> float:
     """Return the RMS error in the second half of a run [y-unit]; infinite if it diverges."""
     plant, order, b0, omega_c, omega_o, most, _, _ = TWINS[twin]
     controller = ql.ADRC(
@@ -98,33 +100,51 @@ def error(twin: str, learner: Any, guard: Any, reference: Any, held: Any = None)
         u_max=most,
         held=held,
     )
-    run = ql.simulate(plant(), controller, ql.Scenario(reference, SECONDS))
+    run = ql.simulate(plant(), controller, ql.Scenario(reference, seconds))
     if run.diverged:
         return math.inf
-    half = run.t >= 0.5 * SECONDS
+    half = run.t >= 0.5 * seconds
     return float(np.sqrt(np.mean((run["r"] - run["y"])[half] ** 2)))
 
 
 def main() -> None:
     """Print a table for each twin."""
-    parser = argparse.ArgumentParser(description="Friction features where a plant sticks.")
+    parser = parser_of(__doc__)
     parser.add_argument("--twin", choices=[*TWINS], help="this twin alone")
-    options = parser.parse_args()
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="duration of a run")
+    parser.add_argument("--learners", nargs="+", choices=[*learners(1.0)], help="none and these")
+    options = options_of(parser, seconds=8.0, twin="EMPS", learners=["RLS, tanh"])
+    figures: dict[str, Any] = {}
     for twin in [options.twin] if options.twin else TWINS:
         *_, size, speed = TWINS[twin]
-        cases = references(size)
+        cases = references(size, options.seconds)
         table = Table("learner", *cases, title=f"{twin}: without guard, with guard")
         plain: dict[str, float] = {}
         for label, learner in learners(speed).items():
+            if label not in ("none", *(options.learners or learners(speed))):
+                continue
             guards = (None, ql.Guard()) if learner is not None else (None,)
-            rows = [{n: error(twin, learner, g, r) for n, r in cases.items()} for g in guards]
+            rows = [
+                {n: error(twin, learner, g, r, seconds=options.seconds) for n, r in cases.items()}
+                for g in guards
+            ]
             plain = plain or rows[0]
             if learner is None:
                 cells = [f"{1e6 * value:.1f}" for value in plain.values()]
             else:
                 cells = [", ".join(f"{row[n] / plain[n]:.3f}" for row in rows) for n in cases]
             table.add_row(label, *cells)
+            for n in cases:
+                mine: dict[str, float] = {"rms [um]": 1e6 * rows[0][n]}
+                if learner is not None:
+                    mine = {"without guard": rows[0][n] / plain[n]}
+                    mine["with guard"] = rows[1][n] / plain[n]
+                figures[f"{twin}, {n}: {label}"] = {
+                    key: value if math.isfinite(value) else "diverged"
+                    for key, value in mine.items()
+                }
         Console(width=130).print(table)
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ that the trial reads; do that for each new guard, and then judge with seeds that
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import time
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -26,7 +26,6 @@ from quell.experiments.stress.loops import GeneralLoop, draw_loop
 from quell.guard import Guard
 
 ORDERS = (1, 2, 3, 4)
-LOOPS, UNSEEN = 10, 30
 
 
 def healthy_loops(order: int, count: int, *seed: int) -> list[GeneralLoop]:
@@ -44,23 +43,29 @@ def healthy_loops(order: int, count: int, *seed: int) -> list[GeneralLoop]:
 
 def main() -> None:
     """Search for all orders, print what was found, and write it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--write", action="store_true", help="replace the file of the trial")
     parser.add_argument("--searches", type=int, default=2, help="searches for each order")
     parser.add_argument("--generations", type=int, default=16)
     parser.add_argument("--population", type=int, default=40)
-    arguments = parser.parse_args()
+    parser.add_argument("--orders", type=int, nargs="+", choices=ORDERS, default=ORDERS)
+    parser.add_argument("--loops", type=int, default=10, help="of a search")
+    parser.add_argument("--unseen", type=int, default=30, help="loops that judge")
+    arguments = options_of(
+        parser, orders=[1], searches=1, generations=2, population=4, loops=1, unseen=1
+    )
+    if arguments.write and tuple(arguments.orders) != ORDERS:
+        parser.error("--write needs all orders: leave out --orders and --quick")
+    figures: dict[str, object] = {}
     guard, points = Guard(), {}
     table = Table("order", "search", "score by generation", "unseen loops", "CPU [s]")
-    for order in ORDERS:
+    for order in arguments.orders:
         points[str(order)] = []
-        unseen = healthy_loops(order, UNSEEN, 9999)
+        unseen = healthy_loops(order, arguments.unseen, 9999)
         for seed in range(arguments.searches):
             began = time.process_time()
             found = search(
-                healthy_loops(order, LOOPS, seed),
+                healthy_loops(order, arguments.loops, seed),
                 guard,
                 np.random.default_rng([seed, order]),
                 generations=arguments.generations,
@@ -69,9 +74,15 @@ def main() -> None:
             points[str(order)].append([float(f"{x:.4g}") for x in found.point])
             score = judge(found.point[None], unseen, guard)[0]
             history = " ".join(f"{x:.2f}" for x in found.history)
-            spent = f"{time.process_time() - began:.0f}"
-            table.add_row(str(order), str(seed), history, f"{score:.2f}", spent)
+            spent = time.process_time() - began
+            table.add_row(str(order), str(seed), history, f"{score:.2f}", f"{spent:.0f}")
+            figures[f"order {order}, search {seed}"] = {
+                "scores": found.history,
+                "unseen": score,
+                "cpu": spent,
+            }
     Console(width=140).print(table)
+    write(arguments, figures)
     if arguments.write:
         FOUND.write_text(json.dumps(points, indent=1) + "\n", encoding="utf-8")
 

@@ -1,6 +1,6 @@
 """One loop over NumPy's structured records and over NamedTuples: run, compile, interpreted, step.
 
-    python benchmarks/structured_records.py [--json FILE]
+    python benchmarks/structured_records.py [--interpreted]
 
 A record has shapes in its Numba type, and is the struct of exported C: could it replace
 NamedTuples, with ``kernels/sized.py``, ``specialised`` and packed controllers? The same text of
@@ -22,7 +22,6 @@ compilation are the best of fresh processes without a disk cache.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -32,13 +31,13 @@ import tempfile
 import time
 from collections.abc import Callable
 from operator import itemgetter
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from c_reference import best, row, show
+from measured import options_of, parser_of, write
 from numba.extending import register_jitable
 
 import quell as ql
@@ -514,10 +513,13 @@ def fresh_compile_times(name: str) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description="Time structured records against NamedTuples.")
-    parser.add_argument("--json", type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("--compile", choices=VARIANTS, help="only compile, and print the times")
-    options = parser.parse_args()
+    parser.add_argument("--interpreted", action="store_true", help="without the compiled runs")
+    parser.add_argument(
+        "--trials", type=int, default=INTERPRETED_TRIALS, help="of which the best counts"
+    )
+    options = options_of(parser, interpreted=True, trials=1)
     if options.compile:
         print(json.dumps(compile_times(options.compile)))
         return
@@ -528,6 +530,9 @@ def main() -> None:
     for name, variant in variants.items():
         interpreted, compiled = np.zeros(INTERPRETED), np.zeros(SAMPLES)
         variant.interpreted_run(*variant.arguments, few, interpreted)
+        logs[name] = interpreted
+        if options.interpreted:
+            continue
         fresh = Variant(name)
         run = fresh.compile_run(*fresh.arguments, inputs, compiled)
         run(*fresh.arguments, inputs, compiled)
@@ -551,18 +556,19 @@ def main() -> None:
                     unit = f"{ours:.2f} against {theirs:.2f} s"
                 rows.append(row(f"{what}: {name}", ours / theirs, bar, unit))
 
-    compare(
-        "compiled run, per sample",
-        timed(
-            {
-                name: lambda one=one, run=run: run(*one.arguments, inputs, out)
-                for name, (one, run) in runs.items()
-            },
-            TRIALS,
-        ),
-        SAMPLES,
-        "≤ 1.05",
-    )
+    if not options.interpreted:
+        compare(
+            "compiled run, per sample",
+            timed(
+                {
+                    name: lambda one=one, run=run: run(*one.arguments, inputs, out)
+                    for name, (one, run) in runs.items()
+                },
+                TRIALS,
+            ),
+            SAMPLES,
+            "≤ 1.05",
+        )
     compare(
         "interpreted run, per sample",
         timed(
@@ -571,7 +577,7 @@ def main() -> None:
                 for name, one in variants.items()
                 if name in (NAMED, RECORDS)
             },
-            INTERPRETED_TRIALS,
+            options.trials,
         ),
         INTERPRETED,
         "≤ 1.25",
@@ -584,15 +590,19 @@ def main() -> None:
 
         return many
 
-    calls = {name: repeated(step) for name, step in steps.items()}
-    calls["records, stock Numba, by its dispatcher"] = repeated(runs[RECORDS][0].dispatched_step)
-    compare("one step from Python", timed(calls, INTERPRETED_TRIALS), CALLS, "")
-    times = {name: fresh_compile_times(name) for name in VARIANTS}
-    for key in times[NAMED]:
-        compare(f"compilation of {key}", {name: each[key] for name, each in times.items()}, 1, "")
+    if not options.interpreted:
+        calls = {name: repeated(step) for name, step in steps.items()}
+        dispatched = repeated(runs[RECORDS][0].dispatched_step)
+        calls["records, stock Numba, by its dispatcher"] = dispatched
+        compare("one step from Python", timed(calls, options.trials), CALLS, "")
+        times = {name: fresh_compile_times(name) for name in VARIANTS}
+        for key in times[NAMED]:
+            each_time = {name: each[key] for name, each in times.items()}
+            compare(f"compilation of {key}", each_time, 1, "")
     for name, distance in apart.items():
         print(f"u apart from that of NamedTuples, {name}: {distance:.1e}")
-    show(rows, options.json, f"Structured records / NamedTuples, Numba {numba.__version__}")
+    shown = show(rows, f"Structured records / NamedTuples, Numba {numba.__version__}")
+    write(options, {"u apart": apart, **shown})
 
 
 if __name__ == "__main__":

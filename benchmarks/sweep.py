@@ -28,6 +28,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 from quell.setup.loading import made, sweep_of
 from quell.sweeping import Sweep, sweep
@@ -92,8 +93,8 @@ def arguments(runs: int, noise: bool) -> dict[str, object]:
     return sweep_of(made("sweep.toml", SETUP | {"scenario": scenario, "sweep": table}))
 
 
-def timed(options: argparse.Namespace, folder: Path) -> None:
-    """Do a sweep, and print its time and memory."""
+def timed(options: argparse.Namespace, folder: Path) -> dict[str, object]:
+    """Do a sweep, print and return its time and memory."""
     watch = Memory()
     watch.start()
     before, began = os.times(), time.perf_counter()
@@ -114,9 +115,19 @@ def timed(options: argparse.Namespace, folder: Path) -> None:
         stored = result.dataset.isel(run=run)
         same = all(stored[name].item() == alone[name] for name in result.store.measures)
         assert same, f"run {run} differs from the run alone"
+    return {
+        "runs": options.runs,
+        "with flags": failures,
+        "seconds": elapsed,
+        "runs a second": options.runs / elapsed,
+        "processor time of a run [ms]": 1e3 * used / options.runs,
+        "PSS [MB]": pss,
+        "RSS [MB]": rss,
+        "disk [MB]": sum(files) / 1e6,
+    }
 
 
-def on_cluster(options: argparse.Namespace, folder: Path) -> None:
+def on_cluster(options: argparse.Namespace, folder: Path) -> dict[str, object]:
     """Do a sweep here and on two workers, one of which is killed, and compare all bits."""
     given = arguments(options.runs, options.noise)
     local = sweep(**given, folder=folder / "here", executor="processes", workers=2)
@@ -142,7 +153,8 @@ def on_cluster(options: argparse.Namespace, folder: Path) -> None:
     try:
         began = time.perf_counter()
         remote = sweep(**given, folder=folder / "there", executor=address, progress=kill)
-        print(f"{options.runs} runs on the cluster: {time.perf_counter() - began:.1f} s")
+        took = time.perf_counter() - began
+        print(f"{options.runs} runs on the cluster: {took:.1f} s")
     finally:
         for process in processes:
             process.terminate()
@@ -151,6 +163,7 @@ def on_cluster(options: argparse.Namespace, folder: Path) -> None:
     assert killed
     assert remote.missing == 0
     compare(local, remote)
+    return {"runs": options.runs, "seconds": took, "missing": remote.missing}
 
 
 def compare(one: Sweep, other: Sweep) -> None:
@@ -166,22 +179,21 @@ def compare(one: Sweep, other: Sweep) -> None:
 
 def main() -> None:
     """Do what the options say."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--runs", type=int)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--executor", default="processes", choices=["processes", "threads"])
     parser.add_argument("--noise", action="store_true")
     parser.add_argument("--cluster", action="store_true")
     parser.add_argument("--port", type=int, default=8786)
-    options = parser.parse_args()
+    options = options_of(parser, runs=100, workers=1, executor="threads")
     options.runs = options.runs or (10_000 if options.cluster else 1_000_000)
     with tempfile.TemporaryDirectory() as folder:
         if options.cluster:
-            on_cluster(options, Path(folder))
+            figures = on_cluster(options, Path(folder))
         else:
-            timed(options, Path(folder) / "runs")
+            figures = timed(options, Path(folder) / "runs")
+    write(options, figures)
 
 
 if __name__ == "__main__":

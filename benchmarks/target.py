@@ -1,6 +1,6 @@
 """Instructions, code, state and stack of exported controllers on a Cortex-M, in the emulator.
 
-    python benchmarks/target.py [--optimise=-O2] [--samples 20000] [--json FILE]
+    python benchmarks/target.py [--optimise=-O2] [--samples 20000] [--only TEXT]
 
 Each controller is exported to C, compiled by ``arm-none-eabi-gcc -O2 -fpeel-loops``, which unrolls
 its short loops, or with other options, without FMA, and run in
@@ -15,8 +15,6 @@ of the same precision.
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import sys
 import tempfile
@@ -24,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import not_run, options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -136,10 +135,10 @@ def export(controller: Any, precision: str, name: str, folder: Path) -> None:
     """Write header and source of a controller."""
     if precision == "single":
         controller = ql.controllers.in_single_precision(controller)
-    write(c_source(controller, name), folder)
+    write_source(c_source(controller, name), folder)
 
 
-def write(source: CSource, folder: Path) -> None:
+def write_source(source: CSource, folder: Path) -> None:
     """Write header and source."""
     (folder / f"{source.name}.h").write_text(source.header, encoding="utf-8")
     (folder / f"{source.name}.c").write_text(source.source, encoding="utf-8")
@@ -207,31 +206,31 @@ def shown(case: Case, found: dict[str, float]) -> list[str]:
 
 def main() -> None:
     """Measure all cases; print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--samples", type=int, default=20_000, help="steps of each run")
     parser.add_argument("--optimise", default=OPTIMISE, help="options of the compiler")
-    parser.add_argument("--json", type=Path, help="write the table to this file")
-    arguments = parser.parse_args()
+    parser.add_argument("--only", default="", help="controllers whose name has this text")
+    arguments = options_of(parser, samples=500, only="table of b0")
     if tool := emulator.missing_tool():
-        sys.exit(f"{tool} is not installed; {emulator.INSTALL}")
-    rows, runs = [], dict[str, ql.Trajectory]()
+        not_run(arguments, f"{tool} is not installed; {emulator.INSTALL}")
+    figures, runs = {}, dict[str, ql.Trajectory]()
     heads = ("controller", "processor", "precision", "instructions, mean", "most", "code [B]")
     table = Table(
         *heads, "constants [B]", "state [B]", "stack [B]", *_MEMORY, "u − double", "golden [ulp]"
     )
     table.title = f"arm-none-eabi-gcc {arguments.optimise}"
     for case in cases():
+        if arguments.only not in case.name:
+            continue
         if case.name not in runs:
             runs[case.name] = simulated(case, arguments.samples)
         with tempfile.TemporaryDirectory() as folder:
             found = measured(case, runs[case.name], Path(folder), arguments.optimise)
             found["golden"] = golden(case, Path(folder) / "golden")
         table.add_row(*shown(case, found))
-        names = {"controller": case.name, "board": case.board, "precision": case.precision}
-        rows.append({**names, **found})
+        figures[f"{case.name}, {case.board}, {case.precision}"] = found
     Console().print(table)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    write(arguments, figures)
 
 
 if __name__ == "__main__":

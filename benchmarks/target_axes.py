@@ -1,6 +1,6 @@
 """Instructions of a step of three coupled axes over those of three single controllers.
 
-    python benchmarks/target_axes.py [--optimise=-O2] [--samples 2000] [--only TEXT] [--json FILE]
+    python benchmarks/target_axes.py [--optimise=-O2] [--samples 2000] [--only TEXT]
 
 The axes have a constant B0, limits of u, and the learners in the row, each with a guard; the single
 controllers have the same observers, laws, learners and guards, and the same limits. Both run in the
@@ -13,18 +13,16 @@ share.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import not_run, options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
-from target import HERE, OPTIMISE, TYPES, emulator, export, write
+from target import HERE, OPTIMISE, TYPES, emulator, export, write_source
 
 import quell as ql
 from quell.export import c_source
@@ -82,7 +80,7 @@ def measured(
     real, dtype = TYPES[precision]
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        write(c_source(axes, "axes", precision=precision), folder)
+        write_source(c_source(axes, "axes", precision=precision), folder)
         for name, learner in zip(("one", "two", "three"), learners, strict=True):
             export(joint(learner, u_min=-limit, u_max=limit), precision, name, folder)
         numbers = run["r"].astype(dtype).tobytes() + run["y_measured"].astype(dtype).tobytes()
@@ -104,24 +102,28 @@ def measured(
 
 def main() -> None:
     """Measure all rows; print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--samples", type=int, default=2000, help="steps of each run")
     parser.add_argument("--only", default="", help="rows whose name has this text")
     parser.add_argument("--optimise", default=OPTIMISE, help="options of the compiler")
-    parser.add_argument("--json", type=Path, help="write the table to this file")
-    options = parser.parse_args()
+    parser.add_argument("--rules", nargs="+", choices=RULES, default=[*RULES])
+    parser.add_argument("--limits", type=float, nargs="+", default=[WIDE_LIMIT, NARROW_LIMIT])
+    options = options_of(
+        parser, samples=100, only="without", rules=["direction"], limits=[WIDE_LIMIT]
+    )
     if tool := emulator.missing_tool():
-        sys.exit(f"{tool} is not installed; {emulator.INSTALL}")
+        not_run(options, f"{tool} is not installed; {emulator.INSTALL}")
     title = f"instructions of a step, arm-none-eabi-gcc {options.optimise}"
     table = Table("axes", "saturation", "limits", "at limits", "processor", "precision",
                   "three axes", "most", "three single ones", "ratio", "state [B]",
                   "states of the single ones [B]", title=title)  # fmt: skip
-    rows = []
-    for (name, learners), limit in itertools.product(ROWS.items(), (WIDE_LIMIT, NARROW_LIMIT)):
+    figures = {}
+    for (name, learners), limit in itertools.product(ROWS.items(), options.limits):
         if options.only not in name:
             continue
         run = simulated(axes_with(learners, "each", limit), options.samples)
-        for rule, given in RULES.items():
+        for rule in options.rules:
+            given = RULES[rule]
             for board, precision in (("Cortex-M4F", "single"), ("Cortex-M7", "double")):
                 if precision == "double" and (rule != "each" or limit != WIDE_LIMIT):
                     continue
@@ -132,11 +134,10 @@ def main() -> None:
                 sizes = (f"{found[key]:.0f}" for key in ("state", "states"))
                 table.add_row(name, rule, f"{limit:g}", f"{100 * found['limited']:.0f} %", board,
                               precision, *cells, f"{ratio:.3f}{mark}", *sizes)  # fmt: skip
-                rows.append({"axes": name, "saturation": rule, "limit": limit, "board": board,
-                             "precision": precision, "ratio": ratio, **found})  # fmt: skip
+                label = f"{name}, {rule}, limits {limit:g}, {board}, {precision}"
+                figures[label] = {"ratio": ratio, **found}
     Console(width=160).print(table)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    write(options, figures)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Cost of telemetry: writing a row, the delay of a loop in Python, and the loss after a kill.
 
-    python benchmarks/telemetry.py [seconds]
+    python benchmarks/telemetry.py [SECONDS]
 
 A loop in Python shares the interpreter with the writer's thread, a compiled loop does not. The
 benchmark measures the first, which is the worse case.
@@ -15,8 +15,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 from quell.realtime import CsvSink, LiveSink, McapSink
 from quell.realtime.recordings import Header, MemorySink, file_sink, load, row_channels
@@ -35,8 +37,9 @@ def rows_like_a_loops(count: int) -> np.ndarray:
     return rows
 
 
-def cost(folder: Path) -> None:
-    """Print the processor time of the writer for each row."""
+def cost(folder: Path) -> dict[str, Any]:
+    """Print and return the processor time of the writer for each row."""
+    figures: dict[str, Any] = {}
     rows = rows_like_a_loops(20_000)
     for sink in (
         MemorySink(),
@@ -56,10 +59,12 @@ def cost(folder: Path) -> None:
             f"{type(sink).__name__:10s} {took / len(rows) * 1e6:6.2f} µs a row of "
             f"{rows.shape[1]}, {size:4.0f} bytes"
         )
+        figures[type(sink).__name__] = {"a row [us]": took / len(rows) * 1e6, "bytes": size}
+    return figures
 
 
-def lateness(folder: Path, seconds: float) -> None:
-    """Print the lateness of a loop in Python at 1 kHz, without and with telemetry."""
+def lateness(folder: Path, seconds: float) -> dict[str, Any]:
+    """Print and return the lateness of a loop in Python at 1 kHz, without and with telemetry."""
     header = Header(CHANNELS, 1e-3)
     rows = rows_like_a_loops(round(seconds * 1000))
     kinds = {
@@ -72,6 +77,7 @@ def lateness(folder: Path, seconds: float) -> None:
             LiveSink(0),
         ],
     }
+    figures: dict[str, Any] = {}
     for name, sinks in kinds.items():
         late = np.empty(len(rows))
         with TelemetryWriter(header, sinks, urgent=True) as telemetry:
@@ -87,6 +93,8 @@ def lateness(folder: Path, seconds: float) -> None:
             f"{name:16s} lateness p50 {shares[0]:.0f}, p99 {shares[1]:.0f}, p99.9 "
             f"{shares[2]:.0f}, max {shares[3]:.0f} µs"
         )
+        figures[name] = dict(zip(("p50", "p99", "p99.9", "max"), shares, strict=True))
+    return figures
 
 
 def in_front(wanted: bool) -> None:
@@ -110,9 +118,9 @@ def produce(dt: float, *paths: str) -> None:
         os.write(1, k.to_bytes(8, "little"))
 
 
-def killed(folder: Path, trials: int = 8) -> None:
-    """Print the largest and mean loss after ``kill -9``."""
-    rng = np.random.default_rng(2)
+def killed(folder: Path, trials: int) -> dict[str, Any]:
+    """Print and return the largest and mean loss after ``kill -9``."""
+    rng, figures = np.random.default_rng(2), dict[str, Any]()
     for dt in (1e-3, 0.1):
         lost: dict[str, list[float]] = {".csv": [], ".mcap": []}
         for trial in range(trials):
@@ -135,12 +143,30 @@ def killed(folder: Path, trials: int = 8) -> None:
                 f"killed at {1 / dt:g} Hz: {suffix[1:]} lost {max(seconds):.3f} s at most, "
                 f"{np.mean(seconds):.3f} s on average of {trials}"
             )
+            figures[f"{suffix[1:]} at {1 / dt:g} Hz"] = {
+                "lost at most [s]": max(seconds),
+                "on average [s]": np.mean(seconds),
+            }
+    return figures
+
+
+def main() -> None:
+    """Measure all three."""
+    parser = parser_of(__doc__)
+    parser.add_argument("seconds", type=float, nargs="?", default=10.0, help="of each loop")
+    parser.add_argument("--trials", type=int, default=8, help="processes to kill")
+    options = options_of(parser, seconds=0.3, trials=1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        figures = {
+            "cost": cost(folder),
+            "lateness [us]": lateness(folder, options.seconds),
+            "killed": killed(folder, options.trials),
+        }
+    write(options, figures)
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["produce"]:
         produce(float(sys.argv[2]), *sys.argv[3:])
-    with tempfile.TemporaryDirectory() as folder:
-        cost(Path(folder))
-        lateness(Path(folder), float(sys.argv[1]) if sys.argv[1:] else 10.0)
-        killed(Path(folder))
+    main()

@@ -14,12 +14,12 @@ bandwidths, refined twice: the same bounds, evaluated at each point, no search.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.analysis import MultivariableLoop, analyse_axes
@@ -92,8 +92,9 @@ def ratios(loop: MultivariableLoop, found: TunedAxes) -> dict[str, float]:
     return result
 
 
-def judge(seeds: range) -> None:
-    """Print whether bounds hold on drawn machines."""
+def judge(seeds: range) -> dict[str, Any]:
+    """Print and return whether bounds hold on drawn machines."""
+    costs, wrong_verdicts = [], 0
     counts: dict[str, list[float]] = {}
     for seed in seeds:
         machine = drawn(seed)
@@ -117,6 +118,8 @@ def judge(seeds: range) -> None:
                 name, largest = max([(name, largest), *again.items()], key=lambda each: each[1])
         wrong = found.met != (largest <= 1.002)
         mean = float(np.exp(np.mean(np.log([each.ratio for each in found.axes]))))
+        costs.append(mean)
+        wrong_verdicts += wrong and found.met
         counts.setdefault(machine.kind, []).append(largest if found.met else math.nan)
         print(
             f"{seed}: {machine.axes} axes, B0 {machine.kind}, {'met' if found.met else 'NOT met'}, "
@@ -124,14 +127,19 @@ def judge(seeds: range) -> None:
             f"{'; the verdict is WRONG' if wrong and found.met else ''}",
             flush=True,
         )
+    figures: dict[str, Any] = {
+        "machines": len(seeds), "wrong verdicts": wrong_verdicts, "cost over alone": np.mean(costs)
+    }  # fmt: skip
     for kind, values in counts.items():
         met = [value for value in values if not math.isnan(value)]
         kept = sum(value <= 1.002 for value in met)
         print(f"B0 {kind}: {len(met)} of {len(values)} met, {kept} of these keep all bounds")
+        figures[kind] = {"machines": len(values), "met": len(met), "keep all bounds": kept}
+    return figures
 
 
-def optimum(seed: int, kind: str) -> None:
-    """Print the cost of a machine of two axes over that of the best of a grid."""
+def optimum(seed: int, kind: str) -> float | str:
+    """Print and return the cost of a machine of two axes over that of the best of a grid."""
     machine = drawn(seed, 2, kind)
     found = tuned(machine)
     axes = found.controller
@@ -154,24 +162,26 @@ def optimum(seed: int, kind: str) -> None:
                 best = measured.cost, x
         if best[1] is None:
             print(f"{seed}: the grid found nothing; tune_axes {'met' if found.met else 'NOT met'}")
-            return
+            return "the grid found nothing"
         centre, width = best[1], width / (0.5 * (points - 1)) * 0.75
     ratio = math.exp(own.cost - best[0])
     print(f"{seed}: B0 {kind}: cost {ratio:.3f} of the grid's best, met {found.met}", flush=True)
+    return ratio
 
 
 def main() -> None:
     """Run the trial."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--plants", type=int, default=30)
     parser.add_argument("--optimum", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1000)
-    given = parser.parse_args()
+    given = options_of(parser, plants=1, seed=1005)
     if given.optimum:
-        for k in range(given.optimum):
-            optimum(given.seed + k, ("exact", "independent")[k % 2])
+        kinds = ("exact", "independent")
+        ratios = [optimum(given.seed + k, kinds[k % 2]) for k in range(given.optimum)]
+        write(given, {"cost over the grid's best": ratios})
         return
-    judge(range(given.seed, given.seed + given.plants))
+    write(given, judge(range(given.seed, given.seed + given.plants)))
 
 
 if __name__ == "__main__":

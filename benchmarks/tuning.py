@@ -3,7 +3,6 @@
     python benchmarks/tuning.py                    all plants, M_s = 1.4 and 2: some 12 minutes
     python benchmarks/tuning.py --every 11         each eleventh plant
     python benchmarks/tuning.py --m-s 2            one M_s
-    python benchmarks/tuning.py --json file        the rows as JSON, too
 
 The nine families are those of K. J. Astrom and T. Hagglund, "Revisiting the Ziegler-Nichols step
 response method for PID control", J. Process Control 14, 2004, and "Advanced PID Control", ISA
@@ -15,13 +14,11 @@ excess of M_s and M_ks is that on a grid 100 times as fine as the optimiser's.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
+from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
 
@@ -116,12 +113,12 @@ def trial(plant: tuple[str, list[float], list[float], float], m_s: float) -> dic
 
 def main() -> None:
     """Print a row for each plant and the shares that reach the bars."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--m-s", type=float, nargs="+", default=[1.4, 2.0])
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    given = options_of(parser, first=53, every=1000, m_s=[2.0])
+    figures: dict[str, object] = {}
     warnings.simplefilter("ignore")
     console, rows, plants = Console(), [], batch()[given.first :: given.every]
     table = Table(title=f"k_i over that of the optimal PI controller; {len(batch())} plants in all")
@@ -136,8 +133,6 @@ def main() -> None:
             rest = (f"{ratio:.3f}", f"{row['excess']:.1e}", f"{row['cpu']:.1f}")
             table.add_row(str(row["plant"]), f"{m_s:g}", *numbers, *rest)
             print(row["plant"], m_s, *numbers, *rest, row["form"], flush=True)
-            if given.json is not None:
-                given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     console.print(table)
     for m_s in given.m_s:
         part = [row for row in rows if row["m_s"] == m_s]
@@ -153,6 +148,20 @@ def main() -> None:
             f"{max(row['excess'] for row in part):.1e}; "
             f"stable: {all(row['stable'] for row in part)}"
         )
+        figures[f"M_s = {m_s:g}"] = {
+            "plants": len(part),
+            "poles over PI, least": np.min(poles),
+            "poles over PID at least 0.97 [%]": 100.0 * np.mean(poles >= 0.97 * pid),
+            "poles over PID, least": np.min(poles / pid),
+            "poles over PID, median": np.median(poles / pid),
+            "bandwidths over PI, least": np.min(bandwidths),
+            "bandwidths over PI, most": np.max(bandwidths),
+            "bandwidths over PI, median": np.median(bandwidths),
+            "excess": max(row["excess"] for row in part),
+            "stable": sum(bool(row["stable"]) for row in part),
+            "cpu of a plant": np.mean([row["cpu"] for row in part]),
+        }
+    write(given, figures | {"rows": rows})
 
 
 if __name__ == "__main__":

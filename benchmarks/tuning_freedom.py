@@ -10,11 +10,12 @@ removed. A removal is *worse* if the objective is by more than 0.1 %, the tolera
 
 from __future__ import annotations
 
-import argparse
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 from tuning import batch, sample_time
 
 import quell as ql
@@ -24,13 +25,15 @@ STRUCTURES = ("pid", "bandwidths", "poles", "model-based", "model-based-poles")
 TOLERANCE = 1e-3
 
 
-def drawn(rng: np.random.Generator) -> tuple[str, Any, float, dict[str, Any], dict[str, float]]:
+def drawn(
+    rng: np.random.Generator, structures: Sequence[str]
+) -> tuple[str, Any, float, dict[str, Any], dict[str, float]]:
     """Return a name, a plant, dt, options of ``tune``, and bounds."""
     plants = batch()
     name, num, den, delay = plants[int(rng.integers(len(plants)))]
     dt = sample_time(num, den, delay)
     options = {
-        "structure": str(rng.choice(STRUCTURES)),
+        "structure": str(rng.choice(structures)),
         "objective": str(rng.choice(["load", "load-iae"])),
         "delay": delay,
         "compare": (),
@@ -59,15 +62,16 @@ def cost(plant: Any, dt: float, options: dict[str, Any], bounds: dict[str, Any])
 
 def main() -> None:
     """Print how many removals make the objective worse."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--tunings", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--verbose", action="store_true")
-    args = parser.parse_args()
+    parser.add_argument("--structures", nargs="+", choices=STRUCTURES, default=STRUCTURES)
+    args = options_of(parser, tunings=1, structures=["pid"])
     removals, worse, began = 0, [], time.process_time()
     for i in range(args.tunings):
         rng = np.random.default_rng([args.seed, i])
-        name, plant, dt, options, bounds = drawn(rng)
+        name, plant, dt, options, bounds = drawn(rng, args.structures)
         with_all = cost(plant, dt, options, bounds)
         for key in ("m_t", "m_ks", "delay_margin"):
             fewer = cost(plant, dt, options, {k: v for k, v in bounds.items() if k != key})
@@ -79,7 +83,10 @@ def main() -> None:
                     print(worse[-1], flush=True)
     print(f"{args.tunings} tunings, {removals} removals, {len(worse)} worse")
     print("\n".join(worse))
-    print(f"{(time.process_time() - began) / args.tunings:.1f} s of processor time a tuning")
+    each = (time.process_time() - began) / args.tunings
+    print(f"{each:.1f} s of processor time a tuning")
+    figures = {"tunings": args.tunings, "removals": removals, "worse": len(worse), "cpu": each}
+    write(args, figures)
 
 
 if __name__ == "__main__":

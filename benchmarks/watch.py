@@ -24,7 +24,8 @@ not exchangeable: what the watch then says.
 
 from __future__ import annotations
 
-import argparse
+import math
+import sys
 import time
 import warnings
 from collections import Counter
@@ -32,6 +33,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.monitoring import Machine, Signals, Watch, features_of
@@ -53,14 +55,16 @@ def moves(rng: np.random.Generator, t: Any) -> Any:
     return r
 
 
-def window(plant: Any, b0: float, limit: float, noise: float, rng: np.random.Generator) -> Any:
+def window(
+    plant: Any, b0: float, limit: float, noise: float, rng: np.random.Generator, seconds: float
+) -> Any:
     """Return the numbers of a window of a machine."""
-    t = np.arange(round(WINDOW / DT) + 1) * DT
-    times = np.arange(0.0, WINDOW + 1.0, 0.5)
+    t = np.arange(round(seconds / DT) + 1) * DT
+    times = np.arange(0.0, seconds + 1.0, 0.5)
     load = np.interp(t, times, 0.003 * rng.normal(size=times.size))
     scenario = ql.Scenario(
         ql.signals.Samples(t, moves(rng, t)),
-        WINDOW,
+        seconds,
         (ql.signals.Samples(t, load),),
         noise=ql.signals.BandLimitedNoise(noise**2 * DT, DT),
         seed=int(rng.integers(2**31)),
@@ -71,26 +75,32 @@ def window(plant: Any, b0: float, limit: float, noise: float, rng: np.random.Gen
     return features_of(signals, order=2)
 
 
-def servo(rng: np.random.Generator, magnet: float = 1.0, friction: float = 1.0) -> Any:
+def servo(
+    rng: np.random.Generator, seconds: float, magnet: float = 1.0, friction: float = 1.0
+) -> Any:
     """Return a window of the servo; ``magnet`` and ``friction`` are factors."""
     plant = ql.plants.dc_motor(
         torque_constant=0.05 * magnet * (1.0 + 0.003 * rng.normal()),
         coulomb=0.01 * friction * (1.0 + 0.05 * rng.normal()),
     )
-    return window(plant, 0.05 / (0.5 * J), 24.0, 1e-4, rng)
+    return window(plant, 0.05 / (0.5 * J), 24.0, 1e-4, rng, seconds)
 
 
-def axis(rng: np.random.Generator, stiffness: float = 1.0, friction: float = 1.0) -> Any:
+def axis(
+    rng: np.random.Generator, seconds: float, stiffness: float = 1.0, friction: float = 1.0
+) -> Any:
     """Return a window of the axis; ``stiffness`` and ``friction`` are factors."""
     ground = [1e-3 * friction * (1.0 + 0.05 * rng.normal()), 5e-4]
     plant = ql.plants.n_mass([J, J], [4.0 * stiffness], [5e-4], ground=ground, sensor=1)
-    return window(plant, 1.0 / (2.0 * J), 2.0, 2e-5, rng)
+    return window(plant, 1.0 / (2.0 * J), 2.0, 2e-5, rng, seconds)
 
 
 GAINS = np.array([[1.0, 0.3], [0.2, 1.0]]) * 0.05 / J
 
 
-def gantry(rng: np.random.Generator, torque: float = 1.0, friction: float = 1.0) -> Any:
+def gantry(
+    rng: np.random.Generator, seconds: float, torque: float = 1.0, friction: float = 1.0
+) -> Any:
     """Return a window of two coupled axes; the factors are of motor 0 and of the first axis."""
     torques = GAINS * [torque * (1.0 + 0.003 * rng.normal()), 1.0 + 0.003 * rng.normal()]
     slowing = -25.0 * np.array([friction, 1.0]) * (1.0 + 0.05 * rng.normal(size=2))
@@ -100,13 +110,13 @@ def gantry(rng: np.random.Generator, torque: float = 1.0, friction: float = 1.0)
     B, E = np.zeros((4, 2)), np.zeros((4, 2))
     B[[1, 3]], E[1, 0], E[3, 1] = torques, 1.0 / J, 1.0 / J
     plant = ql.plants.MultivariableLinearPlant(A, B, [[1, 0, 0, 0], [0, 0, 1, 0]], E=E)
-    t = np.arange(round(WINDOW / DT) + 1) * DT
-    times = np.arange(0.0, WINDOW + 1.0, 0.5)
+    t = np.arange(round(seconds / DT) + 1) * DT
+    times = np.arange(0.0, seconds + 1.0, 0.5)
     loads = [np.interp(t, times, 0.003 * rng.normal(size=times.size)) for _ in range(2)]
     noise = ql.signals.BandLimitedNoise(1e-8 * DT, DT)
     scenario = ql.Scenario(
         tuple(ql.signals.Samples(t, moves(rng, t)) for _ in range(2)),
-        WINDOW,
+        seconds,
         tuple(ql.signals.Samples(t, load) for load in loads),
         noise=(noise, noise),
         seed=int(rng.integers(2**31)),
@@ -140,26 +150,33 @@ def coupled(healthy: Pool, changed: Pool, runs: int, seed: int) -> Counter[str]:
     return found
 
 
-def axes_part(months: int, runs: int, seed: int) -> None:
-    """Print what the watch says of two coupled axes."""
-    healthy = pool(gantry, 150, seed + 5)
+def axes_part(months: int, given: Any) -> dict[str, Any]:
+    """Print and return what the watch says of two coupled axes."""
+    runs, seed = given.runs, given.seed
+    healthy = pool(gantry, given.windows, seed + 5, given.window)
     found = false_alarms(healthy, months, seed + 15)
     print(f"gantry: {found['any']} of {months} healthy months with a false alarm", flush=True)
+    figures: dict[str, Any] = {"months": months, "with a false alarm": found["any"]}
     for i, (what, change) in enumerate(
         (("motor 0 −15 % of torque", {"torque": 0.85}), ("friction of x +50 %", {"friction": 1.5}))
     ):
-        changed = pool(gantry, 60, seed + 150 + i, **change)
+        changed = pool(gantry, given.changed, seed + 150 + i, given.window, **change)
         delay, first = delays(healthy, changed, runs, seed + 250 + i)
+        if not delay:
+            sys.exit(f"{what}: each month had a false alarm before the change")
         median, most = np.quantile(delay, [0.5, 0.9])
         text = f"{median:.0f} windows to the alarm (90 %: {most:.0f})"
         print(f"gantry: {what}: {text}, {first.most_common(3)}")
-        print(f"    {dict(coupled(healthy, changed, runs, seed + 350 + i))}", flush=True)
+        said = dict(coupled(healthy, changed, runs, seed + 350 + i))
+        print(f"    {said}", flush=True)
+        figures[what] = {"median": median, "90 %": most, "axes": said}
+    return figures
 
 
-def pool(make: Callable[..., Any], count: int, seed: int, **change: float) -> Pool:
-    """Return the numbers of some windows."""
+def pool(make: Callable[..., Any], count: int, seed: int, seconds: float, **change: float) -> Pool:
+    """Return the numbers of some windows of so many seconds."""
     rng = np.random.default_rng(seed)
-    return [make(rng, **change) for _ in range(count)]
+    return [make(rng, seconds, **change) for _ in range(count)]
 
 
 def false_alarms(healthy: Pool, months: int, seed: int) -> Counter[str]:
@@ -192,18 +209,24 @@ def delays(healthy: Pool, changed: Pool, runs: int, seed: int) -> tuple[list[int
     return found, first
 
 
-def day_and_night(months: int, seed: int) -> tuple[int, int]:
+def day_and_night(months: int, seed: int, windows: int, seconds: float) -> tuple[int, int]:
     """Return in how many months there was an alarm, and in how many a line said why."""
     rng = np.random.default_rng(seed)
     by_hour = [
-        pool(servo, 12, seed + hour, friction=1.0 + 0.15 * np.sin(2.0 * np.pi * hour / 24.0))
+        pool(
+            servo,
+            windows,
+            seed + hour,
+            seconds,
+            friction=1.0 + 0.15 * math.sin(math.tau * hour / 24),
+        )
         for hour in range(24)
     ]
     alarms = told = 0
     for _ in range(months):
         watch = Watch(tuple(by_hour[0][0]))
         for hour in range(HOURS):
-            watch.update(by_hour[hour % 24][rng.integers(12)])
+            watch.update(by_hour[hour % 24][rng.integers(windows)])
         alarms += bool(watch.alarms)
         told += "NOT exchangeable" in watch.describe()
     return alarms, told
@@ -211,23 +234,32 @@ def day_and_night(months: int, seed: int) -> tuple[int, int]:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--months", type=int, default=1000)
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--axes", action="store_true", help="two coupled axes only")
-    given = parser.parse_args()
+    parser.add_argument("--windows", type=int, default=150, help="of a healthy machine")
+    parser.add_argument("--changed", type=int, default=60, help="windows of a changed machine")
+    parser.add_argument("--hourly", type=int, default=12, help="windows of an hour of the day")
+    parser.add_argument("--window", type=float, default=WINDOW, help="length of a window [s]")
+    given = options_of(parser, months=2, runs=2, windows=10, changed=2, hourly=1, window=3.0)
     warnings.simplefilter("ignore")
     began = time.perf_counter()
-    axes_part(max(given.months // 10, 2), given.runs, given.seed)
+    figures: dict[str, Any] = {"gantry": axes_part(max(given.months // 10, 2), given)}
     if given.axes:
+        write(given, figures)
         return
-    healthy = {make: pool(make, 150, given.seed + i) for i, make in enumerate((servo, axis))}
+    healthy = {
+        make: pool(make, given.windows, given.seed + i, given.window)
+        for i, make in enumerate((servo, axis))
+    }
     for i, (make, windows) in enumerate(healthy.items()):
         months = given.months // 2 if i else given.months - given.months // 2
         found = false_alarms(windows, months, given.seed + 10 + i)
         print(f"{make.__name__}: {found['any']} of {months} healthy months with a false alarm")
         print(f"    by feature: {dict(found)}", flush=True)
+        figures[make.__name__] = {"months": months, "with a false alarm": found["any"]}
     changes: tuple[tuple[Callable[..., Any], str, dict[str, float]], ...] = (
         (axis, "stiffness -20 %", {"stiffness": 0.8}),
         (axis, "stiffness -10 %", {"stiffness": 0.9}),
@@ -238,17 +270,23 @@ def main() -> None:
     )
     print(f"{'change':32}{'median':>8}{'90 %':>8}{'missed':>8}   windows; first feature")
     for i, (make, what, change) in enumerate(changes):
-        changed = pool(make, 60, given.seed + 100 + i, **change)
+        changed = pool(make, given.changed, given.seed + 100 + i, given.window, **change)
         found_delays, first = delays(healthy[make], changed, given.runs, given.seed + 200 + i)
+        if not found_delays:
+            sys.exit(f"{make.__name__}: each month had a false alarm before the change")
         median, most = np.quantile(found_delays, [0.5, 0.9])
         missed = sum(delay == HOURS for delay in found_delays)
         name = f"{make.__name__}: {what}"
         print(f"{name:32}{median:8.0f}{most:8.0f}{missed:8d}   {first.most_common(3)}", flush=True)
-    alarms, told = day_and_night(max(given.months // 50, 2), given.seed + 300)
+        figures[name] = {"median": median, "90 %": most, "missed": missed}
+    months = max(given.months // 50, 2)
+    alarms, told = day_and_night(months, given.seed + 300, given.hourly, given.window)
+    figures["day and night"] = {"months": months, "with an alarm": alarms, "told": told}
     print(
-        f"day and night, friction ±15 %: {alarms} of {max(given.months // 50, 2)} months with an "
+        f"day and night, friction ±15 %: {alarms} of {months} months with an "
         f"alarm; in {told} a line says that neighbouring windows are correlated"
     )
+    write(given, figures)
     print(f"{time.perf_counter() - began:.0f} s")
 
 

@@ -56,42 +56,62 @@ def draw(
     wanted: Callable[[Mutant], bool] = lambda mutant: True,
 ) -> list[Mutant]:
     """Return ``count`` different ``wanted`` mutants of the files, each as likely as any other."""
-    found = [m for path in sorted(paths) for m in mutants(repository, path) if wanted(m)]
-    return random.Random(seed).sample(found, min(count, len(found)))
+    modules = [_Module(repository, path) for path in sorted(paths)]
+    places = [(module, *place) for module in modules for place in module.places()]
+    random.Random(seed).shuffle(places)
+    found: dict[str, Mutant] = {}
+    for module, operator, number in places:  # only the sources that are wanted are made
+        if len(found) == count:
+            break
+        mutant = module.mutant(operator, number)
+        if mutant is not None and wanted(mutant):
+            found.setdefault(mutant.source, mutant)
+    return list(found.values())
 
 
-def mutants(repository: Path, path: str) -> list[Mutant]:
-    """Return all mutants of a file."""
-    source = (repository / path).read_text(encoding="utf-8")
-    tree = ast.parse(source)
-    lines = _lines_of_functions(tree)
-    unique = {}
-    for changed in (*_by_operators(source, set(lines)), *_without_a_statement(source, tree)):
-        line, before, after = _difference(source, changed)
-        if line in lines and _RECORD.sub("[]", before) != _RECORD.sub("[]", after):
-            statement, function = lines[line]
-            unique[changed] = Mutant(path, line, statement, function, before, after, changed)
-    return list(unique.values())
+class _Module:
+    """A file, and the places at which it can be changed."""
 
+    def __init__(self, repository: Path, path: str) -> None:
+        self.path = path
+        self.source = (repository / path).read_text(encoding="utf-8")
+        tree = ast.parse(self.source)
+        self.lines = _lines_of_functions(tree)
+        self.statements = [
+            node
+            for node in ast.walk(tree)
+            if isinstance(node, _SIMPLE) and not _is_docstring(node) and node.lineno in self.lines
+        ]
 
-def _by_operators(source: str, lines: set[int]) -> Iterator[str]:
-    nodes = list(ast_nodes(get_ast(source)))
-    for name in filter(_OPERATORS.fullmatch, operator_names()):
-        operator = get_operator(name)()
-        places = [place for node in nodes for place in operator.mutation_positions(node)]
-        for i, (start, _) in enumerate(places):
-            changed = mutate_code(source, operator, i) if start[0] in lines else None
-            if changed is not None and changed != source:
-                yield changed
+    def places(self) -> Iterator[tuple[str, int]]:
+        """Return operators, each with the number of its place; without a name: the statement."""
+        nodes = list(ast_nodes(get_ast(self.source)))
+        comparisons = [node for node in nodes if node.type == "comparison"]
+        for name in filter(_OPERATORS.fullmatch, operator_names()):
+            operator = get_operator(name)()
+            among = comparisons if "ReplaceComparison" in name else nodes
+            places = [place for node in among for place in operator.mutation_positions(node)]
+            yield from ((name, i) for i, (at, _) in enumerate(places) if at[0] in self.lines)
+        yield from (("", i) for i in range(len(self.statements)))
 
+    def mutant(self, operator: str, number: int) -> Mutant | None:
+        """Return the file with a change; None if the change has no effect."""
+        if operator:
+            changed = mutate_code(self.source, get_operator(operator)(), number)
+        else:
+            changed = self._without(self.statements[number])
+        if changed is None:
+            return None
+        line, before, after = _difference(self.source, changed)
+        if line not in self.lines or _RECORD.sub("[]", before) == _RECORD.sub("[]", after):
+            return None
+        statement, function = self.lines[line]
+        return Mutant(self.path, line, statement, function, before, after, changed)
 
-def _without_a_statement(source: str, tree: ast.Module) -> Iterator[str]:
-    lines = source.splitlines(keepends=True)
-    for node in ast.walk(tree):
-        if not isinstance(node, _SIMPLE) or _is_docstring(node) or node.end_lineno is None:
-            continue
-        first, last = node.lineno - 1, node.end_lineno
-        yield "".join([*lines[:first], " " * node.col_offset + "pass\n", *lines[last:]])
+    def _without(self, node: ast.stmt) -> str:
+        lines = self.source.splitlines(keepends=True)
+        first, last = node.lineno - 1, node.end_lineno or node.lineno
+        return "".join([*lines[:first], " " * node.col_offset + "pass\n", *lines[last:]])
 
 
 def _is_docstring(node: ast.stmt) -> bool:

@@ -1,20 +1,23 @@
 """The mutation trial: it counts the one-line changes of the source that the tests notice.
 
-    python benchmarks/mutation/trial.py [--count 300] [--seed 1] [--areas law,guard] [--json FILE]
+    python benchmarks/mutation/trial.py [--count 300] [--seed 1] [--areas law,guard] [--near]
     python benchmarks/mutation/trial.py --since REVISION    # only lines that are newer
 
-Each mutant runs, in a copy of the repository, the tests that execute its statement, the quickest
-first, until one fails. The tests run interpreted (``interpret_all.py``), so that nothing is
-compiled for a mutant; tests that take longer than ``LIMIT`` that way are left out. A test that
-fails without the mutant, too, does not count. Mutants in ``equivalent.toml`` are known not to
-change anything that a caller can observe; each has its reason there.
+Each mutant runs, in a copy of the repository, the tests (those that are no trials) that execute its
+statement, the quickest first, until one fails. The tests run interpreted (``interpret_all.py``), so
+that nothing is compiled for a mutant; tests that take longer than ``LIMIT`` that way are left out.
+A test that fails without the mutant, too, does not count. With ``--baseline FOLDER`` the run that
+tells what each test executes is made once; new and changed files of tests are added to it. Mutants
+in ``equivalent.toml`` are known not to change anything that a caller can observe; each has its
+reason there.
 """
 
 from __future__ import annotations
 
-import argparse
+import compileall
 import concurrent.futures
 import functools
+import hashlib
 import json
 import multiprocessing
 import os
@@ -24,35 +27,36 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from coverage import CoverageData
-from mutants import Mutant, draw
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from waiting import waited
 
-REPOSITORY = Path(__file__).parents[2]
+try:
+    from coverage import CoverageData
+    from mutants import Mutant, draw
+except ModuleNotFoundError as error:
+    missing: str | None = f"{error}: it comes with the extra mutation"
+else:
+    missing = None
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 # Tests of commands, of processes and threads, of adapters, of compilation itself and of published
-# figures take seconds each, and are not about these areas.
+# figures take seconds each; only the areas that name them (``NEAR``) need them.
 LEFT_OUT = [
     *("adapter_faults", "adapters", "api_page", "batch", "cache", "cli", "cli_rig", "cli_run"),
     *("cobs", "dispatch", "faults", "fault_injection", "frames", "function_pointers", "histogram"),
     *("hostile_files", "live", "loop", "ni", "replay", "rig", "ring", "run_rig", "scalars"),
-    *(
-        "security",
-        "serial_device",
-        "serial_line",
-        "stress",
-        "telemetry",
-        "torsional",
-    ),
-    *("twin", "wire"),
+    *("security", "serial_device", "serial_line", "stress", "telemetry", "torsional", "twin"),
+    "wire",
 ]
 AREAS = {
     "law": ("controllers/law.py", "controllers/base.py"),
@@ -73,6 +77,10 @@ AREAS = {
     "supervisor": ("realtime/supervisor.py", "realtime/safety.py"),
     "metrics": ("records/metrics.py",),
     "margins": ("analysis/margins.py",),
+    **{
+        name: (f"{name}/**/*.py",)
+        for name in ("identification", "tuning", "export", "realtime", "setup")
+    },
 }
 # The files of tests that run first: to collect all takes seconds, and most mutants fail in these.
 NEAR = {
@@ -93,6 +101,34 @@ NEAR = {
     "supervisor": ("supervisor", "supervisor_rules", "safety"),
     "metrics": ("metrics",),
     "margins": ("analysis_margins", "analysis_loop", "advice"),
+    "identification": (
+        *("alternatives", "awkward_records", "commissioning", "excitation", "hostile_files"),
+        *("identification", "identification_search", "input_gain", "input_gain_matrix", "rank"),
+        *("record_file", "step_records", "published/test_identification"),
+    ),
+    "tuning": (
+        *("cli_tune", "compensator", "feedforward", "from_pid", "generalised", "over_seeds"),
+        *("p_pi", "reduction", "schedule", "schedule_of_loads", "tuned_files", "tuning"),
+        *("tuning_axes", "tuning_damping", "tuning_lqg", "tuning_simulated"),
+        "published/test_tuning",
+    ),
+    "export": (
+        *("axes_export", "axes_in_single", "export", "fmu_export", "hostile_exports", "packages"),
+        *("plants_in_c", "profile", "proof", "ros2", "structured_text", "target", "translate"),
+        "contracts/test_exported_options",
+    ),
+    "realtime": (
+        *("axes_channels", "cli_rig", "cobs", "device_channels", "fault_injection", "frames"),
+        *("histogram", "live", "loop", "memory_file", "ni", "proxy", "replay", "rig", "rig_axes"),
+        *("rig_compensators", "ring", "run_rig", "safety", "security", "serial_device"),
+        *("serial_line", "supervisor", "supervisor_rules", "target", "telemetry", "twin", "watch"),
+        *("wire", "contracts/test_devices", "contracts/test_memory"),
+    ),
+    "setup": (
+        *("axes_channels", "cli", "cli_run", "compare", "fuzzed", "hostile_files"),
+        *("points_of_axes", "security", "setup", "setup_axes", "setup_schema", "sweep"),
+        *("sweep_axes", "tuned_files", "contracts/test_described"),
+    ),
 }
 # What takes longest to import, and is the same for all mutants: imported once.
 PRELOADED = [
@@ -103,10 +139,13 @@ PRELOADED = [
 LIMIT = 3.0
 # Without coverage the tests are quicker than in the unchanged run: who passed there has time.
 OPTIONS = [
-    *("-q", "--tb=no", "-p", "no:cacheprovider", "-p", "interpret_all", f"--cpu-limit={LIMIT}")
+    *("-q", "--tb=no", "-p", "no:cacheprovider", "-p", "interpret_all", f"--cpu-limit={LIMIT}"),
+    "--no-budget",
 ]
 # CPU time of the tests that one mutant runs [s]; more tests of the same line rarely find more.
 BUDGET = 60.0
+# Files of tests that the unchanged run takes at a time: what has run is kept.
+FILES = 12
 # A statement that fewer tests execute themselves may run in a fixture, at import or in a cache, for
 # tests that come later.
 FEW = 10
@@ -133,23 +172,35 @@ class Verdict(NamedTuple):
 
 def main() -> None:
     """Run the trial and print what survived."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
+    # It imports the package. The processes that run the tests, in which this file is imported, must
+    # not have it: they would keep it instead of the changed one.
+    from measured import not_run, options_of, parser_of, write
+
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=300, help="mutants to draw")
     parser.add_argument("--seed", type=int, default=1, help="seed of the draw")
     parser.add_argument("--areas", default=",".join(AREAS), help="areas, separated by commas")
     parser.add_argument("--since", help="revision after which the changed lines were written")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--json", type=Path, help="write the verdicts to this file")
+    parser.add_argument("--near", action="store_true", help="only the tests of an area's own files")
     parser.add_argument("--baseline", type=Path, help="folder that keeps the unchanged run")
-    options = parser.parse_args()
+    parser.add_argument(
+        "--budget", type=float, default=BUDGET, help="CPU time of the tests of a mutant [s]"
+    )
+    options = options_of(parser, count=1, areas="metrics", near=True, workers=1)
+    if missing is not None:
+        not_run(options, missing)
+    areas = options.areas.split(",")
+    if unknown := [each for each in areas if each not in AREAS]:
+        parser.error(f"--areas {','.join(unknown)}: there are {', '.join(AREAS)}")
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # for what is preloaded
     console = Console()
-    areas = options.areas.split(",")
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         baseline = options.baseline or work / "baseline"
-        tests = unchanged_run(baseline, options.workers)
         area_of = {path: area for area in areas for path in _files(area)}
+        tests = unchanged_run(baseline, options.workers, _chosen(areas, options.near), area_of)
         drawn = draw(REPOSITORY, area_of, options.count, options.seed, _newer(options.since))
         passing: set[str] = set()
         copies: queue.Queue[Path] = queue.Queue()
@@ -160,7 +211,8 @@ def main() -> None:
             copy = copies.get()
             try:
                 area = area_of[mutant.path]
-                return Verdict(area, mutant, *_judge(mutant, area, copy, tests, passing))
+                found = _judge(mutant, area, copy, tests, passing, options.budget)
+                return Verdict(area, mutant, *found)
             finally:
                 copies.put(copy)
 
@@ -173,8 +225,7 @@ def main() -> None:
                     v = verdicts[-1].mutant
                     text = f"survived, line {v.line} ({verdicts[-1].reason}): {v.name}"
                     console.print(text, markup=False, soft_wrap=True)
-                if options.json:
-                    options.json.write_text(_rows(verdicts), encoding="utf-8")
+                write(options, _figures(verdicts, len(tests.seconds)))  # so far
     console.print(_table(verdicts))
 
 
@@ -197,29 +248,87 @@ def _newer(revision: str | None) -> Callable[[Mutant], bool]:
     return lambda mutant: revision is None or mutant.line in lines(mutant.path)
 
 
-def unchanged_run(folder: Path, workers: int) -> Tests:
-    """Run all tests interpreted, with coverage by test, unless ``folder`` has that run already."""
-    report, data = folder / "report.xml", folder / "coverage"
-    if not report.exists():
-        copy = _copy(folder / "copy")
-        names = [
-            path
-            for path in _test_files()
-            if Path(path).stem.removeprefix("test_") not in LEFT_OUT and "/published/" not in path
-        ]
-        options = [f"-n{workers}", f"--junitxml={report}", "--cov", "--cov-context=test"]
-        subprocess.run(
-            [sys.executable, "-B", "-m", "pytest", *OPTIONS, *names, *options],
-            cwd=copy,
-            env=os.environ | _environment(copy) | {"COVERAGE_FILE": str(data)},
-            capture_output=True,
-            check=False,
-        )
-    seconds = {}
-    for case in ET.parse(report).iter("testcase"):
-        if not any(case.find(kind) is not None for kind in ("failure", "error", "skipped")):
-            path = case.attrib["classname"].replace(".", "/") + ".py"
-            seconds[f"{path}::{case.attrib['name']}"] = float(case.attrib["time"])
+def _chosen(areas: list[str], near: bool) -> list[str]:
+    """Return the files of tests that may notice a mutant of the areas."""
+    own = {_near(each) for area in areas for each in NEAR[area]}
+    if near:
+        return sorted(own)
+    return [
+        path
+        for path in _test_files()
+        if path in own
+        or (Path(path).stem.removeprefix("test_") not in LEFT_OUT and "/published/" not in path)
+    ]
+
+
+def unchanged_run(folder: Path, workers: int, names: list[str], sources: Iterable[str]) -> Tests:
+    """Run files of tests interpreted, with coverage by test; ``folder`` keeps what has run.
+
+    Parameters
+    ----------
+    folder
+        Where results are kept. Only files of tests that are new or have changed since run.
+    workers
+        Number of processes.
+    names
+        The files of tests, relative to the repository.
+    sources
+        Files of the package of which the coverage is wanted, in the same way.
+
+    Raises
+    ------
+    SystemExit
+        If ``folder`` holds a run of other sources, or tests cannot be collected.
+    """
+    state, data = folder / "ran.json", folder / "coverage"
+    package = _digest(*sorted((REPOSITORY / "src").rglob("*.py")))
+    known: dict[str, Any] = {"package": package, "sources": sorted(sources), "tests": {}}
+    if state.exists():
+        known = json.loads(state.read_text(encoding="utf-8"))
+        if known["package"] != package or not set(sources) <= set(known["sources"]):
+            sys.exit(f"--baseline {folder}: it is of other sources; name an empty folder")
+    digests = {name: _digest(REPOSITORY / name) for name in names}
+    left = [name for name in names if known["tests"].get(name) != digests[name]]
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = _copy(Path(temporary) / "copy") if left else Path()
+        for part in (left[i : i + FILES] for i in range(0, len(left), FILES)):
+            folder.mkdir(parents=True, exist_ok=True)
+            report = folder.resolve() / f"report{len([*folder.glob('report*.xml')]):03}.xml"
+            measured = copy / "coveragerc"
+            measured.write_text("[run]\ninclude =\n    " + "\n    ".join(known["sources"]) + "\n")
+            options = [
+                *(f"-n{workers}", f"--junitxml={report}", "--cov"),  # with -n0 all has one context
+                *(f"--cov-config={measured}", "--cov-append", "--cov-context=test"),
+                "--cov-report=",
+            ]
+            ran = subprocess.run(
+                [sys.executable, "-m", "pytest", *OPTIONS, *part, *options],
+                cwd=copy,
+                env=os.environ | _environment(copy) | {"COVERAGE_FILE": str(data.resolve())},
+                capture_output=True,
+                encoding="utf-8",
+                check=False,
+            )
+            if ran.returncode not in (0, 1, 5):  # all passed, some failed, there are only trials
+                report.unlink(missing_ok=True)
+                sys.exit(f"the unchanged run ended with {ran.returncode}: {ran.stdout}{ran.stderr}")
+            known["tests"] |= {name: digests[name] for name in part}
+            state.write_text(json.dumps(known, indent=1), encoding="utf-8")
+    seconds: dict[str, float] = {}
+    for report in sorted(folder.glob("report*.xml")):
+        for case in ET.parse(report).iter("testcase"):
+            # tests.contracts.test_x.TestY; an error of collection has no such name
+            named = re.fullmatch(r"((?:\w+\.)*?)(test_\w+)((?:\.\w+)*)", case.attrib["classname"])
+            if named is None:
+                continue
+            path = f"{named[1].replace('.', '/')}{named[2]}.py"
+            test = "::".join([path, *named[3].split(".")[1:], case.attrib["name"]])
+            used = case.find("properties/property[@name='cpu']")
+            bad = any(case.find(kind) is not None for kind in ("failure", "error", "skipped"))
+            if bad or used is None or path not in digests:
+                seconds.pop(test, None)
+            else:
+                seconds[test] = float(used.attrib["value"])
     covered = CoverageData(str(data))
     covered.read()
     of_line: dict[tuple[str, int], set[str]] = defaultdict(set)
@@ -230,11 +339,13 @@ def unchanged_run(folder: Path, workers: int) -> Tests:
             names = {context.rpartition("|")[0] for context in contexts} - {""}
             of_line[path, line] |= names
             of_file[path] |= names
+    if not of_file.keys() & set(sources) or not any(of_file.values()):
+        sys.exit(f"{folder}: the unchanged run has no coverage by test; every mutant would survive")
     return Tests(seconds, of_line, of_file)
 
 
 def _judge(
-    mutant: Mutant, area: str, copy: Path, tests: Tests, passing: set[str]
+    mutant: Mutant, area: str, copy: Path, tests: Tests, passing: set[str], budget: float
 ) -> tuple[bool, str]:
     """Return whether a test notices the mutant, and which, or why not.
 
@@ -243,12 +354,12 @@ def _judge(
     if (reason := _equivalents().get(mutant.name)) is not None:
         return False, f"equivalent: {reason}"
     executing = set().union(*(tests.of_line[mutant.path, line] for line in mutant.statement))
-    files = {f"tests/{name if '/' in name else f'test_{name}'}.py" for name in NEAR[area]}
+    files = {_near(name) for name in NEAR[area]}
     near = {name for name in executing if name.partition("::")[0] in files}
-    near = _quickest(near, tests, 0.5 * BUDGET)
-    far = _quickest(executing - set(near), tests, 0.5 * BUDGET)
+    near = _quickest(near, tests, 0.5 * budget)
+    far = _quickest(executing - set(near), tests, 0.5 * budget)
     if len(executing) < FEW:
-        far += _quickest(tests.of_file[mutant.path] - executing, tests, 0.5 * BUDGET)
+        far += _quickest(tests.of_file[mutant.path] - executing, tests, 0.5 * budget)
     tested = len(near) + len(far)
     changed = copy / mutant.path
     original = changed.read_text(encoding="utf-8")
@@ -311,11 +422,13 @@ def _pytest(copy: Path, arguments: list[str]) -> tuple[int, str]:
     output.unlink(missing_ok=True)
     process = context.Process(target=_run_pytest, args=(copy, ["-n0", *arguments], output))
     process.start()
-    process.join(4.0 * BUDGET)
-    if process.is_alive():
-        process.kill()
-        process.join()
-        return TIMED_OUT, ""
+    began = time.monotonic()
+    while process.is_alive():
+        process.join(1.0)
+        if time.monotonic() - began - waited(process.pid or "self") > 4.0 * BUDGET:
+            process.kill()
+            process.join()
+            return TIMED_OUT, ""
     if not output.exists():
         raise RuntimeError("a process for tests did not start; its error is above")
     return process.exitcode or 0, output.read_text(encoding="utf-8", errors="replace")
@@ -324,13 +437,14 @@ def _pytest(copy: Path, arguments: list[str]) -> tuple[int, str]:
 def _run_pytest(copy: Path, arguments: list[str], output: Path) -> None:
     import pytest
 
+    if "quell" in sys.modules:
+        raise RuntimeError("the package is imported before the copy's is: no mutant would run")
     with output.open("w", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     os.chdir(copy)
     os.environ |= _environment(copy)
     sys.path[:0] = os.environ["PYTHONPATH"].split(os.pathsep)
-    sys.dont_write_bytecode = True
     code = pytest.main([*OPTIONS, *arguments])
     sys.stdout.flush()
     os._exit(code)
@@ -348,13 +462,23 @@ def _copy(target: Path) -> Path:
         shutil.copytree(REPOSITORY / name, target / name)
     for name in ("pyproject.toml", "README.md", "CHANGELOG.md", "CONTRIBUTING.md"):
         shutil.copy(REPOSITORY / name, target / name)
+    compileall.compile_dir(target / "src", quiet=1)  # once, not for each mutant
     return target
+
+
+def _digest(*paths: Path) -> str:
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
 def _files(area: str) -> list[str]:
     source = REPOSITORY / "src/quell"
     found = [path for pattern in AREAS[area] for path in source.glob(pattern)]
     return [str(path.relative_to(REPOSITORY)) for path in found]
+
+
+def _near(name: str) -> str:
+    """Return the path of a file of tests that ``NEAR`` names."""
+    return f"tests/{name if '/' in name else f'test_{name}'}.py"
 
 
 def _test_files() -> list[str]:
@@ -368,14 +492,17 @@ def _equivalents() -> dict[str, str]:
     return {entry["mutant"]: entry["reason"] for entry in tomllib.loads(text).get("known", [])}
 
 
-def _rows(verdicts: list[Verdict]) -> str:
-    """Return the verdicts as JSON."""
+def _figures(verdicts: list[Verdict], tests: int) -> dict[str, Any]:
+    """Return counts and verdicts for the file of figures."""
     rows = [
         {"area": v.area, "mutant": v.mutant.name, "line": v.mutant.line}
         | {"killed": v.killed, "reason": v.reason}
         for v in verdicts
     ]
-    return json.dumps(rows, indent=1, ensure_ascii=False)
+    killed = sum(v.killed for v in verdicts)
+    same = sum(v.reason.startswith("equivalent") for v in verdicts)
+    counts = {"mutants": len(verdicts), "killed": killed, "equivalent": same}
+    return {**counts, "tests": tests, "rows": rows}
 
 
 def _table(verdicts: list[Verdict]) -> Table:
