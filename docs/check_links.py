@@ -6,6 +6,7 @@ each dead link and returns 1 if there is one.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -66,7 +67,9 @@ def _reason(link: str, path: Path, pages: dict[Path, Page]) -> str:
 
 def main() -> int:
     """Check the folder that the command line names."""
-    site = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description="Check the links of the built pages.")
+    parser.add_argument("site", type=Path, help="folder of the built pages")
+    site = parser.parse_args().site
     dead = dead_links(site)
     count = sum(len(Page(path).links) for path in site.rglob("*.html"))
     print(*dead, f"{count} links, {len(dead)} dead", sep="\n")

@@ -16,6 +16,7 @@ Without Chromium or Playwright nothing is looked at, and the program says so.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 from typing import Any
@@ -133,7 +134,11 @@ def look(view: Any, path: Path) -> tuple[list[str], float]:
 
 def main() -> int:
     """Look at the pages of the folder that the command line names."""
-    site = Path(sys.argv[1]).resolve()
+    parser = argparse.ArgumentParser(description="Look at the built pages in a browser.")
+    parser.add_argument("site", type=Path, help="folder of the built pages")
+    parser.add_argument("pages", nargs="*", help="names of pages; all without")
+    options = parser.parse_args()
+    site = options.site.resolve()
     try:
         from playwright.sync_api import sync_playwright
     except ModuleNotFoundError:
@@ -144,8 +149,8 @@ def main() -> int:
         return 0
     paths = [path for path in sorted(site.rglob("*.html")) if path.name not in _MADE]
     paths = [path for path in paths if "_static" not in path.parts]
-    if names := sys.argv[2:]:
-        paths = [path for path in paths if path.stem in names]
+    if options.pages:
+        paths = [path for path in paths if path.stem in options.pages]
     heights, count = {}, 0
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=OPTIONS)

@@ -13,6 +13,7 @@ import quell
 
 sys.path.insert(0, str(Path(__file__).parent))
 import machine_texts
+import part
 
 # Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
@@ -51,6 +52,13 @@ nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_execution_in_temp = True  # tutorials write files
+if "QUELL_DOCS_PART" in os.environ:
+    run = part.chosen(part.part_of(os.environ["QUELL_DOCS_PART"]))
+    nb_execution_excludepatterns = [
+        path.name for path in Path(__file__).parent.glob("*.md") if path.stem not in run
+    ]
+    # Only a page that has run knows the language of its cells.
+    suppress_warnings = ["myst-nb.lexer"]
 nb_merge_streams = True  # else the lines of a command become many boxes
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3

@@ -10,11 +10,11 @@ signature, the first paragraph of its docstring, and its parameters. ``setup.sch
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import inspect
 import json
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -184,4 +184,6 @@ def write(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description="Write the texts of the site for machines.")
+    parser.add_argument("folder", type=Path)
+    write(parser.parse_args().folder)
