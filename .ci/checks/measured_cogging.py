@@ -2,12 +2,13 @@
 
 import sys
 from math import pi
+from pathlib import Path
 
 import numpy as np
 
 import quell as ql
 
-sys.path.insert(0, "benchmarks")
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from cogging import LEARNERS, error, motor, moving_rms, rms, turning
 
 record = sys.argv[1]

@@ -1,12 +1,17 @@
 """Run the plain Python blocks and the setups of the pages; cells are run where the pages are built.
 
-A block that needs a machine, a cluster or a large library is named in ``NOT_HERE`` with the reason.
+    python .ci/checks/pages.py [--part K/N] [PAGE ...]
+
+``--part K/N`` takes each N-th page from the K-th on; names of pages take only these. A block that
+needs a machine, a cluster or a large library is named in ``NOT_HERE`` with the reason.
 """
 
+import argparse
 import os
 import re
 import sys
 import tempfile
+import time
 import tomllib
 import warnings
 from functools import partial
@@ -17,6 +22,9 @@ import numpy as np
 
 import quell as ql
 from quell.setup import load
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from measured import part_of
 
 ROOT = Path(__file__).parents[2]
 NOT_HERE = {
@@ -80,9 +88,17 @@ def run_setup(code: str) -> str:
     return f"runs, {len(run)} samples"
 
 
+pages = {page.name: page for page in sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"])}
+parser = argparse.ArgumentParser(description="Run the blocks of pages.")
+parser.add_argument("--part", type=part_of, default="1/1", help="K/N")
+parser.add_argument("page", nargs="*", default=[*pages], help="names of pages; all without")
+options = parser.parse_args()
+if unknown := set(options.page) - pages.keys():
+    parser.error(f"there is no page {', '.join(sorted(unknown))}")
 warnings.simplefilter("ignore")
 failed: list[str] = []
-for page in sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]):
+for page in [pages[name] for name in sorted(set(options.page))][options.part]:
+    began = time.process_time()
     shared: dict[str, object] = {}
     for language, how in (("python", partial(run_block, before=shared)), ("toml", run_setup)):
         for number, code in enumerate(blocks(page, language), 1):
@@ -96,4 +112,5 @@ for page in sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]):
                 finally:
                     os.chdir(ROOT)
                 print(f"{page.name}, {language} {number}: {found}", flush=True)
+    print(f"{page.name}: {time.process_time() - began:.1f} s of CPU", flush=True)
 sys.exit("\n".join(failed) or None)
