@@ -363,6 +363,27 @@ def test_without_a_pi_controller_of_use_the_bound_of_noise_is_that_of_a_pid_cont
 
 
 @pytest.mark.trial
+def test_a_guessed_bound_of_noise_has_a_curve_and_a_known_one_none() -> None:
+    """Five bounds of M_ks; the guess, in the middle, has the objective of the result."""
+    found = ql.tune(LAGS, DT, structure="pid", compare=())
+    limits, values = zip(*found.noise_curve, strict=True)
+    assert limits == pytest.approx([found.constraints.m_ks * 2.0**k for k in range(-2, 3)])
+    assert values[2] == found.design.objective
+    assert sorted(values, reverse=True) == list(values)
+    known = replace(Constraints(), m_ks=found.constraints.m_ks)
+    assert ql.tune(LAGS, DT, structure="pid", compare=(), constraints=known).noise_curve == []
+
+
+def test_the_knee_of_the_noise_is_where_doubling_it_brings_less_than_a_tenth() -> None:
+    """In a step of two or of four, of a size and of a gain."""
+    curve = [(1.0, 4.0), (2.0, 3.0), (4.0, 2.5), (8.0, 2.4), (32.0, 2.3)]
+    assert "above 4 doubling it improves by less than 10 %" in report.noise_line(curve, "load-iae")
+    assert report.noise_line(curve[:3], "load-iae").endswith("more noise in u still brings more")
+    gains = [(limit, 1.0 / value) for limit, value in curve]
+    assert "above 4 doubling" in report.noise_line(gains, "load")
+
+
+@pytest.mark.trial
 def test_without_any_pid_controller_of_use_noise_is_not_bounded_and_the_report_says_so() -> None:
     """Three integrators have none, so nothing tells how much of u noise may use."""
     found = ql.tune(([1.0], [1.0, 0, 0, 0]), 0.01, structure="bandwidths", order=3, compare=())

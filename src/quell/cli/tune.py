@@ -653,8 +653,8 @@ def _print(console: Console, tuned: Tuned, name: str) -> None:
     plants = "1 plant" if count == 1 else f"{count} plants"
     print_line(console, f"{name}, dt = {tuned.plants.dt:g} s, {plants}")
     print_line(console, f"constraints: {tuned.constraints}")
-    if tuned.noise_bound:
-        print_line(console, tuned.noise_bound)
+    for line in tuned.noise:
+        print_line(console, line)
     quantity = report.quantity(tuned.objective)
     headings = ("structure", quantity, report.second_quantity(tuned.objective), *_HEADINGS)
     # With so little white space 80 columns hold all names.

@@ -496,3 +496,31 @@ def tradeoff(task: Task, design: Design) -> list[tuple[str, float, float]]:
                 value = 1.0 / size if task.objective == "load" else size
                 found.append((active.name, limit, value))
     return found
+
+
+# Bounds of M_ks around one that is a guess, in its units.
+_OF_CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+
+def noise_curve(task: Task, design: Design) -> list[tuple[float, float]]:
+    """Return M_ks and the objective of a structure for bounds of M_ks around that of the task.
+
+    From the task's bound on each search starts at the one before.
+    """
+    assert design.solution is not None
+    given = task.constraints.m_ks
+    assert given is not None
+    found = {}
+    for side in (1, -1):
+        solution = design.solution
+        for factor in _OF_CURVE[len(_OF_CURVE) // 2 :]:
+            limit = given * factor**side
+            if factor > 1.0:
+                near = _with(task, m_ks=limit).problem()
+                result = search(near, solution.structure, solution.values, _NEARBY_ROUNDS)
+                if result is None or not result.feasible:
+                    break
+                solution = result
+            size = float(np.exp(solution.cost))
+            found[limit] = 1.0 / size if task.objective == "load" else size
+    return sorted(found.items())

@@ -1,7 +1,7 @@
 """The prefilter of the reference of a tuned file: within the limits of u, a step overshoots little.
 
 An axis, whose position needs no u at rest, gets a ``ProfileGenerator``. With the rigid part
-``u = c_1 y' + c_2 y''`` of the plant's inverse and the room for u that loads of the scenario leave,
+``u = c_1 y' + c_2 y''`` of the plant's inverse and the room for u that loads leave while r steps,
 
     |c_1| v_max + |c_2| a_max ≤ share · room,        j_max = a_max / t_j
 
@@ -58,8 +58,9 @@ _LARGEST_ORDER = 8
 ORDER_OF_AXIS = 4
 """Order of the reference model of an axis: with the same largest acceleration a step settles in
 2.9, 1.8 and 1.6 times the quickest time for the orders 2, 3 and 4."""
-# At limits it is made slower by this factor, so often at most.
-_BANDWIDTHS, _MOST_LAGS = 0.85, 32
+# At limits it is made slower by this factor, so often at most; then so many between the quickest
+# one that keeps within them and the next faster one.
+_BANDWIDTHS, _MOST_LAGS, _BETWEEN = 0.85, 32, 3
 # Slower ones are looked at until the step takes this multiple of the quickest one.
 _SLOWER_THAN_BEST = 1.2
 
@@ -117,13 +118,14 @@ class Axis:
 def room_of_u(
     written: Written, linear: LinearPlant, limits: tuple[float, float], u: float
 ) -> float:
-    """Return what u may do on both sides of ``u`` at rest, less the loads of the scenario."""
+    """Return what u may do on both sides of ``u`` at rest, less what loads need while r steps."""
     room = min(limits[1] - u, u - limits[0])
     loads = written.scenario.seeded_signals(written.plant.disturbances)[1]
     if loads:
         values = loads[0](np.arange(round(written.scenario.duration / written.dt)) * written.dt)
-        reserved = abs(held_load(linear)) * float(np.max(np.abs(values - values[0]), initial=0.0))
-        room -= min(reserved, _MOST_RESERVED * room)
+        acting = [values[first:end] for first, end, _ in written.steps] or [values]
+        largest = max(float(np.max(np.abs(each - values[0]), initial=0.0)) for each in acting)
+        room -= min(abs(held_load(linear)) * largest, _MOST_RESERVED * room)
     return room
 
 
@@ -206,21 +208,40 @@ def reference_model_for(
     order = max(order, min(int(getattr(controller, "derivatives", 0)), _LARGEST_ORDER))
     end, at_limits, best = written.largest[1], Shaped(None, None), None
     omega = min(omega, 1.0 / written.dt)
-    for _ in range(_MOST_LAGS):
+
+    def shown_with(omega: float) -> tuple[ReferenceModel, StepFigures, bool] | None:
+        """Return a model, its step and whether u keeps within its limits; None if y does not."""
         model = ReferenceModel(omega, order)
         shown = _with(written, controller, model, end)
-        omega *= _BANDWIDTHS
         if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
+            return None
+        free = shown.limited <= max(_LIMITED * shown.looked, _FEW * written.dt)
+        return model, shown, free
+
+    for _ in range(_MOST_LAGS):
+        tried = shown_with(omega)
+        omega *= _BANDWIDTHS
+        if tried is None:
             continue
-        if shown.limited > max(_LIMITED * shown.looked, _FEW * written.dt):
+        model, shown, free = tried
+        if not free:
             at_limits = Shaped(model, shown) if at_limits.step is None else at_limits
-            continue
         # A slower one may excite a mode less.
-        if best is None or shown.settling < best[1].settling:
+        elif best is None or shown.settling < best[1].settling:
             best = model, shown
         elif shown.settling > _SLOWER_THAN_BEST * best[1].settling:
             break
-    return at_limits if best is None else Shaped(*best)
+    if best is None:
+        return at_limits
+    slow, fast = best[0].omega, best[0].omega / _BANDWIDTHS
+    for _ in range(_BETWEEN):
+        middle = math.sqrt(slow * fast)
+        tried = shown_with(middle)
+        if tried is not None and tried[2] and tried[1].settling < best[1].settling:
+            slow, best = middle, tried[:2]
+        else:
+            fast = middle
+    return Shaped(*best)
 
 
 def model_of_linear_step(plants: PlantSet, controller: Controller) -> ReferenceModel | None:

@@ -14,6 +14,7 @@ The scenario of a tuned setup file: a step of the reference, a load, and where e
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -343,6 +344,29 @@ def tradeoff_lines(tradeoff: Sequence[tuple[str, float, float]], objective: str)
     """Return what other limits would give: (constraint, its limit, objective)."""
     what = quantity(objective)
     return [f"{name} {limit:.4g}: {what} {value:.4g}" for name, limit, value in tradeoff]
+
+
+# Doubling M_ks must improve the objective by this share, or the knee is passed.
+_KNEE = 0.1
+
+
+def noise_line(curve: Sequence[tuple[float, float]], objective: str) -> str:
+    """Return what the objective is over bounds of M_ks, and where more noise brings little."""
+    points = ", ".join(f"{value:.4g} for {limit:.4g}" for limit, value in curve)
+    text = f"{quantity(objective)} over bounds of M_ks: {points}"
+    sizes = [(limit, math.log(value)) for limit, value in curve]
+    sign = 1.0 if objective == "load" else -1.0
+    slopes = [
+        sign * (after - before) / math.log2(higher / lower)
+        for (lower, before), (higher, after) in itertools.pairwise(sizes)
+    ]
+    small = [slope < math.log1p(_KNEE) for slope in slopes]
+    knee = next((i for i in range(len(small)) if all(small[i:])), None)
+    if knee is None:
+        return f"{text}; more noise in u still brings more"
+    return (
+        f"{text}; above {curve[knee][0]:.4g} doubling it improves by less than {100.0 * _KNEE:g} %"
+    )
 
 
 # ---- Figures of a tuning ----

@@ -26,7 +26,7 @@ from quell.sweeping.sweep import share_interval
 from quell.tuning import report
 from quell.tuning.acceptance import Judged, Loop, judge, prefilter_table
 from quell.tuning.constraints import Constraints
-from quell.tuning.designs import Task, tradeoff
+from quell.tuning.designs import Task, noise_curve, tradeoff
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.requirements import all_peaks, beside_poles, closed_loop_poles, counted
 from quell.tuning.optimiser.search import Problem, Solution
@@ -271,6 +271,22 @@ class Tuned:
             return tradeoff(self.task, self.design)
 
     @cached_property
+    def noise_curve(self) -> list[tuple[float, float]]:
+        """Bounds of M_ks and the objective with them, where the bound is a guess; else empty."""
+        if self.search is not None or not self.noise_bound or self.constraints.m_ks is None:
+            return []
+        with one_blas_thread():
+            return noise_curve(self.task, self.design)
+
+    @property
+    def noise(self) -> list[str]:
+        """How noise in u is bounded, as lines, and what other bounds would give."""
+        lines = [self.noise_bound] if self.noise_bound else []
+        if len(self.noise_curve) > 1:
+            lines.append(report.noise_line(self.noise_curve, self.objective))
+        return lines
+
+    @cached_property
     def judged(self) -> Judged | None:
         """What the controller does in the file that is written; None without a file.
 
@@ -335,7 +351,7 @@ class Tuned:
     def summary(self) -> str:
         """Return constraints, measures, costs and trade-off in some lines."""
         lines = [f"constraints: {self.constraints}"]
-        lines += [self.noise_bound] if self.noise_bound else []
+        lines += self.noise
         quantity = report.quantity(self.objective)
         second = report.second_quantity(self.objective)
         for name, value, *rest in report.rows(self.designs, self.objective):
@@ -410,6 +426,9 @@ class Tuned:
                 "tradeoff": [
                     {"constraint": name, "limit": limit, "objective": value}
                     for name, limit, value in self.tradeoff
+                ],
+                "noise_curve": [
+                    {"m_ks": limit, "objective": value} for limit, value in self.noise_curve
                 ],
                 "check": check,
                 "search": None if self.search is None else self.search.to_json(),

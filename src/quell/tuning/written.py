@@ -464,17 +464,21 @@ class Written:
         return self.scenario is not None and self._events is None
 
     @cached_property
-    def largest(self) -> tuple[int, int, float] | None:
-        """First and last sample of the largest step of the reference, and its size; None if none.
+    def steps(self) -> tuple[tuple[int, int, float], ...]:
+        """First and last sample of each step of the reference, and its size.
 
         The last one is that before the next step of any signal.
         """
         events = self._events or ()
-        at = max(range(len(events)), key=lambda i: abs(events[i][1]), default=-1)
-        if at < 0 or events[at][1] == 0.0:
-            return None
-        end = events[at + 1][0] if at + 1 < len(events) else self._t.size
-        return events[at][0], end, events[at][1]
+        ends = [at for at, _ in events[1:]] + [self._t.size]
+        return tuple(
+            (at, end, size) for (at, size), end in zip(events, ends, strict=True) if size != 0.0
+        )
+
+    @cached_property
+    def largest(self) -> tuple[int, int, float] | None:
+        """The largest of the ``steps``; None if there is none."""
+        return max(self.steps, key=lambda step: abs(step[2]), default=None)
 
     def figures(self, controller: Any, run: Trajectory) -> StepFigures | None:
         """Return what a run does after the largest step of the reference; None if it has none."""
