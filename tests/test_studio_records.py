@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from quell.commissioning import measured
+from quell.setup import made
 from quell.studio.messages import parsed_frame
 from quell.studio.records import MOST_FILE, MOST_SAMPLES, PageRecord, for_page, record_frames
 from quell.studio.runs import StoppedError
+from quell.tuning import Constraints
 from quell.tuning.plants import record_model
 
 from .studio_server import TABLES, Client, running, step_test
@@ -237,3 +239,24 @@ def test_a_double_integrator_gets_a_first_controller_with_damping() -> None:
     header, _, _ = parsed_frame(next(frames))
     assert header["structure"] == "pid"
     assert header["plants"][0]["gain"].endswith("of s² G")
+
+
+@pytest.mark.parametrize("limits", [{"u_min": -10.0, "u_max": 10.0}, {}])
+def test_the_noise_of_the_scenario_bounds_u_where_its_limits_are_known(
+    limits: dict[str, float],
+) -> None:
+    """Power 4e-11 in samples of 0.1 ms: a standard deviation of 6.3e-4, as it runs."""
+    noise = {"kind": "noise", "power": 4e-11, "sample_time": 1e-4}
+    tables = {
+        "dt": 1e-4,
+        "plant": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0]},
+        "observer": {"kind": "model-free", "order": 1, "b0": 1.0, "omega_o": 50.0},
+        "controller": {"kind": "adrc", "omega_c": 10.0},
+        "scenario": {"duration": 0.2, "noise": noise},
+    }
+    setup, given = made("setup", tables), Constraints()
+    found = PageRecord().with_noise(given, limits, setup, {})
+    if limits:
+        assert found.noise_std == pytest.approx(6.3e-4, rel=0.1)
+    else:
+        assert found == given

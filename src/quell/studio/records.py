@@ -26,6 +26,7 @@ from quell.studio.runs import Report, Stale, StoppedError, caught_warnings, line
 from quell.tuning import Constraints, Tuned, tune
 from quell.tuning.designs import range_of_u
 from quell.tuning.plants import RecordModel, record_model, with_known_noise
+from quell.tuning.written import Written
 
 MOST_FILE = 8 * 2**20
 """Largest file of a record [bytes]; chosen by hand: 50 000 rows of ten columns take five MB."""
@@ -137,11 +138,14 @@ class PageRecord:
         setup: Setup,
         message: Mapping[str, Any],
     ) -> Constraints:
-        """Return the constraints with the noise of y that the record or the encoder tells of."""
-        shown = self.shown
-        of_record = shown is not None and self._is_of_record(setup, message)
-        plant = shown.model if shown is not None and of_record else setup.plant
-        return with_known_noise(bounds, plant, range_of_u(limits))
+        """Return the constraints with the noise of y that record, encoder or scenario tell of."""
+        shown, scenario = self.shown, setup.scenario
+        if shown is not None and self._is_of_record(setup, message):
+            return with_known_noise(bounds, shown.model, range_of_u(limits))
+        noise = 0.0
+        if setup.plant is not None and scenario is not None:
+            noise = Written(setup.plant, scenario, float(setup.controller.dt)).noise
+        return with_known_noise(bounds, setup.plant, range_of_u(limits), noise)
 
     def _is_of_record(self, setup: Setup, message: Mapping[str, Any]) -> bool:
         """Whether the page shows a record, and the setup has its plant and its sample time."""

@@ -470,7 +470,7 @@ class Written:
         The last one is that before the next step of any signal.
         """
         events = self._events or ()
-        ends = [at for at, _ in events[1:]] + [self._t.size]
+        ends = [*(at for at, _ in events), self._t.size][1:]
         return tuple(
             (at, end, size) for (at, size), end in zip(events, ends, strict=True) if size != 0.0
         )
