@@ -86,11 +86,12 @@ class Wrapper(StatefulController):
     controller: Any
 
     def __getattr__(self, name: str) -> Any:
-        """Return a number that the controller inside was made with, as ``omega_c`` or ``kp``."""
+        """Return numbers that the controller inside was made with, as ``omega_c`` or ``tf``."""
         known = name != "controller" and not name.startswith("_")
         if known and name in inspect.signature(type(self.controller)).parameters:
             value = getattr(self.controller, name, self)
-            if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+            numbers = isinstance(value, int | float | tuple) and not isinstance(value, bool)
+            if value is None or numbers:
                 return value
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 

@@ -39,7 +39,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.identification.model import Structure, free_run, gain_interval, poles_of, zeros_of
+from quell.identification.model import (
+    Root,
+    Structure,
+    free_run,
+    gain_interval,
+    poles_of,
+    zeros_of,
+)
 from quell.identification.output_error import likelihood_ratio
 from quell.identification.result import (
     Identified,
@@ -50,7 +57,7 @@ from quell.identification.result import (
     residuals,
     simulate_fit,
 )
-from quell.identification.search import Fit, Known, Wanted, fit
+from quell.identification.search import Fit, Known, Wanted, fit, without_fast_poles
 from quell.identification.starts import instrumental_variables
 from quell.parallel import one_blas_thread, part_of
 from quell.quantities import UNKNOWN, Signals
@@ -448,15 +455,22 @@ def _validated(
     b, covariance = _numerator(structure, theta, covariance)
     of_b = slice(free, free + b.size)
     gain = b[0] if b[0] != 0.0 else np.nan
-    of_a = covariance[: free + 1, : free + 1]
     friction, friction_std = _friction(structure, theta, fitted.estimate.covariance, seconds, gain)
     statistic, limit = one_more_pole(fitted, u[first], y[first])
-    low, high = gain_interval(a[structure.integrators :], float(b[0]), of_a)
+    q = structure.integrators
+    low, high = gain_interval(a[q:], float(b[0]), covariance[: free + 1, : free + 1])
+    poles = poles_of(a, covariance, q)
+    shown = without_fast_poles(fitted, u[first], y[first])
+    if shown is not fitted:
+        own = float(b[0] / a[q])
+        low, high = (end * dt**-q for end in shown.gain_interval())
+        low, high = min(low, own), max(high, own)
+        poles = _with_deviations(poles, shown, dt)
     return Identified(
         num=b[::-1].copy(),
         den=np.append(1.0, a[::-1]),
         covariance=covariance,
-        poles=poles_of(a, covariance, structure.integrators),
+        poles=poles,
         zeros=zeros_of(b, covariance[of_b, of_b]),
         integrators=structure.integrators,
         delay=fitted.delay * dt,
@@ -485,6 +499,23 @@ def _validated(
         reference=r,
         converged=fitted.estimate.converged,
         method=_METHODS[r is not None],
+    )
+
+
+def _with_deviations(poles: tuple[Root, ...], shown: Fit, dt: float) -> tuple[Root, ...]:
+    """Return the poles with the deviations of those of another model that are nearest to them.
+
+    Poles that samples do not show keep their own.
+    """
+    structure, seconds = shown.structure, 1.0 / shown.structure.powers(dt)
+    covariance = shown.estimate.covariance * np.outer(seconds, seconds)
+    a = structure.denominator(shown.estimate.theta * seconds)
+    known = poles_of(a, covariance, structure.integrators)
+    return tuple(
+        min(known, key=lambda one: abs(one.value - pole.value))._replace(value=pole.value)
+        if pole.omega * dt <= math.pi
+        else pole
+        for pole in poles
     )
 
 
@@ -832,6 +863,12 @@ def _compared(
     more = max(larger.parameters - less.parameters, 1)
     limit = max(float(chi2.isf(_LEVEL, more)), (more + 2) * float(np.log(count)))
     return gain, -ratio if smaller else ratio, limit, True
+
+
+def fits_better(first: Identified, second: Identified) -> bool:
+    """Return whether a second model has the smaller errors, by more than chance explains."""
+    gain, z, limit, _ = _by_blocks(first, second)
+    return z >= limit and gain >= _EQUAL
 
 
 def _by_blocks(first: Identified, second: Identified) -> tuple[float, float, float, bool]:

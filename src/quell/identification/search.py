@@ -62,6 +62,7 @@ from quell.identification.starts import (
     general,
     probability,
     refined,
+    smaller,
     structure_at_rest,
     with_poles,
 )
@@ -489,6 +490,12 @@ class Fit(NamedTuple):
             structure = structure.single()
         return _inputs(structure, u, self.delay, self.bias)
 
+    def gain_interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the gain [y-unit/u-unit/sample^q]."""
+        free, theta = self.structure.free, self.estimate.theta
+        part = self.estimate.covariance[: free + 1, : free + 1]
+        return gain_interval(theta[:free], float(theta[free]), part)
+
 
 def _inputs(structure: Structure, u: Vector, delay: int, bias: bool) -> Matrix:
     """Return the inputs (N, inputs) for ``u``: late, constant forces, and zeros for friction."""
@@ -588,9 +595,7 @@ def _fit_at_rest(
 
 def _relative_width(found: Fit) -> float:
     """Return half the width of the gain's 95 % interval, relative to its middle."""
-    free, theta = found.structure.free, found.estimate.theta
-    part = found.estimate.covariance[: free + 1, : free + 1]
-    low, high = gain_interval(theta[:free], float(theta[free]), part)
+    low, high = found.gain_interval()
     return abs((high - low) / (high + low)) if np.isfinite(high - low) and high + low else np.inf
 
 
@@ -729,6 +734,34 @@ def _over_delays(
         cov += weight / total * (one.covariance + np.outer(moved, moved))
         of_delay += weight / total * late * np.append(moved[:size], late)
     return estimate._replace(covariance=cov), (low, high), of_delay
+
+
+# Steps of a refinement without fast poles, and how much larger its error may be: by hand.
+_WITHOUT_FAST, _HARDLY = 12, 1.01
+
+
+def without_fast_poles(found: Fit, u: Vector, y: Vector) -> Fit:
+    """Return a model without the poles that samples do not show, or the model itself.
+
+    Such a pole and the numerator are uncertain by the same factor, up to rounding, so what is
+    certain, as the gain, is to be taken from the model without it. It is the model itself with
+    friction or direct feedthrough, and where the error would be larger.
+    """
+    structure, a = found.structure, found.structure.denominator(found.estimate.theta)
+    poles = np.roots(np.append(1.0, a[::-1]))
+    slow = poles[np.abs(poles) <= math.pi]
+    lower: Structure | None = structure
+    for _ in range(poles.size - slow.size):
+        lower = None if lower is None else smaller(lower)
+    if lower is None or lower is structure or structure.friction or structure.direct:
+        return found
+    v = found.inputs(u)
+    start = with_poles(lower, np.asarray(np.poly(slow).real[:0:-1], dtype=np.float64))
+    near = refine(lower, start, v, y, _WITHOUT_FAST)
+    if not near.cost <= _HARDLY * found.estimate.cost + _ROUNDING * float(np.mean(y**2)):
+        return found
+    over = _over_delays(lower, near, u, v, y, found.delay, found.searched)
+    return found._replace(structure=lower, estimate=over[0], delays=over[1])
 
 
 def _set_integrators(

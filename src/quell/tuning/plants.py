@@ -33,7 +33,8 @@ import numpy as np
 
 from quell import checks
 from quell.identification import Measured, identify, not_told_apart
-from quell.identification.result import Identified
+from quell.identification.identify import fits_better
+from quell.identification.result import Identified, percent
 from quell.lti.canonical import canonical
 from quell.parallel import part_of
 from quell.plants.base import PlantBatch
@@ -275,6 +276,7 @@ class RecordModel:
     model: Identified
     others: tuple[Identified, ...]
     held_out: float | None  #: share of the record that was to be held out; None: by itself
+    larger: Identified | None = None  #: a model with more poles that does not hold
 
     @property
     def lines(self) -> list[str]:
@@ -283,6 +285,13 @@ class RecordModel:
         found = model.describe().splitlines()
         if model.held_from == model.y.size and self.held_out is None:
             found.append("nothing is held out: u does not move at the end of the record")
+        if self.larger is not None:
+            key = "held out" if "held out" in model.fits else "estimation"
+            found.append(
+                f"order {self.larger.den.size - 1} has a fit of "
+                f"{percent(self.larger.fits[key], 1)} instead of {percent(model.fits[key], 1)} % "
+                f"({key}), but does not hold: {_why_not(self.larger)}"
+            )
         for other in self.others:
             found.append(f"the record does not tell it from {other!r}, which is tuned for, too")
         return found
@@ -309,6 +318,13 @@ class RecordModel:
         return identified_plants(self.model, self.others)
 
 
+def _why_not(model: Identified) -> str:
+    """Return why a model does not hold; empty if it does."""
+    worse = ["it is worse than the mean of y on samples that were not fitted"] * model.fails
+    search = ["its search did not converge"] * (not model.converged)
+    return next(iter([*model.faults, *model.undecided, *worse, *search]), "")
+
+
 def record_model(
     record: Measured,
     order: int = _ORDER,
@@ -322,6 +338,9 @@ def record_model(
     progress: Callable[[float], None] | None = None,
 ) -> RecordModel:
     """Identify a record with a first order, and take the structure that the record supports.
+
+    Where that has a fault, or does not decide the gain, orders from 1 on are tried, and the
+    simplest model that holds is taken, until a larger one that holds fits better.
 
     Parameters
     ----------
@@ -342,25 +361,39 @@ def record_model(
         as ``identify``.
     """
     delay = None if max_delay is None else (0.0, max_delay)
-    first = identify(
-        record.u,
-        record.y,
-        record.dt,
-        order,
-        zeros,
-        delay=delay,
-        integrators=integrators,
-        friction=bool(friction),
-        rest=rest,
-        held_out=held_out,
-        signals=record.signals,
-        progress=part_of(progress, 0.0, 0.5, 1.0),
-    )
-    model, *others = not_told_apart(
-        first,
-        delay,
-        integrators=integrators,
-        friction=friction,
-        progress=part_of(progress, 0.5, 1.0, 1.0),
-    )
-    return RecordModel(model, tuple(others), held_out)
+
+    def fitted(poles: int, friction: bool, share: tuple[float, float]) -> Identified:
+        return identify(
+            record.u,
+            record.y,
+            record.dt,
+            poles,
+            min(zeros, poles - (zeros < order)),
+            delay=delay,
+            integrators=integrators,
+            friction=friction,
+            rest=rest,
+            held_out=held_out,
+            signals=record.signals,
+            progress=part_of(progress, *share, 1.0),
+        )
+
+    first = fitted(order, bool(friction), (0.0, 0.5))
+    how: dict[str, Any] = {"integrators": integrators, "friction": friction}
+    model, *others = not_told_apart(first, delay, **how, progress=part_of(progress, 0.5, 0.8, 1.0))
+    if not _why_not(model):
+        return RecordModel(model, tuple(others), held_out)
+    held: Identified | None = None
+    tried = [(k, rubs) for k in range(1, order + 1) for rubs in (False, True)]
+    tried = [one for one in tried if friction is None or one[1] == friction]
+    for i, (fewer, rubs) in enumerate(tried):
+        ends = 0.8 + 0.2 * i / len(tried), 0.8 + 0.2 * (i + 1) / len(tried)
+        try:
+            one = fitted(fewer, rubs, ends)
+        except ValueError:  # no such model, as with more integrators than poles
+            continue
+        if not _why_not(one) and (held is None or fits_better(held, one)):
+            held = one
+    if held is None:
+        return RecordModel(model, tuple(others), held_out)
+    return RecordModel(held, (), held_out, model)
