@@ -50,6 +50,9 @@ from quell.identification.model import (
 from quell.identification.output_error import likelihood_ratio
 from quell.identification.result import (
     Identified,
+    before_the_record,
+    curvature,
+    early_samples,
     fit_predictor,
     nrmse,
     one_more_pole,
@@ -340,7 +343,35 @@ def identified(
     known: Known | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Identified:
-    """Return the result of ``identify``; the search begins at a model that is ``known``, if any."""
+    """Return the result of ``identify``; the search begins at a model that is ``known``, if any.
+
+    Where u was another one before the record, the samples in which that acts are left out.
+    """
+    given = dt, options, reference, validation, signals, known, progress
+    found = _identified(records, *given)
+    last = round(found.delay_interval[1] / found.dt)
+    single = not records.samples and reference is None
+    if not found.before or not single or found.faults or not found.converged:
+        return found
+    try:
+        # What u was before the record is not in it, but what it was before a later sample is.
+        again = _identified(Records(records.u[last:], records.y[last:], ()), *given)
+    except ValueError:  # too short, or u does not move there
+        return found
+    return found if again.before else replace(again, left_out=last)
+
+
+def _identified(
+    records: Records,
+    dt: float,
+    options: Options,
+    reference: Any,
+    validation: tuple[Any, Any] | None,
+    signals: Signals,
+    known: Known | None,
+    progress: Callable[[float], None] | None,
+) -> Identified:
+    """Return the result for all samples."""
     u, y = records.u, records.y
     order, zeros, integrators, delay, bias, friction, rest, held_out, horizon = options
     if reference is not None:
@@ -401,6 +432,13 @@ def identified(
             fitted = _with_instruments(fitted, u[:held_from], y[:held_from], reference[:held_from])
         rounding = wanted.resolution
         found = _validated(fitted, u, y, reference, dt, held_from, horizon, other, rounding)
+        if not friction and (found.undecided or not found.explained):
+            part = u[:held_from], y[:held_from]
+            # A gain that falls with u looks like an integrator.
+            if integrators is None and found.integrators and found.undecided:
+                plain = wanted._replace(order=1, zeros=0, integrators=0)
+                fitted = fit(*part, records.samples, plain)
+            found = replace(found, curvature=curvature(fitted, *part))
     return replace(found, signals=Signals(signals.y, signals.u))
 
 
@@ -490,6 +528,9 @@ def _validated(
         fits=fits,
         one_more_pole=statistic,
         one_more_pole_limit=limit,
+        early=early_samples(fitted, u[first], y[first]),
+        before=before_the_record(fitted, u[first], y[first]),
+        curvature=0.0,
         residuals=residuals(error, tested_u, min(_LAGS, error.size // 4)),
         resolution=resolution,
         held_from=held_from,

@@ -64,6 +64,10 @@ from quell.types import Matrix, Vector
 _ROUNDS = 6
 # Poles of the test for one more pole, and the probability that it fails by chance: by hand.
 _EXTRA_POLES, _SELDOM = 4, 1e-3
+# Share of the error's power that the u of the same sample explains where y is early: by hand.
+_MOST_EARLY = 0.2
+# Share of it that a gain which depends on u explains, from which on that is the reason: by hand.
+_BENT = 0.5
 # Relative singular value that counts as zero.
 _RANK = 1e-12
 
@@ -123,40 +127,126 @@ def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
 
 def one_more_pole(fit: Fit, u: Vector, y: Vector) -> tuple[float, float]:
     """Return the statistic of the test for one more pole, and its limit at 99.9 %."""
-    from scipy.signal import lfilter
     from scipy.stats import chi2
+
+    structure, theta = fit.structure, fit.estimate.theta
+    u_late = fit.inputs(u)[:, 0]
+    a = structure.denominator(theta)
+    poles = np.abs(np.roots(np.append(1.0, a[::-1])))
+    slow, fast = np.clip([np.min(poles), np.max(poles)], 3.0 / y.size, 1.0)
+    columns = []
+    for rate in np.geomspace(slow / 3.0, min(3.0 * fast, 2.0), _EXTRA_POLES).tolist():
+        wider = np.convolve(np.append(a, 1.0), [rate, 1.0])[:-1]
+        columns.append(_response(fit, wider, u_late - u_late[0]))
+    statistic, _ = _explained_by(fit, u, y, np.column_stack(columns))
+    return statistic, float(chi2.isf(_SELDOM, _EXTRA_POLES))
+
+
+def _response(fit: Fit, a: Vector, u: Vector) -> Vector:
+    """Return the response ``B/A`` to ``u`` (N,) from zero states, with the model's own B."""
+    structure = fit.structure
+    b = structure.numerators(fit.estimate.theta)[0]
+    first = a.size - b.size  # one more pole, and so the next derivative
+    parts = []
+    for place in structure.records(u.size):
+        bank = chains(a, u[place, None])[:, :, 0]
+        parts.append(bank[:, first : first + b.size] @ b)
+    return np.concatenate(parts)
+
+
+def _explained_by(fit: Fit, u: Vector, y: Vector, extra: Matrix) -> tuple[float, Vector]:
+    """Return the χ² of further columns (N, k) in the error of a fit, and their coefficients (k,).
+
+    Beside the derivatives of the output by θ, all of them whitened by the model of the noise.
+    """
+    from scipy.signal import lfilter
 
     structure, theta = fit.structure, fit.estimate.theta
     v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
     predicted, psi = output_gradient(structure, theta, v)
-    alone = np.zeros_like(v)
-    alone[:, 0] = v[:, 0] - v[0, 0]
-    a = structure.denominator(theta)
-    poles = np.abs(np.roots(np.append(1.0, a[::-1])))
-    slow, fast = np.clip([np.min(poles), np.max(poles)], 3.0 / y.size, 1.0)
-    b = structure.numerators(theta)[0]
-    columns = []
-    for rate in np.geomspace(slow / 3.0, min(3.0 * fast, 2.0), _EXTRA_POLES).tolist():
-        wider = np.convolve(np.append(a, 1.0), [rate, 1.0])[:-1]
-        parts = []
-        for place in structure.records(y.size):
-            bank = chains(wider, alone[place, :1])[:, :, 0]
-            parts.append(bank[:, 1 : b.size + 1] @ b)
-        columns.append(np.concatenate(parts))
-    c, variance = noise_model(y - predicted)
+    error, length = y - predicted, nonzero_lengths(extra)
+    c, variance = noise_model(error)
     known = psi / nonzero_lengths(psi)
-    extra = np.column_stack(columns)
-    extra /= nonzero_lengths(extra)
-    whitened = lfilter(c, [1.0], np.column_stack([known, extra, y - predicted]), axis=0)
+    whitened = lfilter(c, [1.0], np.column_stack([known, extra / length, error]), axis=0)
     if not np.all(np.isfinite(whitened)) or not variance > 0.0:
-        return 0.0, float(chi2.isf(_SELDOM, _EXTRA_POLES))
-    error = whitened[:, -1]
-    left = [
-        float(np.sum((error - part @ np.linalg.lstsq(part, error, rcond=1e-9)[0]) ** 2))
+        return 0.0, np.zeros(length.size)
+    target = whitened[:, -1]
+    found = [
+        np.linalg.lstsq(part, target, rcond=1e-9)[0]
         for part in (whitened[:, : known.shape[1]], whitened[:, :-1])
     ]
+    left = [float(np.sum((target - whitened[:, : one.size] @ one) ** 2)) for one in found]
     statistic = (left[0] - left[1]) / (left[1] / max(y.size - whitened.shape[1] + 1, 1))
-    return statistic, float(chi2.isf(_SELDOM, _EXTRA_POLES))
+    return statistic, found[1][known.shape[1] :] / length
+
+
+def early_samples(fit: Fit, u: Vector, y: Vector) -> int:
+    """Return by how many samples y is early against u in a record, 0 to 2; 0 as far as it is not.
+
+    Where u acts from its own sample on, y of that sample can't depend on it. If it does, and with
+    the sign of the plant, the record has y too early: a logger has stored u beside the y that came
+    after it. A controller that answers noise in y at once gives the other sign.
+    """
+    from scipy.stats import chi2
+
+    structure = fit.structure
+    if fit.delay > 0 or structure.direct or structure.friction:
+        return 0
+    sign = float(structure.numerators(fit.estimate.theta)[0, structure.degrees[0]])
+    same, found, share = u - u[0], 0, 0.0
+    columns = [same, np.append(same[1:], same[-1])]
+    for early in (1, 2):
+        statistic, by = _explained_by(fit, u, y, np.column_stack(columns[:early]))
+        now = statistic / (statistic + y.size)
+        certain = statistic > chi2.isf(_SELDOM, early) and by[early - 1] * sign > 0.0
+        if not certain or now - share < _MOST_EARLY * (1.0 - share):
+            break
+        found, share = early, now
+    return found
+
+
+def before_the_record(fit: Fit, u: Vector, y: Vector) -> bool:
+    """Return whether another u before a record than its first one explains its first samples.
+
+    The u that acts in the samples of the delay is not in the record.
+    """
+    from scipy.stats import chi2
+
+    if fit.delay == 0 or fit.structure.friction:
+        return False
+    pulse = np.zeros(u.size)
+    for place in fit.structure.records(u.size):
+        pulse[place.start : place.start + fit.delay] = 1.0
+    a = fit.structure.denominator(fit.estimate.theta)
+    column = _response(fit, a, pulse)[:, None]
+    return bool(_explained_by(fit, u, y, column)[0] > chi2.isf(_SELDOM, 1))
+
+
+def curvature(fit: Fit, u: Vector, y: Vector) -> float:
+    """Return the share of the error's power that a gain explains which depends on u or its sign.
+
+    It is the response of the model to (u − mean)², and to |u| where u has both signs (a Hammerstein
+    model; Narendra & Gallman, *IEEE Trans. Automatic Control* 11, 1966); zero where chance may be
+    the reason.
+    """
+    from scipy.stats import chi2
+
+    structure, theta = fit.structure, fit.estimate.theta
+    u_late, a = fit.inputs(u)[:, 0], structure.denominator(theta)
+    bent = [(u_late - np.mean(u_late)) ** 2]
+    bent += [np.abs(u_late)] if np.min(u_late) < 0.0 < np.max(u_late) else []
+    extra = np.column_stack([_response(fit, a, each - each[0]) for each in bent])
+    statistic, _ = _explained_by(fit, u, y, extra)
+    if not statistic > chi2.isf(_SELDOM, extra.shape[1]):
+        return 0.0
+    v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
+    predicted, known = output_gradient(structure, theta, v)
+    left = []
+    for columns in (known, np.column_stack([known, extra])):
+        scaled, error = columns / nonzero_lengths(columns), y - predicted
+        rest = error - scaled @ np.linalg.lstsq(scaled, error, rcond=1e-9)[0]
+        left.append(float(rest @ rest))
+    return 1.0 - left[1] / left[0] if left[0] > 0.0 else 0.0
 
 
 def _finite(predicted: Matrix) -> Matrix:
@@ -374,6 +464,10 @@ class Identified:
         float  #: χ² of a further response to u in the error of the fit; see ``validation``
     )
     one_more_pole_limit: float  #: limit that it exceeds by chance in one of a thousand records
+    early: int  #: number of samples by which y is early against u; 0 if it is not
+    before: bool  #: whether the first samples show that u was another one before the record
+    #: share of the error's power that a gain which depends on u explains; 0 if not looked for
+    curvature: float
     resolution: float  #: step that y is rounded to, 0.0 if it is not rounded [y-unit]
     held_from: int  #: index of the first held-out sample; N if none was held out
     u: Vector
@@ -383,6 +477,8 @@ class Identified:
     converged: bool  #: whether the search ended at a minimum that a second start or tests confirm
     method: str
     signals: Signals = UNKNOWN  #: names and units of u and y
+    #: number of first samples that were left out, as u before the record was another one
+    left_out: int = 0
 
     @property
     def gain(self) -> float:
@@ -509,7 +605,28 @@ class Identified:
                 "the record does not decide the size of the gain, as the slowest pole may be at "
                 f"s = 0: {self._gain_text}; if the plant integrates, set integrators"
             )
-        if not self.explained:
+        if self.early:
+            count = f"{self.early} sample{'s' * (self.early > 1)}"
+            found.append(
+                f"y follows the u of {'the same' if self.early == 1 else 'the next'} sample, on "
+                f"which it can't depend: it is early by {count}, as where u is stored beside the y "
+                f"that came after it; leave out the first {count} of u and the last of y, or, if u "
+                "acts on y at once, as on an acceleration, give as many zeros as poles"
+            )
+        if self.before:
+            found.append(
+                "u was another one before the record, which acts in its first samples "
+                f"({self.delay:.4g} s of delay); cut the record, so that it begins later than its "
+                "first move of u"
+            )
+        if self.curvature > _BENT:
+            found.append(
+                "the gain depends on the operating point or on the sign of u: the response to u² "
+                f"and |u| explains {100.0 * self.curvature:.0f} % of the error of a linear model; "
+                "set friction, or identify in a narrow range of u, or at each operating point, for "
+                "a schedule ([tune.schedule])"
+            )
+        elif not self.explained:
             found.append(
                 f"the response to u is not of this form (one more pole: {self.one_more_pole:.3g}, "
                 f"limit {self.one_more_pole_limit:.3g}), so gain and poles may be farther from the "
@@ -619,6 +736,8 @@ class Identified:
         if self.rest:
             how = "given" if self.rest_given else "assumed"
             lines += [f"start at rest: {how} (probability {self.rest_probability:.3g})"]
+        if self.left_out:
+            lines += [f"the first {self.left_out} samples are left out: u was another one before"]
         lines += [f"constant force {self.bias:.4g} (in units of u)"]
         if self.friction is not None:
             lines += [
@@ -686,6 +805,10 @@ class Identified:
             "friction_std": self.friction_std,
             "friction_width": self.friction_width,
             "dt": self.dt,
+            "early": self.early,
+            "curvature": self.curvature,
+            "before": self.before,
+            "left_out": self.left_out,
             "samples": self.y.size,
             "held_from": self.held_from,
             "horizon": self.horizon,

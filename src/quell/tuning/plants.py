@@ -23,6 +23,7 @@ The model of a record, those that the record does not tell apart from it, plants
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -383,15 +384,16 @@ def record_model(
     model, *others = not_told_apart(first, delay, **how, progress=part_of(progress, 0.5, 0.8, 1.0))
     if not _why_not(model):
         return RecordModel(model, tuple(others), held_out)
-    held: Identified | None = None
-    tried = [(k, rubs) for k in range(1, order + 1) for rubs in (False, True)]
-    tried = [one for one in tried if friction is None or one[1] == friction]
+    # A friction that nobody asked for is that of a mass: with a speed it hides an offset.
+    tried = [(k, bool(friction)) for k in range(1, order)]
+    tried[2:2] = [(2, True)] if friction is None and order > 1 else []
+    models = []
     for i, (fewer, rubs) in enumerate(tried):
         ends = 0.8 + 0.2 * i / len(tried), 0.8 + 0.2 * (i + 1) / len(tried)
-        try:
-            one = fitted(fewer, rubs, ends)
-        except ValueError:  # no such model, as with more integrators than poles
-            continue
+        with contextlib.suppress(ValueError):  # no such model: more integrators than poles
+            models.append(fitted(fewer, rubs, ends))
+    held: Identified | None = None
+    for one in [*models, first]:
         if not _why_not(one) and (held is None or fits_better(held, one)):
             held = one
     if held is None:
