@@ -131,7 +131,7 @@ def _is_list_of_records(value: Any) -> bool:
     return isinstance(value, list | tuple) and bool(value) and np.ndim(value[0]) == 1
 
 
-def delay_range(delay: Any, dt: float, size: int) -> tuple[int, int]:
+def delay_range(delay: Any, dt: float, size: int) -> tuple[float, float]:
     """Return the least and the largest delay [samples]; None is the default for ``size`` samples.
 
     An end of a range that is no whole number of samples is the next one inside the range.
@@ -139,7 +139,8 @@ def delay_range(delay: Any, dt: float, size: int) -> tuple[int, int]:
     if delay is None:
         return 0, max(min(_MOST_DELAY, size // 4), 0)
     if np.ndim(delay) == 0:
-        samples = checks.samples("delay", delay, dt)
+        samples = checks.non_negative("delay", delay, "s") / dt
+        samples = round(samples) if abs(samples - round(samples)) <= _ROUNDED else samples
         return samples, samples
     low, high = checks.vector("delay", delay, 2).tolist()
     if not 0.0 <= low <= high:
@@ -256,9 +257,9 @@ def identify(
         = 0: if it is within three of its standard deviations, or slower than ten times the record;
         and two poles, if this holds for both at once.
     delay
-        delay of u [s], a whole number of samples; or the least and the largest, to find the best
-        between them; or None, to find it from 0 to 20 samples, and beyond that as long as the
-        longest one is the best.
+        delay of u [s]; or the least and the largest, to find the best between them, with a part of
+        a sample where the record shows it; or None, to find it from 0 to 20 samples, and beyond
+        that as long as the longest one is the best.
     bias
         whether a constant force acts besides u, as an offset of u does.
     friction
@@ -349,7 +350,7 @@ def identified(
     """
     given = dt, options, reference, validation, signals, known, progress
     found = _identified(records, *given)
-    last = round(found.delay_interval[1] / found.dt)
+    last = math.ceil(found.delay_interval[1] / found.dt - _ROUNDED)
     single = not records.samples and reference is None
     if not found.before or not single or found.faults or not found.converged:
         return found
@@ -409,7 +410,7 @@ def _identified(
             f"delay = {delay!r} s: the longest delay to search (--max-delay) is longer than the "
             f"record, which has {shortest * dt:.4g} s; give a quarter of it at most"
         )
-    least = max(least, 4 * delays[1])
+    least = max(least, 4 * math.ceil(delays[1]))
     held_from = first_held_out(records, order, held_out, least, least_held)
     other = None if validation is None else other_record(*validation, least_held)
     wanted = Wanted(
@@ -567,11 +568,9 @@ def _delay_covariance(fitted: Fit, seconds: Vector, dt: float) -> Vector:
 
 
 def _delay_interval(fitted: Fit, dt: float) -> tuple[float, float]:
-    """Return the 95 % interval of the delay [s]: half a sample more than the whole samples."""
-    if fitted.searched[0] == fitted.searched[1]:
-        return fitted.delay * dt, fitted.delay * dt
+    """Return the 95 % interval of the delay [s]."""
     low, high = fitted.delays
-    return max(low - 0.5, 0.0) * dt, (high + 0.5) * dt
+    return max(low, 0.0) * dt, high * dt
 
 
 def _friction(

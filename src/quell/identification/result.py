@@ -216,7 +216,7 @@ def before_the_record(fit: Fit, u: Vector, y: Vector) -> bool:
         return False
     pulse = np.zeros(u.size)
     for place in fit.structure.records(u.size):
-        pulse[place.start : place.start + fit.delay] = 1.0
+        pulse[place.start : place.start + math.ceil(fit.delay)] = 1.0
     a = fit.structure.denominator(fit.estimate.theta)
     column = _response(fit, a, pulse)[:, None]
     return bool(_explained_by(fit, u, y, column)[0] > chi2.isf(_SELDOM, 1))

@@ -1,6 +1,6 @@
 """The search for a model: start, refinement, friction, delay, poles at zero.
 
-The search for the delay of u, in whole samples.
+The search for the delay of u: in whole samples, then with a part of one.
 
 A model with a wrong delay has other poles, so the error of one model at several delays says little,
 and it has a local minimum for each period of a resonance. Therefore a model is estimated at every
@@ -11,6 +11,15 @@ each.
 
 Where the best delay is among the longest ones of a range that may grow, the range is doubled, until
 it is not, or the record is too short.
+
+A part φ of a sample is estimated last. A held u that is late by it is no held signal, but a plant
+that is slow beside a sample sees no difference to ::
+
+    Σ_i h_i u[k − i],  i = −1 … 2,     h_i = Π_{j≠i} (φ − j)/(i − j)
+
+whose response differs from ``exp(−jω φ)`` by less than 0.003 up to ω = 0.6 rad per sample (Lagrange
+interpolation; Laakso et al., *IEEE Signal Processing Magazine* 13, 1996). The part is kept where
+the likelihood ratio shows it; else the delay is a whole number of samples.
 
 Friction in the search: the signs of the speed, and the least error of the simulated model.
 
@@ -33,6 +42,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.identification.model import (
+    WITHIN_95,
     Structure,
     free_run,
     gain_interval,
@@ -79,16 +89,34 @@ _NEARLY = 1.5
 # Steps of the refinement at the neighbours, where a good start is known, and of a model that goes
 # on to the next delay: chosen by hand.
 _STEPS, _FEW_STEPS = 12, 3
+# Samples between which a part of one is interpolated, and to what share of one it is searched.
+_TAPS, _PART = (-1, 0, 1, 2), 1e-4
+# Probability of a part of a sample by chance, and step of the derivative by the delay [samples].
+_BY_CHANCE, _STEP_OF_DELAY = 1e-3, 0.05
+# Part of a sample that is none, beside friction: chosen by hand.
+_HARDLY_A_PART = 0.02
 # Longest delay, as a share of the samples: the rest has to show the plant.
 MOST_SHARE = 0.25
 
 
-def delayed(u: Vector, delay: int) -> Vector:
-    """Return ``u`` later by ``delay`` samples; before the record it has its first value."""
-    return u if delay == 0 else np.concatenate([np.full(delay, u[0]), u[:-delay]])
+def delayed(u: Vector, delay: float) -> Vector:
+    """Return ``u`` later by ``delay`` samples; before the record it has its first value.
+
+    After it, for a part of a sample, it has its last one.
+    """
+    whole = math.floor(delay)
+    part = delay - whole
+    if part == 0.0:
+        return u if whole == 0 else np.concatenate([np.full(whole, u[0]), u[:-whole]])
+    long = np.concatenate([np.full(whole + 2, u[0]), u, u[-1:]])
+    found = np.zeros(u.size)
+    for i in _TAPS:
+        weight = math.prod((part - j) / (i - j) for j in _TAPS if j != i)
+        found += weight * long[2 - i : 2 - i + u.size]
+    return found
 
 
-def with_delay(structure: Structure, v: Matrix, u: Vector, delay: int) -> Matrix:
+def with_delay(structure: Structure, v: Matrix, u: Vector, delay: float) -> Matrix:
     """Return the inputs ``v`` with ``u`` later by ``delay`` samples as the first."""
     parts = [delayed(u[place], delay) for place in structure.records(u.size)]
     return np.column_stack([np.concatenate(parts), v[:, 1:]])
@@ -99,10 +127,10 @@ def start_with_delay(
     u: Vector,
     v: Matrix,
     y: Vector,
-    delays: tuple[int, int],
+    delays: tuple[float, float],
     grows: bool,
     report: Callable[[], None],
-) -> tuple[tuple[int, int], int, Start]:
+) -> tuple[tuple[float, float], float, Start]:
     """Return the range that was searched, the delay of least output error, and the model at it.
 
     ``delays`` is the range at first; it is extended if it ``grows``. ``report`` is called between
@@ -117,7 +145,8 @@ def start_with_delay(
         report()
         return _costs(single, u[part], of_part, y[part], delays)
 
-    low, (high, stride, found) = delays[0], _scanned(costs, delays, longest(structure, y, grows))
+    low, first = (int(end) for end in delays)
+    high, stride, found = _scanned(costs, (low, first), longest(structure, y, grows))
     near = []
     for delay in dict.fromkeys([*_minima(found, stride), low]):
         report()
@@ -133,26 +162,31 @@ def from_poles(
     u: Vector,
     v: Matrix,
     y: Vector,
-    delays: tuple[int, int],
+    delays: tuple[float, float],
     report: Callable[[], None],
-) -> tuple[int, ParameterEstimate]:
+) -> tuple[float, ParameterEstimate]:
     """Return the delay of least output error in a range, and the model at it, from given poles.
 
     ``poles`` are the coefficients a (n,) of polynomials. ``report`` is called at each delay.
     """
-    stride = -(-(delays[1] - delays[0] + 1) // _SCANNED)
+    if delays[0] == delays[1]:
+        inputs = with_delay(structure, v, u, delays[0])
+        tried = [descend(structure, with_poles(structure, a), inputs, y, _STEPS) for a in poles]
+        return delays[0], min(tried, key=lambda one: one.cost)
+    low, high = (int(end) for end in delays)
+    stride = -(-(high - low + 1) // _SCANNED)
     starts = [with_poles(structure, a) for a in poles]
     costs: dict[int, float] = {}
     known: dict[int, ParameterEstimate] = {}
     before: list[Vector] = []
-    for delay in range(delays[0], delays[1] + 1, stride):
+    for delay in range(low, high + 1, stride):
         report()
         inputs = with_delay(structure, v, u, delay)
         tried = [descend(structure, one, inputs, y, _FEW_STEPS) for one in (*starts, *before)]
         known[delay] = min(tried, key=lambda one: one.cost)
         costs[delay], before = known[delay].cost, [known[delay].theta]
     near = [
-        nearest_delay(structure, known[delay], u, v, y, delays, delay, stride)
+        nearest_delay(structure, known[delay], u, v, y, (low, high), delay, stride)
         for delay in _minima(costs, stride)
     ]
     return min(near, key=lambda one: one[1].cost)
@@ -227,10 +261,10 @@ def nearest_delay(
     u: Vector,
     v: Matrix,
     y: Vector,
-    delays: tuple[int, int],
-    delay: int,
+    delays: tuple[float, float],
+    delay: float,
     step: int = 1,
-) -> tuple[int, ParameterEstimate]:
+) -> tuple[float, ParameterEstimate]:
     """Return the delay of least output error near ``delay``, and the model at it."""
     known = {delay: estimate}
     while step:
@@ -241,6 +275,45 @@ def nearest_delay(
         best = min(known, key=lambda one: known[one].cost)
         delay, step = (best, step) if best != delay else (delay, step // 2)
     return delay, known[delay]
+
+
+def with_part_of_sample(
+    structure: Structure,
+    estimate: ParameterEstimate,
+    u: Vector,
+    v: Matrix,
+    y: Vector,
+    delay: float,
+    searched: tuple[float, float],
+) -> tuple[float, ParameterEstimate]:
+    """Return the delay with its part of a sample, and the model at it.
+
+    The whole one, with the given model, if the record does not show the part.
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.stats import chi2
+
+    near = estimate
+
+    def cost(late: float) -> float:
+        nonlocal near
+        found = descend(structure, near.theta, with_delay(structure, v, u, late), y, _STEPS)
+        near = found if found.cost < near.cost else near
+        return found.cost
+
+    ends = max(delay - 1.0, searched[0]), min(delay + 1.0, searched[1])
+    found = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": _PART})
+    late = float(found.x)
+    inputs = with_delay(structure, v, u, late)
+    model = descend(structure, near.theta, inputs, y, _STEPS)
+    errors = (
+        y - output(structure, estimate.theta, with_delay(structure, v, u, delay)),
+        y - output(structure, model.theta, inputs),
+    )
+    if not all(np.all(np.isfinite(error)) for error in errors):
+        return delay, estimate
+    ratio = likelihood_ratio(errors, _ROUNDING * float(y @ y))
+    return (late, model) if ratio > chi2.isf(_BY_CHANCE, 1) else (delay, estimate)
 
 
 # ---- Friction in the search ----
@@ -307,12 +380,12 @@ def simulated_delay(
     u: Vector,
     v: Matrix,
     y: Vector,
-    searched: tuple[int, int],
-    delay: int,
-) -> int:
+    searched: tuple[float, float],
+    delay: float,
+) -> float:
     """Return the delay of the least simulated error near a model [samples].
 
-    The delay is one more parameter; u with a fraction of a sample is the mean of its neighbours.
+    The delay is one more parameter; a part of a sample that is hardly one is none.
     """
     size = _sizes(structure, theta, v)
     if size is None:
@@ -324,14 +397,11 @@ def simulated_delay(
         return float(np.clip(delay + x[-1] / size[-1], *searched))
 
     def error(x: Vector) -> Vector:
-        whole, part = int(late(x)), late(x) % 1.0
-        inputs = with_delay(structure, v, u, whole)
-        if part:
-            after = with_delay(structure, v, u, whole + 1)
-            inputs[:, 0] = (1.0 - part) * inputs[:, 0] + part * after[:, 0]
+        inputs = with_delay(structure, v, u, late(x))
         return _error(structure, theta + x[:-1] / size[:-1], inputs, y)
 
-    return round(late(_least(error, size.size, y).x))
+    found = late(_least(error, size.size, y).x)
+    return round(found) if abs(found - round(found)) < _HARDLY_A_PART else found
 
 
 def _refined(
@@ -473,9 +543,9 @@ class Fit(NamedTuple):
 
     structure: Structure
     estimate: ParameterEstimate
-    delay: int  # delay of u [samples]
-    delays: tuple[int, int]  # delays that the record does not tell apart, at 95 % [samples]
-    searched: tuple[int, int]  # range of delays in which it was searched [samples]
+    delay: float  # delay of u [samples]
+    delays: tuple[float, float]  # its 95 % interval, if it was searched [samples]
+    searched: tuple[float, float]  # range of delays in which it was searched [samples]
     delay_covariance: Vector  # of the delay with a and b, and its variance
     bias: bool
     rest: AtRest
@@ -497,7 +567,7 @@ class Fit(NamedTuple):
         return gain_interval(theta[:free], float(theta[free]), part)
 
 
-def _inputs(structure: Structure, u: Vector, delay: int, bias: bool) -> Matrix:
+def _inputs(structure: Structure, u: Vector, delay: float, bias: bool) -> Matrix:
     """Return the inputs (N, inputs) for ``u``: late, constant forces, and zeros for friction."""
     v = np.zeros((u.size, len(structure.degrees)))
     v[:, 0] = with_delay(structure, v, u, delay)[:, 0]
@@ -511,7 +581,7 @@ class Known(NamedTuple):
     """A model from which a search begins."""
 
     a: Vector  # coefficients of its denominator (n,), per sample
-    searched: tuple[int, int]  # range of delays in which it was searched [samples]
+    searched: tuple[float, float]  # range of delays in which it was searched [samples]
 
 
 class Wanted(NamedTuple):
@@ -520,7 +590,7 @@ class Wanted(NamedTuple):
     order: int
     zeros: int
     integrators: int | None  # None: as many as the record shows
-    delays: tuple[int, int]  # [samples]
+    delays: tuple[float, float]  # [samples]; a range is of whole ones
     grows: bool  # whether the range of delays is extended
     bias: bool
     friction: bool
@@ -615,8 +685,14 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
         none = "no model was found whose output is finite; lower the order, or scale u and y"
         raise ValueError(f"order = {wanted.order}, zeros = {wanted.zeros}: {none}")
     wanted.report()
+    estimate = start.estimate
+    whole = with_delay(structure, v, u, delay)
+    estimate = descend(structure, estimate.theta, whole, y, _STEPS_SEARCH)
+    if searched[0] < searched[1] and not structure.direct:
+        wanted.report()
+        delay, estimate = with_part_of_sample(structure, estimate, u, v, y, delay, searched)
     v = with_delay(structure, v, u, delay)
-    estimate = refine(structure, start.estimate.theta, v, y, _STEPS_SEARCH)
+    estimate = refine(structure, estimate.theta, v, y, _STEPS_SEARCH)
     if wanted.integrators is None:
         structure, estimate = _set_integrators(structure, estimate, v, y)
     if friction and wanted.order > 3:
@@ -646,7 +722,7 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
 
 def _from_known(
     structure: Structure, known: Known, u: Vector, v: Matrix, y: Vector, wanted: Wanted
-) -> tuple[tuple[int, int], int, Start]:
+) -> tuple[tuple[float, float], float, Start]:
     """Return the range of delays, the best delay and the model at it, from a known model.
 
     Its poles, or those without each one of them, are the starts at all delays of its range; at the
@@ -689,9 +765,9 @@ def _over_delays(
     u: Vector,
     v: Matrix,
     y: Vector,
-    delay: int,
-    searched: tuple[int, int],
-) -> tuple[ParameterEstimate, tuple[int, int], Vector]:
+    delay: float,
+    searched: tuple[float, float],
+) -> tuple[ParameterEstimate, tuple[float, float], Vector]:
     """Return the estimate with a covariance that has the delays in it, and their 95 % range.
 
     The last value is the covariance of the delay with a and b, and its variance, with 1/12 for a
@@ -704,11 +780,13 @@ def _over_delays(
     size = structure.free + structure.degrees[0] + 1
     if searched[0] == searched[1]:
         return estimate, (delay, delay), np.zeros(size + 1)
+    if not float(delay).is_integer():
+        return _with_part(structure, estimate, u, v, y, delay, size)
     error = y - output(structure, estimate.theta, v)
     c, power = noise_model(error)
     least = max(power, _ROUNDING * float(np.mean(y**2))) * y.size
     low = high = delay
-    found = [(1.0, 0, estimate)]
+    found = [(1.0, 0.0, estimate)]
     for step in (-1, 1):
         near, other = estimate, delay + step
         for _ in range(_MOST_DELAYS):
@@ -733,7 +811,34 @@ def _over_delays(
         moved = one.theta - estimate.theta
         cov += weight / total * (one.covariance + np.outer(moved, moved))
         of_delay += weight / total * late * np.append(moved[:size], late)
-    return estimate._replace(covariance=cov), (low, high), of_delay
+    return estimate._replace(covariance=cov), (low - 0.5, high + 0.5), of_delay
+
+
+def _with_part(
+    structure: Structure,
+    estimate: ParameterEstimate,
+    u: Vector,
+    v: Matrix,
+    y: Vector,
+    delay: float,
+    size: int,
+) -> tuple[ParameterEstimate, tuple[float, float], Vector]:
+    """Return what ``_over_delays`` does, for a delay with a part of a sample.
+
+    The delay is a parameter like any other; its derivative is a difference.
+    """
+    low, high = max(delay - _STEP_OF_DELAY, 0.0), delay + _STEP_OF_DELAY
+    ends = [
+        output(structure, estimate.theta, with_delay(structure, v, u, end)) for end in (low, high)
+    ]
+    predicted, psi = output_gradient(structure, estimate.theta, v)
+    columns = np.column_stack([psi, (ends[1] - ends[0]) / (high - low)])
+    length = nonzero_lengths(columns)
+    cov = covariance_of(structure, columns / length, y - predicted) / np.outer(length, length)
+    half = WITHIN_95 * math.sqrt(max(float(cov[-1, -1]), 0.0))
+    of_delay = np.append(cov[-1, :size], cov[-1, -1])
+    found = estimate._replace(covariance=cov[:-1, :-1])
+    return found, (delay - half, delay + half), of_delay
 
 
 # Steps of a refinement without fast poles, and how much larger its error may be: by hand.
