@@ -495,7 +495,7 @@ def _validated(
     of_b = slice(free, free + b.size)
     gain = b[0] if b[0] != 0.0 else np.nan
     friction, friction_std = _friction(structure, theta, fitted.estimate.covariance, seconds, gain)
-    statistic, limit = one_more_pole(fitted, u[first], y[first])
+    test = one_more_pole(fitted, u[first], y[first])
     q = structure.integrators
     low, high = gain_interval(a[q:], float(b[0]), covariance[: free + 1, : free + 1])
     poles = poles_of(a, covariance, q)
@@ -527,8 +527,10 @@ def _validated(
         dt=dt,
         horizon=horizon,
         fits=fits,
-        one_more_pole=statistic,
-        one_more_pole_limit=limit,
+        one_more_pole=test.statistic,
+        one_more_pole_limit=test.limit,
+        misfit=test.misfit,
+        misfit_omega=test.omega / dt,
         early=early_samples(fitted, u[first], y[first]),
         before=before_the_record(fitted, u[first], y[first]),
         curvature=0.0,

@@ -64,6 +64,11 @@ from quell.types import Matrix, Vector
 _ROUNDS = 6
 # Poles of the test for one more pole, and the probability that it fails by chance: by hand.
 _EXTRA_POLES, _SELDOM = 4, 1e-3
+# Largest change of G, as a share of it, that costs no margin to speak of: by hand. At a crossover
+# with |L| = 1 it takes as much of the modulus margin at most, which is 0.63 for M_s = 1.6.
+_NO_MATTER = 0.1
+# Where that is looked at: up to this phase, and at most to this frequency [rad/sample].
+_LAST_PHASE, _FASTEST_CROSSOVER, _POINTS = -math.radians(200.0), 0.6, 80
 # Share of the error's power that the u of the same sample explains where y is early: by hand.
 _MOST_EARLY = 0.2
 # Share of it that a gain which depends on u explains, from which on that is the reason: by hand.
@@ -125,8 +130,19 @@ def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
     return predicted
 
 
-def one_more_pole(fit: Fit, u: Vector, y: Vector) -> tuple[float, float]:
-    """Return the statistic of the test for one more pole, and its limit at 99.9 %."""
+class OneMorePole(NamedTuple):
+    """The test for one more pole: whether the response to u is of the model's form."""
+
+    statistic: float  #: χ²
+    limit: float  #: that it exceeds by chance in one of a thousand records
+    #: largest change of G, as a share of it, that the further response stands for, up to the
+    #: fastest crossover that a loop may have, with two deviations; infinite where it is not known
+    misfit: float
+    omega: float  #: where that is [rad/sample]
+
+
+def one_more_pole(fit: Fit, u: Vector, y: Vector) -> OneMorePole:
+    """Return the test for one more pole, and how much of G it is about."""
     from scipy.stats import chi2
 
     structure, theta = fit.structure, fit.estimate.theta
@@ -134,12 +150,57 @@ def one_more_pole(fit: Fit, u: Vector, y: Vector) -> tuple[float, float]:
     a = structure.denominator(theta)
     poles = np.abs(np.roots(np.append(1.0, a[::-1])))
     slow, fast = np.clip([np.min(poles), np.max(poles)], 3.0 / y.size, 1.0)
+    rates = np.geomspace(slow / 3.0, min(3.0 * fast, 2.0), _EXTRA_POLES)
     columns = []
-    for rate in np.geomspace(slow / 3.0, min(3.0 * fast, 2.0), _EXTRA_POLES).tolist():
+    for rate in rates.tolist():
         wider = np.convolve(np.append(a, 1.0), [rate, 1.0])[:-1]
         columns.append(_response(fit, wider, u_late - u_late[0]))
-    statistic, _ = _explained_by(fit, u, y, np.column_stack(columns))
-    return statistic, float(chi2.isf(_SELDOM, _EXTRA_POLES))
+    limit = float(chi2.isf(_SELDOM, _EXTRA_POLES))
+    found = _explained_by(fit, u, y, np.column_stack(columns))
+    if found is None:
+        return OneMorePole(0.0, limit, math.inf, math.nan)
+    if found.statistic <= limit:
+        return OneMorePole(found.statistic, limit, 0.0, math.nan)
+    longest = max(place.stop - place.start for place in structure.records(y.size))
+    return OneMorePole(found.statistic, limit, *_misfit(fit, found, rates, longest))
+
+
+def _misfit(fit: Fit, found: _Explained, rates: Vector, count: int) -> tuple[float, float]:
+    """Return the largest change of G as a share of it, with two deviations, and where it is.
+
+    With the coefficients c of the further poles λ and the changes of A, B and D_u beside them::
+
+        ΔG/G = Σ c jω/(jω + λ) + (ΔB/A − B ΔA/A² + ΔD_u)/G
+
+    from the slow end of a record of ``count`` samples up to where the phase of G, with delay and
+    hold, is −200°: a loop with lead may have its crossover there.
+    """
+    structure, theta = fit.structure, fit.estimate.theta
+    omega = np.geomspace(2.0 * np.pi / count, _FASTEST_CROSSOVER, _POINTS)
+    s, n = 1j * omega, structure.order
+    powers = s[:, None] ** np.arange(n + 1)
+    A = powers @ np.append(structure.denominator(theta), 1.0)
+    B = powers[:, :n] @ structure.numerators(theta)[0]
+    G = B / A + structure.feedthrough(theta)
+    row = np.zeros((omega.size, theta.size + rates.size), dtype=complex)
+    free, degree = structure.free, structure.degrees[0]
+    row[:, :free] = -powers[:, structure.integrators : n] * (B / A**2 / G)[:, None]
+    row[:, free : free + degree + 1] = powers[:, : degree + 1] / (A * G)[:, None]
+    if structure.direct:
+        row[:, structure.common - 1] = 1.0 / G
+    row[:, theta.size :] = s[:, None] / (s[:, None] + rates)
+    phase = np.unwrap(np.angle(G)) - omega * (fit.delay + 0.5)
+    # A negative gain turns by half a turn, and integrators of the model by a quarter each.
+    turned = phase - phase[0] - 0.5 * np.pi * structure.integrators
+    inside = np.cumprod(turned >= _LAST_PHASE).astype(bool)
+    inside[0] = True
+    change = row[inside] @ found.coefficients
+    spread = np.einsum("ij,jk,ik->i", row[inside].conj(), found.covariance, row[inside]).real
+    size = np.abs(change) + 2.0 * np.sqrt(np.maximum(spread, 0.0))
+    if not np.all(np.isfinite(size)):
+        return math.inf, math.nan
+    at = int(np.argmax(size))
+    return float(size[at]), float(omega[at])
 
 
 def _response(fit: Fit, a: Vector, u: Vector) -> Vector:
@@ -154,30 +215,40 @@ def _response(fit: Fit, a: Vector, u: Vector) -> Vector:
     return np.concatenate(parts)
 
 
-def _explained_by(fit: Fit, u: Vector, y: Vector, extra: Matrix) -> tuple[float, Vector]:
-    """Return the χ² of further columns (N, k) in the error of a fit, and their coefficients (k,).
+class _Explained(NamedTuple):
+    """What further columns explain of the error of a fit."""
 
-    Beside the derivatives of the output by θ, all of them whitened by the model of the noise.
+    statistic: float  # χ²
+    coefficients: Vector  # of the derivatives by θ, then of the columns
+    covariance: Matrix
+    extra: Vector  # the coefficients of the columns
+
+
+def _explained_by(fit: Fit, u: Vector, y: Vector, extra: Matrix) -> _Explained | None:
+    """Return what further columns (N, k) explain beside the derivatives of the output by θ.
+
+    All of them are whitened by the model of the noise. None without any error, or if not finite.
     """
     from scipy.signal import lfilter
 
     structure, theta = fit.structure, fit.estimate.theta
     v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
     predicted, psi = output_gradient(structure, theta, v)
-    error, length = y - predicted, nonzero_lengths(extra)
+    error, columns = y - predicted, np.column_stack([psi, extra])
     c, variance = noise_model(error)
-    known = psi / nonzero_lengths(psi)
-    whitened = lfilter(c, [1.0], np.column_stack([known, extra / length, error]), axis=0)
+    length, known = nonzero_lengths(columns), psi.shape[1]
+    whitened = lfilter(c, [1.0], np.column_stack([columns / length, error]), axis=0)
     if not np.all(np.isfinite(whitened)) or not variance > 0.0:
-        return 0.0, np.zeros(length.size)
-    target = whitened[:, -1]
-    found = [
-        np.linalg.lstsq(part, target, rcond=1e-9)[0]
-        for part in (whitened[:, : known.shape[1]], whitened[:, :-1])
-    ]
+        return None
+    target, columns = whitened[:, -1], whitened[:, :-1]
+    found = [np.linalg.lstsq(part, target, rcond=1e-9)[0] for part in (columns[:, :known], columns)]
     left = [float(np.sum((target - whitened[:, : one.size] @ one) ** 2)) for one in found]
-    statistic = (left[0] - left[1]) / (left[1] / max(y.size - whitened.shape[1] + 1, 1))
-    return statistic, found[1][known.shape[1] :] / length
+    power = left[1] / max(y.size - whitened.shape[1] + 1, 1)
+    half = np.linalg.pinv(columns, rcond=1e-9) / length[:, None]
+    coefficients = found[1] / length
+    return _Explained(
+        (left[0] - left[1]) / power, coefficients, power * half @ half.T, coefficients[known:]
+    )
 
 
 def early_samples(fit: Fit, u: Vector, y: Vector) -> int:
@@ -196,9 +267,11 @@ def early_samples(fit: Fit, u: Vector, y: Vector) -> int:
     same, found, share = u - u[0], 0, 0.0
     columns = [same, np.append(same[1:], same[-1])]
     for early in (1, 2):
-        statistic, by = _explained_by(fit, u, y, np.column_stack(columns[:early]))
-        now = statistic / (statistic + y.size)
-        certain = statistic > chi2.isf(_SELDOM, early) and by[early - 1] * sign > 0.0
+        by = _explained_by(fit, u, y, np.column_stack(columns[:early]))
+        if by is None:
+            break
+        now = by.statistic / (by.statistic + y.size)
+        certain = by.statistic > chi2.isf(_SELDOM, early) and by.extra[early - 1] * sign > 0.0
         if not certain or now - share < _MOST_EARLY * (1.0 - share):
             break
         found, share = early, now
@@ -219,7 +292,8 @@ def before_the_record(fit: Fit, u: Vector, y: Vector) -> bool:
         pulse[place.start : place.start + math.ceil(fit.delay)] = 1.0
     a = fit.structure.denominator(fit.estimate.theta)
     column = _response(fit, a, pulse)[:, None]
-    return bool(_explained_by(fit, u, y, column)[0] > chi2.isf(_SELDOM, 1))
+    found = _explained_by(fit, u, y, column)
+    return found is not None and bool(found.statistic > chi2.isf(_SELDOM, 1))
 
 
 def curvature(fit: Fit, u: Vector, y: Vector) -> float:
@@ -236,8 +310,8 @@ def curvature(fit: Fit, u: Vector, y: Vector) -> float:
     bent = [(u_late - np.mean(u_late)) ** 2]
     bent += [np.abs(u_late)] if np.min(u_late) < 0.0 < np.max(u_late) else []
     extra = np.column_stack([_response(fit, a, each - each[0]) for each in bent])
-    statistic, _ = _explained_by(fit, u, y, extra)
-    if not statistic > chi2.isf(_SELDOM, extra.shape[1]):
+    found = _explained_by(fit, u, y, extra)
+    if found is None or not found.statistic > chi2.isf(_SELDOM, extra.shape[1]):
         return 0.0
     v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
     predicted, known = output_gradient(structure, theta, v)
@@ -460,10 +534,11 @@ class Identified:
     #: samples, also with ``", predicted"``
     fits: dict[str, float]
     residuals: Residuals  #: tests of the error, on the last of the samples in ``fits``
-    one_more_pole: (
-        float  #: χ² of a further response to u in the error of the fit; see ``validation``
-    )
+    one_more_pole: float  #: χ² of a further response to u in the error of the fit
     one_more_pole_limit: float  #: limit that it exceeds by chance in one of a thousand records
+    #: largest share of G by which that changes G up to the fastest crossover of a loop
+    misfit: float
+    misfit_omega: float  #: where that is [rad/s]; NaN: nowhere
     early: int  #: number of samples by which y is early against u; 0 if it is not
     before: bool  #: whether the first samples show that u was another one before the record
     #: share of the error's power that a gain which depends on u explains; 0 if not looked for
@@ -519,6 +594,15 @@ class Identified:
     def explained(self) -> bool:
         """True if the error has no further response to u, by the test for one more pole."""
         return self.one_more_pole <= self.one_more_pole_limit
+
+    @property
+    def _form(self) -> str:
+        """What the test for one more pole found, as text."""
+        test = f"one more pole: {self.one_more_pole:.3g}, limit {self.one_more_pole_limit:.3g}"
+        if not math.isfinite(self.misfit):
+            return f"by how much is not known ({test})"
+        where = f"at {self.misfit_omega:.3g} rad/s"
+        return f"G may be off by {100.0 * self.misfit:.3g} % {where} ({test})"
 
     @property
     def _gain_text(self) -> str:
@@ -626,11 +710,11 @@ class Identified:
                 "set friction, or identify in a narrow range of u, or at each operating point, for "
                 "a schedule ([tune.schedule])"
             )
-        elif not self.explained:
+        elif not self.explained and self.misfit > _NO_MATTER:
             found.append(
-                f"the response to u is not of this form (one more pole: {self.one_more_pole:.3g}, "
-                f"limit {self.one_more_pole_limit:.3g}), so gain and poles may be farther from the "
-                "plant's than their deviations say; use a higher order, zeros, friction, or "
+                f"the response to u is not of this form: {self._form}, which takes as much of the "
+                "modulus margin there (0.63 at M_s = 1.6), so gain and poles may be farther from "
+                "the plant's than their deviations say; use a higher order, zeros, friction, or "
                 "another delay"
             )
         if self.rest and self.rest_probability < _CONTRADICTED:
@@ -755,8 +839,10 @@ class Identified:
             f"independent of past u: {'yes' if tests.independent else 'no'} "
             f"(largest correlation {_largest_correlation(tests):.3g}, "
             f"limit {tests.cross_limit:.3g})",
-            *(f"NOT: {text}" for text in self.shortcomings),
         ]
+        if not self.explained and self.misfit <= _NO_MATTER:
+            lines += [f"form of the response to u: {self._form}, which costs no margin"]
+        lines += [f"NOT: {text}" for text in self.shortcomings]
         return "\n".join(lines)
 
     __str__ = describe
@@ -800,6 +886,8 @@ class Identified:
             "rest_probability": self.rest_probability,
             "one_more_pole": self.one_more_pole,
             "one_more_pole_limit": self.one_more_pole_limit,
+            "misfit": self.misfit,
+            "misfit_omega": self.misfit_omega,
             "bias": self.bias,
             "friction": self.friction,
             "friction_std": self.friction_std,
