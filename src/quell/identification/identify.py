@@ -203,6 +203,8 @@ _METHODS = (
 )
 # Number of lags in the tests of the error, fewer for short records: chosen by hand.
 _LAGS = 50
+# How often first samples are left out: with u of before in them, the delay is not found at once.
+_CUTS = 3
 # Parts of a search after which half of the work counts as done: those of a search for the delay.
 _HALF = 30.0
 # Least number of samples for each parameter: chosen by hand; real records have many more.
@@ -349,17 +351,20 @@ def identified(
     Where u was another one before the record, the samples in which that acts are left out.
     """
     given = dt, options, reference, validation, signals, known, progress
-    found = _identified(records, *given)
-    last = math.ceil(found.delay_interval[1] / found.dt - _ROUNDED)
-    single = not records.samples and reference is None
-    if not found.before or not single or found.faults or not found.converged:
+    found = whole = _identified(records, *given)
+    if records.samples or reference is not None or found.faults or not found.converged:
         return found
-    try:
+    first = 0
+    for _ in range(_CUTS):
+        if not found.before:
+            break
         # What u was before the record is not in it, but what it was before a later sample is.
-        again = _identified(Records(records.u[last:], records.y[last:], ()), *given)
-    except ValueError:  # too short, or u does not move there
-        return found
-    return found if again.before else replace(again, left_out=last)
+        first += math.ceil(found.delay_interval[1] / found.dt - _ROUNDED)
+        try:
+            found = _identified(Records(records.u[first:], records.y[first:], ()), *given)
+        except ValueError:  # too short, or u does not move there
+            return whole
+    return whole if found.before else replace(found, left_out=first)
 
 
 def _identified(
@@ -433,7 +438,7 @@ def _identified(
             fitted = _with_instruments(fitted, u[:held_from], y[:held_from], reference[:held_from])
         rounding = wanted.resolution
         found = _validated(fitted, u, y, reference, dt, held_from, horizon, other, rounding)
-        if not friction and (found.undecided or not found.explained):
+        if not friction:
             part = u[:held_from], y[:held_from]
             # A gain that falls with u looks like an integrator.
             if integrators is None and found.integrators and found.undecided:
