@@ -599,10 +599,10 @@ class Identified:
     def _form(self) -> str:
         """What the test for one more pole found, as text."""
         test = f"one more pole: {self.one_more_pole:.3g}, limit {self.one_more_pole_limit:.3g}"
-        if not math.isfinite(self.misfit):
-            return f"by how much is not known ({test})"
+        if not self.misfit < 1.0:
+            return f"G may be off by more than itself ({test})"
         where = f"at {self.misfit_omega:.3g} rad/s"
-        return f"G may be off by {100.0 * self.misfit:.3g} % {where} ({test})"
+        return f"G may be off by {100.0 * self.misfit:.2g} % {where} ({test})"
 
     @property
     def _gain_text(self) -> str:
@@ -712,10 +712,9 @@ class Identified:
             )
         elif not self.explained and self.misfit > _NO_MATTER:
             found.append(
-                f"the response to u is not of this form: {self._form}, which takes as much of the "
-                "modulus margin there (0.63 at M_s = 1.6), so gain and poles may be farther from "
-                "the plant's than their deviations say; use a higher order, zeros, friction, or "
-                "another delay"
+                f"the response to u is not of this form: {self._form}; at a crossover there that "
+                "takes as much of the modulus margin, 0.63 at M_s = 1.6; use a higher order, "
+                "zeros, friction, or another delay"
             )
         if self.rest and self.rest_probability < _CONTRADICTED:
             found.append(
