@@ -802,17 +802,14 @@ def alternatives(
         options = same._replace(**change)
         options = options._replace(rest=_rest(found, smaller, options.friction))
         known = _known(found) if options.order == order - 1 and not options.friction else None
+        given = found.reference, None, found.signals
+        share = part_of(progress, i, i + 1, len(tried))
         try:
-            model = identified(
-                records,
-                found.dt,
-                options,
-                found.reference,
-                None,
-                found.signals,
-                known,
-                part_of(progress, i, i + 1, len(tried)),
-            )
+            model = identified(records, found.dt, options, *given, known, share)
+            nearer = model.fits["estimation"] > found.fits["estimation"]
+            if nearer and not (model.converged or model.faults or options.friction):
+                # Far better, perhaps, and only not confirmed: the search goes on from there.
+                model = identified(records, found.dt, options, *given, _known(model), share)
         except ValueError:  # too short a record for it, or no such model
             continue
         model = replace(model, rest_given=found.rest_given)
