@@ -166,9 +166,7 @@ TIMES: dict[str, Read | Refused] = {
     "times that begin late": Read(table(T + 1234.5)),
     "a heater's whole seconds": Read(table(1.0 * K), 1.0),
     "a heater's whole minutes in seconds": Read(table(60.0 * K), 60.0),
-    "whole numbers that may be milliseconds": Read(
-        table(10.0 * K), 10.0, "whole numbers, 10 apart.*--time-unit ms"
-    ),
+    "whole numbers, ten apart": Read(table(10.0 * K), 10.0),
     "whole numbers without a name": Read(
         table(1.0 * K, ""), 1.0, "if they count samples, give the sample time"
     ),
@@ -388,7 +386,17 @@ FILES: dict[str, Read | Refused] = {
     "an index without a name": Read(",t,u,y\n" + rows(lambda k: f"{k},{T[k]},{U[k]},{Y[k]}")),
     "a column of words": Read("t,u,y,mode\n" + rows(lambda k: f"{T[k]},{U[k]},{Y[k]},RUN")),
 }
-for _text in ("nan", "NaN", "-", "", "#N/A", "null", "inf", "OL"):
+for _text in ("nan", "NaN", "-", "", "#N/A", "null"):
+    FILES[f"the text {_text!r} in place of a number"] = Read(
+        swapped(table(), f",{Y[5]}\n", f",{_text}\n"), warned="1 missing of", y_off=0.2
+    )
+    FILES[f"the text {_text!r} in place of a number, without times"] = Refused(
+        swapped(table(), f",{Y[5]}\n", f",{_text}\n"),
+        f"line 7: y = '?{_text}'?: must be (finite|a number)",
+        "fill it in if you know it, or cut the record there",
+        {"columns": ("u", "y"), "dt": DT},
+    )
+for _text in ("inf", "OL"):
     FILES[f"the text {_text!r} in place of a number"] = Refused(
         swapped(table(), f",{Y[5]}\n", f",{_text}\n"),
         f"line 7: y = '?{_text}'?: must be (finite|a number)",

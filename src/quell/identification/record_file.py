@@ -25,6 +25,7 @@ from quell.identification.record_layout import (
     has_decimal_comma,
     has_thousands,
     hint_of_commas,
+    is_beyond,
     is_comment,
     is_missing,
     is_number,
@@ -97,8 +98,9 @@ def read_record(
 
     The file is a table in UTF-8, UTF-16 or Windows-1252, with tabs, semicolons, commas or white
     space between the cells, perhaps below lines of other text, of names, and of units. Numbers have
-    decimal points or decimal commas. Lines that begin with # or % are comments. Nothing is made up:
-    a cell without a number is an error.
+    decimal points or decimal commas. Lines that begin with # or % are comments. A line without all
+    values (empty cells, NaN) counts as missing; with ``dt`` it is an error, as is any other cell
+    without a number.
 
     Times may be anything that rises: numbers, dates in ISO 8601 or as spreadsheets write them, or
     times of day. If they lie within half a sample, or half their own resolution, of an even grid,
@@ -326,6 +328,7 @@ class _Table:
         timed: bool,
     ) -> None:
         self.where, self.layout, self.places, self.names = where, layout, places, names
+        self.timed = timed
         begin = [[row[place] for place in places if place < len(row)] for _, row in first]
         self.stamps: Stamps | None = None
         told = [row[0] for row in begin if timed and row and is_stamp(row[0])]
@@ -347,8 +350,9 @@ class _Table:
         while block := list(islice(rows, _BLOCK)):
             size += 8 * len(block) * (len(self.places) + 1)
             check_size(size, most, self.where)
-            numbers.append(np.array([number for number, _ in block], dtype=np.float64))
-            blocks.append(self._block(block))
+            of_block, values = self._block(block)
+            numbers.append(np.array(of_block, dtype=np.float64))
+            blocks.append(values)
         return np.concatenate(numbers), np.concatenate(blocks)
 
     def _check_commas(self, cells: list[str], line: int) -> None:
@@ -365,8 +369,8 @@ class _Table:
                 "thousands"
             )
 
-    def _block(self, rows: list[_Row]) -> Matrix:
-        """Return the values of some rows (rows, columns)."""
+    def _block(self, rows: list[_Row]) -> tuple[list[int], Matrix]:
+        """Return the numbers of some lines, and their values (rows, columns)."""
         table = [row for _, row in rows]
         widths, width = {*map(len, table)}, self.layout.width
         even = widths == {width} or (
@@ -376,11 +380,21 @@ class _Table:
             try:
                 values = self._whole(table)
                 if np.all(np.isfinite(values)):
-                    return values
+                    return [number for number, _ in rows], values
             except ValueError:
                 pass
-        # One at a time, to name the faulty one.
-        return np.array([self._row(number, row) for number, row in rows])
+        # One at a time, to name the faulty one, and to leave out those without all values.
+        kept = [(number, row) for number, row in rows if not (self.timed and self._lacks(row))]
+        found = [self._row(number, row) for number, row in kept]
+        return [number for number, _ in kept], np.array(found).reshape(-1, len(self.places))
+
+    def _lacks(self, row: list[str]) -> bool:
+        """Return whether a row has a time, but not all of the other values: none is too large."""
+        if len(row) != self.layout.width:
+            return False
+        time, *others = (row[place] for place in self.places)
+        gone = [cell for cell in others if is_missing(cell)]
+        return bool(gone) and not is_missing(time) and not any(map(is_beyond, gone))
 
     def _whole(self, table: list[list[str]]) -> Matrix:
         """Return the values of rows without faults; raise a ``ValueError`` if there are some."""

@@ -327,6 +327,7 @@ MISSING = {
     *_SHEET_ERRORS,
 }
 """Texts in lower case that stand for a number that is not there."""
+_BEYOND = {"inf", "infinity", "ol", "overload", "***", "****", "1.#inf"}
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:,\d{3})+(?:\.\d*)?|(?:\.\d{3})+(?:,\d*)?)")
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _SETUP = re.compile(r"\s*(?:\[{1,2}[\w.\"' -]+\]{1,2}\s*(?:#.*)?|[\w.-]+\s*=\s*\S.*)\s*")
@@ -438,6 +439,11 @@ def has_thousands(text: str) -> bool:
 def is_missing(text: str) -> bool:
     """Return whether a cell stands for a number that is not there."""
     return text.lower() in MISSING
+
+
+def is_beyond(text: str) -> bool:
+    """Return whether a cell stands for a number that is too large, as one of an instrument."""
+    return text.lower().strip("+-") in _BEYOND
 
 
 def is_value(text: str) -> bool:

@@ -63,9 +63,8 @@ _LATEST = 1e10
 _EPOCH = (1e9, 4e9)
 # Shorter sample times than that of common converters, 1 MHz, are hardly meant [s]: chosen by hand.
 _SHORTEST = 1e-6
-# Whole steps that are plausible as seconds where a name says that they are times: a second, and
-# what clocks of loggers are set to. 2, 5, 10, 20, 100, ... are as common in milliseconds.
-_PLAUSIBLE = (1.0, 15.0, 30.0, 60.0, 300.0, 600.0, 900.0, 1800.0, 3600.0)
+# Seconds since 1970 of rows further apart are hardly meant [s].
+_LONGEST = 3600.0
 # Days as spreadsheets (years 1982 to 2064) and MATLAB (years 1999 to 2053) count them.
 _DAYS = ((30_000.0, 60_000.0), (730_000.0, 750_000.0))
 
@@ -156,9 +155,8 @@ def warn_of_another_step(
 def warn_of_another_unit(where: str, t: Vector, named: bool) -> None:
     """Warn if times without a unit are hardly seconds.
 
-    Whole numbers a second apart are seconds where the column has a name, as loggers of slow plants
-    write them; without a name they may count samples. So are seconds since 1970, and the steps that
-    clocks of loggers are set to. Other whole numbers are as likely milliseconds.
+    Whole numbers are seconds where the column has a name, as loggers of slow plants write them, and
+    seconds since 1970 are; without a name they may count samples.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         d = np.diff(t)
@@ -176,8 +174,7 @@ def warn_of_another_unit(where: str, t: Vector, named: bool) -> None:
                 hint = f"they are plausible in {unit}: give time_unit = {unit!r} "
                 hint += f"(--time-unit {unit}), 's' if seconds"
     elif step >= 1.0 and np.all(t == np.rint(t)):
-        epoch = _EPOCH[0] < begin < _EPOCH[1] and step <= _PLAUSIBLE[-1]
-        if epoch or (named and step in _PLAUSIBLE):
+        if named or (_EPOCH[0] < begin < _EPOCH[1] and step <= _LONGEST):
             return
         reason = f"are whole numbers, {step:g} apart, and are read as seconds"
         hint += "; if they count samples, give the sample time dt in place of the column (--dt)"
