@@ -21,6 +21,7 @@ from quell.cli.options import (
     Trust,
     Whole,
     WholeOrNone,
+    options_of,
     refuse,
 )
 from quell.cli.output import Console, check_outputs, print_line, table, write_results
@@ -49,6 +50,8 @@ def identify(
 ) -> None:
     """Fit a continuous transfer function to recorded input and output.
 
+    Of a record in which u rests and y rings the modes are found: their frequency and damping.
+
     Parameters
     ----------
     data
@@ -75,6 +78,13 @@ def identify(
     how = read.columns, dt, read.time_unit, read.max_size
     records = measured_records(data, *how)
     record, several = records[0], len(records) > 1
+    if not several and record.u.min() == record.u.max():
+        unused = options_of(of_model, MODEL_OPTIONS)
+        unused |= {"order": (order, 4), "delay": (delay, 0.0), "validate": (validate, None)}
+        unused |= {"horizon": (horizon, 10), "no-alternatives": (alternatives, True)}
+        refuse(unused, "is for a u that moves; here it rests, and the modes of y are found")
+        _modes(record, data[0].name, outputs)
+        return
     most = of_model.max_delay
     delays = delay if most is None else (delay, most)
     options: dict[str, Any] = {
@@ -130,6 +140,24 @@ def identify(
     write_results(console, results, outputs, paths)
     if model.fails:
         sys.exit(ExitCode.NOT_VALID)
+
+
+def _modes(record: Measured, name: str, outputs: Outputs) -> None:
+    """Print, draw and write the modes of a free swing."""
+    from quell.experiments.common import save_figure
+    from quell.identification import free_swing
+
+    outputs = check_outputs(outputs, ["modes"])
+    console = Console()
+    found = free_swing(record.y, record.dt)
+    print_line(console, f"{name}: a free swing, as u rests: {found.y.size} samples")
+    for line in str(found).splitlines():
+        print_line(console, line)
+    paths: list[Path] = []
+    if outputs.figures:
+        figure = found.plot()[0].figure
+        paths = save_figure(figure, outputs.figures, "modes", outputs.overwrite)
+    write_results(console, found.to_json(), outputs, paths)
 
 
 def _look_swapped(model: Identified, order: int, delays: Any) -> bool:

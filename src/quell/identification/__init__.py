@@ -15,6 +15,7 @@ from quell.identification.excitation import (
     interleaved_excitations,
     save_excitations,
 )
+from quell.identification.free_swing import FreeSwing, Mode, free_swing
 from quell.identification.gain_by_signal import GainBin, identify_b0_by
 from quell.identification.gain_matrix import InputGainMatrix, identify_b0_matrix
 from quell.identification.identify import (
@@ -33,6 +34,7 @@ __all__ = [
     "Alternative",
     "Bandwidth",
     "Excitation",
+    "FreeSwing",
     "FrequencyResponse",
     "GainBin",
     "Identified",
@@ -40,12 +42,14 @@ __all__ = [
     "InputGainMatrix",
     "MarginError",
     "Measured",
+    "Mode",
     "Residuals",
     "Root",
     "alternatives",
     "decided",
     "excitation",
     "excited",
+    "free_swing",
     "frequency_response",
     "identify",
     "identify_b0",

@@ -181,7 +181,8 @@ def first_held_out(
     for name, value in (("u", u), ("y", y)):
         if np.ptp(value[:held_from]) == 0.0:
             place = "all through the samples for the fit"
-            raise ValueError(f"{name} is {value[0]:g} {place}: must move")
+            ringing = "; of a y that rings meanwhile free_swing finds the modes" * (name == "u")
+            raise ValueError(f"{name} is {value[0]:g} {place}: must move{ringing}")
         if held and np.ptp(value[held_from:]) == 0.0:
             raise ValueError(
                 f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, must "
@@ -352,7 +353,8 @@ def identified(
     """
     given = dt, options, reference, validation, signals, known, progress
     found = whole = _identified(records, *given)
-    if records.samples or reference is not None or found.faults or not found.converged:
+    known_before = bool(options.rest) or bool(records.samples) or reference is not None
+    if known_before or found.faults or not found.converged:
         return found
     first = 0
     for _ in range(_CUTS):

@@ -212,7 +212,7 @@ def squared_distance_from_zero(
     a: Vector, covariance: Matrix, roots: NDArray[np.complex128]
 ) -> float:
     """Return the squared distance of one or two roots from s = 0, in standard deviations."""
-    slopes = np.array([_slope(a, root) for root in roots])
+    slopes = np.array([pole_slope(a, root) for root in roots])
     if roots.size == 1:
         coefficients, slopes = -roots, -slopes
     else:
@@ -226,11 +226,11 @@ def squared_distance_from_zero(
 
 def root_covariance(a: Vector, covariance: Matrix, root: complex) -> tuple[float, float]:
     """Return the variances of real and imaginary part of a root, from the covariance of a."""
-    slope = _slope(a, root)
+    slope = pole_slope(a, root)
     return float(slope.real @ covariance @ slope.real), float(slope.imag @ covariance @ slope.imag)
 
 
-def _slope(a: Vector, root: complex) -> NDArray[np.complex128]:
+def pole_slope(a: Vector, root: complex) -> NDArray[np.complex128]:
     """Return the derivatives of a root by a."""
     powers = root ** np.arange(a.size)
     return np.asarray(-powers / np.polyval(np.polyder(np.append(1.0, a[::-1])), root))

@@ -1,0 +1,242 @@
+"""A free swing: frequency and damping of the modes of a y that rings while u rests.
+
+The motion of a linear plant with m modes after a knock, about a constant y_0, is::
+
+    y(t) = y_0 + Σ_i exp(−ζ_i ω_i t) (α_i cos ω_di t + β_i sin ω_di t) + e,  ω_di = ω_i √(1 − ζ_i²)
+
+with the poles ``p_i = −ζ_i ω_i ± j ω_di``. These are the only parameters that are not linear. They
+start at the matrix pencil (Hua & Sarkar, *IEEE Trans. Acoustics, Speech & Signal Processing* 38,
+1990) of the signal, averaged to some samples per period, and are refined to the least output error
+by variable projection (``output_error``), which also gives their covariance, with noise that may be
+coloured. With the slope ∂p/∂a of a pole by the coefficients of A the deviations are those of ::
+
+    δω = Re(p̄ δp)/ω,        δζ = −(Re δp + ζ δω)/ω
+
+Each further mode must pass the ratio of likelihoods of ``alternatives``. What rings is taken as
+linear: friction makes the damping of a small swing larger than that of a large one.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.identification.model import WITHIN_95, Structure, output, pole_slope
+from quell.identification.output_error import ParameterEstimate, likelihood_ratio, refine
+from quell.identification.starts import with_poles
+from quell.parallel import one_blas_thread
+from quell.records.plotting import draw_line, given_axes, grid_of_axes, new_figure
+from quell.types import Vector
+
+# Most modes, samples of the pencil, and samples per period of the fastest frequency that matters.
+_MOST_MODES, _PENCIL, _PER_PERIOD = 5, 600, 8.0
+# Share of the spectrum's power below the frequency that is called the fastest.
+_POWER = 0.999
+# Steps of the refinement, and the least number of samples for a mode: chosen by hand.
+_STEPS, _PER_MODE = 40, 20
+# Relative mean square that counts as zero.
+_ROUNDING = 1e-24
+
+
+class Mode(NamedTuple):
+    """A mode that rings."""
+
+    omega: float  #: undamped frequency ω [rad/s]
+    omega_interval: tuple[float, float]  #: 95 % interval of it [rad/s]
+    damping: float  #: damping ratio ζ
+    damping_interval: tuple[float, float]  #: 95 % interval of it
+    amplitude: float  #: at the first sample [y-unit]
+
+    @property
+    def frequency(self) -> float:
+        """Undamped frequency [Hz]."""
+        return self.omega / (2.0 * math.pi)
+
+    def __str__(self) -> str:
+        """Return it as a line."""
+        low, high = (end / (2.0 * math.pi) for end in self.omega_interval)
+        zeta = self.damping_interval
+        return (
+            f"mode at {self.frequency:.5g} Hz ({self.omega:.5g} rad/s), 95 %: {low:.5g} to "
+            f"{high:.5g} Hz; damping {self.damping:.4g}, 95 %: {zeta[0]:.4g} to {zeta[1]:.4g}; "
+            f"amplitude {self.amplitude:.4g}"
+        )
+
+
+class FreeSwing(NamedTuple):
+    """The modes of a free swing, large amplitudes first, and how well they describe it."""
+
+    modes: tuple[Mode, ...]
+    at_rest: float  #: y_0 [y-unit]
+    fit: float  #: NRMSE [%]
+    dt: float  #: sample time [s]
+    y: Vector  #: as measured (N,) [y-unit]
+    simulated: Vector  #: (N,) [y-unit]
+
+    def __str__(self) -> str:
+        """Return the report."""
+        lines = [str(mode) for mode in self.modes]
+        return "\n".join([*lines, f"at rest y is {self.at_rest:.5g}; fit {self.fit:.3f} %"])
+
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
+        """Draw y as measured and simulated, and the error; return the two axes.
+
+        ``axes`` are two matplotlib axes, those of a new figure by default.
+        """
+        figure = partial(new_figure, 8.0, 5.0)
+        axes = np.ravel(grid_of_axes(given_axes(axes, ax), figure, 2, sharex="all"))
+        shown, error = axes
+        t = np.arange(float(self.y.size)) * self.dt
+        draw_line(shown, t, self.y, color="0.6", linewidth=2.5, label="measured")
+        draw_line(shown, t, self.simulated, color="C0", linewidth=1.0, label="simulated")
+        draw_line(error, t, self.y - self.simulated, color="C0", linewidth=0.8)
+        shown.set_ylabel("y")
+        shown.legend(fontsize="small")
+        error.set(xlabel="time [s]", ylabel="error")
+        for each in (shown, error):
+            each.grid(alpha=0.3)
+        return axes
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the modes for JSON."""
+        return {
+            "modes": [mode._asdict() for mode in self.modes],
+            "at_rest": self.at_rest,
+            "fit": self.fit,
+        }
+
+
+def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
+    """Return frequency and damping of the modes of a y that rings while u rests.
+
+    Parameters
+    ----------
+    y
+        record (N,) from soon after the knock on [y-unit].
+    dt
+        sample time [s].
+    modes
+        number of modes, 1 to 5; by default as many as the record tells apart.
+
+    Raises
+    ------
+    ValueError
+        for a y that does not ring, and for a record that is too short.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import quell as ql
+    >>> t = np.arange(800) * 0.002
+    >>> y = 3.0 + np.exp(-0.02 * 50.0 * t) * np.cos(50.0 * t)
+    >>> (mode,) = ql.identification.free_swing(y, dt=0.002).modes
+    >>> round(mode.omega, 3), round(mode.damping, 4)
+    (50.01, 0.02)
+    """
+    y, dt = checks.vector("y", y), checks.positive("dt", dt, "s")
+    most = _MOST_MODES if modes is None else checks.whole("modes", modes, 1, _MOST_MODES)
+    if y.size < _PER_MODE * (modes or 1):
+        raise ValueError(
+            f"y has {y.size} samples: must have at least {_PER_MODE} for each mode; record longer"
+        )
+    if np.ptp(y) == 0.0:
+        raise ValueError(f"y is {y[0]:g} all through: must ring; record it from the knock on")
+    v, found = np.ones((y.size, 1)), None
+    least = _ROUNDING * float(np.sum((y - np.mean(y)) ** 2))
+    with one_blas_thread(), np.errstate(all="ignore"):
+        poles = _pencil(y)
+        for count in range(modes or 1, most + 1):
+            if poles.size < count or y.size < _PER_MODE * count:
+                break
+            structure = Structure(2 * count, 0, (0,))
+            pairs = np.concatenate([poles[:count], poles[:count].conjugate()])
+            start = with_poles(structure, np.asarray(np.poly(pairs).real[:0:-1], np.float64))
+            model = structure, refine(structure, start, v, y, _STEPS)
+            if not _rings(*model):
+                continue
+            if found is not None:
+                errors = [y - output(each, one.theta, v) for each, one in (found, model)]
+                more = 2 * (model[0].order - found[0].order)  # poles and start
+                if likelihood_ratio((errors[0], errors[1]), least) < (more + 2) * math.log(y.size):
+                    continue
+            found = model
+        if found is None:
+            raise ValueError(
+                "y does not ring: no pole with a frequency that its samples show was found; is it "
+                "a free swing, after a knock, while u rests? For a heat-up or coast-down use a "
+                "record in which u steps (identify)"
+            )
+        return _result(*found, y, dt)
+
+
+def _pencil(y: Vector) -> Any:
+    """Return poles [rad/sample] with positive frequency, strong ones first."""
+    centred = y - np.mean(y[y.size // 2 :])
+    power = np.cumsum(np.abs(np.fft.rfft(centred - np.mean(centred))) ** 2)
+    top = int(np.searchsorted(power, _POWER * power[-1])) + 1
+    every = max(int(y.size / (_PER_PERIOD * top)), 1)
+    mean = centred[: centred.size // every * every].reshape(-1, every).mean(axis=1)[:_PENCIL]
+    rows = mean.size // 2
+    H = np.lib.stride_tricks.sliding_window_view(mean, rows)
+    U, S, _ = np.linalg.svd(H.T, full_matrices=False)
+    rank = min(2 * _MOST_MODES + 1, S.size - 1, rows - 1)
+    z = np.linalg.eigvals(np.linalg.lstsq(U[:-1, :rank], U[1:, :rank], rcond=None)[0])
+    z = z[(z.imag > 1e-6) & (np.abs(z) > 0.1)]
+    p = np.log(z) / every
+    p = -np.abs(p.real) + 1j * p.imag
+    if not p.size:
+        return p
+    k = np.arange(mean.size) * every
+    shapes = np.exp(np.outer(k, p))
+    columns = np.column_stack([shapes.real, shapes.imag, np.ones(k.size)])
+    sizes = np.linalg.lstsq(columns, mean, rcond=None)[0]
+    amplitude = np.hypot(sizes[: p.size], sizes[p.size : 2 * p.size])
+    energy = amplitude**2 * np.sum(np.abs(shapes) ** 2, axis=0)
+    return p[np.argsort(-energy)]
+
+
+def _rings(structure: Structure, estimate: ParameterEstimate) -> bool:
+    """Return whether all poles are pairs that decay, within what samples show."""
+    p = np.roots(np.append(1.0, structure.denominator(estimate.theta)[::-1]))
+    inside = np.all(p.real < 0.0) and np.all(np.abs(p) < math.pi)
+    return bool(math.isfinite(estimate.cost) and inside and np.all(p.imag != 0.0))
+
+
+def _result(structure: Structure, estimate: ParameterEstimate, y: Vector, dt: float) -> FreeSwing:
+    a, n = structure.denominator(estimate.theta), structure.order
+    covariance = estimate.covariance[:n, :n]
+    roots = np.roots(np.append(1.0, a[::-1]))
+    upper = roots[roots.imag > 0.0]
+    simulated = output(structure, estimate.theta, np.ones((y.size, 1)))
+    at_rest = float(estimate.theta[n] / a[0])
+    t = np.arange(float(y.size))
+    shapes = np.exp(np.outer(t, upper))
+    columns = np.column_stack([shapes.real, shapes.imag])
+    sizes = np.linalg.lstsq(columns, simulated - at_rest, rcond=None)[0]
+    modes = []
+    for i, p in enumerate(upper):
+        slope, omega = pole_slope(a, p), abs(p)
+        zeta = -p.real / omega
+        by_omega = (p.conjugate() * slope).real / omega
+        by_zeta = -(slope.real + zeta * by_omega) / omega
+        half = [
+            WITHIN_95 * math.sqrt(max(float(row @ covariance @ row), 0.0))
+            for row in (by_omega, by_zeta)
+        ]
+        modes.append(
+            Mode(
+                float(omega / dt),
+                (float((omega - half[0]) / dt), float((omega + half[0]) / dt)),
+                float(zeta),
+                (float(zeta - half[1]), float(zeta + half[1])),
+                float(np.hypot(sizes[i], sizes[upper.size + i])),
+            )
+        )
+    modes.sort(key=lambda mode: -mode.amplitude)
+    spread = float(np.linalg.norm(y - np.mean(y)))
+    fit = 100.0 * (1.0 - float(np.linalg.norm(y - simulated)) / spread)
+    return FreeSwing(tuple(modes), at_rest, fit, dt, y, simulated)

@@ -1,0 +1,101 @@
+"""Modes of a y that rings while u rests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.identification import free_swing
+
+from .commands import Shown
+
+DT = 2e-3
+T = np.arange(1200) * DT
+
+
+def swing(*modes: tuple[float, float, float], noise: float = 0.0) -> Any:
+    """Return y about 2 for modes (frequency in Hz, damping, amplitude)."""
+    y = 2.0 + noise * np.random.default_rng(0).standard_normal(T.size)
+    for i, (hertz, zeta, size) in enumerate(modes):
+        w = 2.0 * np.pi * hertz
+        y += size * np.exp(-zeta * w * T) * np.cos(w * np.sqrt(1.0 - zeta**2) * T + i)
+    return y
+
+
+MODES = [(12.0, 0.03, 0.5), (31.0, 0.01, 0.2), (4.0, 0.15, 0.4)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_as_many_modes_as_there_are_come_back(count: int) -> None:
+    """Without noise exactly, with noise within three half widths; the offset, too."""
+    exact = free_swing(swing(*MODES[:count]), DT)
+    noisy = free_swing(swing(*MODES[:count], noise=2e-3), DT)
+    assert len(exact.modes) == len(noisy.modes) == count
+    assert exact.at_rest == pytest.approx(2.0, abs=1e-6)
+    for hertz, zeta, size in MODES[:count]:
+        mode = min(exact.modes, key=lambda one: abs(one.frequency - hertz))
+        assert (mode.frequency, mode.damping) == pytest.approx((hertz, zeta), rel=1e-6)
+        assert mode.amplitude == pytest.approx(size, rel=1e-5)
+        near = min(noisy.modes, key=lambda one: abs(one.frequency - hertz))
+        for value, (low, high), truth in (
+            (near.omega, near.omega_interval, 2.0 * np.pi * hertz),
+            (near.damping, near.damping_interval, zeta),
+        ):
+            assert low < value < high
+            assert abs(value - truth) < 1.5 * (high - low)
+            assert high - low < 0.05 * truth
+    assert [mode.amplitude for mode in exact.modes] == sorted(
+        (mode.amplitude for mode in exact.modes), reverse=True
+    )
+
+
+def test_a_number_of_modes_that_is_given_is_taken() -> None:
+    """One of two: the larger one is in it, and the fit tells that something is left."""
+    found = free_swing(swing(*MODES[:2]), DT, modes=1)
+    assert len(found.modes) == 1
+    assert found.fit < 90.0 < free_swing(swing(*MODES[:2]), DT, modes=2).fit
+
+
+@pytest.mark.parametrize(
+    ("y", "options", "message"),
+    [
+        (np.exp(-T), {}, "y does not ring"),
+        (np.full(400, 3.0), {}, "y is 3 all through: must ring"),
+        (swing(MODES[0])[:15], {}, "y has 15 samples: must have at least 20 for each mode"),
+        (swing(MODES[0]), {"modes": 6}, "modes = 6: must be a whole number from 1 to 5"),
+        (np.append(swing(MODES[0]), np.nan), {}, r"y: entry \(1200,\) is nan"),
+    ],
+)
+def test_what_is_no_free_swing_is_refused(y: Any, options: dict[str, Any], message: str) -> None:
+    """With the reason and what to record."""
+    with pytest.raises(ValueError, match=message):
+        free_swing(y, DT, **options)
+
+
+def test_a_shaper_for_the_mode_leaves_no_vibration() -> None:
+    """Frequency and damping are those that shapers take: of the true mode less than 0.1 % is left."""
+    (mode,) = free_swing(swing((5.0, 0.02, 1.0), noise=1e-3), DT).modes
+    shaper = ql.baselines.ZV(mode.omega, mode.damping)
+    assert shaper.residual(2.0 * np.pi * 5.0, 0.02) < 1e-3
+
+
+def test_the_command_finds_the_modes_of_a_record_in_which_u_rests(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Text, JSON and figure; options of a u that moves are refused."""
+    rows = np.column_stack([T, np.full(T.size, 1.5), swing(*MODES[:2], noise=1e-3)])
+    np.savetxt(tmp_path / "swing.csv", rows, delimiter=",", header="t [s],u,y", comments="")
+    shown = quell("identify", "swing.csv", "--json", "modes.json", "--figures", "seen")
+    assert shown.code == 0, shown.err
+    assert "mode at 12" in shown.out
+    assert "mode at 3" in shown.out
+    assert (tmp_path / "modes.json").is_file()
+    assert (tmp_path / "seen" / "modes.png").is_file()
+    refused = quell("identify", "swing.csv", "--order", "2", "--no-figures")
+    assert refused.code == 2
+    assert "--order: is for a u that moves" in refused.err
