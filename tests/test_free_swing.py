@@ -95,7 +95,7 @@ def test_the_command_finds_the_modes_of_a_record_in_which_u_rests(
     assert "mode at 12" in shown.out
     assert "mode at 3" in shown.out
     assert (tmp_path / "modes.json").is_file()
-    assert (tmp_path / "seen" / "modes.png").is_file()
+    assert (tmp_path / "seen" / "identified.png").is_file()
     refused = quell("identify", "swing.csv", "--order", "2", "--no-figures")
     assert refused.code == 2
     assert "--order: is for a u that moves" in refused.err

@@ -542,10 +542,10 @@ def test_the_commands_refuse_in_a_line_and_design(
         ("t,u\n" + GOOD, ("t", "u", "y"), None, "column y is missing; the first line names t, u"),
         ("t,u,y\n0,1\n" + GOOD, ("t", "u", "y"), None, "line 2: y = '': must be a number"),
         (
-            "t,u,y\n" + GOOD.replace("0.5,2,0", "0.5,nan,0"),
+            "t,u,y\n" + GOOD.replace("0.5,2,0", "0.5,inf,0"),
             ("t", "u", "y"),
             None,
-            "line 7: u = nan: must be finite",
+            "line 7: u = inf: must be finite",
         ),
         (
             GOOD.replace("0.5,2,0", "0.5,x,0"),

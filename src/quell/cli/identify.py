@@ -147,7 +147,7 @@ def _modes(record: Measured, name: str, outputs: Outputs) -> None:
     from quell.experiments.common import save_figure
     from quell.identification import free_swing
 
-    outputs = check_outputs(outputs, ["modes"])
+    outputs = check_outputs(outputs, ["identified"])
     console = Console()
     found = free_swing(record.y, record.dt)
     print_line(console, f"{name}: a free swing, as u rests: {found.y.size} samples")
@@ -156,7 +156,7 @@ def _modes(record: Measured, name: str, outputs: Outputs) -> None:
     paths: list[Path] = []
     if outputs.figures:
         figure = found.plot()[0].figure
-        paths = save_figure(figure, outputs.figures, "modes", outputs.overwrite)
+        paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
     write_results(console, found.to_json(), outputs, paths)
 
 
