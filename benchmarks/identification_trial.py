@@ -23,8 +23,8 @@ from scipy import signal
 import quell as ql
 from quell.identification.model import Structure, output
 from quell.identification.output_error import refine
-from quell.identification.result import nrmse
 from quell.identification.search import delayed
+from quell.identification.validation import nrmse
 from quell.types import Vector
 
 HELD_OUT = 0.3

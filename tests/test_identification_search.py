@@ -14,9 +14,9 @@ from quell.identification import Root, excitation, read_record
 from quell.identification.identify import identify
 from quell.identification.model import Structure, output, output_gradient
 from quell.identification.output_error import descend, projected
-from quell.identification.result import residuals
 from quell.identification.search import delayed
 from quell.identification.starts import reduced_models, stable
+from quell.identification.validation import residuals
 
 from .benchmark_module import benchmark
 from .test_identification import answer

@@ -39,7 +39,8 @@ from quell.controllers.linear import LinearController, LinearLaw
 from quell.files import MAX_SIZE, nonfinite_to_none
 from quell.identification import Measured, excitation
 from quell.identification.record_file import in_common_units
-from quell.identification.result import Identified, nrmse, simulated_plant
+from quell.identification.result import Identified, simulated_plant
+from quell.identification.validation import nrmse
 from quell.realtime.devices import Device, TwinDevice
 from quell.realtime.recordings import Event, is_recording, load, load_one
 from quell.realtime.run import RigRun, run_rig

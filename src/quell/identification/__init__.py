@@ -18,17 +18,18 @@ from quell.identification.excitation import (
 from quell.identification.free_swing import FreeSwing, Mode, free_swing
 from quell.identification.gain_by_signal import GainBin, identify_b0_by
 from quell.identification.gain_matrix import InputGainMatrix, identify_b0_matrix
-from quell.identification.identify import (
-    Alternative,
-    alternatives,
-    decided,
-    identify,
-    not_told_apart,
-)
+from quell.identification.identify import identify
 from quell.identification.input_gain import Bandwidth, InputGain, MarginError, identify_b0
 from quell.identification.model import Root
 from quell.identification.record_file import Measured, excited, read_record
-from quell.identification.result import Identified, Residuals, simulated_plant
+from quell.identification.result import Identified, simulated_plant
+from quell.identification.structures import (
+    Alternative,
+    alternatives,
+    decided,
+    not_told_apart,
+)
+from quell.identification.validation import Residuals
 
 __all__ = [
     "Alternative",

@@ -53,8 +53,8 @@ from quell.identification.input_gain import (
     visible_up_to,
     weighted,
 )
-from quell.identification.result import residuals
 from quell.identification.running_loop import Inputs, LoopFit
+from quell.identification.validation import residuals
 from quell.lti.models import Stack
 from quell.parallel import one_blas_thread
 from quell.types import Matrix, Vector

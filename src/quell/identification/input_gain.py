@@ -24,7 +24,6 @@ from quell import checks
 from quell.identification.bandwidth import Candidate, Reach, bandwidth, near
 from quell.identification.identify import resolution_of
 from quell.identification.model import Structure, autocorrelation, linear_columns, nonzero_lengths
-from quell.identification.result import residuals
 from quell.identification.running_loop import (
     Form,
     Inputs,
@@ -38,6 +37,7 @@ from quell.identification.running_loop import (
 )
 from quell.identification.search import delayed
 from quell.identification.starts import equation, filtered_estimates
+from quell.identification.validation import residuals
 from quell.parallel import one_blas_thread
 from quell.types import Matrix, Vector
 

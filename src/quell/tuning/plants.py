@@ -34,8 +34,8 @@ import numpy as np
 
 from quell import checks
 from quell.identification import Measured, identify, not_told_apart
-from quell.identification.identify import fits_better
 from quell.identification.result import Identified, percent
+from quell.identification.structures import fits_better
 from quell.lti.canonical import canonical
 from quell.parallel import part_of
 from quell.plants.base import PlantBatch
