@@ -161,3 +161,27 @@ def test_the_simplest_model_that_holds_is_taken_where_a_larger_one_has_faults(
     assert found.refusal == ""
     assert any("does not hold" in line for line in found.lines)
     assert found.model.gain == pytest.approx(0.57, rel=0.1)
+
+
+@pytest.mark.trial
+def test_a_speed_with_friction_and_an_early_step_is_one_lag_with_friction(tmp_path: Any) -> None:
+    """An inertia of 2e-4 kg m² with friction of 0.02 N m: larger models without friction have faults."""
+    inertia, viscous, friction, fine = 2e-4, 1e-3, 0.02, 20
+    u = np.repeat([0.0, 0.1, -0.08, 0.06, -0.1], [3, 797, 700, 700, 800])
+    speed, y = 0.0, np.zeros(u.size)
+    for k, torque in enumerate(u):
+        y[k] = speed
+        for _ in range(fine):
+            rub = friction * np.sign(speed) if speed else np.clip(torque, -friction, friction)
+            new = speed + (torque - rub - viscous * speed) / inertia * 1e-3 / fine
+            stuck = speed and np.sign(new) != np.sign(speed) and abs(torque) <= friction
+            speed = 0.0 if stuck else new
+    y += noise(u.size, 0.05)
+    rows = np.column_stack([1e-3 * np.arange(u.size), u, y])
+    file = tmp_path / "speed.csv"
+    np.savetxt(file, rows, delimiter=",", header="t [s],u,y", comments="")
+    model = record_model(measured(file)).model
+    assert model.den.size == 2
+    assert model.friction == pytest.approx(friction, rel=0.01)
+    assert model.num[0] == pytest.approx(1.0 / inertia, rel=0.01)
+    assert model.shortcomings == ()

@@ -384,9 +384,9 @@ def record_model(
     model, *others = not_told_apart(first, delay, **how, progress=part_of(progress, 0.5, 0.8, 1.0))
     if not _why_not(model):
         return RecordModel(model, tuple(others), held_out)
-    # A friction that nobody asked for is that of a mass: with a speed it hides an offset.
     tried = [(k, bool(friction)) for k in range(1, order)]
-    tried[2:2] = [(2, True)] if friction is None and order > 1 else []
+    if friction is None and order > 1:
+        tried[1:1] = [(1, True), (2, True)]
     models = []
     for i, (fewer, rubs) in enumerate(tried):
         ends = 0.8 + 0.2 * i / len(tried), 0.8 + 0.2 * (i + 1) / len(tried)
@@ -394,7 +394,11 @@ def record_model(
             models.append(fitted(fewer, rubs, ends))
     held: Identified | None = None
     for one in [*models, first]:
-        if not _why_not(one) and (held is None or fits_better(held, one)):
+        # Friction on a speed hides an offset: it must be better than a model without, not alone.
+        alone = held is None and not (
+            one.den.size == 2 and one.friction is not None and not friction
+        )
+        if not _why_not(one) and (alone or (held is not None and fits_better(held, one))):
             held = one
     if held is None:
         return RecordModel(model, tuple(others), held_out)
