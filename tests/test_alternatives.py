@@ -73,7 +73,7 @@ def test_a_pole_too_many_is_said_to_be_undecided() -> None:
     rng = np.random.default_rng(1)
     u = excitation("prbs", (0.5, 10.0), 30.0, DT).u
     y = answer(([3.0], [1.0, 2.0]), u, DT) + 0.05 * rng.standard_normal(u.size)
-    found = ql.identify(u, y, DT, order=2)
+    found = ql.identify(u, y, DT, order=2, delay=0.0)
     other = by_name(found)["order 1"]
     assert other.verdict == "undecided"
     assert "cannot decide between order 2 and order 1" in other.describe(found)

@@ -187,7 +187,9 @@ def test_no_shortcoming_is_named_twice() -> None:
 def test_a_record_without_a_model_is_refused_or_told() -> None:
     """An output that is only noise: a poor fit, no traceback."""
     rng = np.random.default_rng(6)
-    found = ql.identify(rng.standard_normal(800), rng.standard_normal(800), 0.01, order=3)
+    found = ql.identify(
+        rng.standard_normal(800), rng.standard_normal(800), 0.01, order=3, delay=0.0
+    )
     assert found.fits["estimation"] < 10.0
 
 

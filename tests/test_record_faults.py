@@ -111,6 +111,18 @@ def test_the_delay_has_a_part_of_a_sample_where_the_record_shows_it(late: float)
     assert found.shortcomings == ()
 
 
+@pytest.mark.parametrize("late", [0.0, 1.6])
+def test_a_delay_is_searched_where_the_model_without_it_does_not_hold(late: float) -> None:
+    """Without an option; where it holds, the delay is zero."""
+    u = random_steps(1500)
+    y = answer([2.0], [1.0, 2.0], u, late) + noise(u.size, 1e-4)
+    found = ql.identify(u, y, DT, order=1)
+    assert found.delay / DT == pytest.approx(late, abs=0.02)
+    assert found.gain == pytest.approx(1.0, rel=1e-3)
+    assert found.shortcomings == ()
+    assert ql.identify(u, y, DT, order=1, delay=0.0).delay == 0.0
+
+
 def test_a_whole_delay_stays_whole() -> None:
     """Noise shows no part of a sample."""
     u = random_steps(1500)
@@ -134,7 +146,7 @@ def test_a_missing_pole_is_a_line_with_not_where_a_loop_would_feel_it(
     """A lag of a quarter of a sample is a plain line at most; one as slow as the plant's is not."""
     u = random_steps(1500, of=40)
     y = answer([2.0 * fast], np.polymul([1.0, 2.0], [1.0, fast]), u) + noise(u.size, 1e-4)
-    found = ql.identify(u, y, DT, order=1)
+    found = ql.identify(u, y, DT, order=1, delay=0.0)
     assert not found.explained
     assert (found.misfit > 0.1) == matters
     assert any("not of this form" in text for text in found.shortcomings) == matters

@@ -64,7 +64,7 @@ def test_a_step_soon_after_the_start_gives_the_right_gain(rest: int, seed: int) 
 def test_a_model_of_too_low_an_order_is_called_so(rest: int) -> None:
     """One lag for two: the gain is far off, the report says NOT, and the alternatives name order 2."""
     u, y = heated(rest)
-    found = ql.identify(u, y, 1.0, order=1)
+    found = ql.identify(u, y, 1.0, order=1, delay=0.0)
     assert not found.explained
     assert "NOT: the response to u is not of this form" in str(found)
     better = {one.name: one for one in alternatives(found)}["order 2"]
@@ -94,11 +94,11 @@ def test_a_lag_with_one_sample_before_the_step_needs_to_be_told_that_it_was_at_r
 def test_a_plant_that_cools_down_at_the_start_is_not_taken_for_one_at_rest(seed: int) -> None:
     """Its gain is right within the interval, or not decided; ``rest=True`` is said to be contradicted."""
     u, y = heated(5, seed=seed, moving=15.0)
-    found = ql.identify(u, y, 1.0, order=2)
+    found = ql.identify(u, y, 1.0, order=2, delay=0.0)
     low, high = found.gain_interval
     assert not found.rest or found.undecided
     assert found.undecided or low <= 0.7 <= high
-    forced = ql.identify(u, y, 1.0, order=2, rest=True)
+    forced = ql.identify(u, y, 1.0, order=2, delay=0.0, rest=True)
     assert any("contradict the start at rest" in text for text in forced.shortcomings)
 
 

@@ -39,7 +39,7 @@ _HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad
 def identify(
     *data: Path,
     order: Whole = 4,
-    delay: float = 0.0,
+    delay: float | None = None,
     dt: float | None = None,
     horizon: Whole = 10,
     validate: Path | None = None,
@@ -61,7 +61,7 @@ def identify(
     order
         Number of poles.
     delay
-        Delay of u [s]; with --max-delay the shortest one.
+        Delay of u [s]; with --max-delay the shortest one. By default it is searched if needed.
     dt
         Sample time [s] of a record without times; columns are then u,y by default.
     horizon
@@ -80,13 +80,15 @@ def identify(
     record, several = records[0], len(records) > 1
     if not several and record.u.min() == record.u.max():
         unused = options_of(of_model, MODEL_OPTIONS)
-        unused |= {"order": (order, 4), "delay": (delay, 0.0), "validate": (validate, None)}
+        unused |= {"order": (order, 4), "delay": (delay, None), "validate": (validate, None)}
         unused |= {"horizon": (horizon, 10), "no-alternatives": (alternatives, True)}
         refuse(unused, "is for a u that moves; here it rests, and the modes of y are found")
         _modes(record, data[0].name, outputs)
         return
     most = of_model.max_delay
-    delays = delay if most is None else (delay, most)
+    delays: Any = "if needed" if delay is None else delay
+    if most is not None:
+        delays = (delay or 0.0, most)
     options: dict[str, Any] = {
         "friction": bool(of_model.friction),
         "held_out": of_model.held_out,

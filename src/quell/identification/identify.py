@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from quell.identification.model import (
     poles_of,
     zeros_of,
 )
+from quell.identification.output_error import likelihood_ratio
 from quell.identification.result import Identified
 from quell.identification.search import Fit, Known, Wanted, fit, without_fast_poles
 from quell.identification.starts import instrumental_variables
@@ -33,7 +34,7 @@ from quell.identification.validation import (
     residuals,
     simulate_fit,
 )
-from quell.parallel import one_blas_thread
+from quell.parallel import one_blas_thread, part_of
 from quell.quantities import UNKNOWN, Signals
 from quell.types import Matrix, Vector
 
@@ -175,6 +176,7 @@ _METHODS = (
 )
 # Number of lags in the tests of the error, fewer for short records: chosen by hand.
 _LAGS = 50
+_IF_NEEDED: Literal["if needed"] = "if needed"
 # How often first samples are left out: with u of before in them, the delay is not found at once.
 _CUTS = 3
 # Parts of a search after which half of the work counts as done: those of a search for the delay.
@@ -191,7 +193,7 @@ def identify(
     zeros: int = 0,
     *,
     integrators: int | None = None,
-    delay: float | tuple[float, float] | None = 0.0,
+    delay: float | tuple[float, float] | Literal["if needed"] | None = "if needed",
     bias: bool = True,
     friction: bool = False,
     rest: bool | None = None,
@@ -233,7 +235,8 @@ def identify(
     delay
         delay of u [s]; or the least and the largest, to find the best between them, with a part of
         a sample where the record shows it; or None, to find it from 0 to 20 samples, and beyond
-        that as long as the longest one is the best.
+        that as long as the longest one is the best. By default, ``"if needed"``, it is searched so
+        where the model without it has ``shortcomings``, and taken if it explains more than chance.
     bias
         whether a constant force acts besides u, as an offset of u does.
     friction
@@ -289,9 +292,40 @@ def identify(
     >>> found.num.round(6).tolist(), found.den.round(6).tolist()
     ([3.0], [1.0, 2.0])
     """
-    options = Options(order, zeros, integrators, delay, bias, friction, rest, held_out, horizon)
-    records = given_records(u, y)
+    none = 0.0 if delay == _IF_NEEDED else delay
+    options = Options(order, zeros, integrators, none, bias, friction, rest, held_out, horizon)
+    given = given_records(u, y), dt, reference, validation, signals
+    if delay != _IF_NEEDED:
+        return _of(*given, options, progress)
+    found = _of(*given, options, part_of(progress, 0.0, 0.3, 1.0))
+    if not found.shortcomings or found.early or found.bends:
+        return found
+    try:
+        late = _of(*given, options._replace(delay=None), part_of(progress, 0.3, 1.0, 1.0))
+    except ValueError:  # too short a record for it
+        return found
+    return late if late.delay > 0.0 and _explains_more(found, late) else found
+
+
+def _of(
+    records: Records,
+    dt: float,
+    reference: Any,
+    validation: tuple[Any, Any] | None,
+    signals: Signals,
+    options: Options,
+    progress: Callable[[float], None] | None,
+) -> Identified:
     return identified(records, dt, options, reference, validation, signals, progress=progress)
+
+
+def _explains_more(found: Identified, late: Identified) -> bool:
+    """Return whether a model with a delay leaves less, beyond chance, and has no more faults."""
+    first, count = found.y.size - late.y.size, late.held_from
+    errors = (found.y - found.simulated)[first : first + count], (late.y - late.simulated)[:count]
+    least = _ROUNDED * float(np.sum((late.y - np.mean(late.y)) ** 2)) * _ROUNDED
+    more = likelihood_ratio(errors, least) > 3.0 * math.log(count)
+    return more and len(late.faults) <= len(found.faults)
 
 
 class Options(NamedTuple):

@@ -252,6 +252,11 @@ class Identified:
         return self.one_more_pole <= self.one_more_pole_limit
 
     @property
+    def bends(self) -> bool:
+        """Whether a gain that depends on u or its sign explains most of the error."""
+        return self.curvature > _BENT
+
+    @property
     def _form(self) -> str:
         """What the test for one more pole found, as text."""
         test = f"one more pole: {self.one_more_pole:.3g}, limit {self.one_more_pole_limit:.3g}"
@@ -359,7 +364,7 @@ class Identified:
                 f"({self.delay:.4g} s of delay); cut the record, so that it begins later than its "
                 "first move of u"
             )
-        if self.curvature > _BENT:
+        if self.bends:
             found.append(
                 "the gain depends on the operating point or on the sign of u: the response to u² "
                 f"and |u| explains {100.0 * self.curvature:.0f} % of the error of a linear model; "
