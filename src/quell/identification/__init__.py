@@ -15,7 +15,6 @@ from quell.identification.excitation import (
     interleaved_excitations,
     save_excitations,
 )
-from quell.identification.free_swing import FreeSwing, Mode, free_swing
 from quell.identification.gain_by_signal import GainBin, identify_b0_by
 from quell.identification.gain_matrix import InputGainMatrix, identify_b0_matrix
 from quell.identification.identify import identify
@@ -29,6 +28,7 @@ from quell.identification.structures import (
     decided,
     not_told_apart,
 )
+from quell.identification.swings import FreeSwing, Mode, free_swing
 from quell.identification.validation import Residuals
 
 __all__ = [
