@@ -460,6 +460,7 @@ def test_what_is_for_one_u_is_refused(tmp_path: Path, options: Any, message: str
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.trial(cases="made_by_a_library")
 @pytest.mark.parametrize(
     ("make", "precision", "message"),
     [

@@ -180,7 +180,9 @@ def test_the_deviations_of_a_model_are_plants_around_it() -> None:
     assert np.mean(b[1:]) == pytest.approx(b[0], rel=1e-9)
     a = np.array([den[1] for _, den in plants])
     assert np.max(np.abs(a - a[0])) == pytest.approx(radius * spread[0], rel=1e-3)
-    quiet = ql.identify(u, 1e-3 * y + rng.standard_normal(u.size), 0.02, order=1, held_out=0.0)
+    quiet = ql.identify(
+        u, 1e-3 * y + rng.standard_normal(u.size), 0.02, order=1, delay=0.0, held_out=0.0
+    )
     with pytest.raises(ValueError, match="does not decide the sign of the gain"):
         identified_plants(quiet)
 

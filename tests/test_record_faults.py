@@ -89,7 +89,8 @@ def test_a_pole_that_samples_do_not_show_leaves_gain_and_slow_pole_as_they_are()
     """Their intervals with two poles are those with one, and hold the estimates."""
     u = np.repeat([0.0, 1.0, 0.3, 0.8], 200)
     y = 0.02 * np.round((answer([1.0], [1.0, 2.0], u) + noise(u.size, 5e-3)) / 0.02)
-    one, two = (ql.identify(u, y, DT, order=order, held_out=0.0) for order in (1, 2))
+    given: dict[str, Any] = {"delay": 0.0, "held_out": 0.0}
+    one, two = (ql.identify(u, y, DT, order=order, **given) for order in (1, 2))
     assert two.poles[-1].omega > np.pi / DT
     low, high = two.gain_interval
     assert low <= two.gain <= high
