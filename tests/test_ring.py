@@ -61,6 +61,7 @@ def test_rows_come_out_in_order_as_they_went_in(produce: Any) -> None:
     assert drain(shared).shape == (0, WIDTH)
 
 
+@pytest.mark.trial(cases="compiled")
 @pytest.mark.parametrize(
     "attempt", [_try_all, interpreted(_try_all)], ids=["compiled", "interpreted"]
 )
@@ -87,6 +88,7 @@ def test_no_row_is_torn_lost_or_repeated_between_two_threads() -> None:
     assert dropped(shared) == pushed[0]
 
 
+@pytest.mark.trial
 def test_every_lost_row_is_counted() -> None:
     """Rows read and rows dropped add up; rows read are whole and in order."""
     count, shared, pushed = 10_000_000, ring(1024, WIDTH), []
