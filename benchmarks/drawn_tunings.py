@@ -26,6 +26,7 @@ from scipy.signal import cont2discrete, tf2ss
 
 from quell.setup import load
 
+# The loop that is tuned; also for other benchmarks.
 SETUP = """title = "{kind}"
 dt = {dt}
 [plant]

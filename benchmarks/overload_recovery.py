@@ -24,26 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from drawn_tunings import SETUP
 from measured import parser_of, write
 from scipy.signal import cont2discrete, tf2ss
 
 from quell.setup import load
-
-SETUP = """title = "{name}"
-dt = {dt}
-[plant]
-kind = "delayed"
-delay = {late}
-plant = {{ kind = "linear", num = {num}, den = {den} }}
-[controller]
-u_min = {low}
-u_max = {high}
-[scenario]
-duration = {last}
-reference = {{ kind = "step", height = {size}, at = 0.05 }}
-disturbances = [{{ kind = "step", height = {load}, at = {load_at} }}]
-noise = {{ kind = "noise", power = {power}, sample_time = {dt} }}
-"""
 
 
 def servos() -> dict[str, dict[str, Any]]:
@@ -115,7 +100,7 @@ def tuned(name: str, of: dict[str, Any]) -> tuple[Any, str]:
     """Return the controller of the file that ``quell tune`` writes, and its structure."""
     numbers = {key: of[key] for key in ("dt", "num", "den", "size")}
     numbers |= {"low": -of["u_max"], "high": of["u_max"], "late": of["samples"] * of["dt"]}
-    numbers |= {"load": 0.3 * of["u_max"], "load_at": 1.5, "last": 3.0, "name": name}
+    numbers |= {"load": 0.3 * of["u_max"], "load_at": 1.5, "last": 3.0, "kind": name, "at": 0.05}
     power = of["step"] ** 2 / 12.0 * of["dt"]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "setup.toml")

@@ -24,6 +24,7 @@ from quell.identification.result import Identified
 from quell.identification.search import Fit, Known, Wanted, fit, without_fast_poles
 from quell.identification.starts import instrumental_variables
 from quell.identification.validation import (
+    Linearised,
     before_the_record,
     curvature,
     early_samples,
@@ -294,29 +295,21 @@ def identify(
     """
     none = 0.0 if delay == _IF_NEEDED else delay
     options = Options(order, zeros, integrators, none, bias, friction, rest, held_out, horizon)
-    given = given_records(u, y), dt, reference, validation, signals
+    records = given_records(u, y)
+
+    def fitted(options: Options, progress: Callable[[float], None] | None) -> Identified:
+        return identified(records, dt, options, reference, validation, signals, progress=progress)
+
     if delay != _IF_NEEDED:
-        return _of(*given, options, progress)
-    found = _of(*given, options, part_of(progress, 0.0, 0.3, 1.0))
+        return fitted(options, progress)
+    found = fitted(options, part_of(progress, 0.0, 0.3, 1.0))
     if not found.shortcomings or found.early or found.bends:
         return found
     try:
-        late = _of(*given, options._replace(delay=None), part_of(progress, 0.3, 1.0, 1.0))
+        late = fitted(options._replace(delay=None), part_of(progress, 0.3, 1.0, 1.0))
     except ValueError:  # too short a record for it
         return found
     return late if late.delay > 0.0 and _explains_more(found, late) else found
-
-
-def _of(
-    records: Records,
-    dt: float,
-    reference: Any,
-    validation: tuple[Any, Any] | None,
-    signals: Signals,
-    options: Options,
-    progress: Callable[[float], None] | None,
-) -> Identified:
-    return identified(records, dt, options, reference, validation, signals, progress=progress)
 
 
 def _explains_more(found: Identified, late: Identified) -> bool:
@@ -445,13 +438,11 @@ def _identified(
             fitted = _with_instruments(fitted, u[:held_from], y[:held_from], reference[:held_from])
         rounding = wanted.resolution
         found = _validated(fitted, u, y, reference, dt, held_from, horizon, other, rounding)
-        if not friction:
+        # A gain that falls with u looks like an integrator.
+        if not friction and integrators is None and found.integrators and found.undecided:
             part = u[:held_from], y[:held_from]
-            # A gain that falls with u looks like an integrator.
-            if integrators is None and found.integrators and found.undecided:
-                plain = wanted._replace(order=1, zeros=0, integrators=0)
-                fitted = fit(*part, records.samples, plain)
-            found = replace(found, curvature=curvature(fitted, *part))
+            plain = fit(*part, records.samples, wanted._replace(order=1, zeros=0, integrators=0))
+            found = replace(found, curvature=curvature(Linearised.of(plain, *part)))
     return replace(found, signals=Signals(signals.y, signals.u))
 
 
@@ -507,7 +498,8 @@ def _validated(
     of_b = slice(free, free + b.size)
     gain = b[0] if b[0] != 0.0 else np.nan
     friction, friction_std = _friction(structure, theta, fitted.estimate.covariance, seconds, gain)
-    test = one_more_pole(fitted, u[first], y[first])
+    near = Linearised.of(fitted, u[first], y[first])
+    test = one_more_pole(near)
     q = structure.integrators
     low, high = gain_interval(a[q:], float(b[0]), covariance[: free + 1, : free + 1])
     poles = poles_of(a, covariance, q)
@@ -543,9 +535,9 @@ def _validated(
         one_more_pole_limit=test.limit,
         misfit=test.misfit,
         misfit_omega=test.omega / dt,
-        early=early_samples(fitted, u[first], y[first]),
-        before=before_the_record(fitted, u[first], y[first]),
-        curvature=0.0,
+        early=early_samples(near),
+        before=before_the_record(near),
+        curvature=0.0 if structure.friction else curvature(near),
         residuals=residuals(error, tested_u, min(_LAGS, error.size // 4)),
         resolution=resolution,
         held_from=held_from,

@@ -685,9 +685,8 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
         none = "no model was found whose output is finite; lower the order, or scale u and y"
         raise ValueError(f"order = {wanted.order}, zeros = {wanted.zeros}: {none}")
     wanted.report()
-    estimate = start.estimate
     whole = with_delay(structure, v, u, delay)
-    estimate = descend(structure, estimate.theta, whole, y, _STEPS_SEARCH)
+    estimate = descend(structure, start.estimate.theta, whole, y, _STEPS_SEARCH)
     if searched[0] < searched[1] and not structure.direct:
         wanted.report()
         delay, estimate = with_part_of_sample(structure, estimate, u, v, y, delay, searched)

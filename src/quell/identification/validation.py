@@ -117,27 +117,27 @@ class OneMorePole(NamedTuple):
     omega: float  #: where that is [rad/sample]
 
 
-def one_more_pole(fit: Fit, u: Vector, y: Vector) -> OneMorePole:
+def one_more_pole(near: Linearised) -> OneMorePole:
     """Return the test for one more pole, and how much of G it is about."""
     from scipy.stats import chi2
 
-    structure, theta = fit.structure, fit.estimate.theta
-    u_late = fit.inputs(u)[:, 0]
-    a = structure.denominator(theta)
+    fit, structure = near.fit, near.fit.structure
+    u_late = fit.inputs(near.u)[:, 0]
+    a = structure.denominator(fit.estimate.theta)
     poles = np.abs(np.roots(np.append(1.0, a[::-1])))
-    slow, fast = np.clip([np.min(poles), np.max(poles)], 3.0 / y.size, 1.0)
+    slow, fast = np.clip([np.min(poles), np.max(poles)], 3.0 / near.u.size, 1.0)
     rates = np.geomspace(slow / 3.0, min(3.0 * fast, 2.0), _EXTRA_POLES)
     columns = []
     for rate in rates.tolist():
         wider = np.convolve(np.append(a, 1.0), [rate, 1.0])[:-1]
         columns.append(_response(fit, wider, u_late - u_late[0]))
     limit = float(chi2.isf(_SELDOM, _EXTRA_POLES))
-    found = _explained_by(fit, u, y, np.column_stack(columns))
+    found = _explained_by(near, np.column_stack(columns))
     if found is None:
         return OneMorePole(0.0, limit, math.inf, math.nan)
     if found.statistic <= limit:
         return OneMorePole(found.statistic, limit, 0.0, math.nan)
-    longest = max(place.stop - place.start for place in structure.records(y.size))
+    longest = max(place.stop - place.start for place in structure.records(near.u.size))
     return OneMorePole(found.statistic, limit, *_misfit(fit, found, rates, longest))
 
 
@@ -191,43 +191,64 @@ def _response(fit: Fit, a: Vector, u: Vector) -> Vector:
     return np.concatenate(parts)
 
 
+class Linearised(NamedTuple):
+    """A fit near its parameters: what all tests of its error begin with."""
+
+    fit: Fit
+    u: Vector
+    error: Vector  # (N,)
+    psi: Matrix  # derivatives of the output by θ (N, size)
+    c: Vector  # of the model of the noise
+    variance: float
+
+    @classmethod
+    def of(cls, fit: Fit, u: Vector, y: Vector) -> Linearised:
+        """Return it for the record of the fit."""
+        structure, theta = fit.structure, fit.estimate.theta
+        v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
+        predicted, psi = output_gradient(structure, theta, v)
+        error = y - predicted
+        return cls(fit, u, error, psi, *noise_model(error))
+
+
 class _Explained(NamedTuple):
     """What further columns explain of the error of a fit."""
 
     statistic: float  # χ²
     coefficients: Vector  # of the derivatives by θ, then of the columns
-    covariance: Matrix
     extra: Vector  # the coefficients of the columns
+    power: float  # of the whitened error that is left
+    columns: Matrix  # whitened, of length 1 before that
+    length: Vector
+
+    @property
+    def covariance(self) -> Matrix:
+        """That of the coefficients."""
+        half = np.linalg.pinv(self.columns, rcond=1e-9) / self.length[:, None]
+        return self.power * half @ half.T
 
 
-def _explained_by(fit: Fit, u: Vector, y: Vector, extra: Matrix) -> _Explained | None:
+def _explained_by(near: Linearised, extra: Matrix) -> _Explained | None:
     """Return what further columns (N, k) explain beside the derivatives of the output by θ.
 
     All of them are whitened by the model of the noise. None without any error, or if not finite.
     """
     from scipy.signal import lfilter
 
-    structure, theta = fit.structure, fit.estimate.theta
-    v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
-    predicted, psi = output_gradient(structure, theta, v)
-    error, columns = y - predicted, np.column_stack([psi, extra])
-    c, variance = noise_model(error)
-    length, known = nonzero_lengths(columns), psi.shape[1]
-    whitened = lfilter(c, [1.0], np.column_stack([columns / length, error]), axis=0)
-    if not np.all(np.isfinite(whitened)) or not variance > 0.0:
+    columns, known = np.column_stack([near.psi, extra]), near.psi.shape[1]
+    length = nonzero_lengths(columns)
+    whitened = lfilter(near.c, [1.0], np.column_stack([columns / length, near.error]), axis=0)
+    if not np.all(np.isfinite(whitened)) or not near.variance > 0.0:
         return None
     target, columns = whitened[:, -1], whitened[:, :-1]
     found = [np.linalg.lstsq(part, target, rcond=1e-9)[0] for part in (columns[:, :known], columns)]
     left = [float(np.sum((target - whitened[:, : one.size] @ one) ** 2)) for one in found]
-    power = left[1] / max(y.size - whitened.shape[1] + 1, 1)
-    half = np.linalg.pinv(columns, rcond=1e-9) / length[:, None]
-    coefficients = found[1] / length
-    return _Explained(
-        (left[0] - left[1]) / power, coefficients, power * half @ half.T, coefficients[known:]
-    )
+    power = left[1] / max(target.size - whitened.shape[1] + 1, 1)
+    coefficients, statistic = found[1] / length, (left[0] - left[1]) / power
+    return _Explained(statistic, coefficients, coefficients[known:], power, columns, length)
 
 
-def early_samples(fit: Fit, u: Vector, y: Vector) -> int:
+def early_samples(near: Linearised) -> int:
     """Return by how many samples y is early against u in a record, 0 to 2; 0 as far as it is not.
 
     Where u acts from its own sample on, y of that sample can't depend on it. If it does, and with
@@ -236,17 +257,17 @@ def early_samples(fit: Fit, u: Vector, y: Vector) -> int:
     """
     from scipy.stats import chi2
 
-    structure = fit.structure
+    fit, structure, u = near.fit, near.fit.structure, near.u
     if fit.delay > 0 or structure.direct or structure.friction:
         return 0
     sign = float(structure.numerators(fit.estimate.theta)[0, structure.degrees[0]])
     same, found, share = u - u[0], 0, 0.0
     columns = [same, np.append(same[1:], same[-1])]
     for early in (1, 2):
-        by = _explained_by(fit, u, y, np.column_stack(columns[:early]))
+        by = _explained_by(near, np.column_stack(columns[:early]))
         if by is None:
             break
-        now = by.statistic / (by.statistic + y.size)
+        now = by.statistic / (by.statistic + u.size)
         certain = by.statistic > chi2.isf(_SELDOM, early) and by.extra[early - 1] * sign > 0.0
         if not certain or now - share < _MOST_EARLY * (1.0 - share):
             break
@@ -254,25 +275,26 @@ def early_samples(fit: Fit, u: Vector, y: Vector) -> int:
     return found
 
 
-def before_the_record(fit: Fit, u: Vector, y: Vector) -> bool:
+def before_the_record(near: Linearised) -> bool:
     """Return whether another u before a record than its first one explains its first samples.
 
     The u that acts in the samples of the delay is not in the record.
     """
     from scipy.stats import chi2
 
+    fit = near.fit
     if fit.delay == 0 or fit.structure.friction:
         return False
-    pulse = np.zeros(u.size)
-    for place in fit.structure.records(u.size):
+    pulse = np.zeros(near.u.size)
+    for place in fit.structure.records(near.u.size):
         pulse[place.start : place.start + math.ceil(fit.delay)] = 1.0
     a = fit.structure.denominator(fit.estimate.theta)
     column = _response(fit, a, pulse)[:, None]
-    found = _explained_by(fit, u, y, column)
+    found = _explained_by(near, column)
     return found is not None and bool(found.statistic > chi2.isf(_SELDOM, 1))
 
 
-def curvature(fit: Fit, u: Vector, y: Vector) -> float:
+def curvature(near: Linearised) -> float:
     """Return the share of the error's power that a gain explains which depends on u or its sign.
 
     It is the response of the model to (u − mean)², and to |u| where u has both signs (a Hammerstein
@@ -281,19 +303,17 @@ def curvature(fit: Fit, u: Vector, y: Vector) -> float:
     """
     from scipy.stats import chi2
 
-    structure, theta = fit.structure, fit.estimate.theta
-    u_late, a = fit.inputs(u)[:, 0], structure.denominator(theta)
+    fit, error = near.fit, near.error
+    u_late, a = fit.inputs(near.u)[:, 0], fit.structure.denominator(fit.estimate.theta)
     bent = [(u_late - np.mean(u_late)) ** 2]
     bent += [np.abs(u_late)] if np.min(u_late) < 0.0 < np.max(u_late) else []
     extra = np.column_stack([_response(fit, a, each - each[0]) for each in bent])
-    found = _explained_by(fit, u, y, extra)
+    found = _explained_by(near, extra)
     if found is None or not found.statistic > chi2.isf(_SELDOM, extra.shape[1]):
         return 0.0
-    v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
-    predicted, known = output_gradient(structure, theta, v)
     left = []
-    for columns in (known, np.column_stack([known, extra])):
-        scaled, error = columns / nonzero_lengths(columns), y - predicted
+    for columns in (near.psi, np.column_stack([near.psi, extra])):
+        scaled = columns / nonzero_lengths(columns)
         rest = error - scaled @ np.linalg.lstsq(scaled, error, rcond=1e-9)[0]
         left.append(float(rest @ rest))
     return 1.0 - left[1] / left[0] if left[0] > 0.0 else 0.0
