@@ -65,6 +65,7 @@ def test_a_number_of_modes_that_is_given_is_taken() -> None:
     ("y", "options", "message"),
     [
         (np.exp(-T), {}, "y does not ring"),
+        (np.random.default_rng(0).standard_normal(500), {}, "y does not ring"),
         (np.full(400, 3.0), {}, "y is 3 all through: must ring"),
         (swing(MODES[0])[:15], {}, "y has 15 samples: must have at least 20 for each mode"),
         (swing(MODES[0]), {"modes": 6}, "modes = 6: must be a whole number from 1 to 5"),

@@ -12,7 +12,7 @@ coloured. With the slope ∂p/∂a of a pole by the coefficients of A the deviat
 
     δω = Re(p̄ δp)/ω,        δζ = −(Re δp + ζ δω)/ω
 
-Each further mode must pass the ratio of likelihoods of ``alternatives``. What rings is taken as
+Each mode must pass the ratio of likelihoods of ``alternatives``. What rings is taken as
 linear: friction makes the damping of a small swing larger than that of a large one.
 """
 
@@ -145,9 +145,9 @@ def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
         )
     if np.ptp(y) == 0.0:
         raise ValueError(f"y is {y[0]:g} all through: must ring; record it from the knock on")
-    v, found = np.ones((y.size, 1)), None
-    least = _ROUNDING * float(np.sum((y - np.mean(y)) ** 2))
+    v, found, error = np.ones((y.size, 1)), None, y - np.mean(y)
     with one_blas_thread(), np.errstate(all="ignore"):
+        least = _ROUNDING * float(np.sum(error**2))
         poles = _pencil(y)
         for count in range(modes or 1, most + 1):
             if poles.size < count or y.size < _PER_MODE * count:
@@ -158,12 +158,10 @@ def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
             model = structure, refine(structure, start, v, y, _STEPS)
             if not _rings(*model):
                 continue
-            if found is not None:
-                errors = [y - output(each, one.theta, v) for each, one in (found, model)]
-                more = 2 * (model[0].order - found[0].order)  # poles and start
-                if likelihood_ratio((errors[0], errors[1]), least) < (more + 2) * math.log(y.size):
-                    continue
-            found = model
+            left = y - output(structure, model[1].theta, v)
+            more = 2 * (structure.order - (0 if found is None else found[0].order))
+            if likelihood_ratio((error, left), least) >= (more + 2) * math.log(y.size):
+                found, error = model, left
         if found is None:
             raise ValueError(
                 "y does not ring: no pole with a frequency that its samples show was found; is it "
