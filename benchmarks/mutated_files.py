@@ -63,14 +63,14 @@ def read(kind: str, path: Path) -> None:
     from quell.experiments.acc import loops
     from quell.identification import read_record
     from quell.realtime import load
-    from quell.records.axes import AxesTrajectory
+    from quell.records.trajectory import Trajectory
     from quell.setup import load as load_setup
     from quell.setup import load_axes
 
     if kind in ("recording in CSV", "header", "recording in MCAP", "NetCDF"):
         loader: Callable[..., Any] = load
         if kind == "NetCDF":
-            loaders = {"runs": ql.BatchTrajectory.load, "axes": AxesTrajectory.load}
+            loaders = {"runs": ql.BatchTrajectory.load, "axes": Trajectory.load}
             loader = loaders.get(path.stem, ql.Trajectory.load)
         run = loader(path)
         run.to_xarray()

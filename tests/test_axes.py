@@ -429,7 +429,7 @@ class TestRuns:
         axes = ql.Axes({"shoulder": joint(learner=ql.learners.RLS()), "elbow": joint()})
         run = ql.simulate(two_masses(), axes, ql.Scenario(reference=REFERENCES, duration=1.0))
         run.save(tmp_path / "run.nc")
-        found = ql.AxesTrajectory.load(tmp_path / "run.nc")
+        found = ql.Trajectory.load(tmp_path / "run.nc")
         assert np.array_equal(found.log, run.log)
         assert found.axis_names == run.axis_names
         assert found.channels == tuple(each for each in run.channels if each[1])
@@ -450,7 +450,7 @@ class TestRuns:
         run = ql.simulate(two_masses(), axes, ql.Scenario(reference=(1.0, 0.0), duration=20.0))
         assert run.diverged
         assert run.ended < 20.0
-        assert "An output went beyond limit" in run.message
+        assert "went beyond limit" in run.message
 
     def test_noise_of_each_output_is_its_own(self) -> None:
         """One noise for all has other numbers at each output."""
@@ -487,15 +487,15 @@ BAD: tuple[tuple[object, str], ...] = (
     (lambda: ql.Axes(GOOD).retune("tool", omega_c=1.0), "axis = 'tool'"),
     (
         lambda: ql.simulate(two_masses(), joint(), ql.Scenario()),
-        "2 control signals and 2 outputs, the controller one of each: control it by quell.Axes",
+        "2 control signals and 2 outputs, the controller 1 and 1: control it by quell.Axes",
     ),
     (
         lambda: ql.simulate(ql.plants.two_mass_spring(), ql.Axes(GOOD), ql.Scenario()),
-        "has one control signal and one output, the controller 2 and 2",
+        "has 1 control signal and 1 output, the controller 2 and 2",
     ),
     (
         lambda: ql.simulate(two_masses(), ql.Axes([joint()]), ql.Scenario()),
-        "has 2 control signals, the controller 1",
+        "has 2 control signals and 2 outputs, the controller 1 and 1",
     ),
     (
         lambda: ql.simulate(two_masses(), ql.Axes(GOOD), ql.Scenario(reference=(1.0,))),

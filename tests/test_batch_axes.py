@@ -46,7 +46,7 @@ def axes(omega_c: float = 8.0, sign: float = 1.0, learner: bool = True) -> ql.Ax
 PLANTS = batch(gantry, gain=[4.5, 5.0, 6.0], lag=2.0)
 
 
-def check_run(runs: ql.AxesBatch, i: int, alone: ql.AxesTrajectory) -> None:
+def check_run(runs: ql.BatchTrajectory, i: int, alone: ql.Trajectory) -> None:
     """Compare a run of a batch with the run alone."""
     mine = runs.run(i)
     assert mine.names == alone.names
@@ -73,7 +73,7 @@ def test_each_run_of_a_batch_is_the_run_alone() -> None:
     runs, one = (
         ql.simulate(PLANTS, law, SCENARIO, record="all", record_every=3, workers=n) for n in (2, 1)
     )
-    assert isinstance(runs, ql.AxesBatch)
+    assert isinstance(runs, ql.BatchTrajectory)
     assert runs["y"].shape == (3, len(runs.t), 2)
     assert runs.names == one.names
     np.testing.assert_array_equal(runs.log, one.log)
@@ -112,7 +112,7 @@ def test_an_axis_of_all_runs_is_a_batch_of_one_axis(tmp_path: Path) -> None:
     short = replace(SCENARIO, duration=0.2, rest_at=())
     runs = ql.simulate(PLANTS, axes(learner=False), short)
     runs.save(tmp_path / "runs.nc")
-    again = ql.AxesBatch.load(tmp_path / "runs.nc")
+    again = ql.BatchTrajectory.load(tmp_path / "runs.nc")
     np.testing.assert_array_equal(again.log, runs.log)
     assert again.axis_names == ("x", "y")
     for some in (runs, again):
@@ -127,8 +127,8 @@ def test_an_axis_of_all_runs_is_a_batch_of_one_axis(tmp_path: Path) -> None:
         np.testing.assert_array_equal(some.axis("y")["u"], runs["v"][..., 1])
     assert runs.to_xarray()["y"].dims == ("run", "time", "y_index")
     ql.simulate(gantry(), axes(learner=False), short).save(tmp_path / "one.nc")
-    with pytest.raises(ValueError, match="it was not written by AxesBatch.save"):
-        ql.AxesBatch.load(tmp_path / "one.nc")
+    with pytest.raises(ValueError, match="it was not written by BatchTrajectory.save"):
+        ql.BatchTrajectory.load(tmp_path / "one.nc")
 
 
 def test_batches_run_in_single_precision_too() -> None:
@@ -194,8 +194,8 @@ def test_a_plot_has_two_rows_of_axes() -> None:
     [
         (partial(ql.simulate, [gantry()] * 2, [axes(), axes()], [SCENARIO] * 3), "controller has 2 entries, plant 2|scenario has 3 entries"),
         (partial(ql.simulate, gantry(), [axes(), axes().axes[1]], SCENARIO), r"controller\[1\] has channels"),
-        (partial(ql.simulate, [ql.plants.two_mass_spring()], axes(), SCENARIO), "has one control signal and one output, the controller 2 and 2"),
-        (partial(ql.simulate, PlantBatch([gantry()]), axes().axes[1], SCENARIO), "has 2 control signals and 2 outputs, the controller one of each"),
+        (partial(ql.simulate, [ql.plants.two_mass_spring()], axes(), SCENARIO), "has 1 control signal and 1 output, the controller 2 and 2"),
+        (partial(ql.simulate, PlantBatch([gantry()]), axes().axes[1], SCENARIO), "has 2 control signals and 2 outputs, the controller 1 and 1"),
         (partial(ql.simulate, [gantry()], axes(), SCENARIO, record=["q"]), "record = 'q'"),
         (partial(ql.simulate, gantry(), axes(), SCENARIO, record=["y"]), r"record = \['y'\]: is for a batch"),
         (lambda: ql.simulate([gantry()], axes(learner=False), replace(SCENARIO, duration=0.01, rest_at=()), record=["y"]).metrics(), "channel 'r' is not recorded; add it to record"),

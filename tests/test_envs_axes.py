@@ -196,15 +196,15 @@ def test_compiled_loops_are_those_of_simulate() -> None:
 @cases(
     ("call", "message"),
     [
-        (partial(Env, gantry(), SCENARIO, axes()), "no axis has learner=quell.envs.Policy"),
+        (partial(Env, gantry(), SCENARIO, axes()), "must be a quell.ADRC with learner=quell.envs.Policy"),
         (partial(Env, gantry(), SCENARIO), "dt = None"),
         (partial(Env, gantry(), SCENARIO, dt=DT), "u_min and u_max = -inf, inf: must be finite"),
         (partial(Env, gantry(), SCENARIO, dt=DT, u_min=[0.0] * 3, u_max=1.0), "one for all or one for each of 2"),
         (partial(Env, gantry(), SCENARIO, axes(Policy()), dt=DT), "dt: the controller has it"),
         (partial(Env, gantry(), SCENARIO, axes(Policy()), u_max=[1.0, 1.0]), "u_max: the controller has it"),
         (partial(Env, gantry(), SCENARIO, axes(Policy(), u_max=np.inf)), "u_min and u_max of the controller"),
-        (partial(Env, ql.plants.two_mass_spring(), SCENARIO, axes(Policy())), "has one control signal and one output"),
-        (partial(Env, gantry(), SCENARIO, axes(Policy()).axes[0]), "must be quell.Axes that follow references"),
+        (partial(Env, ql.plants.two_mass_spring(), SCENARIO, axes(Policy())), "has 1 control signal and 1 output, the controller 2 and 2"),
+        (partial(Env, gantry(), SCENARIO, axes(Policy()).axes[0]), "the controller 1 and 1: control it by quell.Axes"),
         (partial(Env, gantry(), SCENARIO, axes(Policy()), weights=[1.0]), "weights has shape"),
         (partial(Env, gantry(), SCENARIO, axes(Policy()), weights=[0.0, 0.0]), "must not be negative, and one must be positive"),
         (partial(Env, gantry(), SCENARIO, axes(Policy()), render_mode="ansi"), "render_mode = 'ansi': NOT for several axes yet"),

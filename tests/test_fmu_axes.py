@@ -144,7 +144,7 @@ def test_a_setup_of_axes_names_an_fmu_if_it_is_trusted(files: dict[int, Path]) -
     assert (twin.inputs, twin.outputs) == (2, 2)
     tables["axis"].append({"name": "wrist", **part})
     tables["axes"] = {"M": np.eye(3).tolist()}
-    words = r"plant = 'arm' has 2 control signals \(tau\[1\], tau\[2\]\), the controller 3: must be"
+    words = r"plant = 'arm' has 2 control signals \(tau\[1\], tau\[2\]\) and 2 outputs"
     with pytest.raises(setup.SetupError, match=words):
         setup.made_axes("arm.toml", tables, trust=True)
 
@@ -200,11 +200,11 @@ def test_names_that_do_not_fit_are_errors_with_the_variable(
 def test_signals_that_do_not_fit_the_controller_are_named(files: dict[int, Path]) -> None:
     """The FMU's variables, also behind an encoder; one signal only; a state for the start."""
     plant = ql.plants.MultivariableFMU(files[3], **SIGNALS, y=["q[1]"])
-    words = r"has 1 outputs \(q\[1\]\), the controller 2: must be the same"
+    words = r"and 1 output \(q\[1\]\), the controller 2 and 2: must be a plant with as many"
     with pytest.raises(ValueError, match=words):
         ql.simulate(ql.plants.encoded_outputs(plant, 1e-3), axes(), SCENARIO)
     plant = ql.plants.MultivariableFMU(files[3], **SIGNALS)
-    with pytest.raises(ValueError, match=r"2 control signals \(tau\[1\], tau\[2\]\), the contr"):
+    with pytest.raises(ValueError, match=r"2 control signals \(tau\[1\], tau\[2\]\) and 2 outputs"):
         ql.simulate(plant, axes(3), ql.Scenario(0.0, 0.1))
     with pytest.raises(ValueError, match=r"2 disturbance inputs \(push\[1\], push\[2\]\)"):
         ql.simulate(plant, axes(), ql.Scenario(0.0, 0.1, disturbances=(0.0, 0.0, 1.0)))

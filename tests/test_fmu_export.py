@@ -105,7 +105,7 @@ def inputs(law: Any) -> Iterator[dict[str, float]]:
     sampled = SampledScenario.of(SCENARIO, MASS, law, None)
     segment = sampled.segment(0, sampled.samples)
     for k in range(sampled.samples):
-        values = {"r": segment.r[k], "noise": segment.noise[k]}
+        values = {"r": segment.r[k, 0], "noise": segment.noise[k, 0]}
         values |= {f"r_derivative[{i + 1}]": d for i, d in enumerate(segment.derivatives[k])}
         yield values | {f"w[{i + 1}]": w for i, w in enumerate(segment.w[k])}
 

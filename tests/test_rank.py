@@ -15,7 +15,8 @@ from scipy.signal import lfilter
 from quell.identification import Measured
 from quell.monitoring import rank
 from quell.monitoring.rank import correlation_time, period_of
-from quell.records.axes import AxesTrajectory, one_gain
+from quell.records.gains import gain_factor, one_gain
+from quell.records.trajectory import Trajectory
 from tests.commands import in_this_process
 
 from .cases import cases
@@ -277,7 +278,7 @@ def axes_log(
     u = 1.0 + effort * noise[2:].T
     log = np.column_stack([np.zeros((6000, 2)), errors, errors, u, B0 * u])
     channels = (("r", 2), ("y", 2), ("y_measured", 2), ("u", 2), ("v", 2))
-    AxesTrajectory(log, channels, 0.1, axis_names=("x", "y")).save(path)
+    Trajectory(log, channels, 0.1, axis_names=("x", "y")).save(path)
     return str(path)
 
 
@@ -346,10 +347,10 @@ def test_efforts_and_loads_of_axes_are_those_of_the_actuators_whatever_b0_is(
     assert "take runs with one B0" in shown.err
 
 
-def run_of(u: Any, B0: Any) -> AxesTrajectory:
+def run_of(u: Any, B0: Any) -> Trajectory:
     """Return a record with these u and v = B0 u of one axis."""
     v = np.sum(np.broadcast_to(B0, u.shape) * u, axis=1, keepdims=True)
-    return AxesTrajectory(np.column_stack([u, v]), (("u", u.shape[1]), ("v", 1)), 0.1)
+    return Trajectory(np.column_stack([u, v]), (("u", u.shape[1]), ("v", 1)), 0.1)
 
 
 def test_v_of_one_b0_is_taken_as_it_is_and_another_b0_needs_all_actuators_to_have_moved() -> None:
@@ -360,7 +361,7 @@ def test_v_of_one_b0_is_taken_as_it_is_and_another_b0_needs_all_actuators_to_hav
     free = rng.normal(size=(400, 3))
 
     def found(**runs: Any) -> Any:
-        return one_gain({name: run_of(*run).gain_factor() for name, run in runs.items()}, 3)
+        return one_gain({name: gain_factor(run_of(*run)) for name, run in runs.items()}, 3)
 
     assert found(a=(even, B0), b=(1e3 * uneven, B0)) == (None, True)
     assert found(a=(0.0 * even, B0), b=(uneven, B0)).B is None

@@ -30,7 +30,7 @@ from quell.realtime.recordings import (
 from quell.realtime.registry import open_device
 from quell.realtime.run import mode_changes, silence_of
 from quell.realtime.supervisor import Cause, Mode
-from quell.records.axes import AxesTrajectory
+from quell.records.trajectory import Trajectory
 from quell.setup import made_axes
 
 from .cases import cases
@@ -280,7 +280,7 @@ def test_a_run_is_that_of_a_simulation() -> None:
     scenario = ql.Scenario((1.0, -0.5), 2.0)
     simulated = ql.simulate(PLANT, gantry(learning=True), scenario)
     ours = found.run.log[began : began + len(simulated)]
-    part = AxesTrajectory(ours, found.run.channels, DT, axis_names=("x", "y"))
+    part = Trajectory(ours, found.run.channels, DT, axis_names=("x", "y"))
     for name in ("r", "y", "u", "v", "x.x_hat", "y.f_residual"):
         np.testing.assert_allclose(part[name], simulated[name], rtol=1e-9, atol=1e-12)
     assert [change[1:3] for change in found.changes] == [
@@ -470,7 +470,7 @@ def test_a_replay_gives_the_estimates_again() -> None:
     np.testing.assert_array_equal(back["u_wished"][ran], found.run["u"][ran])
     assert back.axis("y").features == gantry(learning=True).axes[1].features
     started = replay(found.run, gantry(), u_before=[0.0, 0.0])
-    assert isinstance(started, AxesTrajectory)
+    assert isinstance(started, Trajectory)
 
 
 @pytest.mark.parametrize(
@@ -524,7 +524,7 @@ def test_a_recording_comes_back_bit_by_bit(tmp_path: Path, suffix: str) -> None:
     sink.write(found.rows)
     sink.close()
     back = load(path)
-    assert isinstance(back, AxesTrajectory)
+    assert isinstance(back, Trajectory)
     assert back.channels == found.run.channels
     np.testing.assert_array_equal(back.log, found.run.log)
     assert back.axis_names == ("x", "y")
@@ -600,7 +600,7 @@ def test_names_and_units_of_signals_are_in_files_and_views(tmp_path: Path) -> No
     first = (tmp_path / "run.csv").read_text().splitlines()[0].split(",")
     assert {"y[x] [mm]", "y[y] [rad]", "u[m] [N m]", "u[f] [N]"} <= {*first}
     run.save(tmp_path / "run.nc")
-    back = AxesTrajectory.load(tmp_path / "run.nc")
+    back = Trajectory.load(tmp_path / "run.nc")
     assert back.signals == signals
     np.testing.assert_array_equal(back["u"], run["u"])
     frame = back.to_xarray().to_dataframe()
@@ -651,7 +651,7 @@ def test_a_simulated_run_is_written_as_csv_or_netcdf(quell: Callable[..., Shown]
     assert {"time [s]", "y[x] [mm]", "y[y]", "u[left] [N]", "v[x] [mm/s^n]"} <= {
         *lines[0].split(",")
     }
-    run = AxesTrajectory.load("run.nc")
+    run = Trajectory.load("run.nc")
     assert len(lines) == len(run) + 1
     assert float(lines[-1].split(",")[0]) == run.t[-1]
     assert run.signals.u[1].unit == "N"
@@ -685,7 +685,7 @@ def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None
         assert text in shown.out
     run = load("run.csv")
     assert run.axis_names == ("x", "y")
-    assert AxesTrajectory.load("run.nc").axis_names == ("x", "y")
+    assert Trajectory.load("run.nc").axis_names == ("x", "y")
     shown = quell("replay", "run.csv", "gantry.toml", "--no-figures", "--json", "replay.json")
     assert shown.code == 0, shown.err
     assert "run.csv through gantry: y" in shown.out

@@ -13,7 +13,7 @@ import pytest
 import quell as ql
 from quell.realtime import Safety, TwinDevice, load, replay
 from quell.realtime.supervisor import Cause, Mode
-from quell.records.axes import AxesTrajectory
+from quell.records.trajectory import Trajectory
 
 from .commands import Shown
 from .scripted import PLANT as ONE
@@ -52,7 +52,7 @@ def test_a_run_is_that_of_a_simulation() -> None:
     found = Outcome(controller=compensated())
     simulated = ql.simulate(PLANT, compensated(), ql.Scenario((1.0, -0.5), 2.0))
     ours = found.run.log[10 : 10 + len(simulated)]
-    part = AxesTrajectory(ours, found.run.channels, DT, axis_names=("x", "y"))
+    part = Trajectory(ours, found.run.channels, DT, axis_names=("x", "y"))
     for name in ("r", "y", "u", "v", "x.x_hat", "y.f_residual"):
         np.testing.assert_array_equal(part[name], simulated[name], err_msg=name)
     assert found.changes[0][1:3] == (Mode.RUN, Cause.SETTLED)

@@ -271,7 +271,7 @@ def test_the_command_simulates_several_axes(quell: Callable[..., Shown], tmp_pat
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["metrics"]["x"][0]["rms"] > told["metrics"]["y"][0]["rms"] > 0.0
     assert (tmp_path / "f" / "gantry.png").exists()
-    run = ql.AxesTrajectory.load(tmp_path / "run.nc")
+    run = ql.Trajectory.load(tmp_path / "run.nc")
     assert run.axis_names == ("x", "y")
     assert run["u"].shape == (501, 2)
     (tmp_path / "late.toml").write_text(

@@ -151,7 +151,7 @@ def mode_check(*, bad: float = 2.0) -> tuple[IntegrationCheck, Samples]:
     model = PythonNonlinear(lambda t, x, u, w: (-bad * x[0], -0.1 * x[1]), None, 1.0, 1)
     x = np.array([[0.5, 3.0], [-4.0, 1.0], [1.0, 2.0]])
     return IntegrationCheck(model, as_python=True), Samples(
-        np.arange(3.0), np.zeros(3), np.zeros((3, 0)), x
+        np.arange(3.0), np.zeros((3, 1)), np.zeros((3, 0)), x
     )
 
 
@@ -194,7 +194,7 @@ def test_behind_a_delay_the_check_takes_the_u_that_arrives() -> None:
     inner = PythonNonlinear(lambda t, x, u, w: (-u * x[0],), None, 1.0, 1)
     check = IntegrationCheck(DelayedPlantModel(inner, 1), as_python=True)
     x = np.array([[1.0, 0.1, 0.2, 2.0]])  # the plant's state, and three values of u on their way
-    check.add(Samples(np.zeros(1), np.array([0.3]), np.zeros((1, 0)), x), all_of_them=True)
+    check.add(Samples(np.zeros(1), np.array([[0.3]]), np.zeros((1, 0)), x), all_of_them=True)
     assert check.error == pytest.approx(abs(runge_kutta(2.0) - runge_kutta(1.0) ** 2))
 
 
@@ -239,7 +239,7 @@ def test_the_check_gets_the_samples_that_are_recorded(monkeypatch: pytest.Monkey
     run = ql.simulate(plant, law, scenario, record_every=3, interpret=True)
     whole = Samples(*map(np.concatenate, zip(*seen, strict=True)))
     np.testing.assert_allclose(whole.t, run.t, atol=1e-12)
-    for part, channel in ((whole.u, "u"), (whole.w, "w"), (whole.x, "x")):
+    for part, channel in ((whole.u[:, 0], "u"), (whole.w, "w"), (whole.x, "x")):
         np.testing.assert_array_equal(part, run[channel])
     monkeypatch.setattr(driver, "_SEGMENT", 10_000)
     seen.clear()

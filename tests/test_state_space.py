@@ -98,7 +98,7 @@ class TestLoop:
         """It has outputs, control signals and disturbances, but no axes."""
         run = ql.simulate(drive(), controller(), ql.Scenario(0.5, duration=0.1))
         run.save(tmp_path / "run.nc")
-        found = ql.AxesTrajectory.load(tmp_path / "run.nc")
+        found = ql.Trajectory.load(tmp_path / "run.nc")
         assert np.array_equal(found["d_hat"], run["d_hat"])
         assert run.plot().size == 3
         with pytest.raises(ValueError, match="has no axes"):

@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from quell.lti.canonical import canonical
     from quell.observers.eso import ESO
     from quell.records import metrics
-    from quell.records.axes import AxesBatch, AxesTrajectory
     from quell.records.plotting import style
     from quell.records.trajectory import BatchTrajectory, Trajectory
     from quell.simulation.driver import Scenario
@@ -68,8 +67,6 @@ __version__ = "0.2.0"
 _HOMES = {
     "ADRC": "controllers.adrc",
     "Axes": "controllers.axes",
-    "AxesBatch": "records.axes",
-    "AxesTrajectory": "records.axes",
     "Compensated": "controllers.compensated",
     "Compensator": "controllers.compensator",
     "DesignWarning": "types",
@@ -103,18 +100,19 @@ _MODULES = (
 )  # fmt: skip
 
 __all__ = [
-    "ADRC", "ESO", "Axes", "AxesBatch", "AxesTrajectory", "BatchTrajectory", "Compensated",
-    "Compensator",
-    "DesignWarning", "Estimate", "Feedforward", "Guard", "HeldPlant", "OnlineGain", "Reason",
-    "SafeSet", "Scenario", "Schedule", "Status", "Trajectory", "Tuned", "analysis", "baselines",
-    "canonical", "controllers", "envs", "experiments", "export", "features", "identification",
-    "identify", "learners", "metrics", "monitoring", "observers", "omega_c_for", "plants",
-    "realtime", "setup", "signals", "simulate", "style", "sweep", "sweeping", "tune",
-    "tune_schedule", "tuning",
+    "ADRC", "ESO", "Axes", "BatchTrajectory", "Compensated", "Compensator", "DesignWarning",
+    "Estimate", "Feedforward", "Guard", "HeldPlant", "OnlineGain", "Reason", "SafeSet", "Scenario",
+    "Schedule", "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical",
+    "controllers", "envs", "experiments", "export", "features", "identification", "identify",
+    "learners", "metrics", "monitoring", "observers", "omega_c_for", "plants", "realtime", "setup",
+    "signals", "simulate", "style", "sweep", "sweeping", "tune", "tune_schedule", "tuning",
 ]  # fmt: skip
 
 
-__getattr__ = imported_on_use(__name__, _HOMES, _MODULES)
+# Names of earlier releases.
+_RENAMED = {"AxesBatch": "BatchTrajectory", "AxesTrajectory": "Trajectory"}
+
+__getattr__ = imported_on_use(__name__, _HOMES, _MODULES, _RENAMED)
 
 
 def __dir__() -> list[str]:

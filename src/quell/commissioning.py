@@ -23,8 +23,8 @@ A verifying step: the tuned loop at the rig beside its prediction from the ident
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -42,11 +42,11 @@ from quell.identification.record_file import in_common_units
 from quell.identification.result import Identified, simulated_plant
 from quell.identification.validation import nrmse
 from quell.realtime.devices import Device, TwinDevice
-from quell.realtime.recordings import Event, is_recording, load, load_one
+from quell.realtime.recordings import Event, check_one, is_recording, load, load_one
 from quell.realtime.run import RigRun, run_rig
 from quell.realtime.safety import Safety
 from quell.realtime.supervisor import Cause
-from quell.records.axes import AxesTrajectory, OneGain, one_gain
+from quell.records.gains import OneGain, gain_factor, one_gain, with_gain
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory
 from quell.records.units import runs_in_common_units
@@ -188,7 +188,7 @@ def measured_axes(
 ) -> MeasuredAxes:
     """Read the inputs and outputs of several axes from a table in text, or a run of them.
 
-    A run is a file that ``AxesTrajectory.save`` wrote, or a recording of ``quell run-rig``.
+    A run is a file that ``Trajectory.save`` wrote, or a recording of ``quell run-rig``.
 
     Parameters
     ----------
@@ -244,15 +244,14 @@ def _of_run(path: Path, axes: Sequence[str] | None, given: Any, max_size: float)
             "all u; give its axes only"
         )
     if path.suffix.lower() == ".nc":
-        run = AxesTrajectory.load(path, max_size)
+        run = Trajectory.load(path, max_size)
     else:
-        recording = load(path, max_size)
-        if not isinstance(recording, AxesTrajectory):
-            raise ValueError(
-                f"{path.name} has one y and one u: must be a run of several axes; leave --axes out"
-            )
-        run, part = recording, controlled(recording)
-        run = replace(run, log=np.ascontiguousarray(run.log[part]))
+        run = load(path, max_size)
+        run = replace(run, log=np.ascontiguousarray(run.log[controlled(run)]))
+    if not run.axis_names:
+        raise ValueError(
+            f"{path.name} has one y and one u: must be a run of several axes; leave --axes out"
+        )
     wanted = run.axis_names if axes is None else tuple(axes)
     places = [run.axis_names.index(checks.one_of("axes", name, run.axis_names)) for name in wanted]
     u, y = run["u"].copy(), run["y_measured"][:, places].copy()
@@ -268,31 +267,29 @@ def recorded_run(
     if columns or dt is not None or time_unit is not None:
         return None
     if path.suffix.lower() == ".nc":
-        return Trajectory.load(path, max_size)
+        return check_one(Trajectory.load(path, max_size), f"path = {os.fspath(path)!r}")
     return load_one(path, max_size) if is_recording(path) else None
 
 
 def run_in(
     path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
-) -> Trajectory | AxesTrajectory | None:
+) -> Trajectory | None:
     """Return the run in a file that quell wrote; None for a table in text."""
     if columns or dt is not None or time_unit is not None:
         return None
     if path.suffix.lower() == ".nc":
-        return _saved_run(path, max_size)
+        return Trajectory.load(path, max_size)
     return load(path, max_size) if is_recording(path) else None
 
 
-def by_axis(run: Trajectory | AxesTrajectory) -> dict[str, Trajectory]:
+def by_axis(run: Trajectory) -> dict[str, Trajectory]:
     """Return the run of each axis by its name, whose u is v, or the only one without a name."""
-    if isinstance(run, AxesTrajectory):
-        return {name: run.axis(name) for name in run.axis_names}
-    return {"": run}
+    return {name: run.axis(name) for name in run.axis_names} or {"": run}
 
 
 def with_one_gain(
-    runs: Mapping[str, Trajectory | AxesTrajectory],
-) -> tuple[dict[str, Trajectory | AxesTrajectory], OneGain]:
+    runs: Mapping[str, Trajectory],
+) -> tuple[dict[str, Trajectory], OneGain]:
     """Return runs by name whose v, of several axes, can be compared, and how.
 
     Of runs of several axes only the samples under control are left, in the units of the first; a
@@ -302,12 +299,12 @@ def with_one_gain(
     ------
     ValueError
         for runs with different numbers of actuators, units that do not convert, and as
-        ``quell.records.axes.one_gain``.
+        ``quell.records.gains.one_gain``.
     """
     several = {
         name: replace(run, log=np.ascontiguousarray(run.log[controlled(run)]))
         for name, run in runs.items()
-        if isinstance(run, AxesTrajectory)
+        if run.several
     }
     counts = {name: run["u"].shape[1] for name, run in several.items()}
     if len(set(counts.values())) > 1:
@@ -319,21 +316,11 @@ def with_one_gain(
         several, notes = runs_in_common_units(several)
         for note in notes:
             warn(note, UserWarning)
-    factors = {name: run.gain_factor() for name, run in several.items()}
+    factors = {name: gain_factor(run) for name, run in several.items()}
     found = one_gain(factors, next(iter(counts.values())))
     if found.B is not None:
-        several = {name: run.with_gain(found.B) for name, run in several.items()}
+        several = {name: with_gain(run, found.B) for name, run in several.items()}
     return {**runs, **several}, found
-
-
-def _saved_run(path: Path, max_size: float) -> Trajectory | AxesTrajectory:
-    """Return what is in a NetCDF file; its error is that of a run of one y and one u."""
-    try:
-        return Trajectory.load(path, max_size)
-    except ValueError as error:
-        with suppress(ValueError):
-            return AxesTrajectory.load(path, max_size)
-        raise error from None
 
 
 def measured_records(
@@ -377,7 +364,7 @@ def measured_records(
     return [record._replace(dt=mean) for record in records]
 
 
-def controlled(run: Trajectory | AxesTrajectory) -> slice:
+def controlled(run: Trajectory) -> slice:
     """Return the samples in which the loop ran; all of a run without modes."""
     from quell.realtime.supervisor import Mode
 

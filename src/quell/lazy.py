@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 
 def imported_on_use(
-    package: str, homes: Mapping[str, str], modules: Iterable[str] = ()
+    package: str,
+    homes: Mapping[str, str],
+    modules: Iterable[str] = (),
+    renamed: Mapping[str, str] | None = None,
 ) -> Callable[[str], Any]:
     """Return the function ``__getattr__`` of a package.
 
@@ -21,10 +25,16 @@ def imported_on_use(
         the module of each public class and function, below the package.
     modules
         public modules, below the package.
+    renamed
+        the present names of public names of earlier releases; a ``FutureWarning`` says them.
     """
     known = {path.rpartition(".")[2]: path for path in modules}
 
     def get(name: str) -> Any:
+        if renamed and name in renamed:
+            now = renamed[name]
+            warnings.warn(f"{package}.{name} is {package}.{now} now", FutureWarning, stacklevel=2)
+            name = now
         if name in homes:
             value = getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
         elif name in known:

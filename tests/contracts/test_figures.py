@@ -139,7 +139,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         "tuned schedule": Case(schedule.plot, 3),
         "tuned axes": Case(coupled.plot, 2),
         "BatchTrajectory": Case(batch.plot, 2),
-        "AxesBatch": Case(machines.plot, 4),
+        "batch of axes": Case(machines.plot, 4),
         "Tuned": Case(tuned.plot, 4),
         "TunedCompensator": Case(add_on.plot, 1),
         "Identified": Case(model.plot, 7),
@@ -192,9 +192,8 @@ def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str
 _DRAWS = re.compile(r"^ *def (plot(?:_\w+)?|draw)\(", re.MULTILINE)
 # Files of functions that draw, and those that are drawn above.
 _PUBLIC = {
-    "records/axes.py plot": "axes",  # and AxesBatch
     "tuning/schedules.py plot": "tuned schedule",
-    "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory
+    "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory, of one axis and of several
     "tuning/tuned.py plot": "Tuned",
     "tuning/tuned_axes.py plot": "tuned axes",
     "tuning/compensator.py plot": "TunedCompensator",

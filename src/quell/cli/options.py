@@ -106,7 +106,7 @@ class RunOutputs(Outputs):
         quell-figures-2 and so on if that exists.
     save
         Write the whole record to this file. One that ends in .nc is NetCDF, which `Trajectory.load`
-        reads (of several axes `AxesTrajectory.load`); one in .csv is text with names and units.
+        reads; one in .csv is text with names and units.
     """
 
     save: Path | None = None

@@ -135,7 +135,7 @@ def print_axes(
 ) -> tuple[dict[str, list[dict[str, Any]]], dict[str, dict[str, float]]]:
     """Print and return the metrics of each axis and what it learned; print the run's status.
 
-    ``run`` is an ``AxesTrajectory``. The variation of u of an axis is that of its v.
+    The variation of u of an axis is that of its v.
     """
     scores, learned = {}, {}
     for name in run.axis_names:

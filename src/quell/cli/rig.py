@@ -447,7 +447,6 @@ def _run(
 ) -> int:
     """Run the loop, print and write its results; return the exit code."""
     from quell.realtime import LiveSink
-    from quell.records.axes import AxesTrajectory
 
     scenario, options = setup.needed("scenario"), dict(setup.needed("rig"))
     files = [*map(Path, options.pop("telemetry", ())), *files]
@@ -473,7 +472,7 @@ def _run(
     _print_timing(console, run)
     scores: Any
     learned: Any
-    if isinstance(record, AxesTrajectory):
+    if record.several:
         scores, learned = print_axes(console, record, setup)
     else:
         scores = windowed_metrics(record, setup)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from quell.controllers.base import control
 from quell.controllers.stateful import PackedController, unpacked
 from quell.kernels import dispatch
 from quell.kernels.dispatch import (
@@ -13,14 +14,28 @@ from quell.kernels.dispatch import (
     dispatcher_for,
     explain_compile_errors,
     generic,
+    generic_with_default,
 )
 from quell.types import Vector
 
 
-@generic
+@generic_with_default
 def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) -> None:
-    """Take one sample: write the control signals ``u`` (m,) for references and measurements."""
-    raise TypeError
+    """Take one sample: write the control signals ``u`` (m,) for references and measurements.
+
+    A controller of one of each has ``control`` instead.
+    """
+    u[0] = control(controller, state, r[0], y[0])
+
+
+def outputs_of(controller: Any) -> int:
+    """Return the number of measurements of a controller."""
+    return int(getattr(controller, "outputs", 1))
+
+
+def references_of(controller: Any) -> int:
+    """Return the number of references of a controller."""
+    return int(getattr(controller, "references", outputs_of(controller)))
 
 
 @generic

@@ -46,11 +46,12 @@ from quell.controllers.memory import Layout, images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.several import control_all
-from quell.controllers.state_space import StateFeedback
+from quell.controllers.state_space import FeedbackDesign, StateFeedback
 from quell.controllers.stateful import StatefulController
 from quell.features.base import CustomDesign
 from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels import dispatch
+from quell.kernels.dispatch import generic_with_default
 from quell.kernels.functions import single
 from quell.kernels.linking import KERNEL_OPTIONS, in_both_precisions
 from quell.kernels.numba_internals import REMEDY
@@ -190,16 +191,30 @@ def _control(design: SingleDesign, state: Any, r: float, y: float) -> float:
     return np.float64(control(design.controller, state, single(r), single(y)))
 
 
-@control_all.register(SingleDesign)
+@generic_with_default
 @in_both_precisions
-def _control_all(design: SingleDesign, state: Any, r: Vector, y: Vector, u: Vector) -> None:
+def control_in_single(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) -> None:
+    """Take one sample of a controller in single precision, with signals in double."""
+    u[0] = np.float64(control(controller, state, single(r[0]), single(y[0])))
+
+
+@control_in_single.register(AxesDesign)
+@control_in_single.register(FeedbackDesign)
+@in_both_precisions
+def _control_in_single(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) -> None:
     for i in range(r.size):
         state.r_given[i] = single(r[i])
     for i in range(y.size):
         state.y_given[i] = single(y[i])
-    control_all(design.controller, state, state.r_given, state.y_given, state.u)
+    control_all(controller, state, state.r_given, state.y_given, state.u)
     for k in range(u.size):
         u[k] = np.float64(state.u[k])
+
+
+@control_all.register(SingleDesign)
+@in_both_precisions
+def _control_all(design: SingleDesign, state: Any, r: Vector, y: Vector, u: Vector) -> None:
+    control_in_single(design.controller, state, r, y, u)
 
 
 @set_reference_derivatives.register(SingleDesign)

@@ -15,12 +15,12 @@ from quell.checks import import_extra
 from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
+    from quell.envs.actions import Policy
     from quell.envs.env import Env, VectorEnv
-    from quell.envs.loops import Policy
 
 __all__ = ["NAMES", "Env", "Policy", "VectorEnv", "register"]
 
-__getattr__ = imported_on_use(__name__, {"Env": "env", "Policy": "loops", "VectorEnv": "env"})
+__getattr__ = imported_on_use(__name__, {"Env": "env", "Policy": "actions", "VectorEnv": "env"})
 
 NAMES = (
     "two-mass",

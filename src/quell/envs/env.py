@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,21 +19,11 @@ from quell import checks
 from quell.checks import import_extra
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
-from quell.controllers.base import Controller, checked_limits
-from quell.envs.axes import Actions, LoopsOfAxes, labels_of, loop_of_axes, observed_by_default
-from quell.envs.loops import (
-    Draw,
-    GivenControl,
-    GivenDesign,
-    Loops,
-    Policy,
-    check_given_once,
-    sample_time,
-)
+from quell.envs.actions import Actions, loop_of, places
+from quell.envs.loops import Draw, Loops
 from quell.lti.models import is_linear_model
-from quell.plants.base import check_plant, signals_of
+from quell.plants.base import check_plant, inputs_of, outputs_of, signals_of
 from quell.plants.linear import LinearPlant
-from quell.plants.multivariable import is_several
 from quell.quantities import UNKNOWN, Signals
 from quell.records.record import columns_of
 from quell.simulation.driver import Scenario
@@ -46,53 +35,6 @@ OBSERVED_WITH_U = ("r", "y_measured", "u", "x")
 OBSERVED_WITH_F = ("r", "y_measured", "u", "x_hat", "f_residual", "f_learned")
 # Entries of a controller's status are flags below this (``types.Status``).
 _FLAGS = 2048.0
-
-
-class Action(NamedTuple):
-    """Values of the actions −1 and 1: ``middle ± reach``."""
-
-    middle: float
-    reach: float
-    u_min: float
-    u_max: float
-
-
-def loop_of(
-    controller: Any, dt: float | None, u_min: float, u_max: float
-) -> tuple[Controller, Action]:
-    """Return the controller of the loop and the meaning of its action.
-
-    Raises
-    ------
-    ValueError
-        for a controller without ``Policy``, without finite limits, or for missing arguments.
-    """
-    if controller is None:
-        dt = sample_time(dt)
-        low, high = _limits(u_min, u_max, "u_min and u_max")
-        middle, reach = 0.5 * (low + high), 0.5 * (high - low)
-        given = GivenDesign(checked_limits(low, high, math.inf, dt))
-        return GivenControl(dt, given), Action(middle, reach, low, high)
-    if not isinstance(controller, ADRC) or not isinstance(controller.learner, Policy):
-        raise ValueError(
-            f"controller = {controller!r}: must be a quell.ADRC with learner=quell.envs.Policy(), "
-            "whose output the actions are, or None for actions that are u"
-        )
-    check_given_once(dt, u_min, u_max)
-    limits = controller.limits
-    low, high = _limits(limits.low, limits.high, "u_min and u_max of the controller")
-    most = controller.learner.most
-    if most is None:
-        most = 0.5 * abs(controller.observer.b0) * (high - low)
-    return controller, Action(0.0, most, low, high)
-
-
-def _limits(low: Any, high: Any, what: str) -> tuple[float, float]:
-    with suppress(TypeError, ValueError, OverflowError):
-        ends = float(low), float(high)
-        if -math.inf < ends[0] < ends[1] < math.inf:
-            return ends
-    raise ValueError(f"{what} = {low!r}, {high!r}: must be finite, the first one smaller")
 
 
 class Observed:
@@ -107,19 +49,14 @@ class Observed:
         self,
         names: Sequence[str] | None,
         loop: Loops,
-        action: Action | Actions,
+        action: Actions,
         x_limit: Any,
     ) -> None:
-        if isinstance(loop, LoopsOfAxes):
-            default = observed_by_default(loop.controller)
-        else:
-            is_adrc = isinstance(loop.controller, ADRC)
-            default = OBSERVED_WITH_F if is_adrc else OBSERVED_WITH_U
         if isinstance(names, str):
             names = (names,)
         if names is not None and not checks.is_sequence(names):
             raise ValueError(f"observe = {names!r}: must be a list of names of channels")
-        self.names = tuple(names or default)
+        self.names = tuple(names or _observed_by_default(loop.controller))
         widths = {name: width for name, width in loop.channels if width}
         for name in self.names:
             checks.one_of("observe", name, tuple(widths))
@@ -134,7 +71,7 @@ class Observed:
         axes = getattr(loop.controller, "names", ())
         #: a name for each number of an observation, as ``"r[elbow]"``
         self.labels = tuple(
-            label for name in self.names for label in labels_of(name, widths[name], axes)
+            label for name in self.names for label in _labels(name, widths[name], axes)
         )
         self.high: Vector = np.concatenate(high).astype(np.float64)
         self.low: Vector = np.concatenate(low).astype(np.float64)
@@ -147,7 +84,25 @@ class Observed:
         return np.clip(rows[..., self.columns], self.low, self.high)
 
 
-def _bounds(loop: Loops, action: Any, x_limit: Any) -> dict[str, Any]:
+def _observed_by_default(controller: Any) -> tuple[str, ...]:
+    """Return the channels that a policy sees."""
+    if isinstance(controller, ADRC):
+        return OBSERVED_WITH_F
+    if not controller.names:
+        return OBSERVED_WITH_U
+    known = {name for name, width in controller.channels if width}
+    every = [f"{axis}.{channel}" for axis in controller.names for channel in OBSERVED_WITH_F[3:]]
+    return (*OBSERVED_WITH_F[:3], *(name for name in every if name in known))
+
+
+def _labels(channel: str, width: int, axis_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a name for each number of a channel: of axes by their names, else by numbers."""
+    if width > 1 and channel in ("r", "y", "y_measured", "v") and len(axis_names) == width:
+        return tuple(f"{channel}[{name}]" for name in axis_names)
+    return places(channel, width)
+
+
+def _bounds(loop: Loops, action: Actions, x_limit: Any) -> dict[str, Any]:
     """Return the bounds that are not the limit, by channel."""
     order, limit = loop.plant.order, loop.limit
     x = np.full(order, limit) if x_limit is None else np.atleast_1d(x_limit)
@@ -159,7 +114,7 @@ def _bounds(loop: Loops, action: Any, x_limit: Any) -> dict[str, Any]:
         raise ValueError(f"x_limit has {x.size} entries: must be a number, or one for each state")
     controller: Any = loop.controller
     if isinstance(controller, ADRC):
-        found |= _bounds_of(controller.observer, limit, action.reach)
+        found |= _bounds_of(controller.observer, limit, float(action.reach[0]))
     elif isinstance(controller, Axes):
         reaches = dict(zip(action.names, action.reach.tolist(), strict=True))
         for name, axis in zip(controller.names, controller.axes, strict=True):
@@ -215,28 +170,20 @@ class Driven:
         if not checks.is_sequence(plant):
             check_plant(plant)
         first: Any = next(iter(plant), None) if checks.is_sequence(plant) else plant
-        law: Any
-        self.action: Any
-        own: dict[str, Any] = {}
-        kind: Any = Loops
-        self.several = is_several(first) or isinstance(controller, Axes)
-        if self.several:
-            law, self.action = loop_of_axes(first, controller, dt, u_min, u_max)
-            kind, own = LoopsOfAxes, {"weights": weights}
-        else:
-            if weights is not None:
-                raise ValueError(f"weights = {weights!r}: are those of several axes; leave it out")
-            law, self.action = loop_of(controller, dt, u_min, u_max)
-        largest = np.maximum(np.abs(self.action.u_min), np.abs(self.action.u_max))
+        law, self.action = loop_of(first, controller, dt, u_min, u_max)
+        #: whether r, y and u have an axis for their entries
+        self.several = max(outputs_of(first), inputs_of(first)) > 1
+        if weights is not None and not self.several:
+            raise ValueError(f"weights = {weights!r}: are those of several axes; leave it out")
         # Of several control signals the square is that of all together.
-        u_most = float(np.linalg.norm(largest)) if self.several else float(largest)
-        self.loops: Loops = kind(
+        u_most = np.linalg.norm(np.maximum(np.abs(self.action.u_min), np.abs(self.action.u_max)))
+        self.loops = Loops(
             *(plant, scenario, law, count),
-            **own,
+            weights=weights,
             repeat=action_repeat,
             limit=limit,
             cost_of_u=cost_of_u,
-            u_most=u_most,
+            u_most=float(u_most),
             interpret=checks.flag("interpret", interpret),
             workers=workers,
         )
@@ -256,13 +203,12 @@ class Driven:
         """Begin an episode in each loop, and write its first row."""
         count = self.loops.count
         self.loops.reset(range(count), rngs)
-        shape = (count, self.actions) if self.several else (count,)
-        self.loops.advance(np.zeros(shape), np.zeros(count, np.int64))
+        self.loops.advance(np.zeros((count, self.actions)), np.zeros(count, np.int64))
 
     def advance(self, actions: Vector, active: Any) -> None:
         """Take the active loops through a step with actions from −1 to 1, which are clipped.
 
-        They are (N,), of several axes (N, actions).
+        They are (N, actions).
         """
         if not np.all(np.isfinite(actions)):
             raise ValueError(f"action = {actions!r}: must be finite")
@@ -271,16 +217,13 @@ class Driven:
 
     def shaped(self, actions: Any) -> Vector:
         """Return actions as ``advance`` takes them; they have the right size."""
-        count = self.loops.count
-        made: Vector = actions.reshape((count, self.actions) if self.several else count)
+        made: Vector = actions.reshape(self.loops.count, self.actions)
         return made
 
     @property
     def action_names(self) -> tuple[str, ...]:
         """What each number of an action is: u, f, or the axis whose f it is."""
-        if self.several:
-            return tuple(self.action.names)
-        return ("f" if isinstance(self.loops.controller, ADRC) else "u",)
+        return self.action.names
 
     @property
     def observations(self) -> Any:

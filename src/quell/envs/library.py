@@ -15,8 +15,8 @@ import numpy as np
 from quell import plants
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
+from quell.envs.actions import Policy
 from quell.envs.env import Env, VectorEnv
-from quell.envs.loops import Policy
 from quell.guard import Guard
 from quell.observers.eso import ESO
 from quell.signals import BandLimitedNoise, Constant, Sinusoid, Step, Sum

@@ -1,14 +1,11 @@
-"""The compiled loops of the environments: what a policy sets, episodes, many loops at once.
-
-The quantity that a policy sets in each sample: f_L of an ADRC, or u itself.
-
-Both are controllers for the compiled loop, which calls ``set_action`` before each sample.
+"""The compiled loops of the environments: episodes, and many loops at once.
 
 Scenarios of episodes: one that is fixed, or one that is drawn for each.
 
 Many loops that a policy drives step by step: the work of ``Env`` and ``VectorEnv``.
 
-The compiled loop of the environments: some samples of each of many loops.
+The compiled loop of the environments: some samples of each of many loops. What a policy sets is
+written into the states of the loops, which lie at equal distances in memory, for all loops at once.
 
 Many states of one layout, one after the other in memory, for a compiled loop over them.
 
@@ -19,11 +16,10 @@ stay constants (``kernels/sized.py``).
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -33,21 +29,12 @@ from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.checks import positive
-from quell.controllers.base import (
-    Controller,
-    Limits,
-    control,
-    reset_loop,
-    status_flags,
-    write_row,
-)
-from quell.controllers.law import AdrcDesign, AdrcState
+from quell.controllers.base import Controller, write_row
+from quell.envs.actions import places_of_actions
 from quell.kernels import dispatch
 from quell.kernels.dispatch import (
     compiled_loop,
     explain_compile_errors,
-    generic,
     interpreted,
     is_finite,
     specialised,
@@ -55,194 +42,28 @@ from quell.kernels.dispatch import (
 from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS
 from quell.kernels.numba_internals import pointer_add
 from quell.kernels.sized import layout_of
-from quell.learners.base import (
-    adapt,
-    coefficients,
-    commit,
-    no_coefficients,
-    nothing_to_restart,
-    predict,
-    restart,
+from quell.plants.base import (
+    Plant,
+    PlantBatch,
+    begin_run,
+    check_run,
+    inputs_of,
+    measure_all,
+    outputs_of,
 )
-from quell.observers.eso import ESO
-from quell.plants.base import Plant, PlantBatch, begin_run, check_run, measure
 from quell.records.record import columns_of
 from quell.simulation.driver import (
-    SIGNALS,
+    Sample,
     SampledScenario,
     Scenario,
     check_scenario,
     is_random,
     logged_channels,
     run_samples,
+    sample_of,
+    width_of_signals,
 )
-from quell.simulation.several import SampledAxes
 from quell.types import Channels, Matrix, Vector
-
-# ---- The quantity that a policy sets in each sample ----
-
-
-@generic
-def set_action(controller: Any, state: Any, action: float) -> None:
-    """Set the action of the next sample: u [u-unit], or f_L [y-unit/s^n]."""
-    raise TypeError
-
-
-class PolicyDesign(NamedTuple):
-    """Parameters of ``Policy``: none."""
-
-
-class PolicyMemory(NamedTuple):
-    """State of ``Policy``."""
-
-    output: Vector  # f_L that the policy asks for (1,) [y-unit/s^n]
-
-
-@dataclass(frozen=True)
-class Policy:
-    """A learner whose output a policy sets from outside, sample by sample.
-
-    ``ADRC(…, learner=Policy(), guard=Guard())`` is the controller of an environment whose action is
-    a share of the disturbance that is fed forward. It learns nothing itself. Outside of an
-    environment, for example in ``simulate``, its output is zero, and the loop is the one without
-    learner.
-
-    Parameters
-    ----------
-    most
-        output f_L for the action 1 [y-unit/s^n]; by default what u can cancel,
-        ``b0 (u_max − u_min)/2``.
-    """
-
-    most: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.most is not None:
-            positive("most", self.most, "y-unit/s^n")
-
-    def design(self, observer: ESO, omega_c: float) -> PolicyDesign:
-        """Return no parameters."""
-        return PolicyDesign()
-
-    def memory(self, parameters: PolicyDesign) -> PolicyMemory:
-        """Return the state with the output zero."""
-        return PolicyMemory(np.zeros(1))
-
-    def feature_names(self, order: int) -> tuple[str, ...]:
-        """Return no names."""
-        return ()
-
-
-@adapt.register(PolicyDesign)
-def _adapt(
-    learner: PolicyDesign,
-    memory: PolicyMemory,
-    estimates: Vector,
-    y: float,
-    u_before: float,
-    f_plain: float,
-) -> None:
-    pass
-
-
-@predict.register(PolicyDesign)
-def _predict(
-    learner: PolicyDesign, memory: PolicyMemory, estimates: Vector, u_before: float
-) -> tuple[float, float]:
-    return memory.output[0], 0.0
-
-
-@commit.register(PolicyDesign)
-def _commit(
-    learner: PolicyDesign, memory: PolicyMemory, estimates: Vector, u: float, f_learned: float
-) -> None:
-    pass
-
-
-restart.register(PolicyDesign)(nothing_to_restart)
-coefficients.register(PolicyDesign)(no_coefficients)
-
-
-@set_action.register(AdrcDesign)
-def _set_feedforward(design: AdrcDesign, state: AdrcState, action: float) -> None:
-    state.learner.output[0] = action
-
-
-class GivenDesign(NamedTuple):
-    """Parameters of ``GivenControl``."""
-
-    limits: Limits  # of magnitude only
-
-
-class GivenState(NamedTuple):
-    """State of ``GivenControl``."""
-
-    u: Vector  # (1,)
-
-
-@dataclass(frozen=True)
-class GivenControl:
-    """The absence of a controller: u comes from outside, within limits."""
-
-    dt: float
-    parameters: GivenDesign
-    features: tuple[str, ...] = ()
-    channels: Channels = ()
-
-    def initial_state(self) -> GivenState:
-        """Return the state before the first sample."""
-        return GivenState(np.zeros(1))
-
-
-@control.register(GivenDesign)
-def _control(design: GivenDesign, state: GivenState, r: float, y: float) -> float:
-    return min(max(state.u[0], design.limits.low), design.limits.high)
-
-
-@set_action.register(GivenDesign)
-def _set_control(design: GivenDesign, state: GivenState, action: float) -> None:
-    state.u[0] = action
-
-
-@write_row.register(GivenDesign)
-def _write_row(design: GivenDesign, state: GivenState, row: Vector) -> None:
-    pass
-
-
-@status_flags.register(GivenDesign)
-def _status_flags(design: GivenDesign, state: GivenState) -> int:
-    return 0
-
-
-@reset_loop.register(GivenDesign)
-def _reset_loop(design: GivenDesign, state: GivenState) -> None:
-    state.u[0] = 0.0
-
-
-# ---- What a loop with and without controller is given ----
-
-
-def sample_time(dt: float | None) -> float:
-    """Return the sample time [s] of a loop without controller.
-
-    Raises
-    ------
-    ValueError
-        if it is missing, or not above zero.
-    """
-    if dt is None:
-        raise ValueError("dt = None: must be the sample time [s] if there is no controller")
-    return positive("dt", dt, "s")
-
-
-def check_given_once(dt: float | None, u_min: Any, u_max: Any) -> None:
-    """Raise a ``ValueError`` for what the controller of a loop has already."""
-    for name, given, usual in (
-        ("dt", dt, None), ("u_min", u_min, -math.inf), ("u_max", u_max, math.inf)
-    ):  # fmt: skip
-        if np.any(given != usual):
-            raise ValueError(f"{name}: the controller has it; give it there only")
-
 
 # ---- Scenarios of episodes ----
 
@@ -254,7 +75,7 @@ _SEEDS = 2**31
 class Episode(NamedTuple):
     """An episode's signals and the plant's initial state."""
 
-    table: NDArray[np.float64]  # r, noise, derivatives of r, w (samples, …)
+    table: NDArray[np.float64]  # r and noise of each axis, derivatives of r, w (samples, …)
     x0: Vector
 
 
@@ -302,9 +123,7 @@ class Episodes:
             raise ValueError(
                 f"rest_at = {scenario.rest_at!r}: must be empty, each episode starts from rest"
             )
-        several = hasattr(self._controller, "outputs")
-        kind: Any = SampledAxes if several else SampledScenario
-        found: Any = kind.of(scenario, self._plant, self._controller, None)
+        found = SampledScenario.of(scenario, self._plant, self._controller, None)
         if found.samples < 2:
             raise ValueError(
                 f"duration = {scenario.duration!r} s with dt = {found.dt!r} s: must be at least "
@@ -416,7 +235,6 @@ def _moved(typing_context: Any, first: Any, shift: Any) -> Any:
 # ---- The compiled loop of the environments ----
 
 Integers = NDArray[np.int64]
-NOISE = 1  # column of the noise in a table of signals; the reference comes first, w last
 
 
 class Lane(NamedTuple):
@@ -425,17 +243,19 @@ class Lane(NamedTuple):
     x: Vector  # state of the plant (n,)
     scratch: Vector  # (6 n,), see ``plants.base.advance``
     controller: Any  # state of the controller
+    sample: Sample  # work space
 
 
 class Step(NamedTuple):
     """Results of a step, for each loop."""
 
-    row: Matrix  # all channels after the step, see ``Lanes.channels`` (N, …)
+    row: Matrix  # all channels after the step (N, …)
     cost: Vector  # of the step (N,)
+    costs: Matrix  # integral of the squared error of each axis over the step (N, n)
     sample: Integers  # sample at which each loop is (N,)
     status: Integers  # flags of the step (N,)
-    diverged: Integers  # 1 if ``|y|`` was beyond the limit (N,)
-    log: NDArray[np.float64]  # work space: r, y, y_measured, u of its samples (N, repeat, 4)
+    diverged: Integers  # 1 if any ``|y|`` was beyond the limit (N,)
+    log: NDArray[np.float64]  # work space: r, y, y_measured, u of its samples (N, repeat, …)
 
 
 class Rules(NamedTuple):
@@ -447,10 +267,10 @@ class Rules(NamedTuple):
     limit: float  # |y| beyond it ends an episode
     cost_of_u: float  # [y-unit²/u-unit²]
     worst: float  # cost of a second beyond the limit [y-unit²], more than any within it
-    derivatives: int  # of the reference
+    derivatives: int  # of the references
 
 
-@compiled_loop("plants", "design", "rules", "actions", "active", "signals")
+@compiled_loop("plants", "design", "rules", "weights", "active", "signals")
 def run_step(
     plants: Any,
     plant_stride: int,
@@ -458,7 +278,7 @@ def run_step(
     lane_stride: int,
     design: Any,
     rules: Rules,
-    actions: Vector,
+    weights: Vector,
     active: Integers,
     signals: NDArray[np.float64],
     step: Step,
@@ -467,20 +287,22 @@ def run_step(
 ) -> None:
     """Take the loops from ``first`` to before ``last`` through a step, and write their rows.
 
-    Those that are not ``active`` do not move. ``signals`` (N or 1, samples, 2 + …) has r, the
-    noise, the derivatives of r and w of each sample, for each loop or for all.
+    Those that are not ``active`` do not move. ``signals`` (N or 1, samples, 2 n + …) has r and the
+    noise of each axis, the derivatives of r and w of each sample, for each loop or for all;
+    ``weights`` (n,) are those of the squared errors.
     """
     shared = signals.shape[0] == 1
-    begin = 2 + rules.derivatives
     for i in range(first, last):
         plant = member(plants, plant_stride, i)
         lane = member(lanes, lane_stride, i)
         table = signals[0 if shared else i]
-        row = step.row[i]
+        row, y = step.row[i], lane.sample.y
+        n, m = y.size, lane.sample.u.size
+        begin = 2 * n
+        end = begin + rules.derivatives
         k = step.sample[i]
-        y = measure(plant, lane.x)
+        measure_all(plant, lane.x, y)
         if active[i] != 0:
-            set_action(design, lane.controller, actions[i])
             log, until = step.log[i], min(k + rules.repeat, rules.samples - 1)
             done, _, _, status = run_samples(
                 plant,
@@ -488,35 +310,47 @@ def run_step(
                 lane.scratch,
                 design,
                 lane.controller,
+                lane.sample,
                 k * rules.dt,
                 rules.dt,
-                table[k:until, 0],
-                table[k:until, 2:begin],
-                table[k:until, begin:],
-                table[k:until, NOISE],
+                table[k:until, :n],
+                table[k:until, begin:end],
+                table[k:until, end:],
+                table[k:until, n:begin],
                 log,
                 0,
                 1,
                 0,
                 rules.limit,
             )
-            y = measure(plant, lane.x)
-            diverged = 0 if abs(y) <= rules.limit else 1
-            u, cost = 0.0, 0.0
+            measure_all(plant, lane.x, y)
+            diverged, cost = 0, 0.0
+            for a in range(n):
+                step.costs[i, a] = 0.0
+                if not abs(y[a]) <= rules.limit:
+                    diverged = 1
             for j in range(done):
                 k += 1
-                u = log[j, 3]
+                for c in range(m):
+                    row[3 * n + c] = log[j, 3 * n + c]
                 if j + 1 < done or diverged == 0:
-                    error = table[k, 0] - (log[j + 1, 1] if j + 1 < done else y)
-                    cost += (error * error + rules.cost_of_u * (u * u)) * rules.dt
+                    squares = 0.0
+                    for a in range(n):
+                        error = table[k, a] - (log[j + 1, n + a] if j + 1 < done else y[a])
+                        step.costs[i, a] += error * error * rules.dt
+                        squares += weights[a] * (error * error)
+                    for c in range(m):
+                        u = log[j, 3 * n + c]
+                        squares += rules.cost_of_u * (u * u)
+                    cost += squares * rules.dt
             if diverged != 0:
                 cost += (rules.samples - k) * rules.worst * rules.dt
-            row[3] = u
             step.cost[i], step.status[i], step.diverged[i] = cost, status, diverged
             step.sample[i] = k
-        row[0], row[1], row[2] = table[k, 0], y, y + table[k, NOISE]
-        at = len(SIGNALS)
-        for j in range(begin, table.shape[1]):
+        for a in range(n):
+            row[a], row[n + a], row[2 * n + a] = table[k, a], y[a], y[a] + table[k, n + a]
+        at = 3 * n + m
+        for j in range(end, table.shape[1]):
             row[at] = table[k, j]
             at += 1
         for j in range(lane.x.size):
@@ -551,15 +385,13 @@ class Loops:
         ``|y|`` that ends an episode; by default the usual range of the scenario.
     cost_of_u
         weight of u² in the cost [y-unit²/u-unit²].
+    weights
+        of the squared errors of the axes in the cost (n,); 1 by default.
     interpret
         run as plain Python.
     workers
         threads; by default one for each core, and none for few loops.
     """
-
-    entry: Any = staticmethod(run_step)
-    weight = 1.0  # of the squared errors, all together
-    outputs = 1
 
     def __init__(
         self,
@@ -571,6 +403,7 @@ class Loops:
         limit: float | None = None,
         cost_of_u: float = 0.0,
         u_most: float = 0.0,
+        weights: Any = None,
         interpret: bool = False,
         workers: int | None = None,
     ) -> None:
@@ -580,6 +413,13 @@ class Loops:
         if each is not None and len(each) != count:
             raise ValueError(f"plant has {len(each)} entries, num_envs = {count}: must be equal")
         self.plant, self.controller, self.count = plant, controller, count
+        self.outputs, self.inputs = outputs_of(plant), inputs_of(plant)
+        self.weights = np.ones(self.outputs)
+        if weights is not None:
+            self.weights = checks.vector("weights", weights, self.outputs)
+            if not np.all(self.weights >= 0.0) or not np.any(self.weights > 0.0):
+                rule = "must not be negative, and one must be positive"
+                raise ValueError(f"weights = {weights!r}: {rule}")
         self.episodes = Episodes(scenario, plant, controller)
         example = self.episodes.example
         self.limit = checks.optional(checks.positive, "limit", limit) or example.range
@@ -591,10 +431,10 @@ class Loops:
             limit=self.limit,
             cost_of_u=cost,
             # Within the limit |r − y| is less than twice the limit.
-            worst=4.0 * self.limit**2 * self.weight + cost * u_most**2,
+            worst=4.0 * self.limit**2 * float(np.sum(self.weights)) + cost * u_most**2,
             derivatives=len(example.derivatives),
         )
-        self.channels: Channels = self._logged(plant, controller)
+        self.channels: Channels = logged_channels(plant, controller)
         self._as_python = interpret or dispatch.interpret_all or not plant.compiled
         models = [p.sampled(controller.dt, interpret) for p in (each or [plant])]
         self._models, self._plant_stride = models, int(len(models) > 1)
@@ -609,6 +449,8 @@ class Loops:
         self._shares = max(1, min(workers, count // _LOOPS_PER_THREAD))
         self._pool = ThreadPoolExecutor(self._shares - 1) if self._shares > 1 else None
         self._run: Any = None
+        state = self._lanes.members[0].controller
+        self._given = [self._everywhere(each) for each in places_of_actions(controller, state)]
 
     def _make_arrays(self) -> None:
         count, width = self.count, sum(width for _, width in self.channels)
@@ -620,28 +462,25 @@ class Loops:
         repeat = min(self.rules.repeat, self.rules.samples)
         self.step: Any = self._arrays_of_step(count, width, repeat)
 
-    def _logged(self, plant: Any, controller: Any) -> Channels:
-        """Return name and width of the channels of a row."""
-        return logged_channels(plant, controller)
-
-    def _arrays_of_step(self, count: int, width: int, repeat: int) -> Any:
+    def _arrays_of_step(self, count: int, width: int, repeat: int) -> Step:
         """Return the arrays that a step writes."""
         return Step(
             row=np.zeros((count, width)),
             cost=np.zeros(count),
+            costs=np.zeros((count, self.outputs)),
             sample=np.zeros(count, np.int64),
             status=np.zeros(count, np.int64),
             diverged=np.zeros(count, np.int64),
-            log=np.zeros((count, repeat, len(SIGNALS))),
+            log=np.zeros((count, repeat, width_of_signals(self.plant, self.controller))),
         )
 
-    @property
-    def _columns_of_u(self) -> slice:
-        return slice(len(SIGNALS) - 1, len(SIGNALS))
-
-    def _inputs(self, actions: Any, active: Any) -> tuple[Any, ...]:
-        """Return the arguments of the compiled loop behind those of plants and lanes."""
-        return self.controller.parameters, self.rules, actions, active, self._signals, self.step
+    def _everywhere(self, first: Vector) -> NDArray[np.float64]:
+        """Return an array of the first loop's state in all loops (N, size)."""
+        memory = self._lanes.memory
+        offset = first.ctypes.data - memory.ctypes.data
+        strides = memory.shape[1], first.itemsize
+        shape = len(memory), first.size
+        return np.ndarray(shape, np.float64, memory.reshape(-1).data, offset, strides)
 
     def column(self, name: str) -> int:
         """Return the first column of a channel."""
@@ -649,7 +488,8 @@ class Loops:
 
     def _at_rest(self) -> Lane:
         n = self.plant.order
-        return Lane(np.zeros(n), np.zeros(6 * n), self.controller.initial_state())
+        state = self.controller.initial_state()
+        return Lane(np.zeros(n), np.zeros(6 * n), state, sample_of(self.plant, self.controller))
 
     def reset(self, which: Sequence[int], rngs: Sequence[np.random.Generator]) -> None:
         """Begin an episode in some loops, drawn from the generator of each."""
@@ -657,7 +497,7 @@ class Loops:
         self._lanes.memory[chosen] = self._rest
         for array in (self.step.sample, self.step.status, self.step.diverged, self.step.cost):
             array[chosen] = 0
-        self.step.row[chosen, self._columns_of_u] = 0.0
+        self.step.row[chosen, 3 * self.outputs : 3 * self.outputs + self.inputs] = 0.0
         for i in which:
             episode = self.episodes.draw(rngs[i])
             if not self.episodes.are_equal:
@@ -670,18 +510,24 @@ class Loops:
     def _model(self, i: int) -> Any:
         return self._models[i if self._plant_stride else 0]
 
-    def advance(self, actions: Vector, active: Any) -> None:
-        """Take the active loops through a step; write ``step``."""
+    def advance(self, actions: Matrix, active: Any) -> None:
+        """Take the active loops through a step with ``actions`` (N, …); write ``step``."""
         models, plant_stride, lanes = self._models, self._plant_stride, self._lanes
-        inputs = self._inputs(actions, active)
+        moving: Any = slice(None) if np.all(active) else np.flatnonzero(active)
+        at = 0
+        for place in self._given:
+            place[moving] = actions[moving, at : at + place.shape[1]]
+            at += place.shape[1]
+        given = self.controller.parameters, self.rules, self.weights
+        inputs: tuple[Any, ...] = (*given, active, self._signals, self.step)
         if self._as_python:
-            run: Any = interpreted(self.entry)
+            run: Any = interpreted(run_step)
             stacks: tuple[Any, ...] = models, plant_stride, lanes.members, lanes.stride
         else:
             stacks = models[0], plant_stride, lanes.members[0], lanes.stride
             if self._run is None:
                 with explain_compile_errors(models[0], inputs[0]):
-                    self._run = specialised(self.entry, *stacks, *inputs, 0, 1)
+                    self._run = specialised(run_step, *stacks, *inputs, 0, 1)
             run = self._run
         edges = [self.count * part // self._shares for part in range(self._shares + 1)]
         jobs = []

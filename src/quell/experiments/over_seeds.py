@@ -36,7 +36,7 @@ from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
 from quell.plants.base import one_at_a_time, signals_of
 from quell.quantities import UNKNOWN, Conversion, Quantity, conversion
-from quell.records.axes import OneGain, one_gain
+from quell.records.gains import OneGain, gain_factor, one_gain, with_gain
 from quell.records.metrics import MEASURES, worsened
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.setup.axes import signals_in
@@ -274,7 +274,7 @@ def over_seeds(
     SeedComparison
         with all ``MEASURES`` of each run, axis and window, and verdicts that begin with NOT where
         the seeds do not decide. u of an axis of several is its v = B0 u; where B0 of the
-        controllers differ, with that of the first for all (``quell.records.axes.one_gain``).
+        controllers differ, with that of the first for all (``quell.records.gains.one_gain``).
 
     Raises
     ------
@@ -323,7 +323,7 @@ def over_seeds(
     def run(controller: Any, seed: int) -> tuple[dict[str, float], bool]:
         found = simulate(plant, controller, replace(scenario, seed=seed))
         if gain.B is not None:
-            found = found.with_gain(gain.B)
+            found = with_gain(found, gain.B)
         return measure_run(found, {**measures, **own}), bool(found.lost)
 
     made = [*controllers.values()]
@@ -361,7 +361,7 @@ def _common_gain(
         return OneGain(None, True), ""
     jobs = [partial(simulate, plant, controller, scenario) for controller in controllers.values()]
     runs: Any = in_parallel(jobs, None, 1 if one_at_a_time(plant) else None)
-    factors = {name: run.gain_factor() for name, run in zip(controllers, runs, strict=True)}
+    factors = {name: gain_factor(run) for name, run in zip(controllers, runs, strict=True)}
     try:
         return one_gain(factors, first.inputs), ""
     except ValueError as error:

@@ -181,7 +181,7 @@ def rank(
     logs
         for each tuning its log or logs, with a reference: r, y and u in samples (N,), all with one
         sample time and u in one unit: v = B0 u of an axis is so for one B0 only, see
-        ``quell.records.axes.one_gain``. Leave out the first seconds after a change of the tuning.
+        ``quell.records.gains.one_gain``. Leave out the first seconds after a change of the tuning.
         Logs in other units (``Measured.signals``) are converted to those of the first one, as from
         °F to K, and ``notes`` say so.
     criterion

@@ -104,6 +104,37 @@ def measure(plant: Any, x: Vector) -> float:
     raise TypeError
 
 
+@generic_with_default
+def measure_all(plant: Any, x: Vector, y: Vector) -> None:
+    """Write the outputs for the state ``x`` (n,) into ``y`` (p,).
+
+    A plant with one output has ``measure`` instead.
+    """
+    y[0] = measure(plant, x)
+
+
+@generic_with_default
+def as_input(plant: Any, u: Vector) -> Any:
+    """Return control signals (m,) as ``advance`` takes them: of one the number, else the array."""
+    return u[0]
+
+
+@kernel
+def all_signals(plant: Any, u: Vector) -> Vector:
+    """Return control signals as they are: ``as_input`` of a plant with several."""
+    return u
+
+
+def inputs_of(plant: Any) -> int:
+    """Return the number of control signals of a plant."""
+    return int(getattr(plant, "inputs", 1))
+
+
+def outputs_of(plant: Any) -> int:
+    """Return the number of outputs of a plant."""
+    return int(getattr(plant, "outputs", 1))
+
+
 @generic
 def advance(plant: Any, x: Vector, scratch: Vector, t: float, u: Any, w: Vector) -> None:
     """Advance the state ``x`` (n,) by a sample from the time ``t`` [s], with held u and w (m,).

@@ -28,7 +28,15 @@ from quell import checks
 from quell.checks import Described
 from quell.files import MAX_SIZE, bytes_of
 from quell.kernels.user_functions import call
-from quell.plants.base import advance, begin_run, check_run, measure
+from quell.plants.base import (
+    advance,
+    all_signals,
+    as_input,
+    begin_run,
+    check_run,
+    measure,
+    measure_all,
+)
 from quell.plants.fmu_file import (
     CALLS,
     FMUError,
@@ -39,7 +47,7 @@ from quell.plants.fmu_file import (
     Variables,
     warn_of_step,
 )
-from quell.plants.multivariable import ChannelNames, measure_all
+from quell.plants.multivariable import ChannelNames
 from quell.types import Vector
 
 # ---- Instances of FMUs, and the function by which loops advance them ----
@@ -486,6 +494,7 @@ def _advance_all(
     call(plant.address, scratch, x, x.size, u, u.size, w, w.size)
 
 
+as_input.register(MultivariableFMUModel)(all_signals)
 begin_run.register(MultivariableFMUModel)(_begin)
 check_run.register(MultivariableFMUModel)(_check)
 

@@ -24,7 +24,6 @@ from numba import types as nb_types
 from quell import checks
 from quell.checks import Described
 from quell.kernels import user_functions
-from quell.kernels.dispatch import generic
 from quell.kernels.frozen import kept_code
 from quell.kernels.sized import Buffer, Size
 from quell.kernels.user_functions import (
@@ -41,9 +40,12 @@ from quell.plants.base import (
     Plant,
     PlantWrapper,
     advance,
+    all_signals,
+    as_input,
     begin_run,
     check_plant,
     check_run,
+    measure_all,
 )
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel, quantized
 from quell.plants.nonlinear import (
@@ -53,13 +55,6 @@ from quell.plants.nonlinear import (
     value_or_nan,
 )
 from quell.types import Matrix, Vector
-
-
-@generic
-def measure_all(plant: Any, x: Vector, y: Vector) -> None:
-    """Write the outputs for the state ``x`` (n,) into ``y`` (p,)."""
-    raise TypeError
-
 
 # ---- Linear plants ----
 
@@ -71,6 +66,9 @@ class MultivariableLinear(NamedTuple):
     input: Matrix  # Γ (n, m)
     disturbance: Matrix  # Γ_w (n, q)
     output: Matrix  # C (p, n)
+
+
+as_input.register(MultivariableLinear)(all_signals)
 
 
 @measure_all.register(MultivariableLinear)
@@ -240,6 +238,10 @@ class PythonMultivariable(NamedTuple):
     output: Callable[..., Any]
     step: float
     substeps: int
+
+
+as_input.register(CompiledMultivariable)(all_signals)
+as_input.register(PythonMultivariable)(all_signals)
 
 
 advance.register(CompiledMultivariable)(runge_kutta)
@@ -482,6 +484,9 @@ class EncodedOutputsModel(NamedTuple):
     resolution: Vector  # q (p,) [y-unit]; zero for an output without encoder
 
 
+as_input.register(EncodedOutputsModel)(all_signals)
+
+
 @measure_all.register(EncodedOutputsModel)
 def _measure_encoders(plant: EncodedOutputsModel, x: Vector, y: Vector) -> None:
     measure_all(plant.inner, x, y)
@@ -544,6 +549,9 @@ class DelayedInputsModel(NamedTuple):
     inner: Any
     size: Size  # number of states of the plant
     waiting: Any  # samples of each control signal (m,), integers
+
+
+as_input.register(DelayedInputsModel)(all_signals)
 
 
 @measure_all.register(DelayedInputsModel)

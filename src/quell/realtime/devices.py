@@ -45,9 +45,10 @@ from quell.plants.base import (
     check_run,
     is_destroyed,
     measure,
+    measure_all,
     signals_of,
 )
-from quell.plants.multivariable import is_several, measure_all
+from quell.plants.multivariable import is_several
 from quell.types import Matrix, Vector
 
 # ---- The interface between the loop and a device ----

@@ -50,8 +50,7 @@ from quell.controllers.base import check_controller, limits_of
 from quell.controllers.compensated import takes_control
 from quell.controllers.compensator import Compensator
 from quell.kernels.dispatch import is_finite, kernel
-from quell.plants.base import advance, measure
-from quell.plants.multivariable import measure_all
+from quell.plants.base import advance, all_signals, as_input, measure, measure_all
 from quell.realtime.axes_supervisor import AxesMemory
 from quell.realtime.channels import await_channels, checked_channels
 from quell.realtime.cycle import (
@@ -168,6 +167,9 @@ class AxesProxyDesign(NamedTuple):
     """Drives of several axes and the compensators in front of them."""
 
     one: ProxyDesign
+
+
+as_input.register(AxesProxyDesign)(all_signals)
 
 
 # ---- The host's side ----

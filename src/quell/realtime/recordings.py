@@ -62,7 +62,6 @@ from quell.realtime.mcap_reader import (
     read_mcap,
     whole_part,
 )
-from quell.records.axes import AxesTrajectory
 from quell.records.record import (
     check_steps,
     check_times,
@@ -656,7 +655,7 @@ def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Any:
     Returns
     -------
     Trajectory
-        of several axes an ``AxesTrajectory``.
+        the run.
 
     Raises
     ------
@@ -697,10 +696,11 @@ def load_one(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajec
 
 def check_one(run: Any, where: str) -> Trajectory:
     """Return a record of one y and one u; a ``ValueError`` says what to do with several axes."""
-    if isinstance(run, AxesTrajectory):
+    if run.several:
+        names = f" ({', '.join(run.axis_names)})" if run.axis_names else ""
         raise ValueError(
-            f"{where}: has several axes ({', '.join(run.axis_names)}): NOT possible here, it must "
-            "be of one y and one u; quell.realtime.load(path).axis(name) is one axis, and quell "
+            f"{where}: has several axes{names}: NOT possible here, it must "
+            "be of one y and one u; .axis(name) of the record is one axis, and quell "
             "replay and quell b0 --axes take several"
         )
     found: Trajectory = run
@@ -728,12 +728,10 @@ def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE
         "plant": header.device,
         "features": header.features,
         "signals": header.signals,
+        "axis_names": header.axis_names,
+        "axis_features": header.axis_features,
     }
-    if not header.axis_names:
-        return Trajectory(**common)
-    return AxesTrajectory(
-        **common, axis_names=header.axis_names, axis_features=header.axis_features
-    )
+    return Trajectory(**common)
 
 
 def _filled(channels: Channels, rows: Matrix, most: int) -> Matrix:

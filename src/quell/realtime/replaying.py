@@ -34,7 +34,6 @@ from quell.realtime.devices import SignalCounts, counts_text
 from quell.realtime.recordings import check_one, in_column
 from quell.realtime.safety import check_takes_reference, default_hold
 from quell.realtime.supervisor import Mode
-from quell.records.axes import AxesTrajectory
 from quell.records.record import signals_of_loop
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status, Vector
@@ -77,8 +76,7 @@ def replay(
     Returns
     -------
     Trajectory
-        ``r``, ``y``, ``y_measured``, ``u`` of the run; ``u_wished``; the controller's channels. Of
-        several axes an ``AxesTrajectory``.
+        ``r``, ``y``, ``y_measured``, ``u`` of the run; ``u_wished``; the controller's channels.
 
     Raises
     ------
@@ -92,7 +90,7 @@ def replay(
     axes = controller if isinstance(controller, Axes) else None
     check_controller(controller, several=axes is not None)
     check_takes_reference(controller)
-    if not isinstance(run, Trajectory | AxesTrajectory):
+    if not isinstance(run, Trajectory):
         raise ValueError(
             f"run = {run!r}: must be a Trajectory, for example quell.realtime.load('run.mcap')"
         )
@@ -164,12 +162,12 @@ def replay(
         return Trajectory(**(common | limits))
     features = tuple(axis.features for axis in axes.axes)
     named = {"axis_names": axes.names, "axis_features": features, "signals": run.signals}
-    return AxesTrajectory(**(common | named))
+    return Trajectory(**(common | named))
 
 
 def _check_axes_of(run: Any, axes: Axes | None) -> None:
     """Raise a ``ValueError`` unless a run has as many signals as the controller."""
-    if axes is None:
+    if axes is None and run.axis_names:
         check_one(run, "run")
     outputs, inputs = (1, 1) if axes is None else (axes.outputs, axes.inputs)
     found = {name: run[name].reshape(len(run), -1).shape[1] for name in _RECORDED}

@@ -59,12 +59,17 @@ from quell.files import GrowingFile, check_writable
 from quell.kernels.dispatch import (
     call_specialised,
     compiled,
-    generic,
     generic_with_default,
     kernel,
 )
-from quell.plants.base import Plant, advance, check_plant, is_destroyed, measure
-from quell.plants.multivariable import measure_all
+from quell.plants.base import (
+    Plant,
+    advance,
+    as_input,
+    check_plant,
+    is_destroyed,
+    measure_all,
+)
 from quell.realtime import wire
 from quell.realtime.devices import Listener, counts_of
 from quell.realtime.system import (
@@ -170,54 +175,6 @@ def fill_log(plant: Any, row: Vector) -> None:
     """Write what a plant adds to a row of the log: the columns that it has as ``log_columns``."""
 
 
-class OneSignal(NamedTuple):
-    """A plant with one y and one u."""
-
-    plant: Any
-
-
-class SeveralSignals(NamedTuple):
-    """A plant with several y and u."""
-
-    plant: Any
-
-
-@generic
-def measure_into(plant: Any, x: Vector, y: Vector) -> None:
-    """Write the outputs for the state ``x`` (n,) into ``y`` (p,)."""
-    raise TypeError
-
-
-@generic
-def advance_under(plant: Any, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector) -> None:
-    """Advance the state ``x`` (n,) by a sample with held u (m,)."""
-    raise TypeError
-
-
-@measure_into.register(OneSignal)
-def _measure_one(plant: OneSignal, x: Vector, y: Vector) -> None:
-    y[0] = measure(plant.plant, x)
-
-
-@measure_into.register(SeveralSignals)
-def _measure_several(plant: SeveralSignals, x: Vector, y: Vector) -> None:
-    measure_all(plant.plant, x, y)
-
-
-@advance_under.register(OneSignal)
-def _advance_one(
-    plant: OneSignal, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
-) -> None:
-    advance(plant.plant, x, scratch, t, u[0], w)
-
-
-@advance_under.register(SeveralSignals)
-def _advance_several(
-    plant: SeveralSignals, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
-) -> None:
-    advance(plant.plant, x, scratch, t, u, w)
-
-
 class RigModel(NamedTuple):
     """Parameters and state of the rig."""
 
@@ -257,9 +214,9 @@ def tick(rig: RigModel, time: int, fresh: bool) -> None:
     counts, signals = rig.counts, rig.signals
     fresh |= _receive_command(rig, time)
     _update_watchdog(rig, fresh)
-    tell_host(rig.plant.plant, counts, rig.endpoint.numbers[wire.SESSION])
-    measure_into(rig.plant, rig.x, rig.y)
-    measure_channels(rig.plant.plant, rig.x, rig.channels)
+    tell_host(rig.plant, counts, rig.endpoint.numbers[wire.SESSION])
+    measure_all(rig.plant, rig.x, rig.y)
+    measure_channels(rig.plant, rig.x, rig.channels)
     if counts[STATE] != IDLE and counts[ASKED] > 0:
         counts[ASKED] -= 1
         _send_channels(rig, time)
@@ -268,7 +225,7 @@ def tick(rig: RigModel, time: int, fresh: bool) -> None:
         if send(rig.transport, rig.outbox) != 0:
             rig.endpoint.counters[wire.NOT_SENT] += 1
     t, u = counts[SINCE_REST] * rig.dt, signals[APPLIED]
-    advance_under(rig.plant, rig.x, rig.scratch, t, u, rig.w)
+    advance(rig.plant, rig.x, rig.scratch, t, as_input(rig.plant, u), rig.w)
     if rig.logged:
         _log(rig)
     for k in range(signals.shape[1]):
@@ -440,7 +397,7 @@ def _log(rig: RigModel) -> None:
     for k in range(inputs):
         row[4 + outputs + k] = signals[APPLIED, k]
         row[4 + outputs + inputs + k] = signals[COMMANDED, k]
-    fill_log(rig.plant.plant, row[4 + outputs + 2 * inputs :])
+    fill_log(rig.plant, row[4 + outputs + 2 * inputs :])
     push(rig.log, row)
 
 
@@ -456,7 +413,7 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> bool:
     k = before = 0
     while True:
         over = (most >= 0 and k >= most) or load_acquire(rig.stop, 0) != 0
-        if over and (not paced or may_end(rig.plant.plant, load_acquire(rig.stop, 0))):
+        if over and (not paced or may_end(rig.plant, load_acquire(rig.stop, 0))):
             break
         time = begin
         if paced:
@@ -480,7 +437,7 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> bool:
             begin += waited
         tick(rig, time, fresh)
         k += 1
-        if has_ended(rig.plant.plant):
+        if has_ended(rig.plant):
             return True
     return False
 
@@ -601,7 +558,7 @@ class Rig:
         self.listener = listener
         self.dt, self.signal_counts = dt, several
         self.model = RigModel(
-            plant=OneSignal(model) if several is None else SeveralSignals(model),
+            plant=model,
             transport=listener.transport,
             endpoint=wire.endpoint(wire.COMMAND, 0, watchdog, inputs),
             inbox=wire.buffer(room),

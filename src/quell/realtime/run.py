@@ -70,7 +70,6 @@ from quell.realtime.system import (
     termination_handler,
 )
 from quell.realtime.telemetry import TelemetryWriter
-from quell.records.axes import AxesTrajectory
 from quell.records.record import signals_of_loop
 from quell.signals import Signal
 from quell.simulation.driver import Scenario
@@ -108,8 +107,7 @@ class Tally(NamedTuple):
 class RigRun:
     """The record of one run at a rig."""
 
-    #: the samples of the scenario; ``ended`` is zero if it did not begin; of several axes an
-    #: ``AxesTrajectory``
+    #: the samples of the scenario; ``ended`` is zero if it did not begin
     trajectory: Any
     record: Any  #: all cycles, also before the scenario (START) and after it (RAMP, STOPPED)
     timing: Timing  #: histograms of lateness and step time
@@ -153,7 +151,7 @@ class RigRun:
             raise ValueError(f"{error}; {why}") from None
         if self.completed or (stop is not None and stop <= run.ended):
             return found
-        if isinstance(run, AxesTrajectory):
+        if run.several:
             return {name: each.without_step(why) for name, each in found.items()}
         return found.without_step(why)
 

@@ -25,8 +25,7 @@ from quell.realtime.supervisor import AxesLimits, AxesRules, Rules
 from quell.records.record import in_steps
 from quell.signals import as_signal
 from quell.signals.shapes import check_derivative
-from quell.simulation.driver import Scenario
-from quell.simulation.several import references_in
+from quell.simulation.driver import Scenario, derivatives_in
 from quell.types import Matrix, Vector
 
 # ---- Default bounds of y, derived from the reference and from what the control signal can do ----
@@ -149,7 +148,8 @@ def axes_reference(scenario: Scenario, axes: Axes, approach: float) -> AxesRefer
 def axes_reference_columns(scenario: Scenario, axes: Axes) -> tuple[Matrix, Matrix]:
     """Return the references of several axes (samples, n), and their derivatives (samples, d)."""
     t = _sample_times(scenario, axes.dt)
-    signals, derivatives = references_in(scenario, axes)
+    signals, _, _ = scenario.seeded(axes.references, len(scenario.disturbances), axes.outputs)
+    derivatives = derivatives_in(signals, axes)
     columns = [
         np.column_stack([each(t) for each in part]) if part else np.zeros((t.size, 0))
         for part in (signals, derivatives)

@@ -181,4 +181,9 @@ def _record_fields(stored: Stored, axes: tuple[str, ...], besides: set[str]) -> 
         "plant": str(stored.attributes["plant"]),
         "features": tuple(map(str, stored.values.get("theta_index", ()))),
         "signals": _signals(stored.attributes.get("signals")),
+        "axis_names": tuple(map(str, json.loads(stored.attributes.get("axis_names", "[]")))),
+        "axis_features": tuple(
+            tuple(map(str, each))
+            for each in json.loads(stored.attributes.get("axis_features", "[]"))
+        ),
     }

@@ -197,7 +197,7 @@ def _draw_estimates(run: Any, ax: Axes) -> None:
 def plot_axes(run: Any, axes: Any = None) -> Any:
     """Draw output, error and estimates of each axis of a machine, and all control signals.
 
-    ``run`` is an ``AxesTrajectory``. Returns the matplotlib axes: a row of outputs, of errors, of
+    Returns the matplotlib axes: a row of outputs, of errors, of
     estimates, and one for the control signals.
     """
     if not run.axis_names:

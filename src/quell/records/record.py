@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.files import check_writable, written_atomically
-from quell.quantities import UNKNOWN, AxesSignals
+from quell.quantities import UNKNOWN, AxesSignals, Signals
 from quell.types import Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
@@ -219,6 +219,15 @@ class Record:
     every: int
     features: tuple[str, ...]
     signals: Any  # ``Signals``, of several axes ``AxesSignals`` if they are known
+    axis_names: tuple[str, ...]
+    axis_features: tuple[tuple[str, ...], ...]
+
+    @property
+    def several(self) -> bool:
+        """Whether it is a record of axes with names, or of more than one r, y or u."""
+        return bool(self.axis_names) or any(
+            width > 1 and name in ("r", "y", "y_measured", "u") for name, width in self.channels
+        )
 
     @property
     def t(self) -> Vector:
@@ -252,7 +261,53 @@ class Record:
 
     def labels(self, name: str, width: int) -> list[str]:
         """Return the names of the entries of a channel; none if they have numbers."""
-        return list(self.features) if name == "theta" else []
+        axis, _, channel = name.rpartition(".")
+        if name == "theta":
+            return list(self.features)
+        if channel == "theta" and axis in self.axis_names and self.axis_features:
+            return list(self.axis_features[self.axis_names.index(axis)])
+        if not self.axis_names:
+            return []
+        of_axes = AxesSignals(self.axis_names, (), ())
+        known = self.signals if isinstance(self.signals, AxesSignals) else of_axes
+        labels = known.labels(name, width)
+        return [] if labels == [str(i) for i in range(width)] else labels
+
+    def _fields_of(self, which: int | str) -> dict[str, Any]:
+        """Return what a record of one axis has: its u is v."""
+        if not self.axis_names:
+            raise ValueError(
+                "this record is of one loop, which has no axes: take columns of run['y'] and "
+                "run['u']"
+            )
+        if isinstance(which, str):
+            which = self.axis_names.index(checks.one_of("axis", which, self.axis_names))
+        i = checks.whole("axis", which, 0, len(self.axis_names) - 1)
+        for name in ("r", "y", "v"):
+            if name not in self.names:
+                raise ValueError(f"axis: channel {name!r} is not recorded; add it to record")
+        prefix = f"{self.axis_names[i]}."
+        own = [(name.removeprefix(prefix), width, name) for name, width in self.channels]
+        own = [each for each in own if each[2].startswith(prefix)]
+        apart = {"r", "y", "y_measured", "u", "u_wished", "v", "status", *(each[0] for each in own)}
+        whole = [(name, width, name) for name, width in self.channels if "." not in name]
+        whole = [each for each in whole if each[0] not in apart]
+        usual = (("r", "r"), ("y", "y"), ("y_measured", "y_measured"), ("u", "v"))
+        singles = [each for each in usual if each[1] in self.names]
+        columns = [columns_of(self.channels, source).start + i for _, source in singles]
+        for _, _, source in (*whole, *own):
+            columns += range(*columns_of(self.channels, source).indices(self.log.shape[-1]))
+        channels = [(name, 1) for name, _ in singles]
+        channels += [(name, width) for name, width, _ in (*whole, *own)]
+        known = isinstance(self.signals, AxesSignals)
+        return {
+            "log": np.ascontiguousarray(self.log[..., columns]),
+            "channels": tuple(channels),
+            "features": self.axis_features[i] if self.axis_features else (),
+            "signals": Signals(self.signals.y[i]) if known else UNKNOWN,
+            "axis_names": (),
+            "axis_features": (),
+        }
 
     def to_xarray(self) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
@@ -287,6 +342,9 @@ class Record:
                 unit = units[0] if len(set(units)) == 1 else ", ".join(units)
             variables[name] = (of_channel, values, {"long_name": about, "units": unit})
         attributes = {"dt": self.dt, "every": self.every, **attributes}
+        if self.several:
+            attributes["axis_names"] = json.dumps(self.axis_names)
+            attributes["axis_features"] = json.dumps(self.axis_features)
         if self.signals.known:
             attributes["signals"] = json.dumps(self.signals.texts())
         return RecordDataset(variables, coordinates, attrs=attributes)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
 from quell.files import MAX_SIZE
-from quell.quantities import UNKNOWN, Signals
+from quell.quantities import UNKNOWN
 from quell.records.metrics import MEASURES, SETTLING_BAND, BatchMetrics, Metrics, Window, measured
 from quell.records.netcdf import Stored, load_record
 from quell.records.record import Record
@@ -25,6 +25,15 @@ if TYPE_CHECKING:
 # Times the largest of 1 and the reference: a loop may well reach a limit below it, for example by
 # its overshoot. Chosen by hand.
 _NEAR = 10.0
+_NO_LIMITS = (-math.inf, math.inf)
+
+
+def check_no_target(target: float | None) -> None:
+    """Raise a ``ValueError`` for a target of several axes."""
+    if target is not None:
+        raise ValueError(
+            f"target = {target!r}: is of one axis; take run.axis(name).metrics(target=…)"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +47,10 @@ class Trajectory(Record):
     ``RAN_AWAY`` if y ran away from r instead (``quell.records.metrics.runs_away``); ``message``
     explains them. ``controller.read(run.final_state)`` explains the controller's state
     at the end.
+
+    Of several axes r, y, y_measured, u, v, w and x are (samples, width). v is what the axes were
+    given, ``B0 u``. The estimates of an axis are channels like ``run["shoulder.x_hat"]``.
+    ``run.axis("shoulder")`` is one axis as a record of its own.
     """
 
     log: Matrix  #: all channels side by side (samples, columns)
@@ -50,8 +63,11 @@ class Trajectory(Record):
     plant: str = ""  #: name of the plant
     features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_state: Any = None
-    signals: Signals = UNKNOWN  #: names and units of y, u and disturbances
-    u_limits: tuple[float, float] = (-math.inf, math.inf)  #: limits of the controller [u-unit]
+    #: names and units of y, u and disturbances; of several axes ``quell.quantities.AxesSignals``
+    signals: Any = UNKNOWN
+    u_limits: tuple[float, float] = _NO_LIMITS  #: limits of the controller [u-unit]
+    axis_names: tuple[str, ...] = ()  #: names of several axes
+    axis_features: tuple[tuple[str, ...], ...] = ()  #: names of each axis' features
 
     @property
     def diverged(self) -> bool:
@@ -60,7 +76,7 @@ class Trajectory(Record):
 
     @property
     def lost(self) -> bool:
-        """True if the run ended early, or y ran away from r."""
+        """True if the run ended early, or an output ran away from its reference."""
         return bool(self.status & LOST)
 
     @property
@@ -86,6 +102,26 @@ class Trajectory(Record):
         """Return the number of samples."""
         return int(self.log.shape[0])
 
+    def axis(self, which: int | str) -> Trajectory:
+        """Return one of several axes as a record of its own: its u is v_i [y-unit/s^n].
+
+        What is of the whole machine, as channels of its device, is in the record of each axis.
+
+        Parameters
+        ----------
+        which
+            name or number, from 0.
+
+        Raises
+        ------
+        ValueError
+            for a record without axes, an axis that it does not have, and missing channels.
+        """
+        own = self._fields_of(which)
+        name = which if isinstance(which, str) else self.axis_names[which]
+        plant = f"{self.plant}, {name}"
+        return replace(self, **own, plant=plant, final_state=None, u_limits=_NO_LIMITS)
+
     def metrics(
         self,
         start: float = 0.0,
@@ -93,8 +129,10 @@ class Trajectory(Record):
         *,
         target: float | None = None,
         band: float = SETTLING_BAND,
-    ) -> Metrics:
+    ) -> Any:
         """Return measures of the response in ``[start, stop)`` [s], as a step from its first y.
+
+        Of several axes they are a dictionary with those of each axis by its name.
 
         Parameters
         ----------
@@ -119,8 +157,14 @@ class Trajectory(Record):
         Raises
         ------
         ValueError
-            if the window has no sample, for instance because the run ended before it.
+            if the window has no sample, for instance because the run ended before it; for a
+            ``target`` of several axes.
         """
+        if self.several:
+            check_no_target(target)
+            return {
+                name: self.axis(name).metrics(start, stop, band=band) for name in self.axis_names
+            }
         return self.metrics_of(MEASURES, start, stop, target, band)
 
     def metrics_of(
@@ -176,15 +220,20 @@ class Trajectory(Record):
         ----------
         axes, ax
             matplotlib axes: three (output, control signal, estimates), four for a run with a guard,
-            and one more for the error; a new figure by default.
+            and one more for the error. Of several axes three for each and one more: rows of
+            outputs, errors and estimates of f, then all control signals; for a loop of several
+            signals without axes three: outputs, control signals, estimated disturbances. A new
+            figure by default.
 
         Returns
         -------
         numpy.ndarray
             the axes in this order; in a new figure the error is drawn below the output.
         """
-        from quell.records.plotting import given_axes, plot_run
+        from quell.records.plotting import given_axes, plot_axes, plot_run
 
+        if self.several:
+            return plot_axes(self, given_axes(axes, ax))
         return plot_run(self, self.ended if self.diverged else None, given_axes(axes, ax))
 
     def to_pandas(self) -> Any:
@@ -242,11 +291,6 @@ class Trajectory(Record):
         """
 
         def made(stored: Stored, fields: dict[str, Any]) -> Trajectory:
-            if "axis_names" in stored.attributes:
-                rule = (
-                    "NOT possible here, it must be of one y and one u; AxesTrajectory.load reads it"
-                )
-                raise ValueError(f"it has several signals: {rule}")
             return cls(
                 **fields,
                 status=Status(int(stored.attributes["status"])),
@@ -282,6 +326,9 @@ class BatchTrajectory(Record):
     ``status`` has all ``Status`` flags that any step of a run reported, ``DIVERGED`` if it ended
     early, and ``RAN_AWAY`` if y ran away from r; ``message`` is their summary.
     ``controller.read(runs.final_states[i])`` explains the state of a controller at the end.
+
+    Of several axes channels are (runs, samples, width), and ``runs.axis("elbow")`` is one axis of
+    all runs.
     """
 
     log: Matrix  #: the recorded channels side by side (runs, samples, columns)
@@ -297,8 +344,9 @@ class BatchTrajectory(Record):
     parameters: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_states: tuple[Any, ...] = ()
-    signals: Any = UNKNOWN  #: names and units of y, u and disturbances
-    stored_attributes: ClassVar[tuple[str, ...]] = ()  # attributes of its files, besides the usual
+    signals: Any = UNKNOWN  #: names and units, as those of a ``Trajectory``
+    axis_names: tuple[str, ...] = ()  #: names of several axes
+    axis_features: tuple[tuple[str, ...], ...] = ()  #: names of each axis' features
 
     @property
     def diverged(self) -> NDArray[np.bool_]:
@@ -339,23 +387,34 @@ class BatchTrajectory(Record):
 
     def run(self, i: int) -> Trajectory:
         """Return the i-th run, to its end, with the channels that were recorded."""
-        return Trajectory(**self._of_run(i), features=self.features)
-
-    def _of_run(self, i: int) -> dict[str, Any]:
-        """Return what a record of the i-th run has, without its features."""
         checks.whole("i", i, 0, len(self) - 1)
-        return {
-            "log": self.log[i, : self.lengths[i]],
-            "channels": self.channels,
-            "dt": self.dt,
-            "every": self.every,
-            "status": Status(int(self.status[i])),
-            "ended": float(self.ended[i]),
-            "limit": float(self.limit[i]),
-            "plant": self.plant,
-            "signals": self.signals,
-            "final_state": self.final_states[i] if self.final_states else None,
-        }
+        return Trajectory(
+            log=self.log[i, : self.lengths[i]],
+            channels=self.channels,
+            dt=self.dt,
+            every=self.every,
+            status=Status(int(self.status[i])),
+            ended=float(self.ended[i]),
+            limit=float(self.limit[i]),
+            plant=self.plant,
+            features=self.features,
+            final_state=self.final_states[i] if self.final_states else None,
+            signals=self.signals,
+            axis_names=self.axis_names,
+            axis_features=self.axis_features,
+        )
+
+    def axis(self, which: int | str) -> BatchTrajectory:
+        """Return one axis of all runs as a batch of its own: its u is v_i [y-unit/s^n].
+
+        Parameters
+        ----------
+        which
+            name or number, from 0. The channels r, y and v must be recorded.
+        """
+        own = self._fields_of(which)
+        name = which if isinstance(which, str) else self.axis_names[which]
+        return replace(self, **own, plant=f"{self.plant}, {name}", final_states=())
 
     def metrics(
         self,
@@ -364,8 +423,10 @@ class BatchTrajectory(Record):
         *,
         target: float | None = None,
         band: float = SETTLING_BAND,
-    ) -> BatchMetrics:
+    ) -> Any:
         """Return measures of each run in ``[start, stop)`` [s], as ``Trajectory.metrics`` does.
+
+        Of several axes they are a dictionary with those of each axis by its name.
 
         For a run that diverged within the window, its samples up to there count; see ``diverged``.
         All measures of a run that ended before the window are NaN, and so are those that are
@@ -390,6 +451,11 @@ class BatchTrajectory(Record):
         ValueError
             as ``Trajectory.metrics``, but for runs that ended before the window only if all did.
         """
+        if self.several:
+            check_no_target(target)
+            return {
+                name: self.axis(name).metrics(start, stop, band=band) for name in self.axis_names
+            }
         window = self.window(start, np.inf if stop is None else stop)
         reached = np.flatnonzero((self.lengths > window.start) | ~self.diverged).tolist()
         found: dict[str, Vector] = {}
@@ -412,10 +478,13 @@ class BatchTrajectory(Record):
         Parameters
         ----------
         axes, ax
-            two matplotlib axes; a new figure by default.
+            two matplotlib axes, of several axes two rows with one for each; a new figure by
+            default.
         """
-        from quell.records.plotting import given_axes, plot_batch
+        from quell.records.plotting import given_axes, plot_batch, plot_batch_of_axes
 
+        if self.several:
+            return plot_batch_of_axes(self, given_axes(axes, ax))
         return plot_batch(self, self.diverged, self.ended, given_axes(axes, ax))
 
     def to_xarray(self) -> xarray.Dataset:
@@ -424,7 +493,8 @@ class BatchTrajectory(Record):
         The plants' parameters are coordinates of ``run``; one that has a channel's name is the
         coordinate ``plant_<name>``.
         """
-        data = self._dataset(("run", "time"), self._attributes())
+        attributes = {"plant": self.plant, "message": self.message}
+        data = self._dataset(("run", "time"), attributes)
         taken = {*map(str, data.variables), *map(str, data.dims), *_PER_RUN}
         values_per_run = (self.lengths, self.status, self.ended, self.limit)
         coordinates: dict[str, Any] = {"run": ("run", np.arange(len(self)))}
@@ -434,15 +504,6 @@ class BatchTrajectory(Record):
             key = f"plant_{name}" if name in taken else name
             coordinates[key] = ("run", values, {"parameter": name})
         return data.assign_coords(coordinates)
-
-    def _attributes(self) -> dict[str, Any]:
-        """Return the attributes of its dataset."""
-        return {"plant": self.plant, "message": self.message}
-
-    @classmethod
-    def _read_attributes(cls, stored: Stored) -> dict[str, Any]:
-        """Return fields that are stored as attributes, besides those of every record."""
-        return {}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Self:
@@ -460,9 +521,6 @@ class BatchTrajectory(Record):
         """
 
         def made(stored: Stored, fields: dict[str, Any]) -> Any:
-            if "axis_names" in stored.attributes and not cls.stored_attributes:
-                rule = "NOT possible here, they must be of one y and one u; AxesBatch.load reads it"
-                raise ValueError(f"its runs have several signals: {rule}")
             runs, samples, _ = fields["log"].shape
             values = {name: stored.values[name] for name in (*_PER_RUN, *stored.parameters)}
             lengths = values["lengths"]
@@ -477,11 +535,10 @@ class BatchTrajectory(Record):
                 ended=values["ended"],
                 limit=values["limit"],
                 parameters={called: values[name] for name, called in stored.parameters.items()},
-                **cls._read_attributes(stored),
             )
 
         axes, variables = ("run", "time"), set(_PER_RUN)
-        attributes = {"dt", "every", "plant", *cls.stored_attributes}
-        writer = f"{cls.__name__}.save"
+        attributes = {"dt", "every", "plant"}
+        writer = "BatchTrajectory.save"
         found: Self = load_record(path, writer, axes, attributes, variables, max_size, made)
         return found

@@ -9,11 +9,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from quell.quantities import UNKNOWN, AxesSignals, Conversion, Quantity, Signals, in_one_unit
-from quell.records.axes import AxesTrajectory
 from quell.records.record import columns_of
 from quell.records.trajectory import Trajectory
 
-Run = TypeVar("Run", bound=Trajectory | AxesTrajectory)
+Run = TypeVar("Run", bound=Trajectory)
 
 
 def runs_in_common_units(
@@ -48,7 +47,7 @@ def runs_in_common_units(
         return {}, []
     of_y, of_u = zip(*(_quantities(run) for run in given.values()), strict=True)
     first = next(iter(given.values()))
-    axes = first.axis_names if isinstance(first, AxesTrajectory) else ("",)
+    axes = first.axis_names or ("",)
     known_y, known_u = _of_signals(like, len(axes), len(of_u[0]))
     notes: list[str] = []
 
@@ -104,7 +103,7 @@ def _converted(
     if not any(each.changes for each in (*of_y, *of_u)):
         return run
     log = run.log.copy()
-    several = isinstance(run, AxesTrajectory)
+    several = run.several
     prefixes = [f"{name}." for name in run.axis_names] if several else [""]
     names = {name for name, _ in run.channels}
     for name in ("r", "y", "y_measured"):

@@ -31,7 +31,7 @@ from quell.plants.multivariable import (
     check_several,
 )
 from quell.quantities import AxesSignals
-from quell.records.axes import AxesTrajectory
+from quell.records.trajectory import Trajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, is_of_axes, optional
 from quell.setup.loading import (
@@ -325,7 +325,7 @@ SCENARIO = call_table(
     without=("reference", "noise", "schedule"),
 )
 TUNE = call_table("tune", tuning_of_axes, only=True)
-METRICS = call_table("metrics", AxesTrajectory.metrics, only=True)
+METRICS = call_table("metrics", Trajectory.metrics, only=True, without=("target",))
 if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
     Observer, Learner = one_of(OBSERVERS), registry.Learner
@@ -519,11 +519,11 @@ def _scenario(builder: Builder, tables: AxesDescription, dt: float) -> Scenario 
 
 def _check_fit(plant: Any, controller: Axes, scenario: Scenario | None) -> None:
     """Check that plant, controller and scenario have the same signals."""
-    from quell.simulation.several import SampledAxes, check_fit
+    from quell.simulation.driver import SampledScenario, check_fit
 
     check_fit(plant, controller)
     if scenario is not None:
-        SampledAxes.of(scenario, plant, controller, None)
+        SampledScenario.of(scenario, plant, controller, None)
 
 
 def _explained(error: SetupError) -> SetupError:

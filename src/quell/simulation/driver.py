@@ -36,12 +36,12 @@ from numpy.typing import ArrayLike, NDArray
 from quell import checks
 from quell.controllers.base import (
     Controller,
-    control,
     reset_loop,
     set_reference_derivatives,
     status_flags,
     write_row,
 )
+from quell.controllers.several import control_all, outputs_of, references_of
 from quell.kernels.dispatch import (
     call_specialised,
     compiled,
@@ -52,13 +52,22 @@ from quell.kernels.dispatch import (
     kernel,
     specialised,
 )
-from quell.plants.base import Plant, advance, begin_run, check_run, measure
+from quell.plants.base import (
+    Plant,
+    advance,
+    as_input,
+    begin_run,
+    check_run,
+    inputs_of,
+    measure_all,
+)
+from quell.plants.base import outputs_of as outputs_of_plant
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel
 from quell.plants.multivariable import (
     CompiledMultivariable,
     EncodedOutputsModel,
     PythonMultivariable,
-    is_several,
+    named,
 )
 from quell.plants.nonlinear import (
     CompiledNonlinear,
@@ -138,26 +147,54 @@ class Scenario:
             raise ValueError(f"rest_at = {self.rest_at!r}: {rule}")
 
     def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
-        """Return the reference, ``inputs`` disturbances and the noise, seeded."""
-        if len(self.disturbances) > inputs:
-            have = checks.counted(len(self.disturbances), "signal")
+        """Return the reference, ``inputs`` disturbances and the noise of one axis, seeded."""
+        reference, disturbances, noise = self.seeded(1, inputs, 1)
+        return reference[0], disturbances, noise[0]
+
+    def seeded(
+        self, references: int, inputs: int, outputs: int, plant: Any = None
+    ) -> tuple[tuple[Signal, ...], tuple[Signal, ...], tuple[Signal, ...]]:
+        """Return references, disturbances and noise, as many as there are, seeded.
+
+        ``plant`` is the one whose disturbances they are, for errors.
+        """
+        given = tuple(map(as_signal, self.disturbances))
+        if len(given) > inputs:
+            have = checks.counted(len(given), "signal")
             most = checks.counted(inputs, "disturbance input")
-            raise ValueError(f"disturbances has {have}: the plant has {most}")
-        for name in ("reference", "noise"):
-            listed = getattr(self, name)
-            if checks.is_sequence(listed):
-                have = checks.counted(len(listed), "signal")
-                raise ValueError(
-                    f"{name} = {listed!s:.60}: is a list of {have}, "
-                    "and the loop has one output: must be one number or signal, without brackets; "
-                    "several axes are controlled by quell.Axes"
-                )
-        one: Any = self.reference, self.noise
-        given = (as_signal(one[0]), *map(as_signal, self.disturbances))
-        noise = as_signal(one[1]).seeded(self.seed)
-        # The noise has the seed itself: its bits must not depend on the number of disturbances.
-        reference, *disturbances = seeded_apart(given, self.seed)
-        return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
+            raise ValueError(f"disturbances has {have}: the plant has {most}{named(plant, 'w')}")
+        reference = _one_for_each("reference", self.reference, references)
+        noise = _one_for_each("noise", self.noise, outputs)
+        if outputs == 1:
+            # The noise has the seed itself: its bits must not depend on the number of disturbances.
+            noise = (noise[0].seeded(self.seed),)
+            every = tuple(seeded_apart((*reference, *given), self.seed))
+        else:
+            # Signals are seeded apart, so the noise of each output has numbers of its own.
+            every = tuple(seeded_apart((*reference, *given, *noise), self.seed))
+            noise = every[-outputs:]
+        disturbances = every[references : references + len(given)]
+        return (
+            every[:references],
+            disturbances + (Constant(0.0),) * (inputs - len(given)),
+            noise,
+        )
+
+
+def _one_for_each(name: str, given: Any, count: int) -> tuple[Signal, ...]:
+    """Return a signal for each axis or output, from one for all or one for each."""
+    if not checks.is_sequence(given):
+        return (as_signal(given, name),) * count
+    if len(given) != count:
+        have = checks.counted(len(given), "signal")
+        if count == 1:
+            raise ValueError(
+                f"{name} = {given!s:.60}: is a list of {have}, and the loop has one output: must "
+                "be one number or signal; several axes are controlled by quell.Axes"
+            )
+        what = "axes" if name == "reference" else "outputs"
+        raise ValueError(f"{name} has {have}: there are {count} {what}, give one each")
+    return tuple(as_signal(each, f"{name}[{i}]") for i, each in enumerate(given))
 
 
 def check_scenario(value: Any, name: str = "scenario") -> None:
@@ -200,23 +237,25 @@ _MOST_SAMPLES = 10**12
 
 
 class Segment(NamedTuple):
-    """The signals at some consecutive samples."""
+    """The signals at some consecutive samples: a column for each reference or output."""
 
     first: int
     dt: float
     from_rest: bool  # true if the loop starts from rest at the first of them
-    r: Vector
+    r: Matrix
     derivatives: Matrix
     w: Matrix
-    noise: Vector
+    noise: Matrix
 
 
 @dataclass(frozen=True, eq=False)
 class SampledScenario:
     """A scenario for a plant and a controller."""
 
-    signals: tuple[Signal, tuple[Signal, ...], Signal]
-    derivatives: tuple[Signal, ...]  # of the reference, as used, and signals of a schedule
+    reference: tuple[Signal, ...]
+    derivatives: tuple[Signal, ...]  # those that the first axis uses, …, and those of a schedule
+    disturbances: tuple[Signal, ...]
+    noise: tuple[Signal, ...]
     samples: int
     dt: float
     x0: Vector
@@ -229,39 +268,66 @@ class SampledScenario:
         cls, scenario: Scenario, plant: Plant, controller: Controller, limit: float | None
     ) -> SampledScenario:
         """Sample a scenario for a plant and a controller; ``limit`` as in ``simulate``."""
-        check_one_signal(plant)
+        check_fit(plant, controller)
         dt = controller.dt
         samples, x0 = samples_and_start(scenario, plant, dt)
-        signals = scenario.seeded_signals(plant.disturbances)
-        size = size_of(signals[0], x0, samples, dt)
-        limit = DIVERGED * size if limit is None else checks.positive("limit", limit)
-        rests = rest_samples(scenario, dt, samples)
-        derivative, derivatives = signals[0], []
-        for _ in range(getattr(controller, "derivatives", 0)):
-            check_derivative(derivative)
-            derivative = derivative.derivative()
-            derivatives.append(derivative)
+        reference, disturbances, noise = scenario.seeded(
+            references_of(controller), plant.disturbances, outputs_of(controller), plant
+        )
+        derivatives = derivatives_in(reference, controller)
         derivatives += _schedule_signals(scenario, controller)
-        usual = UNUSUAL * size
-        return cls(signals, tuple(derivatives), samples, dt, x0, limit, usual, rests)
+        size = max(size_of(signal, x0, samples, dt) for signal in reference)
+        return cls(
+            reference,
+            tuple(derivatives),
+            disturbances,
+            noise,
+            samples,
+            dt,
+            x0,
+            DIVERGED * size if limit is None else checks.positive("limit", limit),
+            UNUSUAL * size,
+            rest_samples(scenario, dt, samples),
+        )
 
     def segment(self, first: int, last: int) -> Segment:
         """Return the samples from ``first`` to before ``last``."""
-        reference, disturbances, noise = self.signals
-        t = np.arange(first, last, dtype=np.float64)
-        t *= self.dt
-        derivatives, w = columns_at(self.derivatives, t), columns_at(disturbances, t)
-        r, added = (np.ascontiguousarray(s(t), np.float64) for s in (reference, noise))
-        return Segment(first, self.dt, first in self.rest_samples, r, derivatives, w, added)
+        t = np.arange(first, last, dtype=np.float64) * self.dt
+        every = (self.reference, self.derivatives, self.disturbances, self.noise)
+        columns = [columns_at(signals, t) for signals in every]
+        return Segment(first, self.dt, first in self.rest_samples, *columns)
 
 
-def check_one_signal(plant: Any) -> None:
-    """Raise a ``ValueError`` for a plant with several inputs or outputs."""
-    if is_several(plant):
-        raise ValueError(
-            f"plant = {plant.name!r} has {plant.inputs} control signals and {plant.outputs} "
-            "outputs, the controller one of each: control it by quell.Axes"
-        )
+def derivatives_in(reference: Sequence[Signal], controller: Controller) -> list[Signal]:
+    """Return the derivatives of the references that a controller uses, axis by axis."""
+    given: Any = getattr(controller, "derivatives", 0)
+    counts = given if isinstance(given, tuple) else (given,)
+    found: list[Signal] = []
+    for derivative, count in zip(reference, counts, strict=False):
+        for _ in range(count):
+            check_derivative(derivative)
+            derivative = derivative.derivative()
+            found.append(derivative)
+    return found
+
+
+def check_fit(plant: Any, controller: Any) -> None:
+    """Raise a ``ValueError`` unless a plant has as many signals as a controller."""
+    own = int(getattr(controller, "inputs", 1)), outputs_of(controller)
+    of_plant = inputs_of(plant), outputs_of_plant(plant)
+    if own == of_plant:
+        return
+    u = checks.counted(of_plant[0], "control signal")
+    y = checks.counted(of_plant[1], "output")
+    remedy = (
+        "control it by quell.Axes"
+        if own == (1, 1)
+        else "must be a plant with as many, for example quell.plants.arm()"
+    )
+    raise ValueError(
+        f"plant = {getattr(plant, 'name', plant)!r} has {u}{named(plant, 'u')} and "
+        f"{y}{named(plant, 'y')}, the controller {own[0]} and {own[1]}: {remedy}"
+    )
 
 
 def samples_and_start(scenario: Scenario, plant: Any, dt: float) -> tuple[int, Vector]:
@@ -412,8 +478,8 @@ class Samples(NamedTuple):
     """Samples of a run, from which the plant is integrated over one sample."""
 
     t: Vector  # [s] (k,)
-    u: Any  # (k,), or (k, m) for a plant with several inputs
-    w: Matrix  # (k, m)
+    u: Matrix  # (k, m)
+    w: Matrix  # (k, q)
     x: Matrix  # (k, n)
 
 
@@ -422,7 +488,7 @@ def step_differences(
     coarse: Any,
     fine: Any,
     t: Vector,
-    u: Any,
+    u: Matrix,
     w: Matrix,
     x: Matrix,
     scratch: Vector,
@@ -434,8 +500,9 @@ def step_differences(
         for j in range(x.shape[1]):
             after[k, j] = x[k, j]
             difference[k, j] = x[k, j]
-        advance(coarse, difference[k], scratch, t[k], u[k], w[k])
-        advance(fine, after[k], scratch, t[k], u[k], w[k])
+        acting = as_input(coarse, u[k])
+        advance(coarse, difference[k], scratch, t[k], acting, w[k])
+        advance(fine, after[k], scratch, t[k], acting, w[k])
         for j in range(x.shape[1]):
             difference[k, j] -= after[k, j]
 
@@ -482,7 +549,7 @@ class IntegrationCheck:
             self.add(Samples(*(part[finite] for part in samples)), all_of_them)
             return
         if self._delay:  # the state ends with the values of u on their way, the oldest last
-            u, x = x[:, -1], x[:, : self._size]
+            u, x = x[:, -1:], x[:, : self._size]
         scale = np.max(np.abs(x), axis=0)
         chosen = slice(None) if all_of_them else chosen_samples(x, scale)
         picked = Samples(*(np.ascontiguousarray(part[chosen]) for part in (t, u, w, x)))
@@ -535,7 +602,23 @@ def with_substeps(model: Any, substeps: int) -> Any:
 
 # ---- The inner loop ----
 
-SIGNALS = ("r", "y", "y_measured", "u")  # the first columns of a log
+SIGNALS = ("r", "y", "y_measured", "u")  # the first channels of a log
+
+
+class Sample(NamedTuple):
+    """The signals of one sample; as fields their sizes are constants in compiled code."""
+
+    r: Vector  # references (n,)
+    y: Vector  # outputs (p,)
+    measured: Vector  # the same with noise (p,)
+    u: Vector  # control signals (m,)
+
+
+def sample_of(plant: Any, controller: Any) -> Sample:
+    """Return room for the signals of a sample of a loop."""
+    outputs = outputs_of_plant(plant)
+    widths = (references_of(controller), outputs, outputs, inputs_of(plant))
+    return Sample(*map(np.zeros, widths))
 
 
 @compiled_loop("plant", "design", "r", "derivatives", "w", "noise")
@@ -545,51 +628,63 @@ def run_block(
     scratch: Vector,
     design: Any,
     state: Any,
+    sample: Sample,
     t0: float,
     dt: float,
-    r: Vector,
+    r: Matrix,
     derivatives: Matrix,
     w: Matrix,
-    noise: Vector,
+    noise: Matrix,
     log: Matrix,
     row: int,
     every: int,
     until_next: int,
     limit: float,
 ) -> tuple[int, int, int, int]:
-    """Run ``r.size`` samples from the time ``t0``; log every ``every``-th from ``row`` on.
+    """Run ``r.shape[0]`` samples from the time ``t0``; log every ``every``-th from ``row`` on.
 
-    A log with as many columns as ``SIGNALS`` gets only these. Returns the number of samples that
-    were run (fewer if the loop diverged: ``|y|`` beyond ``limit``, or not finite), the next row,
-    the number of samples until it is written, and all status flags.
+    ``sample`` is work space. A log with as many columns as ``SIGNALS`` have gets only these.
+    Returns the number of samples that were run (fewer if the loop diverged: ``|y|`` beyond
+    ``limit``, or not finite), the next row, the number of samples until it is written, and all
+    status flags.
     """
-    inputs = w.shape[1]
+    y, u = sample.y, sample.u
+    references, outputs, inputs = sample.r.size, y.size, w.shape[1]
+    first_u = references + 2 * outputs
+    first_w = first_u + u.size
+    first_x = first_w + inputs
     status = 0
-    for k in range(r.size):
-        y = measure(plant, x)
-        measured = y + noise[k]
-        if not abs(y) <= limit:
-            return k, row, until_next, status
+    for k in range(r.shape[0]):
+        measure_all(plant, x, y)
+        for i in range(outputs):
+            if not abs(y[i]) <= limit:
+                return k, row, until_next, status
+            sample.measured[i] = y[i] + noise[k, i]
+        for i in range(references):
+            sample.r[i] = r[k, i]
         if derivatives.shape[1] > 0:
             set_reference_derivatives(design, state, derivatives[k])
-        u = control(design, state, r[k], measured)
+        control_all(design, state, sample.r, sample.measured, u)
         status |= status_flags(design, state)
         if until_next == 0:
-            log[row, 0] = r[k]
-            log[row, 1] = y
-            log[row, 2] = measured
-            log[row, 3] = u
-            if log.shape[1] > len(SIGNALS):
+            for i in range(references):
+                log[row, i] = sample.r[i]
+            for i in range(outputs):
+                log[row, references + i] = y[i]
+                log[row, references + outputs + i] = sample.measured[i]
+            for i in range(u.size):
+                log[row, first_u + i] = u[i]
+            if log.shape[1] > first_w:
                 for j in range(inputs):
-                    log[row, 4 + j] = w[k, j]
+                    log[row, first_w + j] = w[k, j]
                 for j in range(x.size):
-                    log[row, 4 + inputs + j] = x[j]
-                write_row(design, state, log[row, 4 + inputs + x.size :])
+                    log[row, first_x + j] = x[j]
+                write_row(design, state, log[row, first_x + x.size :])
             row += 1
             until_next = every
         until_next -= 1
-        advance(plant, x, scratch, t0 + k * dt, u, w[k])
-    return r.size, row, until_next, status
+        advance(plant, x, scratch, t0 + k * dt, as_input(plant, u), w[k])
+    return r.shape[0], row, until_next, status
 
 
 run_samples = kernel(interpreted(run_block))
@@ -619,6 +714,7 @@ class Loop:
         self.state = controller.initial_state()
         self.x0, self.limit = scenario.x0, scenario.limit
         self.x, self.scratch = scenario.x0.copy(), np.zeros(6 * plant.order)
+        self._sample = sample_of(plant, controller)
         begin_run(model, self.x, self.scratch)
         self.done = self.status = self.until_next = 0
         as_python = interpret or not plant.compiled
@@ -703,8 +799,9 @@ class Loop:
     def _arguments(self, segment: Segment, log: Matrix, row: int, every: int) -> tuple[Any, ...]:
         """Return the arguments of ``run_block``."""
         first, dt, _, *signals = segment
-        loop = (self.model, self.x, self.scratch, self.design, self.state, first * dt, dt)
-        return (*loop, *signals, log, row, every, self.until_next, self.limit)
+        loop = (self.model, self.x, self.scratch, self.design, self.state, self._sample)
+        times = first * dt, dt
+        return (*loop, *times, *signals, log, row, every, self.until_next, self.limit)
 
     def _check_integration(self, log: Matrix, first: int, every: int, dt: float) -> None:
         """Check the plant's integration at rows of the log, ``every`` samples apart.
@@ -724,25 +821,36 @@ class Loop:
     @property
     def first_state(self) -> int:
         """The first column of a log that has the plant's state."""
-        return len(SIGNALS) + int(self.plant.disturbances)
+        return width_of_signals(self.plant, self.controller) + int(self.plant.disturbances)
 
-    def controls(self, log: Matrix) -> Any:
-        """Return the control signals of rows of a log."""
-        return log[:, 3]
+    def controls(self, log: Matrix) -> Matrix:
+        """Return the control signals of rows of a log (rows, m)."""
+        last = width_of_signals(self.plant, self.controller)
+        return log[:, last - inputs_of(self.plant) : last]
 
     def is_usual(self, row: Vector) -> bool:
-        """Return whether y of a row of a log is in its usual range."""
-        return bool(abs(row[1]) <= self.scenario.range)
+        """Return whether all outputs of a row of a log are in their usual range."""
+        first = references_of(self.controller)
+        y = row[first : first + outputs_of_plant(self.plant)]
+        return bool(np.all(np.abs(y) <= self.scenario.range))
 
     def measured(self) -> Vector:
-        """Return the outputs now."""
-        return np.array([measure(self.model, self.x)])
+        """Return the outputs now (p,)."""
+        y = np.zeros(outputs_of_plant(self.plant))
+        measure_all(self.model, self.x, y)
+        return y
 
 
-def logged_channels(plant: Plant, controller: Controller) -> Channels:
+def width_of_signals(plant: Any, controller: Any) -> int:
+    """Return the number of columns of ``SIGNALS`` in a log."""
+    return sum(part.size for part in sample_of(plant, controller))
+
+
+def logged_channels(plant: Any, controller: Any) -> Channels:
     """Return name and width of the columns that ``run_block`` logs, in order."""
-    scalars = tuple((name, 1) for name in SIGNALS)
-    return (*scalars, ("w", plant.disturbances), ("x", plant.order), *controller.channels)
+    widths = (part.size for part in sample_of(plant, controller))
+    signals = tuple(zip(SIGNALS, widths, strict=True))
+    return (*signals, ("w", plant.disturbances), ("x", plant.order), *controller.channels)
 
 
 # ---- Verdict on finished runs ----

@@ -34,30 +34,22 @@ from quell.lti.models import is_linear_model
 from quell.parallel import in_parallel, one_blas_thread, part_of
 from quell.plants.base import Plant, PlantBatch, check_plant, signals_of
 from quell.plants.linear import LinearPlant
-from quell.records.axes import AxesBatch, AxesTrajectory
 from quell.records.record import columns_of, readable_names, signals_of_loop
 from quell.records.trajectory import BatchTrajectory, Trajectory
 from quell.simulation.driver import (
-    SIGNALS,
     Loop,
     SampledScenario,
     Scenario,
     Segment,
+    check_fit,
     check_scenario,
     judge_integration,
     judged,
     logged_channels,
     segment_bounds,
     warn_of_lost,
+    width_of_signals,
 )
-from quell.simulation.several import (
-    LoopOfAxes,
-    SampledAxes,
-    check_fit,
-    names_of_axes,
-    simulate_axes,
-)
-from quell.simulation.several import logged_channels as channels_of_axes
 from quell.types import Channels, Status
 
 # ---- Many runs at once, on all cores ----
@@ -88,7 +80,7 @@ def simulate_batch(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-) -> BatchTrajectory | AxesBatch:
+) -> BatchTrajectory:
     """Run every plant, controller and scenario of a batch; see ``quell.simulate``."""
     plants, controllers, scenarios = _members(plant, controller, scenario)
     every = checks.whole("record_every", record_every, 1)
@@ -97,7 +89,7 @@ def simulate_batch(
     sampled = _sampled(scenarios, plants[0], controllers, limit)
     dt, samples, runs = sampled[0].dt, sampled[0].samples, len(sampled)
     several = is_of_several(controllers[0])
-    logged = (channels_of_axes if several else logged_channels)(plants[0], controllers[0])
+    logged = logged_channels(plants[0], controllers[0])
     width = sum(width for _, width in logged)
     usual = [name for name, _ in logged if name in _RECORDED_OF_AXES] if several else _RECORDED
     channels = _selected(usual if record is None else record, logged)
@@ -108,19 +100,15 @@ def simulate_batch(
     outcome = Outcome(log, *(np.zeros(runs, dtype=np.int64) for _ in range(3)))
     loops: list[Loop] = []
     first: dict[Any, Loop] = {}
-    make = LoopOfAxes if several else Loop
     for i, model in enumerate(_models(plants, dt, interpret)):
         compiled = not interpret and plants[i].compiled
         structure = (id(controllers[i]), layout_of(model)) if compiled else i
         like = first.get(structure)
-        loops.append(make(plants[i], model, controllers[i], sampled[i], interpret, like))
+        loops.append(Loop(plants[i], model, controllers[i], sampled[i], interpret, like))
         first.setdefault(structure, loops[i])
-    if (
-        not several
-        and max(columns) < len(SIGNALS)
-        and not any(loop.integration.needed for loop in loops)
-    ):
-        width = len(SIGNALS)  # states and estimates are not used
+    narrow = width_of_signals(plants[0], controllers[0])
+    if max(columns) < narrow and not any(loop.integration.needed for loop in loops):
+        width = narrow  # states and estimates are not used
     _run_loops(loops, columns, width, every, outcome, progress, workers)
     for i in np.flatnonzero(outcome.lengths < log.shape[2]).tolist():
         log[:, i, outcome.lengths[i] :] = np.nan
@@ -141,10 +129,16 @@ def simulate_batch(
         "parameters": plants.parameters if isinstance(plants, PlantBatch) else {},
         "final_states": tuple(loop.state for loop in loops),
     }
-    if several:
-        return AxesBatch(**found, **names_of_axes(controllers[0]))
-    signals = signals_of_loop(signals_of(plants[0]), controllers[0])
-    return BatchTrajectory(**found, features=controllers[0].features, signals=signals)
+    return BatchTrajectory(**found, **_names_of(plants[0], controllers[0]))
+
+
+def _names_of(plant: Any, controller: Any) -> dict[str, Any]:
+    """Return the names of signals, axes and features for a record."""
+    if not is_of_several(controller):
+        signals = signals_of_loop(signals_of(plant), controller)
+        return {"features": controller.features, "signals": signals}
+    features = tuple(axis.features for axis in controller.axes)
+    return {"axis_names": controller.names, "axis_features": features}
 
 
 def is_of_several(controller: Any) -> bool:
@@ -236,9 +230,8 @@ def _members(
                     f"controller[{i}] has {what} = {value!r}, controller[0] {first!r}: "
                     "must be the same; run them as two batches"
                 )
-    if is_of_several(controllers[0]):
-        for parts in zip(plants, controllers, strict=True):
-            check_fit(*parts)
+    for parts in zip(plants, controllers, strict=True):
+        check_fit(*parts)
     return plants, controllers, scenarios
 
 
@@ -246,14 +239,13 @@ def _sampled(
     scenarios: Sequence[Scenario], plant: Plant, controllers: Sequence[Controller], limit: Any
 ) -> list[Any]:
     """Return the sampled scenario of each run; runs of one scenario share theirs."""
-    kind: Any = SampledAxes if is_of_several(controllers[0]) else SampledScenario
     found: dict[tuple[int, Any], Any] = {}
     sampled: list[Any] = []
     for i, (scenario, controller) in enumerate(zip(scenarios, controllers, strict=True)):
         key = id(scenario), getattr(controller, "derivatives", 0)
         if key not in found:
             try:
-                found[key] = kind.of(scenario, plant, controller, limit)
+                found[key] = SampledScenario.of(scenario, plant, controller, limit)
             except ValueError as error:
                 where = "" if all(each is scenario for each in scenarios) else f"scenario[{i}]: "
                 raise ValueError(f"{where}{error}") from None
@@ -294,7 +286,7 @@ def _selected(record: Sequence[str], logged: Channels) -> Channels:
 @overload
 def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
     plant: Plant | tuple[ArrayLike, ...],
-    controller: Controller,
+    controller: Controller | Axes | StateFeedback | SeveralInSingle,
     scenario: Scenario,
     *,
     record_every: int = 1,
@@ -305,20 +297,8 @@ def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
 ) -> Trajectory: ...
 @overload
 def simulate(
-    plant: Any,
-    controller: Axes | StateFeedback | SeveralInSingle,
-    scenario: Scenario,
-    *,
-    record_every: int = 1,
-    limit: float | None = None,
-    interpret: bool = False,
-    precision: str = "double",
-    progress: Callable[[float], None] | None = None,
-) -> AxesTrajectory: ...
-@overload
-def simulate(
     plant: Plant | Sequence[Plant],
-    controller: Controller | Sequence[Controller],
+    controller: Controller | Axes | StateFeedback | Sequence[Any],
     scenario: Scenario | Sequence[Scenario],
     *,
     record_every: int = 1,
@@ -329,20 +309,6 @@ def simulate(
     record: Sequence[str] | None = None,
     workers: int | None = None,
 ) -> BatchTrajectory: ...
-@overload
-def simulate(
-    plant: Any,
-    controller: Axes | StateFeedback | SeveralInSingle | Sequence[Axes] | Sequence[StateFeedback],
-    scenario: Scenario | Sequence[Scenario],
-    *,
-    record_every: int = 1,
-    limit: float | None = None,
-    interpret: bool = False,
-    precision: str = "double",
-    progress: Callable[[float], None] | None = None,
-    record: Sequence[str] | None = None,
-    workers: int | None = None,
-) -> AxesBatch: ...
 def simulate(
     plant: Any,
     controller: Any,
@@ -355,7 +321,7 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
-) -> Trajectory | BatchTrajectory | AxesTrajectory | AxesBatch:
+) -> Trajectory | BatchTrajectory:
     """Run a controller on a plant through a scenario, or a batch of them on all cores.
 
     The controller starts with nothing learned, from a new state: neither it nor the plant is
@@ -395,8 +361,8 @@ def simulate(
 
     Returns
     -------
-    Trajectory, BatchTrajectory, AxesTrajectory or AxesBatch
-        the recorded samples, up to the end of the run; the latter two for several signals.
+    Trajectory or BatchTrajectory
+        the recorded samples, up to the end of the run.
 
     Raises
     ------
@@ -432,13 +398,7 @@ def simulate(
             rule = "is for a batch; a single run records all channels, in this thread"
             raise ValueError(f"{name} = {value!r}: {rule}")
     check_plant(plant)
-    if is_of_several(controller):
-        check_scenario(scenario)
-        more = (record_every, limit, interpret, progress)
-        several = simulate_axes(plant, controller, scenario, *more)
-        warn_of_lost(several)
-        return several
-    check_controller(controller)
+    check_controller(controller, several=True)
     check_scenario(scenario)
     every = checks.whole("record_every", record_every, 1)
     sampled = SampledScenario.of(scenario, plant, controller, limit)
@@ -455,10 +415,9 @@ def simulate(
         ended=loop.ended * dt,
         limit=sampled.limit,
         plant=plant.name,
-        features=controller.features,
-        signals=signals_of_loop(signals_of(plant), controller),
-        u_limits=limits_of(controller),
+        u_limits=(-np.inf, np.inf) if is_of_several(controller) else limits_of(controller),
         final_state=loop.state,
+        **_names_of(plant, controller),
     )
     warn_of_lost(run)
     return run

@@ -21,7 +21,6 @@ from quell.kernels.cache import compile_time
 from quell.plants.base import PlantWrapper
 from quell.plants.linearise import held_at, linear_model, linear_part
 from quell.plants.multivariable import MultivariableNonlinearPlant
-from quell.records.axes import AxesTrajectory
 from quell.records.metrics import worsened
 from quell.records.record import describe
 from quell.records.trajectory import Trajectory
@@ -147,7 +146,7 @@ def run_frames(
     with caught_warnings() as caught:
         whole = simulate(plant, setup.controller, scenario, progress=watched(stale))
     run, actuators = whole, {}
-    if isinstance(whole, AxesTrajectory):
+    if whole.axis_names:
         run = whole.axis(checks.whole("axis", axis, 0, len(whole.axis_names) - 1))
         actuators = {f"u_{k + 1}": u for k, u in enumerate(whole["u"].T)}
     header: dict[str, Any] = {

@@ -9,7 +9,6 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from quell import checks
-from quell.records.axes import AxesTrajectory
 from quell.records.metrics import MEASURES, SETTLING_BAND
 from quell.records.trajectory import Trajectory
 from quell.types import Vector
@@ -130,7 +129,7 @@ def describe_measures(measures: Measures) -> dict[str, Any]:
 
 
 def measure_runs(
-    runs: Sequence[Trajectory | AxesTrajectory], measures: Measures
+    runs: Sequence[Trajectory], measures: Measures
 ) -> tuple[dict[str, Vector], list[str]]:
     """Return each measure (runs,), NaN where there is none, and the error of each run, if any."""
     values = {name: np.full(len(runs), np.nan) for name in measures}
@@ -144,7 +143,7 @@ def measure_runs(
     return values, errors
 
 
-def measure_run(run: Trajectory | AxesTrajectory, measures: Measures) -> dict[str, float]:
+def measure_run(run: Trajectory, measures: Measures) -> dict[str, float]:
     """Return each measure of a run, NaN where there is none."""
     windows: dict[tuple[Any, ...], dict[str, str]] = {}
     for name, each in measures.items():
@@ -162,11 +161,10 @@ def measure_run(run: Trajectory | AxesTrajectory, measures: Measures) -> dict[st
     return values | {name: float(function(run)) for name, function in own.items()}
 
 
-def _one_axis(run: Trajectory | AxesTrajectory, axis: str, wanted: Mapping[str, str]) -> Trajectory:
+def _one_axis(run: Trajectory, axis: str, wanted: Mapping[str, str]) -> Trajectory:
     """Return the record that measures of an axis are taken of."""
-    axes = None if isinstance(run, Trajectory) else run.axis_names
-    check_axis(axis, next(iter(wanted.values())), axes)
-    return run if isinstance(run, Trajectory) else run.axis(axis)
+    check_axis(axis, next(iter(wanted.values())), run.axis_names if run.several else None)
+    return run.axis(axis) if run.several else run
 
 
 def check_axis(axis: str, name: str, axes: Sequence[str] | None) -> None:
