@@ -432,8 +432,7 @@ def gain_of_attitude(x, level):  # type: ignore[no-untyped-def]
 
 def single_loops(craft: Any, B0: Any, r: Any, scenario: Any, hover: float, most: float) -> Any:
     """Return the angles under three ADRCs, each with the torque's limit of its own axis."""
-    from quell.plants.base import advance
-    from quell.plants.multivariable import measure_all
+    from quell.plants.base import advance, measure_all
 
     mixer = np.linalg.pinv(B0)
     reach = [(most - hover) * np.sum(np.abs(row)) for row in B0]
@@ -532,7 +531,7 @@ def part_cost(draws: int, seed: int, share: float = 1.0) -> dict[str, Any]:
     print(f"step, three axes, RLS of 28 features: one for each {1e6 * a:.2f} us, "
           f"one for all {1e6 * b:.2f} us, ratio {b / a:.2f}")  # fmt: skip
     figures["step, RLS of 28 features, one for all over one for each"] = b / a
-    masses = ql.plants.MultivariableLinearPlant(
+    masses = ql.plants.LinearPlant(
         np.kron(np.eye(3), [[0, 1], [0, -1]]), np.kron(np.eye(3), [[0], [1]]),
         np.kron(np.eye(3), [[1, 0]]),
     )  # fmt: skip

@@ -39,7 +39,7 @@ def gantry(gain: float, friction: float) -> Any:
     """Return a machine whose drives act on both axes."""
     A = [[0, 1, 0, 0], [0, -friction, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]]
     B = [[0, 0], [gain, 0.5], [0, 0], [0.4, 6]]
-    return ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    return ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
 
 
 def gantries(runs: int) -> tuple[Any, ...]:

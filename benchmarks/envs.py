@@ -46,7 +46,7 @@ def two_axes(lanes: int, repeat: int) -> Any:
     """Return loops of a gantry whose drives act on both axes, each with an ADRC and a policy."""
     A = [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]]
     B = [[0, 0], [5, 0.5], [0, 0], [0.4, 6]]
-    plant = ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    plant = ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
     observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3)
     one = ql.ADRC(observer, omega_c=8.0, learner=quell.envs.Policy(), guard=ql.Guard())
     limits = {"u_min": -25.0, "u_max": 25.0}

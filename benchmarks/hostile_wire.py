@@ -48,7 +48,7 @@ from quell.realtime.rig import APPLIED, Rig
 DT, LIMIT, WATCHDOG = 0.01, 5.0, 50
 ONE = ql.plants.two_mass_spring()
 # Three masses with a spring between neighbours: as many measurements and control signals.
-SEVERAL = ql.plants.MultivariableLinearPlant(
+SEVERAL = ql.plants.LinearPlant(
     np.block([[np.zeros((3, 3)), np.eye(3)], [-np.diag([2.0, 3.0, 1.0]) + 0.5, -0.4 * np.eye(3)]]),
     np.vstack([np.zeros((3, 3)), np.eye(3) + 0.2]),
     np.hstack([np.eye(3), np.zeros((3, 3))]),

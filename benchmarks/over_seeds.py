@@ -23,7 +23,7 @@ def gantry():
     """Return a gantry whose drives act on both axes."""
     A = [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]]
     B = [[0, 0], [5, 0.5], [0, 0], [0.4, 6]]
-    return ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    return ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
 
 
 def axes(omega_c):

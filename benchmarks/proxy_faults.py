@@ -82,7 +82,7 @@ def plant_of(axes: int) -> Any:
         return ql.plants.LinearPlant.of(([GAIN], [1.0, 1.0, 0.0]))
     parts = [[[0.0, 1.0], [0.0, -1.0]], [[0.0], [GAIN]], [[1.0, 0.0]]]
     blocks = (np.kron(np.eye(axes), np.array(part)).tolist() for part in parts)
-    return ql.plants.MultivariableLinearPlant(*blocks)
+    return ql.plants.LinearPlant(*blocks)
 
 
 def in_child(work: Callable[[], int]) -> int:

@@ -55,7 +55,7 @@ def machine(gain: Any, damping: Any = 0.5) -> Any:
     n, m = gain.shape
     A, B, C = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m)), np.zeros((n, 2 * n))
     A[:n, n:], A[n:, n:], B[n:], C[:, :n] = np.eye(n), -damping * np.eye(n), gain, np.eye(n)
-    return ql.plants.MultivariableLinearPlant(A, B, C)
+    return ql.plants.LinearPlant(A, B, C)
 
 
 def loops() -> dict[str, tuple[Any, Any, Any]]:
@@ -76,7 +76,7 @@ def served(name: str) -> Iterator[str]:
     gain = GAIN if size == 3 else np.array([[2.0]])
     plant: Any = machine(gain)
     table = f"A = {plant.A.tolist()}, B = {plant.B.tolist()}, C = {plant.C.tolist()}"
-    text = f'kind = "multivariable-linear", {table}'
+    text = f'kind = "linear", {table}'
     if size == 1:
         text = 'kind = "linear", num = [2.0], den = [1.0, 0.5, 0.0]'
     with TemporaryDirectory() as folder:
@@ -136,7 +136,7 @@ def first_motion(seed: int) -> tuple[bool, bool, bool]:
         C = plant.C.copy()
         if turned is not None:
             C[turned] *= -1.0
-        plant = ql.plants.MultivariableLinearPlant(plant.A, plant.B, C)
+        plant = ql.plants.LinearPlant(plant.A, plant.B, C)
         parts = [
             ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=36.0, dt=dt), 6.0) for _ in range(n)
         ]

@@ -52,7 +52,7 @@ def simulated(controller: ql.Axes, samples: int) -> Any:
     A[:3, 3:] = np.eye(3)
     A[3:] = [[-4, 1, 0, -0.5, 0, 0], [1, -9, 1, 0, -1.0, 0.2], [0, 1, -2, 0, 0.2, -0.3]]
     B[3:] = 1.2 * B0
-    plant = ql.plants.MultivariableLinearPlant(A, B, np.eye(6)[:3])
+    plant = ql.plants.LinearPlant(A, B, np.eye(6)[:3])
     references = tuple(ql.signals.Sinusoid(0.5, omega) for omega in (2.0, 3.0, 5.0))
     noise = ql.signals.BandLimitedNoise(power=1e-12, sample_time=1e-3)
     duration = (samples - 1) * controller.dt

@@ -62,7 +62,7 @@ def drawn(seed: int, axes: int | None = None, kind: str | None = None) -> Machin
     A = np.block([[np.zeros((n, n)), np.eye(n)], [-B0 @ spring, -B0 @ friction]])
     B = np.vstack([np.zeros((n, n)), B0])
     C = np.hstack([np.eye(n), np.zeros((n, n))])
-    linear = ql.plants.MultivariableLinearPlant(A, B, C)
+    linear = ql.plants.LinearPlant(A, B, C)
     plant = ql.plants.delayed_inputs(linear, int(rng.integers(1, 5)) * dt, dt)
     own = np.diag(np.diag(M)) if kind == "independent" else M
     return Machine(plant, own, dt, n, kind, 0.03 if kind == "off" else 0.0)
@@ -108,9 +108,7 @@ def judge(seeds: range) -> dict[str, Any]:
                 n = machine.axes
                 B0 = plain.B[n:]
                 off = B0 * (1.0 + rng.uniform(-machine.off, machine.off, B0.shape))
-                moved = ql.plants.MultivariableLinearPlant(
-                    plain.A, np.vstack([np.zeros((n, n)), off]), plain.C
-                )
+                moved = ql.plants.LinearPlant(plain.A, np.vstack([np.zeros((n, n)), off]), plain.C)
                 late = ql.plants.delayed_inputs(
                     moved, machine.plant.samples[0] * machine.dt, machine.dt
                 )

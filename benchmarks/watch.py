@@ -109,7 +109,7 @@ def gantry(
     A[1, 1], A[3, 3] = slowing
     B, E = np.zeros((4, 2)), np.zeros((4, 2))
     B[[1, 3]], E[1, 0], E[3, 1] = torques, 1.0 / J, 1.0 / J
-    plant = ql.plants.MultivariableLinearPlant(A, B, [[1, 0, 0, 0], [0, 0, 1, 0]], E=E)
+    plant = ql.plants.LinearPlant(A, B, [[1, 0, 0, 0], [0, 0, 1, 0]], E=E)
     t = np.arange(round(seconds / DT) + 1) * DT
     times = np.arange(0.0, seconds + 1.0, 0.5)
     loads = [np.interp(t, times, 0.003 * rng.normal(size=times.size)) for _ in range(2)]

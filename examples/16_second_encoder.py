@@ -28,13 +28,13 @@ def drive(t, x, u, w):
         torque = max(K * (twist - 0.5 * PLAY) + C * slip, 0.0)
     elif twist < -0.5 * PLAY:
         torque = min(K * (twist + 0.5 * PLAY) + C * slip, 0.0)
-    of_motor = u[0] + w[0] - torque - FRICTION[0] * math.tanh(x[1] / 0.02) - 1e-4 * x[1]
+    of_motor = u + w[0] - torque - FRICTION[0] * math.tanh(x[1] / 0.02) - 1e-4 * x[1]
     of_load = w[1] + torque - FRICTION[1] * math.tanh(x[3] / 0.02) - 1e-4 * x[3]
     return x[1], of_motor / JM, x[3], of_load / JL
 
 
-plant = ql.plants.MultivariableNonlinearPlant(
-    drive, order=4, inputs=1, output=np.eye(4)[[0, 2]], disturbances=2, substeps=8, name="servo"
+plant = ql.plants.NonlinearPlant(
+    drive, order=4, output=np.eye(4)[[0, 2]], disturbances=2, substeps=8, name="servo"
 )
 encoded = ql.plants.encoded_outputs(plant, math.tau / 2**20)
 moves = ql.signals.Sum((ql.signals.Step(0.5, 0.05), ql.signals.Step(-0.8, 1.0)))

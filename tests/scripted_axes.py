@@ -24,10 +24,8 @@ from .rig_bench import TIME
 DT = 0.01
 A = [[0, 1, 0, 0], [0, -0.5, 0, 0], [0, 0, 0, 1], [0, 0, 0, -0.3]]
 B0 = [[2.0, 0.5], [0.4, 3.0]]
-PLANT = ql.plants.MultivariableLinearPlant(
-    A, [[0, 0], B0[0], [0, 0], B0[1]], [[1, 0, 0, 0], [0, 0, 1, 0]]
-)
-THREE = ql.plants.MultivariableLinearPlant(np.zeros((3, 3)), np.eye(3), np.eye(3))
+PLANT = ql.plants.LinearPlant(A, [[0, 0], B0[0], [0, 0], B0[1]], [[1, 0, 0, 0], [0, 0, 1, 0]])
+THREE = ql.plants.LinearPlant(np.zeros((3, 3)), np.eye(3), np.eye(3))
 SESSION = 0x5EED0001
 FAST = Safety(settle=10, hold=4, ramp=10)
 

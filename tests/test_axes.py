@@ -33,11 +33,11 @@ def joint(omega_o: float = 60.0, omega_c: float = 8.0, order: int = 2, **parts: 
     return ql.ADRC(observer, omega_c, **parts)  # type: ignore[arg-type]
 
 
-def two_masses(coupling: float = 0.0) -> ql.plants.MultivariableLinearPlant:
+def two_masses(coupling: float = 0.0) -> ql.plants.LinearPlant:
     """Return two masses with friction, that their forces move together."""
     A = np.array([[0, 1, 0, 0], [0, -0.5, 0, 0], [0, 0, 0, 1], [0, 0, 0, -2.0]])
     B = np.array([[0, 0], [1, coupling], [0, 0], [coupling, 1]])
-    return ql.plants.MultivariableLinearPlant(A, B, [[1, 0, 0, 0], [0, 0, 1, 0]])
+    return ql.plants.LinearPlant(A, B, [[1, 0, 0, 0], [0, 0, 1, 0]])
 
 
 REFERENCES = (ql.signals.Step(1.0, 0.1), ql.signals.Sinusoid(0.5, 3.0))

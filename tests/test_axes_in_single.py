@@ -31,7 +31,7 @@ def plant(gain: Any) -> Any:
     A, B = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m))
     A[:n, n:], A[n:, :n] = np.eye(n), 0.5 - 4.0 * np.eye(n)
     A[n:, n:], B[n:] = -0.2 * np.eye(n), 1.1 * np.asarray(gain)
-    return ql.plants.MultivariableLinearPlant(A, B, np.eye(2 * n)[:n])
+    return ql.plants.LinearPlant(A, B, np.eye(2 * n)[:n])
 
 
 def scenario(controller: Any, duration: float = 0.12, **parts: Any) -> ql.Scenario:
@@ -218,7 +218,7 @@ def test_an_actuator_at_its_limits_is_not_compared_and_the_others_are() -> None:
 def plant_of_two(gain: Any) -> Any:
     """Return two masses with friction."""
     A = np.kron([[0.0, 1.0], [0.0, -0.2]], np.eye(2))
-    return ql.plants.MultivariableLinearPlant(
+    return ql.plants.LinearPlant(
         A, np.vstack([np.zeros((2, 2)), 1.1 * np.asarray(gain)]), np.eye(4)[:2]
     )
 
@@ -269,7 +269,7 @@ def test_single_precision_that_changes_u_of_one_actuator_too_much_is_refused(
     chain[1] = chain[5] = 0.0
     B = np.zeros((6, 2))
     B[1, 0] = B[5, 1] = 1.0
-    machine = ql.plants.MultivariableLinearPlant(chain, B, np.eye(6)[[0, 2]])
+    machine = ql.plants.LinearPlant(chain, B, np.eye(6)[[0, 2]])
     axes = ql.Axes({"slow": joint(), "fast": fast})
     run = ql.Scenario(tuple(ql.signals.Sinusoid(1.0, 3.0) for _ in range(2)), duration=0.5)
     options: dict[str, Any] = {"precision": "single", "plant": machine, "scenario": run}

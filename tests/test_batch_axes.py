@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.plants import MultivariableLinearPlant, PlantBatch, batch
+from quell.plants import LinearPlant, PlantBatch, batch
 
 from .cases import cases
 
@@ -22,11 +22,11 @@ NOISE = ql.signals.BandLimitedNoise(1e-11, DT)
 SCENARIO = ql.Scenario(SINES, 0.4, (0.0, ql.signals.Step(at=0.2)), NOISE, rest_at=(0.1,), seed=4)
 
 
-def gantry(gain: float = 5.0, lag: float = 2.0) -> MultivariableLinearPlant:
+def gantry(gain: float = 5.0, lag: float = 2.0) -> LinearPlant:
     """Two axes whose drives act on both."""
     A = [[0, 1, 0, 0], [0, -lag, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]]
     B = [[0, 0], [gain, 0.5], [0, 0], [0.4, 6]]
-    return MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]], name="gantry")
+    return LinearPlant(A, B, np.eye(4)[[0, 2]], name="gantry")
 
 
 def axes(omega_c: float = 8.0, sign: float = 1.0, learner: bool = True) -> ql.Axes:

@@ -17,8 +17,7 @@ from numba.extending import register_jitable
 
 import quell as ql
 from quell.kernels import user_functions
-from quell.plants.base import advance, measure
-from quell.plants.multivariable import measure_all
+from quell.plants.base import advance, measure, measure_all
 from quell.plants.nonlinear import derivatives
 
 pytestmark = pytest.mark.compiled
@@ -228,7 +227,7 @@ def test_plants_follow_what_their_equation_takes_from_outside(
 
     numbers: dict[str, Any] = {"parameters": {"mass": 4.0}} if parametric else {}
     make: Any = (
-        partial(ql.plants.MultivariableNonlinearPlant, f, 2, 1, h_of_several, **numbers)
+        partial(ql.plants.NonlinearPlant, f, 2, 1, h_of_several, **numbers)
         if several
         else partial(ql.plants.NonlinearPlant, f, 2, h, **numbers)
     )
@@ -335,7 +334,7 @@ def test_callable_objects_are_refused_or_run_as_python_with_hash_or_without() ->
     for plant in (
         ql.plants.NonlinearPlant(OddRate(), 1),
         ql.plants.NonlinearPlant(OddRate(), 1, parameters={}),
-        ql.plants.MultivariableNonlinearPlant(OddRate(), 1, 1, [[1.0]]),
+        ql.plants.NonlinearPlant(OddRate(), 1, [[1.0]]),
     ):
         with pytest.warns(UserWarning, match="runs as Python"):
             plant.sampled(0.01)

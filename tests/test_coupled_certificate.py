@@ -48,7 +48,7 @@ def random_system(rng: np.random.Generator, size: int, states: int = 4) -> Matri
 def test_one_axis_has_the_bounds_of_certify(order: int, b: float, b0: float, delay: int) -> None:
     """Γ and Γ_y to the accuracy of the sums, with delays, and for an inertia of 2e-4."""
     single = analysis.certify(([b], [1.0, *[0.0] * order]), axis(order, b0=b0), delay=delay * DT)
-    plant = ql.plants.MultivariableLinearPlant(
+    plant = ql.plants.LinearPlant(
         np.diag(np.ones(order - 1), 1), b * np.eye(order)[:, -1:], np.eye(order)[:1]
     )
     late = ql.plants.delayed_inputs(plant, delay * DT, DT)

@@ -12,15 +12,15 @@ from quell.analysis import analyse_axes, coupling, invariant_zeros, relative_gai
 from quell.analysis.coupling import is_turned
 from quell.analysis.matrices import sampled_matrices
 from quell.lti.models import zero_order_hold
-from quell.plants.multivariable import MultivariableLinear
+from quell.plants.linear import LinearModelOfMany
 from quell.types import Matrix
 
 from .cases import cases
 
 
-def sampled(A: Any, B: Any, C: Any) -> MultivariableLinear:
+def sampled(A: Any, B: Any, C: Any) -> LinearModelOfMany:
     """Return a sampled plant without disturbances."""
-    return MultivariableLinear(A, B, np.zeros((len(A), 0)), C)
+    return LinearModelOfMany(A, B, np.zeros((len(A), 0)), C)
 
 
 DT = 1e-3
@@ -156,7 +156,7 @@ def test_what_cannot_be_judged_is_refused() -> None:
         coupling(sampled(A, B, C), DT, axes=("x", "x"))
 
 
-def tanks(shares: tuple[float, float]) -> ql.plants.MultivariableLinearPlant:
+def tanks(shares: tuple[float, float]) -> ql.plants.LinearPlant:
     """Return the quadruple tank (Johansson, IEEE Trans. Control Syst. Technol. 8, 2000), [cm], [V].
 
     Two pumps fill the lower tanks, which are measured, with these shares, and cross over the upper
@@ -175,7 +175,7 @@ def tanks(shares: tuple[float, float]) -> ql.plants.MultivariableLinearPlant:
         [0.0, (1 - b) * 3.35 / 28],
         [(1 - a) * 3.33 / 32, 0.0],
     ]
-    return ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[:2])
+    return ql.plants.LinearPlant(A, B, np.eye(4)[:2])
 
 
 def test_a_zero_in_the_right_half_plane_is_named_and_b0_is_no_remedy() -> None:

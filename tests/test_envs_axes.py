@@ -26,11 +26,11 @@ SCENARIO = ql.Scenario(
 B0 = np.array([[5.0, 0.5], [0.4, 6.0]])
 
 
-def gantry(gain: float = 5.0) -> ql.plants.MultivariableLinearPlant:
+def gantry(gain: float = 5.0) -> ql.plants.LinearPlant:
     """Two axes whose drives act on both."""
     A = [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]]
     B = [[0, 0], [gain, 0.5], [0, 0], [0.4, 6]]
-    return ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    return ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
 
 
 def axes(x: Any = None, y: Any = None, guard: Any = None, **options: Any) -> ql.Axes:

@@ -493,7 +493,7 @@ def test_what_an_fmu_cannot_do_is_refused_with_a_reason(made: Maker) -> None:
         ql.plants.arm(),
         ql.plants.encoded_outputs(ql.plants.arm(), 1e-6),
         ql.plants.delayed_inputs(ql.plants.arm(), 2 * DT, DT),
-        ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2)),
+        ql.plants.LinearPlant(-np.eye(2), np.eye(2), np.eye(2)),
     ],
 )
 def test_a_plant_with_several_signals_is_refused_with_a_reason(plant: Any, tmp_path: Path) -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.plants.base import advance
-from quell.plants.multivariable import measure_all
+from quell.plants.base import advance, measure_all
 
 from .cases import cases
 
@@ -35,14 +34,14 @@ def pid(**parts: Any) -> ql.baselines.PID:
     return ql.baselines.PID(kp=100.0, ki=50.0, kd=20.0, tf=0.005, dt=DT, **parts)
 
 
-def masses(B: Any = B0, spring: float = 0.0) -> ql.plants.MultivariableLinearPlant:
+def masses(B: Any = B0, spring: float = 0.0) -> ql.plants.LinearPlant:
     """Return two masses that all forces move, perhaps with a spring between them."""
     A, inputs = np.zeros((4, 4)), np.zeros((4, np.shape(B)[1]))
     A[0, 1] = A[2, 3] = 1.0
     A[1, [0, 2]] = A[3, [2, 0]] = -spring, spring
     inputs[1], inputs[3] = B
     loads = [[0, 0], [1, 0], [0, 0], [0, 1]]
-    return ql.plants.MultivariableLinearPlant(A, inputs, [[1, 0, 0, 0], [0, 0, 1, 0]], E=loads)
+    return ql.plants.LinearPlant(A, inputs, [[1, 0, 0, 0], [0, 0, 1, 0]], E=loads)
 
 
 LOADS = (ql.signals.Sinusoid(3.0, 6.0), ql.signals.Sinusoid(2.0, 9.0))

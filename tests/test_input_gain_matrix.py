@@ -265,9 +265,7 @@ def test_a_saved_run_of_axes_is_read(tmp_path: Path) -> None:
     observers = [ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT) for _ in range(2)]
     axes = ql.Axes({"x": ql.ADRC(observers[0], 4.0), "y": ql.ADRC(observers[1], 4.0)})
     A = np.array([[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
-    plant = ql.plants.MultivariableLinearPlant(
-        A, [[0, 0], [1, 0], [0, 0], [0, 1]], [[1, 0, 0, 0], [0, 0, 1, 0]]
-    )
+    plant = ql.plants.LinearPlant(A, [[0, 0], [1, 0], [0, 0], [0, 1]], [[1, 0, 0, 0], [0, 0, 1, 0]])
     run = ql.simulate(plant, axes, ql.Scenario(reference=(1.0, 0.5), duration=1.0))
     run.save(tmp_path / "run.nc")
     found = measured_axes(tmp_path / "run.nc", ["y", "x"])

@@ -345,7 +345,7 @@ def joint(omega_o: float = 60.0) -> ql.ADRC:
 def test_axes_around_a_plant_are_the_loop_that_a_run_shows() -> None:
     """Poles and the closed loop of ``analyse_axes`` are those of ``ql.simulate``, delays included."""
     true = np.array([[2.0, -0.9], [-0.9, 1.5]])
-    plant = ql.plants.MultivariableLinearPlant(
+    plant = ql.plants.LinearPlant(
         np.kron(np.eye(2), [[0.0, 1.0], [0.0, -0.3]]),
         np.kron(true, [[0.0], [1.0]]),
         np.kron(np.eye(2), [[1.0, 0.0]]),
@@ -413,10 +413,10 @@ def test_what_is_no_loop_of_axes_is_refused() -> None:
 DOUBLE = (np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]]), np.kron(np.eye(2), [[0.0], [1.0]]))
 
 
-def two_masses(B: Any = None) -> ql.plants.MultivariableLinearPlant:
+def two_masses(B: Any = None) -> ql.plants.LinearPlant:
     """Return two masses, which the matrix B couples."""
     inputs = DOUBLE[1] if B is None else np.kron(B, [[0.0], [1.0]])
-    return ql.plants.MultivariableLinearPlant(DOUBLE[0], inputs, np.eye(4)[[0, 2]])
+    return ql.plants.LinearPlant(DOUBLE[0], inputs, np.eye(4)[[0, 2]])
 
 
 def of_all(**parts: Any) -> Any:

@@ -11,8 +11,7 @@ from scipy.linalg import expm
 
 import quell as ql
 from quell.kernels import user_functions
-from quell.plants.base import advance, measure
-from quell.plants.multivariable import measure_all
+from quell.plants.base import advance, measure, measure_all
 from quell.plants.nonlinear import derivatives
 
 from .cases import cases
@@ -36,7 +35,7 @@ def test_linear_plant_is_the_matrix_exponential(seed: int) -> None:
     n, m, p, q = 4, 2, 3, 1
     A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
     C, E = rng.standard_normal((p, n)), rng.standard_normal((n, q))
-    plant = ql.plants.MultivariableLinearPlant(A, B, C, E)
+    plant = ql.plants.LinearPlant(A, B, C, E)
     x0, u, w = rng.standard_normal(n), rng.standard_normal(m), rng.standard_normal(q)
     whole = np.zeros((n + m + q, n + m + q))
     whole[:n] = np.hstack([A, B, E])
@@ -52,12 +51,10 @@ def test_nonlinear_plant_with_the_same_equations_is_the_linear_one() -> None:
     def f(t, x, u, w, a):  # type: ignore[no-untyped-def]
         return x[1], -a * x[0] + u[0] + 0.5 * u[1] + w[0]
 
-    nonlinear = ql.plants.MultivariableNonlinearPlant(
+    nonlinear = ql.plants.NonlinearPlant(
         f, order=2, inputs=2, output=np.eye(2), substeps=20, parameters={"a": 4.0}
     )
-    linear = ql.plants.MultivariableLinearPlant(
-        [[0, 1], [-4, 0]], [[0, 0], [1, 0.5]], np.eye(2), [[0], [1]]
-    )
+    linear = ql.plants.LinearPlant([[0, 1], [-4, 0]], [[0, 0], [1, 0.5]], np.eye(2), [[0], [1]])
     arguments = ([0.3, -0.2], [1.0, -0.4], [0.2], 0.05)
     np.testing.assert_allclose(
         moved(nonlinear, *arguments)[0], moved(linear, *arguments)[0], atol=1e-9
@@ -74,12 +71,12 @@ def test_sub_steps_are_chosen_as_for_one_input(force: float) -> None:
         return x[1], u - 1e4 * x[1] - force * np.sign(x[1])
 
     def several(t, x, u, w):  # type: ignore[no-untyped-def]
-        return x[1], u[0] - 1e4 * x[1] - force * np.sign(x[1])
+        return x[1], u - 1e4 * x[1] - force * np.sign(x[1])
 
     for dt in (1e-3, 1.0):
         plants = (
             ql.plants.NonlinearPlant(single, 2),
-            ql.plants.MultivariableNonlinearPlant(several, 2, 1, np.eye(2)),
+            ql.plants.NonlinearPlant(several, 2, np.eye(2)),
         )
         if force == 0.0 and dt == 1.0:
             for plant in plants:
@@ -192,9 +189,9 @@ def test_quadrotor_turns_as_its_rotors_push() -> None:
 class TestChannels:
     """Encoders and delays of single channels."""
 
-    def integrators(self) -> ql.plants.MultivariableLinearPlant:
+    def integrators(self) -> ql.plants.LinearPlant:
         """Return two integrators."""
-        return ql.plants.MultivariableLinearPlant(np.zeros((2, 2)), np.eye(2), np.eye(2))
+        return ql.plants.LinearPlant(np.zeros((2, 2)), np.eye(2), np.eye(2))
 
     def test_each_input_is_late_by_its_own_samples(self) -> None:
         """An integrator shows u a sample after it arrives."""
@@ -234,20 +231,18 @@ class TestChannels:
 @cases(
     ("wrong", "message"),
     [
-        (lambda: ql.plants.MultivariableLinearPlant(np.eye(2), np.eye(3), np.eye(2)),
-         r"B has shape \(3, 3\), A \(2, 2\): B must be \(2, 3\), a row for each state"),
-        (lambda: ql.plants.MultivariableLinearPlant.of(3), "model = 3: must be"),
-        (lambda: ql.plants.MultivariableNonlinearPlant(lambda t, x, u, w: [1.0], 2, 1, np.eye(2)),
+        (lambda: ql.plants.LinearPlant(np.eye(2), np.eye(3), np.eye(2)),
+         r"B has shape \(3, 3\), A \(2, 2\): must be a matrix of shape \(2, 3\), a row for each"),
+        (lambda: ql.plants.LinearPlant.of(3), "plant = 3: must be a linear plant"),
+        (lambda: ql.plants.NonlinearPlant(lambda t, x, u, w: [1.0], 2, np.eye(2)),
          r"f returns shape \(1,\): must return the 2 derivatives"),
-        (lambda: ql.plants.MultivariableNonlinearPlant(
-            lambda t, x, u, w: [1.0, u[3]], 2, 1, np.eye(2)), "fails with IndexError"),
+        (lambda: ql.plants.NonlinearPlant(
+            lambda t, x, u, w: [1.0, x[3]], 2, np.eye(2)), "fails with IndexError"),
         (lambda: ql.plants.arm((0.4, 0.3), (1.0,)), "masses"),
         (lambda: ql.plants.arm(stiffness=100.0), "an elastic joint needs a stiffness and a motor"),
         (lambda: ql.plants.arm(encoders="tool"), "encoders = 'tool'"),
         (lambda: ql.plants.arm(stiffness="soft"), "stiffness = 'soft': must be one number, or one"),
         (lambda: ql.plants.quadrotor_attitude((0.1, 0.1)), "inertia has shape"),
-        (lambda: ql.plants.delayed_inputs(ql.plants.two_mass_spring(), 0.1, 0.01),
-         "has one control signal and one output; must be a plant with several"),
         (lambda: ql.plants.encoded_outputs(ql.plants.arm(), -1.0), "must not be negative"),
         (lambda: ql.plants.delayed(ql.plants.arm(), 0.1, 0.01), "several: .*delayed_inputs"),
         (lambda: ql.plants.encoded(ql.plants.arm(), 1024), "several: .*encoded_outputs"),
@@ -298,7 +293,7 @@ def test_a_hundred_drawn_arms_compile_once(compiled_functions: list[Any]) -> Non
 
 def rates(t, x, u, w, gain, K, offsets=(0.5, 0.25)):  # type: ignore[no-untyped-def]
     """Return the equation of a plant with a number, a matrix and a vector."""
-    return K[0, 1] * x[1] + offsets[0] * w[0], gain * u[0] - K[1, 0] * x[0] + K[1, 1] * offsets[1]
+    return K[0, 1] * x[1] + offsets[0] * w[0], gain * u - K[1, 0] * x[0] + K[1, 1] * offsets[1]
 
 
 def combined(x, H, gain):  # type: ignore[no-untyped-def]
@@ -311,8 +306,8 @@ def combined(x, H, gain):  # type: ignore[no-untyped-def]
 def test_parameters_are_numbers_vectors_and_matrices() -> None:
     """Compiled code reads them in their order, and other numbers compile nothing; a default is data, too."""
     K = [[0.0, 3.0], [5.0, 7.0]]
-    several = ql.plants.MultivariableNonlinearPlant(
-        rates, 2, 1, combined, parameters={"gain": 2.0, "K": K, "H": [[1.5, -0.5]]}
+    several = ql.plants.NonlinearPlant(
+        rates, 2, combined, parameters={"gain": 2.0, "K": K, "H": [[1.5, -0.5]]}
     )
     one = ql.plants.NonlinearPlant(
         lambda t, x, u, w, K, c: (K[0, 1] * x[1], c[1] * u - K[1, 0] * x[0] + c[0]), 2,
@@ -340,7 +335,7 @@ def test_parameters_are_numbers_vectors_and_matrices() -> None:
 @cases(
     ("wrong", "message"),
     [
-        (lambda p: ql.plants.MultivariableNonlinearPlant(rates, 2, 1, np.eye(2), parameters=p),
+        (lambda p: ql.plants.NonlinearPlant(rates, 2, np.eye(2), parameters=p),
          r"parameters\['K'\]: entry \(0, 0\) is nan"),
         (lambda p: ql.Axes([joint(), joint()], M=partial(gain, K=p["K"])), r"M: K: entry \(0, 0\)"),
         (lambda p: ql.Axes([joint(), joint()], M=partial(gain, k=1.0)),

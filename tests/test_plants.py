@@ -234,7 +234,7 @@ def test_methods_and_callable_objects_are_served_too() -> None:
         (lambda: ql.plants.two_mass_spring(c2=0.0), "nothing is measured"),
         (
             lambda: ql.plants.LinearPlant(np.eye(2), [1.0], [1.0, 0.0]),
-            r"B has shape \(1, 1\): must be a matrix of shape \(2, 1\)",
+            r"B has shape \(1, 1\), A \(2, 2\): must be a matrix of shape \(2, 1\)",
         ),
         (
             lambda: ql.plants.LinearPlant(np.zeros((2, 3)), [1.0, 0.0], [1.0, 0.0]),
@@ -271,8 +271,8 @@ def test_methods_and_callable_objects_are_served_too() -> None:
             "fails with IndexError",
         ),
         (
-            lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=lambda x: x),
-            r"output\(x\) must return one number",
+            lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=lambda x: [[x[0]]]),
+            r"output\(x\) returns shape \(1, 1\): must return one number, or a vector",
         ),
     ],
 )

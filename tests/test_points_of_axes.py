@@ -100,7 +100,7 @@ def test_the_input_that_holds_a_pose_is_found() -> None:
     with pytest.raises(ValueError, match="no u holds it at rest"):
         held_at(robot, [0.0, 0.0, 1.0, 0.0])
     with pytest.raises(ValueError, match="a linear one is the same at all points"):
-        held_at(ql.plants.MultivariableLinearPlant(np.eye(1), np.eye(1), np.eye(1)), [0.0])
+        held_at(ql.plants.LinearPlant(np.eye(1), np.eye(1), np.eye(1)), [0.0])
     with pytest.raises(ValueError, match=r"points = \[\]"):
         analyse_points(robot, axes(robot), [])
 

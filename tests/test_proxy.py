@@ -73,7 +73,7 @@ def test_the_host_sees_a_drive_that_the_load_does_not_move(with_proxy: bool) -> 
 B0 = [[2.0, 0.5], [0.4, 3.0]]
 
 
-ARM = ql.plants.MultivariableLinearPlant(
+ARM = ql.plants.LinearPlant(
     [[0, 1, 0, 0, 0], [0, -4, 0, 0, -1], [0, 0, 0, 1, 0], [0, 0, 0, -5, 0], [0] * 5],
     [[0, 0], B0[0], [0, 0], B0[1], [0, 0]],
     [[1, 0, 0, 0, 0], [0, 0, 1, 0, 0]],
@@ -325,7 +325,7 @@ class Servo:
         if axes > 1:
             a, b, c = np.array([[0.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [50.0]]), [[1.0, 0.0]]
             blocks = [np.kron(np.eye(axes), block) for block in (a, b, np.array(c))]
-            plant = ql.plants.MultivariableLinearPlant(*(block.tolist() for block in blocks))
+            plant = ql.plants.LinearPlant(*(block.tolist() for block in blocks))
             each = {
                 f"q{i}": ql.Compensator(ql.ESO.model_free(b0=1.0, **observer)) for i in range(axes)
             }

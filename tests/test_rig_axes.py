@@ -371,7 +371,7 @@ def test_one_missing_measurement_holds_all_u() -> None:
 @pytest.mark.trial
 def test_a_wrong_sign_of_one_axis_is_found() -> None:
     """An encoder that counts backwards: the run ends, and names the axis."""
-    turned = ql.plants.MultivariableLinearPlant(PLANT.A, PLANT.B, [[1, 0, 0, 0], [0, 0, -1, 0]])
+    turned = ql.plants.LinearPlant(PLANT.A, PLANT.B, [[1, 0, 0, 0], [0, 0, -1, 0]])
     found = Outcome(TwinDevice(turned, DT), duration=20.0)
     (end,) = [change for change in found.changes if change[1] is Mode.RAMP]
     assert end[2:] == (Cause.WRONG_WAY, "y")

@@ -184,12 +184,12 @@ class TestQuadraticProgram:
 B0 = np.array([[1.0, 0.6], [0.5, 1.0]])
 
 
-def masses(B: Any = B0) -> ql.plants.MultivariableLinearPlant:
+def masses(B: Any = B0) -> ql.plants.LinearPlant:
     """Return two masses that both forces move."""
     A, inputs = np.zeros((4, 4)), np.zeros((4, 2))
     A[0, 1] = A[2, 3] = 1.0
     inputs[1], inputs[3] = B
-    return ql.plants.MultivariableLinearPlant(A, inputs, [[1, 0, 0, 0], [0, 0, 1, 0]])
+    return ql.plants.LinearPlant(A, inputs, [[1, 0, 0, 0], [0, 0, 1, 0]])
 
 
 # The first axis is pushed to its border while the second takes the actuators to their limits.

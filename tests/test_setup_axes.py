@@ -32,7 +32,7 @@ def gantry(**changes: Any) -> dict[str, Any]:
 def test_the_run_of_a_file_is_that_of_the_objects_in_python() -> None:
     """Plant, B0, limits of the actuators, references, noise and disturbances."""
     setup = made_axes("gantry.toml", gantry())
-    plant = ql.plants.MultivariableLinearPlant(
+    plant = ql.plants.LinearPlant(
         [[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]],
         [[0, 0], [5, 0.5], [0, 0], [0.4, 6]],
         [[1, 0, 0, 0], [0, 0, 1, 0]],
@@ -146,11 +146,17 @@ def test_b0_of_the_plant_is_that_of_each_kind() -> None:
         ({"axes": {"B1": 1}}, "axes.B1: unknown; "),
         ({"axes": {"B0": "model"}}, "axes.B0 = 'model'"),
         ({"axes": {"B0": [[1, 2], [2, 4]]}}, "axes.*singular"),
-        ({"axes": {"B0": [[1, 0, 0], [0, 1, 0]]}}, "plant.*2 control signals, the controller 3"),
+        (
+            {"axes": {"B0": [[1, 0, 0], [0, 1, 0]]}},
+            "plant.*2 control signals and 2 outputs, the controller 3",
+        ),
         ({"axes": {"B0": "plant", "M": [[1, 0], [0, 1]]}}, 'B0 = "plant" and M'),
         ({"axes": {"u_max": [1.0, 2.0, 3.0]}}, "axes.u_max"),
         ({"plant": {"kind": "amr"}}, "plant.kind = 'amr': unknown; did you mean arm"),
-        ({"plant": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0]}}, "plant.kind = 'linear'"),
+        (
+            {"plant": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0]}},
+            "plant has 1 outputs, there are 2 axes",
+        ),
         ({"scenario": {"reference": 1.0}}, r"scenario.reference: belongs into each \[\[axis\]\]"),
         ({"scenario": {"disturbances": [0, 0, 1.0]}}, "disturbances has 3 signals"),
         ({"axis": []}, "axis: is empty; give a table"),
@@ -239,7 +245,7 @@ def test_what_is_missing_is_shown_as_a_setup_of_axes_has_it() -> None:
         SetupError, match=r"scenario: missing.* reference = .* in each \[\[axis\]\]"
     ):
         setup.needed("scenario")
-    with pytest.raises(SetupError, match="plant: missing.*multivariable-linear"):
+    with pytest.raises(SetupError, match="plant: missing.*linear"):
         setup.needed("plant")
 
 

@@ -485,7 +485,7 @@ def test_a_loop_that_runs_away_says_so_at_the_line_of_the_user() -> None:
 
 def test_an_axis_that_runs_away_says_so() -> None:
     """One of two; the status is that of the whole run."""
-    plant = ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2))
+    plant = ql.plants.LinearPlant(-np.eye(2), np.eye(2), np.eye(2))
     made = [
         ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
         for _ in range(2)

@@ -31,9 +31,9 @@ ENCODERS = np.eye(4)[[0, 2]]
 NOISE = (2 * np.pi / 2**20) ** 2 / 12
 
 
-def drive() -> ql.plants.MultivariableLinearPlant:
+def drive() -> ql.plants.LinearPlant:
     """Return a servo with a flexible coupling, an encoder and a disturbance at each side."""
-    return ql.plants.MultivariableLinearPlant(A, AT_MOTOR[:, None], ENCODERS, E)
+    return ql.plants.LinearPlant(A, AT_MOTOR[:, None], ENCODERS, E)
 
 
 def controller(**limits: object) -> StateFeedback:

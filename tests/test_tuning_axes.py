@@ -47,7 +47,7 @@ def machine(mass: Any = M, delay: float = 2 * DT) -> Any:
     """Return two coupled axes behind a delay."""
     A = np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]])
     B = np.kron(np.linalg.inv(mass), [[0.0], [1.0]])
-    plant = ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    plant = ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
     return ql.plants.delayed_inputs(plant, delay, DT)
 
 
@@ -236,7 +236,7 @@ def test_a_b0_is_compared_with_that_of_the_plant() -> None:
     A[[1, 3], 4:] = B0
     A[4, 4], A[5, 5] = -1 / 3e-4, -1 / 1e-3
     B[4, 0], B[5, 1] = 1 / 3e-4, 1 / 1e-3
-    lagging = ql.plants.MultivariableLinearPlant(A, B, np.eye(6)[[0, 2]])
+    lagging = ql.plants.LinearPlant(A, B, np.eye(6)[[0, 2]])
     assert judged(lagging, axes()) == (True, False)
     assert judged(lagging, axes(np.diag(np.diag(M)))) == (False, None)
 
@@ -463,7 +463,7 @@ def test_a_bound_of_damping_is_judged_as_the_others_are() -> None:
 def test_a_result_without_enough_damping_does_not_meet_its_bounds() -> None:
     """Though its M_s is kept, or all but kept."""
     B0 = np.array([[1.0, 0.4], [0.4, 1.0]])
-    plant = ql.plants.MultivariableLinearPlant(np.zeros((2, 2)), B0, np.eye(2))
+    plant = ql.plants.LinearPlant(np.zeros((2, 2)), B0, np.eye(2))
     one = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=60.0, dt=DT), 8.0)
     bounds = Constraints(m_s=3.0, m_t=3.0, damping=0.9999)
     late = ql.plants.delayed_inputs(plant, 2 * DT, DT)

@@ -194,7 +194,7 @@ def test_a_watched_machine_keeps_its_units(tmp_path: Path) -> None:
 def test_runs_of_several_axes_come_into_one_unit() -> None:
     """Outputs and references with v and estimates; control signals by their own units."""
     axes = ql.Axes({"x": adrc(), "z": adrc()}, np.eye(2))
-    plant = ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2))
+    plant = ql.plants.LinearPlant(-np.eye(2), np.eye(2), np.eye(2))
     run = ql.simulate(plant, axes, ql.Scenario(reference=(1.0, 2.0), duration=0.5))
 
     def known(x: str, u: str) -> AxesSignals:

@@ -35,6 +35,8 @@ def imported_on_use(
             now = renamed[name]
             warnings.warn(f"{package}.{name} is {package}.{now} now", FutureWarning, stacklevel=2)
             name = now
+        if name in vars(sys.modules[package]):
+            return vars(sys.modules[package])[name]
         if name in homes:
             value = getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
         elif name in known:

@@ -41,8 +41,7 @@ from quell.observers.forms import (
     without_delay,
 )
 from quell.plants import registry
-from quell.plants.base import advance, begin_run, measure
-from quell.plants.multivariable import measure_all
+from quell.plants.base import advance, begin_run, measure, measure_all
 from quell.simulation.driver import run_block
 from tests.cases import cases
 
@@ -117,7 +116,7 @@ def test_every_plant_has_an_example() -> None:
     classes = {thing for thing in public if isinstance(thing, type)}
     registered = [*registry.PLANTS.items(), *registry.AXES_PLANTS.items()]
     made = {make for name, make in registered if name not in FROM_FILES}
-    assert public - classes == made - {registry.linear, registry.multivariable_linear}
+    assert public - classes == made - {registry.linear}
     examples = [*PLANTS.values(), *PLANTS_OF_AXES.values()]
     assert classes <= {type(plant) for plant in examples} | {
         plant_room.FMU,
@@ -129,12 +128,12 @@ def test_every_plant_has_an_example() -> None:
 PLANTS_OF_AXES: dict[str, Any] = {
     "arm": plant_room.arm(motor_inertia=0.1, stiffness=(math.inf, 300.0), encoders="both"),
     "quadrotor attitude": plant_room.quadrotor_attitude(),
-    "linear": plant_room.MultivariableLinearPlant(
+    "linear": plant_room.LinearPlant(
         [[0.0, 1.0], [-2.0, -0.3]], [[0.0, 0.0], [1.0, 0.5]], np.eye(2)
     ),
-    "nonlinear": plant_room.MultivariableNonlinearPlant(
+    "nonlinear": plant_room.NonlinearPlant(
         lambda t, x, u, w, a: (u[0] - a * x[0] ** 3, u[1] - x[1] + w[0]),
-        2, 2, np.eye(2), parameters={"a": 2.0},
+        2, np.eye(2), parameters={"a": 2.0}, inputs=2,
     ),
     "encoded": plant_room.encoded_outputs(plant_room.arm(), 1e-4),
     "delayed": plant_room.delayed_inputs(plant_room.arm(), [0.02, 0.0], 0.01),

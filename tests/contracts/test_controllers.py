@@ -159,7 +159,7 @@ SEVERAL: dict[str, Any] = {
 @pytest.mark.parametrize("name", SEVERAL)
 def test_several_signals_step_as_they_are_simulated(name: str) -> None:
     """Compiled ``step`` with what was measured gives the u of an interpreted run but for rounding."""
-    plant = ql.plants.MultivariableLinearPlant(*_COUPLED, _POSITIONS)
+    plant = ql.plants.LinearPlant(*_COUPLED, _POSITIONS)
     noise = ql.signals.BandLimitedNoise(power=1e-6 * DT, sample_time=DT)
     scenario = ql.Scenario((1.0, ql.signals.Sinusoid(0.5, 2.0)), 2.0, noise=noise)
     run = ql.simulate(plant, SEVERAL[name], scenario, interpret=True)

@@ -44,9 +44,7 @@ OTHERS: dict[str, Any] = {
     "guard": ql.Guard(bound=2.25),
     "Arm": plant_room.arm(),
     "Craft": plant_room.quadrotor_attitude(),
-    "MultivariableLinearPlant": plant_room.MultivariableLinearPlant(
-        [[-1.25]], [[2.0, 3.0]], [[1.0]]
-    ),
+    "LinearPlant": plant_room.LinearPlant([[-1.25]], [[2.0, 3.0]], [[1.0]]),
     "Axes": ql.Axes({"x": ql.ADRC(ql.ESO.model_free(2, 1.0, 12.0, 0.01), 1.75)}, [[2.25]]),
     "StateFeedback": SEVERAL["StateFeedback"],
     "MultivariableESO": SEVERAL["StateFeedback"].observer,

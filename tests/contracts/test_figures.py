@@ -125,7 +125,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     pid = ql.baselines.PID(4.0, 1.0, 3.0, tf=0.05, dt=0.01)
     add_on = ql.tuning.tune_compensator(([1.0], [1.0, 1.0, 0.0]), pid, speeds=(1.0, 1.0))
     axes = ql.Axes([adrc(), adrc()])
-    lags = ql.plants.MultivariableLinearPlant(-np.eye(2), np.eye(2), np.eye(2))
+    lags = ql.plants.LinearPlant(-np.eye(2), np.eye(2), np.eye(2))
     coupled = ql.tuning.tune_axes(lags, axes)
     machine = ql.simulate(lags, axes, ql.Scenario((1.0, 0.5), duration=1.0))
     short = ql.Scenario((1.0, 0.5), duration=0.2)

@@ -70,7 +70,6 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "Guard": ql.Guard,
     "LinearController.of": controllers.LinearController.from_transfer_function,
     "LinearPlant.of": plants.LinearPlant.of,
-    "MultivariableLinearPlant.of": plants.MultivariableLinearPlant.of,
     "Notch": baselines.Notch.at,
     "PID.simc": baselines.PID.simc,
     "PID.simc_double_integrator": baselines.PID.simc_double_integrator,

@@ -27,16 +27,16 @@ _S, _B = feature("State"), feature("Bias")
 
 # ---- Several axes ----
 
-_GANTRY = make("plants.MultivariableLinearPlant", A=[[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]], B=[[0, 0], [5, 0.5], [0, 0], [0.4, 6]], C=[[1, 0, 0, 0], [0, 0, 1, 0]])  # fmt: skip
-_SPRING = make("plants.MultivariableLinearPlant", A=[[0, 1, 0, 0], [-4, -0.4, 3, 0.1], [0, 0, 0, 1], [3, 0.1, -5, -0.6]], B=[[0, 0], [1, 0.3], [0, 0], [0.2, 1]], C=[[1, 0, 0, 0], [0, 0, 1, 0]], E=[[0], [1], [0], [0.5]])  # fmt: skip
-_THREE = make("plants.MultivariableLinearPlant", A=[[0, 1, 0, 0, 0, 0], [0, -1, 0.5, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0.5, 0, 0, -2, 0, 0.3], [0, 0, 0, 0, 0, 1], [0, 0, 0, 0.3, 0, -1]], B=[[0, 0, 0, 0], [1, 0.3, 0.1, 0.5], [0, 0, 0, 0], [0.2, 2, 0.1, 0.2], [0, 0, 0, 0], [0, 0.3, 0.5, 0.4]], C=[[1, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0]])  # fmt: skip
-_SQUARE3 = make("plants.MultivariableLinearPlant", A=[[-1, 0.2, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0.3, -1, -2, -1, 0, 0], [0, 0, 0, 0, 0, 1], [0, 0.3, 0, 0, -1, -1]], B=[[1, 0.3, 0.1], [0, 0, 0], [0, 0, 0], [0.2, 2, 0.1], [0, 0, 0], [0, 0.3, 0.5]], C=[[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]])  # fmt: skip
-_WIDE2 = make("plants.MultivariableLinearPlant", A=[[0, 1, 0, 0], [0, -0.5, 0.4, 0], [0, 0, 0, 1], [0.4, 0, 0, -0.5]], B=[[0, 0, 0], [1, 0.1, 0.3], [0, 0, 0], [0.1, 0.5, -0.3]], C=[[1, 0, 0, 0], [0, 0, 1, 0]])  # fmt: skip
+_GANTRY = make("plants.LinearPlant", A=[[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]], B=[[0, 0], [5, 0.5], [0, 0], [0.4, 6]], C=[[1, 0, 0, 0], [0, 0, 1, 0]])  # fmt: skip
+_SPRING = make("plants.LinearPlant", A=[[0, 1, 0, 0], [-4, -0.4, 3, 0.1], [0, 0, 0, 1], [3, 0.1, -5, -0.6]], B=[[0, 0], [1, 0.3], [0, 0], [0.2, 1]], C=[[1, 0, 0, 0], [0, 0, 1, 0]], E=[[0], [1], [0], [0.5]])  # fmt: skip
+_THREE = make("plants.LinearPlant", A=[[0, 1, 0, 0, 0, 0], [0, -1, 0.5, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0.5, 0, 0, -2, 0, 0.3], [0, 0, 0, 0, 0, 1], [0, 0, 0, 0.3, 0, -1]], B=[[0, 0, 0, 0], [1, 0.3, 0.1, 0.5], [0, 0, 0, 0], [0.2, 2, 0.1, 0.2], [0, 0, 0, 0], [0, 0.3, 0.5, 0.4]], C=[[1, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0]])  # fmt: skip
+_SQUARE3 = make("plants.LinearPlant", A=[[-1, 0.2, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0.3, -1, -2, -1, 0, 0], [0, 0, 0, 0, 0, 1], [0, 0.3, 0, 0, -1, -1]], B=[[1, 0.3, 0.1], [0, 0, 0], [0, 0, 0], [0.2, 2, 0.1], [0, 0, 0], [0, 0.3, 0.5]], C=[[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]])  # fmt: skip
+_WIDE2 = make("plants.LinearPlant", A=[[0, 1, 0, 0], [0, -0.5, 0.4, 0], [0, 0, 0, 1], [0.4, 0, 0, -0.5]], B=[[0, 0, 0], [1, 0.1, 0.3], [0, 0, 0], [0.1, 0.5, -0.3]], C=[[1, 0, 0, 0], [0, 0, 1, 0]])  # fmt: skip
 _ARM = make("plants.arm", viscous=0.1)
 _SOFT = make(
     "plants.arm", gravity=0.0, coulomb=0.2, motor_inertia=0.05, stiffness=200.0, damping=0.5
 )
-_TANKS = make("plants.MultivariableNonlinearPlant", f=function("tanks"), order=4, inputs=2, output=function("places"))  # fmt: skip
+_TANKS = make("plants.NonlinearPlant", f=function("tanks"), order=4, inputs=2, output=function("places"))  # fmt: skip
 _DRONE = make("plants.quadrotor_attitude")
 _MATRIX2, _MATRIX3 = [[1.0, 0.3], [0.2, 1.0]], [[1.0, 0.3, 0.1], [0.2, 2.0, 0.1], [0.0, 0.3, 0.5]]
 _MATRIX34 = [[1.0, 0.3, 0.1, 0.5], [0.2, 2.0, 0.1, 0.2], [0.0, 0.3, 0.5, 0.4]]
@@ -249,12 +249,12 @@ class DrawAxes(Draw):
         }[kind]  # fmt: skip
         gain: Any = [self.near(each) for each in (2.0, 1.5, 1.0, 0.5)]
         controlled: Any = [[0.0, 0.0, 1.0, 0.0]]
-        plant = make("plants.MultivariableLinearPlant", **flexible)
+        plant = make("plants.LinearPlant", **flexible)
         if kind == "two inputs":
             two = {"A": [[0, 1, 0, 0], [0, -0.5, 0, 0], [0, 0, 0, 1], [0, 0, 0, -0.5]], "B": [[0, 0], [1, 0.3], [0, 0], [0.2, 1]], "C": [[1, 0, 0, 0], [0, 0, 1, 0]], "E": [[0, 0], [1, 0.3], [0, 0], [0.2, 1]]}  # fmt: skip
             observer |= two
             plant, gain, controlled = (
-                make("plants.MultivariableLinearPlant", **two),
+                make("plants.LinearPlant", **two),
                 [[2.0, 2.5, -0.4, -0.6], [-0.4, -0.5, 2.0, 2.4]],
                 None,
             )

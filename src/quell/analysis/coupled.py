@@ -37,11 +37,8 @@ from quell.guard.guard import check_one_state_of_f, check_stable, state_path
 from quell.lti.models import MatrixSystem, System, peak_gain
 from quell.observers.design import f_learned_response, response
 from quell.observers.forms import without_delay
-from quell.plants.multivariable import (
-    DelayedInputs,
-    EncodedOutputs,
-    MultivariableNonlinearPlant,
-)
+from quell.plants.channels import DelayedInputs, EncodedOutputs
+from quell.plants.nonlinear import NonlinearPlant
 from quell.types import Matrix, Vector
 
 
@@ -299,7 +296,7 @@ def _not_covered(plant: Any, axes: Axes) -> tuple[str, ...]:
         if isinstance(plant, EncodedOutputs):
             found.append("the encoders' steps (they count as noise, the same in both loops)")
         plant = plant.plant
-    if isinstance(plant, MultivariableNonlinearPlant):
+    if isinstance(plant, NonlinearPlant):
         found.append("large motions (the plant is linearised)")
     if callable(axes.B0) or callable(axes.M):
         found.append("changes of B0 with the estimates")

@@ -24,15 +24,10 @@ from quell.controllers.allocation import update_gain
 from quell.controllers.axes import Axes
 from quell.controllers.linear import LinearLaw
 from quell.lti.models import MatrixSystem
+from quell.plants.channels import DelayedInputs, EncodedOutputs
+from quell.plants.linear import LinearModelOfMany, LinearPlant
 from quell.plants.linearise import linearised
-from quell.plants.multivariable import (
-    DelayedInputs,
-    EncodedOutputs,
-    MultivariableLinear,
-    MultivariableLinearPlant,
-    MultivariableNonlinearPlant,
-)
-from quell.plants.nonlinear import checked_point
+from quell.plants.nonlinear import NonlinearPlant, checked_point
 from quell.types import Matrix, Vector
 
 # ---- Frequency responses of several inputs and outputs ----
@@ -110,9 +105,10 @@ def sampled_matrices(
     Parameters
     ----------
     plant
-        a ``MultivariableLinearPlant`` or what it is made ``of``, (A, B, C) in continuous time; one
-        behind delays or encoders, which are left out; a ``MultivariableNonlinearPlant``, linearised
-        at the operating point; a sampled plant: a ``MultivariableLinear``, or a system with A, B, C
+        a ``LinearPlant`` or what it is made ``of``, (A, B, C) in continuous time; one
+        behind delays or encoders, which are left out; a ``NonlinearPlant``, linearised
+        at the operating point; a sampled plant: what a ``LinearPlant`` of several signals is
+        ``sampled`` to, or a system with A, B, C
         and the same ``dt``.
     dt
         sample time [s].
@@ -124,7 +120,7 @@ def sampled_matrices(
     ValueError
         for another plant, one of another sample time, a nonlinear one without operating point.
     """
-    if isinstance(plant, MultivariableLinear):
+    if isinstance(plant, LinearModelOfMany):
         return plant_matrices((plant.transition, plant.input, plant.output))
     if getattr(plant, "A", None) is not None and getattr(plant, "dt", None):
         if plant.dt is True or not math.isclose(plant.dt, dt, rel_tol=1e-9):
@@ -134,8 +130,7 @@ def sampled_matrices(
             )
         return plant_matrices(plant)
     linear, waiting = linear_part_of(plant, dt, operating_point)
-    sampled = linear.sampled(dt)
-    A, B, C = sampled.transition, sampled.input, sampled.output
+    A, B, C = linear.sampled_matrices(dt)[:3]
     for j, samples in enumerate(waiting):
         for _ in range(samples):
             n, m = B.shape
@@ -147,7 +142,7 @@ def sampled_matrices(
 
 def linear_part_of(
     plant: Any, dt: float, operating_point: Any = None
-) -> tuple[MultivariableLinearPlant, tuple[int, ...]]:
+) -> tuple[LinearPlant, tuple[int, ...]]:
     """Return a plant without delays and encoders, in continuous time, and the delays [samples].
 
     There is a delay for each input. Plants and errors are those of ``sampled_matrices``, but for
@@ -159,14 +154,14 @@ def linear_part_of(
             plant.sampled(dt)  # made for this dt
             waiting = waiting + np.array(plant.samples)
         plant = plant.plant
-    if isinstance(plant, MultivariableNonlinearPlant):
+    if isinstance(plant, NonlinearPlant):
         if operating_point is None:
             raise ValueError(
                 f"plant = {plant.name!r} is nonlinear: give the point at which it is linearised, "
                 "operating_point=(x, u)"
             )
         plant = linearised(plant, *checked_point(operating_point))
-    linear = MultivariableLinearPlant.of(plant)
+    linear = LinearPlant.of(plant)
     return linear, tuple(np.broadcast_to(waiting, linear.inputs).tolist())
 
 
@@ -188,7 +183,7 @@ def estimates_at(axes: Axes, plant: Any, operating_point: Any) -> Matrix | None:
         return None
     while isinstance(plant, DelayedInputs | EncodedOutputs):
         plant = plant.plant
-    if not isinstance(plant, MultivariableNonlinearPlant):
+    if not isinstance(plant, NonlinearPlant):
         return None
     state = checks.vector("x", checked_point(operating_point)[0], plant.order)
     model: Any = plant.sampled(axes.dt, interpret=True)

@@ -496,10 +496,10 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
     Parameters
     ----------
     plant
-        a plant with an output for each axis: a ``MultivariableLinearPlant`` or what it is made
+        a plant with an output for each axis: a ``LinearPlant`` or what it is made
         ``of``, such as (A, B, C) in continuous time; one behind delays or encoders, which are left
-        out; a ``MultivariableNonlinearPlant``, with its operating point; or a sampled one, a
-        ``control.StateSpace`` with the same dt or a ``MultivariableLinear``.
+        out; a ``NonlinearPlant``, with its operating point; or a sampled one, a
+        ``control.StateSpace`` with the same dt, or what a ``LinearPlant`` is ``sampled`` to.
     axes
         the controller.
     operating_point

@@ -47,9 +47,9 @@ from quell.controllers.law import ModelFeedforward, ReferenceOnly
 from quell.lti.canonical import Canonical, canonical, format_roots
 from quell.observers.eso import ESO
 from quell.observers.forms import DelayedModel
+from quell.plants.friction import FrictionPlant
 from quell.plants.linear import DelayedPlant, EncodedPlant
 from quell.plants.linearise import linear_model
-from quell.plants.nonlinear import FrictionPlant
 from quell.signals.shapes import Signal
 from quell.types import Vector
 

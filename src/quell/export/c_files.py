@@ -41,7 +41,7 @@ from quell.export.translate.text import (
     wrapped,
 )
 from quell.kernels.dispatch import generic, generic_with_default
-from quell.plants.base import Plant, advance, check_plant, measure
+from quell.plants.base import Plant, advance, check_one_input, check_plant, measure
 from quell.plants.fmu import FMUPlant
 from quell.types import Status, Vector
 
@@ -405,6 +405,7 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
         naming what has no counterpart in C.
     """
     check_plant(plant)
+    check_one_input(plant, "NOT exported to C yet")
     inner: Any = plant
     while hasattr(inner, "plant"):
         inner = inner.plant

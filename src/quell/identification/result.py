@@ -20,8 +20,8 @@ from quell.identification.starts import SURE
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
 from quell.plants.base import labelled
+from quell.plants.friction import with_friction_and_delay
 from quell.plants.linear import LinearPlant
-from quell.plants.nonlinear import with_friction_and_delay
 from quell.quantities import UNKNOWN, Quantity, Signals
 from quell.records.plotting import draw_line, given_axes
 from quell.types import Matrix, Vector

@@ -104,7 +104,7 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
             raise ValueError(f"plant has {size} outputs and inputs: must have one of each")
         return _transfer_function(plant.num[0][0], plant.den[0][0])
     named = repr(getattr(plant, "name", None) or plant)
-    if hasattr(plant, "sampled") and hasattr(plant, "inputs"):
+    if getattr(plant, "inputs", 1) > 1 or getattr(plant, "outputs", 1) > 1:
         raise ValueError(
             f"plant = {named} has {plant.inputs} control signals and {plant.outputs} outputs, here "
             "there is one of each; several: quell.Axes and quell.analysis.analyse_axes"
@@ -165,22 +165,62 @@ def leading_gain(A: Matrix, column: Matrix, C: Matrix) -> tuple[float, int] | No
     return None
 
 
-def check_matrices(A: Any, B: Any, C: Any) -> tuple[Matrix, Matrix, Matrix]:
-    """Return A (n, n), B (n, 1) and C (1, n), checked; B and C may be given as vectors."""
+def check_matrices(A: Any, B: Any, C: Any, several: bool = False) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A (n, n), B (n, m) and C (p, n), checked; B and C may be given as vectors.
+
+    m and p are 1, unless ``several`` are allowed.
+    """
     A = checks.matrix("A", A)
     n = A.shape[0]
     checks.matrix("A", A, n, n)
     inputs = np.shape(B)[1] if np.ndim(B) == 2 else 1
     outputs = np.shape(C)[0] if np.ndim(C) == 2 else 1
-    if max(inputs, outputs) > 1:
+    if max(inputs, outputs) > 1 and not several:
         raise ValueError(
             f"B has shape {np.shape(B)}, C {np.shape(C)}: {inputs} inputs and {outputs} outputs, "
-            "here there is one of each; several: quell.plants.MultivariableLinearPlant, controlled "
-            "by quell.Axes and judged by quell.analysis.analyse_axes"
+            "here there is one of each; several are controlled by quell.Axes and judged by "
+            "quell.analysis.analyse_axes"
         )
-    B = checks.matrix("B", np.reshape(B, (-1, 1)) if np.ndim(B) == 1 else B, n, 1)
-    C = checks.matrix("C", np.reshape(C, (1, -1)) if np.ndim(C) == 1 else C, 1, n)
+    B = checks.matrix("B", np.reshape(B, (-1, 1)) if np.ndim(B) == 1 else B)
+    C = checks.matrix("C", np.reshape(C, (1, -1)) if np.ndim(C) == 1 else C)
+    for name, value, shape, rule in (
+        ("B", B, (n, inputs), "a row for each state, a column for each control signal"),
+        ("C", C, (outputs, n), "a row for each output, a column for each state"),
+    ):
+        if value.shape != shape:
+            raise ValueError(
+                f"{name} has shape {value.shape}, A {A.shape}: must be a matrix of shape {shape}, "
+                f"{rule}"
+            )
     return A, B, C
+
+
+def several_matrices(model: Any, E: Any = None) -> tuple[Any, Any, Any, Any] | None:
+    """Return A, B, C and E of a model with several inputs or outputs; None for another one.
+
+    A model is ``(A, B, C)``, ``(A, B, E, C)``, or has A, B and C, and D of zero. ``E`` is the
+    input of the disturbances in place of the model's own.
+
+    Raises
+    ------
+    ValueError
+        for a model of discrete time, and one in which y follows u at once.
+    """
+    of_model, own, D = None, None, 0.0
+    if isinstance(model, tuple | list) and len(model) in (3, 4):
+        of_model, own = (model[0], model[1], model[-1]), model[2] if len(model) == 4 else None
+    elif all(hasattr(model, part) for part in "ABC"):
+        of_model, own = (model.A, model.B, model.C), getattr(model, "E", None)
+        D = getattr(model, "D", 0.0)
+    if of_model is None:
+        return None
+    _, B, C = of_model
+    if not ((np.ndim(B) == 2 and np.shape(B)[1] > 1) or (np.ndim(C) == 2 and np.shape(C)[0] > 1)):
+        return None
+    _check_time(model, None)
+    if np.any(np.asarray(D)):
+        raise ValueError("model has D other than zero: y must not follow u at once")
+    return *of_model, own if E is None else _column(E, own)
 
 
 def _from_matrices(plant: tuple[Any, ...], E: Any) -> StateSpace:

@@ -68,6 +68,16 @@ class PlantWrapper(Described):
         return self.plant.disturbances
 
     @property
+    def inputs(self) -> int:
+        """Number of control signals."""
+        return inputs_of(self.plant)
+
+    @property
+    def outputs(self) -> int:
+        """Number of measured outputs."""
+        return outputs_of(self.plant)
+
+    @property
     def compiled(self) -> bool:
         """Whether the driver can run it compiled."""
         return self.plant.compiled
@@ -91,10 +101,11 @@ def check_plant(value: Any, name: str = "plant") -> None:
 
 def check_one_input(plant: Any, several: str, name: str = "plant") -> None:
     """Raise a ``ValueError`` for a plant with several signals; ``several`` is what takes those."""
-    if hasattr(plant, "sampled") and hasattr(plant, "inputs"):
+    if hasattr(plant, "sampled") and is_several(plant):
         raise ValueError(
-            f"{name} = {plant.name!r} has {plant.inputs} control signals and {plant.outputs} "
-            f"outputs, here there is one of each; several: {several}"
+            f"{name} = {plant.name!r} has {checks.counted(inputs_of(plant), 'control signal')} and "
+            f"{checks.counted(outputs_of(plant), 'output')}, here there is one of each; several: "
+            f"{several}"
         )
 
 
@@ -133,6 +144,11 @@ def inputs_of(plant: Any) -> int:
 def outputs_of(plant: Any) -> int:
     """Return the number of outputs of a plant."""
     return int(getattr(plant, "outputs", 1))
+
+
+def is_several(plant: Any) -> bool:
+    """Return whether a plant has more than one control signal or output."""
+    return max(inputs_of(plant), outputs_of(plant)) > 1
 
 
 @generic

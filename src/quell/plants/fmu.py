@@ -37,6 +37,7 @@ from quell.plants.base import (
     measure,
     measure_all,
 )
+from quell.plants.channels import ChannelNames
 from quell.plants.fmu_file import (
     CALLS,
     FMUError,
@@ -47,7 +48,6 @@ from quell.plants.fmu_file import (
     Variables,
     warn_of_step,
 )
-from quell.plants.multivariable import ChannelNames
 from quell.types import Vector
 
 # ---- Instances of FMUs, and the function by which loops advance them ----

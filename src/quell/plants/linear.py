@@ -42,6 +42,7 @@ from quell.lti.models import (
     check_matrices,
     leading_gain,
     read_model,
+    several_matrices,
     to_state_space,
     zero_order_hold,
 )
@@ -49,12 +50,16 @@ from quell.plants.base import (
     Plant,
     PlantWrapper,
     advance,
+    all_signals,
+    as_input,
     begin_run,
     check_one_input,
     check_plant,
     check_run,
+    is_several,
     labelled,
     measure,
+    measure_all,
     signals_of,
 )
 from quell.types import Matrix, Vector
@@ -94,27 +99,77 @@ def _advance(plant: LinearModel, x: Vector, scratch: Vector, t: float, u: float,
         x[i] = scratch[i]
 
 
+class LinearModelOfMany(NamedTuple):
+    """A sampled linear plant with several signals."""
+
+    transition: Matrix  # Φ (n, n)
+    input: Matrix  # Γ (n, m)
+    disturbance: Matrix  # Γ_w (n, q)
+    output: Matrix  # C (p, n)
+
+
+as_input.register(LinearModelOfMany)(all_signals)
+
+
+@measure_all.register(LinearModelOfMany)
+def _measure_many(plant: LinearModelOfMany, x: Vector, y: Vector) -> None:
+    outputs, size = plant.output.shape
+    for i in range(outputs):
+        total = 0.0
+        for j in range(size):
+            total += plant.output[i, j] * x[j]
+        y[i] = total
+
+
+@advance.register(LinearModelOfMany)
+def _advance_many(
+    plant: LinearModelOfMany, x: Vector, scratch: Vector, t: float, u: Any, w: Vector
+) -> None:
+    size, inputs = plant.input.shape
+    for i in range(size):
+        total = 0.0
+        for j in range(plant.disturbance.shape[1]):
+            total += plant.disturbance[i, j] * w[j]
+        for j in range(size):
+            total += plant.transition[i, j] * x[j]
+        for j in range(inputs):
+            total += plant.input[i, j] * u[j]
+        scratch[i] = total
+    for i in range(size):
+        x[i] = scratch[i]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearPlant(Described):
-    """A linear plant ``x' = A x + B u + E w``, ``y = C x`` of any size with one input and output.
+    """A linear plant ``x' = A x + B u + E w``, ``y = C x`` with any number of inputs and outputs.
 
     Parameters
     ----------
     A
         (n, n).
     B
-        (n,) or (n, 1).
+        (n, m): a column for each control signal; (n,) for one.
     C
-        (n,) or (1, n).
+        (p, n): a row for each measured output; (n,) for one.
     E
-        (n, m), m ≥ 0 disturbance inputs; by default the disturbance enters as u does.
+        (n, q): a column for each disturbance; by default each enters where a control signal does.
     name
         for tables and plots.
 
     Raises
     ------
     ValueError
-        if shapes do not fit or an entry is not finite.
+        if shapes do not fit, with both shapes, or an entry is not finite.
+
+    Examples
+    --------
+    >>> gantry = LinearPlant(
+    ...     A=[[0, 1, 0, 0], [0, -2, 0, 0], [0, 0, 0, 1], [0, 0, 0, -3]],
+    ...     B=[[0, 0], [5, 0.5], [0, 0], [0.4, 6]],
+    ...     C=[[1, 0, 0, 0], [0, 0, 1, 0]],
+    ... )
+    >>> gantry.order, gantry.inputs, gantry.outputs, gantry.disturbances
+    (4, 2, 2, 2)
     """
 
     A: Any
@@ -125,7 +180,7 @@ class LinearPlant(Described):
     compiled = True
 
     def __post_init__(self) -> None:
-        A, B, C = check_matrices(self.A, self.B, self.C)
+        A, B, C = check_matrices(self.A, self.B, self.C, several=True)
         E = B if self.E is None else checks.matrix("E", self.E, A.shape[0])
         for name, value in (("A", A), ("B", B), ("C", C), ("E", E)):
             value.flags.writeable = False
@@ -144,8 +199,8 @@ class LinearPlant(Described):
               list; B, E and C may be vectors,
             * a transfer function ``(numerator, denominator)``, sequences in descending powers of s,
             * ``(a, b)`` with a number b: ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u``,
-            * a continuous-time ``control.StateSpace`` or ``control.TransferFunction``, of one input
-              and output, with D = 0,
+            * a continuous-time ``control.StateSpace`` with D = 0, or a
+              ``control.TransferFunction`` of one input and output,
             * the same of scipy.signal: ``StateSpace``, ``TransferFunction``, ``ZerosPolesGain``,
             * a ``LinearPlant``, which is returned as it is, or anything else with A, B and C.
         E
@@ -177,6 +232,8 @@ class LinearPlant(Described):
         """
         if isinstance(model, cls) and E is None:
             return model
+        if (parts := several_matrices(model, E)) is not None:
+            return cls(*parts, name=name)
         found = read_model(model, E)
         if isinstance(found, TransferFunction):
             found = to_state_space(found)
@@ -189,12 +246,29 @@ class LinearPlant(Described):
         return int(self.A.shape[0])
 
     @property
+    def inputs(self) -> int:
+        """Number of control signals."""
+        return int(self.B.shape[1])
+
+    @property
+    def outputs(self) -> int:
+        """Number of measured outputs."""
+        return int(self.C.shape[0])
+
+    @property
     def disturbances(self) -> int:
         """Number of disturbance inputs."""
         return int(self.E.shape[1])
 
-    def sampled(self, dt: float, interpret: bool = False) -> LinearModel:
+    def sampled(self, dt: float, interpret: bool = False) -> Any:
         """Return the plant sampled at ``dt`` [s] with zero-order hold on u and w."""
+        phi, gamma, C, gamma_w = self.sampled_matrices(dt)
+        if is_several(self):
+            return LinearModelOfMany(phi, gamma, gamma_w, C)
+        return LinearModel(phi, gamma[:, 0].copy(), gamma_w, C[0].copy())
+
+    def sampled_matrices(self, dt: float) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """Return A, B, C and E of the plant sampled at ``dt`` [s], as ``sampled``."""
         inputs = [self.B, self.E]
         phi, (gamma, gamma_w) = zero_order_hold(self.A, inputs, checks.positive("dt", dt, "s"))
         if not all(np.isfinite(part).all() for part in (phi, gamma, gamma_w)):
@@ -202,7 +276,7 @@ class LinearPlant(Described):
                 f"dt = {dt!r} s: {self.name} can't be sampled with it, exp(A dt) is beyond all "
                 "numbers; check the units of dt and of the plant"
             )
-        return LinearModel(phi, gamma[:, 0].copy(), gamma_w, self.C[0].copy())
+        return phi, gamma, self.C, gamma_w
 
 
 # ---- The plant as the controller sees it ----
@@ -241,6 +315,7 @@ def sampled_plant(
         model = to_state_space(model) if isinstance(model, TransferFunction) else model
         N, B = model.A - np.eye(model.C.size), model.B[:, None]
         return _delayed(N, B, np.zeros_like(B), model.C, B, round(delay / dt), {})
+    check_one_input(plant, "quell.analysis.analyse_axes")
     linear: Any = LinearPlant.of(plant)
     first = leading_gain(linear.A, linear.B, linear.C)
     gains = {} if first is None else {first[1]: first[0]}
@@ -523,7 +598,7 @@ def lagged(plant: Plant, lag: float) -> Plant:
     ([[0.0, 1.0], [0.0, -10.0]], [0.0, 10.0])
     """
     check_plant(plant)
-    check_one_input(plant, "a lag in A and B of a MultivariableLinearPlant")
+    check_one_input(plant, "a lag in A and B of a LinearPlant")
     lag = checks.positive("lag", lag, "s")
     if isinstance(plant, DelayedPlant | EncodedPlant):
         return replace(plant, plant=lagged(plant.plant, lag))

@@ -12,16 +12,12 @@ import numpy as np
 
 from quell import checks
 from quell.lti.models import is_linear_model
-from quell.plants.base import labelled, signals_of
+from quell.plants.base import as_input, check_one_input, labelled, signals_of
+from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.flexible import CubicSpringPlant
+from quell.plants.friction import FrictionPlant
 from quell.plants.linear import DelayedPlant, EncodedPlant, LaggedPlant, LinearPlant, lagged
-from quell.plants.multivariable import (
-    DelayedInputs,
-    EncodedOutputs,
-    MultivariableLinearPlant,
-    MultivariableNonlinearPlant,
-)
-from quell.plants.nonlinear import FrictionPlant, NonlinearPlant, checked_point, value_or_nan
+from quell.plants.nonlinear import NonlinearPlant, checked_point, value_or_nan
 from quell.types import Matrix, Vector
 
 # Step of the central differences, absolute for values below 1, else relative. Its error is 1e-10 by
@@ -47,7 +43,7 @@ def linearised(plant: Any, x: Any, u: Any = 0.0, *, w: Any = None, t: float = 0.
     ----------
     plant
         a ``NonlinearPlant``, whose derivatives are found by central differences with steps of 1e-6
-        (choose units in which states are of order one); a ``MultivariableNonlinearPlant``; a plant
+        (choose units in which states are of order one); a plant
         with a cubic spring; an encoded plant, whose encoders are left out; a linear plant, which is
         returned as it is.
     x
@@ -61,7 +57,7 @@ def linearised(plant: Any, x: Any, u: Any = 0.0, *, w: Any = None, t: float = 0.
 
     Returns
     -------
-    LinearPlant or MultivariableLinearPlant
+    LinearPlant
 
     Raises
     ------
@@ -78,20 +74,19 @@ def linearised(plant: Any, x: Any, u: Any = 0.0, *, w: Any = None, t: float = 0.
     """
     while isinstance(plant, EncodedPlant | EncodedOutputs):
         plant = plant.plant
-    if isinstance(plant, LinearPlant | MultivariableLinearPlant):
+    if isinstance(plant, LinearPlant):
         return plant
     if isinstance(plant, CubicSpringPlant):
         return _with_spring_of(plant, checks.vector("x", x, plant.order))
-    if isinstance(plant, NonlinearPlant | MultivariableNonlinearPlant):
+    if isinstance(plant, NonlinearPlant):
         state = checks.vector("x", x, plant.order)
         loads = np.zeros(plant.disturbances) if w is None else w
         loads = checks.vector("w", loads, plant.disturbances)
-        t = checks.finite("t", t)
-        if isinstance(plant, MultivariableNonlinearPlant):
-            signals = np.full(plant.inputs, u) if np.ndim(u) == 0 else u
-            signals = checks.vector("u", signals, plant.inputs)
-            return _differentiated_all(plant, state, signals, loads, t)
-        return _differentiated(plant, state, checks.finite("u", u), loads, t)
+        if np.ndim(u) == 0:
+            signals = np.full(plant.inputs, checks.finite("u", u))
+        else:
+            signals = checks.vector("u", u, plant.inputs)
+        return _differentiated(plant, state, signals, loads, checks.finite("t", t))
     rule = "must be a NonlinearPlant, a plant with a cubic spring, or a linear plant"
     raise ValueError(f"plant = {getattr(plant, 'name', plant)!r}: {rule}")
 
@@ -107,7 +102,7 @@ def held_points(name: str, plant: Any, points: Any) -> tuple[tuple[Vector, Vecto
         raise ValueError(f"{name} = {points!r:.60}: {rule}")
     if len(points) == 0:
         raise ValueError(f"{name} = []: give at least one state, or (x, u)")
-    if _of_several_signals(plant).order > 1 and not any(_has_entries(each) for each in points):
+    if _nonlinear(plant).order > 1 and not any(_has_entries(each) for each in points):
         raise ValueError(f"{name} = {points!r:.60}: {rule}; of one state write [[…]]")
     found = []
     for i, each in enumerate(points):
@@ -124,7 +119,7 @@ def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
     Parameters
     ----------
     plant
-        a ``MultivariableNonlinearPlant``, also behind delays or encoders.
+        a ``NonlinearPlant``, also behind delays or encoders.
     point
         (x, u), which is returned as it is, or the state x (n,), for which u is found by least
         squares: the equations of motion are taken as linear in u.
@@ -134,7 +129,7 @@ def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
     ValueError
         for another plant, a state of unsuitable length, and one that no u holds at rest.
     """
-    plant = _of_several_signals(plant)
+    plant = _nonlinear(plant)
     if isinstance(point, list | tuple) and len(point) == 2 and np.ndim(point[0]) > 0:
         x = checks.vector("x", point[0], plant.order)
         return x, checks.vector("u", point[1], plant.inputs)
@@ -147,7 +142,7 @@ def held_at(plant: Any, point: Any) -> tuple[Vector, Vector]:
     w = np.zeros(plant.disturbances)
 
     def rate(u: Vector) -> Vector:
-        return np.array(model.rate(0.0, x, u, w), dtype=np.float64)
+        return np.array(model.rate(0.0, x, as_input(model, u), w), dtype=np.float64)
 
     first = rate(np.zeros(plant.inputs))
     columns = np.column_stack([rate(row) - first for row in np.eye(plant.inputs)])
@@ -165,15 +160,14 @@ def _has_entries(value: Any) -> bool:
     return checks.is_sequence(value) or (isinstance(value, np.ndarray) and value.ndim > 0)
 
 
-def _of_several_signals(plant: Any) -> MultivariableNonlinearPlant:
-    """Return a nonlinear plant with several signals, without its delays and encoders."""
+def _nonlinear(plant: Any) -> NonlinearPlant:
+    """Return a nonlinear plant without its delays and encoders."""
     while isinstance(plant, DelayedInputs | EncodedOutputs):
         plant = plant.plant
-    if not isinstance(plant, MultivariableNonlinearPlant):
+    if not isinstance(plant, NonlinearPlant):
         name = getattr(plant, "name", plant)
         raise ValueError(
-            f"plant = {name!r}: must be a nonlinear plant with several signals; a linear one is "
-            "the same at all points"
+            f"plant = {name!r}: must be a nonlinear plant; a linear one is the same at all points"
         )
     return plant
 
@@ -187,31 +181,19 @@ def _with_spring_of(plant: CubicSpringPlant, x: Vector) -> LinearPlant:
     return LinearPlant(A, plant.linear.B, plant.linear.C, plant.linear.E, name=plant.name)
 
 
-def _differentiated(plant: NonlinearPlant, x: Vector, u: float, w: Vector, t: float) -> LinearPlant:
-    model: Any = plant.sampled(1.0, interpret=True)
-    n = x.size
-
-    def rate(point: Vector) -> Any:
-        return model.rate(t, point[:n], float(point[n]), point[n + 1 :])
-
-    J = _jacobian(rate, np.concatenate([x, [u], w]), "f")
-    C = _jacobian(lambda point: [model.output(point)], x, "output")
-    return LinearPlant(J[:, :n], J[:, n], C, J[:, n + 1 :], name=f"{plant.name}, linearised")
-
-
-def _differentiated_all(
-    plant: MultivariableNonlinearPlant, x: Vector, u: Vector, w: Vector, t: float
-) -> MultivariableLinearPlant:
+def _differentiated(
+    plant: NonlinearPlant, x: Vector, u: Vector, w: Vector, t: float
+) -> LinearPlant:
     model: Any = plant.sampled(1.0, interpret=True)
     n, m = x.size, x.size + u.size
 
     def rate(point: Vector) -> Any:
-        return model.rate(t, point[:n], point[n:m], point[m:])
+        return model.rate(t, point[:n], as_input(model, point[n:m]), point[m:])
 
     J = _jacobian(rate, np.concatenate([x, u, w]), "f")
-    C = _jacobian(model.output, x, "output")
+    C = _jacobian(lambda point: np.atleast_1d(model.output(point)), x, "output")
     parts = (J[:, :n], J[:, n:m], C, J[:, m:])
-    return MultivariableLinearPlant(*parts, name=f"{plant.name}, linearised")
+    return LinearPlant(*parts, name=f"{plant.name}, linearised")
 
 
 def _jacobian(function: Callable[[Vector], Any], point: Vector, name: str) -> Matrix:
@@ -277,9 +259,10 @@ def operating_point_of(plant: NonlinearPlant) -> tuple[Any, float]:
         return checked_point(plant.operating_point)
     rest, model = np.zeros(plant.order), plant.sampled(1.0, interpret=True)
     with np.errstate(all="ignore"):
-        rate = value_or_nan(model.rate, 0.0, rest, 0.0, np.zeros(plant.disturbances))
+        u = as_input(model, np.zeros(plant.inputs))
+        rate = value_or_nan(model.rate, 0.0, rest, u, np.zeros(plant.disturbances))
     if np.all(np.asarray(rate) == 0.0):
-        return rest, 0.0
+        return rest, plant.no_control
     raise ValueError(
         f"plant = {plant.name!r} is nonlinear, and zero is no state of rest: give the point at "
         "which it is linearised, operating_point=(x, u)"
@@ -294,6 +277,7 @@ def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any
     ``ValueError`` for a delay that was made for another sample time, and for a nonlinear plant
     without operating point.
     """
+    check_one_input(plant, "quell.Axes and quell.analysis.analyse_axes")
     delay = 0.0
     while isinstance(plant, DelayedPlant | EncodedPlant):
         if isinstance(plant, DelayedPlant):

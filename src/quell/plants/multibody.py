@@ -39,13 +39,13 @@ import numba
 import numpy as np
 
 from quell import checks
-from quell.plants.multivariable import MultivariableNonlinearPlant
+from quell.plants.nonlinear import NonlinearPlant
 from quell.types import Matrix, Vector
 
 # ---- A planar arm ----
 
 
-class Arm(MultivariableNonlinearPlant):
+class Arm(NonlinearPlant):
     """A planar arm; make it with ``arm``.
 
     The states are the angles of the joints, their rates, then angles and rates of the motors of
@@ -119,7 +119,7 @@ def arm(
         where the angles are measured: ``"motor"``, ``"link"``, or ``"both"``, with the motors'
         first. At a rigid joint motor and link have one angle.
     substeps, name
-        as for ``MultivariableNonlinearPlant``.
+        as for ``NonlinearPlant``.
 
     Raises
     ------
@@ -167,9 +167,13 @@ def arm(
         "joints": np.array([*parts, rigid_inertia], dtype=np.float64),
     }  # fmt: skip
     return Arm(
-        _arm_rate, order, n, _encoder_rows(encoders, elastic, order), n, substeps,
-        name or f"arm of {n} links", parameters,
+        _arm_rate if n > 1 else _rate_of_one_link, order, _encoder_rows(encoders, elastic, order),
+        n, substeps, name or f"arm of {checks.counted(n, 'link')}", parameters, inputs=n,
     )  # fmt: skip
+
+
+def _rate_of_one_link(t, x, u, w, a, g, friction, width, joints):  # type: ignore[no-untyped-def]
+    return _arm_rate(t, x, np.full(1, u), w, a, g, friction, width, joints)  # type: ignore[no-untyped-call]
 
 
 def _each(name: str, value: Any, count: int, *, finite: bool = True) -> Vector:
@@ -290,7 +294,7 @@ def _arm_rate(t, x, u, w, a, g, friction, width, joints):  # type: ignore[no-unt
 # ---- The attitude of a craft with rotors ----
 
 
-class Craft(MultivariableNonlinearPlant):
+class Craft(NonlinearPlant):
     """The attitude of a craft; make it with ``quadrotor_attitude``."""
 
     @property
@@ -338,7 +342,7 @@ def quadrotor_attitude(
     lag = checks.positive("motor_lag", motor_lag, "s")
     lever = rotor_levers(arm, drag)
     parameters = {"inertia": about, "lever": lever, "lag": lag}
-    return Craft(_craft_rate, 10, 4, np.eye(10)[:3], 3, None, name, parameters)
+    return Craft(_craft_rate, 10, np.eye(10)[:3], 3, None, name, parameters, inputs=4)
 
 
 def _craft_rate(t, x, u, w, inertia, lever, lag):  # type: ignore[no-untyped-def]

@@ -5,17 +5,6 @@ Machine code of a user's differential equation whose parameters are numbers by n
 The numbers are an array beside the addresses of the code: other numbers need no other code.
 
 The equation of a nonlinear plant in a sample: Runge-Kutta over the user's function.
-
-A transfer function whose input acts against Coulomb friction, as identification finds it.
-
-::
-
-    x' = A x + B (u + w − σ F tanh(y'/v)),      y = x_1
-
-σ is the sign of the gain from u to the motion, so that friction acts against it. In order 1 y is
-the speed, and stands in the place of y'. v is small against the speeds of motion. The sign of the
-speed is smooth, so that Runge-Kutta steps solve the equation; a plant at rest creeps slowly under
-less than F.
 """
 
 from __future__ import annotations
@@ -36,7 +25,7 @@ from quell.checks import Described
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic
 from quell.kernels.frozen import frozen, kept_code
-from quell.kernels.functions import tanh
+from quell.kernels.sized import Buffer
 from quell.kernels.user_functions import (
     POINTER,
     Shapes,
@@ -50,8 +39,15 @@ from quell.kernels.user_functions import (
     set_origin,
     shapes_of,
 )
-from quell.plants.base import Plant, advance, labelled, measure, signals_of
-from quell.plants.linear import LinearPlant, delayed
+from quell.plants.base import (
+    advance,
+    all_signals,
+    as_input,
+    labelled,
+    measure,
+    measure_all,
+    signals_of,
+)
 from quell.types import Matrix, Vector, warn
 
 # ---- Machine code of a user's differential equation whose parameters are numbers by name ----
@@ -158,6 +154,77 @@ def machine_code(
     return code
 
 
+_RATE_SIGNATURE_OF_MANY = nb_types.void(
+    nb_types.float64, POINTER, POINTER, POINTER, POINTER, POINTER
+)
+_OUTPUT_SIGNATURE_OF_MANY = nb_types.void(POINTER, POINTER, POINTER)
+
+
+def _first(u: Vector) -> float:
+    return u[0]
+
+
+def _all(u: Vector) -> Vector:
+    return u
+
+
+class _Sizes(NamedTuple):
+    """Numbers of states, control signals, outputs and disturbances, and shapes of parameters."""
+
+    n: int
+    m: int
+    p: int
+    q: int
+    own: Shapes  # of the parameters of f
+    more: Shapes  # of those of the output
+
+
+@kept_code(_KEPT)
+def _machine_code_of_many(
+    rate_of: Callable[..., Any], output_of: Callable[..., Any], sizes: _Sizes
+) -> tuple[Any, Any]:
+    """Return the compiled f and output; raise ``NotCompilableError`` if Numba can't."""
+    n, m, p, q, of_rate, of_output = sizes
+    own, more = reader(of_rate), reader(of_output, count_of(of_rate))
+    f = user_functions.jit_user_function(rate_of)
+    h = user_functions.jit_user_function(output_of)
+    taken = user_functions.jit_user_function(_first if m == 1 else _all)
+
+    def rate(t, px, pu, pw, pp, pdx):  # type: ignore[no-untyped-def]
+        dx = numba.carray(pdx, (n,))
+        u = taken(numba.carray(pu, (m,)))
+        found = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (q,)), *own(pp))
+        for i in range(n):
+            dx[i] = found[i]
+
+    def output(px, pp, py):  # type: ignore[no-untyped-def]
+        y = numba.carray(py, (p,))
+        found = h(numba.carray(px, (n,)), *more(pp))
+        for i in range(p):
+            y[i] = found[i]
+
+    compile_cfunc = user_functions.compile_cfunc
+    return (
+        compile_cfunc(_RATE_SIGNATURE_OF_MANY, rate),
+        compile_cfunc(_OUTPUT_SIGNATURE_OF_MANY, output),
+    )
+
+
+@lru_cache(maxsize=_KEPT)
+def rows_output(rows: tuple[tuple[float, ...], ...]) -> Callable[[Vector], Any]:
+    """Return the function ``C x`` of a matrix C."""
+    C = np.array(rows)
+
+    def linear(x: Vector) -> Vector:
+        y = np.zeros(C.shape[0])
+        for i in range(C.shape[0]):
+            for j in range(C.shape[1]):
+                y[i] += C[i, j] * x[j]
+        return y
+
+    return linear
+
+
 # ---- The equation of a nonlinear plant in a sample ----
 
 
@@ -262,6 +329,57 @@ def _derivatives_python(
     dx[:] = value_or_nan(plant.rate, t, x, u, w)
 
 
+class CompiledOfMany(NamedTuple):
+    """A nonlinear plant with several signals and compiled functions, given by address."""
+
+    rate: int
+    output: int
+    step: float  # length of a sub-step [s]
+    substeps: int
+    parameters: Buffer  # those of the rate, then those of the output
+
+
+class PythonOfMany(NamedTuple):
+    """A nonlinear plant with several signals whose functions only Python can run."""
+
+    rate: Callable[..., Any]
+    output: Callable[..., Any]
+    step: float
+    substeps: int
+
+
+as_input.register(CompiledOfMany)(all_signals)
+as_input.register(PythonOfMany)(all_signals)
+
+
+advance.register(CompiledOfMany)(runge_kutta)
+advance.register(PythonOfMany)(runge_kutta)
+
+
+@derivatives.register(CompiledOfMany)
+def _derivatives_many(
+    plant: CompiledOfMany, t: float, x: Vector, u: Any, w: Vector, dx: Vector
+) -> None:
+    call(plant.rate, t, x, u, w, plant.parameters, dx)
+
+
+@measure_all.register(CompiledOfMany)
+def _measure_many(plant: CompiledOfMany, x: Vector, y: Vector) -> None:
+    call(plant.output, x, plant.parameters, y)
+
+
+@derivatives.register(PythonOfMany)
+def _derivatives_python_many(
+    plant: PythonOfMany, t: float, x: Vector, u: Any, w: Vector, dx: Vector
+) -> None:
+    dx[:] = value_or_nan(plant.rate, t, x, u, w)
+
+
+@measure_all.register(PythonOfMany)
+def _measure_python_many(plant: PythonOfMany, x: Vector, y: Vector) -> None:
+    y[:] = value_or_nan(plant.output, x)
+
+
 def value_or_nan(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return the function's value, or NaN as compiled code does, for example for log(-1.0).
 
@@ -296,30 +414,214 @@ _RATE_SIGNATURE_PLANT = nb_types.void(nb_types.float64, POINTER, nb_types.float6
 _OUTPUT_SIGNATURE_PLANT = nb_types.float64(POINTER)
 
 
-class EquationPlant(Described):
-    """What plants given by an equation have in common, with one control signal or several."""
+@dataclass(frozen=True, eq=False, repr=False)
+class NonlinearPlant(Described):
+    """A plant ``x' = f(t, x, u, w, …)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
+
+    Parameters
+    ----------
+    f
+        ``f(t, x, u, w)`` returns the n derivatives as a tuple, list or array; t [s], x (n,), u a
+        number, of several inputs an array (m,), w (q,). Numba compiles it if it can; else it runs
+        as Python, about a hundred times slower, and a warning says why. Further arguments are
+        parameters.
+    order
+        number of states n.
+    output
+        the output y: a function ``h(x)`` that returns a number or several, or C of ``y = C x``, a
+        row or a matrix (p, n); the first state by default. It may take parameters, too.
+    disturbances
+        number q of disturbance inputs.
+    substeps
+        Runge-Kutta steps in a sample; u and w are held over the sample. By default one, or so many
+        that ``h |λ| <= 1`` for each eigenvalue λ of the plant linearised at rest (x, u, w and t
+        zero): stiff friction, for example, needs them. ``simulate`` checks the integration along
+        the run and reports ``Status.POORLY_INTEGRATED`` if there are too few.
+    name
+        for tables and plots.
+    parameters
+        numbers, vectors and matrices by name that f and output take as further arguments;
+        ``with_parameters`` changes them, and compiles nothing for the same shapes.
+    operating_point
+        state and control signal (x, u) about which designs and ``analyse`` take the plant as
+        linear. By default x and u are zero if that is a state of rest.
+    inputs
+        number m of control signals.
+
+    Raises
+    ------
+    ValueError
+        if ``f`` does not return n numbers, or ``output`` is neither a row or matrix nor a function
+        that returns numbers.
+
+    Examples
+    --------
+    >>> import math
+    >>> pendulum = NonlinearPlant(lambda t, x, u, w: (x[1], u - 9.81 * math.sin(x[0])), order=2)
+
+    With parameters:
+
+    >>> def swing(t, x, u, w, m, length):
+    ...     return x[1], u / (m * length**2) - 9.81 / length * math.sin(x[0])
+    >>> pendulum = NonlinearPlant(swing, order=2, parameters={"m": 1.0, "length": 0.5})
+    >>> pendulum.with_parameters(m=2.0).parameters
+    {'m': 2.0, 'length': 0.5}
+
+    With several signals:
+
+    >>> def tanks(t, x, u, w):
+    ...     return u[0] - 0.2 * x[0], u[1] + 0.2 * x[0] - 0.1 * x[1]
+    >>> NonlinearPlant(tanks, order=2, inputs=2, output=[[1, 0], [0, 1]]).outputs
+    2
+    """
 
     f: Callable[..., Any]
     order: int
-    output: Any
-    disturbances: int
-    substeps: int | None
-    name: str
-    parameters: Mapping[str, Any] | None
+    output: Any = None
+    disturbances: int = 1
+    substeps: int | None = None
+    name: str = "nonlinear plant"
+    parameters: Mapping[str, Any] | None = None
+    operating_point: Any = None
+    inputs: int = 1
+
+    def __post_init__(self) -> None:
+        n = checks.whole("order", self.order, 1)
+        q = checks.whole("disturbances", self.disturbances, 0)
+        checks.whole("inputs", self.inputs, 1)
+        checks.optional(checks.whole, "substeps", self.substeps, 1)
+        if not callable(self.f):
+            raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
+        rule = (
+            "f takes (t, x, u, w) and the names in parameters, output takes (x), with arrays x and "
+            "w of the plant's sizes, and u a number or, with inputs=m, an array"
+        )
+        if self.parameters is not None:
+            own, more = self._numbers
+            object.__setattr__(self, "parameters", {**own, **more})
+        if self.operating_point is not None:
+            x, u = checked_point(self.operating_point)
+            checks.vector("operating_point[0]", x, n)
+            if self.inputs == 1:
+                checks.finite("operating_point[1]", u)
+            else:
+                checks.vector("operating_point[1]", u, self.inputs)
+        u0, tried = self.no_control, "0.0" if self.inputs == 1 else "zeros"
+        returned = user_functions.attempt_kernel(
+            f"f(0.0, zeros, {tried}, zeros)", rule, self._rate, 0.0, np.zeros(n), u0, np.zeros(q)
+        )
+        if returned is not user_functions.UNKNOWN and np.shape(returned) != (n,):
+            raise ValueError(
+                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of x"
+            )
+        if callable(self.output):
+            shape = np.shape(self._output_at_rest(rule))
+            if len(shape) > 1:
+                raise ValueError(
+                    f"output(x) returns shape {shape}: must return one number, or a vector"
+                )
+        elif np.ndim(self._row) == 2:
+            rows = checks.matrix("output", self._row)
+            if rows.shape[1] != n:
+                raise ValueError(
+                    f"output has shape {rows.shape}: must have a row for each output and a column "
+                    f"for each of the {n} states"
+                )
+            shape = (rows.shape[0],)
+        else:
+            checks.vector("output", self._row, n)
+            shape = ()
+        object.__setattr__(self, "_output_shape", shape)
+
+    def _output_at_rest(self, rule: str) -> Any:
+        """Return what ``output`` returns for a state of zeros, or a near one."""
+        n = self.order
+        found = user_functions.attempt_kernel("output(zeros)", rule, self._measured, np.zeros(n))
+        if found is not user_functions.UNKNOWN:
+            return found
+        return self._measured(user_functions.sample_values(n))
+
+    @property
+    def outputs(self) -> int:
+        """Number of measured outputs."""
+        shape: tuple[int, ...] = self._output_shape  # type: ignore[attr-defined]
+        return shape[0] if shape else 1
+
+    @property
+    def _has_vectors(self) -> bool:
+        """Whether its u or its y are arrays."""
+        return self.inputs > 1 or self._output_shape != ()  # type: ignore[attr-defined]
+
+    @property
+    def no_control(self) -> Any:
+        """The control signal at rest, as f takes it."""
+        return 0.0 if self.inputs == 1 else np.zeros(self.inputs)
+
+    def with_parameters(self, **values: Any) -> NonlinearPlant:
+        """Return the plant with other values of some parameters; nothing is compiled again."""
+        made = replace(self, parameters={**(self.parameters or {}), **values})
+        signals = signals_of(self)
+        return labelled(made, *signals[:3]) if signals.known else made
+
+    @property
+    def _row(self) -> Any:
+        return np.eye(self.order)[0] if self.output is None else self.output
 
     @cached_property
     def _output_function(self) -> Callable[..., Any]:
-        """The function h(x, …), also of rows."""
-        raise NotImplementedError
+        if callable(self.output):
+            return self.output
+        if np.ndim(self._row) == 2:
+            return rows_output(tuple(map(tuple, np.asarray(self._row, dtype=float).tolist())))
+        return row_output(tuple(np.asarray(self._row, dtype=float).tolist()))
 
     def _machine_code_of_both(self) -> tuple[Any, Any]:
-        """Return the two compiled functions; raise ``NotCompilableError`` if Numba can't."""
-        raise NotImplementedError
+        n, m = self.order, self.disturbances
+        if self._has_vectors:
+            own, more = map(shapes_of, self._numbers)
+            sizes = _Sizes(n, self.inputs, self.outputs, m, own, more)
+            return _machine_code_of_many(self.f, self._output_function, sizes)
 
-    @property
-    def _no_control(self) -> Any:
-        """The control signal at rest, as f takes it."""
-        return 0.0
+        def rate(t, px, u, pw, pdx):  # type: ignore[no-untyped-def]
+            dx = numba.carray(pdx, (n,))
+            derivatives = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (m,)))
+            for i in range(n):
+                dx[i] = derivatives[i]
+
+        def output(px):  # type: ignore[no-untyped-def]
+            return h(numba.carray(px, (n,)))
+
+        if self.parameters is not None:
+            own, more = map(shapes_of, self._numbers)
+            return machine_code(self.f, self._output_function, (n, m), (own, more))
+        f = user_functions.jit_user_function(self.f)
+        h = user_functions.jit_user_function(self._output_function)
+        compile_cfunc = user_functions.compile_cfunc
+        code = (
+            compile_cfunc(_RATE_SIGNATURE_PLANT, rate),
+            compile_cfunc(_OUTPUT_SIGNATURE_PLANT, output),
+        )
+        set_origin(code[0].address, self.f)
+        set_origin(code[1].address, self._output_function)
+        return code
+
+    def sampled(self, dt: float, interpret: bool = False) -> Any:
+        """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
+        step, substeps = self._step(dt)
+        code = self._code(interpret)
+        if code is None and self._has_vectors:
+            rate_of: Any = self._rate if self.inputs > 1 else _taking_one(self._rate)
+            return PythonOfMany(rate_of, self._measured, step, substeps)
+        if code is None:
+            return PythonNonlinear(self._rate, self._measured, step, substeps)
+        rate, output = code
+        if self._has_vectors:
+            numbers = as_array(*self._numbers)
+            return CompiledOfMany(rate.address, output.address, step, substeps, numbers)
+        if self.parameters is None:
+            return CompiledNonlinear(rate.address, output.address, step, substeps)
+        numbers = as_array(*self._numbers)
+        return CompiledParametric(rate.address, output.address, step, substeps, numbers)
 
     @property
     def _numbers(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -411,156 +713,15 @@ class EquationPlant(Described):
         with np.errstate(all="ignore"):
             for j, shift in enumerate(by * np.eye(n)):
                 ends = [
-                    value_or_nan(self._rate, 0.0, x, self._no_control, w) for x in (shift, -shift)
+                    value_or_nan(self._rate, 0.0, x, self.no_control, w) for x in (shift, -shift)
                 ]
                 slopes[:, j] = (np.asarray(ends[0]) - np.asarray(ends[1])) / (2.0 * by)
         return slopes
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class NonlinearPlant(EquationPlant):
-    """A plant ``x' = f(t, x, u, w, …)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
-
-    Parameters
-    ----------
-    f
-        ``f(t, x, u, w)`` returns the n derivatives as a tuple, list or array; t [s], x (n,), u a
-        number, w (m,). Numba compiles it if it can; else it runs as Python, about a hundred times
-        slower, and a warning says why. Further arguments are parameters.
-    order
-        number of states n.
-    output
-        the output y: a function ``h(x)``, or the row C of ``y = C x``; the first state by default.
-        It may take parameters, too.
-    disturbances
-        number m of disturbance inputs.
-    substeps
-        Runge-Kutta steps in a sample; u and w are held over the sample. By default one, or so many
-        that ``h |λ| <= 1`` for each eigenvalue λ of the plant linearised at rest (x, u, w and t
-        zero): stiff friction, for example, needs them. ``simulate`` checks the integration along
-        the run and reports ``Status.POORLY_INTEGRATED`` if there are too few.
-    name
-        for tables and plots.
-    parameters
-        numbers, vectors and matrices by name that f and output take as further arguments;
-        ``with_parameters`` changes them, and compiles nothing for the same shapes.
-    operating_point
-        state and control signal (x, u) about which designs and ``analyse`` take the plant as
-        linear. By default x and u are zero if that is a state of rest.
-
-    Raises
-    ------
-    ValueError
-        if ``f`` does not return n numbers, or ``output`` is neither a row nor a function that
-        returns a number.
-
-    Examples
-    --------
-    >>> import math
-    >>> pendulum = NonlinearPlant(lambda t, x, u, w: (x[1], u - 9.81 * math.sin(x[0])), order=2)
-
-    With parameters:
-
-    >>> def swing(t, x, u, w, m, length):
-    ...     return x[1], u / (m * length**2) - 9.81 / length * math.sin(x[0])
-    >>> pendulum = NonlinearPlant(swing, order=2, parameters={"m": 1.0, "length": 0.5})
-    >>> pendulum.with_parameters(m=2.0).parameters
-    {'m': 2.0, 'length': 0.5}
-    """
-
-    f: Callable[..., Any]
-    order: int
-    output: Any = None
-    disturbances: int = 1
-    substeps: int | None = None
-    name: str = "nonlinear plant"
-    parameters: Mapping[str, Any] | None = None
-    operating_point: Any = None
-
-    def __post_init__(self) -> None:
-        n = checks.whole("order", self.order, 1)
-        m = checks.whole("disturbances", self.disturbances, 0)
-        checks.optional(checks.whole, "substeps", self.substeps, 1)
-        if not callable(self.f):
-            raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
-        rule = (
-            "f takes (t, x, u, w) and the names in parameters, output takes (x), with arrays x and "
-            "w of the plant's sizes"
-        )
-        if self.parameters is not None:
-            own, more = self._numbers
-            object.__setattr__(self, "parameters", {**own, **more})
-        if self.operating_point is not None:
-            x, u = checked_point(self.operating_point)
-            checks.vector("operating_point[0]", x, n)
-            checks.finite("operating_point[1]", u)
-        returned = user_functions.attempt_kernel(
-            "f(0.0, zeros, 0.0, zeros)", rule, self._rate, 0.0, np.zeros(n), 0.0, np.zeros(m)
-        )
-        if returned is not user_functions.UNKNOWN and np.shape(returned) != (n,):
-            raise ValueError(
-                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of x"
-            )
-        if not callable(self.output):
-            checks.vector("output", self._row, n)
-        elif np.shape(
-            user_functions.attempt_kernel("output(zeros)", rule, self._measured, np.zeros(n))
-        ):
-            raise ValueError("output(x) must return one number")
-
-    def with_parameters(self, **values: Any) -> NonlinearPlant:
-        """Return the plant with other values of some parameters; nothing is compiled again."""
-        made = replace(self, parameters={**(self.parameters or {}), **values})
-        signals = signals_of(self)
-        return labelled(made, *signals[:3]) if signals.known else made
-
-    @property
-    def _row(self) -> Any:
-        return np.eye(self.order)[0] if self.output is None else self.output
-
-    @cached_property
-    def _output_function(self) -> Callable[..., Any]:
-        if callable(self.output):
-            return self.output
-        return row_output(tuple(np.asarray(self._row, dtype=float).tolist()))
-
-    def _machine_code_of_both(self) -> tuple[Any, Any]:
-        n, m = self.order, self.disturbances
-
-        def rate(t, px, u, pw, pdx):  # type: ignore[no-untyped-def]
-            dx = numba.carray(pdx, (n,))
-            derivatives = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (m,)))
-            for i in range(n):
-                dx[i] = derivatives[i]
-
-        def output(px):  # type: ignore[no-untyped-def]
-            return h(numba.carray(px, (n,)))
-
-        if self.parameters is not None:
-            own, more = map(shapes_of, self._numbers)
-            return machine_code(self.f, self._output_function, (n, m), (own, more))
-        f = user_functions.jit_user_function(self.f)
-        h = user_functions.jit_user_function(self._output_function)
-        compile_cfunc = user_functions.compile_cfunc
-        code = (
-            compile_cfunc(_RATE_SIGNATURE_PLANT, rate),
-            compile_cfunc(_OUTPUT_SIGNATURE_PLANT, output),
-        )
-        set_origin(code[0].address, self.f)
-        set_origin(code[1].address, self._output_function)
-        return code
-
-    def sampled(self, dt: float, interpret: bool = False) -> Any:
-        """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
-        step, substeps = self._step(dt)
-        code = self._code(interpret)
-        if code is None:
-            return PythonNonlinear(self._rate, self._measured, step, substeps)
-        rate, output = code
-        if self.parameters is None:
-            return CompiledNonlinear(rate.address, output.address, step, substeps)
-        numbers = as_array(*self._numbers)
-        return CompiledParametric(rate.address, output.address, step, substeps, numbers)
+def _taking_one(rate: Callable[..., Any]) -> Callable[..., Any]:
+    """Return f of one control signal that takes it in an array."""
+    return lambda t, x, u, w: rate(t, x, u[0], w)
 
 
 def checked_point(given: Any) -> tuple[Any, float]:
@@ -572,143 +733,3 @@ def checked_point(given: Any) -> tuple[Any, float]:
             f"operating_point = {given!r}: must be a state and a control signal, (x, u)"
         ) from None
     return x, u
-
-
-# ---- A transfer function whose input acts against Coulomb friction ----
-
-# Largest h |λ| of a sub-step h with the eigenvalue of largest magnitude at rest, as for nonlinear
-# plants, and most sub-steps: beyond, friction is stiffer than any sample shows. By hand.
-_LARGEST_STEP_FRICTION, _MOST_SUBSTEPS_FRICTION = 1.0, 1000
-
-
-class FrictionModel(NamedTuple):
-    """Parameters of a transfer function with friction."""
-
-    A: Matrix  # observable companion form (n, n)
-    B: Vector  # (n,)
-    force: float  # σ F [u-unit]
-    width: float  # v [y-unit/s]
-    step: float  # length of a sub-step [s]
-    substeps: int
-
-
-@measure.register(FrictionModel)
-def _measure_friction(plant: FrictionModel, x: Vector) -> float:
-    return x[0]
-
-
-@derivatives.register(FrictionModel)
-def _derivatives_friction(
-    plant: FrictionModel, t: float, x: Vector, u: float, w: Vector, dx: Vector
-) -> None:
-    n = plant.B.size
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += plant.A[i, j] * x[j]
-        dx[i] = total
-    speed = dx[0] if n > 1 else x[0]
-    drive = u + w[0] - plant.force * tanh(speed / plant.width)
-    for i in range(n):
-        dx[i] += plant.B[i] * drive
-
-
-advance.register(FrictionModel)(runge_kutta)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class FrictionPlant(Described):
-    """A transfer function with Coulomb friction: of order 1, or of relative degree 2 or more.
-
-    Parameters
-    ----------
-    linear
-        the plant without friction: for design.
-    num, den
-        its transfer function, highest power of s first.
-    force
-        Coulomb friction F [u-unit].
-    width
-        speed v at which three quarters of it act [y-unit/s].
-    """
-
-    linear: LinearPlant
-    num: Vector
-    den: Vector
-    force: float
-    width: float
-    name: str = "plant with friction"
-    disturbances = 1
-    compiled = True
-
-    def __post_init__(self) -> None:
-        checks.positive("force", self.force, "u-unit")
-        checks.positive("width", self.width, "y-unit/s")
-        if self.den[0] == 0.0:
-            raise ValueError(f"den[0] = {self.den[0]}: must not be zero; leave it out")
-        if self.order > 1 and len(self.num) > self.order - 1:
-            raise ValueError(
-                f"num has {len(self.num)} coefficients, den {len(self.den)}: the relative degree "
-                "must be 2 or more, or u moves the speed at once"
-            )
-
-    @property
-    def order(self) -> int:
-        """Number of states."""
-        return len(self.den) - 1
-
-    @property
-    def signed_force(self) -> float:
-        """F with the sign of the gain: friction acts against the motion that u causes [u-unit]."""
-        return math.copysign(self.force, self.num[0] / self.den[0])
-
-    def sampled(self, dt: float, interpret: bool = False) -> FrictionModel:
-        """Return the parameters for a sample time ``dt`` [s]."""
-        n, lead = self.order, float(self.den[0])
-        A = np.diag(np.ones(n - 1), 1)
-        A[:, 0] -= np.asarray(self.den[1:], dtype=np.float64) / lead
-        B = np.zeros(n)
-        B[n - len(self.num) :] = np.asarray(self.num, dtype=np.float64) / lead
-        force = self.signed_force
-        speed = A[0] if n > 1 else np.ones(1)
-        at_rest = A - force / self.width * np.outer(B, speed)
-        fastest = float(np.max(np.abs(np.linalg.eigvals(at_rest))))
-        wanted = checks.positive("dt", dt, "s") * fastest / _LARGEST_STEP_FRICTION
-        substeps = min(max(math.ceil(wanted), 1), _MOST_SUBSTEPS_FRICTION)
-        return FrictionModel(A, B, force, self.width, dt / substeps, substeps)
-
-
-# ---- A transfer function with the dry friction and the delay that an identification found ----
-
-
-def with_friction_and_delay(
-    linear: LinearPlant,
-    num: Vector,
-    den: Vector,
-    force: float | None,
-    width: float | None,
-    delay: float,
-    dt: float,
-) -> Plant:
-    """Return the plant ``linear`` for simulations, as identified.
-
-    Parameters
-    ----------
-    linear
-        the plant without friction and delay.
-    num, den
-        its transfer function, highest power of s first.
-    force, width
-        Coulomb friction [u-unit] and the speed at which three quarters of it act [y-unit/s]; None
-        or zero for none.
-    delay
-        [s]; with friction rounded to a whole number of samples.
-    dt
-        sample time of the loop [s].
-    """
-    plant: Plant = linear
-    if force and width:
-        plant = FrictionPlant(linear, num, den, force, width, linear.name)
-    if plant is not linear:
-        delay = round(delay / dt) * dt
-    return delayed(plant, delay, dt) if delay > 0.0 else plant

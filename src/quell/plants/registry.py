@@ -15,16 +15,13 @@ from typing import Any
 from quell import checks
 from quell.files import whole_text
 from quell.plants.base import Plant, check_plant
+from quell.plants.channels import delayed_inputs, encoded_outputs
 from quell.plants.flexible import lagged_two_mass_spring, n_mass, two_mass_spring
 from quell.plants.fmu import FMU, MultivariableFMU
+from quell.plants.friction import with_friction_and_delay
 from quell.plants.linear import LinearPlant, delayed, encoded, lagged
 from quell.plants.multibody import arm, quadrotor_attitude
-from quell.plants.multivariable import (
-    MultivariableLinearPlant,
-    delayed_inputs,
-    encoded_outputs,
-)
-from quell.plants.nonlinear import NonlinearPlant, with_friction_and_delay
+from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.testbeds import dc_motor, torsional, torsional_identified
 from quell.types import warn
 
@@ -312,19 +309,6 @@ def linear(
     raise ValueError(f"given: {', '.join(given) or 'nothing'}; must be num and den, or A, B and C")
 
 
-def multivariable_linear(A: Any, B: Any, C: Any, E: Any = None) -> MultivariableLinearPlant:
-    """Return a linear plant with several control signals and outputs.
-
-    Parameters
-    ----------
-    A, B, C
-        matrices as lists of rows.
-    E
-        how disturbances enter, with a column for each; by default as the control signals do.
-    """
-    return MultivariableLinearPlant(A, B, C, E)
-
-
 TESTBEDS: Mapping[str, Callable[[], Plant]] = {
     "torsional": torsional,
     "torsional-identified": torsional_identified,
@@ -349,7 +333,8 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
 
 AXES_PLANTS: Mapping[str, Callable[..., Any]] = {
     "arm": arm,
-    "multivariable-linear": multivariable_linear,
+    "linear": linear,
+    "multivariable-linear": linear,  # its name in setup files of earlier releases
     "quadrotor-attitude": quadrotor_attitude,
     "encoded-outputs": encoded_outputs,
     "delayed-inputs": delayed_inputs,

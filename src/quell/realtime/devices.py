@@ -44,11 +44,11 @@ from quell.plants.base import (
     check_plant,
     check_run,
     is_destroyed,
+    is_several,
     measure,
     measure_all,
     signals_of,
 )
-from quell.plants.multivariable import is_several
 from quell.types import Matrix, Vector
 
 # ---- The interface between the loop and a device ----
@@ -163,7 +163,8 @@ def drop_signals(handle: Any) -> None:
 
 def counts_of(plant: Any) -> SignalCounts | None:
     """Return how many signals a plant, or a controller, has; None for one y and one u."""
-    return SignalCounts(plant.outputs, plant.inputs) if is_several(plant) else None
+    of_arrays = hasattr(plant, "inputs") if hasattr(plant, "initial_state") else is_several(plant)
+    return SignalCounts(plant.outputs, plant.inputs) if of_arrays else None
 
 
 def checked_counts(signals: Any, most: int) -> SignalCounts | None:

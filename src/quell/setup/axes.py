@@ -24,12 +24,9 @@ from quell.controllers.axes import Axes
 from quell.controllers.compensator import Compensator
 from quell.features.all_axes import sees_all_axes
 from quell.plants.base import PlantWrapper
+from quell.plants.linear import LinearPlant
 from quell.plants.multibody import Arm, Craft
-from quell.plants.multivariable import (
-    MultivariableLinearPlant,
-    MultivariableNonlinearPlant,
-    check_several,
-)
+from quell.plants.nonlinear import NonlinearPlant
 from quell.quantities import AxesSignals
 from quell.records.trajectory import Trajectory
 from quell.setup import registry
@@ -158,7 +155,7 @@ def _of_plant(plant: Any, orders: Sequence[int], M: Any) -> tuple[Any, Any]:
         return None, inner.inertia
     if isinstance(inner, Craft):
         return inner.B0, None
-    if isinstance(inner, MultivariableLinearPlant):
+    if isinstance(inner, LinearPlant):
         return _markov(inner, orders), None
     raise ValueError(
         f'B0 = "plant": is not known of {plant.name!r}; give its rows, or M, or find it in a '
@@ -166,7 +163,7 @@ def _of_plant(plant: Any, orders: Sequence[int], M: Any) -> tuple[Any, Any]:
     )
 
 
-def _markov(plant: MultivariableLinearPlant, orders: Sequence[int]) -> Matrix:
+def _markov(plant: LinearPlant, orders: Sequence[int]) -> Matrix:
     """Return ``C_i A^(n_i − 1) B`` of a linear plant."""
     if len(orders) != plant.outputs:
         raise ValueError(
@@ -258,7 +255,7 @@ def _inner(plant: Any) -> Any:
 
 
 def _is_nonlinear(plant: Any) -> bool:
-    return isinstance(_inner(plant), MultivariableNonlinearPlant)
+    return isinstance(_inner(plant), NonlinearPlant)
 
 
 # ---- The tables ----
@@ -427,7 +424,6 @@ def made_axes(
     if tables.plant is not None:
         make = partial(builder.build, tables.plant, "plant", dt=dt)
         plant = made_once({} if known is None else known, "plant", (tables.plant, dt), make)
-        builder.attempt("", (), check_several, plant)
     names = [axis.name or f"axis{i + 1}" for i, axis in enumerate(tables.axis)]
     if len(set(names)) < len(names):
         raise SetupError([f"{name}: axis: names {', '.join(names)} must be different"])

@@ -73,7 +73,7 @@ _EXAMPLES = {
 }
 _EXAMPLES_OF_AXES = {
     "scenario": "scenario = {duration = 10.0}, and reference = {kind = 'step'} in each [[axis]]",
-    "plant": "plant = {kind = 'multivariable-linear', A = …, B = …, C = …}, or {kind = 'arm'}",
+    "plant": "plant = {kind = 'linear', A = …, B = …, C = …}, or {kind = 'arm'}",
     "rig": "rig = {device = 'udp://127.0.0.1:5005'}",
 }
 

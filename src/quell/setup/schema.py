@@ -50,9 +50,8 @@ from quell.features.base import Features
 from quell.files import begin_of, encoding_of, kind_of, whole_text
 from quell.plants import registry as plants
 from quell.plants.base import Plant as AnyPlant
-from quell.plants.base import labelled
+from quell.plants.base import is_several, labelled
 from quell.plants.linearise import linear_model
-from quell.plants.multivariable import is_several
 from quell.plants.registry import RUN_CODE
 from quell.signals.shapes import Signal
 

@@ -62,18 +62,15 @@ from quell.plants.base import (
     measure_all,
 )
 from quell.plants.base import outputs_of as outputs_of_plant
+from quell.plants.channels import EncodedOutputsModel, named
+from quell.plants.friction import FrictionModel
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel
-from quell.plants.multivariable import (
-    CompiledMultivariable,
-    EncodedOutputsModel,
-    PythonMultivariable,
-    named,
-)
 from quell.plants.nonlinear import (
     CompiledNonlinear,
+    CompiledOfMany,
     CompiledParametric,
-    FrictionModel,
     PythonNonlinear,
+    PythonOfMany,
     refined,
 )
 from quell.records.metrics import runs_away
@@ -520,7 +517,7 @@ class IntegrationCheck:
             if isinstance(model, DelayedPlantModel):
                 self._size, self._delay = model.size, 1
             model = model.inner
-        several = CompiledMultivariable | PythonMultivariable
+        several = CompiledOfMany | PythonOfMany
         kinds = CompiledNonlinear | CompiledParametric | PythonNonlinear | FrictionModel | several
         self.needed = isinstance(model, kinds)
         self.model, self.error, self.enough = model, 0.0, 0

@@ -20,7 +20,7 @@ from quell.controllers.axes import Axes
 from quell.kernels.cache import compile_time
 from quell.plants.base import PlantWrapper
 from quell.plants.linearise import held_at, linear_model, linear_part
-from quell.plants.multivariable import MultivariableNonlinearPlant
+from quell.plants.nonlinear import NonlinearPlant
 from quell.records.metrics import worsened
 from quell.records.record import describe
 from quell.records.trajectory import Trajectory
@@ -257,7 +257,7 @@ def _analysis_of_axis(setup: Setup, axis: int) -> tuple[dict[str, Any], dict[str
     while isinstance(inner, PlantWrapper):
         inner = inner.plant
     point = None
-    if isinstance(inner, MultivariableNonlinearPlant):
+    if isinstance(inner, NonlinearPlant):
         start = np.zeros(plant.order) if scenario.x0 is None else np.asarray(scenario.x0)
         point = held_at(plant, start[: inner.order])
     loop = analyse_axes(plant, controller, point)

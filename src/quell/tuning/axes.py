@@ -63,9 +63,9 @@ from quell.learners.base import NoLearner
 from quell.lti.zeros import invariant_zeros
 from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
+from quell.plants.channels import delayed_inputs
 from quell.plants.linear import LinearPlant
 from quell.plants.linearise import held_points
-from quell.plants.multivariable import MultivariableLinearPlant, delayed_inputs
 from quell.sweeping.sweep import share_interval
 from quell.tuning.constraints import Constraints, first_given, given_constraints
 from quell.tuning.optimiser.coupled import (
@@ -140,7 +140,7 @@ def tune_axes(
     ----------
     plant
         a plant with an output for each axis, as for ``analysis.analyse_axes``, in continuous time:
-        a ``MultivariableLinearPlant`` or matrices (A, B, C), one behind delays or encoders (which
+        a ``LinearPlant`` or matrices (A, B, C), one behind delays or encoders (which
         are left out), or a nonlinear one with its operating points.
     axes
         the controller, whose orders, forms of observers, B0 and names are kept.
@@ -185,7 +185,7 @@ def tune_axes(
     >>> import quell as ql
     >>> M = np.array([[1.2, 0.35], [0.35, 0.2]])
     >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron(np.linalg.inv(M), [[0], [1]])
-    >>> arm = ql.plants.MultivariableLinearPlant(A, B, np.eye(4)[[0, 2]])
+    >>> arm = ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
     >>> arm = ql.plants.delayed_inputs(arm, 2e-3, 1e-3)
     >>> joint = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3), omega_c=8.0)
     >>> tuned = ql.tuning.tune_axes(arm, ql.Axes([joint, joint], M=M), B0_off=0.1)
@@ -431,7 +431,7 @@ def _each_alone(
         known.append(m_ks)
         own = bounds.m_s, bounds.m_t, None if m_ks is None else (m_ks,), least, bounds.damping
         linear = LinearPlant.of(own_plants[i])
-        one = MultivariableLinearPlant(linear.A, linear.B.reshape(-1, 1), linear.C.reshape(1, -1))
+        one = linear
         late = delayed_inputs(one, dead * axes.dt, axes.dt) if dead else one
         single = Plant(*sampled_matrices(late, axes.dt), np.eye(1))
         task = loops([single], [axes.axes[i]], Limits(*own), alone=np.ones(1))

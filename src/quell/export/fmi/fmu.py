@@ -53,9 +53,8 @@ from quell.export.library.exported import FLAGS, NoCompilerError
 from quell.export.translate.text import TranslationError, checked_name
 from quell.files import check_regular, check_writable, whole_text, written_atomically
 from quell.lti.models import is_linear_model
-from quell.plants.base import check_plant
+from quell.plants.base import check_plant, is_several
 from quell.plants.linear import LinearPlant
-from quell.plants.multivariable import is_several
 
 # ---- modelDescription.xml and buildDescription.xml of an FMU (FMI 3.0.1, 2.4 and 2.5) ----
 
