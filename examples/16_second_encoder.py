@@ -67,9 +67,7 @@ alone = ql.ADRC(
     ql.ESO.model_free(order=2, b0=1.0 / (JM + JL), omega_o=4.0 * OMEGA, dt=DT),
     OMEGA, u_min=-2.0, u_max=2.0,
 )  # fmt: skip
-from_motor = ql.plants.NonlinearPlant(
-    lambda t, x, u, w: drive(t, x, (u, 0.0), w), 4, disturbances=2, substeps=8, name="servo"
-)
+from_motor = ql.plants.NonlinearPlant(drive, order=4, disturbances=2, substeps=8, name="servo")
 single = ql.simulate(ql.plants.encoded(from_motor, 2**20), alone, scenario)
 
 at_rest = ((run.t > 0.4) & (run.t < 0.5)) | ((run.t > 0.9) & (run.t < 1.0)) | (run.t > 1.9)

@@ -1,7 +1,8 @@
 """Several axes, one inside of the other, so that each may be of another kind.
 
 A tuple of all axes would do, but compiled code cannot go through a tuple of different types. Each
-function does its work for one axis, and calls itself for those behind it.
+function does its work for one axis, and calls itself for those behind it; its declaration is what
+it does behind the last one, for ``NoAxis``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from quell.controllers.base import (
 from quell.controllers.compensator import start_at_rest
 from quell.controllers.safe_axes import add_axes_flags, write_axes_bounds
 from quell.controllers.safe_set import write_bounds
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic_with_default
 from quell.types import Matrix, Vector
 
 # ---- The axes, one inside of the other ----
@@ -53,37 +54,33 @@ class AxisStates(NamedTuple):
 # ---- What is done for each axis ----
 
 
-@generic
+@generic_with_default
 def ask_axes(axes: Any, states: Any, i: int, r: Vector, y: Vector, v: Vector, x: Matrix) -> int:
     """Run the axes from the i-th on: write v and the estimates x; return the flags."""
-    raise TypeError
+    return 0
 
 
-@generic
+@generic_with_default
 def tell_axes(axes: Any, states: Any, i: int, v: Vector) -> None:
     """Tell the axes from the i-th on what was applied."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def reset_axes(axes: Any, states: Any) -> None:
     """Start the axes from rest at the next sample."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def write_axes(axes: Any, states: Any, widths: Any, i: int, row: Vector) -> None:
     """Write the channels of the axes from the i-th on into ``row``; ``widths`` has their number."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def set_axes_derivatives(axes: Any, states: Any, counts: Any, i: int, values: Vector) -> None:
     """Set the derivatives of the references of the axes from the i-th on."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def start_axes(
     axes: Any, states: Any, samples: Any, i: int, y: Vector, v: Vector, r: Vector
 ) -> None:
@@ -91,36 +88,27 @@ def start_axes(
 
     A reference that is no number is y.
     """
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def have_started(axes: Any, states: Any) -> bool:
     """Return whether all axes had a measurement or a start."""
-    raise TypeError
+    return True
 
 
-@generic
+@generic_with_default
 def continue_axes(axes: Any, states: Any) -> None:
     """Let the next sample of each axis continue from what was applied."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def set_axes_manual(axes: Any, states: Any, manual: float, i: int, v: Vector) -> None:
     """Begin or end manual operation under v of the axes from the i-th on."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def hold_axis(axes: Any, states: Any, i: int, axis: int, held: bool) -> None:
     """Set whether an axis, of those from the i-th on, is held."""
-    raise TypeError
-
-
-@ask_axes.register(NoAxis)
-def _ask_none(axes: NoAxis, states: Any, i: int, r: Any, y: Any, v: Any, x: Any) -> int:
-    return 0
 
 
 @ask_axes.register(AxisDesigns)
@@ -134,20 +122,10 @@ def _ask(
     return flags | ask_axes(axes.others, states.others, i + 1, r, y, v, x)
 
 
-@tell_axes.register(NoAxis)
-def _tell_none(axes: NoAxis, states: Any, i: int, v: Any) -> None:
-    pass
-
-
 @tell_axes.register(AxisDesigns)
 def _tell(axes: AxisDesigns, states: AxisStates, i: int, v: Vector) -> None:
     set_applied_control(axes.axis, states.axis, v[i])
     tell_axes(axes.others, states.others, i + 1, v)
-
-
-@reset_axes.register(NoAxis)
-def _reset_none(axes: NoAxis, states: Any) -> None:
-    pass
 
 
 @reset_axes.register(AxisDesigns)
@@ -156,20 +134,10 @@ def _reset(axes: AxisDesigns, states: AxisStates) -> None:
     reset_axes(axes.others, states.others)
 
 
-@write_axes.register(NoAxis)
-def _write_none(axes: NoAxis, states: Any, widths: Any, i: int, row: Any) -> None:
-    pass
-
-
 @write_axes.register(AxisDesigns)
 def _write(axes: AxisDesigns, states: AxisStates, widths: Any, i: int, row: Vector) -> None:
     write_row(axes.axis, states.axis, row[: widths[i]])
     write_axes(axes.others, states.others, widths, i + 1, row[widths[i] :])
-
-
-@set_axes_derivatives.register(NoAxis)
-def _no_derivatives(axes: NoAxis, states: Any, counts: Any, i: int, values: Any) -> None:
-    pass
 
 
 @set_axes_derivatives.register(AxisDesigns)
@@ -181,11 +149,6 @@ def _derivatives(
     set_axes_derivatives(axes.others, states.others, counts, i + 1, values[counts[i] :])
 
 
-@start_axes.register(NoAxis)
-def _start_none(axes: NoAxis, states: Any, samples: Any, i: int, y: Any, v: Any, r: Any) -> None:
-    pass
-
-
 @start_axes.register(AxisDesigns)
 def _start(
     axes: AxisDesigns, states: AxisStates, samples: Any, i: int, y: Vector, v: Vector, r: Vector
@@ -195,21 +158,11 @@ def _start(
     start_axes(axes.others, states.others, samples, i + 1, y, v, r)
 
 
-@have_started.register(NoAxis)
-def _none_has_started(axes: NoAxis, states: Any) -> bool:
-    return True
-
-
 @have_started.register(AxisDesigns)
 def _have_started(axes: AxisDesigns, states: AxisStates) -> bool:
     if states.axis.loop[0].started == 0.0:
         return False
     return have_started(axes.others, states.others)
-
-
-@continue_axes.register(NoAxis)
-def _continue_none(axes: NoAxis, states: Any) -> None:
-    pass
 
 
 @continue_axes.register(AxisDesigns)
@@ -218,20 +171,10 @@ def _continue(axes: AxisDesigns, states: AxisStates) -> None:
     continue_axes(axes.others, states.others)
 
 
-@set_axes_manual.register(NoAxis)
-def _set_none_manual(axes: NoAxis, states: Any, manual: float, i: int, v: Any) -> None:
-    pass
-
-
 @set_axes_manual.register(AxisDesigns)
 def _set_manual(axes: AxisDesigns, states: AxisStates, manual: float, i: int, v: Vector) -> None:
     states.axis.loop[0].manual, states.axis.loop[0].u_manual = manual, v[i]
     set_axes_manual(axes.others, states.others, manual, i + 1, v)
-
-
-@hold_axis.register(NoAxis)
-def _hold_none(axes: NoAxis, states: Any, i: int, axis: int, held: bool) -> None:
-    pass
 
 
 @hold_axis.register(AxisDesigns)

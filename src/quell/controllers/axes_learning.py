@@ -14,10 +14,10 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.adrc import ADRC
-from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
+from quell.controllers.axes_chain import AxisDesigns, AxisStates
 from quell.controllers.law import start_learning_again
 from quell.guard import Guard
-from quell.kernels.dispatch import generic, generic_with_default
+from quell.kernels.dispatch import generic_with_default
 from quell.kernels.sized import Size, Work
 from quell.learners.all_axes import (
     AxesView,
@@ -97,7 +97,7 @@ def restart_of_all(learning: Any, memory: Any) -> None:
     """Start from rest at the next sample; what was learned stays."""
 
 
-@generic
+@generic_with_default
 def gather_axes(
     axes: Any, states: Any, learning: Any, at: int, i: int, before: Vector, now: Vector
 ) -> None:
@@ -105,50 +105,38 @@ def gather_axes(
 
     Both arrays have the states of all axes, then v, y and y − x̂_1 of each.
     """
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def show_axes(axes: Any, states: Any, before: Vector, now: Vector) -> None:
     """Show the learners of the axes the signals of all."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def share_with_axes(axes: Any, states: Any, shared: Any, memory: Any) -> None:
     """Hand the features of a shared learner to its outputs."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def least_confidence(axes: Any, states: Any, i: int, shared: Any, memory: Any) -> float:
     """Return the least confidence of the axes from the i-th on that learn in this sample; or 2."""
-    raise TypeError
+    return 2.0
 
 
-@generic
+@generic_with_default
 def take_gains(axes: Any, states: Any, shared: Any, memory: Any) -> None:
     """Move θ of all outputs by their errors."""
-    raise TypeError
 
 
-@generic
+@generic_with_default
 def has_forgotten(axes: Any, states: Any) -> bool:
     """Return whether the θ of an output was forgotten in this sample, or in a restart before."""
-    raise TypeError
+    return False
 
 
-@generic
+@generic_with_default
 def start_all_again(axes: Any, states: Any) -> None:
     """Let all axes start learning again; those that have not forgotten their θ do it now."""
-    raise TypeError
-
-
-@gather_axes.register(NoAxis)
-def _gather_none(
-    axes: NoAxis, states: Any, learning: Any, at: int, i: int, before: Any, now: Any
-) -> None:
-    pass
 
 
 @gather_axes.register(AxisDesigns)
@@ -178,20 +166,10 @@ def _gather(
     gather_axes(axes.others, states.others, learning, at + order, i + 1, before, now)
 
 
-@show_axes.register(NoAxis)
-def _show_none(axes: NoAxis, states: Any, before: Any, now: Any) -> None:
-    pass
-
-
 @show_axes.register(AxisDesigns)
 def _show(axes: AxisDesigns, states: AxisStates, before: Vector, now: Vector) -> None:
     show(axes.axis.learner, states.axis.learner, before, now)
     show_axes(axes.others, states.others, before, now)
-
-
-@share_with_axes.register(NoAxis)
-def _share_with_none(axes: NoAxis, states: Any, shared: Any, memory: Any) -> None:
-    pass
 
 
 @share_with_axes.register(AxisDesigns)
@@ -200,11 +178,6 @@ def _share(
 ) -> None:
     share(shared, memory, axes.axis.learner, states.axis.learner)
     share_with_axes(axes.others, states.others, shared, memory)
-
-
-@least_confidence.register(NoAxis)
-def _no_confidence(axes: NoAxis, states: Any, i: int, shared: Any, memory: Any) -> float:
-    return 2.0
 
 
 @least_confidence.register(AxisDesigns)
@@ -217,11 +190,6 @@ def _least_confidence(
     return min(confidence_in(shared, memory, axes.axis.learner, i), others)
 
 
-@take_gains.register(NoAxis)
-def _take_no_gain(axes: NoAxis, states: Any, shared: Any, memory: Any) -> None:
-    pass
-
-
 @take_gains.register(AxisDesigns)
 def _take(
     axes: AxisDesigns, states: AxisStates, shared: SharedDesign, memory: SharedMemory
@@ -230,19 +198,9 @@ def _take(
     take_gains(axes.others, states.others, shared, memory)
 
 
-@has_forgotten.register(NoAxis)
-def _none_has_forgotten(axes: NoAxis, states: Any) -> bool:
-    return False
-
-
 @has_forgotten.register(AxisDesigns)
 def _has_forgotten(axes: AxisDesigns, states: AxisStates) -> bool:
     return states.axis.learner.loop[0].forgot != 0.0 or has_forgotten(axes.others, states.others)
-
-
-@start_all_again.register(NoAxis)
-def _start_none_again(axes: NoAxis, states: Any) -> None:
-    pass
 
 
 @start_all_again.register(AxisDesigns)

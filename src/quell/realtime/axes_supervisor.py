@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.controllers.axes import AxesDesign, AxesState
-from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
+from quell.controllers.axes_chain import AxisDesigns, AxisStates
 from quell.controllers.base import bumpless_transfer
 from quell.controllers.several import tell_applied
-from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.dispatch import generic_with_default, is_finite, kernel
 from quell.kernels.sized import Work
 from quell.realtime.supervisor import (
     AxesLimits,
@@ -37,15 +37,9 @@ from quell.types import Vector
 # ---- What the loop tells several axes ----
 
 
-@generic
+@generic_with_default
 def transfer_axes(axes: Any, states: Any) -> None:
     """Continue each axis from what was applied, as if it had been at rest until now."""
-    raise TypeError
-
-
-@transfer_axes.register(NoAxis)
-def _transfer_none(axes: NoAxis, states: Any) -> None:
-    pass
 
 
 @transfer_axes.register(AxisDesigns)

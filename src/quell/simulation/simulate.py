@@ -54,8 +54,7 @@ from quell.types import Channels, Status
 
 # ---- Many runs at once, on all cores ----
 
-_RECORDED = ("r", "y", "u")
-_RECORDED_OF_AXES = (*_RECORDED, "v")
+_RECORDED = ("r", "y", "u", "v")
 # Runs in a job: enough that threads seldom wait for the next one, few enough that progress is
 # reported often and that all threads end at about the same time. Chosen by hand.
 _RUNS_PER_JOB = 16
@@ -88,10 +87,9 @@ def simulate_batch(
     checks.optional(checks.positive, "limit", limit)
     sampled = _sampled(scenarios, plants[0], controllers, limit)
     dt, samples, runs = sampled[0].dt, sampled[0].samples, len(sampled)
-    several = is_of_several(controllers[0])
     logged = logged_channels(plants[0], controllers[0])
     width = sum(width for _, width in logged)
-    usual = [name for name, _ in logged if name in _RECORDED_OF_AXES] if several else _RECORDED
+    usual = [name for name, _ in logged if name in _RECORDED]
     channels = _selected(usual if record is None else record, logged)
     columns = [k for name, _ in channels for k in range(width)[columns_of(logged, name)]]
     recorded = [(name, j) for name, width in channels for j in range(width)]
