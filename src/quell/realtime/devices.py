@@ -34,19 +34,22 @@ from quell.kernels.dispatch import (
     compiled,
     generic,
     generic_with_default,
+    interpreted,
     is_finite,
     kernel,
 )
 from quell.plants.base import (
     Plant,
     advance,
+    as_input,
     begin_run,
     check_plant,
     check_run,
+    inputs_of,
     is_destroyed,
     is_several,
-    measure,
     measure_all,
+    outputs_of,
     signals_of,
 )
 from quell.types import Matrix, Vector
@@ -324,87 +327,51 @@ class TwinHandle(NamedTuple):
     w: Vector  # disturbances: zero (q,)
     t: Vector  # samples since the start, and the sample time [s] (2,)
     channels: Matrix  # of each sample; the last row holds for all later ones (N, c)
+    y: Vector  # last measurements (p,)
+    u: Vector  # last control signals (m,)
 
 
 @read_measurement.register(TwinHandle)
 def _read_measurement_twin(handle: TwinHandle, clock: Any, until: int) -> tuple[float, int]:
-    return measure(handle.plant, handle.x), 0
-
-
-@kernel
-def _copy_channels(channels: Matrix, samples: float, values: Vector) -> None:
-    """Write the channels of a twin that has taken so many samples."""
-    row = min(int(samples), channels.shape[0] - 1)
-    for i in range(values.size):
-        values[i] = channels[row, i] if i < channels.shape[1] else math.nan
-
-
-@read_channels.register(TwinHandle)
-def _read_channels_twin(handle: TwinHandle, values: Vector) -> None:
-    _copy_channels(handle.channels, handle.t[0], values)
-
-
-@write_command.register(TwinHandle)
-def _write_command_twin(handle: TwinHandle, u: float) -> int:
-    advance(handle.plant, handle.x, handle.scratch, handle.t[0] * handle.t[1], u, handle.w)
-    handle.t[0] += 1.0
-    return 0
-
-
-class AxesTwinHandle(NamedTuple):
-    """A sampled plant of several signals and its state."""
-
-    plant: Any
-    x: Vector  # state of the plant (n,)
-    scratch: Vector
-    w: Vector  # disturbances: zero (q,)
-    t: Vector  # samples since the start, and the sample time [s] (2,)
-    channels: Matrix  # as of ``TwinHandle``
-    y: Vector  # last measurements (p,)
-
-
-@read_measurement.register(AxesTwinHandle)
-def _read_measurement_of_axes(handle: AxesTwinHandle, clock: Any, until: int) -> tuple[float, int]:
     measure_all(handle.plant, handle.x, handle.y)
     return first_if_finite(handle.y), 0
 
 
-@read_signals.register(AxesTwinHandle)
-def _read_signals_of_axes(handle: AxesTwinHandle, y: Vector) -> None:
+@read_signals.register(TwinHandle)
+def _read_signals_twin(handle: TwinHandle, y: Vector) -> None:
     for i in range(y.size):
         y[i] = handle.y[i]
 
 
-@read_channels.register(AxesTwinHandle)
-def _read_channels_of_axes(handle: AxesTwinHandle, values: Vector) -> None:
-    _copy_channels(handle.channels, handle.t[0], values)
+@read_channels.register(TwinHandle)
+def _read_channels_twin(handle: TwinHandle, values: Vector) -> None:
+    row = min(int(handle.t[0]), handle.channels.shape[0] - 1)
+    for i in range(values.size):
+        values[i] = handle.channels[row, i] if i < handle.channels.shape[1] else math.nan
 
 
-@write_signals.register(AxesTwinHandle)
-def _write_signals_of_axes(handle: AxesTwinHandle, u: Vector) -> int:
-    advance(handle.plant, handle.x, handle.scratch, handle.t[0] * handle.t[1], u, handle.w)
+@write_signals.register(TwinHandle)
+def _write_signals_twin(handle: TwinHandle, u: Vector) -> int:
+    acting = as_input(handle.plant, u)
+    advance(handle.plant, handle.x, handle.scratch, handle.t[0] * handle.t[1], acting, handle.w)
     handle.t[0] += 1.0
     return 0
 
 
-@compiled
-def _read(handle: TwinHandle) -> float:
-    return measure(handle.plant, handle.x)
+@write_command.register(TwinHandle)
+def _write_command_twin(handle: TwinHandle, u: float) -> int:
+    handle.u[0] = u
+    return write_signals(handle, handle.u)
 
 
 @compiled
-def _read_all(handle: AxesTwinHandle) -> None:
+def _read(handle: TwinHandle) -> None:
     measure_all(handle.plant, handle.x, handle.y)
 
 
 @compiled
-def _write_all(handle: AxesTwinHandle, u: Vector) -> None:
-    write_signals(handle, u)
-
-
-@compiled
-def _write(handle: TwinHandle, u: float) -> None:
-    write_command(handle, u)
+def _write(handle: TwinHandle) -> None:
+    write_signals(handle, handle.u)
 
 
 class TwinDevice:
@@ -450,10 +417,8 @@ class TwinDevice:
         begin_run(model, x, scratch)
         given, t = _checked_rows(channels), np.array([0.0, dt])
         self.signal_counts, self._channels = counts_of(plant), given
-        self._handle: Any = TwinHandle(model, x, scratch, w, t, given)
-        if self.signal_counts is not None:
-            y = np.full(self.signal_counts.outputs, np.nan)
-            self._handle = AxesTwinHandle(model, x, scratch, w, t, given, y)
+        y, u = np.full(outputs_of(plant), np.nan), np.zeros(inputs_of(plant))
+        self._handle = TwinHandle(model, x, scratch, w, t, given, y, u)
         # Without a public handle the loop runs as Python.
         self.handle = self._handle if plant.compiled else None
 
@@ -469,15 +434,16 @@ class TwinDevice:
 
     def read(self) -> Any:
         """Return y [y-unit]."""
-        if self.signal_counts is not None:
-            if self.handle is None:
-                measure_all(self._handle.plant, self._handle.x, self._handle.y)
-            else:
-                call_specialised(_read_all, self.handle)
-            return self._handle.y.copy()
+        self._run(_read)
+        y = self._handle.y
+        return float(y[0]) if self.signal_counts is None else y.copy()
+
+    def _run(self, entry: Any) -> None:
+        """Run a compiled function of the handle, or as Python."""
         if self.handle is None:
-            return float(measure(self._handle.plant, self._handle.x))
-        return float(call_specialised(_read, self.handle))
+            interpreted(entry)(self._handle)
+        else:
+            call_specialised(entry, self.handle)
 
     def read_channels(self) -> list[float]:
         """Return the channels of this sample."""
@@ -487,16 +453,11 @@ class TwinDevice:
 
     def write(self, u: Any) -> None:
         """Apply u [u-unit] for a sample."""
-        if self.signal_counts is not None:
-            values = checks.vector("u", u, self.signal_counts.inputs)
-            if self.handle is None:
-                write_signals(self._handle, values)
-            else:
-                call_specialised(_write_all, self.handle, values)
-        elif self.handle is None:
-            write_command(self._handle, float(u))
+        if self.signal_counts is None:
+            self._handle.u[0] = float(u)
         else:
-            call_specialised(_write, self.handle, float(u))
+            self._handle.u[:] = checks.vector("u", u, self.signal_counts.inputs)
+        self._run(_write)
         check_run(self._handle.plant, self._handle.scratch)
 
     def close(self) -> None:
