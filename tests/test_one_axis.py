@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import numpy as np
@@ -88,9 +89,15 @@ def test_a_nonlinear_plant_takes_a_number_or_an_array_for_u() -> None:
         (ql, "AxesBatch", "BatchTrajectory"),
         (ql.plants, "MultivariableLinearPlant", "LinearPlant"),
         (ql.plants, "MultivariableNonlinearPlant", "NonlinearPlant"),
+        (
+            importlib.import_module("quell.plants.multivariable"),
+            "MultivariableLinearPlant",
+            "LinearPlant",
+        ),
+        (importlib.import_module("quell.records.axes"), "AxesTrajectory", "Trajectory"),
     ],
 )
 def test_a_name_of_an_earlier_release_is_the_present_one(of: Any, old: str, new: str) -> None:
     """With a line that says it."""
     with pytest.warns(FutureWarning, match=rf"{old} is quell\S*\.{new} now"):
-        assert getattr(of, old) is getattr(of, new)
+        assert getattr(of, old) is {**vars(ql), **vars(ql.plants)}[new]
