@@ -563,25 +563,18 @@ def _batch_key(parts: Parts) -> Hashable:
     return *about_plant, *about_controller, type(controller), scenario.duration
 
 
-def _is_of_axes(controller: Any) -> bool:
-    return hasattr(controller, "inputs")
-
-
 def _axes_of(controller: Any) -> tuple[str, ...] | None:
-    return tuple(getattr(controller, "names", ())) if _is_of_axes(controller) else None
+    return tuple(getattr(controller, "names", ())) if hasattr(controller, "inputs") else None
 
 
 def _run_group(job: Job, group: Sequence[tuple[int, Parts]], outcome: Outcome) -> None:
     """Simulate runs as one batch; if one of them makes that impossible, in halves."""
     places = [place for place, _ in group]
     plants, controllers, scenarios = zip(*(parts for _, parts in group), strict=True)
-    options: dict[str, Any] = {"record": job.record, "workers": 1}
+    has_axes = any(name == "v" for name, _ in controllers[0].channels)  # what their u is
+    record = (*job.record, "v") if has_axes else job.record
+    options: dict[str, Any] = {"record": record, "workers": 1}
     try:
-        if _is_of_axes(controllers[0]):  # a batch has one control signal and one output
-            alone: list[Any] = [simulate(*parts) for _, parts in group]
-            statuses = np.array([int(run.status) for run in alone])
-            _take(job, places, alone, statuses, np.array([run.ended for run in alone]), outcome)
-            return
         result = simulate(list(plants), list(controllers), list(scenarios), **options)
     except Exception as error:  # a plant of the user's may raise anything
         if len(group) == 1:
