@@ -333,20 +333,26 @@ def test_roots_have_the_deviations_of_a_first_order_expansion() -> None:
 
 
 def test_the_interval_of_a_gain_is_fieller_s() -> None:
-    """The ends g make b − g a just 1.96 of its deviations from zero."""
-    a, b = np.array([2.0, 0.7]), 3.0
-    P = np.diag([0.05, 0.02, 0.1]).astype(float)
-    # descending a, then b
-    P[1, 2] = P[2, 1] = 0.03
-    low, high = gain_interval(a, b, P)
-    assert low < 1.5 < high
-    for g in (low, high):
-        var_a = {P[0, 0]: P[0, 2], P[1, 1]: P[1, 2]}
-        ratios = []
-        for own, mixed in var_a.items():
-            spread = math.sqrt(P[2, 2] - 2.0 * g * mixed + g * g * own)
-            ratios.append(abs(b - g * a[0]) / spread)
-        assert min(abs(ratio - 1.959964) for ratio in ratios) < 2e-3
+    """At its ends g the value b − g a is 1.96 of its own deviations from zero."""
+    a, b, P = 2.0, 3.0, np.array([[0.05, 0.03], [0.03, 0.1]])
+    ends = gain_interval(np.array([a]), b, P)
+    assert ends[0] < 1.5 < ends[1]
+    for g in ends:
+        variance = P[1, 1] - 2.0 * g * P[0, 1] + g * g * P[0, 0]
+        assert abs(b - g * a) == pytest.approx(1.959964 * math.sqrt(variance), rel=1e-3)
+    mirrored = gain_interval(np.array([a]), -b, P * [[1.0, -1.0], [-1.0, 1.0]])
+    assert mirrored == pytest.approx((-ends[1], -ends[0]))
+    # A pole that may be at zero: the gain has no upper end, and none at all if b may be zero, too.
+    low, high = gain_interval(np.array([0.1]), 3.0, np.diag([0.01, 0.01]))
+    assert (low > 0.0, high) == (True, math.inf)
+    low, high = gain_interval(np.array([0.1]), -3.0, np.diag([0.01, 0.01]))
+    assert (low, high < 0.0) == (-math.inf, True)
+    assert gain_interval(np.array([0.1]), 0.1, np.diag([0.01, 0.01])) == (-math.inf, math.inf)
+    half = 1.959964 * 0.2
+    assert gain_interval(np.zeros(0), 3.0, np.array([[0.04]])) == pytest.approx(
+        (3.0 - half, 3.0 + half), rel=1e-4
+    )
+    assert gain_interval(np.array([a]), b, np.full((2, 2), np.nan)) == (-math.inf, math.inf)
 
 
 @cases(

@@ -461,7 +461,7 @@ def _signals(name: str, given: Any) -> Matrix:
         )
     if not np.all(np.isfinite(table)):
         at = np.argwhere(~np.isfinite(table))[0]
-        raise ValueError(f"{name}[{at[0]}, {at[1]}] = {table[tuple(at)]!r}: must be finite")
+        raise ValueError(f"{name}[{at[0]}, {at[1]}] = {float(table[tuple(at)])}: must be finite")
     return table
 
 
