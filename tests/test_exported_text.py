@@ -1,0 +1,468 @@
+"""Texts that are exported, without a compiler: Structured Text has the bits of the controller, and reports say what was found."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.export import NoCompilerError, TranslationError, c_source, ros2, st, st_source
+from quell.export.axes_source import names_in_c
+from quell.export.controller_source import limits_path
+from quell.export.library import exported, vectors
+from quell.export.proof import (
+    Alarm,
+    Findings,
+    Proof,
+    Structure,
+    narrower_limits,
+    proof_files,
+    read_findings,
+    structure,
+)
+from quell.export.ros2 import _class_name, _rate
+from quell.types import Status
+
+from .cases import cases
+from .st_in_python import FunctionBlock
+
+DT = 0.01
+LIMITS = {"u_min": -1.0, "u_max": 1.5}
+
+
+def eso(order: int = 1, **more: Any) -> ql.ESO:
+    """Return an observer without model."""
+    return ql.ESO.model_free(order=order, b0=2.0, omega_o=20.0, dt=DT, **more)
+
+
+def axes() -> ql.Axes:
+    """Return two axes."""
+    one = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=20.0, dt=DT), 4.0)
+    limits = {"u_min": [-1.0, -1.0], "u_max": [1.0, 1.0]}
+    return ql.Axes({"slide": one, "arm": one}, B0=[[2.0, 0.5], [0.0, 1.0]], **limits)
+
+
+MAKERS = {
+    "PI": lambda: ql.baselines.PID(kp=2.0, ki=3.0, dt=DT, **LIMITS),
+    "PID with a filter and a limited rate": lambda: ql.baselines.PID(
+        kp=2.0, ki=3.0, kd=0.2, tf=0.05, dt=DT, rate_limit=20.0, **LIMITS
+    ),
+    "ADRC": lambda: ql.ADRC(eso(), 4.0, **LIMITS),
+    "P-PI": lambda: ql.baselines.PPI(2.0, 3.0, 1.0, dt=DT, **LIMITS),
+    "reference model": lambda: ql.controllers.Prefiltered(
+        ql.baselines.PID(kp=2.0, ki=3.0, dt=DT, **LIMITS), ql.controllers.ReferenceModel(6.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_structured_text_has_the_bits_of_the_interpreted_controller(name: str) -> None:
+    """In a loop with NaN in r and y, a u that was not the one applied, limits and a restart."""
+    controller = MAKERS[name]()
+    block = FunctionBlock(st_source(MAKERS[name](), "axis"))
+    rng = np.random.default_rng(4)
+    y, seen = 0.0, Status(0)
+    for k in range(70):
+        r = math.nan if k in (0, 33) else 1.0 if k < 20 else 4.0 if k < 40 else -0.3
+        measured = math.nan if k in (11, 12) else y + 1e-3 * rng.standard_normal()
+        inputs = {"r": r, "y": measured, "limited": False, "u_limited": 0.0, "restart": k == 55}
+        if k % 9 == 8:
+            inputs |= {"limited": True, "u_limited": math.nan if k == 26 else 0.4}
+            if k != 26:
+                controller.applied(inputs["u_limited"])
+        if inputs["restart"]:
+            controller.reset()
+        block.call(**inputs)
+        u = controller.step(r, measured)
+        assert float(block.v["u"]).hex() == float(u).hex(), k
+        status = getattr(controller, "status", None)
+        assert status is None or block.v["status"] == int(status), k
+        seen |= Status(block.v["status"])
+        y += DT * (2.0 * u - 1.5 * y)
+    assert Status.MEASUREMENT_HELD | Status.REFERENCE_HELD | Status.SATURATED in seen
+
+
+def test_the_head_of_a_block_has_its_name_type_and_sample_time() -> None:
+    """LREAL in double precision, REAL in single; inputs and outputs in their order."""
+    text = st_source(MAKERS["PI"](), "axis")
+    assert "FUNCTION_BLOCK axis\n" in text
+    assert "one sample every 0.01 s" in text
+    assert text.rstrip().endswith("END_FUNCTION_BLOCK")
+    inputs = re.search(r"VAR_INPUT\n(.*?)END_VAR", text, re.S)
+    assert inputs is not None
+    assert re.findall(r"(\w+) : (\w+);", inputs[1]) == [
+        ("r", "LREAL"), ("y", "LREAL"), ("limited", "BOOL"), ("u_limited", "LREAL"),
+        ("restart", "BOOL"),
+    ]  # fmt: skip
+    single = st_source(MAKERS["PI"](), "axis", "single")
+    assert "LREAL" not in single
+    assert "r : REAL;" in single
+    assert "law_D_r : REAL := 2.015" in single
+
+
+def test_a_block_is_written_with_a_readme_that_names_its_inputs(tmp_path: Path) -> None:
+    """Two files without a placeholder; a folder with files is left alone."""
+    written = st(MAKERS["PI"](), tmp_path / "block", name="servo")
+    assert [each.name for each in written.files] == ["servo.st", "README.md"]
+    assert written.comparison is None
+    readme = (tmp_path / "block" / "README.md").read_text(encoding="utf-8")
+    assert not re.search(r"@\w+@", readme)
+    assert "0.01 s" in readme
+    assert "servo" in readme
+    with pytest.raises(ValueError, match=str(tmp_path)):
+        st(MAKERS["PI"](), tmp_path / "block", name="servo")
+
+
+@cases(
+    ("make", "name", "message"),
+    [
+        (lambda: ql.baselines.PID(kp=1.0, dt=DT), "axis", "u_min = -inf, u_max = inf: Structured"),
+        (lambda: MAKERS["PI"](), "if", "name"),
+        (lambda: MAKERS["PI"](), "2x", "name"),
+        (lambda: MAKERS["PI"](), "a__b", "name"),
+        (lambda: axes(), "axis", "controller has 2 axes"),
+    ],
+)
+def test_a_controller_without_a_block_is_refused(make: Any, name: str, message: str) -> None:
+    """Infinite limits, names of the language, several axes."""
+    with pytest.raises(ValueError, match=message):
+        st_source(make(), name)
+
+
+# ---- ROS
+
+
+def test_a_package_of_ros_has_rate_interfaces_and_class(tmp_path: Path) -> None:
+    """100 Hz for 0.01 s; an estimated disturbance of an ADRC, none of a PID controller."""
+    for make, has_f in ((MAKERS["PI"], False), (MAKERS["ADRC"], True)):
+        folder = tmp_path / str(has_f)
+        files = ros2(make(), folder, name="servo_axis")
+        texts = {str(each.relative_to(folder)): each.read_text(encoding="utf-8") for each in files}
+        whole = "\n".join(texts.values())
+        assert not re.search(r"(?<!\w)@\w+@", whole)
+        assert "update_rate: 100" in whole
+        assert "ServoAxisController" in texts["servo_axis.xml"]
+        assert "<name>servo_axis</name>" in texts["package.xml"]
+        assert "u[0] = servo_axis_step(&state_, r[0], y[0])" in whole
+        assert ('"_disturbance"' in whole) is has_f
+        assert ("joint/position_disturbance` the estimated f" in whole) is has_f
+        assert "joint/effort" in whole
+        assert ("parameters_.limits.low" in whole) or ("limits.low" in whole)
+        assert {"src/servo_axis.h", "src/servo_axis.c", "LICENSE"} <= texts.keys()
+
+
+@cases(
+    ("name", "cls"),
+    [
+        ("servo_axis", "ServoAxisController"),
+        ("servo_axis_controller", "ServoAxisController"),
+        ("x1", "X1Controller"),
+    ],
+)
+def test_a_class_is_named_after_its_package(name: str, cls: str) -> None:
+    """In capitals, once ``Controller``."""
+    assert _class_name(name) == cls
+
+
+def test_a_rate_is_a_whole_number_of_hertz() -> None:
+    """0.003 s is none; the next one is proposed."""
+    assert _rate(0.001) == 1000
+    assert _rate(1.0) == 1
+    assert _rate(1.0 / 3.0) == 3
+    with pytest.raises(TranslationError, match=r"1/dt is 333\.333; .* dt = 0\.003003, for"):
+        _rate(0.003)
+    with pytest.raises(TranslationError, match="whole number of Hz"):
+        _rate(2.5)
+
+
+@cases(
+    ("name", "message"),
+    [
+        ("Servo", "lower-case letters"),
+        ("servo__axis", "lower-case letters"),
+        ("rclcpp", "is a package that this one needs"),
+    ],
+)
+def test_names_that_ros_does_not_take_are_refused(name: str, message: str) -> None:
+    """Before anything is written."""
+    with pytest.raises(ValueError, match=message):
+        ros2(MAKERS["PI"](), "not_written", name=name)
+    assert not Path("not_written").exists()
+
+
+# ---- proofs
+
+
+def test_the_contract_of_a_controller_promises_a_number_within_the_limits() -> None:
+    """Of each function that returns u; without limits a number alone."""
+    pi = MAKERS["PI"]()
+    files = proof_files(pi, c_source(pi, "servo"))
+    assert list(files) == ["proof/servo_contract.h", "proof/servo_proof.c", "proof/prove.sh"]
+    contract, program, script = files.values()
+    path = limits_path(pi)
+    low, high = (f"state->parameters->{path}.{end}" for end in ("low", "high"))
+    assert "ensures a_number: \\is_finite(\\result);" in contract
+    assert f"ensures within_limits: {low} <= \\result <= {high};" in contract
+    assert "double servo_step(servo_state *state, double r, double y);" in contract
+    assert "requires a_state: \\valid(state) && \\valid_read(state->parameters);" in contract
+    assert "case 0:\n            servo_step(state, any_real, any_real);\n" in program
+    for line in ("servo_init(&controller);", "servo_reset(state);", "servo_applied(state, any_real);"):
+        assert line in program
+    assert f"    narrower.{path}.high = 0.25;" in program  # the middle of −1 and 1.5
+    assert "servo_retune(&controller, &narrower);" in program
+    assert "@" not in script.replace("$@", "")
+    assert "servo" in script
+
+
+@cases(
+    ("limits", "value"),
+    [
+        ((-1.0, 1.5), 0.25),
+        ((2.0, math.inf), 5.0),
+        ((-2.0, math.inf), 1.0),
+        ((-math.inf, 2.0), -1.0),
+        ((-math.inf, math.inf), 1.0),
+    ],
+)
+def test_narrower_limits_lie_within_those_of_the_controller(limits: Any, value: float) -> None:
+    """Above the lower one, below the upper one."""
+    pi = ql.baselines.PID(kp=1.0, ki=1.0, dt=DT, u_min=limits[0], u_max=limits[1])
+    ((place, text),) = narrower_limits(pi, limits_path(pi) or "limits", "double")
+    assert place == ""
+    assert float(text) == pytest.approx(value)
+    assert narrower_limits(pi, "", "double") == []
+
+
+CODE = """
+static const int order = 3;
+
+static void helper(double x[4])
+{
+    for (int i = 0; i < 4; i++) {
+        x[i] = sqrt(x[i]);
+    }
+}
+
+double servo_step(state *s, double r)
+{
+    double x[4];
+
+    for (int i = 0; i < order; i++) {
+        helper(x);
+    }
+    return r;
+}
+"""
+
+
+def test_the_passes_of_a_step_are_counted_with_those_of_what_it_calls() -> None:
+    """Three of its own, and four in each."""
+    found = structure(CODE, "servo_step")
+    assert found.problems == []
+    assert found.passes["helper"] == 4
+    assert found.passes["servo_step"] == 3 + 3 * 4
+    assert found.library == {"sqrt"}
+    assert structure(CODE, "other_step").problems == ["there is no function other_step"]
+    called = structure(CODE.replace("sqrt(", "malloc("), "servo_step")
+    assert called.problems == ["malloc is called"]
+    looping = structure(CODE.replace("return r;", "while (r > 0.0) { r -= 1.0; } return r;"), "servo_step")
+    assert "servo_step has 'while'" in looping.problems
+    changing = structure(CODE.replace("helper(x);", "i = i + 1;"), "servo_step")
+    assert any(each.startswith("servo_step changes i in its loop, line ") for each in changing.problems)
+
+
+LOG = """[eva] using specification for function sqrt
+[eva:summary] ====== ANALYSIS SUMMARY ======
+  5 functions analyzed (out of 6): 83% coverage.
+  In these functions, 40 statements reached (out of 44): 90% coverage.
+  No errors or warnings raised during the analysis.
+  0 errors by the Eva analyzer:   0 errors
+"""
+TABLE = "\n".join([
+    "\t".join(["directory", "file", "line", "function", "kind", "status", "property"]),
+    "\t".join([".", "servo.c", "12", "servo_step", "index_bound", "Unknown", "i < 3"]),
+    "\t".join([".", "servo.c", "14", "servo_step", "shift", "Invalid", "k < 32"]),
+    "\t".join([".", "c.h", "3", "servo_step", "postcondition", "Valid", "a_number: \\is_finite(u)"]),
+    "\t".join([".", "c.h", "4", "servo_step", "postcondition", "Valid", "within_limits: u <= 1"]),
+    "\t".join([".", "c.h", "5", "servo_step", "postcondition", "Valid", "other: 1"]),
+    "\t".join(["FRAMAC_SHARE", "math.h", "9", "sqrt", "assigns clause", "Unknown", "nothing"]),
+    "\t".join([".", "c.h", "6", "servo_step", "precondition", "Considered valid", "x"]),
+])  # fmt: skip
+
+
+def test_what_frama_c_has_found_is_read_from_its_log_and_table() -> None:
+    """Alarms, promises, coverage; what is assumed of the library is none."""
+    found = read_findings("27.1", 3.2, LOG, TABLE)
+    assert [alarm.place for alarm in found.alarms] == ["servo.c:12", "servo.c:14"]
+    assert [alarm.status for alarm in found.alarms] == ["Unknown", "Invalid"]
+    assert found.promises == 2
+    assert (found.functions, found.statements) == ("5 of 6", "40 of 44")
+    assert found.assumed == ("sqrt",)
+    assert found.failure == ""
+    errors = read_findings("27.1", 3.2, LOG + "by the Eva analyzer:   2 errors", TABLE)
+    assert errors.failure == "2 errors of the Eva analyzer, see eva.log"
+    recursive = read_findings("27.1", 3.2, LOG + "Recursive call", TABLE)
+    assert recursive.failure == "the analysis found a recursive call, see eva.log"
+    assert read_findings("27.1", 3.2, "", TABLE).functions == "unknown"
+
+
+def proof(findings: Findings, **more: Any) -> Proof:
+    """Return a proof of a controller with two promises."""
+    text = Structure({"sqrt"}, {"servo_step": 15, "servo_start": 4})
+    given: dict[str, Any] = {"structure": text, "promised": 2, "promising": ("step", "track")}
+    given |= {"digest": "ab12", "limited": True}
+    return Proof(Path(), "servo", findings, **{**given, **more})
+
+
+def test_a_proof_says_what_holds_and_what_is_open() -> None:
+    """In a line and as a report; a failure proves nothing."""
+    whole = proof(Findings("27.1", 3.2, (), 2, "5 of 6", "40 of 44", ("sqrt",)))
+    assert whole.proved
+    assert whole.summary == (
+        "Proved: no undefined behaviour, u is always a number within its limits (Frama-C 27.1, 3 s)"
+    )
+    assert "What is proved" in whole.text
+    assert "A step has 15 passes of loops at most, `servo_start` 4." in whole.text
+    assert "`servo_step` or `servo_track`" in whole.text
+    assert "What is open" not in whole.text
+    assert not re.search(r"@\w+@", whole.text)
+    alarm = Alarm("servo.c", 12, "servo_step", "index_bound", "Unknown", "i < 3")
+    few = proof(Findings("27.1", 3.2, (alarm,), 1))
+    assert not few.proved
+    assert few.alarms == (alarm,)
+    assert few.open == (
+        "servo.c:12, in servo_step: a place outside of an array may be read or written (i < 3)",
+        "1 of 2 promises on u are proved",
+    )
+    assert few.summary == "NOT proved: 2 properties are open (Frama-C 27.1, 3 s)"
+    assert "- NOT proved: 1 of 2 promises on u are proved\n" in few.text
+    assert "What holds but for the open properties" in few.text
+    wrong = proof(Findings("", 0.0, (alarm._replace(kind="other", status="Invalid"),), 2))
+    assert wrong.open == ("servo.c:12, in servo_step: 'other' is not excluded, status Invalid (i < 3)",)
+    none = proof(Findings(failure="there is no frama-c here"))
+    assert none.open == ("there is no frama-c here",)
+    assert none.summary == "NOT proved: there is no frama-c here"
+    assert "What is proved" not in none.text
+    by_data = Structure(set(), {"servo_step": None}, ["7: for (k)"], ["x"])
+    counted = proof(Findings("27.1", 1.0, (), 2), structure=by_data, limited=False, sizes="| t |")
+    assert counted.open == ("x",)
+    assert "NOT counted: the passes of a step, as these ends depend on data:\n  - line 7" in counted.text
+    assert "There are no limits of u." in counted.text
+    assert "## Stack and code\n\n| t |" in counted.text
+
+
+# ---- sizes
+
+CALLS = (
+    'graph: { node: { title: "a.c:step" label: "step\\na.c:1\\n48 bytes (static)" }\n'
+    'node: { title: "a.c:inner" label: "inner\\na.c:9\\n16 bytes (static)" }\n'
+    'node: { title: "a.c:other" label: "other\\na.c:9\\n80 bytes (static)" }\n'
+    'edge: { sourcename: "a.c:step" targetname: "a.c:inner" }\n'
+    'edge: { sourcename: "a.c:step" targetname: "a.c:other" }\n'
+    'edge: { sourcename: "a.c:inner" targetname: "sqrt" } }'
+)
+
+
+def test_the_stack_of_a_function_is_that_of_its_deepest_calls() -> None:
+    """48 and 80 bytes; what other files have counts as zero, what the graph lacks is not known."""
+    assert exported.stack_of("step", CALLS) == 128
+    assert exported.stack_of("inner", CALLS) == 16
+    assert exported.stack_of("sqrt", CALLS) is None
+    assert exported._edges(CALLS) == {"step": {"inner", "other"}, "inner": {"sqrt"}}
+
+
+def test_instructions_are_counted_by_function() -> None:
+    """Without words of data in the code."""
+    code = (
+        "\n00000000 <step>:\n   0:\tpush\t{r4}\n   2:\tbx\tlr\n   4:\t.word\t0x1\n\n"
+        "00000008 <inner>:\n   8:\tbx\tlr\n"
+    )
+    assert exported._instructions(code) == {"step": 2, "inner": 1}
+    sections = ".text          100   0\n.text.step      20   0\n.rodata   8  0\n.rodata.c  4 0\n"
+    assert exported._sum(sections, ".text") == 120
+    assert exported._sum(sections, ".rodata") == 12
+    symbols = "00000000 00000058 B of_state\n00000058 00000010 B of_parameters\n"
+    assert exported._size_of("of_state", symbols) == 0x58
+    with pytest.raises(NoCompilerError, match="the output of nm is not known"):
+        exported._size_of("of_none", symbols)
+
+
+def test_the_table_of_sizes_has_a_row_for_each_function(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a dash for a stack that is not known; without a compiler it says why."""
+    source = c_source(MAKERS["PI"](), "servo")
+
+    def sizes(*_: Any) -> Any:
+        rows = exported.FunctionSize("servo_step", 40, 90), exported.FunctionSize("servo_x", None, 7)
+        return "Cortex, gcc -O2", rows
+
+    monkeypatch.setattr(exported, "function_sizes", sizes)
+    table = exported._function_table(source)
+    assert table.startswith("For Cortex, gcc -O2. Stack is the most")
+    assert table.endswith("|---|---|---|\n| `servo_step` | 40 | 90 |\n| `servo_x` | – | 7 |\n")
+
+    def none(*_: Any) -> Any:
+        raise NoCompilerError("there is no gcc here")
+
+    monkeypatch.setattr(exported, "function_sizes", none)
+    assert exported._function_table(source) == "NOT measured: there is no gcc here.\n"
+
+
+# ---- golden vectors
+
+
+def test_the_loop_of_the_golden_vectors_is_a_chain_with_the_gains_of_the_law() -> None:
+    """Euler steps of ``x'' = v − k_1 x − k_2 x'``; r is a triangle, y has noise of 2⁻²⁷ of it."""
+    inner = ql.ADRC(eso(2), 4.0)
+    plant = vectors.plant_of(inner, 3.0, float)
+    assert plant.gains == pytest.approx((16.0, 8.0))
+    assert (plant.dt, plant.amplitude) == (DT, 3.0)
+    assert plant.noise == 3.0 / 2.0**27
+    moving = vectors.Loop(plant._replace(samples=16), float, seed=1)
+    r = []
+    x = [0.0, 0.0]
+    for _ in range(20):
+        now, y = moving.measure()
+        r.append(now)
+        assert y == pytest.approx(x[0], abs=3.0 * 2.0**-11)
+        moving.advance(0.5)
+        x = [x[0] + DT * x[1], x[1] + DT * (0.5 - 16.0 * x[0] - 8.0 * x[1])]
+        assert moving.x == pytest.approx(x)
+    triangle = [0.0, 1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0]
+    assert r == pytest.approx([3.0 * each / 4.0 for each in (triangle * 3)[:20]])
+    # The random integers are those of the linear congruence.
+    seed = (1 * vectors.MULTIPLIER + vectors.INCREMENT) & 0x7FFFFFFF
+    again = vectors.Loop(plant._replace(samples=16), float, seed=1)
+    assert again.measure()[1] == plant.noise * ((seed >> 15) - 32768)
+
+
+# ---- axes
+
+
+def test_axes_in_c_have_names_and_places(tmp_path: Path) -> None:
+    """Letters, digits and one underscore; each in the header, with its estimate."""
+    assert names_in_c(("x", "X", "2 nd", "größe", "v")) == names_in_c(("x", "X", "2 nd", "größe", "v"))
+    found = names_in_c(("x", "X", "2 nd", "v"))
+    assert found[0] == "x"
+    assert found[2] == "axis3"
+    assert len({each.upper() for each in found} | {"V"}) == 5
+    controller = axes()
+    source = c_source(controller, "machine")
+    assert source.axes == ("slide", "arm")
+    assert source.sizes == (2, 2, 2)
+    header = source.header
+    assert "enum machine_axis { MACHINE_AXIS_SLIDE = 0, MACHINE_AXIS_ARM = 1 };" in header
+    assert "machine_axis_estimate slide;" in header
+    assert "machine_axis_estimate arm;" in header
+    assert "double v[2]; /* B0 u as it was applied */" in header
+    contract = proof_files(controller, source)["proof/machine_contract.h"]
+    for k in (0, 1):
+        limits = "state->parameters->limits"
+        assert f"ensures within_limits: {limits}.low[{k}] <= u[{k}] <= {limits}.high[{k}];" in contract
+    assert "\\valid(u + (0 .. 1))" in contract
+    assert json.dumps(source.sizes) == "[2, 2, 2]"
