@@ -110,6 +110,8 @@ _CANCEL, _CANCEL_OF_FASTEST = 1e-6, 1e-10
 # Difference to the gains of the plant, as a share of the largest entries of its row and column,
 # below which B0 counts as that of the plant; and the frequencies that are looked at.
 _SAME_B0, _FREQUENCIES = 0.01, 40
+# An entry of B0 below this share of the largest ones of its row and column is rounding.
+_ROUNDED = 1e-12
 # Least sum of squares that is divided by.
 _TINY = float(np.finfo(np.float64).tiny)
 # Bounds of ``Constraints`` that are not for axes.
@@ -323,7 +325,7 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
     """Return the plants whose B0 differs from the controller's by a share."""
     if off == 0.0:
         return []
-    B0 = np.asarray(np.linalg.pinv(nominal.R), dtype=np.float64)
+    B0 = _gain_of(nominal)
     entries = int(np.count_nonzero(B0))
     if 2**entries <= _MOST_PATTERNS:
         patterns = np.array(list(itertools.product((-1.0, 1.0), repeat=entries)))
@@ -331,6 +333,14 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
         rng = np.random.default_rng([seed, 2])
         patterns = rng.choice(np.array([-1.0, 1.0]), size=(_MOST_PATTERNS, entries))
     return [_off_by(nominal, B0, off * signs) for signs in patterns]
+
+
+def _gain_of(nominal: Plant) -> Matrix:
+    """Return B0 of its inverse; an entry that is rounding beside its row and column is zero."""
+    B0 = np.asarray(np.linalg.pinv(nominal.R), dtype=np.float64)
+    size = np.abs(B0)
+    least = np.minimum(np.max(size, axis=0), np.max(size, axis=1, keepdims=True))
+    return np.where(size > _ROUNDED * least, B0, 0.0)
 
 
 def _off_by(nominal: Plant, B0: Matrix, shares: Vector) -> Plant:
@@ -641,7 +651,7 @@ def _check(
     drawn = []
     for k in range(samples):
         one = nominal[k % len(nominal)]
-        B0 = np.asarray(np.linalg.pinv(one.R), dtype=np.float64)
+        B0 = _gain_of(one)
         drawn.append(_off_by(one, B0, rng.uniform(-off, off, int(np.count_nonzero(B0)))))
     measured = loops(drawn).measured(found.values)
     ratios = np.exp(-np.min(measured.slacks, axis=1))
