@@ -212,7 +212,11 @@ def test_the_contract_of_a_controller_promises_a_number_within_the_limits() -> N
     assert "double servo_step(servo_state *state, double r, double y);" in contract
     assert "requires a_state: \\valid(state) && \\valid_read(state->parameters);" in contract
     assert "case 0:\n            servo_step(state, any_real, any_real);\n" in program
-    for line in ("servo_init(&controller);", "servo_reset(state);", "servo_applied(state, any_real);"):
+    for line in (
+        "servo_init(&controller);",
+        "servo_reset(state);",
+        "servo_applied(state, any_real);",
+    ):
         assert line in program
     assert f"    narrower.{path}.high = 0.25;" in program  # the middle of −1 and 1.5
     assert "servo_retune(&controller, &narrower);" in program
@@ -271,10 +275,14 @@ def test_the_passes_of_a_step_are_counted_with_those_of_what_it_calls() -> None:
     assert structure(CODE, "other_step").problems == ["there is no function other_step"]
     called = structure(CODE.replace("sqrt(", "malloc("), "servo_step")
     assert called.problems == ["malloc is called"]
-    looping = structure(CODE.replace("return r;", "while (r > 0.0) { r -= 1.0; } return r;"), "servo_step")
+    looping = structure(
+        CODE.replace("return r;", "while (r > 0.0) { r -= 1.0; } return r;"), "servo_step"
+    )
     assert "servo_step has 'while'" in looping.problems
     changing = structure(CODE.replace("helper(x);", "i = i + 1;"), "servo_step")
-    assert any(each.startswith("servo_step changes i in its loop, line ") for each in changing.problems)
+    assert any(
+        each.startswith("servo_step changes i in its loop, line ") for each in changing.problems
+    )
 
 
 LOG = """[eva] using specification for function sqrt
@@ -344,7 +352,9 @@ def test_a_proof_says_what_holds_and_what_is_open() -> None:
     assert "- NOT proved: 1 of 2 promises on u are proved\n" in few.text
     assert "What holds but for the open properties" in few.text
     wrong = proof(Findings("", 0.0, (alarm._replace(kind="other", status="Invalid"),), 2))
-    assert wrong.open == ("servo.c:12, in servo_step: 'other' is not excluded, status Invalid (i < 3)",)
+    assert wrong.open == (
+        "servo.c:12, in servo_step: 'other' is not excluded, status Invalid (i < 3)",
+    )
     none = proof(Findings(failure="there is no frama-c here"))
     assert none.open == ("there is no frama-c here",)
     assert none.summary == "NOT proved: there is no frama-c here"
@@ -352,7 +362,10 @@ def test_a_proof_says_what_holds_and_what_is_open() -> None:
     by_data = Structure(set(), {"servo_step": None}, ["7: for (k)"], ["x"])
     counted = proof(Findings("27.1", 1.0, (), 2), structure=by_data, limited=False, sizes="| t |")
     assert counted.open == ("x",)
-    assert "NOT counted: the passes of a step, as these ends depend on data:\n  - line 7" in counted.text
+    assert (
+        "NOT counted: the passes of a step, as these ends depend on data:\n  - line 7"
+        in counted.text
+    )
     assert "There are no limits of u." in counted.text
     assert "## Stack and code\n\n| t |" in counted.text
 
@@ -398,7 +411,10 @@ def test_the_table_of_sizes_has_a_row_for_each_function(monkeypatch: pytest.Monk
     source = c_source(MAKERS["PI"](), "servo")
 
     def sizes(*_: Any) -> Any:
-        rows = exported.FunctionSize("servo_step", 40, 90), exported.FunctionSize("servo_x", None, 7)
+        rows = (
+            exported.FunctionSize("servo_step", 40, 90),
+            exported.FunctionSize("servo_x", None, 7),
+        )
         return "Cortex, gcc -O2", rows
 
     monkeypatch.setattr(exported, "function_sizes", sizes)
@@ -446,7 +462,9 @@ def test_the_loop_of_the_golden_vectors_is_a_chain_with_the_gains_of_the_law() -
 
 def test_axes_in_c_have_names_and_places(tmp_path: Path) -> None:
     """Letters, digits and one underscore; each in the header, with its estimate."""
-    assert names_in_c(("x", "X", "2 nd", "größe", "v")) == names_in_c(("x", "X", "2 nd", "größe", "v"))
+    assert names_in_c(("x", "X", "2 nd", "größe", "v")) == names_in_c(
+        ("x", "X", "2 nd", "größe", "v")
+    )
     found = names_in_c(("x", "X", "2 nd", "v"))
     assert found[0] == "x"
     assert found[2] == "axis3"
@@ -463,6 +481,8 @@ def test_axes_in_c_have_names_and_places(tmp_path: Path) -> None:
     contract = proof_files(controller, source)["proof/machine_contract.h"]
     for k in (0, 1):
         limits = "state->parameters->limits"
-        assert f"ensures within_limits: {limits}.low[{k}] <= u[{k}] <= {limits}.high[{k}];" in contract
+        assert (
+            f"ensures within_limits: {limits}.low[{k}] <= u[{k}] <= {limits}.high[{k}];" in contract
+        )
     assert "\\valid(u + (0 .. 1))" in contract
     assert json.dumps(source.sizes) == "[2, 2, 2]"

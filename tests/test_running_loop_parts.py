@@ -114,7 +114,9 @@ def test_without_loads_the_predictor_is_the_sampled_plant() -> None:
     np.testing.assert_allclose(late.gamma[:, 0] + late.gamma[:, 1], found.gamma[:, 1], atol=1e-15)
     _, (rest,) = ql.lti.models.zero_order_hold(np.array([[0.0]]), [np.eye(1)], 0.7)
     assert rest[0, 0] == pytest.approx(0.7)
-    with_lag = predicted(BOTH, [np.append(A, [2.0, 1.0])], np.r_[1.0, np.zeros(4)], Inputs.of(u, u), u)
+    with_lag = predicted(
+        BOTH, [np.append(A, [2.0, 1.0])], np.r_[1.0, np.zeros(4)], Inputs.of(u, u), u
+    )
     num, den, _ = signal.cont2discrete(([0.5], np.polymul([1.0, 0.3, 0.06], [1.0, 0.5])), 1.0)
     shown = signal.lfilter(np.ravel(num), den, np.r_[u[0], u[:-1]])
     np.testing.assert_allclose(with_lag[:, 0], shown, atol=1e-10)
@@ -155,7 +157,7 @@ def test_derivatives_are_those_of_the_prediction() -> None:
     late = PLAIN._replace(delay=True)
     slope = derivatives(late, at_zero, np.ones(4), inputs, y)[:, 2]
     step = 1e-6
-    ends = predicted(late, [at_zero + [0, 0, step], at_zero], np.ones(4), inputs, y)
+    ends = predicted(late, [at_zero + np.array([0.0, 0.0, step]), at_zero], np.ones(4), inputs, y)
     np.testing.assert_allclose(slope, (ends[:, 0] - ends[:, 1]) / step, rtol=1e-2, atol=1e-4)
 
 
@@ -241,7 +243,7 @@ def loop_record(count: int, b: float, noise: float = 0.0) -> tuple[np.ndarray, n
 
 
 def test_a_fit_of_a_loop_without_noise_is_exact() -> None:
-    """a and b to seven digits from starts that are off by a half; Σ e² is zero."""
+    """Both a and b to seven digits from starts that are off by a half; Σ e² is zero."""
     u, y = loop_record(60, 0.4)
     form = Form(1, lag=False, delay=False, drift=False)
     found = fit(form, np.array([0.15]), Inputs.of(u, y), y)
@@ -307,7 +309,9 @@ def test_lag_and_delay_together_are_known_by_the_sum_of_their_covariance() -> No
 
 def test_parameters_have_units_of_time_and_signals() -> None:
     """a_i by dt^(i − n), b by its unit, times by dt; the covariance with the highest a first."""
-    one = made(BOTH, [0.1, 0.2, 2.0, 3.0], [1.5, 0, 0, 0, 0], np.diag([1.0, 2, 3, 4, 5, 6, 7, 8, 9]))
+    one = made(
+        BOTH, [0.1, 0.2, 2.0, 3.0], [1.5, 0, 0, 0, 0], np.diag([1.0, 2, 3, 4, 5, 6, 7, 8, 9])
+    )
     scale, P = physical(one, 10.0, 0.5)
     assert scale.tolist() == [4.0, 2.0, 10.0, 0.5, 0.5]
     # a_1, a_0, b, τ, T
@@ -317,7 +321,7 @@ def test_parameters_have_units_of_time_and_signals() -> None:
 
 
 def test_a_mean_of_models_counts_their_scatter() -> None:
-    """var = Σ w (σ² + (b − mean)²)."""
+    """It is Σ w (σ² + (b − mean)²)."""
     mean, std = mixture([(1.0, 0.1), (2.0, 0.2)], np.array([0.75, 0.25]))
     assert mean == pytest.approx(1.25)
     variance = 0.75 * (0.01 + 0.0625) + 0.25 * (0.04 + 0.5625)
@@ -379,7 +383,7 @@ def test_a_bandwidth_scales_with_time_and_not_with_the_gain() -> None:
 
 
 def test_a_margin_that_no_bandwidth_keeps_gives_the_best_one() -> None:
-    """y'' = b u with a ratio of 5 has 41° at most, as its docstring says."""
+    """Of y'' = b u with a ratio of 5: 41°, as its docstring says."""
     loops = Candidate(1.0, np.array([1.0, 0.0, 0.0]), 0.0, 0.0, b0=1.0, dt=1e-3)
     found = bandwidth(loops, 60.0, 5.0)
     assert not found.keeps
@@ -429,7 +433,9 @@ def test_b0_is_known_within_thirty_percent_at_two_deviations() -> None:
         ({"white": False}, False, "the error is not white, as that of the rounding of y at rest"),
     ],
 )
-def test_what_rejects_the_form_of_the_plant_is_said(changed: Any, rejected: bool, text: str) -> None:
+def test_what_rejects_the_form_of_the_plant_is_said(
+    changed: Any, rejected: bool, text: str
+) -> None:
     """Then there is no bandwidth, and no interval in JSON."""
     one = result(**changed)
     assert one.rejected is rejected
@@ -640,7 +646,9 @@ def test_a_matrix_that_is_known_has_no_shortcomings() -> None:
     np.testing.assert_allclose(one.intervals[0, 0], [2.0 - 0.0392, 2.0 + 0.0392])
     lines = str(one).splitlines()
     assert lines[0] == "B0 of x: u1 2 ± 0.02, u2 -0.5 ± 0.02"
-    assert lines[2].startswith("x, order 2: lag: none is visible; delay: none is visible; together 2 ±")
+    assert lines[2].startswith(
+        "x, order 2: lag: none is visible; delay: none is visible; together 2 ±"
+    )
     assert lines[2].endswith("shown up to 40 rad/s; condition number of the excitation 2")
     assert len(lines) == 4
     shown = json.loads(json.dumps(one.to_json()))

@@ -57,7 +57,7 @@ def noisy() -> Identified:
 
 
 def test_a_lag_is_found_exactly_with_its_constant_force_and_the_start() -> None:
-    """y' + 2 y = 3 (u + 0.5) from y = 4: seven digits, a gain of 1.5 and no doubts."""
+    """Of y' + 2 y = 3 (u + 0.5) from y = 4: seven digits, a gain of 1.5 and no doubts."""
     u, a = binary(200), math.exp(-0.2)
     y = np.empty(200)
     y[0] = 4.0
@@ -121,8 +121,10 @@ def test_a_fit_and_its_deviations_are_those_of_a_general_least_squares_program()
         (([3.0], [1.0, 1.0, 0.0]), 2, 0, {"integrators": 1}),
     ],
 )
-def test_a_model_has_the_units_of_its_record(plant: Any, order: int, zeros: int, given: Any) -> None:
-    """y in mm, u in mA, t in ms: coefficients, deviations, delays and noise scale, tests stay."""
+def test_a_model_has_the_units_of_its_record(
+    plant: Any, order: int, zeros: int, given: Any
+) -> None:
+    """With y in mm, u in mA, t in ms: coefficients, deviations, delays and noise scale, tests stay."""
     u = binary(120)
     y = answer(plant, u) + noise(120)
     how: dict[str, Any] = {"order": order, "zeros": zeros, "delay": 0.0, "held_out": 0.0, **given}
@@ -219,7 +221,7 @@ def test_instruments_from_the_reference_find_the_plant_in_a_loop() -> None:
 
 
 def test_coulomb_friction_of_a_speed_is_found() -> None:
-    """y' = −y + 2 u − 0.6 sign y, integrated in 400 steps of a sample: 0.3 in units of u."""
+    """Of y' = −y + 2 u − 0.6 sign y, integrated in 100 steps of a sample: 0.3 in units of u."""
     u, y, x = 1.5 * binary(200), [], 0.0
     u = u * (1.0 + 0.5 * np.sin(0.3 * np.arange(200)))
     for value in u.tolist():
@@ -476,11 +478,15 @@ def test_a_gain_that_the_record_does_not_decide_is_said() -> None:
     """Its sign where the interval has zero, its size beyond; unless the highest derivative is sure."""
     one = noisy()
     poor = np.diag([0.01, 1e4])
-    assert replace(one, gain_interval=(-1.0, 4.0), covariance=poor).undecided[0].startswith(
-        "the record does not decide the sign of the gain: it is "
+    assert (
+        replace(one, gain_interval=(-1.0, 4.0), covariance=poor)
+        .undecided[0]
+        .startswith("the record does not decide the sign of the gain: it is ")
     )
-    assert replace(one, gain_interval=(0.5, 4.0), covariance=poor).undecided[0].startswith(
-        "the record does not decide the size of the gain: it is "
+    assert (
+        replace(one, gain_interval=(0.5, 4.0), covariance=poor)
+        .undecided[0]
+        .startswith("the record does not decide the size of the gain: it is ")
     )
     sure = replace(one, gain_interval=(0.5, 4.0))
     assert sure.undecided == ()

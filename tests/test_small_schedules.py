@@ -179,7 +179,7 @@ def compensated() -> TunedCompensator:
 
 
 def test_the_figures_of_the_controller_alone_are_those_of_closed_forms() -> None:
-    """y after a load has one sign: ∫|y| is 1/k_i; M_ks is asked for three times."""
+    """As y after a load has one sign: ∫|y| is 1/k_i; M_ks is asked for three times."""
     before = compensated().before
     assert before.iae == pytest.approx(1.0 / 0.5, rel=1e-6)
     omega = np.geomspace(1e-3, math.pi / DT * 0.9999, 4000)

@@ -129,7 +129,7 @@ def test_measures_are_those_of_an_independent_analysis() -> None:
     ],
 )
 def test_a_tuning_has_the_units_of_its_plant(structure: str, plant: Any, order: Any) -> None:
-    """y in mm, u in mA and t in ms: gains and times scale, peaks and damping stay."""
+    """With y in mm, u in mA and t in ms: gains and times scale, peaks and damping stay."""
     num, den = plant
     y, u, t = 250.0, 8.0, 40.0
     n = len(den) - 1
