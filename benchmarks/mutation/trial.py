@@ -103,8 +103,8 @@ NEAR = {
     "margins": ("analysis_margins", "analysis_loop", "advice"),
     "identification": (
         *("alternatives", "awkward_records", "commissioning", "excitation", "free_swing"),
-        *("hostile_files", "identification", "identification_search", "input_gain"),
-        *("input_gain_matrix", "rank", "record_file", "running_loop_parts"),
+        *("hostile_files", "identification", "identification_parts", "identification_search"),
+        *("input_gain", "input_gain_matrix", "rank", "record_file", "running_loop_parts"),
         *("small_identifications", "step_records", "published/test_identification"),
     ),
     "tuning": (
