@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import math
 import re
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ import quell as ql
 from quell.export import NoCompilerError, TranslationError, c_source, ros2, st, st_source
 from quell.export.axes_source import names_in_c
 from quell.export.controller_source import limits_path
+from quell.export.fmi.fmu import build_description
 from quell.export.library import exported, vectors
 from quell.export.proof import (
     Alarm,
@@ -27,6 +30,7 @@ from quell.export.proof import (
     structure,
 )
 from quell.export.ros2 import _class_name, _rate
+from quell.export.translate.structs import into_procedure, read_function
 from quell.types import Status
 
 from .cases import cases
@@ -486,3 +490,116 @@ def test_axes_in_c_have_names_and_places(tmp_path: Path) -> None:
         )
     assert "\\valid(u + (0 .. 1))" in contract
     assert json.dumps(source.sizes) == "[2, 2, 2]"
+
+
+def test_the_run_of_the_golden_vectors_is_that_of_the_controller() -> None:
+    """Steps, another u that was applied, manual operation, a lower limit and a restart, by its own methods."""
+    player, own = vectors.Player(MAKERS["ADRC"]()), MAKERS["ADRC"]()
+    act = vectors.Action
+
+    def played(action: Any, r: float, y: float, given: float = 0.0) -> float:
+        return float(player.play(action, r, y, given)[0])
+
+    assert played(act.STEP, 1.0, 0.2) == own.step(1.0, 0.2)
+    assert played(act.STEP, 1.0, 0.3) == own.step(1.0, 0.3)
+    own.applied(0.1)
+    assert played(act.APPLIED, 1.0, 0.35, 0.1) == own.step(1.0, 0.35)
+    assert played(act.TRACK, 1.0, 0.4, 0.25) == own.track(1.0, 0.4, 0.25)
+    own.hand_over()
+    assert played(act.HAND_OVER, 1.0, 0.4) == own.step(1.0, 0.4)
+    own.reset()
+    assert played(act.RESET, 1.0, 0.5) == own.step(1.0, 0.5)
+    player.limit_at(
+        "limits" if hasattr(player.default, "limits") else limits_path(own), np.array([0.05])
+    )
+    low = played(act.LIMIT, 5.0, 0.0)
+    assert low == 0.05
+    assert played(act.FREE, 5.0, 0.0) > 0.05
+    last = player.rows[-1]
+    assert (last.action, last.r[0], last.y[0]) == (act.FREE, 5.0, 0.0)
+    assert len(player.rows) == 8
+
+
+# ---- functions of users
+
+
+def two_numbers(x: float, y: float) -> Any:
+    """Return two numbers."""
+    if x < 0.0:
+        return 0.0, y
+    return x + y, 2.0 * x
+
+
+def nested(x: float) -> Any:
+    """Return a matrix."""
+    return (x, 1.0), (2.0, x * x)
+
+
+def an_array(x: float) -> Any:
+    """Return an array."""
+    return np.array([x, 3.0 - x])
+
+
+def filled(x: float) -> Any:
+    """Return an array that it has filled."""
+    a = np.zeros((2, 2))
+    for i in range(2):
+        a[i, 1] = x + i
+    return a
+
+
+@cases(
+    ("function", "arguments", "shape"),
+    [
+        (two_numbers, (1.5, 4.0), (2,)),
+        (two_numbers, (-1.5, 4.0), (2,)),
+        (nested, (3.0,), (2, 2)),
+        (an_array, (0.5,), (2,)),
+        (filled, (0.5,), (2, 2)),
+    ],
+)
+def test_a_function_that_returns_numbers_writes_them_into_an_array(
+    function: Any, arguments: Any, shape: Any
+) -> None:
+    """Run as Python it writes what the function returns, and returns nothing."""
+    source = into_procedure(read_function(function), len(shape))
+    names = dict(source.names)
+    tree = ast.Module([source.tree], [])
+    exec(compile(ast.fix_missing_locations(tree), "<procedure>", "exec"), names)
+    out = np.full(shape, math.nan)
+    assert names[function.__name__](*arguments, out) is None
+    np.testing.assert_array_equal(out, np.array(function(*arguments)))
+
+
+def one_number(x: float) -> Any:
+    """Return one number."""
+    return x
+
+
+def test_a_function_that_returns_no_tuple_is_named() -> None:
+    """With what it must return."""
+    with pytest.raises(
+        TranslationError, match=r"one_number: must return a tuple of numbers, written"
+    ):
+        into_procedure(read_function(one_number))
+    with pytest.raises(TranslationError, match="must return a matrix written as nested tuples"):
+        into_procedure(read_function(two_numbers), 2)
+    with pytest.raises(TranslationError, match="its source is not in a file"):
+        read_function(len)
+    double = read_function(lambda z: 2.0 * z)
+    assert ast.unparse(double.tree.body[0]) == "return 2.0 * z"
+
+
+# ---- FMUs
+
+
+def test_the_description_of_the_sources_names_all_files_and_the_library() -> None:
+    """In C99, with libm, which Linux needs."""
+    root = ElementTree.fromstring(build_description("model", ["fmi3.c", "model.c"]))
+    (configuration,) = root
+    assert (root.tag, root.attrib["fmiVersion"]) == ("fmiBuildDescription", "3.0")
+    assert configuration.attrib == {"modelIdentifier": "model"}
+    sources, library = configuration
+    assert sources.attrib == {"language": "C99"}
+    assert [each.attrib["name"] for each in sources] == ["fmi3.c", "model.c"]
+    assert (library.tag, library.attrib["name"]) == ("Library", "m")

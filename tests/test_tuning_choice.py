@@ -15,6 +15,7 @@ from quell.analysis import analyse
 from quell.plants.linear import LinearPlant
 from quell.tuning import Constraints, report
 from quell.tuning.acceptance import Loop, axis_of, judge, time_constant
+from quell.tuning.by_simulation import Build, LinearBounds, _around, _later
 from quell.tuning.designs import (
     Task,
     _order,
@@ -25,6 +26,7 @@ from quell.tuning.designs import (
 )
 from quell.tuning.optimiser.loops import load_step
 from quell.tuning.optimiser.requirements import Active, Pole
+from quell.tuning.optimiser.search import limits
 from quell.tuning.plants import as_list, given_plants, model_of, plant_set, with_known_noise
 from quell.tuning.report import Design, impossible
 from quell.tuning.tune import _by_model, _check_feedforward, _check_u_max, _inputs, _of_axis
@@ -429,3 +431,46 @@ def test_an_axis_is_a_plant_that_rests_anywhere() -> None:
     assert (found.viscous, found.inertia) == (pytest.approx(0.125), pytest.approx(0.25))
     lag = loop(Written(LinearPlant.of(LAG), None, DT), (-1.0, 1.0))
     assert axis_of(lag.linear, 0.2, lag.plants) is None
+
+
+# ---- tuning by simulation
+
+
+def test_ranges_around_a_start_lie_within_the_bounds_of_the_structure() -> None:
+    """From a value over the factor to the value times it; a start outside is named."""
+    structure = tuned().design.solution.structure  # type: ignore[union-attr]
+    low, high = (dict(zip(("K", "T_i", "T_f"), each, strict=True)) for each in limits(structure))
+    values = {"K": 2.0, "T_i": 0.5, "T_f": low["T_f"] * 1.5}
+    found = _around(structure, values, 4.0)
+    assert (found["K"].low, found["K"].high) == (0.5, 8.0)
+    assert (found["T_i"].low, found["T_i"].high) == (0.125, 2.0)
+    assert found["T_f"].low == low["T_f"]
+    assert found["T_f"].high == pytest.approx(min(6.0 * low["T_f"], high["T_f"]))
+    with pytest.raises(ValueError, match="start: T_f = .*: must lie within"):
+        _around(structure, {**values, "T_f": 0.5 * low["T_f"]}, 4.0)
+    with pytest.raises(ValueError, match="start: T_i = nan"):
+        _around(structure, {"K": 2.0, "T_f": values["T_f"]}, 4.0)
+    made = Build(structure, {"u_max": 2.0})(values)
+    assert (made.kp, made.ki) == (2.0, 4.0)
+    assert made.step(100.0, 0.0) == 2.0
+
+
+def test_bounds_of_linear_loops_are_a_logarithm() -> None:
+    """Zero at the bound, infinite for an unstable loop, log 2 at half the bound."""
+    own = tuned()
+    exact = LinearBounds(own.plants, Constraints(m_ks=3.0))(own.controller)
+    assert exact == pytest.approx(-1e-3, abs=2e-3)
+    half = LinearBounds(own.plants, Constraints(m_ks=1.5))(own.controller)
+    assert half == pytest.approx(math.log(2.0) - 1e-3, abs=2e-3)
+    wild = ql.baselines.PID(kp=200.0, ki=5.0, dt=DT)
+    assert LinearBounds(own.plants, Constraints(m_ks=3.0))(wild) == math.inf
+
+
+def test_fresh_plants_have_seeds_of_their_own() -> None:
+    """Of one scenario another seed; of several as many as there are plants, each another one."""
+    one, two = ql.Scenario(1.0, 2.0, seed=3), ql.Scenario(1.0, 2.0, seed=10)
+    later = _later(one, 5)
+    assert later.seed > 3
+    several = _later([one, two], 3)
+    fresh = later.seed - 3
+    assert [each.seed for each in several] == [3 + fresh, 10 + fresh + 1, 3 + fresh + 2]

@@ -17,6 +17,7 @@ import pytest
 import quell as ql
 from quell.analysis import analyse
 from quell.analysis.loop import LoopAnalysis
+from quell.analysis.multivariable import sampled_matrices
 from quell.tuning import Constraints, TunedAxes, tune_axes
 from quell.tuning.axes import (
     _are_rows_of,
@@ -358,6 +359,30 @@ def law_k_i(omega_c: float, omega_o: float) -> float:
     loop = analyse(([1.0], [1.0, 1.0]), one)
     omega = np.array([1e-6])
     return float((loop.response("C_y", omega)[0] * np.expm1(1j * omega[0] * DT) / DT).real)
+
+
+def test_the_grid_of_coupled_loops_is_fine_beside_a_resonance() -> None:
+    """Of a machine with a pair of poles at 20 rad/s: points within a thousandth of it, up to π/dt."""
+    dt = 0.01
+    A = np.array([[0.0, 1.0, 0.0], [-400.0, -0.4, 0.0], [0.0, 0.0, -1.0]])
+    plant = ql.plants.MultivariableLinearPlant(
+        A, [[0.0, 0.0], [400.0, 0.0], [0.0, 1.0]], np.eye(3)[[0, 2]]
+    )
+    matrices = sampled_matrices(plant, dt)
+    observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=4.0, dt=dt)
+    parts = [ql.ADRC(observer, 2.0)] * 2
+    one = CoupledLoops([Plant(*matrices, np.eye(2))], parts, Limits(1.6, 1.6, None, 0.6, None), dt, 0,
+                       np.ones(2), "load")  # fmt: skip
+    assert np.min(np.abs(one.omega / 20.0 - 1.0)) < 1e-3
+    assert one.omega[-1] == pytest.approx(math.pi / dt, rel=1e-5)
+    assert np.all(np.diff(one.omega) > 0.0)
+    near = np.abs(one.omega / 20.0 - 1.0) < 0.15
+    far = np.abs(one.omega / 5.0 - 1.0) < 0.15
+    assert np.sum(near) > 2 * np.sum(far)
+    G = one._G[0, np.argmin(np.abs(one.omega - 1.0))]
+    s = 1j * one.omega[np.argmin(np.abs(one.omega - 1.0))]
+    assert abs(G[0, 0]) == pytest.approx(abs(400.0 / (s**2 + 0.4 * s + 400.0)), rel=1e-3)
+    assert abs(G[0, 1]) < 1e-12
 
 
 def test_a_closed_loop_of_axes_has_the_poles_of_both() -> None:
