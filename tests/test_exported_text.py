@@ -489,6 +489,11 @@ def test_axes_in_c_have_names_and_places(tmp_path: Path) -> None:
             f"ensures within_limits: {limits}.low[{k}] <= u[{k}] <= {limits}.high[{k}];" in contract
         )
     assert "\\valid(u + (0 .. 1))" in contract
+    texts = exported._texts_of_several(controller, source)
+    assert texts["title"] == "Controller of 2 axes with 2 actuators"
+    assert "The places of the axes in `r`, `y` and `v`: 0 `slide`, 1 `arm`." in texts["places"]
+    assert (texts["r_size"], texts["y_size"]) == ("MACHINE_AXES", "MACHINE_AXES")
+    assert texts["further"] == texts["about_further"] == ""
     assert json.dumps(source.sizes) == "[2, 2, 2]"
 
 
@@ -518,6 +523,32 @@ def test_the_run_of_the_golden_vectors_is_that_of_the_controller() -> None:
     last = player.rows[-1]
     assert (last.action, last.r[0], last.y[0]) == (act.FREE, 5.0, 0.0)
     assert len(player.rows) == 8
+
+
+def test_the_run_of_axes_is_that_of_their_own_methods() -> None:
+    """Steps, applied u with a NaN, manual operation, its end, a start under load: each u."""
+    player, own, act = vectors.Player(axes()), axes(), vectors.Action
+    r, y = np.array([1.0, -0.5]), np.array([0.2, 0.1])
+
+    def played(action: Any, given: Any = (0.0, 0.0)) -> list[float]:
+        return player.play(action, r, y, np.array(given)).tolist()  # type: ignore[no-any-return]
+
+    assert played(act.STEP) == own.step(r, y).tolist()
+    own.applied([0.1, -0.2])
+    assert played(act.APPLIED, (0.1, -0.2)) == own.step(r, y).tolist()
+    own.track(r, y, [0.3, 0.4])
+    assert played(act.TRACK, (0.3, 0.4)) == [0.0, 0.0]
+    own.hand_over()
+    assert played(act.HAND_OVER) == own.step(r, y).tolist()
+    own.reset()
+    assert played(act.RESET) == own.step(r, y).tolist()
+    # What is no number changes nothing but the status.
+    before = own.step(r, y).tolist()
+    assert played(act.APPLIED, (math.nan, math.nan)) == pytest.approx(before)
+    own.start(y, u=[0.2, -0.1], r=r)
+    assert played(act.START, (0.2, -0.1)) == own.step(r, y).tolist()
+    ignored = played(act.START, (math.nan, 0.0))
+    assert ignored == own.step(r, y).tolist()
 
 
 # ---- functions of users

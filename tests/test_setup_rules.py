@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import signal
+import tempfile
+import tomllib
 from email.message import Message
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,8 +22,9 @@ from quell.realtime.memory_file import MemoryFile, memory_file
 from quell.realtime.viewers import Viewers, is_local
 from quell.setup import SetupError, registry
 from quell.setup import json_schema as rules
-from quell.setup.axes import axes_task
+from quell.setup.axes import _markov, axes_task, made_axes
 from quell.setup.loading import tuning_task
+from quell.setup.points import _merged, schedule_task
 
 from .cases import cases
 from .setups import GANTRY, TWO_MASS
@@ -288,6 +291,134 @@ def test_a_task_of_axes_has_the_file_and_its_changes(tmp_path: Path) -> None:
     assert (options["B0_off"], options["objective"]) == (0.3, "load")
     _, options = axes_task(written(tmp_path, GANTRY))
     assert options["B0_off"] == 0.0
+
+
+def test_the_b0_of_a_plant_is_the_gain_of_the_highest_derivative() -> None:
+    """C A^(n − 1) B of each output: (5, 0.5) and (0.4, 6) of the gantry; not beside M."""
+    found = load_text_of_axes(GANTRY)
+    np.testing.assert_allclose(found.controller.B0, [[5.0, 0.5], [0.4, 6.0]])
+    assert found.controller.names == ("x", "y")
+    assert found.controller.limits.high.tolist() == [20.0, 30.0]
+    assert found.controller.limits.low.tolist() == [-25.0, -25.0]
+    with pytest.raises(SetupError, match='B0 = "plant" and M: are two of the same'):
+        load_text_of_axes(
+            GANTRY.replace('B0 = "plant",', 'B0 = "plant", M = [[1.0, 0.0], [0.0, 1.0]],')
+        )
+    with pytest.raises(SetupError, match="B0"):
+        load_text_of_axes(GANTRY.replace('B0 = "plant"', 'B0 = "model"'))
+    one = np.zeros((2, 4))
+    one[0, 0] = one[1, 2] = 1.0
+    plant = ql.plants.MultivariableLinearPlant(np.eye(4, k=1), np.eye(4)[:, [1, 3]], one)
+    np.testing.assert_allclose(_markov(plant, [2, 2]), one @ np.eye(4, k=1) @ np.eye(4)[:, [1, 3]])
+    with pytest.raises(
+        ValueError, match="the plant has 2 outputs, there are 1 axes: must be as many"
+    ):
+        _markov(plant, [2])
+
+
+def load_text_of_axes(text: str) -> Any:
+    """Return a setup of axes."""
+    return made_axes("setup.toml", tomllib.loads(text))
+
+
+# ---- schedules
+
+SCHEDULE = """
+dt = 0.05
+[plant]
+kind = "linear"
+A = [[-1.0]]
+B = [2.0]
+C = [1.0]
+[controller]
+u_min = -1.0
+u_max = 1.5
+[tune]
+structure = "bandwidths"
+[[tune.schedule.points]]
+at = 1.0
+plant = { B = [4.0] }
+[[tune.schedule.points]]
+at = 0.0
+plant = { A = [[-3.0]] }
+"""
+
+
+def test_points_of_a_schedule_change_the_plant_of_the_file(tmp_path: Path) -> None:
+    """In their order; limits are those of the controller, the file's plant that of the middle."""
+    task = schedule_task(written(tmp_path, SCHEDULE))
+    assert list(task.plant) == [(0.0,), (1.0,)]
+    assert task.plant[(0.0,)].A.tolist() == [[-3.0]]
+    assert task.plant[(0.0,)].B.tolist() == [[2.0]]
+    assert task.plant[(1.0,)].A.tolist() == [[-1.0]]
+    assert task.plant[(1.0,)].B.tolist() == [[4.0]]
+    assert task.dt == 0.05
+    assert (task.options["u_min"], task.options["u_max"]) == (-1.0, 1.5)
+    assert task.options["structure"] == "bandwidths"
+    assert "between" not in task.options
+    assert task.options["setup"]["plant"]["B"] == [4.0]
+    limited = schedule_task(
+        written(tmp_path, SCHEDULE), {"structure": "half-gain"}, False, {"u_max": 0.5}
+    )
+    assert (limited.options["structure"], limited.options["u_max"]) == ("half-gain", 0.5)
+
+
+def test_values_of_a_parameter_are_points_and_more_between(tmp_path: Path) -> None:
+    """A function of the value, and the points as they are."""
+    text = TWO_MASS + "[tune.schedule]\nparameter = 'plant.m1'\npoints = [0.5, 2.0]\n"
+    task = schedule_task(written(tmp_path, text))
+    light, heavy = task.plant(0.5), task.plant(2.0)
+    assert np.max(np.abs(light.B)) == pytest.approx(4.0 * np.max(np.abs(heavy.B)))
+    assert task.options["points"] == [0.5, 2.0]
+    wrong = text.replace("[0.5, 2.0]", "[[0.5, 2.0], [1.0, 2.0]]")
+    with pytest.raises(
+        SetupError, match="must be a list of numbers for parameter, two lists for two"
+    ):
+        schedule_task(written(tmp_path, wrong))
+    with pytest.raises(SetupError, match=r"is a key of \[plant\], which is missing"):
+        schedule_task(written(tmp_path, "dt = 0.01\n" + text[text.index("[tune") :]))
+
+
+@cases(
+    ("old", "new", "message"),
+    [
+        (
+            "at = 0.0",
+            "at = 1.0",
+            r"tune.schedule.points\[1\].at = 1.0: is the value of another point, too",
+        ),
+        ("A = [[-3.0]]", "A = [[-3.0, 1.0]]", r"tune.schedule.points\[1\]: plant"),
+        (
+            "[controller]",
+            "[compensator]\n[controller]",
+            "compensator: is not tuned with a schedule",
+        ),
+    ],
+)
+def test_points_that_make_no_plant_are_named(old: str, new: str, message: str) -> None:
+    """With their number and key."""
+    with tempfile.TemporaryDirectory() as folder, pytest.raises(SetupError, match=message):
+        schedule_task(written(Path(folder), SCHEDULE.replace(old, new)))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        pytest.raises(SetupError, match="needs the kind of the plant"),
+    ):
+        schedule_task(
+            written(Path(folder), "dt = 0.05\n" + SCHEDULE[SCHEDULE.index("[controller]") :])
+        )
+
+
+def test_a_table_is_changed_by_its_keys_and_replaced_by_a_kind() -> None:
+    """Inner tables as well."""
+    base = {"kind": "a", "x": 1, "inner": {"p": 1, "q": 2}}
+    assert _merged(base, {"x": 2, "inner": {"q": 3}}) == {
+        "kind": "a",
+        "x": 2,
+        "inner": {"p": 1, "q": 3},
+    }
+    assert _merged(base, {"kind": "b"}) == {"kind": "b"}
+    assert _merged("a", {"x": 2}) == {"kind": "a", "x": 2}
+    assert base["inner"] == {"p": 1, "q": 2}
 
 
 # ---- memory of a run
