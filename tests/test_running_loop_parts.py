@@ -6,6 +6,7 @@ import json
 import math
 from functools import cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,7 +14,15 @@ from scipy import signal
 
 import quell as ql
 from quell.analysis import analyse
-from quell.identification import GainBin, InputGain, InputGainMatrix, MarginError, identify_b0_by
+from quell.identification import (
+    GainBin,
+    InputGain,
+    InputGainMatrix,
+    MarginError,
+    identify_b0,
+    identify_b0_by,
+    input_gain,
+)
 from quell.identification.bandwidth import Candidate, Reach, bandwidth, near
 from quell.identification.gain_by_signal import _average, _edges, _stretches
 from quell.identification.gain_matrix import _balanced, _excitation, _names, _signals
@@ -720,3 +729,97 @@ def test_records_of_axes_are_tables_with_names() -> None:
     for given in (["a"], ["a", "a"]):
         with pytest.raises(ValueError, match="must be 2 different names"):
             _names("axes", given, "y", 2)
+
+
+# ---- whole searches
+
+
+def record(count: int, delay: int = 0, noise: float = 0.01) -> Any:
+    """Return u and y of y' = −y + 4 u, sampled at 0.1 s, in a loop, behind a delay."""
+    rng, r = np.random.default_rng(2), binary(count)
+    y, p = 0.0, math.exp(-0.1)
+    used, seen = [0.0] * delay, []
+    for k in range(count):
+        seen.append(y + noise * rng.standard_normal())
+        used.append(0.8 * (r[k] - seen[-1]))
+        y = p * y + (1.0 - p) * 4.0 * used[k]
+    return np.array(used[delay:]), np.array(seen)
+
+
+@cache
+def found_b0() -> InputGain:
+    """Return b0 of 91 samples."""
+    return identify_b0(*record(91), 0.1, 1)
+
+
+def test_b0_of_a_short_record_of_a_loop_is_found_within_its_deviation() -> None:
+    """4 within three deviations of a half percent; a_0 of 1, no lag or delay, white noise."""
+    found = found_b0()
+    assert abs(found.b0 - 4.0) < 3.0 * found.b0_std
+    assert 0.002 < found.b0_std < 0.04
+    assert found.den.tolist() == pytest.approx([1.0, 1.0], abs=0.05)
+    assert found.total_delay < 4.0 * found.total_delay_std + 1e-3
+    assert found.noise == pytest.approx(0.01, rel=0.2)
+    assert (found.order, found.dt, found.samples) == (1, 0.1, 91)
+    assert found.white
+    assert found.independent
+    assert found.converged
+    assert found.shortcomings == ()
+    assert found.omega_max == pytest.approx(math.pi / 0.1, rel=0.2)
+
+
+def test_b0_has_the_units_of_its_record() -> None:
+    """With y in mm, u in mA and t in ms: all figures scale, verdicts stay."""
+    u, y = record(91)
+    one, other = found_b0(), identify_b0(8.0 * u, 500.0 * y, 4.0, 1)
+    assert other.b0 == pytest.approx(one.b0 * 500.0 / 8.0 / 40.0, rel=1e-6)
+    assert other.b0_std == pytest.approx(one.b0_std * 500.0 / 8.0 / 40.0, rel=1e-4)
+    assert other.den[1] == pytest.approx(one.den[1] / 40.0, rel=1e-5)
+    assert other.total_delay == pytest.approx(40.0 * one.total_delay, rel=1e-3, abs=1e-6)
+    assert other.noise == pytest.approx(500.0 * one.noise, rel=1e-6)
+    assert other.omega_max == pytest.approx(one.omega_max / 40.0, rel=1e-9)
+    assert other.shortcomings == one.shortcomings
+
+
+def test_a_delay_in_a_loop_is_found_beside_b0() -> None:
+    """Two samples, within its deviation; the lag is none. By a search from fewer starts."""
+    few = {"_RATES": (0.05,), "_GRID": 4, "_DENOMINATORS": 1, "_SHARES": (0.5,)}
+    with patch.multiple(input_gain, **few):
+        found = identify_b0(*record(91, delay=2), 0.1, 1)
+    assert found.total_delay == pytest.approx(0.2, abs=4.0 * found.total_delay_std)
+    assert found.total_delay_std < 2e-3
+    assert abs(found.b0 - 4.0) < 4.0 * found.b0_std
+    assert found.delay == pytest.approx(0.2, abs=3e-3)
+
+
+def test_b0_in_bins_is_that_of_the_stretches_in_them() -> None:
+    """The first 91 samples are one; the others are too few."""
+    u, y = record(110)
+    known, few = identify_b0_by(u, y, np.arange(110) >= 91, 0.1, 1, bins=2)
+    assert known.is_known
+    assert (known.samples, known.used, known.mean) == (91, 91, 0.0)
+    assert abs(known.b0 - 4.0) < 3.0 * known.b0_std
+    assert (few.samples, few.used) == (19, 0)
+    assert "no stretch of 90 samples in a row" in few.reason
+    assert str(few).startswith("NOT known at 0.5 … 1: ")
+
+
+@pytest.mark.parametrize(
+    ("u", "y", "options", "message"),
+    [
+        (80, 80, {}, "u has 80 samples: must have at least 90 for order 1; record longer"),
+        (95, 94, {}, "y"),
+        (95, 95, {"order": 5}, "order = 5"),
+        (95, 95, {"dt": 0.0}, "dt = 0.0"),
+        (95, 95, {"max_delay": -1.0}, "max_delay = -1.0"),
+    ],
+)
+def test_records_of_a_loop_that_say_nothing_are_refused(
+    u: int, y: int, options: Any, message: str
+) -> None:
+    """Too short, of other lengths, arguments out of range; one that rests."""
+    given = {"dt": 0.1, "order": 1, **options}
+    with pytest.raises(ValueError, match=message):
+        identify_b0(binary(u), np.cumsum(binary(y)), **given)
+    with pytest.raises(ValueError, match="y"):
+        identify_b0(binary(95), np.ones(95), 0.1, 1)

@@ -7,13 +7,14 @@ import math
 from dataclasses import replace
 from functools import cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from scipy import optimize, signal, stats
 
 import quell as ql
-from quell.identification import Identified, alternatives, free_swing
+from quell.identification import Identified, alternatives, free_swing, search
 from quell.identification.identify import delay_range, resolution_of
 from quell.identification.model import Root, gain_interval, poles_of, zeros_of
 from quell.identification.structures import Alternative, not_told_apart
@@ -236,6 +237,23 @@ def test_coulomb_friction_of_a_speed_is_found() -> None:
     assert 0.0 < found.friction_width < speed
     assert found.parameters == 5
     assert "Coulomb friction 0." in found.describe()
+
+
+def test_coulomb_friction_of_a_position_is_found() -> None:
+    """Of y'' = −0.5 y' + 2 u − 0.8 sign y', integrated in 20 steps of a sample: 0.4 in units of u."""
+    u, y, x, v = 2.0 * binary(92), [], 0.0, 0.0
+    for value in u.tolist():
+        y.append(x)
+        for _ in range(20):
+            v += 0.005 * (-0.5 * v + 2.0 * value - 0.8 * math.copysign(1.0, v))
+            x += 0.005 * v
+    how: dict[str, Any] = {"delay": 0.0, "friction": True, "held_out": 0.0, "integrators": 1}
+    with patch.multiple(search, _PASSES=2, _MOST_RUNS=8):
+        found = ql.identify(u, y, DT, 2, **how)
+    assert found.num[0] == pytest.approx(2.0, rel=0.03)
+    assert found.den[1] == pytest.approx(0.5, abs=0.05)
+    assert found.friction == pytest.approx(0.4, rel=0.06)
+    assert found.integrators == 1
 
 
 # ---- free swings

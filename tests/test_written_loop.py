@@ -414,6 +414,61 @@ def test_a_reference_model_makes_a_linear_step_overshoot_by_a_twentieth() -> Non
     assert reference.model_of_linear_step(plants, pi(0.5, 0.1)) is None
 
 
+def test_a_reference_model_is_the_one_with_which_a_step_settles_soonest() -> None:
+    """It overshoots by a twentieth at most; none of slower and faster ones settles sooner."""
+    shown = loop(reference=ql.signals.Step(0.4, 0.2), duration=5.0)
+    controller = pi(0.5, 2.0, u_min=-1.0, u_max=1.0)
+    found = reference.reference_model_for(shown, controller, 6.0)
+    assert found.prefilter is not None
+    assert found.step is not None
+    assert found.step.overshoot <= 0.05
+    assert found.prefilter.order == 2
+    assert 0.5 < found.prefilter.omega <= 6.0
+    for factor in (0.7, 1.4):
+        other = ql.controllers.ReferenceModel(factor * found.prefilter.omega, 2)
+        step = reference._with(shown, controller, other, shown.steps[0][1])
+        assert step.overshoot > 0.05 or not step.settling < found.step.settling - DT
+    slow = pi(0.05, 0.05, u_min=-1.0, u_max=1.0)
+    none = reference.reference_model_for(
+        loop(reference=ql.signals.Step(0.4, 0.2), duration=1.0), slow, 6.0
+    )
+    assert none.prefilter is None
+
+
+def test_a_profile_generator_moves_an_axis_within_its_room() -> None:
+    """The quickest one that overshoots little: u stays off its limits but for a few samples."""
+    axis = Axis.of(AXIS, 10.0)
+    assert axis is not None
+    shown = loop(reference=ql.signals.Step(1.0, 0.2), duration=6.0, plant=AXIS)
+    observer = ql.ESO.model_free(2, 4.0, 12.0, DT)
+    controller = ql.ADRC(observer, 3.0, u_min=-1.0, u_max=1.0)
+    found = reference.profile_for(shown, controller, axis, 0.4, 1.0)
+    assert found.step is not None
+    assert found.step.overshoot <= 0.05
+    generator = found.prefilter
+    assert 0.125 * generator.v_max + 0.25 * generator.a_max <= 0.951
+    move = reference._duration(generator, 1.0)
+    assert move > 2.0 * math.sqrt(1.0 / generator.a_max)
+    assert found.step.settling >= 0.5 * move
+    still = loop(reference=0.0, plant=AXIS)
+    plain = reference.profile_for(still, controller, axis, 0.4, 1.0)
+    assert plain.step is None
+    assert 0.125 * plain.prefilter.v_max + 0.25 * plain.prefilter.a_max == pytest.approx(0.95)
+
+
+def test_profiles_are_tried_from_the_quickest_on() -> None:
+    """Three shares of the room, with ramps of four samples and of one and three time constants."""
+    axis = Axis(0.125, 0.25)
+    tried = [*reference._profiles(axis, 2.0, 0.5, 0.3, DT)]
+    times = [reference._duration(each, 2.0) for each in tried]
+    assert times == sorted(times)
+    assert len(tried) == 9
+    ramps = sorted({round(each.a_max / each.j_max, 9) for each in tried})
+    assert ramps == pytest.approx([4 * DT, 0.3, 0.9])
+    rooms = sorted({round(0.125 * each.v_max + 0.25 * each.a_max, 9) for each in tried})
+    assert rooms == pytest.approx([0.65 * 0.5, 0.8 * 0.5, 0.95 * 0.5])
+
+
 def test_the_table_of_a_prefilter_has_its_numbers() -> None:
     """``reference-model`` and ``profile-generator``."""
     model = ql.controllers.ReferenceModel(3.0, 2)
