@@ -114,6 +114,11 @@ def test_a_schedule_says_where_it_is_worse_and_where_it_leaves_its_bounds() -> N
     assert (other.m_s, other.worst_ratio) == (1.69, 1.0)
     (line,) = [each for each in other.verdicts() if each.startswith("NOT within")]
     assert line.startswith("NOT within M_s = 1.6: 1.690 at 0.5, where the plant is not that of")
+    assert not any(each.startswith("NOT as good") for each in other.verdicts())
+    slow = tuple(each._replace(iae=3.0) for each in loops)
+    alone = TunedSchedule(found.controller, slow, found.own, None, True)
+    assert alone.worst_ratio == 1.5
+    assert not any(each.startswith("NOT as good") for each in alone.verdicts())
     rows = other.rows()
     assert rows[0] == ("at 0", "1", "1.600", "1.200", "2", "1.000")
     assert rows[1] == ("between, at 0.5", "1.5", "1.690", "1.200", "2", "nan")
