@@ -111,18 +111,9 @@ NEAR = {
     "tuning": (
         *("cli_tune", "compensator", "feedforward", "from_pid", "generalised", "over_seeds"),
         *("p_pi", "reduction", "refused_arguments", "schedule", "schedule_of_loads"),
-        *(
-            "small_schedules",
-            "tuned_files",
-            "tuned_limits",
-            "tuned_loops",
-            "tuning",
-            "tuning_axes",
-            "tuning_damping",
-            "tuning_lqg",
-        ),
-        *("tuning_choice", "tuning_parts", "tuning_simulated", "written_loop"),
-        "published/test_tuning",
+        *("small_schedules", "tuned_files", "tuned_limits", "tuned_loops", "tuning"),
+        *("tuning_axes", "tuning_choice", "tuning_damping", "tuning_lqg", "tuning_parts"),
+        *("tuning_simulated", "written_loop", "published/test_tuning"),
     ),
     "export": (
         *("axes_export", "axes_in_single", "export", "exported_text", "fmu_export"),
