@@ -18,6 +18,7 @@ from quell.export import NoCompilerError, TranslationError, c_source, ros2, st, 
 from quell.export.axes_source import names_in_c
 from quell.export.controller_source import limits_path
 from quell.export.fmi.fmu import build_description
+from quell.export.fmi.parts import ControllerPart
 from quell.export.library import exported, vectors
 from quell.export.proof import (
     Alarm,
@@ -489,6 +490,18 @@ def test_axes_in_c_have_names_and_places(tmp_path: Path) -> None:
             f"ensures within_limits: {limits}.low[{k}] <= u[{k}] <= {limits}.high[{k}];" in contract
         )
     assert "\\valid(u + (0 .. 1))" in contract
+    declared = "void machine_step(machine_state *state, const double r[2], const double y[2], double u[2]);"
+    assert declared in contract
+    part = ControllerPart.of(controller, source)
+    assert part.references == ["r.slide", "r.arm"]
+    assert part.measurements == ["y.slide", "y.arm"]
+    assert part.controls == ["u[1]", "u[2]"]
+    assert part.held == ["held.slide", "held.arm"]
+    assert [each.name for each in part.inputs] == ["r.slide", "r.arm", "held.slide", "held.arm"]
+    assert [each.name for each in part.tunables] == ["u_min[1]", "u_min[2]", "u_max[1]", "u_max[2]"]
+    assert [each.start for each in part.tunables] == [-1.0, -1.0, 1.0, 1.0]
+    names = [each.name for each in part.outputs]
+    assert {"slide.f_hat", "arm.f_hat", "v[1]", "v[2]", "status"} <= set(names)
     texts = exported._texts_of_several(controller, source)
     assert texts["title"] == "Controller of 2 axes with 2 actuators"
     assert "The places of the axes in `r`, `y` and `v`: 0 `slide`, 1 `arm`." in texts["places"]
@@ -622,6 +635,30 @@ def test_a_function_that_returns_no_tuple_is_named() -> None:
 
 
 # ---- FMUs
+
+
+def test_the_variables_of_an_fmu_are_those_of_its_controller() -> None:
+    """Inputs, outputs, limits and bandwidths of an ADRC; a PID controller has no bandwidths."""
+    adrc = MAKERS["ADRC"]()
+    part = ControllerPart.of(adrc, c_source(adrc, "servo"))
+    assert (part.references, part.measurements, part.controls) == (["r"], ["y"], ["u"])
+    assert part.can_be_held
+    assert part.held == ["held"]
+    assert [(each.name, each.flag) for each in part.inputs] == [("r", False), ("held", True)]
+    names = [each.name for each in part.outputs]
+    assert {"f_hat", "f_residual", "f_learned", "status", "x_hat[1]"} <= set(names)
+    (status,) = [each for each in part.outputs if each.name == "status"]
+    assert status.whole
+    assert [(each.name, each.start) for each in part.tunables] == [
+        ("u_min", -1.0), ("u_max", 1.5), ("omega_c", 4.0), ("omega_o", 20.0),
+    ]  # fmt: skip
+    assert part.fixed == ""
+    pid = MAKERS["PI"]()
+    plain = ControllerPart.of(pid, c_source(pid, "servo"))
+    assert not plain.can_be_held
+    assert [each.name for each in plain.inputs] == ["r"]
+    assert [each.name for each in plain.tunables] == ["u_min", "u_max"]
+    assert plain.derivatives_of(0) == []
 
 
 def test_the_description_of_the_sources_names_all_files_and_the_library() -> None:
