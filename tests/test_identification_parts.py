@@ -290,6 +290,37 @@ def test_the_delay_near_a_model_is_found_step_by_step() -> None:
     assert search.nearest_delay(LAG, start, u, v, y, (4, 8), 5, 2)[0] == 4
 
 
+def test_a_part_of_a_sample_is_taken_where_the_record_shows_it() -> None:
+    """Of 2.5 samples it is; of 2 with noise the whole one and its model stay."""
+    u, theta = binary(70), np.array([0.3, 0.6, 0.1, 0.0])
+    v = inputs(u)
+    noise = 0.002 * np.random.default_rng(8).standard_normal(70)
+    for true in (2.5, 2.0):
+        y = output(LAG, theta, search.with_delay(LAG, v, u, true)) + noise
+        start = refine(LAG, theta, search.with_delay(LAG, v, u, 2.0), y, 3)
+        late, found = search.with_part_of_sample(LAG, start, u, v, y, 2.0, (0.0, 4.0))
+        if true == 2.0:
+            assert late == 2.0
+            assert found is start
+        else:
+            assert late == pytest.approx(2.5, abs=0.03)
+            assert found.cost < 0.1 * start.cost
+
+
+def test_a_delay_under_friction_is_whole_where_its_part_is_hardly_one() -> None:
+    """Of the least simulated error: 2 samples exactly, 2.4 nearly."""
+    structure = Structure(1, 0, (0, 0, 0), friction=(0.0,))
+    theta = np.array([0.3, 0.6, 0.1, 0.15, 0.0])
+    u = 1.5 * binary(50)
+    v = np.column_stack([inputs(u), np.zeros(50)])
+    for true, at in ((2.0, 2.1), (2.4, 2.3)):
+        late = search.with_delay(structure, v, u, true)
+        y = model.free_run(structure, theta, late, own_friction=True)[0]
+        near = model.free_run(structure, theta, search.with_delay(structure, v, u, at), own_friction=True)[1]
+        found = search.simulated_delay(structure, theta, u, near, y, (0.0, 4.0), at)
+        assert found == (2 if true == 2.0 else pytest.approx(2.4, abs=0.02))
+
+
 # ---- least squares and noise
 
 
