@@ -31,6 +31,10 @@ from quell.export.proof import (
     structure,
 )
 from quell.export.ros2 import _class_name, _rate
+from quell.export.structured_text import places
+from quell.export.structured_text.c_reader import CFile
+from quell.export.structured_text.places import Node, Whole
+from quell.export.structured_text.translator import Translator
 from quell.export.translate.structs import into_procedure, read_function
 from quell.types import Status
 
@@ -138,6 +142,107 @@ def test_a_controller_without_a_block_is_refused(make: Any, name: str, message: 
     """Infinite limits, names of the language, several axes."""
     with pytest.raises(ValueError, match=message):
         st_source(make(), name)
+
+
+def in_text(body: str, **given: float) -> float:
+    """Return what a C function of x, y and z returns after it has become Structured Text."""
+    code = f"double f(double x, double y, double z)\n{{\n{body}}}\n"
+    writer = Translator(CFile("", code), False, ("u",))
+    place = [writer.variable(each, "real", "state") for each in "xyz"]
+    found = writer.call(writer.file.function("f"), place)
+    assert isinstance(found, Node)
+    writer.assign(Node("real", lambda: "u", 9, True), found)
+    lines = ["VAR", "u : LREAL;"]
+    for section in writer.variables.values():
+        for each in section:
+            kind = {"real": "LREAL", "bool": "BOOL"}.get(str(each.kind)) or each.kind.name  # type: ignore[union-attr]
+            shape = ", ".join(f"0..{size - 1}" for size in each.shape)
+            of = f"ARRAY[{shape}] OF " if each.shape else ""
+            lines.append(f"{each.name} : {of}{kind};")
+    block = FunctionBlock("\n".join([*lines, "END_VAR", "", writer.text()]))
+    block.call(**given)
+    return float(block.v["u"])
+
+
+@cases(
+    ("body", "value"),
+    [
+        ("    return x - (y - z);\n", 3.0 - (4.0 - 9.0)),
+        ("    return x - y - z;\n", 3.0 - 4.0 - 9.0),
+        ("    return x / (y / z);\n", 3.0 / (4.0 / 9.0)),
+        ("    return (x + y) * z - -x;\n", 7.0 * 9.0 + 3.0),
+        ("    return -(x + y) * z;\n", -63.0),
+        ("    return sqrt(z) + fabs(x - y);\n", 3.0 + 1.0),
+        ("    return x < y ? (y < z ? 1.0 : 2.0) : 3.0;\n", 1.0),
+        ("    return x < y && !(y < z) ? 1.0 : 2.0;\n", 2.0),
+        ("    return x > y || y < z ? 1.0 : 2.0;\n", 1.0),
+        ("    for (int i = 0; i <= 3; i++) {\n        x += y;\n    }\n    return x;\n", 3.0 + 4 * 4.0),
+        ("    for (int i = 0; i < 3; i++) {\n        x += y;\n    }\n    return x;\n", 3.0 + 3 * 4.0),
+        ("    for (int i = 4; i >= 2; i--) {\n        x = x * 2.0 - y;\n    }\n    return x;\n", -4.0),
+        ("    for (int i = 4; i > 2; i--) {\n        x = x * 2.0 - y;\n    }\n    return x;\n", 0.0),
+        (
+            "    for (int i = 0; i < 5; i++) {\n        if (x > 10.0) {\n            break;\n        }\n"
+            "        x += y;\n    }\n    return x;\n",
+            11.0,
+        ),
+        (
+            "    double a[3];\n\n    for (int i = 0; i < 3; i++) {\n        a[i] = x;\n        x = x * 2.0;\n    }\n"
+            "    return a[1] + 10.0 * a[2];\n",
+            6.0 + 120.0,
+        ),
+        (
+            "    if (x > y) {\n        return 1.0;\n    } else if (y > z) {\n        return 2.0;\n    }\n"
+            "    return 3.0;\n",
+            3.0,
+        ),
+        (
+            "    double b = 0.0;\n\n    if (x < y) {\n        b = x;\n    } else {\n        b = y;\n    }\n"
+            "    b = b * 2.0;\n    return b;\n",
+            6.0,
+        ),
+        (
+            "    for (int i = 0; i < 4; i++) {\n        if (i == 2) {\n            return x + y;\n"
+            "        }\n    }\n    return z;\n",
+            7.0,
+        ),
+    ],
+)  # fmt: skip
+def test_c_means_the_same_in_structured_text(body: str, value: float) -> None:
+    """Order of operations, choices, loops up and down, breaks, arrays and returns, for 3, 4 and 9."""
+    assert in_text(body, x=3.0, y=4.0, z=9.0) == value
+
+
+def test_an_integer_is_for_flags_or_for_counts() -> None:
+    """Both together are refused; what is the same type learns it from each other."""
+    one, two, three = Whole(), Whole(), Whole()
+    assert one.name == "DINT"
+    one.unify(two)
+    two.unify(three)
+    three.use("DWORD")
+    assert (one.name, two.name, three.name) == ("DWORD", "DWORD", "DWORD")
+    later = Whole()
+    later.unify(one)
+    assert later.name == "DWORD"
+    first = Whole()
+    first.use("DWORD")
+    open_one = Whole()
+    first.unify(open_one)
+    assert open_one.name == "DWORD"
+    with pytest.raises(TranslationError, match="an integer for flags and for counts"):
+        two.use("DINT")
+    assert places.count(3).text() == "3"
+    assert [places.real_text(x) for x in (1.0, -0.5, 1e-7, 3e20)] == [
+        "1.0",
+        "-0.5",
+        "1.0E-7",
+        "3.0E20",
+    ]
+    low = Node("real", lambda: "a + b", 6)
+    assert places.inside(low, 6) == "a + b"
+    assert places.inside(low, 7) == "(a + b)"
+    assert places.inside(Node("real", lambda: "-2.0"), 6) == "(-2.0)"
+    assert places.is_keyword("If")
+    assert not places.is_keyword("servo")
 
 
 # ---- ROS

@@ -316,7 +316,9 @@ def test_a_delay_under_friction_is_whole_where_its_part_is_hardly_one() -> None:
     for true, at in ((2.0, 2.1), (2.4, 2.3)):
         late = search.with_delay(structure, v, u, true)
         y = model.free_run(structure, theta, late, own_friction=True)[0]
-        near = model.free_run(structure, theta, search.with_delay(structure, v, u, at), own_friction=True)[1]
+        near = model.free_run(
+            structure, theta, search.with_delay(structure, v, u, at), own_friction=True
+        )[1]
         found = search.simulated_delay(structure, theta, u, near, y, (0.0, 4.0), at)
         assert found == (2 if true == 2.0 else pytest.approx(2.4, abs=0.02))
 
