@@ -307,6 +307,51 @@ def test_a_part_of_a_sample_is_taken_where_the_record_shows_it() -> None:
             assert found.cost < 0.1 * start.cost
 
 
+def test_a_delay_with_a_part_of_a_sample_has_a_deviation_like_any_parameter() -> None:
+    """Its column is the slope of y by the delay; the interval is 1.96 deviations to both sides."""
+    u, theta = binary(70), np.array([0.3, 0.6, 0.1, 0.0])
+    v = search.with_delay(LAG, inputs(u), u, 2.4)
+    y = output(LAG, theta, v) + 0.01 * np.random.default_rng(8).standard_normal(70)
+    estimate = refine(LAG, theta, v, y, 5)
+    found, interval, of_delay = search._with_part(LAG, estimate, u, v, y, 2.4, 2)
+    assert found.covariance.shape == (4, 4)
+    np.testing.assert_array_equal(found.theta, estimate.theta)
+    assert 0.5 * sum(interval) == pytest.approx(2.4)
+    deviation = 0.5 * (interval[1] - interval[0]) / 1.959964
+    assert of_delay.shape == (3,)
+    assert of_delay[2] == pytest.approx(deviation**2, rel=1e-3)
+    ends = [output(LAG, estimate.theta, search.with_delay(LAG, v, u, at)) for at in (2.41, 2.39)]
+    psi = np.column_stack([output_gradient(LAG, estimate.theta, v)[1], (ends[0] - ends[1]) / 0.02])
+    plain = 1e-4 * np.linalg.inv(psi.T @ psi)
+    assert deviation == pytest.approx(math.sqrt(plain[4, 4]), rel=0.6)
+    # A delay that is not known makes the poles less certain.
+    assert found.covariance[0, 0] > estimate.covariance[0, 0]
+
+
+def test_a_delay_of_whole_samples_is_known_to_half_a_sample() -> None:
+    """Where the neighbours fit far worse; with much noise the interval has them, too."""
+    u, theta = binary(70), np.array([0.3, 0.6, 0.1, 0.0])
+    v = search.with_delay(LAG, inputs(u), u, 3.0)
+    clean = output(LAG, theta, v)
+    noise = np.random.default_rng(8).standard_normal(70)
+    widths = []
+    for size in (0.01, 1.5):
+        y = clean + size * noise
+        estimate = refine(LAG, theta, v, y, 8)
+        found, interval, of_delay = search._over_delays(LAG, estimate, u, v, y, 3.0, (0.0, 8.0))
+        assert interval[0] <= 2.5
+        assert interval[1] >= 3.5
+        assert of_delay[2] >= 1.0 / 12.0
+        assert np.all(np.diag(found.covariance) >= np.diag(estimate.covariance) * (1.0 - 1e-6))
+        widths.append(interval[1] - interval[0])
+    assert widths[0] == 1.0
+    assert widths[1] > 1.0
+    given = search._over_delays(LAG, estimate, u, v, y, 3.0, (3.0, 3.0))
+    assert given[0] is estimate
+    assert given[1] == (3.0, 3.0)
+    assert given[2].tolist() == [0.0, 0.0, 0.0]
+
+
 def test_a_delay_under_friction_is_whole_where_its_part_is_hardly_one() -> None:
     """Of the least simulated error: 2 samples exactly, 2.4 nearly."""
     structure = Structure(1, 0, (0, 0, 0), friction=(0.0,))
