@@ -7,6 +7,7 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -478,6 +479,49 @@ def test_a_proof_says_what_holds_and_what_is_open() -> None:
     )
     assert "There are no limits of u." in counted.text
     assert "## Stack and code\n\n| t |" in counted.text
+
+
+# ---- examples of a library
+
+
+def example(**changed: Any) -> Any:
+    """Return what the examples know of a C source."""
+    given = {
+        "name": "servo",
+        "derivatives": 0,
+        "further": (),
+        "real": "double",
+        "precision": "double",
+    }
+    return SimpleNamespace(**{**given, "operations": ("step",), **changed})
+
+
+def test_the_reference_of_an_example_has_its_derivatives() -> None:
+    """One number, a move of two derivatives, in single precision with f; signals are further variables."""
+    plain = exported._reference_texts(example())
+    assert plain["reference"] == "reference"
+    assert plain["defined_reference"] == "static double reference = 0.0;"
+    assert plain["derivatives"] == ""
+    single = exported._reference_texts(example(real="float", precision="single"))
+    assert single["defined_reference"] == "static float reference = 0.0f;"
+    moving = exported._reference_texts(example(operations=("step", "stopping_point")))
+    assert moving["defined_reference"].endswith("= 0.0; /* target of the moves */")
+    fed = exported._reference_texts(example(derivatives=2, further=("r1", "r2")))
+    assert fed["reference"] == "r[0]"
+    assert fed["derivatives"] == ", r[1], r[2]"
+    assert fed["declared_reference"] == "extern void next_reference(double r[3]); /* r, r', r'' */"
+    assert "for (int i = 0; i <= 2; i++)\n        r[i] = 0.0;" in fed["defined_reference"]
+    assert fed["next_reference"] == "    double r[3];\n\n    next_reference(r);\n"
+    one = example(derivatives=1, further=("r1", "inertia"))
+    found = exported._with_signals(exported._reference_texts(one), one)
+    assert found["derivatives"] == ", r[1], inertia"
+    assert found["declared_reference"].endswith(
+        "\nvolatile double inertia; /* a signal that the gains follow: write it before each step */"
+    )
+    assert "\nstatic double inertia = 0.0; /* a signal" in found["defined_reference"]
+    small = example(real="float", precision="single", further=("inertia",))
+    found = exported._with_signals(exported._reference_texts(small), small)
+    assert "\nstatic float inertia = 0.0f; /* a signal" in found["defined_reference"]
 
 
 # ---- sizes

@@ -351,6 +351,10 @@ def test_measures_of_decoupled_loops_are_those_of_single_ones() -> None:
     wild = loops().measured(np.array([[40.0, 400.0], [2.5, 4.0]]))
     assert not wild.stable
     assert wild.violation == math.inf
+    lost = loops().measured(np.array([[90.0, 900.0], [2.5, 4.0]]))
+    assert not lost.stable
+    assert lost.costs.tolist() == [100.0, 100.0]  # a hundred times that of each alone
+    assert lost.cost == pytest.approx(math.log(100.0))
 
 
 def law_k_i(omega_c: float, omega_o: float) -> float:
@@ -645,3 +649,37 @@ def test_unstable_poles_of_a_controller_are_counted_with_and_without_delay() -> 
             inner = law.A + np.outer(law.B_u, law.C)
             outside = int(np.sum(np.abs(np.linalg.eigvals(inner)) > 1.0 + 1e-6))
             assert structure.unstable_poles(row[None, :])[0] == outside, (name, row)
+
+
+@cases(
+    ("name", "order", "units"),
+    [
+        ("pi", 0, ["u-unit/y-unit", "s", "s"]),
+        ("pid", 0, ["u-unit/y-unit", "s", "s", "s"]),
+        ("bandwidths", 2, [None, "rad/s", "rad/s"]),
+        ("poles", 2, [None, "rad/s", "", "rad/s", "", "rad/s"]),
+        ("half-gain", 2, [None, "rad/s", "rad/s"]),
+        ("p-pi-notch", 0, ["u-unit/(y-unit/s)", "1/s", "s", "s"]),
+    ],
+)
+def test_parameters_of_a_structure_have_ranges_around_the_crossover(
+    name: str, order: int, units: Any
+) -> None:
+    """No pole is faster than 0.5/dt; a thousandth of the crossover is in; starts lie inside."""
+    structure = structure_of(name, ([1.0], [1.0, 0.3, 0.0]), order)
+    omega, fastest = structure.model.omega, 0.5 / 0.01
+    for parameter, unit in zip(structure.parameters, units, strict=True):
+        assert 0.0 < parameter.low < parameter.high, parameter
+        assert unit is None or parameter.unit == unit
+        if parameter.unit == "rad/s":
+            assert parameter.high == pytest.approx(fastest)
+            assert parameter.low == pytest.approx(1e-3 * omega)
+        if parameter.name == "T_f":
+            root = math.sqrt(2.0) if name == "pid" else 1.0  # of the second-order filter
+            assert parameter.low == pytest.approx(root / fastest)
+    low, high = (
+        np.array([getattr(each, end) for each in structure.parameters]) for end in ("low", "high")
+    )
+    for row in structure.shapes():
+        assert np.all((row >= low * (1.0 - 1e-9)) & (row <= high * (1.0 + 1e-9))), row
+    assert len({tuple(row) for row in structure.shapes().tolist()}) > 3
