@@ -6,6 +6,7 @@ import ast
 import json
 import math
 import re
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -558,6 +559,17 @@ def test_instructions_are_counted_by_function() -> None:
     assert exported._size_of("of_state", symbols) == 0x58
     with pytest.raises(NoCompilerError, match="the output of nm is not known"):
         exported._size_of("of_none", symbols)
+
+
+def test_a_compiler_that_fails_is_told_by_its_first_error(tmp_path: Path) -> None:
+    """Or by all it said; what it prints without an error is its result."""
+    say = "import sys; sys.stderr.write({!r}); sys.exit({})"
+    text = "a.c: in f\na.c:1: error: no such type\na.c:2: error: more\n"
+    with pytest.raises(NoCompilerError, match=" fails: a.c:1: error: no such type$"):
+        exported._run(tmp_path, sys.executable, "-c", say.format(text, 1))
+    with pytest.raises(NoCompilerError, match=" fails: nothing works$"):
+        exported._run(tmp_path, sys.executable, "-c", say.format("nothing works\n", 2))
+    assert exported._run(tmp_path, sys.executable, "-c", "print(3)").strip() == "3"
 
 
 def test_the_table_of_sizes_has_a_row_for_each_function(monkeypatch: pytest.MonkeyPatch) -> None:

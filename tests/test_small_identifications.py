@@ -17,7 +17,7 @@ import quell as ql
 from quell.identification import Identified, alternatives, free_swing, search
 from quell.identification.identify import delay_range, resolution_of
 from quell.identification.model import Root, gain_interval, poles_of, zeros_of
-from quell.identification.structures import Alternative, not_told_apart
+from quell.identification.structures import _EQUAL, Alternative, not_told_apart
 from quell.quantities import Quantity, Signals
 from quell.tuning.plants import RecordModel, doubts, identified_plants
 
@@ -559,6 +559,9 @@ def test_a_verdict_needs_both_significance_and_size() -> None:
     assert alternative(z=-5.0).verdict == "worse"
     assert alternative(z=2.9).verdict == "undecided"
     assert alternative(gain=1e-9).verdict == "undecided"
+    assert alternative(z=3.0).verdict == "better"  # at the limit it is decided
+    assert alternative(gain=_EQUAL).verdict == "better"
+    assert alternative(gain=-_EQUAL, z=-5.0).verdict == "worse"
     assert alternative(gain=1e-9, by_likelihood=True).verdict == "better"
     assert alternative(z=-2.9, by_likelihood=True).may_be_as_good
     assert not alternative(z=-3.0, by_likelihood=True).may_be_as_good
