@@ -333,6 +333,11 @@ def test_the_contract_of_a_controller_promises_a_number_within_the_limits() -> N
     assert f"    narrower.{path}.high = 0.25;" in program  # the middle of −1 and 1.5
     assert "servo_retune(&controller, &narrower);" in program
     assert "@" not in script.replace("$@", "")
+    foreign = SimpleNamespace(externals=("table", "lookup"))
+    with pytest.raises(
+        ValueError, match="proof = True: the controller calls table, lookup, which is"
+    ):
+        proof_files(pi, foreign)  # type: ignore[arg-type]
     assert "servo" in script
 
 

@@ -186,6 +186,8 @@ def test_the_factor_of_a_search_is_above_one() -> None:
         ({"held_out": 0.95}, "held_out = 0.95: must be from 0 to 0.9"),
         ({"held_out": -0.1}, "held_out = -0.1"),
         ({"held_out": 0.01}, "held_out = 0.01: of 200 samples these are 2, must be at least"),
+        ({"held_out": 0.295}, "of 200 samples these are 59, must be at least 60 to be judged on"),
+        ({"held_out": 0.1, "horizon": 4}, "of 200 samples these are 20, must be at least 24 to be"),
         ({"delay": -0.1}, "delay = -0.1"),
         (
             {"delay": (0.3, 0.1)},
