@@ -308,7 +308,7 @@ def test_the_b0_of_a_plant_is_the_gain_of_the_highest_derivative() -> None:
         load_text_of_axes(GANTRY.replace('B0 = "plant"', 'B0 = "model"'))
     one = np.zeros((2, 4))
     one[0, 0] = one[1, 2] = 1.0
-    plant = ql.plants.MultivariableLinearPlant(np.eye(4, k=1), np.eye(4)[:, [1, 3]], one)
+    plant = ql.plants.LinearPlant(np.eye(4, k=1), np.eye(4)[:, [1, 3]], one)
     np.testing.assert_allclose(_markov(plant, [2, 2]), one @ np.eye(4, k=1) @ np.eye(4)[:, [1, 3]])
     with pytest.raises(
         ValueError, match="the plant has 2 outputs, there are 1 axes: must be as many"

@@ -51,9 +51,9 @@ DT = 0.05
 B0 = np.array([[1.0, 0.0], [0.3, 0.5]])
 
 
-def machine() -> ql.plants.MultivariableLinearPlant:
+def machine() -> ql.plants.LinearPlant:
     """Return two lags that are coupled through their inputs."""
-    return ql.plants.MultivariableLinearPlant(-np.eye(2), B0, np.eye(2))
+    return ql.plants.LinearPlant(-np.eye(2), B0, np.eye(2))
 
 
 def axes(**more: Any) -> ql.Axes:
@@ -369,7 +369,7 @@ def test_the_grid_of_coupled_loops_is_fine_beside_a_resonance() -> None:
     """Of a machine with a pair of poles at 20 rad/s: points within a thousandth of it, up to π/dt."""
     dt = 0.01
     A = np.array([[0.0, 1.0, 0.0], [-400.0, -0.4, 0.0], [0.0, 0.0, -1.0]])
-    plant = ql.plants.MultivariableLinearPlant(
+    plant = ql.plants.LinearPlant(
         A, [[0.0, 0.0], [400.0, 0.0], [0.0, 1.0]], np.eye(3)[[0, 2]]
     )
     matrices = sampled_matrices(plant, dt)
