@@ -369,9 +369,7 @@ def test_the_grid_of_coupled_loops_is_fine_beside_a_resonance() -> None:
     """Of a machine with a pair of poles at 20 rad/s: points within a thousandth of it, up to π/dt."""
     dt = 0.01
     A = np.array([[0.0, 1.0, 0.0], [-400.0, -0.4, 0.0], [0.0, 0.0, -1.0]])
-    plant = ql.plants.LinearPlant(
-        A, [[0.0, 0.0], [400.0, 0.0], [0.0, 1.0]], np.eye(3)[[0, 2]]
-    )
+    plant = ql.plants.LinearPlant(A, [[0.0, 0.0], [400.0, 0.0], [0.0, 1.0]], np.eye(3)[[0, 2]])
     matrices = sampled_matrices(plant, dt)
     observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=4.0, dt=dt)
     parts = [ql.ADRC(observer, 2.0)] * 2
