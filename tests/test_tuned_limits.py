@@ -18,7 +18,8 @@ from quell.setup import load
 from quell.setup.loading import tuning_task
 from quell.tuning.acceptance import Loop, judge
 from quell.tuning.reference import Axis, _profiles
-from quell.tuning.written import StepFigures, Written, late_tables
+from quell.tuning.tables import late_tables
+from quell.tuning.written import StepFigures, Written
 
 MOTOR = ([50.0], [1.0, 4.0, 0.0])
 DT = 1e-3

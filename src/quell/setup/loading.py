@@ -57,8 +57,9 @@ from quell.tuning.constraints import Constraints
 from quell.tuning.designs import SIMPLEST, range_of_u
 from quell.tuning.plants import with_known_noise
 from quell.tuning.structures.registry import FEEDING_FORWARD
+from quell.tuning.tables import late_tables, rest_of_plant
 from quell.tuning.tuned import checked_range
-from quell.tuning.written import Written, late_tables, rest_of_plant
+from quell.tuning.written import Written
 
 # ---- A setup ----
 

@@ -25,7 +25,7 @@ from quell.setup.loading import (
     unchecked,
 )
 from quell.setup.schema import SetupError, read
-from quell.tuning.written import rest_of_plant
+from quell.tuning.tables import rest_of_plant
 
 Place: TypeAlias = tuple[float, ...]
 """Values of the signals at an operating point."""

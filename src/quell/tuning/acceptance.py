@@ -1,15 +1,20 @@
-"""Whether a tuned loop is accepted as it is written: its step, its overloads, its limits.
+"""Whether tuned loops are accepted as they are written: their steps, overloads and limits.
 
 Limits of u are not in the loop that was tuned. So each design that may be chosen runs in the file
 that would be written: with its prefilter through the scenario, and with loads that u can't hold. A
 loop that is conditionally stable, or whose observer models another plant, may cycle there between
 the limits, or take long until it is back.
+
+So do all tuned results: single loops, those with a compensator, at the points of a schedule and of
+several axes; and a controller that is meant for a set of plants, for some of them.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,6 +22,7 @@ from quell.analysis.loop import LoopAnalysis
 from quell.controllers.base import Controller
 from quell.controllers.prefilters import Prefiltered, ReferenceModel
 from quell.plants.linear import LinearPlant
+from quell.simulation import Scenario
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.reference import (
     ORDER_OF_AXIS,
@@ -25,24 +31,31 @@ from quell.tuning.reference import (
     profile_for,
     reference_model_for,
     room_of_u,
+    worst_step,
 )
 from quell.tuning.structures.base import Model, resonances
+from quell.tuning.tables import SHARE, held_load, held_state, held_step, late_plant
 from quell.tuning.written import (
     MOST_OVERSHOOT,
-    SHARE,
     MoveFigures,
     Overload,
     StepFigures,
     Written,
-    held_load,
-    held_step,
+    bounded,
 )
+from quell.types import Matrix, Vector
 
 # Where the scenario has no step: how long one is looked at, in time constants of the loop, and the
 # time before it, in samples.
 _LOOKED, _BEFORE = 150.0, 10
 # The first reference model that is tried at limits, in units of the bandwidth of the loop.
 _FASTEST_MODEL = 3.0
+# Plants of a set in which a controller is run at most: those of the most and the least gain and
+# phase at the crossover come first.
+_MOST_PLANTS = 8
+WORSE = 1.5
+"""A design that fails gives way to one whose objective is at most so many times its own."""
+Design = TypeVar("Design")
 
 
 class Loop(NamedTuple):
@@ -50,11 +63,26 @@ class Loop(NamedTuple):
 
     written: Written
     linear: LinearPlant  # the first plant, without delay and lag
-    model: Model
+    model: Model | None  # None where no prefilter is added
     plants: PlantSet
     limits: tuple[float, float]  # of u
     rest: float  # u at rest
     shaped: bool  # whether a prefilter is added where the step needs one
+
+
+class Seen(NamedTuple):
+    """What a controller does in one scenario with one plant, or of one axis."""
+
+    name: str  # empty for that of the file
+    step: StepFigures | None  # after the largest step of the scenario; None if its r moves
+    move: MoveFigures | None  # along a reference that moves
+    overloads: tuple[Overload, ...]
+    failures: tuple[str, ...]  # lines that begin with NOT
+
+    def __str__(self) -> str:
+        """Return its step or move as a line, with the name behind it."""
+        what = str(self.move if self.step is None else self.step)
+        return f"{what} ({self.name})" if self.name else what
 
 
 class Judged(NamedTuple):
@@ -68,6 +96,8 @@ class Judged(NamedTuple):
     offered_step: StepFigures | None  #: what the step is with it
     overloads: tuple[Overload, ...]  #: after loads that u can't hold
     failures: tuple[str, ...]  #: lines that begin with NOT
+    others: tuple[Seen, ...] = ()  #: with other plants or at other points; or the axes
+    several: str = ""  #: what the others are
 
     def __str__(self) -> str:
         """Return what was found, in lines."""
@@ -86,6 +116,10 @@ class Judged(NamedTuple):
         if self.overloads:
             loads = "; ".join(str(each) for each in self.overloads)
             lines.append(f"overload, a load of 1.4 times what u can hold: {loads}")
+        if self.several:
+            lines.append(f"{self.several}: {_together(self.others)}")
+        else:
+            lines[:0] = map(str, self.others)
         lines += [line for line in self.failures if line not in lines]
         return "\n".join(lines)
 
@@ -120,59 +154,238 @@ def axis_of(linear: LinearPlant, tau: float, plants: PlantSet) -> Axis | None:
 
 
 def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
-    """Return what a controller does in the file that would be written."""
+    """Return what a controller does in the file that would be written, and with other plants."""
     tau = time_constant(analysis, loop.plants)
     axis, limits = axis_of(loop.linear, tau, loop.plants), loop.limits
     limited = math.isfinite(limits[0]) or math.isfinite(limits[1])
-    bounded = math.isfinite(limits[1] - limits[0])
+    both = math.isfinite(limits[1] - limits[0])
     written = loop.written
     if written.largest is None and not written.moves:
         needed = axis.needs(tau) if axis is not None else abs(held_step(loop.linear))
         room = min(limits[1] - loop.rest, loop.rest - limits[0])
-        size = SHARE * room / needed if bounded and needed > 0.0 else 1.0
+        size = SHARE * room / needed if both and needed > 0.0 else 1.0
         written = written.stepping(float(f"{size:.2g}"), _LOOKED * tau, _BEFORE)
     prefilter, offered, offered_step = None, None, None
-    failures: list[str] = []
-    if loop.shaped and bounded and axis is not None:
-        if resonances(loop.model):
+    if loop.shaped and both and axis is not None:
+        if loop.model is not None and resonances(loop.model):
             fastest = _FASTEST_MODEL * ORDER_OF_AXIS / tau
             prefilter = reference_model_for(written, controller, fastest, ORDER_OF_AXIS).prefilter
         else:
             room = room_of_u(written, loop.linear, limits, loop.rest)
             prefilter = profile_for(written, controller, axis, tau, room).prefilter
+    if prefilter is None and written.largest is not None:
+        step = worst_step(written, controller)
+        if step.overshoot > MOST_OVERSHOOT:
+            if loop.shaped and limited:
+                prefilter = reference_model_for(written, controller, _FASTEST_MODEL / tau).prefilter
+            elif not limited and math.isfinite(step.overshoot):
+                offered, offered_step = _offer(written, loop.plants, controller, tau)
     whole = controller if prefilter is None else Prefiltered(controller, prefilter)
-    run = written.run(whole)
-    step = written.figures(whole, run)
-    if prefilter is None and step is not None and step.overshoot > MOST_OVERSHOOT:
-        if loop.shaped and limited:
-            prefilter = reference_model_for(written, controller, _FASTEST_MODEL / tau).prefilter
-            if prefilter is not None:
-                whole = Prefiltered(controller, prefilter)
-                run = written.run(whole)
-                step = written.figures(whole, run)
-        elif not limited and math.isfinite(step.overshoot):
-            offered, offered_step = _offer(written, loop.plants, controller, tau)
-    move = written.along(run) if step is None else None
-    first = str(move if step is None else step)
-    if first.startswith("NOT"):
-        failures.append(first)
-    elif loop.shaped and step is not None and bounded and step.overshoot > 1.2 * MOST_OVERSHOOT:
-        failures.append(
-            f"NOT below {100.0 * MOST_OVERSHOOT:.0f} %: no prefilter was found with which the step "
-            "overshoots less at the limits of u; give a smaller step, or move the reference slowly"
+    held = np.array([[held_load(loop.linear)]])
+    remedy = ""
+    if loop.shaped:
+        remedy = (
+            "no prefilter was found with which the step overshoots less at the limits of u; give a "
+            "smaller step, or move the reference slowly"
         )
-    if bounded and written.cycles(whole, run):
+    own = _seen(written, whole, tau, held, remedy)
+    others, failures, several = tuple[Seen, ...](), own.failures, ""
+    if both and not failures and written.others:
+        others = tuple(_seen(each, whole, tau, held, remedy) for each in written.others)
+        failures = _of_others(others)
+        several = f"with {len(others)} {written.of_others}"
+    rest = offered, offered_step, own.overloads, failures, others, several
+    return Judged(whole, prefilter, own.step, own.move, *rest)
+
+
+def judge_axes(written: Written, controller: Any, tau: float, held: Matrix, size: Vector) -> Judged:
+    """Return what a controller of several axes does in the file, each axis and after overloads.
+
+    Parameters
+    ----------
+    written
+        plant and scenario.
+    controller
+        as it is written.
+    tau
+        time constant of the slowest axis [s].
+    held
+        u that holds each disturbance of 1 (m, q).
+    size
+        step of each reference (n,) for a scenario in which none steps or moves.
+    """
+    axes = [replace(written, axis=i) for i in range(len(controller.names))]
+    if not any(each.largest or each.moves for each in axes):
+        axes = [
+            each.stepping(float(f"{step:.2g}"), _LOOKED * tau, _BEFORE)
+            for each, step in zip(axes, size.tolist(), strict=True)
+        ]
+    remedy = (
+        "axes have no prefilter; give profiles (shaped references), a smaller step, or bound the "
+        "loop more (M_ks)"
+    )
+    seen, runs = [], dict[int, Any]()
+    for axis, name in zip(axes, controller.names, strict=True):
+        key = id(axis.scenario)
+        runs[key] = runs[key] if key in runs else axis.run(controller)
+        seen.append(_seen(axis, controller, tau, np.zeros(1), remedy, name, runs[key]))
+    failures = tuple(dict.fromkeys(line for each in seen for line in each.failures))
+    overloads: list[Overload] = []
+    if bounded(controller) and not failures:
+        calm = axes[0].stepping(0.0, _LOOKED * tau, _BEFORE)
+        overloads = calm.overloads(controller, None, tau, held)
+        failures = tuple(_slow(each) for each in overloads if not each.passes)
+    rest = None, None, tuple(overloads), failures, tuple(seen)
+    return Judged(controller, None, None, None, *rest)
+
+
+def _seen(
+    written: Written,
+    controller: Any,
+    tau: float,
+    held: Matrix,
+    remedy: str,
+    name: str = "",
+    run: Any = None,
+) -> Seen:
+    """Return what a controller does in a scenario, and where u has limits after overloads.
+
+    ``remedy`` is what to do where the step overshoots; empty where that is no failure.
+    """
+    name, run = name or written.name, written.run(controller) if run is None else run
+    step = written.figures(controller, run)
+    move = written.along(run) if step is None else None
+    first, limited = str(move if step is None else step), bounded(controller)
+    failures = [first] if first.startswith("NOT") else []
+    over = 0.0 if step is None else step.overshoot
+    if not failures and remedy and limited and over > 1.2 * MOST_OVERSHOOT:
+        failures.append(
+            f"NOT below {100.0 * MOST_OVERSHOOT:.0f} %: the step overshoots by {100.0 * over:.1f} "
+            f"%: {remedy}"
+        )
+    if limited and written.cycles(controller, run):
         failures.append(
             "NOT at rest: at the end of the scenario u still goes from limit to limit; bound the "
             "loop more (M_ks, M_s), or give a smaller step"
         )
     overloads: list[Overload] = []
-    held = held_load(loop.linear)
-    if bounded and held and not failures:
-        overloads = written.overloads(whole, step, tau, held)
+    if limited and np.any(held) and not failures:
+        overloads = written.overloads(controller, step, tau, held)
         failures += [_slow(each) for each in overloads if not each.passes]
-    rest = offered, offered_step, tuple(overloads), tuple(failures)
-    return Judged(whole, prefilter, step, move, *rest)
+    named = tuple(f"{line} ({name})" if name else line for line in failures)
+    return Seen(name, step, move, tuple(overloads), named)
+
+
+def _of_others(others: Sequence[Seen]) -> tuple[str, ...]:
+    """Return the first failure with other plants, and with how many of them there are some."""
+    failing = [each for each in others if each.failures]
+    if not failing:
+        return ()
+    count = f"; {len(failing)} of {len(others)} fail" if len(others) > 1 else ""
+    return (f"{failing[0].failures[0]}{count}",)
+
+
+def _together(others: Sequence[Seen]) -> str:
+    """Return the worst figures of several as a part of a sentence."""
+    parts = []
+    steps = [each.step for each in others if each.step is not None]
+    if steps:
+        worst = max(steps, key=lambda step: step.overshoot)
+        times = [step.settling for step in steps]
+        until = "not all settle" if np.isnan(times).any() else f"settles in {max(times):.3g} s"
+        parts.append(f"overshoots by {100.0 * worst.overshoot:.1f} %, {until} at most")
+    moves = [each.move.largest for each in others if each.move is not None]
+    if moves:
+        parts.append(f"the largest |r − y| is {max(moves):.3g}")
+    times = [load.back for each in others for load in each.overloads]
+    if times:
+        never = np.isnan(times).any()
+        back = "not back from all overloads" if never else f"back in {max(times):.3g} s"
+        parts.append(back if never else f"{back} after overloads at most")
+    return "; ".join(parts)
+
+
+def accepted(
+    first: Design, others: Iterable[Design], judged: Callable[[Design], Judged], name: str
+) -> tuple[Design, Judged, str]:
+    """Return the first design that is accepted at the limits of u, what it does, what is left out.
+
+    ``others`` are those that may take the place of ``first``, whose ``name`` stands in the text.
+    Where none is accepted it is ``first``.
+    """
+    found = judged(first)
+    for each in others if found.failures else ():
+        other = judged(each)
+        if not other.failures:
+            return each, other, f"{name} is left out: {found.failures[0]}"
+    return first, found, ""
+
+
+def conditionally_stable(gains: Iterable[tuple[float, float]], of: str = "") -> list[str]:
+    """Return a line with the least and the largest gain of loops, where a least one is needed.
+
+    ``gains`` are the margins of gain of stable loops, ``of`` says what the gain is one of.
+    """
+    ends = np.array(list(gains)).reshape(-1, 2)
+    if ends.size == 0 or not np.max(ends[:, 0]) > 0.0:
+        return []
+    low, high = float(np.max(ends[:, 0])), float(np.min(ends[:, 1]))
+    return [f"conditionally stable: it bears {low:.3g} to {high:.3g} times its gain{of}"]
+
+
+def place_of(
+    file: Written,
+    linear: LinearPlant,
+    late: tuple[float, float],
+    name: str,
+    at: tuple[float, ...] = (),
+) -> Written:
+    """Return another plant in the scenario of a file, at rest where the file's is.
+
+    ``late`` are the lag of the actuator and the delay [s], ``at`` the signals of a schedule at
+    which the controller is held.
+    """
+    scenario = replace(file.scenario, schedule=()) if at else file.scenario
+    if linear.disturbances == 0:
+        linear = LinearPlant(linear.A, linear.B, linear.C)
+    plant = late_plant(linear, *late, file.dt)
+    if scenario.x0 is not None:
+        w = [float(load(0.0)) for load in file.loads]
+        x, u = held_state(linear, file.start, w)
+        scenario = replace(scenario, x0=[*x, *[u] * (plant.order - linear.order)])
+    return Written(plant, scenario, file.dt, name=name, at=at)
+
+
+def with_others(
+    file: Written, linear: Sequence[LinearPlant], late: Sequence[tuple[float, float]], of: PlantSet
+) -> Written:
+    """Return the file with other plants of a set, for which the controller is meant, too.
+
+    ``linear`` and ``late`` are the plants without the factors of their gain.
+    """
+    if len(of.plants) == 1:
+        return file
+    at = of.responses(np.array([of.crossover]))[:, 0]
+    sizes, phases = np.abs(at), np.angle(at / at[0])
+    first = [int(pick(values)) for values in (sizes, phases) for pick in (np.argmax, np.argmin)]
+    spread = np.linspace(1, len(of.plants) - 1, min(_MOST_PLANTS, len(of.plants) - 1))
+    members = dict.fromkeys([*first, *np.unique(np.round(spread).astype(int)).tolist()])
+    chosen = [i for i in members if i != 0][:_MOST_PLANTS]
+    others = []
+    for i in chosen:
+        j, factor = i % len(linear), float(of.factors[i])
+        plant = linear[j]
+        if factor != 1.0:
+            plant = LinearPlant(plant.A, factor * plant.B, plant.C, factor * plant.E)
+        others.append(place_of(file, plant, late[j], f"plant {i + 1} of the set"))
+    what = f"other plants of the set of {len(of.plants)}, linear"
+    return replace(file, others=tuple(others), of_others=what)
+
+
+def file_without_step(plant: Any, dt: float, axes: int = 0) -> Written:
+    """Return a plant in a scenario in which nothing happens yet, for one that has no file."""
+    scenario = Scenario([0.0] * axes if axes else 0.0, duration=_BEFORE * dt)
+    return Written(plant, scenario, dt)
 
 
 def _slow(each: Overload) -> str:
@@ -187,10 +400,11 @@ def _offer(
 ) -> tuple[ReferenceModel | None, StepFigures | None]:
     """Return a prefilter for a loop without limits of u, and the step with it."""
     model = None
-    if not getattr(controller, "derivatives", 0):
+    if not getattr(controller, "derivatives", 0) and not written.others:
         model = model_of_linear_step(plants, controller)
     if model is None:
-        found = reference_model_for(written, controller, _FASTEST_MODEL / tau)
-        return found.prefilter, found.step
+        model = reference_model_for(written, controller, _FASTEST_MODEL / tau).prefilter
+    if model is None:
+        return None, None
     shaped = Prefiltered(controller, model)
     return model, written.figures(shaped, written.run(shaped))

@@ -32,7 +32,8 @@ from quell.plants.linear import LinearPlant
 from quell.signals import LimitedMove
 from quell.tuning.optimiser import loops
 from quell.tuning.optimiser.loops import PlantSet, law_of, response
-from quell.tuning.written import MOST_OVERSHOOT, StepFigures, Written, held_load, held_step
+from quell.tuning.tables import held_load, held_step
+from quell.tuning.written import MOST_OVERSHOOT, StepFigures, Written
 from quell.types import Vector
 
 # A step that needs less than this share of the u that the loop's own gain makes of it needs none.
@@ -63,6 +64,8 @@ ORDER_OF_AXIS = 4
 _BANDWIDTHS, _MOST_LAGS, _BETWEEN = 0.85, 32, 3
 # Slower ones are looked at until the step takes this multiple of the quickest one.
 _SLOWER_THAN_BEST = 1.2
+# Other plants with which a prefilter is tried.
+_OTHERS = 4
 
 
 class Shaped(NamedTuple):
@@ -120,7 +123,7 @@ def room_of_u(
 ) -> float:
     """Return what u may do on both sides of ``u`` at rest, less what loads need while r steps."""
     room = min(limits[1] - u, u - limits[0])
-    loads = written.scenario.seeded_signals(written.plant.disturbances)[1]
+    loads = written.loads
     if loads:
         values = loads[0](np.arange(round(written.scenario.duration / written.dt)) * written.dt)
         acting = [values[first:end] for first, end, _ in written.steps] or [values]
@@ -187,12 +190,27 @@ def _duration(generator: ProfileGenerator, size: float) -> float:
 
 
 def _with(written: Written, controller: Controller, prefilter: Any, last: int) -> StepFigures:
-    """Return the step of the file with a prefilter, up to a sample."""
-    shaped = Prefiltered(controller, prefilter)
-    run = written.run(shaped, written.until_settled(last * written.dt))
-    found = written.figures(shaped, run)
-    assert found is not None
-    return found
+    """Return the step of the file with a prefilter, up to a sample; the worst of its plants."""
+    return worst_step(written, Prefiltered(controller, prefilter), last)
+
+
+def worst_step(written: Written, controller: Controller, last: int | None = None) -> StepFigures:
+    """Return the largest overshoot, settling time and time at limits of a file and other plants.
+
+    ``last`` is the sample up to which it is looked at.
+    """
+    found = []
+    for each in (written, *written.others[:_OTHERS]):
+        until = None if last is None else each.until_settled(last * each.dt)
+        figures = each.figures(controller, each.run(controller, until))
+        assert figures is not None
+        found.append(figures)
+    times = [each.settling for each in found]
+    return found[0]._replace(
+        overshoot=max(each.overshoot for each in found),
+        settling=math.nan if any(map(math.isnan, times)) else max(times),
+        limited=max(each.limited for each in found),
+    )
 
 
 def reference_model_for(

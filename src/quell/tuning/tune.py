@@ -19,7 +19,16 @@ from quell.parallel import one_blas_thread
 from quell.plants.base import signals_of
 from quell.plants.linear import LinearPlant
 from quell.signals.shapes import Signal, as_signal
-from quell.tuning.acceptance import Judged, Loop, axis_of, judge, time_constant
+from quell.tuning.acceptance import (
+    WORSE,
+    Judged,
+    Loop,
+    accepted,
+    axis_of,
+    judge,
+    time_constant,
+    with_others,
+)
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import (
@@ -42,11 +51,9 @@ from quell.tuning.structures.registry import (
     STRUCTURES,
     WITH_ONE_INTEGRATOR,
 )
-from quell.tuning.tuned import Check, Tuned, Uncertain, checked
-from quell.tuning.written import (
+from quell.tuning.tables import (
     Limits,
     Rest,
-    Written,
     checked_rest,
     held_sizes,
     late_plant,
@@ -58,6 +65,8 @@ from quell.tuning.written import (
     scenario_tables,
     windows_of,
 )
+from quell.tuning.tuned import Check, Tuned, Uncertain, checked
+from quell.tuning.written import Written
 from quell.types import Progress, Vector
 
 COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "poles", "model-based")
@@ -273,6 +282,7 @@ def tune(
     _check_u_max(bounds.u_max, inputs, plants)
     by_default = feedforward is None and objective != "tracking" and written is not False
     by_default &= not (isinstance(written, Written) and written.moves)
+    by_default &= bool(set(names) & set(FEEDING_FORWARD))
     if by_default and math.isfinite(u_limits[1] - u_limits[0]):
         forward = _of_axis(given, written)
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
@@ -592,6 +602,10 @@ def _file(
     file = Written(plant, scenario or scenario_of(tables["scenario"]), dt)
     at = 0.0 if rest is None else rest.u
     shaped = task.objective != "tracking" and written is not False and not file.moves
+    if shaped and any(map(math.isfinite, limits)):
+        parts = [LinearPlant.of(each) for each in given.linear]
+        late = [(lag, float(each)) for each in given.delays]
+        file = with_others(file, parts, late, plants)
     return tables, Loop(file, linear, task.model, plants, limits, at, shaped)
 
 
@@ -614,10 +628,6 @@ def _of_axis(given: Given, written: Written | bool) -> Feedforward | None:
     return replace(found, delay=late) if late > 0.0 else found
 
 
-# A design that is not accepted at the limits gives way to one with this multiple of its objective.
-_WORSE = 1.5
-
-
 def _accepted(
     first: Design,
     designs: Mapping[str, Design],
@@ -630,22 +640,20 @@ def _accepted(
 
     Of a structure that is named it is the only one.
     """
-    judged = judge(loop, _controller(first), _analysis(given, task.plants, first))
-    if not judged.failures or structure != SIMPLEST:
-        return first, judged, ""
     able = STRUCTURES if task.feedforward is None else FEEDING_FORWARD
     others = [
         each
         for name, each in designs.items()
         if name in able and each is not first and each.controller is not None
         if each.undamped <= first.undamped
-        if relative(first, each, task.objective) <= _WORSE
+        if relative(first, each, task.objective) <= WORSE
     ]
-    for each in sorted(others, key=lambda each: -relative(each, first, task.objective)):
-        other = judge(loop, _controller(each), _analysis(given, task.plants, each))
-        if not other.failures:
-            return each, other, f"{first.name} is left out: {judged.failures[0]}"
-    return first, judged, ""
+    others.sort(key=lambda each: -relative(each, first, task.objective))
+
+    def judged(design: Design) -> Judged:
+        return judge(loop, _controller(design), _analysis(given, task.plants, design))
+
+    return accepted(first, others if structure == SIMPLEST else [], judged, first.name)
 
 
 def _controller(design: Design) -> Any:

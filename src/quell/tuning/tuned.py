@@ -24,10 +24,10 @@ from quell.records.plotting import given_axes
 from quell.sweeping.runs import latin_hypercube
 from quell.sweeping.sweep import share_interval
 from quell.tuning import report
-from quell.tuning.acceptance import Judged, Loop, judge, prefilter_table
+from quell.tuning.acceptance import Judged, Loop, conditionally_stable, judge, prefilter_table
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, noise_curve, tradeoff
-from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.optimiser.loops import PlantSet, law_of
 from quell.tuning.optimiser.requirements import all_peaks, beside_poles, closed_loop_poles, counted
 from quell.tuning.optimiser.search import Problem, Solution
 from quell.tuning.report import Design, draw, toml_text
@@ -329,10 +329,17 @@ class Tuned:
         """What the written loop does, as lines: step, overloads, what is not as it should be."""
         judged = self.judged
         lines = [] if judged is None else str(judged).splitlines()
-        low, high = self.analysis.margins.gain
-        if low > 0.0 and self.analysis.stable:
-            lines.append(f"conditionally stable: it bears {low:.3g} to {high:.3g} times its gain")
+        lines += conditionally_stable(self._gains())
         return [*([self.refused] if self.refused else []), *lines]
+
+    def _gains(self) -> list[tuple[float, float]]:
+        """Return the margins of gain of the loops with all plants, where they are stable."""
+        found = [self.analysis.margins.gain] if self.analysis.stable else []
+        if self.design.controller is not None and len(self.plants.plants) > 1:
+            law = law_of(self.design.controller)
+            loops = [LoopAnalysis(each, law, self.plants.dt) for each in self.plants.scaled()]
+            found += [each.margins.gain for each in loops if each.stable]
+        return found
 
     @property
     def costs(self) -> list[str]:
@@ -452,7 +459,7 @@ class Tuned:
             if judged.prefilter is not None:
                 found["prefilter"] = prefilter_table(judged.prefilter)
             found["prefilter_omega"] = getattr(judged.offered, "omega", None)
-        loads = [each._asdict() for each in judged.overloads]
+        loads = [each.to_json() for each in judged.overloads]
         return {"reference_step": found, "overloads": loads, "not": list(judged.failures)}
 
 
