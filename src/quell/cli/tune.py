@@ -32,8 +32,10 @@ from quell.cli.rig import exit_code
 
 if TYPE_CHECKING:
     from quell.commissioning import Limits, Verification
+    from quell.controllers import Controller
     from quell.identification import Identified, Measured
     from quell.realtime.devices import Device
+    from quell.setup import Setup
     from quell.tuning import Tuned
     from quell.tuning.plants import RecordModel
 
@@ -455,9 +457,12 @@ def _tune_compensator(
     from quell.controllers.compensated import Compensated
     from quell.controllers.prefilters import without_prefilters
     from quell.files import written_atomically
-    from quell.setup.loading import load, varied
+    from quell.setup.loading import load, unchecked, varied
+    from quell.simulation import Scenario
     from quell.tuning import Constraints, tune_compensator
     from quell.tuning.report import toml_text
+    from quell.tuning.tables import late_tables
+    from quell.tuning.written import Written
 
     usable = {"m_s", "m_t", "m_ks", "delay"}
     rule = "is for a controller; of the compensator in this file m_s, m_t, m_ks and delay count"
@@ -467,13 +472,24 @@ def _tune_compensator(
     assert isinstance(both, Compensated)
     delay = options.pop("delay", 0.0)
     bounds = Constraints(**{"m_s": 2.0, "m_t": 2.0, "damping": None} | options)
+
+    def file_with(observer: Mapping[str, Any]) -> Setup:
+        """Return the file that is written with an observer."""
+        tables = varied(setup, {"observer": observer}).tables()
+        return unchecked(setup.file, late_tables(tables, plant, both.dt, delay), trust)
+
+    def loop_of(observer: Mapping[str, Any]) -> tuple[Controller, Written]:
+        file = file_with(observer)
+        scenario = file.scenario or Scenario(0.0, duration=both.dt)
+        return file.controller, Written(file.plant, scenario, both.dt)
+
     with console.status("tuning the compensator"):
-        tuned = tune_compensator(plant, both.controller, constraints=bounds, delay=delay)
+        how: dict[str, Any] = {"constraints": bounds, "delay": delay, "file": loop_of}
+        tuned = tune_compensator(plant, both.controller, **how)
     print_line(console, f"{setup.title}, dt = {both.dt:g} s")
     print_line(console, str(tuned))
     if out is not None:
-        changes = {"observer": tuned.tables["observer"]}
-        text = toml_text(varied(setup, changes).tables(), str(tuned))
+        text = toml_text(file_with(tuned.tables["observer"]).tables(), str(tuned))
         with written_atomically(out, outputs.overwrite) as part:
             part.write_text(text, encoding="utf-8")
         print_line(console, f"Setup: {out}")

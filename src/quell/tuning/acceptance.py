@@ -84,6 +84,16 @@ class Seen(NamedTuple):
         what = str(self.move if self.step is None else self.step)
         return f"{what} ({self.name})" if self.name else what
 
+    def to_json(self) -> dict[str, Any]:
+        """Return it as a table."""
+        step = None if self.step is None else self.step._asdict()
+        move = None if self.move is None else self.move._asdict()
+        for each in (step, move):
+            if each is not None:
+                del each["signals"]
+        loads = [each.to_json() for each in self.overloads]
+        return {"name": self.name, "step": step, "move": move, "overloads": loads}
+
 
 class Judged(NamedTuple):
     """A design in the file that is written."""
@@ -122,6 +132,22 @@ class Judged(NamedTuple):
             lines[:0] = map(str, self.others)
         lines += [line for line in self.failures if line not in lines]
         return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return step, overloads and failures for ``quell.files.write_json``."""
+        step = self.step
+        found = None if step is None else {**step._asdict(), "prefilter": None}
+        if found is not None:
+            del found["signals"]
+            if self.prefilter is not None:
+                found["prefilter"] = prefilter_table(self.prefilter)
+            found["prefilter_omega"] = getattr(self.offered, "omega", None)
+        loads = [each.to_json() for each in self.overloads]
+        told: dict[str, Any] = {"reference_step": found, "overloads": loads}
+        told["not"] = list(self.failures)
+        if self.others:
+            told["others"] = [each.to_json() for each in self.others]
+        return told
 
 
 def _described(prefilter: Any) -> str:

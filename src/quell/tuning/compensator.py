@@ -12,6 +12,10 @@ the plant, whole and reduced. Each has its bandwidth ω_o as the second paramete
 on a grid of logarithms, then between its points; a loop is sampled exactly, its peaks are those of
 ``analyse``.
 
+Where u has limits the result runs in the file that is written, as all tuned loops do
+(``acceptance.py``); one that fails there gives way to one within the bounds with at most 1.5 times
+its integral.
+
 With a load d at the plant's input, the controller C, the plant P and the observer's response Q from
 f to f̂, a nominal model gives ``y = P (1 − Q)/(1 + P C) d``: the compensator removes what lies
 within the bandwidth of Q, whatever C does.
@@ -22,7 +26,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -31,13 +35,23 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, closed_loop, subsystem
 from quell.analysis.margins import Response
-from quell.controllers.base import Controller
+from quell.controllers.base import Controller, limits_of
 from quell.controllers.compensated import Compensated, check_takes_compensator
 from quell.controllers.compensator import Compensator
 from quell.files import nonfinite_to_none
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
+from quell.tuning.acceptance import (
+    WORSE,
+    Judged,
+    Loop,
+    accepted,
+    conditionally_stable,
+    file_without_step,
+    judge,
+    with_others,
+)
 from quell.tuning.constraints import Constraints, first_given, given_constraints
 from quell.tuning.optimiser.loops import (
     PlantSet,
@@ -49,6 +63,8 @@ from quell.tuning.optimiser.loops import (
 from quell.tuning.plants import Given, given_plants, model_of, plant_set
 from quell.tuning.report import toml_text
 from quell.tuning.structures.adrc import matrices
+from quell.tuning.tables import late_plant
+from quell.tuning.written import Written
 from quell.types import DesignWarning, Vector
 
 # Default bounds of the whole loop: a tuned controller has M_s = 1.6 itself, and what the
@@ -63,6 +79,8 @@ _HALVINGS = 5
 _ELSEWHERE = 1.5
 # Less than this share of the load's effect is not worth a second observer.
 _WORTH = 0.05
+# Candidates that may take the place of one that fails at the limits of u, at most.
+_MOST_OTHERS = 6
 
 
 class Measures(NamedTuple):
@@ -90,6 +108,11 @@ class _Candidate(NamedTuple):
     table: dict[str, Any]  # [observer] of a setup file
     measures: Measures
 
+    @property
+    def omega_o(self) -> str:
+        """Its bandwidth as text."""
+        return f"omega_o = {self.observer.omega_o:.4g} rad/s"
+
 
 @dataclass(frozen=True)
 class TunedCompensator:
@@ -107,6 +130,8 @@ class TunedCompensator:
     dt: float  #: sample time [s]
     loads: tuple[Vector, Vector]  #: y after the step of the load, before and after [y-unit]
     loads_dt: float  #: time from one y of the loads to the next: ``dt``, or more of slow loops [s]
+    judged: Judged | None = None  #: what it does in the file, if u has limits or there is a file
+    told: tuple[str, ...] = ()  #: a candidate that is left out, and the least gain of the loop
 
     @property
     def compensator(self) -> Compensator:
@@ -140,6 +165,7 @@ class TunedCompensator:
         """Return all results for ``quell.files.write_json``; infinite numbers become None."""
         figures = {"before": self.before._asdict(), "after": self.after._asdict()}
         found = {"observer": self.name, "worth": self.worth, **figures, "tables": self.tables}
+        found |= {} if self.judged is None else self.judged.to_json()
         return dict(nonfinite_to_none(found))
 
     def __str__(self) -> str:
@@ -160,6 +186,7 @@ class TunedCompensator:
                 "effect; the controller uses the margin itself: tune it more gently (M_s 1.4), or "
                 "allow more with Constraints(m_s=..., m_ks=...)"
             )
+        lines += [*self.told, *([] if self.judged is None else [str(self.judged)])]
         return "\n".join(lines)
 
 
@@ -174,6 +201,7 @@ def tune_compensator(
     actuator_lag: float = 0.0,
     operating_point: Any = None,
     load: float = 1.0,
+    file: Callable[[dict[str, Any]], tuple[Controller, Written]] | None = None,
     **options: Any,
 ) -> TunedCompensator:
     """Return the compensator that rejects loads best on top of a linear controller.
@@ -199,6 +227,9 @@ def tune_compensator(
         as for ``analyse``.
     load
         step of the load at the plant's input [u-unit].
+    file
+        returns, for a table ``[observer]``, the controller of the setup file that is written and
+        its loop, in which both are judged; by default the controller and the linear plant.
     **options
         ``learner``, ``guard``, ``omega_c``, limits and ``safe_set`` of the ``Compensator``.
 
@@ -223,6 +254,7 @@ def tune_compensator(
     how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag, "b_range": b_range}
     given = given_plants(plant, dt, operating_point=operating_point, **how)
     count = len(given.linear)
+    known = given
     given = _with_speeds(given, speeds)
     plants = _Plants(plant_set(given, dt), count, len(given.linear))
     inputs = load_step(plants.all, checks.nonzero("load", load, "or nothing is rejected"))
@@ -243,30 +275,70 @@ def tune_compensator(
             f"constraints: the controller alone has {before}, and the bounds are {bounds}: a "
             "compensator can not give margin back; raise the bounds or tune the controller gently"
         )
-    best: _Candidate | None = None
+    candidates: list[_Candidate] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DesignWarning)  # of candidates on the way
         for family in _families(model, dt):
-            found = _searched(family, controller, plants, bounds, model)
-            if found is not None and (best is None or found.measures.iae < best.measures.iae):
-                best = found
-    if best is None:
+            candidates += _searched(family, controller, plants, bounds, model)
+    if not candidates:
         raise ValueError(
             "no compensator keeps the bounds with this controller: it uses the margin itself; tune "
             f"it more gently, or raise the bounds ({bounds})"
         )
+    candidates.sort(key=lambda each: each.measures.iae)
+    best, judged, told = candidates[0], None, list[str]()
+    linear = LinearPlant.of(known.linear[0])
+
+    def seen(each: _Candidate) -> Judged:
+        """Return what a candidate does in the file."""
+        both: Controller = Compensated(controller, Compensator(each.observer, **options))
+        plain = Compensated(controller, Compensator(each.observer))
+        late = actuator_lag, float(known.delays[0])
+        if file is None:
+            written = file_without_step(late_plant(linear, *late, dt), dt)
+        else:
+            both, written = file(each.table)
+        if len(plants.all.plants) > plants.distinct or count > 1:
+            parts = [LinearPlant.of(one) for one in known.linear]
+            every = [(actuator_lag, float(delay)) for delay in known.delays]
+            written = with_others(written, parts, every, plant_set(known, dt))
+        analysis = LoopAnalysis(plants.all.scaled()[0], law_of(plain), dt)
+        return judge(
+            Loop(written, linear, None, plants.all, limits_of(both), 0.0, False), both, analysis
+        )
+
+    limits = limits_of(Compensated(controller, Compensator(best.observer, **options)))
+    if file is not None or any(map(math.isfinite, limits)):
+        others = _less_and_less(candidates) if math.isfinite(limits[1] - limits[0]) else []
+        best, judged, refused = accepted(best, others, seen, f"{best.name} with {best.omega_o}")
+        told += [refused] if refused else []
     compensator = Compensator(best.observer, **options)
     numbers = {name: value for name, value in options.items() if isinstance(value, int | float)}
     both = Compensated(controller, compensator)
     tables = {"observer": best.table, "compensator": numbers}
     first = plants.all.scaled()[0]
     plain = Compensated(controller, Compensator(best.observer))  # without learner
+    members = [each for j, each in enumerate(plants.all.scaled()) if not plants.elsewhere(j)]
+    gains = [LoopAnalysis(each, law_of(plain), dt).margins.gain for each in members]
+    told += conditionally_stable(gains)
     loads = (
         response(first, law_of(controller), inputs),
         response(first, law_of(plain), inputs),
     )
-    known, apart = (before, best.measures, bounds, tables, dt, loads), dt * inputs.distance
-    return TunedCompensator(both, best.name, *known, apart)
+    figures, apart = (before, best.measures, bounds, tables, dt, loads), dt * inputs.distance
+    return TunedCompensator(both, best.name, *figures, apart, judged, tuple(told))
+
+
+def _less_and_less(candidates: list[_Candidate]) -> list[_Candidate]:
+    """Return candidates behind the best one, with integrals up to 1.5 times its own."""
+    best = candidates[0].measures.iae
+    ends = np.geomspace(1.0, WORSE, _MOST_OTHERS + 1)
+    found = []
+    for low, high in itertools.pairwise(ends.tolist()):
+        # The slowest observer of each part: it is the most different one.
+        part = [each for each in candidates[1:] if low * best < each.measures.iae <= high * best]
+        found += sorted(part, key=lambda each: each.observer.omega_o)[:1]
+    return found
 
 
 # Bounds that the search of an observer does not know.
@@ -355,8 +427,8 @@ def _searched(
     plants: _Plants,
     bounds: Constraints,
     model: Any,
-) -> _Candidate | None:
-    """Return the best observer of a family, or None if none keeps the bounds."""
+) -> list[_Candidate]:
+    """Return the observers of a family that keep the bounds, of those that the search tried."""
     fastest = bounds.omega_o_dt / plants.all.dt
     grid = np.geomspace(min(0.1 * model.omega, 0.01 * fastest), fastest, _BANDWIDTHS)
     tried: dict[tuple[float, float], tuple[float, _Candidate] | None] = {}
@@ -373,7 +445,7 @@ def _searched(
     for _ in range(_HALVINGS):
         kept = [(found[0], key) for key, found in tried.items() if found is not None]
         if not kept:
-            return None
+            return []
         _, (omega_o, factor) = min(kept)
         ratio = math.sqrt(ratio)
         for other in (omega_o / ratio, min(omega_o * ratio, fastest)):
@@ -381,7 +453,7 @@ def _searched(
         if len(family.factors) > 1:
             for other in (factor / math.sqrt(ratio), factor * math.sqrt(ratio)):
                 at(omega_o, other)
-    return min((found for found in tried.values() if found is not None), key=lambda f: f[0])[1]
+    return [found[1] for found in tried.values() if found is not None]
 
 
 def _tried(

@@ -418,6 +418,8 @@ class Tuned:
         if self.check is not None:
             check = {**vars(self.check), "interval": list(self.check.interval)}
             check = {k: dict(v) if isinstance(v, Mapping) else v for k, v in check.items()}
+        judged: dict[str, Any] = {"reference_step": None, "overloads": [], "not": list(self.nots)}
+        judged = judged if self.judged is None else self.judged.to_json()
         found: dict[str, Any] = nonfinite_to_none(
             {
                 "structure": self.design.name,
@@ -429,7 +431,7 @@ class Tuned:
                 "designs": {name: each.to_json() for name, each in self.designs.items()},
                 "costs": self.costs,
                 "damping": self.damping,
-                **self._judged_to_json(),
+                **judged,
                 "tradeoff": [
                     {"constraint": name, "limit": limit, "objective": value}
                     for name, limit, value in self.tradeoff
@@ -447,20 +449,6 @@ class Tuned:
             }
         )
         return found
-
-    def _judged_to_json(self) -> dict[str, Any]:
-        judged = self.judged
-        if judged is None:
-            return {"reference_step": None, "overloads": [], "not": list(self.nots)}
-        step = judged.step
-        found = None if step is None else {**step._asdict(), "prefilter": None}
-        if found is not None:
-            del found["signals"]
-            if judged.prefilter is not None:
-                found["prefilter"] = prefilter_table(judged.prefilter)
-            found["prefilter_omega"] = getattr(judged.offered, "omega", None)
-        loads = [each.to_json() for each in judged.overloads]
-        return {"reference_step": found, "overloads": loads, "not": list(judged.failures)}
 
 
 def _measures(second: str, cells: list[str]) -> str:
