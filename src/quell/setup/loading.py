@@ -558,7 +558,7 @@ def tuning_task(
     plant, ranges = setup.needed("plant"), _ranges(setup)
     options = tuning_options(setup, given, plant, limits or {})
     options["setup"] = tuned_tables(setup, data, plant, options)
-    options["written"] = _written(setup, options["setup"])
+    options["written"] = written_loop(setup, options["setup"])
     if "scenario" not in data:
         with suppress(ValueError):  # of a plant without operating point, which tune refuses
             options["rest"] = rest_of_plant(plant, setup.controller.dt)
@@ -629,7 +629,7 @@ def _feedforward(controller: Mapping[str, Any]) -> dict[str, Any]:
     return {}
 
 
-def _written(setup: Setup, tables: Mapping[str, Any]) -> Written:
+def written_loop(setup: Setup, tables: Mapping[str, Any]) -> Written:
     """Return plant and scenario of the file that a tuning writes."""
     used = ("title", "dt", "plant", "scenario")
     kept = {key: tables[key] for key in used if key in tables} | {"controller": NO_CONTROLLER}

@@ -23,6 +23,7 @@ from quell.setup.loading import (
     tuned_tables,
     tuning_options,
     unchecked,
+    written_loop,
 )
 from quell.setup.schema import SetupError, read
 from quell.tuning.tables import rest_of_plant
@@ -103,6 +104,7 @@ def schedule_task(
         with suppress(ValueError):  # of a plant without operating point, which tune refuses
             options["rest"] = rest_of_plant(plants[middle], setup.controller.dt)
     options["setup"] = tuned_tables(setup, {**whole, "tune": data["tune"]}, setup.plant, options)
+    options["written"] = written_loop(setup, options["setup"])
     if given["parameter"] is not None:
         options["points"] = at.axes if len(at.axes) > 1 else at.axes[0]
         return ScheduleTask(at.linear, setup.controller.dt, options, setup)

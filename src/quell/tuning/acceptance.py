@@ -170,11 +170,13 @@ def time_constant(analysis: LoopAnalysis, plants: PlantSet) -> float:
     return 1.0 / (omega if math.isfinite(omega) and omega > 0.0 else plants.crossover)
 
 
-def axis_of(linear: LinearPlant, tau: float, plants: PlantSet) -> Axis | None:
+def axis_of(linear: LinearPlant | None, tau: float, plants: PlantSet) -> Axis | None:
     """Return the rigid part of a plant that needs no u at rest; None for another one.
 
     ``tau`` is the time constant of the closed loop [s].
     """
+    if linear is None:
+        return None
     gain = abs(complex(plants.responses(np.array([1.0 / tau]))[0, 0]))
     return Axis.of(linear, 1.0 / gain)
 
@@ -198,7 +200,9 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
             prefilter = reference_model_for(written, controller, fastest, ORDER_OF_AXIS).prefilter
         else:
             room = room_of_u(written, loop.linear, limits, loop.rest)
-            prefilter = profile_for(written, controller, axis, tau, room).prefilter
+            every = [axis, *(axis_of(each.linear, tau, loop.plants) for each in written.others)]
+            heaviest = Axis.heaviest([each for each in every if each is not None])
+            prefilter = profile_for(written, controller, heaviest, tau, room).prefilter
     if prefilter is None and written.largest is not None:
         step = worst_step(written, controller)
         if step.overshoot > MOST_OVERSHOOT:
@@ -379,7 +383,7 @@ def place_of(
         w = [float(load(0.0)) for load in file.loads]
         x, u = held_state(linear, file.start, w)
         scenario = replace(scenario, x0=[*x, *[u] * (plant.order - linear.order)])
-    return Written(plant, scenario, file.dt, name=name, at=at)
+    return Written(plant, scenario, file.dt, name=name, at=at, linear=linear)
 
 
 def with_others(

@@ -18,7 +18,7 @@ model is as slow for a small step as for a large one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -95,6 +95,11 @@ class Axis:
         except ValueError:  # a zero at s = 0
             return None
         return cls(abs(viscous), abs(inertia)) if viscous or inertia else None
+
+    @classmethod
+    def heaviest(cls, axes: Sequence[Axis]) -> Axis:
+        """Return one that needs as much u as any of several."""
+        return cls(max(each.viscous for each in axes), max(each.inertia for each in axes))
 
     def needs(self, tau: float) -> float:
         """Return the largest u of a move by 1 in 20 time constants [u-unit/y-unit]."""

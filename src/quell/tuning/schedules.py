@@ -14,14 +14,18 @@ poles in the law and one with them in the observer.
 The result is judged at the points, and between them where the plant is a function: M_s and M_t of
 the frozen loop, and the integral of ``|y|`` after a step of the load over that of a controller that
 is tuned for this very point, with the same structure and constraints.
+
+Where u has limits the controller runs in the file that is written, and at each point with its plant
+and the signals held (``acceptance.py``). One that fails gives way to one with a tighter bound of
+what noise does to u, if its integrals are at most 1.5 times as large.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,13 +40,31 @@ from quell.files import nonfinite_to_none, written_atomically
 from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
+from quell.tuning.acceptance import (
+    WORSE,
+    Judged,
+    Loop,
+    accepted,
+    conditionally_stable,
+    judge,
+    place_of,
+    prefilter_table,
+)
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import range_of_u
 from quell.tuning.optimiser.loops import area_until_rest
 from quell.tuning.plants import Given, given_plants, with_known_noise
 from quell.tuning.report import toml_text
+from quell.tuning.tables import (
+    checked_rest,
+    late_plant,
+    rest_of_plant,
+    rest_within,
+    scenario_of,
+)
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
+from quell.tuning.written import Written
 from quell.types import Progress
 
 _STRUCTURES = ("bandwidths", "half-gain", "half-gain-law")
@@ -56,6 +78,9 @@ _NOT_HERE = ("uncertain", "scenario", "search", "compare", "feedforward")
 _SAME, _MUCH = 1e-6, 1.15
 # Times the bound of M_s from which on the summary tells of it between the points.
 _MORE = 1.05
+# Points at which the controller runs at most, and shares of the bound of noise in u with which one
+# is tuned that takes the place of a controller that fails at the limits of u.
+_MOST_POINTS, _GENTLER = 12, (0.6, 0.35, 0.2)
 
 
 class PointResult(NamedTuple):
@@ -89,6 +114,11 @@ class TunedSchedule:
         the tuning of each point by itself, by signals.
     joint : Tuned or None
         the tuning for all points at once, of plants with the same b; None with ``tables="all"``.
+    judged : Judged or None
+        what the controller does in the file and at the points, if u has limits; its ``controller``
+        is behind the prefilter of the file.
+    told : tuple
+        lines on a controller that is left out, and on the least gain of the loops.
     """
 
     controller: ADRC
@@ -96,6 +126,8 @@ class TunedSchedule:
     own: Mapping[tuple[float, ...], Tuned]
     joint: Tuned | None
     knows_between: bool
+    judged: Judged | None = None
+    told: tuple[str, ...] = ()
 
     @property
     def schedule(self) -> Schedule:
@@ -150,6 +182,7 @@ class TunedSchedule:
     def verdicts(self) -> list[str]:
         """Return the largest M_s and ratio, and what does not hold or is not known, as lines."""
         lines = [f"largest M_s {self.m_s:.3f}, largest ratio of ∫|y| {self.worst_ratio:.3f}"]
+        lines += [*self.told, *([] if self.judged is None else str(self.judged).splitlines())]
         bound = self.constraints.m_s
         above = [each for each in self.results if bound and each.m_s > _MORE * bound]
         if above:
@@ -198,6 +231,7 @@ class TunedSchedule:
                     {"signals": list(at), "design": each.design.to_json()}
                     for at, each in self.own.items()
                 ],
+                **({} if self.judged is None else self.judged.to_json()),
             }
         )
         return found
@@ -265,7 +299,13 @@ class TunedSchedule:
             fixed = zip(schedule.signals, middle, strict=True)
             scenario["schedule"] = [value for name, value in fixed if name == "external"]
             tables["scenario"] = scenario
-        return toml_text(tables, f"{tuned.design.name} with a schedule, tuned by quell\n")
+        comment = f"{tuned.design.name} with a schedule, tuned by quell\n"
+        judged = self.judged
+        if judged is not None:
+            comment += "\n".join([*self.told, str(judged)])
+            if judged.prefilter is not None:
+                tables["prefilter"] = prefilter_table(judged.prefilter)
+        return toml_text(tables, comment)
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
@@ -303,6 +343,7 @@ def tune_schedule(
     actuator_lag: float = 0.0,
     setup: Mapping[str, Any] | None = None,
     rest: Any = None,
+    written: Written | bool = True,
     progress: Progress | None = None,
     **options: Any,
 ) -> TunedSchedule:
@@ -335,6 +376,8 @@ def tune_schedule(
         middle point by default.
     rest
         u and y at rest at the middle point, as for ``tune``; the scenario of ``toml`` begins there.
+    written
+        plant and scenario of ``setup`` as objects, as for ``tune``.
     progress
         called with the point that is tuned and the share that is done.
     **options
@@ -366,7 +409,7 @@ def tune_schedule(
     # Points and signal are checked before the tuning, which takes longer.
     shape = tuple(len(axis) for axis in axes)
     given_points = axes[0] if len(axes) == 1 else axes
-    Schedule(given_points, signal, b0=np.ones(shape).tolist())
+    signals = Schedule(given_points, signal, b0=np.ones(shape).tolist()).signals
     late: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
     given = [given_plants(plant_at(at), dt, **late) for at in grid]
     degree = given[0].degree
@@ -390,50 +433,133 @@ def tune_schedule(
         finer = (_finer(axis, checks.whole("between", between, 0)) for axis in axes)
         fine = [at for at in product(*finer) if at not in grid]
     report, parts = progress or (lambda part, share: None), len(grid) + len(fine) + 1
-    middle, own, joint_only = grid[len(grid) // 2], {}, {}
+    middle, joint_only = grid[len(grid) // 2], {}
     if tables == "b0" and tuple(options.get("b_range", _NO_RANGE)) == _NO_RANGE:
         joint_only = {name: how.pop(name) for name in ("quantile",) if name in how}
-    for i, at in enumerate(grid):
-        report(f"at {_place(at)}", i / parts)
-        of_file = {"setup": setup, "rest": rest} if at == middle else {}
-        own[at] = tune(plant_at(at), dt, **how, **of_file)
-    joint = None
-    found: dict[str, Any] = {}
-    if tables == "b0":
-        report("for all points", len(grid) / parts)
-        b = np.array([each.b for each in given])
-        # The least b: bounds on u, as M_ks, are those of the point with the largest gains.
-        base = b[int(np.argmin(np.abs(b)))]
-        same = [_scaled(each, base / own_b) for each, own_b in zip(given, b, strict=True)]
-        delays = [float(each.delays[0]) for each in given]
-        joint = tune(same, dt, **{**how, **joint_only, "delay": delays})
-        tuned: Any = joint.controller
-        found["b0"] = tuned.observer.b0 * b / base
-    else:
-        tuned = own[grid[0]].controller
-        at_points: list[Any] = [each.controller for each in own.values()]
-        found["b0"] = np.array([each.observer.b0 for each in at_points])
-        found["omega_c"] = np.array([each.omega_c for each in at_points])
-        found["omega_o"] = np.array([each.observer.omega_o for each in at_points])
-        # What is the same at all points, as omega_o at the limit of the sample time, is no table.
-        found = {
-            name: values
-            for name, values in found.items()
-            if name == "b0" or np.ptp(values) > _SAME * np.max(values)
-        }
-    lists = {name: value.reshape(shape).tolist() for name, value in found.items()}
-    schedule = Schedule(given_points, signal, **lists)
-    b0 = float(found["b0"][len(grid) // 2])
-    observer = with_gains(tuned.observer, b0, tuned.observer.omega_o)
-    half = {"half_gain": tuned.half_gain}
-    controller = ADRC(observer, tuned.omega_c, schedule=schedule, **half, **limits)
-    judged = [(at, True) for at in grid] + [(at, False) for at in fine]
+
+    def tuned_points(bounds: Constraints) -> dict[tuple[float, ...], Tuned]:
+        """Return the tuning of each point by itself."""
+        own = {}
+        for i, at in enumerate(grid):
+            report(f"at {_place(at)}", i / parts)
+            of_file = {"setup": setup, "rest": rest} if at == middle else {}
+            own[at] = tune(plant_at(at), dt, **{**how, "constraints": bounds}, **of_file)
+        return own
+
+    def made(bounds: Constraints, own: Mapping[tuple[float, ...], Tuned]) -> _Made:
+        """Return a controller with a schedule, and what it was tuned by."""
+        joint = None
+        found: dict[str, Any] = {}
+        if tables == "b0":
+            report("for all points", len(grid) / parts)
+            b = np.array([each.b for each in given])
+            # The least b: bounds on u, as M_ks, are those of the point with the largest gains.
+            base = b[int(np.argmin(np.abs(b)))]
+            same = [_scaled(each, base / own_b) for each, own_b in zip(given, b, strict=True)]
+            delays = [float(each.delays[0]) for each in given]
+            for_all = {**how, **joint_only, "delay": delays, "constraints": bounds}
+            joint = tune(same, dt, **for_all)
+            tuned: Any = joint.design.controller
+            found["b0"] = tuned.observer.b0 * b / base
+        else:
+            at_points: list[Any] = [each.design.controller for each in own.values()]
+            tuned = at_points[0]
+            found["b0"] = np.array([each.observer.b0 for each in at_points])
+            found["omega_c"] = np.array([each.omega_c for each in at_points])
+            found["omega_o"] = np.array([each.observer.omega_o for each in at_points])
+            # What is the same at all points, as omega_o at the limit of the sample time, is no
+            # table.
+            found = {
+                name: values
+                for name, values in found.items()
+                if name == "b0" or np.ptp(values) > _SAME * np.max(values)
+            }
+        lists = {name: value.reshape(shape).tolist() for name, value in found.items()}
+        schedule = Schedule(given_points, signal, **lists)
+        b0 = float(found["b0"][len(grid) // 2])
+        observer = with_gains(tuned.observer, b0, tuned.observer.omega_o)
+        half = {"half_gain": tuned.half_gain}
+        controller = ADRC(observer, tuned.omega_c, schedule=schedule, **half, **limits)
+        return _Made(controller, own, joint)
+
+    first = made(bounds, tuned_points(bounds))
+    linear = {at: LinearPlant.of(each.linear[0]) for at, each in zip(grid, given, strict=True)}
+    waiting = {at: float(each.delays[0]) for at, each in zip(grid, given, strict=True)}
+
+    def frozen(of: _Made, at: tuple[float, ...]) -> LoopAnalysis:
+        return analyse(plant_at(at), of.controller.at(*at), **late)
+
+    def gentler() -> Iterator[_Made]:
+        """Yield controllers with tighter bounds of noise in u that are not much worse."""
+        now = (first.joint or first.own[middle]).constraints
+        name = "u_std" if now.u_std is not None else "m_ks"
+        usual = [load_iae(frozen(first, at)) for at in grid]
+        for share in _GENTLER if getattr(now, name) is not None else ():
+            tight = replace(now, **{name: share * getattr(now, name)})
+            own = first.own if tables == "b0" else tuned_points(tight)
+            other = made(tight, own)
+            worse = [load_iae(frozen(other, at)) for at in grid]
+            if max(a / b for a, b in zip(worse, usual, strict=True)) > WORSE:
+                return
+            yield other
+
+    judged, told, ends = None, list[str](), range_of_u(limits)
+    # The objects of a setup that has a scenario have to be given.
+    known = isinstance(written, Written) or setup is None or "scenario" not in setup
+    if written is not False and known and any(map(math.isfinite, ends)):
+        plant_of_file = scenario = None
+        if isinstance(written, Written):
+            plant_of_file, scenario = written.plant, written.scenario
+        if plant_of_file is None:
+            plant_of_file = late_plant(linear[middle], actuator_lag, waiting[middle], dt)
+        if scenario is None:
+            scenario = scenario_of(first.own[middle].setup["scenario"])
+        file = Written(plant_of_file, scenario, dt)
+        external = [v for name, v in zip(signals, middle, strict=True) if name == "external"]
+        if external and not file.scenario.schedule:
+            file = replace(file, scenario=replace(file.scenario, schedule=tuple(external)))
+        spread = np.linspace(0, len(grid) - 1, min(_MOST_POINTS, len(grid)))
+        members = [grid[i] for i in np.unique(np.round(spread).astype(int))]
+        others = [
+            place_of(file, linear[at], (actuator_lag, waiting[at]), f"at {_place(at)}", at)
+            for at in members
+        ]
+        file = replace(file, others=tuple(others), of_others="points of the schedule, linear")
+        task = first.own[middle].task
+        shaped = task.objective != "tracking" and not file.moves
+        point = checked_rest(rest) or rest_of_plant(plant_at(middle), dt)
+        if setup is None or "scenario" not in setup:
+            point = rest_within(linear[middle], point, ends)
+        at_rest = 0.0 if point is None else point.u
+        loop = Loop(file, linear[middle], task.model, task.plants, ends, at_rest, shaped)
+
+        def seen(each: _Made) -> Judged:
+            return judge(loop, each.controller, frozen(each, middle))
+
+        report("limits of u", len(grid) / parts)
+        first, judged, refused = accepted(first, gentler(), seen, "the first controller")
+        told += [refused] if refused else []
+    loops = [frozen(first, at) for at in grid]
+    told += conditionally_stable(each.margins.gain for each in loops if each.stable)
+    checked = [(at, True) for at in grid] + [(at, False) for at in fine]
     results = []
-    for i, (at, of_table) in enumerate(sorted(judged)):
-        report(f"judging at {_place(at)}", (len(grid) + 1 + i * len(fine) / len(judged)) / parts)
-        alone = own[at] if of_table else tune(plant_at(at), dt, **how)
-        results.append(_result(at, of_table, plant_at(at), controller, alone.controller, late))
-    return TunedSchedule(controller, tuple(results), own, joint, is_function and between > 0)
+    for i, (at, of_table) in enumerate(sorted(checked)):
+        report(f"judging at {_place(at)}", (len(grid) + 1 + i * len(fine) / len(checked)) / parts)
+        alone = first.own[at] if of_table else tune(plant_at(at), dt, **how)
+        parts_of = first.controller, alone.design.controller, late
+        results.append(_result(at, of_table, plant_at(at), *parts_of))
+    knows = is_function and between > 0
+    return TunedSchedule(
+        first.controller, tuple(results), first.own, first.joint, knows, judged, tuple(told)
+    )
+
+
+class _Made(NamedTuple):
+    """A controller with a schedule, and what it was tuned by."""
+
+    controller: ADRC
+    own: Mapping[tuple[float, ...], Tuned]
+    joint: Tuned | None
 
 
 def _points(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.plants.base import measure
+from quell.plants.linear import LinearPlant
 from quell.plants.multivariable import measure_all
 from quell.quantities import UNKNOWN, Signals
 from quell.records.metrics import SETTLING_BAND, settling_time
@@ -135,6 +136,7 @@ class Written:
     at: tuple[float, ...] = ()
     others: tuple[Written, ...] = ()
     of_others: str = ""  # what they are, as text
+    linear: LinearPlant | None = None  # one of the others, without delay and lag
 
     def run(self, controller: Any, scenario: Scenario | None = None) -> Any:
         """Run a controller through the scenario, or another one: a ``Trajectory``, or of axes."""
