@@ -292,6 +292,7 @@ class PrefilteredDesign(NamedTuple):
 
     controller: Any
     prefilter: Any
+    used: int  # derivatives of the shaped reference that the controller uses
 
 
 class PrefilteredLoop(Scalars):
@@ -332,7 +333,9 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
         shaped = prefilter(design.prefilter, state.prefilter, loop.r)
         if state.derivatives.size > 0:
             write_derivatives(design.prefilter, state.prefilter, state.derivatives)
-            set_reference_derivatives(design.controller, state.controller, state.derivatives)
+            # What a prefilter has beyond them would be taken for signals of a schedule.
+            used = state.derivatives[: design.used]
+            set_reference_derivatives(design.controller, state.controller, used)
     loop.r_shaped = shaped if is_finite(shaped) else y
     return control(design.controller, state.controller, shaped, y)
 
@@ -494,7 +497,9 @@ class Prefiltered(Wrapper):
 
     def _update_parameters(self) -> None:
         design = self.prefilter.design(self.dt)
-        self.parameters = PrefilteredDesign(self.controller.parameters, design)
+        has = getattr(self.prefilter, "derivatives", 0)
+        used = min(has, int(getattr(self.controller, "derivatives", 0)))
+        self.parameters = PrefilteredDesign(self.controller.parameters, design, used)
 
     @property
     def channels(self) -> Channels:

@@ -81,6 +81,8 @@ _MORE = 1.05
 # Points at which the controller runs at most, and shares of the bound of noise in u with which one
 # is tuned that takes the place of a controller that fails at the limits of u.
 _MOST_POINTS, _GENTLER = 12, (0.6, 0.35, 0.2)
+# Derivatives that a profile generator has.
+_MOST_DERIVATIVES = 3
 
 
 class PointResult(NamedTuple):
@@ -292,6 +294,7 @@ class TunedSchedule:
         tables["controller"] = {
             **own["controller"],
             "omega_c": self.controller.omega_c,
+            **({"feedforward": True} if self.controller.feedforward else {}),
             "schedule": table,
         }
         if schedule.external and "schedule" not in tables["scenario"]:
@@ -437,6 +440,14 @@ def tune_schedule(
     if tables == "b0" and tuple(options.get("b_range", _NO_RANGE)) == _NO_RANGE:
         joint_only = {name: how.pop(name) for name in ("quantile",) if name in how}
 
+    # An axis follows a profile within the limits of u with the feedforward of its order, which
+    # changes no margin and follows the tables.
+    moves = isinstance(written, Written) and written.moves
+    forward = written is not False and not moves and order <= _MOST_DERIVATIVES
+    forward &= math.isfinite(np.subtract(*range_of_u(limits)))
+    parts_of_plants = [LinearPlant.of(each.linear[0]) for each in given]
+    forward &= all(np.linalg.matrix_rank(each.A) < each.order for each in parts_of_plants)
+
     def tuned_points(bounds: Constraints) -> dict[tuple[float, ...], Tuned]:
         """Return the tuning of each point by itself."""
         own = {}
@@ -478,12 +489,12 @@ def tune_schedule(
         schedule = Schedule(given_points, signal, **lists)
         b0 = float(found["b0"][len(grid) // 2])
         observer = with_gains(tuned.observer, b0, tuned.observer.omega_o)
-        half = {"half_gain": tuned.half_gain}
+        half = {"half_gain": tuned.half_gain, "feedforward": forward}
         controller = ADRC(observer, tuned.omega_c, schedule=schedule, **half, **limits)
         return _Made(controller, own, joint)
 
     first = made(bounds, tuned_points(bounds))
-    linear = {at: LinearPlant.of(each.linear[0]) for at, each in zip(grid, given, strict=True)}
+    linear = dict(zip(grid, parts_of_plants, strict=True))
     waiting = {at: float(each.delays[0]) for at, each in zip(grid, given, strict=True)}
 
     def frozen(of: _Made, at: tuple[float, ...]) -> LoopAnalysis:
