@@ -388,7 +388,9 @@ def test_a_tuned_schedule_keeps_the_constraints_at_and_between_its_points(tmp_pa
     assert "NOT proved" in tuned.summary()
     tuned.save(tmp_path / "axis.toml")
     setup = load(tmp_path / "axis.toml")
-    assert list(setup.controller.schedule.b0) == tuned.schedule.b0
+    assert list(setup.controller.controller.schedule.b0) == tuned.schedule.b0
+    assert setup.controller.prefilter == tuned.judged.prefilter
+    assert not tuned.judged.failures
     found = ql.simulate(setup.plant, setup.controller, setup.scenario)
     assert ql.Status.DIVERGED not in found.status
 

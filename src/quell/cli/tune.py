@@ -557,6 +557,7 @@ def _tune_axes(
     from quell.setup.axes import axes_task
     from quell.tuning.axes import tune_axes
     from quell.tuning.tuned_axes import quantity
+    from quell.tuning.written import Written
 
     usable = {"m_s", "m_t", "m_ks", "damping", "objective"}
     rule = "is for one axis; of several m_s, m_t, m_ks, damping and objective count, and [tune]"
@@ -565,6 +566,8 @@ def _tune_axes(
     plant = setup.needed("plant")
     axes: Any = setup.controller
     with progress_bar(console, "tuning") as bar:
+        if setup.scenario is not None:
+            how["written"] = Written(plant, setup.scenario, axes.dt)
         tuned = tune_axes(plant, axes, progress=partial(_progress, bar), **how)
     count = len(axes.names)
     print_line(console, f"{setup.title}, dt = {axes.dt:g} s, {count} axes, {tuned.plants} plants")

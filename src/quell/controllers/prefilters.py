@@ -68,7 +68,7 @@ from quell.controllers.compensator import Compensator, manual_operation
 from quell.controllers.stateful import Retuning, StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.functions import copysign, sqrt
-from quell.kernels.sized import Scalars, clear
+from quell.kernels.sized import Scalars, Size, clear
 from quell.lti.models import zero_order_hold
 from quell.observers.eso import ESO
 from quell.types import Channels, Matrix, Status, Vector
@@ -292,7 +292,7 @@ class PrefilteredDesign(NamedTuple):
 
     controller: Any
     prefilter: Any
-    used: int  # derivatives of the shaped reference that the controller uses
+    used: Size  # derivatives of the shaped reference that the controller uses
 
 
 class PrefilteredLoop(Scalars):

@@ -245,24 +245,35 @@ def judge_axes(written: Written, controller: Any, tau: float, held: Matrix, size
         step of each reference (n,) for a scenario in which none steps or moves.
     """
     axes = [replace(written, axis=i) for i in range(len(controller.names))]
-    if not any(each.largest or each.moves for each in axes):
+    before = _BEFORE
+    if written.scenario.x0 is not None:  # comes to rest first
+        before = max(round(_LOOKED / 5.0 * tau / written.dt), _BEFORE)
+    of_file = any(each.largest or each.moves for each in axes)
+    if not of_file:
         axes = [
-            each.stepping(float(f"{step:.2g}"), _LOOKED * tau, _BEFORE)
+            each.stepping(float(f"{step:.2g}"), _LOOKED * tau, before)
             for each, step in zip(axes, size.tolist(), strict=True)
         ]
-    remedy = (
-        "axes have no prefilter; give profiles (shaped references), a smaller step, or bound the "
-        "loop more (M_ks)"
-    )
     seen, runs = [], dict[int, Any]()
     for axis, name in zip(axes, controller.names, strict=True):
         key = id(axis.scenario)
         runs[key] = runs[key] if key in runs else axis.run(controller)
-        seen.append(_seen(axis, controller, tau, np.zeros(1), remedy, name, runs[key]))
+        seen.append(_seen(axis, controller, tau, np.zeros(1), "", name, runs[key]))
     failures = tuple(dict.fromkeys(line for each in seen for line in each.failures))
+    over = [
+        f"{100.0 * each.step.overshoot:.1f} % of {each.name}"
+        for each in seen
+        if each.step is not None and each.step.overshoot > 1.2 * MOST_OVERSHOOT
+    ]
+    if of_file and over and not failures and bounded(controller):
+        failures = (
+            f"NOT below {100.0 * MOST_OVERSHOOT:.0f} %: steps overshoot by {', '.join(over)}; axes "
+            "have no prefilter: give references that the actuators can follow (LimitedMove), "
+            "smaller steps, or bound the loop more (M_ks)",
+        )
     overloads: list[Overload] = []
     if bounded(controller) and not failures:
-        calm = axes[0].stepping(0.0, _LOOKED * tau, _BEFORE)
+        calm = axes[0].stepping(0.0, _LOOKED * tau, before)
         overloads = calm.overloads(controller, None, tau, held)
         failures = tuple(_slow(each) for each in overloads if not each.passes)
     rest = None, None, tuple(overloads), failures, tuple(seen)

@@ -25,6 +25,10 @@ The bounds, for every plant of the set:
 
 The plants are those of the operating points, and those with entries of B0 that are off by a share,
 in both directions: all combinations for two axes, else as many drawn ones.
+
+Where actuators have limits the axes run in the file that is written, with steps of the references
+and loads that the actuators can't hold (``acceptance.py``). Axes that fail give way to slower ones
+that pass, where no ``∫ |y_i| dt`` is more than 1.5 times as large.
 """
 
 from __future__ import annotations
@@ -67,6 +71,15 @@ from quell.plants.channels import delayed_inputs
 from quell.plants.linear import LinearPlant
 from quell.plants.linearise import held_points
 from quell.sweeping.sweep import share_interval
+from quell.tuning.acceptance import Judged, accepted, judge_axes
+from quell.tuning.axes_at_limits import (
+    file_at,
+    held_loads,
+    least_gains,
+    slower,
+    step_sizes,
+    time_constant,
+)
 from quell.tuning.constraints import Constraints, first_given, given_constraints
 from quell.tuning.optimiser.coupled import (
     UNSTABLE,
@@ -89,6 +102,7 @@ from quell.tuning.tuned_axes import (
     GivenB0,
     TunedAxes,
 )
+from quell.tuning.written import Written, bounded
 from quell.types import Matrix, Progress, Vector
 
 # Sign patterns of the errors of B0 that are in the set at most.
@@ -131,6 +145,7 @@ def tune_axes(
     check_samples: int = 200,
     seed: int = 0,
     setup: Mapping[str, Any] | None = None,
+    written: Written | None = None,
     progress: Progress | None = None,
 ) -> TunedAxes:
     """Return axes with the best bandwidths under bounds for the coupled loop.
@@ -165,6 +180,9 @@ def tune_axes(
         of the drawn errors.
     setup
         tables of a setup file of these axes, which ``TunedAxes.toml`` completes.
+    written
+        plant and scenario of that file, in which the axes are judged; by default the plant, and a
+        step of each reference that uses 40 % of the range of an actuator.
     progress
         called with what is done and its share.
 
@@ -234,6 +252,26 @@ def tune_axes(
         if B0_off > 0.0:
             drawn = partial(loops, limits=limits)
             checked = _check(nominal, B0_off, drawn, found, check_samples, seed)
+        told, seen = list[str](), None
+        stable = all(_loop(each, axes, found.values).stable for each in judged)
+        if bounded(axes) and stable:
+            report("limits of u", (parts - 1) / parts)
+            file = written or file_at(plant, axes, points[0])
+            held = held_loads(plant, axes, points[0])
+
+            def at_limits(each: Found) -> Judged:
+                """Return what the axes do with these bandwidths in the file."""
+                whole = _made(axes, each.values)
+                tau = time_constant(_loop(nominal[0], axes, each.values))
+                sizes = step_sizes(nominal[0], whole, tau, points[0])
+                return judge_axes(file, whole, tau, held, sizes)
+
+            others = slower(found, loops(plants, limits=limits))
+            found, seen, refused = accepted(found, others, at_limits, "the quickest")
+            if refused:
+                told.append(refused)
+                worst = _exact(loops(judged, limits=limits), range(len(judged)), axes, found.values)
+                excess = _excess(worst)
         made = _made(axes, found.values)
         A, B, C, R = nominal[0]
         bandwidth, fastest = (
@@ -260,6 +298,8 @@ def tune_axes(
             check=checked,
             with_learners=_with_learners(plant, made, points[0]),
             setup=dict(setup or {}),
+            judged=seen,
+            told=(*told, *least_gains(shown)),
         )
 
 

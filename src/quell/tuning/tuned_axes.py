@@ -16,6 +16,7 @@ from quell.analysis.coupling import INDEPENDENT, Coupling, about_zeros
 from quell.analysis.multivariable import MultivariableLoop
 from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none, written_atomically
+from quell.tuning.acceptance import Judged
 from quell.tuning.constraints import Constraints
 from quell.tuning.report import toml_text
 from quell.tuning.tuned import Tuned
@@ -130,6 +131,10 @@ class TunedAxes:
         drawn errors of B0, if it may be off.
     setup : Mapping
         tables of a setup file that ``toml`` completes; empty without.
+    judged : Judged or None
+        what the axes do in the file, each and after overloads, if actuators have limits.
+    told : tuple
+        lines on axes that are left out, and on the least gain of the channels.
     """
 
     controller: Axes
@@ -151,6 +156,8 @@ class TunedAxes:
     check: AxesCheck | None = None
     with_learners: MultivariableLoop | None = None
     setup: Mapping[str, Any] = field(default_factory=dict)
+    judged: Judged | None = None
+    told: tuple[str, ...] = ()
 
     @cached_property
     def disk_margins(self) -> tuple[float, float]:
@@ -208,7 +215,7 @@ class TunedAxes:
             lines.append(
                 "NOT proved for fast motion: margins are those of B0 held at each operating point"
             )
-        lines += self._limits()
+        lines += [*self.told, *([] if self.judged is None else str(self.judged).splitlines())]
         if self.controller.learning.learns:
             lines.append(
                 "NOT in any margin: what learners learn from the states of other axes; simulate "
@@ -226,26 +233,6 @@ class TunedAxes:
             told = loop.remark.splitlines()
             lines += [line for line in told if line.startswith("NOT in these margins")]
         return lines
-
-    def _limits(self) -> list[str]:
-        """Return which steps of the references the actuators can not follow, where they end."""
-        low, high = self.controller.limits.low, self.controller.limits.high
-        half, steps = 0.5 * (high - low), []
-        if not np.any(np.isfinite(half)):
-            return []
-        inverse = np.linalg.pinv(self.controller.first_gain)
-        for i, (tuned, axis) in enumerate(zip(self.axes, self.controller.axes, strict=True)):
-            asked = np.abs(inverse[:, i]) * tuned.omega_c**axis.observer.order
-            largest = float(np.min(half[asked > 0.0] / asked[asked > 0.0]))
-            if np.isfinite(largest):
-                steps.append(f"{largest:.3g} of {tuned.name}")
-        if not steps:
-            return []
-        return [
-            f"NOT looked at: limits of u. A step of a reference above {', '.join(steps)} asks for "
-            "more than half the range of an actuator, and may then overshoot: simulate the motions "
-            "of the machine, give a profile or a prefilter, or bound M_ks"
-        ]
 
     @property
     def _is_coupled(self) -> bool:
@@ -394,6 +381,7 @@ class TunedAxes:
                 if self.check is None
                 else {**self.check._asdict(), "interval": list(self.check.interval)},
                 "verdicts": self.verdicts(),
+                **({} if self.judged is None else self.judged.to_json()),
             }
         )
         return found

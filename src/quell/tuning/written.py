@@ -99,7 +99,8 @@ class Overload(NamedTuple):
     peak: float  # largest error [y-unit]
     back: float  # time from its end until the error stays within 2 % of the largest; NaN if never
     usual: float  # the same after a load that u can hold [s]
-    name: str = ""  # of several axes: which load, and which axis comes back last
+    name: str = ""  # of several axes: which load
+    last: str = ""  # the axis that comes back last
 
     @property
     def passes(self) -> bool:
@@ -109,13 +110,14 @@ class Overload(NamedTuple):
     def __str__(self) -> str:
         """Return it as a part of a sentence."""
         how = "never" if math.isnan(self.back) else f"in {self.back:.3g} s"
-        which = f"{self.name}, " if self.name else ""
-        return f"{which}{self.load:.3g} for {self.duration:.3g} s: back {how}"
+        which = f"{self.name} by " if self.name else ""
+        last = f" ({self.last})" if self.last else ""
+        return f"{which}{self.load:.3g} for {self.duration:.3g} s: back {how}{last}"
 
     def to_json(self) -> dict[str, Any]:
         """Return it as a table."""
         found = self._asdict()
-        return found if self.name else {key: found[key] for key in found if key != "name"}
+        return {key: value for key, value in found.items() if value != ""}
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +317,7 @@ class Written:
             u that holds a first disturbance of 1; of several axes a column for each disturbance
             (m, q), zero for one that is not looked at.
         """
-        begin = _CONSTANTS[0] * tau
+        begin = _CONSTANTS[0 if self.scenario.x0 is None else 1] * tau  # until it is at rest
         if step is not None and self.largest is not None:
             first, end, _ = self.largest
             settled = max(2.0 * step.settling, begin)
@@ -375,8 +377,8 @@ class Written:
                     usual = {k: last if math.isnan(t) else t for k, (_, t) in times_back.items()}
             for k, (axis, t) in times_back.items():
                 peak = math.inf if tried[k] is None else float(np.max(tried[k][:, axis]))
-                name = f"disturbance {k + 1}, {names[axis]} last" if several else ""
-                found.append(Overload(_OVERLOAD * room[k], duration, peak, t, usual[k], name))
+                which = (f"disturbance {k + 1}", str(names[axis])) if several else ()
+                found.append(Overload(_OVERLOAD * room[k], duration, peak, t, usual[k], *which))
         return found
 
 
