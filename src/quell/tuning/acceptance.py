@@ -27,6 +27,7 @@ from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.reference import (
     ORDER_OF_AXIS,
     Axis,
+    Shaped,
     model_of_linear_step,
     profile_for,
     reference_model_for,
@@ -195,14 +196,22 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
         written = written.stepping(float(f"{size:.2g}"), _LOOKED * tau, _BEFORE)
     prefilter, offered, offered_step = None, None, None
     if loop.shaped and both and axis is not None:
-        if loop.model is not None and resonances(loop.model):
+        modes = [] if loop.model is None else resonances(loop.model)
+        period = 2.0 * math.pi / modes[0] if modes else 0.0
+        room = room_of_u(written, loop.linear, limits, loop.rest)
+        every = [axis, *(axis_of(each.linear, tau, loop.plants) for each in written.others)]
+        heaviest = Axis.heaviest([each for each in every if each is not None])
+        found = Shaped(None, None)
+        if not modes or written.largest is not None:
+            found = profile_for(written, controller, heaviest, tau, room, period)
+        if modes:
             fastest = _FASTEST_MODEL * ORDER_OF_AXIS / tau
-            prefilter = reference_model_for(written, controller, fastest, ORDER_OF_AXIS).prefilter
-        else:
-            room = room_of_u(written, loop.linear, limits, loop.rest)
-            every = [axis, *(axis_of(each.linear, tau, loop.plants) for each in written.others)]
-            heaviest = Axis.heaviest([each for each in every if each is not None])
-            prefilter = profile_for(written, controller, heaviest, tau, room).prefilter
+            model = reference_model_for(written, controller, fastest, ORDER_OF_AXIS)
+            if found.step is None or (
+                model.step is not None and model.step.settling < found.step.settling
+            ):
+                found = model
+        prefilter = found.prefilter
     if prefilter is None and written.largest is not None:
         step = worst_step(written, controller)
         if step.overshoot > MOST_OVERSHOOT:

@@ -9,10 +9,14 @@ and of the v_max those are taken with which the largest step of the scenario tak
 ``share`` and the ramp t_j of the acceleration are tried in simulations of the file: the quickest
 move that keeps u within its limits and overshoots by 5 % at most.
 
+Of an axis with a resonance the ramp of the acceleration takes whole periods of the lowest mode:
+its ends then cancel each other in the mode (Singer & Seering, *J. Dyn. Syst. Meas. Control* 112,
+1990). A small step behind a generator is quicker than the mode, and feedforward of the whole
+inertia then moves the motor alone: so smaller steps have to overshoot little, too.
+
 Another plant gets a ``ReferenceModel``, the fastest with which u keeps within its limits and the
-step overshoots by 5 % at most. So does an axis with a resonance: a small step behind a generator is
-quicker than its mode, and feedforward of the whole inertia then moves the motor alone. A reference
-model is as slow for a small step as for a large one.
+step overshoots by 5 % at most. So does an axis for which no generator is quicker. A reference model
+is as slow for a small step as for a large one.
 """
 
 from __future__ import annotations
@@ -42,6 +46,9 @@ _NO_U = 1e-6
 # the acceleration: in samples and in time constants of the loop. Chosen by hand; each is simulated.
 _SHARES, _MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
 _SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
+# Beside a resonance: in periods of it, and the shares of the step that are looked at, too, for so
+# many periods behind so many samples.
+_PERIODS, _SMALLER, _RINGING, _BEFORE = (1.0, 1.5, 2.0), (0.3, 0.1, 0.03), 60.0, 10
 # Steps of v_max between nothing and what the room allows. Without viscous friction u bounds no
 # speed: then v_max is this multiple of the one that the largest step reaches.
 _SPEEDS, _FASTER = 40, 10.0
@@ -143,10 +150,12 @@ def profile_for(
     axis: Axis,
     tau: float,
     room: float,
+    period: float = 0.0,
 ) -> Shaped:
     """Return the quickest profile generator with which the step of the file keeps to its limits.
 
-    ``tau`` is the time constant of the closed loop [s].
+    ``tau`` is the time constant of the closed loop [s], ``period`` that of a mode [s], beside which
+    there may be none.
     """
     if written.largest is None:
         size = 1.0 / axis.needs(tau) * room
@@ -155,20 +164,34 @@ def profile_for(
         )
     first, end, step = written.largest
     size, found = abs(step), list[tuple[float, Shaped]]()
-    for generator in _profiles(axis, size, room, tau, written.dt):
+    small = []
+    if period > 0.0:
+        how = max(_RINGING * period, _AFTER * tau), _BEFORE
+        small = [written.stepping(share * step, *how) for share in _SMALLER]
+        ramps = [n * period for n in _PERIODS]
+    else:
+        ramps = [*(n * written.dt for n in _SAMPLES), *(n * tau for n in _CONSTANTS)]
+    for generator in _profiles(axis, size, room, ramps):
         own = _duration(generator, size)
         last = min(end, first + math.ceil((_LOOKED * own + _AFTER * tau) / written.dt))
         shown = _with(written, controller, generator, last)
         most = max(_LIMITED * own, _FEW * written.dt)
         if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
             continue
+        whole = Prefiltered(controller, generator)
+        if any(not worst_step(each, whole).overshoot <= MOST_OVERSHOOT for each in small):
+            continue
         # One that reaches a limit comes behind all that do not.
         rank = shown.settling if shown.limited <= most else math.inf
+        if period > 0.0 and math.isinf(rank):
+            continue
         found.append((rank, Shaped(generator, shown)))
         if rank <= _QUICK * own:
             break
     if found:
         return min(found, key=lambda pair: pair[0])[1]
+    if period > 0.0:
+        return Shaped(None, None)
     generator = axis.profile(size, _SHARES[-1] * room, max(_SAMPLES[0] * written.dt, tau))
     for i in range(_TRIES):
         share = _SHARES[-1] * _SLOWER ** (i + 1)
@@ -180,10 +203,9 @@ def profile_for(
 
 
 def _profiles(
-    axis: Axis, size: float, room: float, tau: float, dt: float
+    axis: Axis, size: float, room: float, ramps: Sequence[float]
 ) -> Iterator[ProfileGenerator]:
-    """Yield the generators to try, quick ones first."""
-    ramps = [*(n * dt for n in _SAMPLES), *(n * tau for n in _CONSTANTS)]
+    """Yield the generators to try, quick ones first, with these ramps of the acceleration [s]."""
     made = [axis.profile(size, share * room, ramp) for share in _SHARES for ramp in ramps]
     yield from sorted(made, key=lambda each: _duration(each, size))
 
