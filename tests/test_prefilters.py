@@ -96,3 +96,30 @@ def test_a_mistake_is_named(make: object, message: str) -> None:
     """With the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message):
         make()  # type: ignore[operator]
+
+
+def test_a_profile_leaves_the_external_signal_of_a_schedule_alone() -> None:
+    """Its third derivative is not fed forward: u is that of the controller held at the signal."""
+    observer = ql.ESO.model_free(order=2, b0=1000.0, omega_o=100.0, dt=DT)
+    table = ql.Schedule((0.0, 1.0), "external", b0=(2000.0, 500.0))
+    controller = ql.ADRC(observer, 30.0, schedule=table, feedforward=True)
+    move = ql.controllers.ProfileGenerator(5.0, 200.0, 20000.0)
+    both = [ql.controllers.Prefiltered(each, move) for each in (controller, controller.at(0.7))]
+    both[0].set_signals(0.7)
+    u = np.array([[each.step(0.1, 1e-4 * k) for each in both] for k in range(30)])
+    np.testing.assert_allclose(u[:, 0], u[:, 1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_a_reference_model_with_a_bounded_rate_follows_a_ramp(order: int) -> None:
+    """A step of 2 at 0.5/s is the answer to a ramp that ends after 4 s: no rate is above 0.5; a smaller rate of r changes nothing."""
+    model = ql.controllers.ReferenceModel(3.0, order, rate_limit=0.5)
+    free = ql.controllers.ReferenceModel(3.0, order)
+    ramp = np.minimum(0.5 * DT * np.arange(1, 801), 2.0)
+    found = followed(model, np.full(800, 2.0))
+    np.testing.assert_allclose(found, followed(free, ramp), atol=1e-12)
+    assert np.max(found[:, 1]) <= 0.5 * (1.0 + 1e-9)
+    slow = 0.4 * np.sin(DT * np.arange(800))
+    np.testing.assert_array_equal(followed(model, slow), followed(free, slow))
+    with pytest.raises(ValueError, match="rate_limit"):
+        ql.controllers.ReferenceModel(3.0, rate_limit=0.0)

@@ -303,7 +303,7 @@ PARTS: dict[str, Part] = {
     "Shaper": Part(baseline_room.Shaper, lambda shaper: room.Prefiltered(PID, shaper), {"times": (0.0, 0.5), "amplitudes": (0.5, 0.5)}, {
         "times": Several(((0.0, 0.305),)), "amplitudes": Several(((0.4, 0.6), With((0.3, 0.4, 0.3), {"times": (0.0, 0.3, 0.6)}))),
     }),
-    "ReferenceModel": Part(room.ReferenceModel, _shaped, {"omega": 3.0}, {"omega": 2.0, "order": Several((1, 3))}),
+    "ReferenceModel": Part(room.ReferenceModel, _shaped, {"omega": 3.0}, {"omega": 2.0, "order": Several((1, 3)), "rate_limit": 0.5}),
     "TrackingDifferentiator": Part(room.TrackingDifferentiator, _shaped, {"acceleration": 2.0}, {"acceleration": 1.0, "horizon": 0.05}),
     "ProfileGenerator": Part(room.ProfileGenerator, _shaped, {"v_max": 0.5, "a_max": 2.0, "j_max": 5.0}, {"v_max": 0.4, "a_max": 1.0, "j_max": 4.0}),
 }  # fmt: skip

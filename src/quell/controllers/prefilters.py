@@ -16,6 +16,8 @@ A reference model: a lag between the reference and the loop, with derivatives of
 If as many derivatives are fed forward as the plant has integrators, the ideal loop responds to r as
 the model does, for any ``omega_c``: two degrees of freedom, one for the reference and one for
 disturbances (Horowitz, *Synthesis of Feedback Systems*, 1963). It is sampled with zero-order hold.
+With a bounded rate the model is given a reference that follows r at ``rate_limit`` at most. r_f is
+a weighted mean of what that was, so ``|r_f'|`` is bounded as well.
 
 Han's tracking differentiator: a reference that a plant can follow, and its derivative.
 
@@ -551,18 +553,24 @@ class ReferenceModelDesign(NamedTuple):
     input: Vector  # (m,)
     rates: Vector  # coefficients of the state and of r in r_f^(m) (m + 1,)
     dt: float
+    most_change: float  # of the reference in a sample
 
 
 class ReferenceModelMemory(NamedTuple):
     """State."""
 
     x: Vector  # (2 m,): the state, and scratch for the next one
-    r: Vector  # (1,): the reference of the last sample
+    r: Vector  # (1,): the reference of the last sample, with bounded rate
 
 
 @prefilter.register(ReferenceModelDesign)
 def _prefilter(design: ReferenceModelDesign, memory: ReferenceModelMemory, r: float) -> float:
     x, m = memory.x, design.input.size
+    change = r - memory.r[0]
+    if change > design.most_change:
+        r = memory.r[0] + design.most_change
+    elif change < -design.most_change:
+        r = memory.r[0] - design.most_change
     for i in range(m):
         total = design.input[i] * r
         for j in range(m):
@@ -605,19 +613,25 @@ class ReferenceModel:
         bandwidth [rad/s], at most 1/dt.
     order
         order m, 1 to 8: with feedforward in the controller, the plant's order (relative degree).
+    rate_limit
+        largest rate of what it makes of the reference [y-unit/s]: a larger step takes longer, and
+        needs no more u on the way; none by default.
 
     Raises
     ------
     ValueError
-        for a bandwidth that is not positive, or in ``design`` too high for the sample time.
+        for a bandwidth or a rate that is not positive, or in ``design`` a bandwidth too high for
+        the sample time.
     """
 
     omega: float
     order: int = 2
+    rate_limit: float = math.inf
 
     def __post_init__(self) -> None:
         checks.positive("omega", self.omega, "rad/s")
         checks.whole("order", self.order, 1, 8)
+        checks.positive_or_infinite("rate_limit", self.rate_limit, "y-unit/s")
 
     @property
     def derivatives(self) -> int:
@@ -636,7 +650,9 @@ class ReferenceModel:
         B = np.zeros((m, 1))
         B[-1] = rate**m
         transition, (gamma,) = zero_order_hold(A, [B], 1.0)
-        return ReferenceModelDesign(transition, gamma[:, 0].copy(), np.append(rates, rate**m), dt)
+        most = float(self.rate_limit) * dt
+        last = np.append(rates, rate**m)
+        return ReferenceModelDesign(transition, gamma[:, 0].copy(), last, dt, most)
 
     def memory(self, design: ReferenceModelDesign) -> ReferenceModelMemory:
         """Return the state at rest at zero."""

@@ -28,6 +28,8 @@ from quell.tuning.reference import (
     ORDER_OF_AXIS,
     Axis,
     Shaped,
+    bounded_rate,
+    largest_step,
     model_of_linear_step,
     profile_for,
     reference_model_for,
@@ -109,6 +111,7 @@ class Judged(NamedTuple):
     failures: tuple[str, ...]  #: lines that begin with NOT
     others: tuple[Seen, ...] = ()  #: with other plants or at other points; or the axes
     several: str = ""  #: what the others are
+    larger: StepFigures | None = None  #: after nearly the largest step that u can hold
 
     def __str__(self) -> str:
         """Return what was found, in lines."""
@@ -124,6 +127,8 @@ class Judged(NamedTuple):
                     f"{100.0 * step.overshoot:.1f} % and settles in {step.settling:.3g} s"
                 )
             lines.append(text)
+        if self.larger is not None:
+            lines.append(f"one near what u can hold: {self.larger}".replace(": NOT", ", NOT"))
         if self.overloads:
             loads = "; ".join(str(each) for each in self.overloads)
             lines.append(f"overload, a load of 1.4 times what u can hold: {loads}")
@@ -162,7 +167,8 @@ def _described(prefilter: Any) -> str:
 def prefilter_table(prefilter: Any) -> dict[str, Any]:
     """Return the table of a prefilter in a setup file."""
     model = isinstance(prefilter, ReferenceModel)
-    return {"kind": "reference-model" if model else "profile-generator"} | dict(vars(prefilter))
+    known = {key: value for key, value in vars(prefilter).items() if value != math.inf}
+    return {"kind": "reference-model" if model else "profile-generator"} | known
 
 
 def time_constant(analysis: LoopAnalysis, plants: PlantSet) -> float:
@@ -212,6 +218,7 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
             ):
                 found = model
         prefilter = found.prefilter
+    process = loop.shaped and both and axis is None and written.largest is not None
     if prefilter is None and written.largest is not None:
         step = worst_step(written, controller)
         if step.overshoot > MOST_OVERSHOOT:
@@ -219,6 +226,10 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
                 prefilter = reference_model_for(written, controller, _FASTEST_MODEL / tau).prefilter
             elif not limited and math.isfinite(step.overshoot):
                 offered, offered_step = _offer(written, loop.plants, controller, tau)
+    larger = None
+    if process:
+        most = largest_step(written, loop.linear, limits, loop.rest)
+        prefilter, larger = bounded_rate(written, controller, prefilter, most, tau)
     whole = controller if prefilter is None else Prefiltered(controller, prefilter)
     held = np.array([[held_load(loop.linear)]])
     remedy = ""
@@ -233,7 +244,7 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
         others = tuple(_seen(each, whole, tau, held, remedy) for each in written.others)
         failures = _of_others(others)
         several = f"with {len(others)} {written.of_others}"
-    rest = offered, offered_step, own.overloads, failures, others, several
+    rest = offered, offered_step, own.overloads, failures, others, several, larger
     return Judged(whole, prefilter, own.step, own.move, *rest)
 
 

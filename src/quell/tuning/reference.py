@@ -17,13 +17,19 @@ inertia then moves the motor alone: so smaller steps have to overshoot little, t
 Another plant gets a ``ReferenceModel``, the fastest with which u keeps within its limits and the
 step overshoots by 5 % at most. So does an axis for which no generator is quicker. A reference model
 is as slow for a small step as for a large one.
+
+Of a plant that needs u at rest, a process, the model has a bounded rate, near the largest one of
+the step of the scenario, so that a larger step takes longer and needs no more u on the way. Nearly
+the largest step that u can hold is simulated, too: of the faster models with such rates that one is
+taken with which both overshoot by 5 % at most, and the step of the scenario settles first.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,6 +77,13 @@ ORDER_OF_AXIS = 4
 _BANDWIDTHS, _MOST_LAGS, _BETWEEN = 0.85, 32, 3
 # Slower ones are looked at until the step takes this multiple of the quickest one.
 _SLOWER_THAN_BEST = 1.2
+# The step near what u can hold, as a share; one that is not larger than that of the scenario by
+# this factor is not looked at. Shares of the largest rate of the scenario's step and factors of the
+# bandwidth that are tried, and how much slower that step may become.
+_NEARLY, _LARGER, _AS_QUICK = 0.9, 1.1, 1.1
+_RATES, _FASTER_MODELS = (2.0, 1.4, 1.0, 0.7), (4.0, 2.5, 1.6)
+# How long it is looked at, in time constants of the loop and times of the largest rate.
+_CONSTANTS_OF_LARGER = 150.0
 # Other plants with which a prefilter is tried.
 _OTHERS = 4
 
@@ -287,6 +300,67 @@ def reference_model_for(
         else:
             fast = middle
     return Shaped(*best)
+
+
+def largest_step(
+    written: Written, linear: LinearPlant, limits: tuple[float, float], u: float
+) -> float:
+    """Return nearly the largest step that u can hold, in the direction of that of the scenario."""
+    assert written.largest is not None
+    sign = math.copysign(1.0, written.largest[2])
+    held = held_step(linear) * sign
+    room = limits[1] - u if held > 0.0 else u - limits[0]
+    return sign * _NEARLY * room / abs(held) if held else 0.0
+
+
+def bounded_rate(
+    written: Written, controller: Controller, model: Any, most: float, tau: float
+) -> tuple[Any, StepFigures | None]:
+    """Return a reference model with bounded rate, and the step by ``most`` behind it.
+
+    Parameters
+    ----------
+    written
+        the file, in which the step is well behind ``model``, or without one (None).
+    controller
+        without the model.
+    most
+        a larger step, which u can hold [y-unit]; a smaller one is not looked at.
+    tau
+        time constant of the closed loop [s].
+    """
+    assert written.largest is not None
+    size = abs(written.largest[2])
+    if abs(most) < _LARGER * size:
+        return model, None
+
+    def larger_with(prefilter: Any, slowest: float) -> StepFigures:
+        """Return the larger step behind a prefilter."""
+        last = _CONSTANTS_OF_LARGER * tau + _LOOKED * abs(most) / slowest
+        whole = controller if prefilter is None else Prefiltered(controller, prefilter)
+        return worst_step(written.stepping(most, last, _BEFORE), whole)
+
+    first = model or ReferenceModel(min(1.0 / tau, 1.0 / written.dt), _ORDER)
+    # The largest rate of the model's own step: ω (m − 1)^(m−1) e^(1−m)/(m − 1)! of its size.
+    m = first.order
+    own = first.omega * size * (m - 1) ** (m - 1) * math.exp(1 - m) / math.factorial(m - 1)
+    plain = larger_with(model, own)
+    well = plain.overshoot <= MOST_OVERSHOOT and not math.isnan(plain.settling)
+    if model is None and well:
+        return None, plain
+    usual = worst_step(written, controller if model is None else Prefiltered(controller, model))
+    best, latest = (model, plain), _AS_QUICK * usual.settling
+    for share, factor in itertools.product(_RATES, _FASTER_MODELS):
+        omega = min(factor * first.omega, 1.0 / written.dt)
+        tried = replace(first, omega=omega, rate_limit=float(f"{share * own:.4g}"))
+        step = worst_step(written, Prefiltered(controller, tried))
+        limited = step.limited > max(_LIMITED * step.looked, _FEW * written.dt, usual.limited)
+        if limited or not (step.overshoot <= MOST_OVERSHOOT and step.settling < latest):
+            continue
+        shown = larger_with(tried, tried.rate_limit)
+        if shown.overshoot <= MOST_OVERSHOOT and not math.isnan(shown.settling):
+            best, latest = (tried, shown), step.settling
+    return best
 
 
 def model_of_linear_step(plants: PlantSet, controller: Controller) -> ReferenceModel | None:
