@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,11 @@ import pytest
 import quell as ql
 from quell.analysis.linearise import linear_law
 from quell.controllers.law import law_gains
+from quell.setup import load
 from quell.types import Status
 
 from .cases import cases
+from .commands import Shown
 
 DT = 0.01
 PLANT = ([2.0], [1.0, 1.0, 0.0])
@@ -191,6 +195,34 @@ def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
         den = [1.0, factor, 0.0]
         elsewhere = ql.analysis.analyse(([2.0 * factor**2], den), tuned.controller)
         assert 1.0 / elsewhere.margins.modulus <= 1.01 * tuned.after.m_s_elsewhere
+
+
+@pytest.mark.trial
+def test_a_tuned_compensator_is_judged_in_its_file(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Its step is that of the written file, which has the delay of the command; overloads and NOT are in the report."""
+    file = tmp_path / "axis.toml"
+    file.write_text(
+        """dt = 0.01
+plant = { kind = "linear", num = [1.0], den = [1.0, 1.0, 0.0] }
+observer = { kind = "model-free", order = 2, b0 = 1.0, omega_o = 10.0 }
+controller = { kind = "pid", kp = 4.0, ki = 1.0, kd = 3.0, tf = 0.05, u_min = -2.0, u_max = 2.0 }
+compensator = {}
+scenario = { duration = 20.0, reference = { kind = "step", height = 0.3, at = 1.0 } }
+""",
+        encoding="utf-8",
+    )
+    out = tmp_path / "t.toml"
+    shown = quell("tune", str(file), "--delay", "0.02", "--out", str(out), "--no-figures")
+    assert shown.code == 0
+    setup = load(out)
+    assert setup.plant.order == 4
+    run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    over = 100.0 * run.metrics(1.0)["overshoot"]
+    assert f"step of the reference by 0.3 at 1 s: overshoots by {over:.1f} %" in shown.out
+    assert "overload, a load of 1.4 times what u can hold" in shown.out
+    assert "overload, a load" in out.read_text(encoding="utf-8")
 
 
 @pytest.mark.trial

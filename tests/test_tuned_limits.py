@@ -16,7 +16,18 @@ from quell.controllers.shaping import ProfileGenerator
 from quell.plants.linear import LaggedPlant
 from quell.setup import load
 from quell.setup.loading import tuning_task
-from quell.tuning.acceptance import Loop, judge
+from quell.tuning.acceptance import (
+    Judged,
+    Loop,
+    accepted,
+    conditionally_stable,
+    judge,
+    judge_axes,
+    place_of,
+    with_others,
+)
+from quell.tuning.axes_at_limits import held_loads
+from quell.tuning.plants import given_plants, plant_set
 from quell.tuning.reference import Axis, _profiles
 from quell.tuning.tables import late_tables
 from quell.tuning.written import StepFigures, Written
@@ -241,3 +252,113 @@ def test_a_design_that_fails_at_the_limits_gives_a_line_with_not() -> None:
     file = Written(ql.plants.delayed(late[0], 0.03, DT), late[1], DT)
     bad = judge(found.loop._replace(shaped=False, written=file), cascade(40.0), found.analysis)
     assert bad.failures[0].startswith("NOT settled")
+
+
+def test_the_plants_of_a_set_are_looked_at_those_of_the_ends_first() -> None:
+    """Gain and phase at the crossover, at most eight; each in the scenario of the file."""
+    plants = [([50.0 * gain], [1.0, 4.0, 0.0]) for gain in (1.0, *np.linspace(0.5, 2.0, 30))]
+    linear = [ql.plants.LinearPlant.of(each) for each in plants]
+    of = plant_set(given_plants(plants, DT), DT)
+    file = written(ql.Scenario(reference=ql.signals.Step(0.5, 0.01), duration=0.3))
+    found = with_others(file, linear, [(0.0, 0.03)] * len(plants), of)
+    parts = [each.linear for each in found.others if each.linear is not None]
+    gains = [float((each.C @ each.A @ each.B)[0, 0]) for each in parts]
+    assert len(gains) == 8
+    assert {25.0, 100.0} <= {round(gain, 9) for gain in gains[:4]}
+    assert all(each.plant.order == file.plant.order for each in found.others)
+    alone = with_others(file, linear[:1], [(0.0, 0.0)], plant_set(given_plants(plants[:1], DT), DT))
+    assert alone is file
+
+
+def test_another_plant_starts_at_rest_where_that_of_the_file_does() -> None:
+    """With the state and the u that hold y there under the scenario's load: nothing moves."""
+    lag = ql.plants.LinearPlant.of(([2.0], [3.0, 1.0]))
+    file = Written(
+        lag, ql.Scenario(20.0, duration=0.5, x0=[20.0 / lag.C[0, 0]], disturbances=[-1.0]), 0.01
+    )
+    place = place_of(
+        file, ql.plants.LinearPlant.of(([4.0], [3.0, 1.0])), (0.05, 0.03), "half", at=()
+    )
+    assert place.start == pytest.approx(20.0)
+    x, waiting = place.scenario.x0[0], place.scenario.x0[1:]
+    assert place.linear is not None
+    assert place.linear.A[0, 0] * x + place.linear.B[0, 0] * (waiting[0] - 1.0) == pytest.approx(0)
+    assert waiting == [waiting[0]] * (place.plant.order - 1)
+
+
+@pytest.mark.trial
+def test_a_plant_of_the_set_that_cycles_is_named() -> None:
+    """The file's plant settles; one of four times its gain goes from limit to limit."""
+    step = ql.Scenario(reference=ql.signals.Step(0.2, 0.01), duration=0.9)
+    plant, more = ql.plants.LinearPlant.of(MOTOR), ql.plants.LinearPlant.of(([400.0], [1, 4, 0.0]))
+    of = plant_set(given_plants([MOTOR, ([400.0], [1.0, 4.0, 0.0])], DT, delay=0.03), DT)
+    file = with_others(written(step), [plant, more], [(0.0, 0.03)] * 2, of)
+    loop = Loop(file, plant, None, of, (-10.0, 10.0), 0.0, False)
+    controller = cascade(1.0)
+    found = judge(loop, controller, ql.analysis.analyse(MOTOR, controller, delay=0.03))
+    assert found.step is not None
+    assert found.step.settling > 0.0
+    (failure,) = found.failures
+    assert failure.startswith("NOT settled")
+    assert failure.endswith("(plant 2 of the set)")
+    assert "with 1 other plants of the set of 2, linear: overshoots by" in str(found)
+
+
+def test_the_first_design_that_passes_takes_the_place_of_one_that_fails() -> None:
+    """And the text says which is left out; where none passes it stays."""
+    rest = None, None, None, None, None, ()
+    verdicts = {name: Judged(None, *rest, fails) for name, fails in (("a", ("NOT",)), ("b", ()))}  # type: ignore[arg-type]
+    assert accepted("a", "b", verdicts.__getitem__, "a")[::2] == ("b", "a is left out: NOT")
+    assert accepted("a", "a", verdicts.__getitem__, "a")[::2] == ("a", "")
+    assert accepted("b", "a", verdicts.__getitem__, "b")[0] == "b"
+
+
+def test_the_least_gain_is_that_of_all_loops() -> None:
+    """Of loops that bear 0.2 and 0.3 of their gain it is 0.3; a loop that needs none has no line."""
+    (line,) = conditionally_stable([(0.2, 4.0), (0.3, 5.0)])
+    assert line == "conditionally stable: it bears 0.3 to 4 times its gain"
+    assert conditionally_stable([(0.0, 4.0), (0.0, math.inf)]) == []
+
+
+@pytest.mark.trial
+def test_axes_that_do_not_notice_each_other_are_judged_as_single_loops() -> None:
+    """Two different integrators: steps and overloads of each are those of a loop of its own, to rounding."""
+    dt, gains, limits = 5e-3, (1.0, 3.0), (1.0, 2.0)
+    single, scenarios = [], []
+    for b, most, size in zip(gains, limits, (0.3, 0.8), strict=True):
+        observer = ql.ESO.model_free(order=1, b0=b, omega_o=40.0, dt=dt)
+        single.append(ql.ADRC(observer, 10.0, u_min=-most, u_max=most))
+        scenarios.append(ql.Scenario(ql.signals.Step(size, 0.1), duration=3.0))
+    free = [ql.ADRC(ql.ESO.model_free(1, 1.0, 40.0, dt), 10.0) for _ in gains]
+    both = ql.Axes(free, B0=np.diag(gains), u_min=[-1.0, -2.0], u_max=[1.0, 2.0])
+    plant = ql.plants.MultivariableLinearPlant(np.zeros((2, 2)), np.diag(gains), np.eye(2))
+    file = Written(
+        plant,
+        ql.Scenario([each.reference for each in scenarios], duration=3.0),
+        dt,  # type: ignore[misc]
+    )
+    found = judge_axes(file, both, 0.1, held_loads(plant, both, None), np.ones(2))
+    assert not found.failures
+    for i, (b, own, scenario) in enumerate(zip(gains, single, scenarios, strict=True)):
+        alone = Written(ql.plants.LinearPlant.of(([b], [1.0, 0.0])), scenario, dt)
+        step = alone.figures(own, alone.run(own))
+        theirs = found.others[i].step
+        assert step is not None
+        assert theirs is not None
+        assert theirs.overshoot == pytest.approx(step.overshoot, abs=1e-9)
+        assert theirs.settling == pytest.approx(step.settling)
+        assert theirs.limited >= step.limited - 1e-9  # that of any actuator
+        calm = alone.stepping(0.0, 1.0, 10)
+        loads = calm.overloads(own, None, 0.1, -1.0)
+        mine = [each for each in found.overloads if each.name == f"disturbance {i + 1}"]
+        for each, other in zip(mine, loads, strict=True):
+            assert each[:5] == pytest.approx(other[:5], rel=1e-6)
+
+
+@pytest.mark.trial
+def test_structures_that_feed_nothing_forward_are_compared_at_limits() -> None:
+    """An axis has feedforward by default; where no structure of the list has any it has none."""
+    found = ql.tune(MOTOR, DT, compare=("pid",), u_min=-10.0, u_max=10.0, b_range=(0.7, 1.4))
+    assert found.design.name == "pid"
+    assert found.judged.others
+    assert "other plants of the set of 3, linear" in str(found.judged)

@@ -32,6 +32,7 @@ from quell.tuning.optimiser.coupled import (
     starts,
 )
 from quell.tuning.optimiser.loops import area_of_step, pulse_in_blocks
+from quell.tuning.written import Written
 
 from .benchmark_module import benchmark
 from .cases import cases
@@ -146,24 +147,24 @@ def test_b0_that_is_off_is_designed_for_and_checked() -> None:
 
 
 @pytest.mark.trial
-def test_steps_that_the_limits_of_u_do_not_allow_are_named() -> None:
-    """A larger step of the reference meets the limits at once, a smaller one does not."""
-    made = copy.copy(tuned().controller)
-    assert "NOT looked at: limits of u" not in tuned().summary()
-    made.set_limits(u_min=-3.0, u_max=3.0)
-    found = replace(tuned(), controller=made)
-    line = next(each for each in found.verdicts() if "limits of u" in each)
-    steps = [
-        float(each.split()[0]) for each in line.split("above ")[1].split(" asks")[0].split(",")
-    ]
-    for i, step in enumerate(steps):
-        for share in (0.98, 1.02):
-            made.reset()
-            r = np.zeros(len(steps))
-            made.step(r, r)
-            r[i] = share * step
-            u = made.step(r, np.zeros(len(steps)))
-            assert bool(np.max(np.abs(u)) < 3.0) == (share < 1.0)
+def test_axes_with_limits_are_judged_in_their_file() -> None:
+    """Steps of the scenario that the actuators can't follow are named with their overshoot; without limits nothing is added."""
+    assert tuned().judged is None
+    limited = copy.copy(axes())
+    limited.set_limits(u_min=-3.0, u_max=3.0)
+    r = [ql.signals.Step(0.5, 0.1), ql.signals.Step(0.5, 0.5)]
+    file = Written(machine(), ql.Scenario(r, duration=1.0), DT)
+    found = tune_axes(machine(), limited, written=file)
+    assert found.judged is not None
+    run = ql.simulate(machine(), found.controller, file.scenario)
+    for i, each in enumerate(found.judged.others):
+        y, (first, end) = run["y"][:, i], ((100, 500), (500, 1001))[i]
+        own = max(float(np.max((y[first:end] - y[first]) / (0.5 - y[first]))) - 1.0, 0.0)
+        assert each.step is not None
+        assert each.step.overshoot == pytest.approx(own, abs=1e-9)
+    assert found.judged.failures[0].startswith("NOT")
+    assert all(line in found.summary() for line in found.judged.failures)
+    assert "conditionally stable: it bears" in found.summary()
 
 
 @pytest.mark.trial
