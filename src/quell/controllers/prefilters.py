@@ -70,7 +70,7 @@ from quell.controllers.compensator import Compensator, manual_operation
 from quell.controllers.stateful import Retuning, StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.functions import copysign, sqrt
-from quell.kernels.sized import Scalars, Size, clear
+from quell.kernels.sized import Scalars, Work, clear
 from quell.lti.models import zero_order_hold
 from quell.observers.eso import ESO
 from quell.types import Channels, Matrix, Status, Vector
@@ -294,7 +294,6 @@ class PrefilteredDesign(NamedTuple):
 
     controller: Any
     prefilter: Any
-    used: Size  # derivatives of the shaped reference that the controller uses
 
 
 class PrefilteredLoop(Scalars):
@@ -313,6 +312,7 @@ class PrefilteredState(NamedTuple):
     controller: Any
     prefilter: Any
     derivatives: Vector  # derivatives of the shaped reference; empty if the controller uses none
+    used: Work  # those that the controller uses
     loop: NDArray[PrefilteredLoop]  # (1,)
 
 
@@ -336,8 +336,9 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
         if state.derivatives.size > 0:
             write_derivatives(design.prefilter, state.prefilter, state.derivatives)
             # What a prefilter has beyond them would be taken for signals of a schedule.
-            used = state.derivatives[: design.used]
-            set_reference_derivatives(design.controller, state.controller, used)
+            for i in range(state.used.size):
+                state.used[i] = state.derivatives[i]
+            set_reference_derivatives(design.controller, state.controller, state.used)
     loop.r_shaped = shaped if is_finite(shaped) else y
     return control(design.controller, state.controller, shaped, y)
 
@@ -499,9 +500,7 @@ class Prefiltered(Wrapper):
 
     def _update_parameters(self) -> None:
         design = self.prefilter.design(self.dt)
-        has = getattr(self.prefilter, "derivatives", 0)
-        used = min(has, int(getattr(self.controller, "derivatives", 0)))
-        self.parameters = PrefilteredDesign(self.controller.parameters, design, used)
+        self.parameters = PrefilteredDesign(self.controller.parameters, design)
 
     @property
     def channels(self) -> Channels:
@@ -510,11 +509,12 @@ class Prefiltered(Wrapper):
 
     def initial_state(self) -> PrefilteredState:
         """Return a state before the first sample, with nothing learned."""
-        used = getattr(self.controller, "derivatives", 0) > 0
-        count = getattr(self.prefilter, "derivatives", 0) if used else 0
+        wanted = getattr(self.controller, "derivatives", 0)
+        count = getattr(self.prefilter, "derivatives", 0) if wanted > 0 else 0
         inner = self.controller.initial_state()
         memory = self.prefilter.memory(self.parameters.prefilter)
-        return PrefilteredState(inner, memory, np.zeros(count), PrefilteredLoop.zeros())
+        derivatives, used = np.zeros(count), np.zeros(min(count, wanted))
+        return PrefilteredState(inner, memory, derivatives, used, PrefilteredLoop.zeros())
 
     def read(self, state: PrefilteredState) -> Any:
         """Return the estimates of the ADRC in ``state``."""
@@ -553,6 +553,12 @@ class ReferenceModelDesign(NamedTuple):
     input: Vector  # (m,)
     rates: Vector  # coefficients of the state and of r in r_f^(m) (m + 1,)
     dt: float
+
+
+class BoundedModelDesign(NamedTuple):
+    """Parameters of a reference model with bounded rate."""
+
+    model: ReferenceModelDesign
     most_change: float  # of the reference in a sample
 
 
@@ -566,11 +572,6 @@ class ReferenceModelMemory(NamedTuple):
 @prefilter.register(ReferenceModelDesign)
 def _prefilter(design: ReferenceModelDesign, memory: ReferenceModelMemory, r: float) -> float:
     x, m = memory.x, design.input.size
-    change = r - memory.r[0]
-    if change > design.most_change:
-        r = memory.r[0] + design.most_change
-    elif change < -design.most_change:
-        r = memory.r[0] - design.most_change
     for i in range(m):
         total = design.input[i] * r
         for j in range(m):
@@ -601,6 +602,28 @@ def _settle(design: ReferenceModelDesign, memory: ReferenceModelMemory, value: f
     for i in range(memory.x.size):
         memory.x[i] = 0.0
     memory.x[0] = memory.r[0] = value
+
+
+@prefilter.register(BoundedModelDesign)
+def _prefilter_bounded(design: BoundedModelDesign, memory: ReferenceModelMemory, r: float) -> float:
+    change, most = r - memory.r[0], design.most_change
+    if change > most:
+        r = memory.r[0] + most
+    elif change < -most:
+        r = memory.r[0] - most
+    return prefilter(design.model, memory, r)
+
+
+@write_derivatives.register(BoundedModelDesign)
+def _write_derivatives_bounded(
+    design: BoundedModelDesign, memory: ReferenceModelMemory, derivatives: Vector
+) -> None:
+    write_derivatives(design.model, memory, derivatives)
+
+
+@settle.register(BoundedModelDesign)
+def _settle_bounded(design: BoundedModelDesign, memory: ReferenceModelMemory, value: float) -> None:
+    settle(design.model, memory, value)
 
 
 @dataclass(frozen=True)
@@ -638,7 +661,7 @@ class ReferenceModel:
         """Number of derivatives of its output: m."""
         return self.order
 
-    def design(self, dt: float) -> ReferenceModelDesign:
+    def design(self, dt: float) -> ReferenceModelDesign | BoundedModelDesign:
         """Return the parameters for a sample time [s]."""
         m, rate = self.order, self.omega * checks.positive("dt", dt, "s")
         if rate > 1.0:
@@ -650,13 +673,14 @@ class ReferenceModel:
         B = np.zeros((m, 1))
         B[-1] = rate**m
         transition, (gamma,) = zero_order_hold(A, [B], 1.0)
-        most = float(self.rate_limit) * dt
         last = np.append(rates, rate**m)
-        return ReferenceModelDesign(transition, gamma[:, 0].copy(), last, dt, most)
+        model = ReferenceModelDesign(transition, gamma[:, 0].copy(), last, dt)
+        most = float(self.rate_limit) * dt
+        return BoundedModelDesign(model, most) if math.isfinite(most) else model
 
-    def memory(self, design: ReferenceModelDesign) -> ReferenceModelMemory:
+    def memory(self, design: ReferenceModelDesign | BoundedModelDesign) -> ReferenceModelMemory:
         """Return the state at rest at zero."""
-        return ReferenceModelMemory(np.zeros(2 * design.input.size), np.zeros(1))
+        return ReferenceModelMemory(np.zeros(2 * self.order), np.zeros(1))
 
 
 # ---- Han's tracking differentiator ----
