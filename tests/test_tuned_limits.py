@@ -331,7 +331,7 @@ def test_axes_that_do_not_notice_each_other_are_judged_as_single_loops() -> None
         scenarios.append(ql.Scenario(ql.signals.Step(size, 0.1), duration=3.0))
     free = [ql.ADRC(ql.ESO.model_free(1, 1.0, 40.0, dt), 10.0) for _ in gains]
     both = ql.Axes(free, B0=np.diag(gains), u_min=[-1.0, -2.0], u_max=[1.0, 2.0])
-    plant = ql.plants.MultivariableLinearPlant(np.zeros((2, 2)), np.diag(gains), np.eye(2))
+    plant = ql.plants.LinearPlant(np.zeros((2, 2)), np.diag(gains), np.eye(2))
     file = Written(
         plant,
         ql.Scenario([each.reference for each in scenarios], duration=3.0),

@@ -15,7 +15,7 @@ import numpy as np
 from quell.analysis.matrices import linear_part_of
 from quell.analysis.multivariable import MultivariableLoop
 from quell.controllers.axes import Axes
-from quell.plants.multivariable import DelayedInputs, EncodedOutputs
+from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.nonlinear import checked_point
 from quell.tuning.acceptance import WORSE, conditionally_stable, file_without_step
 from quell.tuning.optimiser.coupled import CoupledLoops, Found, Plant

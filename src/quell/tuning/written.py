@@ -14,14 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.plants.base import measure
+from quell.plants.base import measure_all, outputs_of
 from quell.plants.linear import LinearPlant
-from quell.plants.multivariable import measure_all
 from quell.quantities import UNKNOWN, Signals
 from quell.records.metrics import SETTLING_BAND, settling_time
 from quell.signals import Signal, Step, as_signal
 from quell.simulation import Scenario, simulate
-from quell.simulation.several import signals_in
 from quell.types import Vector
 
 # Samples up to which a run is plain Python: that takes as long as code that is loaded from the disk
@@ -150,11 +148,8 @@ class Written:
     @cached_property
     def _signals(self) -> tuple[tuple[Signal, ...], tuple[Signal, ...], tuple[Signal, ...]]:
         """References, disturbances and noise."""
-        if self.axis is not None:
-            outputs = self.plant.outputs
-            return signals_in(self.scenario, self.plant, outputs, outputs)
-        r, loads, noise = self.scenario.seeded_signals(self.plant.disturbances)
-        return (r,), loads, (noise,)
+        plant, outputs = self.plant, outputs_of(self.plant)
+        return self.scenario.seeded(outputs, plant.disturbances, outputs, plant)
 
     @property
     def loads(self) -> tuple[Signal, ...]:
@@ -182,11 +177,9 @@ class Written:
         x0 = self.scenario.x0
         x: Vector = np.zeros(self.plant.order) if x0 is None else np.asarray(x0, dtype=np.float64)
         model = self.plant.sampled(self.dt, interpret=True)
-        if self.axis is None:
-            return float(measure(model, x))
-        y = np.zeros(self.plant.outputs)
+        y = np.zeros(outputs_of(self.plant))
         measure_all(model, x, y)
-        return float(y[self.axis])
+        return float(y[self.axis or 0])
 
     @cached_property
     def _events(self) -> tuple[tuple[int, float], ...] | None:
