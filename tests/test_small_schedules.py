@@ -216,7 +216,8 @@ def test_with_the_compensator_the_loop_keeps_its_bounds_and_leaves_a_tenth_of_a_
     assert lines[0].startswith("Compensator with a model-free (order 1) observer, omega_o = ")
     assert lines[1].startswith("controller alone: M_s 1.05 (1.06 at other speeds of the plant)")
     assert lines[3].startswith(f"a load leaves {found.after.iae / found.before.iae:.3g} of what")
-    assert len(lines) == 4
+    assert lines[4].startswith("conditionally stable: it bears ")
+    assert len(lines) == 5
     tables = tomllib.loads(found.toml)
     observer = found.compensator.observer
     assert tables["observer"]["kind"] == "model-free"

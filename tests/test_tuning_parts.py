@@ -184,20 +184,6 @@ def test_what_is_not_known_of_axes_is_said() -> None:
     )
 
 
-def test_steps_that_ask_for_more_than_half_the_range_of_an_actuator_are_named() -> None:
-    """Half of 3 over what ω_c asks of each actuator through B0⁻¹."""
-    limited = changed(controller=axes(u_min=[-1.0, -2.0], u_max=[2.0, 2.0]))
-    (line,) = limited._limits()
-    inverse = np.linalg.inv(B0)
-    steps = []
-    for i, axis in enumerate(limited.axes):
-        asked = np.abs(inverse[:, i]) * axis.omega_c
-        half = np.array([1.5, 2.0])
-        steps.append(min(half[k] / asked[k] for k in (0, 1) if asked[k] > 0.0))
-    assert f"above {steps[0]:.3g} of x, {steps[1]:.3g} of y asks for" in line
-    assert tuned()._limits() == []
-
-
 def test_bounds_and_checks_of_axes_are_sentences() -> None:
     """At most, at least, and one without a value."""
     assert (

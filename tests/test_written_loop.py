@@ -12,10 +12,11 @@ import quell as ql
 from quell.plants.linear import LinearPlant
 from quell.quantities import Quantity, Signals
 from quell.records.metrics import SETTLING_BAND
-from quell.tuning import reference, written
+from quell.tuning import reference, tables
 from quell.tuning.acceptance import Judged, _described, _slow, prefilter_table
 from quell.tuning.reference import Axis
-from quell.tuning.written import MoveFigures, Overload, Rest, StepFigures, Written
+from quell.tuning.tables import Rest
+from quell.tuning.written import MoveFigures, Overload, StepFigures, Written
 
 from .cases import cases
 
@@ -47,50 +48,50 @@ def loop(
 
 def test_what_holds_a_plant_at_rest_solves_its_equations() -> None:
     """A lag of gain 2 needs half of y, an axis nothing; a load at the input its own negative."""
-    assert written.held_step(LAG) == pytest.approx(0.5)
-    assert written.held_step(AXIS) == pytest.approx(0.0, abs=1e-12)
-    assert written.held_load(LAG) == pytest.approx(-1.0)
-    assert written.held_load(AXIS) == pytest.approx(-1.0)
+    assert tables.held_step(LAG) == pytest.approx(0.5)
+    assert tables.held_step(AXIS) == pytest.approx(0.0, abs=1e-12)
+    assert tables.held_load(LAG) == pytest.approx(-1.0)
+    assert tables.held_load(AXIS) == pytest.approx(-1.0)
     none = LinearPlant(LAG.A, LAG.B, LAG.C, np.zeros((1, 0)))
-    assert written.held_load(none) == 0.0
+    assert tables.held_load(none) == 0.0
     half = LinearPlant(LAG.A, LAG.B, LAG.C, 0.5 * LAG.E)
-    assert written.held_load(half) == pytest.approx(-0.5)
+    assert tables.held_load(half) == pytest.approx(-0.5)
 
 
 def test_state_and_load_of_an_operating_point_hold_the_plant_there() -> None:
     """Of u = 0.3 and y = 0.8 a lag of gain 2 needs a load of 0.1; of y = 2 u none."""
-    found = written.rest_of_linear(LAG, Rest(0.3, 0.8))
+    found = tables.rest_of_linear(LAG, Rest(0.3, 0.8))
     x, w = np.array(found.x0), np.array(found.w)
     np.testing.assert_allclose(LAG.A @ x + LAG.B[:, 0] * 0.3 + LAG.E @ w, 0.0, atol=1e-12)
     np.testing.assert_allclose(LAG.C @ x, 0.8)
     assert w[0] == pytest.approx(0.1)
     assert (found.u, found.y) == (0.3, 0.8)
-    assert written.rest_of_linear(LAG, Rest(0.3, 0.6)).w == (0.0,)
+    assert tables.rest_of_linear(LAG, Rest(0.3, 0.6)).w == (0.0,)
 
 
 def test_an_operating_point_lies_within_the_limits_of_u() -> None:
     """Zero where it does, else their middle with y = P(0) u; an axis has none there."""
-    assert written.rest_within(LAG, None, (-1.0, 1.0)) is None
-    assert written.rest_within(LAG, None, (0.0, 1.0)) is None
-    assert written.rest_within(LAG, None, (0.4, 1.0)) == Rest(0.7, pytest.approx(1.4))
+    assert tables.rest_within(LAG, None, (-1.0, 1.0)) is None
+    assert tables.rest_within(LAG, None, (0.0, 1.0)) is None
+    assert tables.rest_within(LAG, None, (0.4, 1.0)) == Rest(0.7, pytest.approx(1.4))
     given = Rest(0.4, 0.0)
-    assert written.rest_within(LAG, given, (0.4, 1.0)) is given
+    assert tables.rest_within(LAG, given, (0.4, 1.0)) is given
     with pytest.raises(ValueError, match=r"u at rest = 2: must lie within u_min = 0 and u_max = 1"):
-        written.rest_within(LAG, Rest(2.0, 0.0), (0.0, 1.0))
+        tables.rest_within(LAG, Rest(2.0, 0.0), (0.0, 1.0))
     for plant, limits in ((AXIS, (0.5, 1.0)), (LAG, (0.5, INF))):
         with pytest.raises(ValueError, match="give u and y at rest"):
-            written.rest_within(plant, None, limits)
+            tables.rest_within(plant, None, limits)
 
 
 def test_a_rest_is_given_as_u_and_y() -> None:
     """A linear plant has none of its own; one number is refused."""
-    assert written.rest_of_plant(LAG, DT) is None
-    assert written.checked_rest(None) is None
-    assert written.checked_rest((0.5, 2.0)) == Rest(0.5, 2.0)
+    assert tables.rest_of_plant(LAG, DT) is None
+    assert tables.checked_rest(None) is None
+    assert tables.checked_rest((0.5, 2.0)) == Rest(0.5, 2.0)
     given = Rest(1.0, 2.0, (3.0,))
-    assert written.checked_rest(given) is given
+    assert tables.checked_rest(given) is given
     with pytest.raises(ValueError, match="rest"):
-        written.checked_rest((1.0,))
+        tables.checked_rest((1.0,))
 
 
 @cases(
@@ -110,7 +111,7 @@ def test_steps_and_loads_need_two_fifths_of_the_room_of_u(
     plant: Any, rest: Any, limits: Any, of_axis: float, sizes: Any
 ) -> None:
     """At rest, or on the way of an axis; 1 at most; negative where there is more room."""
-    assert written.held_sizes(plant, rest, limits, of_axis) == pytest.approx(sizes)
+    assert tables.held_sizes(plant, rest, limits, of_axis) == pytest.approx(sizes)
 
 
 # ---- tables
@@ -118,26 +119,26 @@ def test_steps_and_loads_need_two_fifths_of_the_room_of_u(
 
 def test_a_scenario_has_a_step_and_later_a_load() -> None:
     """At rest it begins half of the time later, with the constants that hold the plant."""
-    tables = written.scenario_tables(8.0, 1, None)
-    assert tables["scenario"] == {
+    found = tables.scenario_tables(8.0, 1, None)
+    assert found["scenario"] == {
         "duration": 8.0,
         "reference": {"kind": "step"},
         "disturbances": [{"kind": "step", "at": 4.0}],
     }
-    assert tables["metrics"] == [{"start": 0.0, "stop": 4.0}, {"start": 4.0}]
+    assert found["metrics"] == [{"start": 0.0, "stop": 4.0}, {"start": 4.0}]
     rest = Rest(0.3, 0.8, (0.8,), (0.1,))
-    tables = written.scenario_tables(8.0, 2, rest, (0.4, -0.2))
-    assert tables["scenario"] == {
+    found = tables.scenario_tables(8.0, 2, rest, (0.4, -0.2))
+    assert found["scenario"] == {
         "duration": 12.0,
         "reference": [0.8, {"kind": "step", "at": 4.0, "height": 0.4}],
         "x0": [0.8],
         "disturbances": [[0.1, {"kind": "step", "at": 8.0, "height": -0.2}], 0.0],
     }
-    assert tables["metrics"] == [{"start": 4.0, "stop": 8.0}, {"start": 8.0}]
-    none = written.scenario_tables(8.0, 0, None)
+    assert found["metrics"] == [{"start": 4.0, "stop": 8.0}, {"start": 8.0}]
+    none = tables.scenario_tables(8.0, 0, None)
     assert "disturbances" not in none["scenario"]
     assert none["metrics"] == [{"start": 0.0}]
-    scenario = written.scenario_of(tables["scenario"])
+    scenario = tables.scenario_of(found["scenario"])
     t = np.array([0.0, 3.9, 4.1])
     assert scenario.reference(t).tolist() == pytest.approx([0.8, 0.8, 1.2])
     assert scenario.disturbances[0](np.array([7.9, 8.1])).tolist() == pytest.approx([0.1, -0.1])
@@ -151,25 +152,25 @@ def test_windows_begin_where_signals_begin() -> None:
         "reference": [1.0, {"kind": "step", "at": 2.0}],
         "disturbances": [{"kind": "sinusoid", "start": 6.0}, {"kind": "step", "at": 2.0}, 0.5],
     }
-    assert written.windows_of(scenario) == [
+    assert tables.windows_of(scenario) == [
         {"start": 0.0, "stop": 2.0},
         {"start": 2.0, "stop": 6.0},
         {"start": 6.0},
     ]
     late = {"duration": 2.0, "reference": {"kind": "step", "at": 2.0}}
-    assert written.windows_of(late) == [{"start": 0.0}]
-    assert written.windows_of({}) == [{"start": 0.0}]
+    assert tables.windows_of(late) == [{"start": 0.0}]
+    assert tables.windows_of({}) == [{"start": 0.0}]
 
 
 def test_a_lag_and_a_delay_stand_around_the_plant_of_a_file() -> None:
     """Names go out, paths of a sweep and ranges in; a start gets a zero for each further state."""
-    tables = {
+    found = {
         "plant": {"kind": "lag", "signals": {"y": "x"}, "uncertain": {"gain": [1.0, 2.0]}},
         "scenario": {"x0": [0.5, 7.0]},
         "sweep": {"parameters": {"plant.gain": [1.0], "controller.kp": [2.0]}},
         "tune": {"schedule": {"parameter": "gain"}},
     }
-    found = written.late_tables(tables, LAG, DT, 0.1, 0.3)
+    found = tables.late_tables(found, LAG, DT, 0.1, 0.3)
     assert found["plant"] == {
         "kind": "delayed",
         "delay": 0.1,
@@ -182,17 +183,17 @@ def test_a_lag_and_a_delay_stand_around_the_plant_of_a_file() -> None:
     parameters = {"plant.plant.plant.gain": [1.0], "controller.kp": [2.0]}
     assert found["sweep"]["parameters"] == parameters
     assert found["tune"]["schedule"] == {"parameter": "plant.plant.gain"}
-    assert written.late_tables(tables, LAG, DT) == tables
+    assert tables.late_tables(found, LAG, DT) == found
     points = {"points": [{"at": 1.0, "plant": {"gain": 2.0}}]}
-    only = written.late_tables({"plant": "lag", "tune": {"schedule": points}}, LAG, DT, 0.1)
+    only = tables.late_tables({"plant": "lag", "tune": {"schedule": points}}, LAG, DT, 0.1)
     assert only["plant"] == {"kind": "delayed", "delay": 0.1, "plant": {"kind": "lag"}}
     assert only["tune"]["schedule"] == {"points": [{"at": 1.0, "plant": {"plant": {"gain": 2.0}}}]}
     names = {"plant": "lag", "tune": {"schedule": {"parameter": ["a", "b"]}}}
-    found = written.late_tables(names, LAG, DT, 0.1)
+    found = tables.late_tables(names, LAG, DT, 0.1)
     assert found["tune"]["schedule"] == {"parameter": ["plant.a", "plant.b"]}
-    table, more = written.plant_table(LAG, 0.3, 0.1, DT)
+    table, more = tables.plant_table(LAG, 0.3, 0.1, DT)
     assert (table["kind"], table["plant"]["kind"], more) == ("delayed", "lagged", 3)
-    assert written.plant_table(LAG, 0.0, 0.0, DT)[1] == 0
+    assert tables.plant_table(LAG, 0.0, 0.0, DT)[1] == 0
 
 
 # ---- figures
@@ -329,7 +330,7 @@ def test_loads_beyond_the_room_of_u_last_five_and_twenty_time_constants() -> Non
     """1.4 times what u can hold; y is back soon, as the PI controller does not wind up."""
     shown = loop(reference=0.0, disturbances=(0.0,), duration=2.0)
     controller = pi(4.0, 4.0, u_min=-1.0, u_max=1.0)
-    found = shown.overloads(controller, None, 0.1, written.held_load(LAG))
+    found = shown.overloads(controller, None, 0.1, tables.held_load(LAG))
     assert [each.duration for each in found] == pytest.approx([0.5, 2.0])
     assert [each.load for each in found] == pytest.approx([-1.4, -1.4])
     # u is at 1, so 0.4 of the load is left: y goes towards 2 · 0.4 with 1 − e^{−t}.
@@ -457,9 +458,9 @@ def test_a_profile_generator_moves_an_axis_within_its_room() -> None:
 
 
 def test_profiles_are_tried_from_the_quickest_on() -> None:
-    """Three shares of the room, with ramps of four samples and of one and three time constants."""
+    """Three shares of the room, each with the ramps that are given."""
     axis = Axis(0.125, 0.25)
-    tried = [*reference._profiles(axis, 2.0, 0.5, 0.3, DT)]
+    tried = [*reference._profiles(axis, 2.0, 0.5, (4 * DT, 0.3, 0.9))]
     times = [reference._duration(each, 2.0) for each in tried]
     assert times == sorted(times)
     assert len(tried) == 9
