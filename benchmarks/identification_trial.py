@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 import quell as ql
+from quell.identification.delays import delayed
 from quell.identification.model import Structure, output
 from quell.identification.output_error import refine
-from quell.identification.search import delayed
 from quell.identification.validation import nrmse
 from quell.types import Vector
 

@@ -11,10 +11,10 @@ from scipy import signal
 
 import quell as ql
 from quell.identification import Root, excitation, read_record
+from quell.identification.delays import delayed
 from quell.identification.identify import identify
 from quell.identification.model import Structure, output, output_gradient
 from quell.identification.output_error import descend, projected
-from quell.identification.search import delayed
 from quell.identification.starts import reduced_models, stable
 from quell.identification.validation import residuals
 

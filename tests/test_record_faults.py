@@ -10,7 +10,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import quell as ql
 from quell.commissioning import measured
-from quell.identification.search import delayed
+from quell.identification.delays import delayed
 from quell.tuning.plants import record_model
 
 DT = 0.01

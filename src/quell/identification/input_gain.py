@@ -22,6 +22,7 @@ import numpy as np
 
 from quell import checks
 from quell.identification.bandwidth import Candidate, Reach, bandwidth, near
+from quell.identification.delays import delayed
 from quell.identification.identify import resolution_of
 from quell.identification.model import Structure, autocorrelation, linear_columns, nonzero_lengths
 from quell.identification.running_loop import (
@@ -35,7 +36,6 @@ from quell.identification.running_loop import (
     power,
     responses,
 )
-from quell.identification.search import delayed
 from quell.identification.starts import equation, filtered_estimates
 from quell.identification.validation import residuals
 from quell.parallel import one_blas_thread

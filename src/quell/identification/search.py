@@ -1,50 +1,31 @@
-"""The search for a model: start, refinement, friction, delay, poles at zero.
-
-The search for the delay of u: in whole samples, then with a part of one.
-
-A model with a wrong delay has other poles, so the error of one model at several delays says little,
-and it has a local minimum for each period of a resonance. Therefore a model is estimated at every
-delay of the range (at evenly spread ones of a long range, then at all between the best of them)
-from the part of the record in which u moves most. The best delays and the shortest one, in which
-such an estimate may fail, are searched in full, and small steps lead to the nearest minimum of
-each.
-
-Where the best delay is among the longest ones of a range that may grow, the range is doubled, until
-it is not, or the record is too short.
-
-A part φ of a sample is estimated last. A held u that is late by it is no held signal, but a plant
-that is slow beside a sample sees no difference to ::
-
-    Σ_i h_i u[k − i],  i = −1 … 2,     h_i = Π_{j≠i} (φ − j)/(i − j)
-
-whose response differs from ``exp(−jω φ)`` by less than 0.003 up to ω = 0.6 rad per sample (Lagrange
-interpolation; Laakso et al., *IEEE Signal Processing Magazine* 13, 1996). The part is kept where
-the likelihood ratio shows it; else the delay is a whole number of samples.
-
-Friction in the search: the signs of the speed, and the least error of the simulated model.
-
-With v, the signs of the speed, known the model is linear in F, and the search is that for any other
-input. But v depends on θ: a model with more friction stops earlier. So the search ends with the
-output of the simulated model, which takes v from its own speed (``structure``): its error is
-minimised by Levenberg and Marquardt's method, with derivatives ψ by differences whose steps change
-the output by a share of its error. The covariance is that of ``output_error`` with these ψ: those
-for known v say nothing of what the moments of reversal tell, and are wrong where a plant sticks.
-
-The search for a model: start, refinement, signs of friction, delay of u, and poles at s = 0.
-"""
+"""The search for a model: start, refinement, signs of friction, delay of u, and poles at s = 0."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
+from quell.identification.delays import (
+    ROUNDING,
+    from_poles,
+    longest,
+    nearest_delay,
+    start_with_delay,
+    with_delay,
+    with_part_of_sample,
+)
+from quell.identification.friction_search import (
+    add_driven_friction,
+    least_simulated,
+    measured_sign,
+    simulated_delay,
+)
 from quell.identification.model import (
     WITHIN_95,
     Structure,
-    free_run,
     gain_interval,
     nonzero_lengths,
     output,
@@ -56,7 +37,6 @@ from quell.identification.output_error import (
     covariance,
     covariance_of,
     descend,
-    gauss_newton,
     likelihood_ratio,
     noise_model,
     refine,
@@ -66,450 +46,17 @@ from quell.identification.starts import (
     AtRest,
     Start,
     best_start,
-    filtered_estimates,
-    from_any_start,
     from_rest,
     general,
     probability,
-    refined,
     smaller,
     structure_at_rest,
     with_poles,
 )
 from quell.types import Matrix, Vector
 
-# ---- The search for the delay of u, in whole samples ----
-
-# Most delays that are estimated, number of samples for it, and number of delays that are searched
-# in full besides the shortest. Chosen by hand: the first two limit the time, and a second minimum
-# is sometimes better.
-_SCANNED, _SAMPLES, _SEARCHED = 25, 4000, 2
-# Mean square errors of estimates up to this factor of the least may become the least: by hand.
-_NEARLY = 1.5
-# Steps of the refinement at the neighbours, where a good start is known, and of a model that goes
-# on to the next delay: chosen by hand.
-_STEPS, _FEW_STEPS = 12, 3
-# Samples between which a part of one is interpolated, and to what share of one it is searched.
-_TAPS, _PART = (-1, 0, 1, 2), 1e-4
-# Probability of a part of a sample by chance, and step of the derivative by the delay [samples].
-_BY_CHANCE, _STEP_OF_DELAY = 1e-3, 0.05
-# Part of a sample that is none, beside friction: chosen by hand.
-_HARDLY_A_PART = 0.02
-# Longest delay, as a share of the samples: the rest has to show the plant.
-MOST_SHARE = 0.25
-
-
-def delayed(u: Vector, delay: float) -> Vector:
-    """Return ``u`` later by ``delay`` samples; before the record it has its first value.
-
-    After it, for a part of a sample, it has its last one.
-    """
-    whole = math.floor(delay)
-    part = delay - whole
-    if part == 0.0:
-        return u if whole == 0 else np.concatenate([np.full(whole, u[0]), u[:-whole]])
-    long = np.concatenate([np.full(whole + 2, u[0]), u, u[-1:]])
-    found = np.zeros(u.size)
-    for i in _TAPS:
-        weight = math.prod((part - j) / (i - j) for j in _TAPS if j != i)
-        found += weight * long[2 - i : 2 - i + u.size]
-    return found
-
-
-def with_delay(structure: Structure, v: Matrix, u: Vector, delay: float) -> Matrix:
-    """Return the inputs ``v`` with ``u`` later by ``delay`` samples as the first."""
-    parts = [delayed(u[place], delay) for place in structure.records(u.size)]
-    return np.column_stack([np.concatenate(parts), v[:, 1:]])
-
-
-def start_with_delay(
-    structure: Structure,
-    u: Vector,
-    v: Matrix,
-    y: Vector,
-    delays: tuple[float, float],
-    grows: bool,
-    report: Callable[[], None],
-) -> tuple[tuple[float, float], float, Start]:
-    """Return the range that was searched, the delay of least output error, and the model at it.
-
-    ``delays`` is the range at first; it is extended if it ``grows``. ``report`` is called between
-    the parts of the search.
-    """
-    if delays[0] == delays[1]:
-        return delays, delays[0], best_start(structure, with_delay(structure, v, u, delays[0]), y)
-    part = _moving_part(structure, u)
-    single, of_part = from_any_start(structure, v[part])
-
-    def costs(delays: range) -> dict[int, float]:
-        report()
-        return _costs(single, u[part], of_part, y[part], delays)
-
-    low, first = (int(end) for end in delays)
-    high, stride, found = _scanned(costs, (low, first), longest(structure, y, grows))
-    near = []
-    for delay in dict.fromkeys([*_minima(found, stride), low]):
-        report()
-        start = best_start(structure, with_delay(structure, v, u, delay), y)
-        found_near = nearest_delay(structure, start.estimate, u, v, y, (low, high), delay, stride)
-        near.append((found_near[0], start._replace(estimate=found_near[1])))
-    return (low, high), *min(near, key=lambda one: one[1].estimate.cost)
-
-
-def from_poles(
-    structure: Structure,
-    poles: Sequence[Vector],
-    u: Vector,
-    v: Matrix,
-    y: Vector,
-    delays: tuple[float, float],
-    report: Callable[[], None],
-) -> tuple[float, ParameterEstimate]:
-    """Return the delay of least output error in a range, and the model at it, from given poles.
-
-    ``poles`` are the coefficients a (n,) of polynomials. ``report`` is called at each delay.
-    """
-    if delays[0] == delays[1]:
-        inputs = with_delay(structure, v, u, delays[0])
-        tried = [descend(structure, with_poles(structure, a), inputs, y, _STEPS) for a in poles]
-        return delays[0], min(tried, key=lambda one: one.cost)
-    low, high = (int(end) for end in delays)
-    stride = -(-(high - low + 1) // _SCANNED)
-    starts = [with_poles(structure, a) for a in poles]
-    costs: dict[int, float] = {}
-    known: dict[int, ParameterEstimate] = {}
-    before: list[Vector] = []
-    for delay in range(low, high + 1, stride):
-        report()
-        inputs = with_delay(structure, v, u, delay)
-        tried = [descend(structure, one, inputs, y, _FEW_STEPS) for one in (*starts, *before)]
-        known[delay] = min(tried, key=lambda one: one.cost)
-        costs[delay], before = known[delay].cost, [known[delay].theta]
-    near = [
-        nearest_delay(structure, known[delay], u, v, y, (low, high), delay, stride)
-        for delay in _minima(costs, stride)
-    ]
-    return min(near, key=lambda one: one[1].cost)
-
-
-def longest(structure: Structure, y: Vector, grows: bool) -> int:
-    """Return the longest delay to which a range may grow; 0 if it may not."""
-    shortest = min(place.stop - place.start for place in structure.records(y.size))
-    return int(MOST_SHARE * shortest) if grows else 0
-
-
-def _scanned(
-    costs: Callable[[range], dict[int, float]], delays: tuple[int, int], most: int
-) -> tuple[int, int, dict[int, float]]:
-    """Return the longest delay, the step, and the errors over a range that may grow up to ``most``.
-
-    It is doubled as long as the least error is in its last fifth.
-    """
-    low, high = delays
-    stride = -(-(high - low + 1) // _SCANNED)
-    found = costs(range(low, high + 1, stride))
-    while min(found, key=lambda one: found[one]) > high - 0.2 * (high - low) and high < most:
-        first, high = max(found) + stride, min(2 * high, most)
-        found |= costs(range(first, high + 1, stride))
-    return high, stride, found
-
-
-def _minima(costs: dict[int, float], stride: int) -> list[int]:
-    """Return the delays of the best local minima, the least error first."""
-    least = min(costs.values())
-    minima = [
-        delay
-        for delay in costs
-        if costs[delay] <= min(costs.get(delay - stride, np.inf), costs.get(delay + stride, np.inf))
-        and costs[delay] <= _NEARLY * least
-    ]
-    return sorted(minima, key=lambda one: costs[one])[:_SEARCHED] or [min(costs)]
-
-
-def _moving_part(structure: Structure, u: Vector) -> slice:
-    """Return the part of a record, ``_SAMPLES`` long at most, in which u moves most."""
-    best = (-1.0, slice(0, 0))
-    for place in structure.records(u.size):
-        moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(u[place])))])
-        for first in range(0, max(moved.size - _SAMPLES // 2, 1), _SAMPLES // 4):
-            last = min(first + _SAMPLES, moved.size)
-            # The response to what happens in the last half of it would be cut off.
-            until = max(first + (last - first) // 2, first + 1)
-            amount = float(moved[until - 1] - moved[first]) + 0.1 * float(
-                moved[last - 1] - moved[first]
-            )
-            if amount > best[0] * (1.0 + 1e-9):
-                best = amount, slice(place.start + first, place.start + last)
-    return best[1]
-
-
-def _costs(
-    structure: Structure, u: Vector, v: Matrix, y: Vector, delays: range
-) -> dict[int, float]:
-    """Return the mean square error of an estimated model at each of the delays."""
-    costs: dict[int, float] = {}
-    for delay in delays:
-        inputs = with_delay(structure, v, u, delay)
-        theta = filtered_estimates(structure, inputs, y)[0]
-        costs[delay] = refined(structure, theta, inputs, y)[0]
-    return costs
-
-
-def nearest_delay(
-    structure: Structure,
-    estimate: ParameterEstimate,
-    u: Vector,
-    v: Matrix,
-    y: Vector,
-    delays: tuple[float, float],
-    delay: float,
-    step: int = 1,
-) -> tuple[float, ParameterEstimate]:
-    """Return the delay of least output error near ``delay``, and the model at it."""
-    known = {delay: estimate}
-    while step:
-        for other in (delay + step, delay - step):
-            if delays[0] <= other <= delays[1] and other not in known:
-                inputs = with_delay(structure, v, u, other)
-                known[other] = descend(structure, known[delay].theta, inputs, y, _STEPS)
-        best = min(known, key=lambda one: known[one].cost)
-        delay, step = (best, step) if best != delay else (delay, step // 2)
-    return delay, known[delay]
-
-
-def with_part_of_sample(
-    structure: Structure,
-    estimate: ParameterEstimate,
-    u: Vector,
-    v: Matrix,
-    y: Vector,
-    delay: float,
-    searched: tuple[float, float],
-) -> tuple[float, ParameterEstimate]:
-    """Return the delay with its part of a sample, and the model at it.
-
-    The whole one, with the given model, if the record does not show the part.
-    """
-    from scipy.optimize import minimize_scalar
-    from scipy.stats import chi2
-
-    near = estimate
-
-    def cost(late: float) -> float:
-        nonlocal near
-        found = descend(structure, near.theta, with_delay(structure, v, u, late), y, _STEPS)
-        near = found if found.cost < near.cost else near
-        return found.cost
-
-    ends = max(delay - 1.0, searched[0]), min(delay + 1.0, searched[1])
-    found = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": _PART})
-    late = float(found.x)
-    inputs = with_delay(structure, v, u, late)
-    model = descend(structure, near.theta, inputs, y, _STEPS)
-    errors = (
-        y - output(structure, estimate.theta, with_delay(structure, v, u, delay)),
-        y - output(structure, model.theta, inputs),
-    )
-    if not all(np.all(np.isfinite(error)) for error in errors):
-        return delay, estimate
-    ratio = likelihood_ratio(errors, _ROUNDING * float(y @ y))
-    return (late, model) if ratio > chi2.isf(_BY_CHANCE, 1) else (delay, estimate)
-
-
-# ---- Friction in the search ----
-
-# Half width of the mean slope that stands for the measured speed until there is a model [samples]:
-# chosen by hand, the sign of the model's own speed replaces it.
-_HALF_WIDTH = 10
-# Most passes until the signs of friction settle, and the share of them that may still change:
-# chosen by hand; not tuned further.
-_PASSES, _SETTLED = 12, 5e-4
-# Mean signs of a sample that differ by less are the same: chosen by hand.
-_SAME = 1e-3
-# The last steps: relative gain at which they end, and most simulations besides those for the
-# derivatives: chosen by hand, not tuned.
-_GAIN, _MOST_RUNS = 1e-8, 60
-# Steps of the derivatives: share of the error by which the output changes, and the least error
-# relative to y, above rounding; error of a model that is not finite, relative to y: chosen by hand.
-_STEP, _EXACT, _FAR = 0.03, 1e-6, 1e3
-# Steps of the refinement for known signs.
-_FEW_STEPS_FRICTION = 2
-# Range of ω_a²/ω_r² and most trials for the driven side. The ratio is J₁'s share of both inertias;
-# a driven side of less than a tenth of them is rare. The number of trials is chosen by hand.
-_SHARES, _TRIALS = (0.1, 1.0), 10
-
-
-def measured_sign(structure: Structure, y: Vector) -> Vector:
-    """Return minus the sign of the speed: the mean slope of y over ten samples each way.
-
-    In order 1 the speed is y itself.
-    """
-    if structure.order == 1:
-        return -np.sign(y)
-    found, half_width = [], _HALF_WIDTH
-    for place in structure.records(y.size):
-        part = y[place]
-        index = np.arange(part.size)
-        ahead, behind = index + half_width, index - half_width
-        after, before = np.minimum(ahead, part.size - 1), np.maximum(behind, 0)
-        found.append(-np.sign(part[after] - part[before]))
-    return np.concatenate(found)
-
-
-def least_simulated(
-    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
-) -> tuple[ParameterEstimate, Matrix]:
-    """Return the parameters of the least simulated error near an estimate, and the inputs."""
-    best = (np.inf, estimate, v)
-    for _ in range(_PASSES):
-        predicted, own = free_run(structure, estimate.theta, v, own_friction=True)
-        error = float(np.mean((y - predicted) ** 2))
-        best = min(best, (error, estimate, own), key=lambda one: one[0])
-        if np.mean(np.any(np.abs(own - v) > _SAME, axis=1)) <= _SETTLED:
-            break
-        v = own
-        estimate = refine(structure, estimate.theta, v, y, _FEW_STEPS_FRICTION)
-    # An earlier pass may have been better than the last one.
-    _, estimate, v = best
-    return _refined(structure, estimate, v, y)
-
-
-def simulated_delay(
-    structure: Structure,
-    theta: Vector,
-    u: Vector,
-    v: Matrix,
-    y: Vector,
-    searched: tuple[float, float],
-    delay: float,
-) -> float:
-    """Return the delay of the least simulated error near a model [samples].
-
-    The delay is one more parameter; a part of a sample that is hardly one is none.
-    """
-    size = _sizes(structure, theta, v)
-    if size is None:
-        return delay
-    y_hat = free_run(structure, theta, v, own_friction=True)[0]
-    size = np.append(size, float(np.linalg.norm(np.diff(y_hat))) or 1.0)
-
-    def late(x: Vector) -> float:
-        return float(np.clip(delay + x[-1] / size[-1], *searched))
-
-    def error(x: Vector) -> Vector:
-        inputs = with_delay(structure, v, u, late(x))
-        return _error(structure, theta + x[:-1] / size[:-1], inputs, y)
-
-    found = late(_least(error, size.size, y).x)
-    return round(found) if abs(found - round(found)) < _HARDLY_A_PART else found
-
-
-def _refined(
-    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
-) -> tuple[ParameterEstimate, Matrix]:
-    """Return the parameters of the least simulated error near an estimate, and the inputs."""
-    start, size = estimate.theta, _sizes(structure, estimate.theta, v)
-    if size is None:
-        return estimate, v
-
-    def error(x: Vector) -> Vector:
-        return _error(structure, start + x / size, v, y)
-
-    found = _least(error, start.size, y)
-    theta, left = start + found.x / size, error(found.x)
-    inputs = free_run(structure, theta, v, own_friction=True)[1]
-    psi = -_slopes(error, found.x, y, central=True)
-    cov = covariance_of(structure, psi, left) / np.outer(size, size)
-    return ParameterEstimate(theta, cov, float(np.mean(left**2)), bool(found.success)), inputs
-
-
-def _sizes(structure: Structure, theta: Vector, v: Matrix) -> Vector | None:
-    """Return the effect of each parameter on the output for known signs; None if not finite."""
-    with np.errstate(all="ignore"):
-        size = nonzero_lengths(output_gradient(structure, theta, v)[1])
-    return size if np.all(np.isfinite(size)) else None
-
-
-def _least(error: Callable[[Vector], Vector], count: int, y: Vector) -> Any:
-    """Return scipy's result of Levenberg and Marquardt's method from x = 0 (count,)."""
-    from scipy.optimize import least_squares
-
-    def slopes(x: Vector) -> Matrix:
-        return _slopes(error, x, y)
-
-    zero = np.zeros(count)
-    return least_squares(error, zero, slopes, method="lm", ftol=_GAIN, max_nfev=_MOST_RUNS)
-
-
-def _slopes(
-    error: Callable[[Vector], Vector], x: Vector, y: Vector, central: bool = False
-) -> Matrix:
-    """Return the derivatives of the error (N, size), by differences."""
-    here = error(x)
-    h = _STEP * max(float(np.linalg.norm(here)), _EXACT * float(np.linalg.norm(y)))
-    found = np.empty((y.size, x.size))
-    for i, step in enumerate(h * np.eye(x.size)):
-        below = error(x - step) if central else here
-        found[:, i] = (error(x + step) - below) / (2.0 * h if central else h)
-    return found
-
-
-def _error(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Vector:
-    """Return the error of the simulated model (N,); where it is not finite, a large one."""
-    with np.errstate(all="ignore"):
-        predicted = free_run(structure, theta, v, own_friction=True)[0]
-        error = y - predicted
-        usable = bool(np.all(np.isfinite(error))) and math.isfinite(float(error @ error))
-    return error if usable else np.full(y.size, _FAR * float(np.max(np.abs(y)) or 1.0))
-
-
-def add_driven_friction(
-    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
-) -> tuple[Structure, ParameterEstimate, Matrix]:
-    """Add friction on the driven side if there is a resonance; return model and inputs."""
-    from scipy.optimize import minimize_scalar
-
-    v = free_run(structure, estimate.theta, v, own_friction=True)[1]
-    estimate = refine(structure, estimate.theta, v, y, _FEW_STEPS_FRICTION)
-    omega = _resonance(structure.denominator(estimate.theta))
-    if omega == 0.0:
-        return structure, estimate, v
-    # A coefficient is added before those of friction on the measured side; it takes over the value
-    # of their first one.
-    at = structure.places[-1]
-    start = np.insert(estimate.theta, at, estimate.theta[at])
-    start[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
-    wider = structure._replace(degrees=(*structure.degrees[:-1], 0, structure.degrees[-1]))
-    v = np.column_stack([v, v[:, -1]])
-    tried: list[tuple[float, Structure, Vector]] = []
-
-    def error(share: float) -> float:
-        candidate = wider._replace(friction=(1.0 / (share * omega**2), 0.0))
-        theta, predicted = min(tried, key=lambda one: one[0])[2] if tried else start, 0.0
-        for _ in range(2):
-            own = free_run(candidate, theta, v, own_friction=True)[1]
-            predicted, theta = gauss_newton(candidate, theta, own, y)
-        tried.append((predicted, candidate, theta))
-        return predicted
-
-    options = {"xatol": 1e-2, "maxiter": _TRIALS}
-    minimize_scalar(error, bounds=_SHARES, method="bounded", options=options)
-    _, wider, theta = min(tried, key=lambda one: one[0])
-    v = free_run(wider, theta, v, own_friction=True)[1]
-    return wider, refine(wider, theta, v, y, _FEW_STEPS_FRICTION), v
-
-
-def _resonance(a: Vector) -> float:
-    """Return |p| of the least damped pair of poles [1/sample]; 0.0 if there is no stable pair."""
-    poles = np.roots(np.append(1.0, a[::-1]))
-    pairs = poles[(poles.imag > 0.0) & (poles.real <= 0.0)]
-    return float(np.abs(pairs[np.argmin(-pairs.real / np.abs(pairs))])) if pairs.size else 0.0
-
-
-# ---- The search for a model ----
-
 # Steps of the refinement on the way, and most of them at the end: chosen by hand, not tuned.
-_FEW_STEPS_SEARCH, _STEPS_SEARCH = 2, 60
+_FEW_STEPS, _STEPS = 2, 60
 # Most rounds of the delay with friction: chosen by hand.
 _ROUNDS = 4
 # A pole is set to s = 0 within three standard deviations of it (99.7 %), or if its time constant is
@@ -523,7 +70,6 @@ _SLOWER = 10.0
 # the fit; or increase it to this share of the output's mean square. With friction the signs that
 # are not settled decide the fit, and only the factors hold. Chosen by hand.
 _MOST_COST, _FIT_SHARE = {1: 30.0, 2: 1.05}, 0.005
-_ROUNDING = 1e-18
 # A gain whose interval is within ±2 % needs no assumption on the start, one within ±10 % only
 # if it is sure: chosen by hand. A start at rest is likely from this probability on.
 _CERTAIN, _USEFUL, _LIKELY = 0.02, 0.1, 0.5
@@ -536,6 +82,8 @@ _SELDOM = 1e-3
 _MOST_DELAYS, _DELAY_STEPS, _WITHIN_95 = 10, 12, 3.84
 # Variance of a delay whose nearest whole number of samples is known.
 _WHOLE = 1.0 / 12.0
+# Step of the derivative by the delay [samples].
+_STEP_OF_DELAY = 0.05
 
 
 class Fit(NamedTuple):
@@ -639,7 +187,7 @@ def _contradicts(found: Fit, at_rest: Fit, u: Vector, y: Vector) -> bool:
     at_rest_error, error = (
         y - output(one.structure, one.estimate.theta, one.inputs(u)) for one in (at_rest, found)
     )
-    ratio = likelihood_ratio((at_rest_error, error), _ROUNDING * float(y @ y))
+    ratio = likelihood_ratio((at_rest_error, error), ROUNDING * float(y @ y))
     return bool(not ratio <= chi2.isf(_SELDOM, found.structure.order))
 
 
@@ -686,12 +234,12 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
         raise ValueError(f"order = {wanted.order}, zeros = {wanted.zeros}: {none}")
     wanted.report()
     whole = with_delay(structure, v, u, delay)
-    estimate = descend(structure, start.estimate.theta, whole, y, _STEPS_SEARCH)
+    estimate = descend(structure, start.estimate.theta, whole, y, _STEPS)
     if searched[0] < searched[1] and not structure.direct:
         wanted.report()
         delay, estimate = with_part_of_sample(structure, estimate, u, v, y, delay, searched)
     v = with_delay(structure, v, u, delay)
-    estimate = refine(structure, estimate.theta, v, y, _STEPS_SEARCH)
+    estimate = refine(structure, estimate.theta, v, y, _STEPS)
     if wanted.integrators is None:
         structure, estimate = _set_integrators(structure, estimate, v, y)
     if friction and wanted.order > 3:
@@ -701,7 +249,7 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
     if friction:
         estimate, v = least_simulated(structure, estimate, v, y)
     else:
-        estimate = refine(structure, estimate.theta, v, y, _STEPS_SEARCH)
+        estimate = refine(structure, estimate.theta, v, y, _STEPS)
     if friction and searched[0] < searched[1]:
         # With wrong signs of the speed another delay may have been the best.
         for _ in range(_ROUNDS):
@@ -783,7 +331,7 @@ def _over_delays(
         return _with_part(structure, estimate, u, v, y, delay, size)
     error = y - output(structure, estimate.theta, v)
     c, power = noise_model(error)
-    least = max(power, _ROUNDING * float(np.mean(y**2))) * y.size
+    least = max(power, ROUNDING * float(np.mean(y**2))) * y.size
     low = high = delay
     found = [(1.0, 0.0, estimate)]
     for step in (-1, 1):
@@ -862,7 +410,7 @@ def without_fast_poles(found: Fit, u: Vector, y: Vector) -> Fit:
     v = found.inputs(u)
     start = with_poles(lower, np.asarray(np.poly(slow).real[:0:-1], dtype=np.float64))
     near = refine(lower, start, v, y, _WITHOUT_FAST)
-    if not near.cost <= _HARDLY * found.estimate.cost + _ROUNDING * float(np.mean(y**2)):
+    if not near.cost <= _HARDLY * found.estimate.cost + ROUNDING * float(np.mean(y**2)):
         return found
     over = _over_delays(lower, near, u, v, y, found.delay, found.searched)
     return found._replace(structure=lower, estimate=over[0], delays=over[1])
@@ -888,7 +436,7 @@ def _set_integrators(
         part = covariance[: a.size, : a.size]
         if slower_than_record or squared_distance_from_zero(a, part, slow[:count]) < limit:
             fewer = structure._replace(integrators=count)
-            steps = _FEW_STEPS_SEARCH if structure.friction else _STEPS_SEARCH
+            steps = _FEW_STEPS if structure.friction else _STEPS
             without = refine(fewer, estimate.theta[count:], v, y, steps)
             if without.cost <= _most_cost(structure, count, estimate.cost, y):
                 return fewer, without
@@ -901,4 +449,4 @@ def _most_cost(structure: Structure, count: int, cost: float, y: Vector) -> floa
     if not structure.friction:
         error, spread = float(np.sqrt(cost)), float(np.std(y))
         most = min(most, (error + _FIT_SHARE * max(spread - error, 0.0)) ** 2)
-    return max(most, _ROUNDING * float(np.mean(y**2)))
+    return max(most, ROUNDING * float(np.mean(y**2)))
