@@ -38,7 +38,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     "identify_b0": identification.identify_b0,
     "identify_b0_by": identification.identify_b0_by,
     "identify_b0_matrix": identification.identify_b0_matrix,
-    "frequency_response": identification.frequency_response,
+    "frequency_response": lambda **given: identification.frequency_response(**given)._asdict(),
     "excitation": identification.excitation,
 }
 """What a case of ``tuned`` or ``identified`` calls."""

@@ -18,6 +18,7 @@ from quell.cli.options import (
     Overwrite,
     ReadOptions,
     ResultOutputs,
+    Switch,
     Trust,
     Whole,
     WholeOrNone,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 # Fits below which u and y may be swapped, and above which they are [%]: chosen by hand.
 _COLLAPSED, _GOOD = 20.0, 60.0
+_OF_FREQUENCY = ("f\n[Hz]", "|G|", "|G|\n[dB]", "phase\n[°]", "coherence", "±\n[%]")
 _HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping")
 
 
@@ -44,6 +46,7 @@ def identify(
     horizon: Whole = 10,
     validate: Path | None = None,
     alternatives: bool = True,
+    frequencies: Switch = False,
     read: ReadOptions = READ_OPTIONS,
     of_model: ModelOptions = MODEL_OPTIONS,
     outputs: Outputs = OUTPUTS,
@@ -70,6 +73,8 @@ def identify(
         Another record, with the same columns, on which the model is judged, too.
     alternatives
         Fit other orders, with and without friction, and say what the record decides.
+    frequencies
+        Fit no model: print the frequency response with its coherence and deviation.
     """
     from quell.commissioning import measured_records
     from quell.identification import alternatives as other_structures
@@ -78,10 +83,16 @@ def identify(
     how = read.columns, dt, read.time_unit, read.max_size
     records = measured_records(data, *how)
     record, several = records[0], len(records) > 1
+    unused = options_of(of_model, MODEL_OPTIONS)
+    unused |= {"order": (order, 4), "delay": (delay, None), "validate": (validate, None)}
+    unused |= {"horizon": (horizon, 10), "no-alternatives": (alternatives, True)}
+    if frequencies:
+        refuse(unused, "is for a model; with --frequencies none is fitted")
+        if several:
+            raise ValueError(f"data: --frequencies goes with one record, not with {len(records)}")
+        _frequencies(record, data[0].name, bool(read.columns), outputs)
+        return
     if not several and record.u.min() == record.u.max():
-        unused = options_of(of_model, MODEL_OPTIONS)
-        unused |= {"order": (order, 4), "delay": (delay, None), "validate": (validate, None)}
-        unused |= {"horizon": (horizon, 10), "no-alternatives": (alternatives, True)}
         refuse(unused, "is for a u that moves; here it rests, and the modes of y are found")
         _modes(record, data[0].name, outputs)
         return
@@ -142,6 +153,35 @@ def identify(
     write_results(console, results, outputs, paths)
     if model.fails:
         sys.exit(ExitCode.NOT_VALID)
+
+
+def _frequencies(record: Measured, name: str, with_reference: bool, outputs: Outputs) -> None:
+    """Print, draw and write the frequency response of a record."""
+    import numpy as np
+
+    from quell.experiments.common import save_figure
+    from quell.identification import frequency_response
+
+    outputs = check_outputs(outputs, ["identified"])
+    console = Console()
+    # A recording of a loop has a reference, which need not be used.
+    r = record.reference if with_reference else None
+    found = frequency_response(record.u, record.y, record.dt, reference=r, method="auto")
+    print_line(console, f"{name}: {record.y.size} samples, dt = {record.dt:g} s")
+    rows = table("Frequency response", *_OF_FREQUENCY)
+    for i in found.rows():
+        G = complex(found.response[i])
+        size = abs(G)
+        numbers = found.frequency[i], size, 20.0 * math.log10(size), np.degrees(np.angle(G))
+        cells = (f"{value:.4g}" for value in (*numbers, found.coherence[i]))
+        rows.add_row(*cells, f"{100.0 * found.deviation[i]:.2g}")
+    console.print(rows)
+    print_line(console, found.describe())
+    paths: list[Path] = []
+    if outputs.figures:
+        figure = found.plot()[0].figure
+        paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
+    write_results(console, found.to_json(), outputs, paths)
 
 
 def _modes(record: Measured, name: str, outputs: Outputs) -> None:

@@ -9,12 +9,11 @@ files here put them together.
 
 from quell.identification.excitation import (
     Excitation,
-    FrequencyResponse,
     excitation,
-    frequency_response,
     interleaved_excitations,
     save_excitations,
 )
+from quell.identification.frequencies import FrequencyResponse, frequency_response
 from quell.identification.gain_by_signal import GainBin, identify_b0_by
 from quell.identification.gain_matrix import InputGainMatrix, identify_b0_matrix
 from quell.identification.identify import identify

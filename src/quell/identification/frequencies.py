@@ -8,10 +8,10 @@ Audio Electroacoustics* 15, 1967). Its resolution is that of a segment. The rela
 about ``(1 − γ²)/(2 γ² n)`` for the coherence γ² and n independent averages (Bendat & Piersol,
 *Random Data*, 4th ed. 2010, sec. 9.2).
 
-*Periods*: of a u that repeats itself, all periods but the first are averaged. There is no leakage,
-and what differs between them is noise (Pintelon & Schoukens, *System Identification*, 2nd ed. 2012,
-sec. 2.4): with the errors ``e_m = Y_m − Ĝ U_m`` of M periods the variance of Ĝ is ``Σ|e_m|²/(M (M −
-1) |Ū|²)``.
+*Periods*: a u that repeats itself M times has each M-th line of the spectrum of all periods.
+Between them are the noise and the transient of the start: this is a polynomial of second degree
+over the nearest 12 of these lines, what they are off it is the noise, and its value is taken from Y
+and U at the line (Pintelon & Schoukens, *System Identification*, 2nd ed. 2012, sec. 7.3).
 
 *Local polynomials*: leakage is a transient that is as smooth over frequency as G. Around each
 frequency both are polynomials of second degree over 2 n + 1 lines (Pintelon, Schoukens,
@@ -47,17 +47,24 @@ from quell.types import Vector
 Complex = NDArray[np.complex128]
 
 METHODS = ("welch", "periods", "local", "auto")
-# Half width of the window of local polynomials [lines], their degree, and most samples of a
-# segment: with more the lines would be more than a plot or a model needs. Chosen by hand.
-_HALF, _DEGREE, _LONGEST = 6, 2, 16384
+# Half width of the window of local polynomials [lines], their degree, most samples of a
+# segment, as more lines are more than a model needs, and lines near s = 0. Chosen by hand.
+_HALF, _DEGREE, _LONGEST, _LOW = 6, 2, 16384, 64
 # Least number of periods, and of samples of one; largest change from one to the next, as a share of
 # the power; and least size of a line, as a share of the largest. Chosen by hand.
 _PERIODS, _SHORTEST, _REPEATS, _LINE = 3, 16, 1e-8, 1e-3
+# Relative singular value that counts as zero, and what may be lost by it.
+_RANK, _DECIDED = 1e-10, 1e-6
+# Variance relative to that of an even spectrum which is too much, and size of a spectrum, as a
+# share of the largest, that is none. Chosen by hand.
+_MULTIPLIED, _NO_POWER = 100.0, 1e-5
 # Largest relative deviation of a point that is printed, and number of points. Chosen by hand.
-KNOWN = 0.3
+KNOWN = 0.2
 """Relative deviation up to which a point of Ĝ is taken as known."""
 
 _ROWS = 40
+# Relative deviation of a response to the reference from which on it is lost: by hand.
+_LOST = 0.15
 
 
 class FrequencyResponse(NamedTuple):
@@ -76,8 +83,24 @@ class FrequencyResponse(NamedTuple):
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Which points have a relative deviation of 0.3 at most."""
+        """Which points have a relative deviation of 0.2 at most."""
         return self.deviation <= KNOWN
+
+    def describe(self) -> str:
+        """Return how it was estimated, and how many points are known, as text."""
+        names = {
+            "welch": "averaged spectra",
+            "periods": "periods of u",
+            "local": "local polynomials",
+        }
+        share = f"{np.sum(self.known)} of {self.omega.size} frequencies"
+        lines = [f"by {names[self.method]}: {share} are known within {100.0 * KNOWN:g} %"]
+        if not np.any(self.known):
+            lines.append(
+                "NOT: noise hides the response at all frequencies; excite with more power, or "
+                "record longer"
+            )
+        return "\n".join(lines)
 
     def rows(self, most: int = _ROWS) -> list[int]:
         """Return the places of some known points, evenly over the logarithm of frequency."""
@@ -99,7 +122,11 @@ class FrequencyResponse(NamedTuple):
         lines = [
             f"{f:.9g},{g.real:.9g},{g.imag:.9g},{c:.6g},{d:.4g}\n"
             for f, g, c, d, known in zip(
-                self.frequency.tolist(), self.response, self.coherence, self.deviation, self.known,
+                self.frequency.tolist(),
+                self.response,
+                self.coherence,
+                self.deviation,
+                self.known,
                 strict=True,
             )
             if known
@@ -182,8 +209,8 @@ def frequency_response(
     Raises
     ------
     ValueError
-        for records that differ in length, are too short for the number of segments, or have no
-        periods.
+        for records that differ in length, are too short for the number of segments, have no
+        periods, or a u that tells G from the transient at no frequency.
 
     Examples
     --------
@@ -207,7 +234,7 @@ def frequency_response(
     if method == "periods":
         if segments is not None:
             raise ValueError(f"segments = {segments!r}: has no effect on periods; leave it out")
-        return _periods(u, y, r, dt)
+        return _periods(u, y, r, dt, reference is not None)
     if method == "local":
         return _local(u, y, r, dt, segments, reference is not None)
     return _welch(u, y, r, dt, 8 if segments is None else segments)
@@ -238,6 +265,11 @@ def _found(
 ) -> FrequencyResponse:
     """Return the points that are numbers, without the frequency zero."""
     good = np.isfinite(response) & np.isfinite(deviation) & (omega > 0.0)
+    if not np.any(good) and method != "welch":
+        raise ValueError(
+            "u: no frequency is told apart from the transient of the start, as after one step; "
+            "excite with a PRBS, a multisine or a chirp (quell excite)"
+        )
     coherence = np.clip(coherence[good], 0.0, 1.0)
     return FrequencyResponse(omega[good], response[good], coherence, deviation[good], method)
 
@@ -266,89 +298,168 @@ def _period(r: Vector) -> int:
     return 0
 
 
-def _periods(u: Vector, y: Vector, r: Vector, dt: float) -> FrequencyResponse:
-    """Return the response at the lines of a periodic signal; the first period is left out."""
+def _periods(u: Vector, y: Vector, r: Vector, dt: float, closed: bool) -> FrequencyResponse:
+    """Return the response at the lines of a periodic signal."""
     period = _period(r)
     if not period:
         raise ValueError(
             'method = "periods": u (or the reference) does not repeat itself three times; take '
             '"local"'
         )
-    count = (u.size - 1) // period - 1
+    count = (u.size - 1) // period
     first = u.size - 1 - count * period
-
-    def spectra(x: Vector) -> Complex:
-        return np.asarray(np.fft.rfft(np.diff(x)[first:].reshape(count, period), axis=1))
-
-    U, Y, R = spectra(u), spectra(y), np.mean(spectra(r), axis=0)
-    lines = np.flatnonzero(np.abs(R) > _LINE * np.max(np.abs(R)))
-    lines = lines[(lines > 0) & (2 * lines < period)]
-    # With one period there is nothing to compare: ``_PERIODS`` leaves two at least.
-    U, Y = U[:, lines], Y[:, lines]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        of_u, of_y = np.mean(U, axis=0), np.mean(Y, axis=0)
-        response = of_y / of_u
-        noise = np.sum(np.abs(Y - response * U) ** 2, axis=0) / (count - 1)
-        variance = noise / count / np.abs(of_y) ** 2
-        coherence = np.abs(of_y) ** 2 / (np.abs(of_y) ** 2 + noise)
-        # Real and imaginary part have half of it each.
-        deviation = np.sqrt(0.5 * variance)
-    return _found(2.0 * np.pi * lines / (period * dt), response, coherence, deviation, "periods")
+    U, Y, R = (np.fft.rfft(np.diff(x)[first:]) for x in (u, y, r))
+    at = np.arange(count, R.size, count)
+    at = at[(np.abs(R[at]) > _LINE * np.max(np.abs(R))) & (2 * at < count * period)]
+    between = np.flatnonzero(np.arange(R.size) % count)
+    at_line = np.zeros((at.size, 2), dtype=np.complex128)
+    noise = np.zeros((at.size, 3))
+    for i, k in enumerate(at.tolist()):
+        near = between[np.argsort(np.abs(between - k), kind="stable")[: 2 * _HALF]]
+        powers = ((near - k) / _HALF)[:, None] ** np.arange(_DEGREE + 1)
+        both = np.column_stack([Y[near], U[near]])
+        transients, *_ = np.linalg.lstsq(powers, both, rcond=None)
+        at_line[i] = Y[k] - transients[0, 0], U[k] - transients[0, 1]
+        error = both - powers @ transients
+        # The transient at the line itself is not certain either.
+        more = 1.0 + float(np.linalg.inv(powers.T @ powers)[0, 0])
+        of_line = _powers(error[None], at_line[i : i + 1])
+        noise[i] = of_line[0] * more / (near.size - _DEGREE - 1)
+    omega = 2.0 * np.pi * at / (count * period * dt)
+    return _found(omega, *_ratio(at_line, noise, 1.0, closed), "periods")
 
 
 def _local(
     u: Vector, y: Vector, r: Vector, dt: float, segments: int | None, closed: bool
 ) -> FrequencyResponse:
     """Return the response by local polynomials, averaged over segments."""
-    count = u.size - 1
+    count = u.size - 2
     least = 4 * (2 * _HALF + 1)
     parts = -(-count // _LONGEST) if segments is None else checks.whole("segments", segments, 1)
     length = count // parts
     if length < least:
         raise ValueError(
-            f"u has {u.size} samples: must have at least {parts * least + 1} for {parts} "
+            f"u has {u.size} samples: must have at least {parts * least + 2} for {parts} "
             f"segment{'s' * (parts > 1)}; take fewer, or record longer"
         )
-    signals = [np.diff(x)[: parts * length].reshape(parts, length) for x in (u, y, r)]
-    U, Y, R = (np.fft.rfft(x, axis=1)[:, 1 : (length + 1) // 2] for x in signals)
+
+    def spectra(x: Vector, times: int) -> Complex:
+        blocks = np.diff(x, times)[: parts * length].reshape(parts, length)
+        return np.asarray(np.fft.rfft(blocks, axis=1)[:, 1 : (length + 1) // 2])
+
+    U, Y, R = (spectra(x, 1) for x in (u, y, r))
     lines = R.shape[1]
-    # At the ends the window is not symmetric: its centre moves.
-    middle = np.clip(np.arange(lines), _HALF, lines - 1 - _HALF)
-    places = middle[:, None] + np.arange(-_HALF, _HALF + 1)
-    away = (places - np.arange(lines)[:, None]) / _HALF
-    powers = away[:, :, None] ** np.arange(_DEGREE + 1)
-    size = np.sqrt(np.mean(np.abs(R[:, places]) ** 2, axis=(0, 2)))
-    size = np.where(size > 0.0, size, 1.0)
-    rows = 2 * _HALF + 1
-    # All segments have one G and each its own transient.
-    width = _DEGREE + 1
-    X = np.zeros((lines, parts * rows, width * (1 + parts)), dtype=np.complex128)
-    for m in range(parts):
-        block = slice(m * rows, (m + 1) * rows)
-        X[:, block, :width] = (R[m][places] / size[:, None])[:, :, None] * powers
-        X[:, block, width * (m + 1) : width * (m + 2)] = powers
-    targets = [np.concatenate([Z[m][places] for m in range(parts)], axis=1) for Z in (Y, U)]
-    gram = np.conj(np.swapaxes(X, 1, 2)) @ X
-    inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
-    gain = inverse @ np.conj(np.swapaxes(X, 1, 2))
-    of_y, of_u = (np.einsum("kij,kj->ki", gain, target) for target in targets)
-    free = parts * rows - width * (1 + parts)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if closed:
-            response = of_y[:, 0] / of_u[:, 0]
-            error = targets[0] - response[:, None] * targets[1]
-            error = error - np.einsum("kij,kj->ki", X, of_y - response[:, None] * of_u)
-            drive = of_u[:, 0]
-        else:
-            response = of_y[:, 0] / size
-            error = targets[0] - np.einsum("kij,kj->ki", X, of_y)
-            drive = size.astype(np.complex128)
-        noise = np.sum(np.abs(error) ** 2, axis=1) / free
-        variance = noise * np.abs(inverse[:, 0, 0]) / np.abs(response * drive) ** 2
-        power = np.abs(response * drive) ** 2
-        coherence = power / (power + noise)
-        deviation = np.sqrt(0.5 * variance)
-    # Without any r in the window G is not determined.
-    response[np.all(np.abs(R[:, places]) == 0.0, axis=(0, 2))] = np.nan
     omega = 2.0 * np.pi * np.arange(1, lines + 1) / (length * dt)
-    return _found(omega, response, coherence, deviation, "local")
+    size = np.sqrt(np.mean(np.abs(R) ** 2, axis=0))
+    known = _polynomials(U, Y, R, np.arange(lines), _DEGREE, closed)
+    # Between the lines of a multisine G has no slope that could be told; at a line it is known.
+    spread = np.lib.stride_tricks.sliding_window_view(np.pad(size, _HALF), 2 * _HALF + 1)
+    alone = np.median(spread, axis=1) < _LINE * size
+    sparse = np.flatnonzero(np.isnan(known[0]) & alone & (size > _LINE * np.max(size)))
+    if sparse.size:
+        at_lines = _polynomials(U, Y, R, sparse, 0, closed)
+        for values, new in zip(known, at_lines, strict=True):
+            values[sparse] = new
+    # Near s = 0 that of an integrator is no polynomial, but its product with (z − 1)^d is.
+    low = np.arange(min(_LOW, lines))
+    U, R = spectra(u, 0), spectra(r, 0)
+    for d in (1, 2):
+        other = _polynomials(U, spectra(y, d), R, low, _DEGREE, closed)
+        other[0][:] /= (np.exp(1j * omega[low] * dt) - 1.0) ** d
+        better = np.nan_to_num(other[2], nan=np.inf) < np.nan_to_num(known[2][low], nan=np.inf)
+        better &= np.isfinite(other[0])
+        for values, new in zip(known, other, strict=True):
+            values[low[better]] = new[better]
+    return _found(omega, *known, "local")
+
+
+def _polynomials(
+    U: Complex, Y: Complex, R: Complex, at: NDArray[np.int64], degree: int, closed: bool
+) -> tuple[Complex, Vector, Vector]:
+    """Return response, coherence and deviation at some lines; NaN where they are not determined.
+
+    The spectra are (segments, lines). All segments have one G, of ``degree``, and each its own
+    transient, which is projected out.
+    """
+    parts, lines = R.shape
+    # At the ends the window is not symmetric: its centre moves.
+    middle = np.clip(at, _HALF, lines - 1 - _HALF)
+    places = middle[:, None] + np.arange(-_HALF, _HALF + 1)
+    away = (places - at[:, None]) / _HALF
+    powers = away[:, :, None] ** np.arange(_DEGREE + 1)
+    Q = np.linalg.qr(powers)[0]
+
+    def free(Z: Complex) -> Complex:
+        return np.asarray(Z - Q @ (np.swapaxes(Q, 1, 2) @ Z))
+
+    size = np.sqrt(np.mean(np.abs(R[:, places]) ** 2, axis=(0, 2)))
+    scale = np.where(size > 0.0, size, 1.0)[:, None, None]
+    width = degree + 1
+    gram = np.zeros((at.size, width, width), dtype=np.complex128)
+    right = np.zeros((at.size, width, 2), dtype=np.complex128)
+    for of_u, of_y, of_r in zip(U, Y, R, strict=True):
+        X = free(of_r[places][:, :, None] * powers[:, :, :width] / scale)
+        Xh = np.conj(np.swapaxes(X, 1, 2))
+        gram += Xh @ X
+        right += Xh @ free(np.stack([of_y[places], of_u[places]], axis=2))
+    inverse = np.linalg.pinv(gram, rcond=_RANK, hermitian=True)
+    found = inverse @ right
+    if not closed:  # u is its own response
+        found[:, :, 1] = 0.0
+        found[:, 0, 1] = scale[:, 0, 0]
+    noise = np.zeros((at.size, 3))
+    for of_u, of_y, of_r in zip(U, Y, R, strict=True):
+        X = of_r[places][:, :, None] * powers[:, :, :width] / scale
+        error = free(np.stack([of_y[places], of_u[places]], axis=2) - X @ found)
+        noise += _powers(error, found[:, 0])
+    noise /= parts * (2 * _HALF - _DEGREE) - width
+    # Few lines tell the noise of one: with that of its neighbours none looks known by chance.
+    noise = np.maximum(noise, _smoothed(noise))
+    response, coherence, deviation = _ratio(found[:, 0], noise, np.abs(inverse[:, 0, 0]), closed)
+    undecided = np.abs((inverse @ gram)[:, 0, 0] - 1.0) > _DECIDED
+    # After a step u is as smooth over frequency as a transient: noise and curvature of G are
+    # multiplied. Where u has no power there is nothing to tell either.
+    worse = parts * (2 * _HALF + 1) * np.abs(inverse[:, 0, 0]) > _MULTIPLIED
+    nothing = size <= _NO_POWER * np.max(np.abs(R))
+    response[undecided | worse | nothing] = np.nan
+    return response, coherence, deviation
+
+
+def _powers(error: Complex, found: Complex) -> Vector:
+    """Return the sums of |e_y|², |e_u|² and |e_y − G e_u|² (points, 3), with G = y/u.
+
+    ``error`` (points, lines, 2) and the responses ``found`` (points, 2) are of y and u.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        G = (found[:, 0] / found[:, 1])[:, None]
+    parts = error[:, :, 0], error[:, :, 1], error[:, :, 0] - G * error[:, :, 1]
+    return np.column_stack([np.sum(np.abs(part) ** 2, axis=1) for part in parts])
+
+
+def _ratio(
+    found: Complex, noise: Vector, share: Vector | float, closed: bool
+) -> tuple[Complex, Vector, Vector]:
+    """Return the ratio of the responses y and u (points, 2), its coherence and its deviation.
+
+    ``noise`` are the variances of ``_powers`` for a line, of which the responses have a ``share``.
+    Where a response in a closed loop is lost in noise the ratio is minus the inverse of the
+    controller, for which e_y − G e_u is small: then its own deviation counts.
+    """
+    y, u = found.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        response, power = y / u, np.abs(y) ** 2
+        # Real and imaginary part have half of the variance each.
+        of_y, of_u, deviation = np.sqrt(
+            0.5 * share * noise.T / np.array([power, np.abs(u) ** 2, power])
+        )
+        own = np.maximum(of_y, of_u)
+        if closed:
+            deviation = np.where(own > _LOST, np.maximum(own, deviation), deviation)
+        return response, power / (power + noise[:, 0 if closed else 2]), deviation
+
+
+def _smoothed(noise: Vector) -> Vector:
+    """Return the mean over 4 n + 1 points, of fewer at the ends (points, columns)."""
+    from scipy.ndimage import uniform_filter1d
+
+    return np.asarray(uniform_filter1d(noise, 4 * _HALF + 1, axis=0, mode="nearest"))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.identification.excitation import FrequencyResponse, frequency_response
+from quell.identification.frequencies import FrequencyResponse, frequency_response
 from quell.identification.model import (
     WITHIN_95,
     Root,
