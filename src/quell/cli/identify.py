@@ -28,7 +28,14 @@ from quell.cli.options import (
 from quell.cli.output import Console, check_outputs, print_line, table, write_results
 
 if TYPE_CHECKING:
-    from quell.identification import Alternative, Identified, InputGain, Measured, Root
+    from quell.identification import (
+        Alternative,
+        FrequencyTable,
+        Identified,
+        InputGain,
+        Measured,
+        Root,
+    )
 
 # ---- quell identify ----
 
@@ -40,7 +47,7 @@ _HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad
 
 def identify(
     *data: Path,
-    order: Whole = 4,
+    order: WholeOrNone = None,
     delay: float | None = None,
     dt: float | None = None,
     horizon: Whole = 10,
@@ -53,7 +60,9 @@ def identify(
 ) -> None:
     """Fit a continuous transfer function to recorded input and output.
 
-    Of a record in which u rests and y rings the modes are found: their frequency and damping.
+    Of a record in which u rests and y rings the modes are found: their frequency and damping. A
+    table of frequencies (f, magnitude and phase, or real and imaginary part) is fitted in the same
+    way, and the modes of a power spectrum are found.
 
     Parameters
     ----------
@@ -62,11 +71,12 @@ def identify(
         one model, each its own initial state and constant force. A further column of --columns is
         the external input of a closed loop.
     order
-        Number of poles.
+        Number of poles, 4 by default; of a table of frequencies the simplest that holds.
     delay
         Delay of u [s]; with --max-delay the shortest one. By default it is searched if needed.
     dt
-        Sample time [s] of a record without times; columns are then u,y by default.
+        Sample time [s] of a record without times; columns are then u,y by default. Of a table of
+        frequencies the time for which u was held while it was measured.
     horizon
         Number of samples of the prediction ahead.
     validate
@@ -81,10 +91,18 @@ def identify(
     from quell.identification import identify
 
     how = read.columns, dt, read.time_unit, read.max_size
+    if len(data) == 1 and (table := frequencies_in(data[0], read)) is not None:
+        of_time: dict[str, tuple[Any, Any]] = {"horizon": (horizon, 10)}
+        of_time |= {"no-alternatives": (alternatives, True), "validate": (validate, None)}
+        of_time |= {"frequencies": (frequencies, False)} | only_in_time(read, of_model)
+        refuse(of_time, "is for a record in time; this is a table of frequencies")
+        structure = order, of_model.zeros, of_model.integrators
+        _of_table(table, data[0].name, *structure, delay, dt, outputs)
+        return
     records = measured_records(data, *how)
     record, several = records[0], len(records) > 1
     unused = options_of(of_model, MODEL_OPTIONS)
-    unused |= {"order": (order, 4), "delay": (delay, None), "validate": (validate, None)}
+    unused |= {"order": (order, None), "delay": (delay, None), "validate": (validate, None)}
     unused |= {"horizon": (horizon, 10), "no-alternatives": (alternatives, True)}
     if frequencies:
         refuse(unused, "is for a model; with --frequencies none is fitted")
@@ -98,6 +116,7 @@ def identify(
         return
     most = of_model.max_delay
     delays: Any = "if needed" if delay is None else delay
+    order = 4 if order is None else order
     if most is not None:
         delays = (delay or 0.0, most)
     options: dict[str, Any] = {
@@ -153,6 +172,72 @@ def identify(
     write_results(console, results, outputs, paths)
     if model.fails:
         sys.exit(ExitCode.NOT_VALID)
+
+
+def frequencies_in(path: Path, read: ReadOptions) -> FrequencyTable | None:
+    """Return the table of frequencies that a file is; None of another file."""
+    from quell.identification import frequency_table
+
+    columns = [name.strip() for name in read.columns.split(",")] if read.columns else []
+    return frequency_table(path, columns, max_size=read.max_size)
+
+
+def only_in_time(read: ReadOptions, of_model: ModelOptions) -> dict[str, tuple[Any, Any]]:
+    """Return the options that a table of frequencies does not have, for ``refuse``."""
+    of_all = options_of(of_model, MODEL_OPTIONS) | {"time-unit": (read.time_unit, None)}
+    return {name: pair for name, pair in of_all.items() if name not in ("zeros", "integrators")}
+
+
+def _of_table(
+    table: FrequencyTable,
+    name: str,
+    order: int | None,
+    zeros: int,
+    integrators: int | None,
+    delay: float | None,
+    dt: float | None,
+    outputs: Outputs,
+) -> None:
+    """Print, draw and write the model of a table of frequencies, or the modes of a spectrum."""
+    from quell.experiments.common import save_figure
+    from quell.identification import identify_frequencies, modes_of_spectrum
+
+    outputs = check_outputs(outputs, ["identified"])
+    console = Console()
+    found: Any
+    if table.response is None:
+        assert table.power is not None
+        unused: dict[str, tuple[Any, Any]] = {"order": (order, None), "zeros": (zeros, 0)}
+        unused |= {"integrators": (integrators, None), "delay": (delay, None), "dt": (dt, None)}
+        refuse(unused, "is for a table with phase; of this one the modes are found")
+        found = modes_of_spectrum(table.omega, table.power)
+    else:
+        found = identify_frequencies(
+            table.omega,
+            table.response,
+            order,
+            None if order is None and not zeros else zeros,
+            integrators=integrators,
+            delay=delay,
+            deviation=table.deviation,
+            dt=dt,
+        )
+    print_line(console, describe_table(table, name))
+    for line in str(found).splitlines():
+        print_line(console, line)
+    paths: list[Path] = []
+    if outputs.figures:
+        figure = found.plot()[0].figure
+        paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
+    results = found.to_json() | {"columns": table.columns, "notes": table.notes}
+    write_results(console, results, outputs, paths)
+
+
+def describe_table(table: FrequencyTable, name: str) -> str:
+    """Return what a table of frequencies is and what was assumed, as text."""
+    low, high = (table.omega[i] / (2.0 * math.pi) for i in (0, -1))
+    count = f"{table.omega.size} frequencies, {low:.4g} to {high:.4g} Hz"
+    return "\n".join([f"{name}: {count}, of {', '.join(table.columns)}", *table.notes])
 
 
 def _frequencies(record: Measured, name: str, with_reference: bool, outputs: Outputs) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from cyclopts import Parameter
 
 from quell.cli.exit_codes import ExitCode, confirm
+from quell.cli.identify import describe_table, frequencies_in, only_in_time
 from quell.cli.options import (
     MODEL_OPTIONS,
     OUTPUTS,
@@ -33,7 +34,7 @@ from quell.cli.rig import exit_code
 if TYPE_CHECKING:
     from quell.commissioning import Limits, Verification
     from quell.controllers import Controller
-    from quell.identification import Identified, Measured
+    from quell.identification import FrequencyModel, FrequencyTable, Identified, Measured
     from quell.realtime.devices import Device
     from quell.setup import Setup
     from quell.tuning import Tuned
@@ -171,6 +172,48 @@ def from_record(
     found = identified(console, record, asked)
     plants, delays = found.plants
     return plants, record.dt, {"delay": delays}, found.model
+
+
+def from_frequencies(
+    console: Console, path: Path, table: FrequencyTable, asked: Asked
+) -> tuple[list[Any], dict[str, Any], FrequencyModel]:
+    """Return the plants that a table of frequencies shows, options of ``tune``, and the model."""
+    from quell.identification import identify_frequencies
+    from quell.tuning import identified_plants
+
+    print_line(console, describe_table(table, path.name))
+    if table.response is None:
+        raise ValueError(
+            f"{path.name}: has no phase, from which no controller follows; quell identify has its "
+            "modes; for a controller measure size and phase from u to y, or record u and y"
+        )
+    if asked.dt is None:
+        raise ValueError(f"{path.name}: has no sample time; give that of the controller (--dt)")
+    of_time = only_in_time(asked.read, asked.model)
+    refuse(of_time, "is for a record in time; this is a table of frequencies")
+    zeros = asked.model.zeros
+    found = identify_frequencies(
+        table.omega,
+        table.response,
+        asked.order,
+        None if asked.order is None and not zeros else zeros,
+        integrators=asked.model.integrators,
+        deviation=table.deviation,
+    )
+    for line in str(found).splitlines():
+        print_line(console, line)
+    reasons = [*found.faults, *found.undecided]
+    if found.is_poor:
+        reasons = list(found.shortcomings)
+    if reasons:
+        raise ValueError(f"{path.name}: no plant to tune for: {'; '.join(reasons)}")
+    print_line(
+        console,
+        "what hold and computing add to the phase of the table is in the delay: the loop keeps "
+        "its margins with a little more",
+    )
+    plants, delays = identified_plants(found)
+    return plants, {"delay": delays}, found
 
 
 @dataclass(frozen=True)
@@ -311,15 +354,17 @@ def tune(
     several axes, a table [[axis]] each, all bandwidths are tuned for the coupled loop.
 
     The plant is that of a setup file, a transfer function, one that a record shows, or that an
-    experiment at a rig shows (--device). A record is identified first, and the deviations of gain,
-    poles and delay become the set of plants. PI, PID and other structures are tuned under the same
-    constraints and shown beside it. If safety ends the verifying step the exit code is 3.
+    experiment at a rig shows (--device). A record, or a table of frequencies, is identified first,
+    and the deviations of gain, poles and delay become the set of plants. PI, PID and other
+    structures are tuned under the same constraints and shown beside it. If safety ends the
+    verifying step the exit code is 3.
 
     Parameters
     ----------
     setup
         The file, in TOML, with [plant], and [tune] for all options; docs/tuning. Or a record: a
-        recording of quell run-rig (.mcap or .csv), a saved run (.nc), or a table t,u,y in text.
+        recording of quell run-rig (.mcap or .csv), a saved run (.nc), or a table t,u,y in text; or
+        a table of frequencies with size and phase, or real and imaginary part.
     num
         Numerator of the transfer function, highest power of s first: 1 or 2,1.
     den
@@ -419,22 +464,26 @@ def tune(
     _bounds(options)
     options |= works.limits()
     place: Rig | None = None
+    model: Any
     asked = Asked(dt, read, of_model, model_order)
-    if rig.device is not None:
+    if rig.device is not None or setup is None:
         place = rig_at(rig, works, dt, trust)
         shown = from_rig(console, place, float(dt or 0.0), asked, save_record, outputs.overwrite)
         if shown is None:
             return ExitCode.DONE
         plant, dt, more, model, y_now = shown
         more |= rest_of_model(model, y_now)
+    elif (table := frequencies_in(setup, read)) is not None:
+        refuse(of_rig, "goes with --device, an experiment at a rig")
+        plant, more, model = from_frequencies(console, setup, table, asked)
+        more |= works.rest()
     else:
-        assert setup is not None
         refuse(of_rig, "goes with --device, an experiment at a rig")
         given_rest = works.rest()
         plant, dt, more, model = from_record(console, setup, asked)
         more |= given_rest or rest_of_model(model)
     options["constraints"] = with_known_noise(options["constraints"], model, range_of_u(options))
-    tuned = _tuned(console, plant, dt, options | more)
+    tuned = _tuned(console, plant, float(dt or 0.0), options | more)
     tuned = replace(tuned, signals=model.signals, doubts=doubts(model))
     _print(console, tuned, rig.device or str(setup))
     step = None

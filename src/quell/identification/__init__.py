@@ -14,6 +14,9 @@ from quell.identification.excitation import (
     save_excitations,
 )
 from quell.identification.frequencies import FrequencyResponse, frequency_response
+from quell.identification.frequency_model import FrequencyModel
+from quell.identification.frequency_table import FrequencyTable, frequency_table
+from quell.identification.from_frequencies import identify_frequencies
 from quell.identification.gain_by_signal import GainBin, identify_b0_by
 from quell.identification.gain_matrix import InputGainMatrix, identify_b0_matrix
 from quell.identification.identify import identify
@@ -21,6 +24,7 @@ from quell.identification.input_gain import Bandwidth, InputGain, MarginError, i
 from quell.identification.model import Root
 from quell.identification.record_file import Measured, excited, read_record
 from quell.identification.result import Identified, simulated_plant
+from quell.identification.spectra import SpectralMode, SpectralModes, modes_of_spectrum
 from quell.identification.structures import (
     Alternative,
     alternatives,
@@ -35,7 +39,9 @@ __all__ = [
     "Bandwidth",
     "Excitation",
     "FreeSwing",
+    "FrequencyModel",
     "FrequencyResponse",
+    "FrequencyTable",
     "GainBin",
     "Identified",
     "InputGain",
@@ -45,17 +51,22 @@ __all__ = [
     "Mode",
     "Residuals",
     "Root",
+    "SpectralMode",
+    "SpectralModes",
     "alternatives",
     "decided",
     "excitation",
     "excited",
     "free_swing",
     "frequency_response",
+    "frequency_table",
     "identify",
     "identify_b0",
     "identify_b0_by",
     "identify_b0_matrix",
+    "identify_frequencies",
     "interleaved_excitations",
+    "modes_of_spectrum",
     "not_told_apart",
     "read_record",
     "save_excitations",

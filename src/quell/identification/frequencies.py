@@ -112,7 +112,7 @@ class FrequencyResponse(NamedTuple):
         return sorted({int(places[i]) for i in near})
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
-        """Write the known points as a table that ``read_frequencies`` reads, or nothing at all.
+        """Write the known points as a table that ``frequency_table`` reads, or nothing at all.
 
         Raises
         ------

@@ -142,30 +142,13 @@ def read_record(
             raise ValueError(f"time_unit = {time_unit!r}: there are no times, as dt is given")
     timed = dt is None
     _check_columns(columns, timed)
-    where, most = f"data = {os.fspath(path)!r}", bytes_of(max_size)
-    if Path(path).suffix.lower() == ".toml":
-        raise ValueError(
-            f"{where}: is a setup by its name, not a record: quell run, quell sweep and quell tune "
-            "take a setup; a record is a table of time, input and output"
-        )
-    lines = text_lines(path, where, most)
-    head = _head(lines)
-    layout = layout_of(where, head, columns, timed)
+    opened = open_table(path, columns, timed, max_size)
+    where, layout = opened.where, opened.layout
     places = [
         _place(where, layout, name, role)
         for role, name in enumerate(columns, start=0 if timed else 1)
     ]
-    rows = _rows(where, chain(head[layout.before :], lines), layout)
-    first = list(islice(rows, _HEAD_LINES))
-    if len(first) < _FEWEST:
-        remedy = "record more, or give a table with a line for each sample"
-        if sum(bool(line.strip()) for line in head[layout.before :]) > len(first) + _FEWEST:
-            remedy = "is there a quotation mark without a second one? Mend it"
-        raise ValueError(
-            f"{where}: has {len(first)} samples; must have at least {_FEWEST}: {remedy}"
-        )
-    table = _Table(where, layout, places, columns, first, timed)
-    numbers, values = table.values(chain(first, rows), most)
+    table, first, numbers, values = _numbers(opened, places, columns, timed)
     if dt is None:
         name = "" if layout.names is None else layout.names[places[0]]
         t = _times(where, table, name, layout.units[places[0]], values[:, 0], numbers, time_unit)
@@ -183,6 +166,69 @@ def read_record(
         for role, place in zip(roles, places, strict=False)
     }
     return found._replace(signals=Signals(known["y"], known["u"]), r=known.get("r", Quantity()))
+
+
+class OpenTable(NamedTuple):
+    """A table in text, of which the layout is known and the numbers are not read yet."""
+
+    where: str
+    head: list[str]  #: lines that it begins with
+    lines: Iterator[str]  #: the others
+    layout: Layout
+    most: int  #: limit of what the file may unpack to [bytes]
+
+
+def open_table(
+    path: str | os.PathLike[str],
+    columns: Sequence[str] = (),
+    timed: bool = True,
+    max_size: float = MAX_SIZE,
+) -> OpenTable:
+    """Return a table in text, whose line of names has ``columns``.
+
+    Raises
+    ------
+    ValueError
+        as ``read_record``.
+    """
+    where, most = f"data = {os.fspath(path)!r}", bytes_of(max_size)
+    if Path(path).suffix.lower() == ".toml":
+        raise ValueError(
+            f"{where}: is a setup by its name, not a record: quell run, quell sweep and quell tune "
+            "take a setup; a record is a table of time, input and output"
+        )
+    lines = text_lines(path, where, most)
+    head = _head(lines)
+    return OpenTable(where, head, lines, layout_of(where, head, columns, timed), most)
+
+
+def numbers_of(opened: OpenTable, places: list[int], names: Sequence[str]) -> Matrix:
+    """Return the numbers of some columns; a line that lacks one, but not the first, is left out.
+
+    Raises
+    ------
+    ValueError
+        as ``read_record``.
+    """
+    return _numbers(opened, places, names, True)[-1]
+
+
+def _numbers(
+    opened: OpenTable, places: list[int], columns: Sequence[str], timed: bool
+) -> tuple[_Table, list[_Row], Vector, Matrix]:
+    """Return the table, its first rows, and number and values of all lines."""
+    where, head, lines, layout, most = opened
+    rows = _rows(where, chain(head[layout.before :], lines), layout)
+    first = list(islice(rows, _HEAD_LINES))
+    if len(first) < _FEWEST:
+        remedy = "record more, or give a table with a line for each sample"
+        if sum(bool(line.strip()) for line in head[layout.before :]) > len(first) + _FEWEST:
+            remedy = "is there a quotation mark without a second one? Mend it"
+        raise ValueError(
+            f"{where}: has {len(first)} samples; must have at least {_FEWEST}: {remedy}"
+        )
+    table = _Table(where, layout, places, columns, first, timed)
+    return table, first, *table.values(chain(first, rows), most)
 
 
 def in_common_units(

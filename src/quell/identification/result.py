@@ -464,16 +464,19 @@ class Identified:
         """Return the report as text."""
         delay = f" · exp(−{self.delay:g} s)" if self.delay else ""
         lines = [
-            f"G(s) = ({_polynomial(self.num)}) / ({_polynomial(self.den)}){delay}",
+            f"G(s) = ({polynomial_text(self.num)}) / ({polynomial_text(self.den)}){delay}",
             f"{self.method}{'' if self.converged else '; the search did NOT converge'}",
             "",
             "pole [rad/s]                  ± real      ± imag     |p|       damping",
-            *(_row(root) for root in self.poles),
+            *(describe_root(root) for root in self.poles),
         ]
         if self.zeros:
-            lines += ["zero [rad/s]", *(_row(root) for root in self.zeros)]
+            lines += ["zero [rad/s]", *(describe_root(root) for root in self.zeros)]
         low, high = self.gain_interval
-        lines += ["", f"gain {self.gain:.5g}, 95 %: {low:.5g} to {high:.5g}{_of(self.integrators)}"]
+        lines += [
+            "",
+            f"gain {self.gain:.5g}, 95 %: {low:.5g} to {high:.5g}{gain_of_s(self.integrators)}",
+        ]
         low, high = self.delay_interval
         if low < high:
             lines += [f"delay {self.delay:.4g} s, 95 %: {low:.4g} to {high:.4g} s"]
@@ -579,7 +582,7 @@ class Identified:
         return dict(nonfinite_to_none(value))
 
 
-def _of(integrators: int) -> str:
+def gain_of_s(integrators: int) -> str:
     """Return what a gain with integrators is the gain of."""
     return f" (of s^{integrators} G)" if integrators > 1 else (" (of s G)" if integrators else "")
 
@@ -609,13 +612,14 @@ def _format(root: Root) -> str:
     return f"{format_roots(np.array([root.value]))} rad/s"
 
 
-def _row(root: Root) -> str:
+def describe_root(root: Root) -> str:
+    """Return a root with its deviations as a row of text."""
     value = f"{root.value.real:.6g}" + (f"{root.value.imag:+.6g}j" if root.value.imag else "")
     damping = "" if math.isnan(root.damping) else f"{root.damping:.4f}"
     return f"{value:<28}  {root.real_std:<10.2g}{root.imag_std:<10.2g} {root.omega:<9.5g} {damping}"
 
 
-def _polynomial(coefficients: Vector) -> str:
+def polynomial_text(coefficients: Vector) -> str:
     """Return a polynomial in s as text, from its coefficients in descending powers."""
     terms = []
     for i, value in enumerate(coefficients.tolist()):

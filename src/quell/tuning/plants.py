@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.identification import Measured, identify, not_told_apart
+from quell.identification import FrequencyModel, Measured, identify, not_told_apart
 from quell.identification.result import Identified, percent
 from quell.identification.structures import fits_better
 from quell.lti.canonical import canonical
@@ -189,14 +189,14 @@ _INSIDE = 0.95
 
 
 def identified_plants(
-    found: Identified, others: Sequence[Identified] = ()
+    found: Identified | FrequencyModel, others: Sequence[Identified] = ()
 ) -> tuple[list[tuple[Vector, Vector]], list[float]]:
     """Return the plants ``(num, den)`` that a model stands for, itself first, and their delays [s].
 
     Parameters
     ----------
     found
-        result of ``identify``.
+        result of ``identify``, or of ``identify_frequencies``.
     others
         further models of the record, as ``not_told_apart`` returns them behind the first.
 
