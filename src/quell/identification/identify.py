@@ -21,6 +21,7 @@ from quell.identification.model import (
 )
 from quell.identification.output_error import likelihood_ratio
 from quell.identification.result import Identified
+from quell.identification.saturation import Standing, standing
 from quell.identification.search import Fit, Known, Wanted, fit, without_fast_poles
 from quell.identification.starts import instrumental_variables
 from quell.identification.validation import (
@@ -180,6 +181,9 @@ _LAGS = 50
 _IF_NEEDED: Literal["if needed"] = "if needed"
 # How often first samples are left out: with u of before in them, the delay is not found at once.
 _CUTS = 3
+# Most rounds in which samples at a limit are bounded, and the change of y, as a share of its range,
+# that ends them; rounds that tell where they lead: chosen by hand.
+_ROUNDS, _SETTLED, _MEMORY = 20, 5e-5, 5
 # Parts of a search after which half of the work counts as done: those of a search for the delay.
 _HALF = 30.0
 # Least number of samples for each parameter: chosen by hand; real records have many more.
@@ -347,9 +351,15 @@ def identified(
 ) -> Identified:
     """Return the result of ``identify``; the search begins at a model that is ``known``, if any.
 
-    Where u was another one before the record, the samples in which that acts are left out.
+    Where u was another one before the record, the samples in which that acts are left out; those of
+    a y that stands at a limit are bounded by it.
     """
     given = dt, options, reference, validation, signals, known, progress
+    at_limits = None
+    if not records.samples and reference is None:
+        at_limits = standing(records.y, resolution_of(records.y))
+    if at_limits is not None and at_limits.is_usable:
+        return _bounded(records, at_limits, given)
     found = whole = _identified(records, *given)
     known_before = bool(options.rest) or bool(records.samples) or reference is not None
     if known_before or found.faults or not found.converged:
@@ -365,6 +375,59 @@ def identified(
         except ValueError:  # too short, or u does not move there
             return whole
     return whole if found.before else replace(found, left_out=first)
+
+
+def _bounded(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> Identified:
+    """Return the result where y stands at a limit, which is bounded there and not fitted."""
+    y, model = records.y, None
+    before: list[tuple[Vector, Vector]] = []
+    for _ in range(_ROUNDS):
+        found = _identified(records._replace(y=y), *given)
+        model, bounded = found, at_limits.bounded(records.y, found.simulated)
+        change = bounded - y
+        spread = float(np.ptp(bounded))
+        if float(np.max(np.abs(change))) <= _SETTLED * spread or not found.converged:
+            break
+        # The search goes on from there, as each round is near the last one.
+        given = (*given[:5], known_of(found), given[6])
+        # Each round goes part of the way: the last ones tell where it leads (Anderson, *J. ACM*
+        # 12, 1965).
+        before = [*before[-_MEMORY:], (bounded, change)]
+        new = bounded
+        if len(before) > 1:
+            of_y, of_change = (
+                np.column_stack([now - past[k] for past in before[:-1]])
+                for k, now in enumerate(before[-1])
+            )
+            new = bounded - of_y @ np.linalg.lstsq(of_change, change, rcond=1e-6)[0]
+        y = at_limits.bounded(records.y, new)
+    assert model is not None
+    # Where y is bounded it has no error, and counts as known: both make deviations small.
+    factor = y.size / (y.size - at_limits.samples)
+    low, high = (model.gain + factor * (end - model.gain) for end in model.gain_interval)
+    poles, zeros = (
+        tuple(
+            root._replace(real_std=factor * root.real_std, imag_std=factor * root.imag_std)
+            for root in roots
+        )
+        for roots in (model.poles, model.zeros)
+    )
+    return replace(
+        model,
+        at_limits=at_limits.samples,
+        covariance=factor**2 * model.covariance,
+        delay_covariance=factor**2 * model.delay_covariance,
+        gain_interval=(low, high),
+        poles=poles,
+        zeros=zeros,
+    )
+
+
+def known_of(found: Identified) -> Known:
+    """Return a model from which the search for another one of the same record begins."""
+    powers = found.dt ** np.arange(found.den.size - 1.0, 0.0, -1.0)
+    low, high = (round(end / found.dt) for end in found.delays_searched)
+    return Known(found.den[:0:-1] * powers, (low, high))
 
 
 def _identified(

@@ -16,6 +16,7 @@ from quell.identification.model import (
     Root,
 )
 from quell.identification.output_error import noise_model
+from quell.identification.saturation import standing
 from quell.identification.starts import SURE
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
@@ -210,6 +211,9 @@ class Identified:
     signals: Signals = UNKNOWN  #: names and units of u and y
     #: number of first samples that were left out, as u before the record was another one
     left_out: int = 0
+    #: number of samples in which y stands at a limit; they are bounded by it, and ``y`` has there
+    #: what the model says, where that is beyond the limit
+    at_limits: int = 0
 
     @property
     def gain(self) -> float:
@@ -485,6 +489,19 @@ class Identified:
             lines += [f"start at rest: {how} (probability {self.rest_probability:.3g})"]
         if self.left_out:
             lines += [f"the first {self.left_out} samples are left out: u was another one before"]
+        if self.at_limits:
+            share = 100.0 * self.at_limits / self.y.size
+            lines += [
+                f"y stands at a limit in {self.at_limits} samples ({share:.2g} %), as of a "
+                "saturated sensor: there it is bounded by it, not fitted"
+            ]
+        stands = standing(self.u, 0.0).samples
+        if stands:
+            share = 100.0 * stands / self.u.size
+            lines += [
+                f"u stands at a limit in {stands} samples ({share:.2g} %), as of a saturated "
+                "actuator: the model holds if this u is what acts, not what was asked for"
+            ]
         lines += [f"constant force {self.bias:.4g} (in units of u)"]
         if self.friction is not None:
             lines += [
@@ -560,6 +577,7 @@ class Identified:
             "curvature": self.curvature,
             "before": self.before,
             "left_out": self.left_out,
+            "at_limits": self.at_limits,
             "samples": self.y.size,
             "held_from": self.held_from,
             "horizon": self.horizon,

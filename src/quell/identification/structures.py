@@ -32,10 +32,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quell.identification.identify import Options, Records, identified
+from quell.identification.identify import Options, Records, identified, known_of
 from quell.identification.output_error import likelihood_ratio
 from quell.identification.result import Identified
-from quell.identification.search import Known
 from quell.parallel import part_of
 
 # Blocks: each should be longer than the correlation of the errors, and there should be enough of
@@ -210,7 +209,7 @@ def alternatives(
     for i, (name, smaller, change) in enumerate(tried):
         options = same._replace(**change)
         options = options._replace(rest=_rest(found, smaller, options.friction))
-        known = _known(found) if options.order == order - 1 and not options.friction else None
+        known = known_of(found) if options.order == order - 1 and not options.friction else None
         given = found.reference, None, found.signals
         share = part_of(progress, i, i + 1, len(tried))
         try:
@@ -218,7 +217,7 @@ def alternatives(
             nearer = model.fits["estimation"] > found.fits["estimation"]
             if nearer and not (model.converged or model.faults or options.friction):
                 # Far better, perhaps, and only not confirmed: the search goes on from there.
-                model = identified(records, found.dt, options, *given, _known(model), share)
+                model = identified(records, found.dt, options, *given, known_of(model), share)
         except ValueError:  # too short a record for it, or no such model
             continue
         model = replace(model, rest_given=found.rest_given)
@@ -239,13 +238,6 @@ def _rest(found: Identified, smaller: bool, friction: bool) -> bool | None:
     if found.rest_given or (smaller and found.rest):
         return not friction
     return False if smaller and not found.undecided else None
-
-
-def _known(found: Identified) -> Known:
-    """Return where the search for a smaller model begins."""
-    powers = found.dt ** np.arange(found.den.size - 1.0, 0.0, -1.0)
-    low, high = (round(end / found.dt) for end in found.delays_searched)
-    return Known(found.den[:0:-1] * powers, (low, high))
 
 
 def decided(found: Identified, delay: Delay = OF_MODEL, **given: Any) -> Identified:

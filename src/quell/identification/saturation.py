@@ -1,0 +1,88 @@
+"""A y or u that stands at an extreme: a sensor or an actuator at its limit.
+
+A signal at its limit has the same largest (or least) value in many samples, and comes there while
+it moves fast. A signal that settles at its largest value comes there slowly, and one that has
+levels, as steps or a PRBS, has few values: both are none.
+
+Samples of y at a limit y_max say only that y was y_max or more. They are bounded, not fitted: in
+their place the fit has ``max(ŷ, y_max)`` with the ŷ of the model, and again with the model that
+follows, until it no longer changes (the EM algorithm for censored data, in its limit of small
+noise: Dempster, Laird & Rubin, *J. Royal Statistical Society B* 39, 1977, sec. 4.2).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.types import Vector
+
+# Samples at a limit at least, times as many as at a value below it, and values of a signal that has
+# no levels. All chosen by hand.
+_FEWEST, _PILED, _VALUES = 10, 4.0, 20
+# Share of the samples beyond which too little is left.
+_MOST = 0.6
+
+
+class Standing(NamedTuple):
+    """Where a signal stands at its limits."""
+
+    upper: NDArray[np.bool_]  # (N,)
+    lower: NDArray[np.bool_]
+
+    @property
+    def samples(self) -> int:
+        """Number of samples at a limit."""
+        return int(np.sum(self.upper) + np.sum(self.lower))
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether some samples are at a limit, and enough are not."""
+        return 0 < self.samples <= _MOST * self.upper.size
+
+    def bounded(self, y: Vector, model: Vector) -> Vector:
+        """Return y with the model in place of a limit that it is beyond."""
+        found = np.where(self.upper, np.maximum(y, model), y)
+        return np.where(self.lower, np.minimum(y, model), found)
+
+
+def standing(x: Vector, resolution: float) -> Standing:
+    """Return where a signal stands at its limits; ``resolution`` is the step it is rounded to."""
+    none = np.zeros(x.size, dtype=bool)
+    held = resolution == 0.0 and np.median(np.abs(np.diff(x))) == 0.0
+    if held or np.unique(x).size <= _VALUES:
+        return Standing(none, none)
+    return Standing(_at_top(x, resolution), _at_top(-x, resolution))
+
+
+def _at_top(x: Vector, resolution: float) -> NDArray[np.bool_]:
+    """Return where a signal stands at its largest value; nowhere if it does not."""
+    top, span = float(np.max(x)), float(np.ptp(x))
+    same = max(0.25 * resolution, 1e-9 * span)
+    every, nowhere = x >= top - same, np.zeros(x.size, dtype=bool)
+    at = every.copy()
+    # A plant that rests at the begin or the end of a record may stand at an extreme, too.
+    away = np.flatnonzero(~at)
+    if away.size:
+        at[: away[0]] = at[away[-1] :] = False
+    count = int(np.sum(at))
+    if count < _FEWEST:
+        return nowhere
+    width = resolution or 1e-3 * span
+    # Samples at the values below, per value: a sine's crest has as many as its top.
+    near, far = (
+        float(np.sum((x < top - (a - 0.5) * width) & (x >= top - (b + 0.5) * width))) / (b + 1 - a)
+        for a, b in ((1, 2), (3, 8))
+    )
+    if resolution and near > 2.0 * far + 2.0:  # what settles is there longer and longer
+        return nowhere
+    starts = np.flatnonzero(at[1:] & ~at[:-1]) + 1
+    if count <= _PILED * near or not starts.size:
+        return nowhere
+    # The steps to the limit: what settles has small ones.
+    steps = [float(max(x[k] - x[k - 1], x[k - 1] - x[k - 2])) for k in starts if k > 1]
+    typical = 0.5 * float(np.median(np.abs(np.diff(x[~at]))))
+    fast = bool(steps) and (resolution > 0.0 or float(np.median(steps)) > typical)
+    return every if fast else nowhere

@@ -1,0 +1,64 @@
+"""A y or u that stands at an extreme: a saturated sensor is named and bounded, rest and levels are not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.identification.identify import resolution_of
+from quell.identification.saturation import standing
+
+from .test_record_faults import DT, answer, noise, random_steps
+
+
+def stairs(count: int = 1500, of: int = 30) -> Any:
+    """Return u of random steps."""
+    return np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, count // of + 1), of)[:count]
+
+
+@pytest.mark.parametrize("quantum", [0.0, 0.01])
+def test_samples_at_a_limit_are_named_and_bounded(quantum: float) -> None:
+    """A third of them: gain and poles are those of the plant, within three half widths."""
+    u = stairs()
+    y = answer([9.0], [1.0, 1.2, 9.0], u) + noise(u.size, 2e-3)
+    y = np.clip(quantum * np.round(y / quantum) if quantum else y, -0.6, 0.6)
+    found = ql.identify(u, y, DT, order=2, delay=0.0)
+    assert 0.2 < found.at_limits / y.size < 0.5
+    low, high = found.gain_interval
+    assert abs(found.gain - 1.0) < 1.5 * (high - low) < 0.02
+    assert found.den[1:] == pytest.approx([1.2, 9.0], rel=5e-3)
+    assert f"y stands at a limit in {found.at_limits} samples" in str(found)
+    assert found.shortcomings == ()
+
+
+@pytest.mark.parametrize(
+    "y",
+    [
+        answer([2.0], [1.0, 2.0], random_steps(3000, of=300)),
+        0.02 * np.round(answer([2.0], [1.0, 2.0], random_steps(3000, of=300)) / 0.02),
+        0.1 * np.round(np.sin(0.02 * np.arange(3000.0)) / 0.1),
+        np.repeat([0.0, 1.0, 0.4], 500),
+        random_steps(1500),
+        np.maximum(np.arange(2000.0) - 500.0, 0.0) ** 2,
+    ],
+)
+def test_what_settles_rests_or_has_levels_stands_at_no_limit(y: Any) -> None:
+    """Steps that end, a rounded sine, levels, and a start from rest."""
+    assert standing(y, resolution_of(y)).samples == 0
+
+
+def test_a_u_at_the_limits_of_its_actuator_is_named_without_not() -> None:
+    """Of a controller that asks for more; the model of what acts is right."""
+    rng, a = np.random.default_rng(3), np.exp(-2.0 * DT)
+    x, u, y = 0.0, np.zeros(2000), np.zeros(2000)
+    for k in range(u.size):
+        y[k] = x + 0.01 * rng.standard_normal()
+        u[k] = np.clip(4.0 * (np.sign(np.sin(0.02 * k)) - y[k]), -3.0, 3.0)
+        x = a * x + (1.0 - a) * u[k]
+    found = ql.identify(u, y, DT, order=1)
+    assert "u stands at a limit in" in str(found)
+    assert found.shortcomings == ()
+    assert found.gain == pytest.approx(1.0, rel=0.02)
