@@ -17,7 +17,7 @@ from scipy.linalg import expm
 import quell as ql
 from quell.controllers.baselines import PID
 from quell.identification import InputGain, identify_b0, identify_b0_by
-from quell.identification.bandwidth import Candidate, bandwidth
+from quell.identification.bandwidth import Candidate, Reach, bandwidth, pid_of_margin
 from quell.identification.input_gain import MarginError, mixture, seconds_text, white_where
 from quell.identification.running_loop import Form, Inputs, linear_columns, placed, predicted
 
@@ -520,3 +520,27 @@ def test_what_a_model_does_not_have_is_zero(
     form = Form(2, lag, delay, False, share=share)
     phi = np.concatenate([np.full(form.times.start, 7.0), [3.0, 5.0]])[: form.size]
     assert (form.lag_of(phi), form.delay_of(phi)) == expected
+
+
+@pytest.mark.parametrize(("order", "late"), [(1, 0.0), (1, 0.05), (2, 0.02)])
+def test_a_pi_or_pid_of_the_same_margin_stands_beside_omega_c(order: int, late: float) -> None:
+    """Its margin is that of the sampled loop, and no other crossover has a larger k_i."""
+    dt, den = 0.01, np.array([1.0, 0.5] + [0.0] * (order - 1))
+    loops = Candidate(-3.0, den, 0.0, late, b0=-3.0, dt=dt)
+    found = pid_of_margin(loops, 60.0, Reach(2.0, 10.0, 60.0, True))
+    assert found is not None
+    assert found.name == ("PI" if order == 1 else "PID")
+    assert found.phase == pytest.approx(60.0, abs=0.6)
+    assert found.kp < 0.0
+    pid = PID(found.kp, found.ki, found.kd, tf=found.tf, dt=dt)
+    loop = ql.analysis.analyse(([-3.0], den), pid, delay=late)
+    assert loop.margins.phase == pytest.approx(found.phase, rel=1e-9)
+    adrc = loops.loop(2.0, 10.0)
+    k_adrc = abs(adrc.response("C_y", np.array([1e-4]))[0]) * 1e-4
+    assert found.over_adrc == pytest.approx(abs(found.ki) / k_adrc, rel=1e-3)
+
+
+def test_no_simple_controller_stands_beside_a_third_order() -> None:
+    """It has no phase for three integrators."""
+    loops = Candidate(1.0, np.array([1.0, 0.0, 0.0, 0.0]), 0.0, 0.0, b0=1.0, dt=0.01)
+    assert pid_of_margin(loops, 60.0, Reach(1.0, 30.0, 60.0, True)) is None

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 # Fits below which u and y may be swapped, and above which they are [%]: chosen by hand.
 _COLLAPSED, _GOOD = 20.0, 60.0
 _OF_FREQUENCY = ("f\n[Hz]", "|G|", "|G|\n[dB]", "phase\n[°]", "coherence", "±\n[%]")
+# Largest order with a PI or PID controller beside its ADRC.
+_SIMPLE = 2
 _HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping")
 
 
@@ -572,7 +574,9 @@ def _print_bandwidth(
     nothing = {"omega_c": None, "omega_c_std": None, "ratio": ratio}
     try:
         with console.status("Searching for the omega_c that keeps the phase margin."):
-            omega_c, spread, ratio = found.omega_c(phase_margin, ratio)
+            reach = found.omega_c(phase_margin, ratio)
+            beside = found.beside(reach, phase_margin)
+        omega_c, spread, ratio = reach
     except MarginError as error:
         print_line(console, f"NOT: {error}")
         return nothing | {"best_phase_margin": error.phase_margin}
@@ -591,7 +595,23 @@ def _print_bandwidth(
         f"omega_c = {omega_c:.4g}{deviation} rad/s keeps {phase_margin:g}° of phase margin "
         f"with omega_o = {ratio:.3g} omega_c and this b0{beyond}",
     )
-    return {"omega_c": omega_c, "omega_c_std": spread if known else None, "ratio": ratio}
+    print_line(
+        console,
+        f"in it are the lag, the delay of {found.delay:.4g} s, and the hold of {found.dt:.4g} s",
+    )
+    results: dict[str, Any] = {"beside": None}
+    if beside is not None:
+        results["beside"] = beside._asdict()
+        derivative = f", k_d = {beside.kd:.4g}, tf = {beside.tf:.3g} s" if beside.kd else ""
+        print_line(
+            console,
+            f"a {beside.name} of {beside.phase:.3g}°: k_p = {beside.kp:.4g}, k_i = {beside.ki:.4g}"
+            f"{derivative}; its k_i is {beside.over_adrc:.3g} times that of this ADRC: the larger "
+            "one rejects a constant load better",
+        )
+    elif found.order <= _SIMPLE:
+        print_line(console, "no PI or PID with T_i = 4 T_d keeps this margin")
+    return results | {"omega_c": omega_c, "omega_c_std": spread if known else None, "ratio": ratio}
 
 
 # ---- quell excite ----

@@ -14,6 +14,7 @@ loop the plant may be unstable, so unstable denominators are among the starts.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -21,7 +22,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.identification.bandwidth import Candidate, Reach, bandwidth, near
+from quell.identification.bandwidth import (
+    Candidate,
+    Reach,
+    SimpleController,
+    bandwidth,
+    near,
+    pid_of_margin,
+)
 from quell.identification.delays import delayed
 from quell.identification.identify import resolution_of
 from quell.identification.model import Structure, autocorrelation, linear_columns, nonzero_lengths
@@ -478,14 +486,7 @@ class InputGain:
         if self.delay > _MOST_SAMPLES * self.dt:
             rule = f"the delay of {self.delay:.4g} s is longer than {_MOST_SAMPLES} samples"
             raise MarginError(f"omega_c for {asked} is not computed: {rule}")
-        n = self.order
-        at = np.concatenate([self.den[1:], [self.b0, self.lag, self.delay]])
-
-        def loops(values: Vector) -> Candidate:
-            # The gain that the observer assumes stays b0 where the plant's gain changes.
-            den, times = np.append(1.0, values[:n]), np.maximum(values[n + 1 :], 0.0).tolist()
-            return Candidate(float(values[n]), den, *times, b0=self.b0, dt=self.dt)
-
+        at, loops = self._loops()
         with one_blas_thread():
             found = bandwidth(loops(at), margin, ratio)
             if not found.keeps:
@@ -502,6 +503,36 @@ class InputGain:
         variance = float(slope @ self.covariance @ slope)
         std = math.sqrt(variance) if variance >= 0.0 else math.nan
         return Bandwidth(found.omega_c, std, found.ratio)
+
+    def _loops(self) -> tuple[Vector, Callable[[Vector], Candidate]]:
+        """Return a, b, lag and delay, and the loops of a plant with such values."""
+        n = self.order
+
+        def loops(values: Vector) -> Candidate:
+            # The gain that the observer assumes stays b0 where the plant's gain changes.
+            den, times = np.append(1.0, values[:n]), np.maximum(values[n + 1 :], 0.0).tolist()
+            return Candidate(float(values[n]), den, *times, b0=self.b0, dt=self.dt)
+
+        return np.concatenate([self.den[1:], [self.b0, self.lag, self.delay]]), loops
+
+    def beside(self, found: Bandwidth, phase_margin: float = 60.0) -> SimpleController | None:
+        """Return the PI (order 1) or PID controller (order 2) that keeps the same phase margin.
+
+        Of those with ``T_i = 4 T_d`` it is the one with the largest k_i. None for a larger order,
+        and where none keeps the margin.
+
+        Parameters
+        ----------
+        found
+            result of ``omega_c``.
+        phase_margin
+            that of ``omega_c`` [degrees].
+        """
+        margin, _ = asked_margin(phase_margin, None)
+        at, loops = self._loops()
+        with one_blas_thread():
+            reach = Reach(found.omega_c, found.ratio, margin, True)
+            return pid_of_margin(loops(at), margin, reach)
 
     def describe(self) -> str:
         """Return the report as text."""
