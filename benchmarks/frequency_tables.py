@@ -25,7 +25,7 @@ import quell as ql
 from quell.identification import frequency_response, frequency_table, identify_frequencies
 from quell.signals import PRBS
 
-SAMPLES, NEAR = 12000, 0.01
+SAMPLES, NEAR = 4000, 0.01
 KINDS = ("rigid", "at the motor", "at the load", "oven", "converter")
 
 
@@ -133,6 +133,7 @@ def main() -> None:
                 kind,
                 f"{max(away):.4f} of the record's, {max(truth):.4f} of the truth,",
                 f"order {len(found.poles)} of {order}, {found.shortcomings}",
+                flush=True,
             )
     figures = {
         "tables": tables,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.identification import free_swing
+from quell.identification import free_decay, free_swing
 
 from .commands import Shown
 
@@ -100,3 +100,49 @@ def test_the_command_finds_the_modes_of_a_record_in_which_u_rests(
     refused = quell("identify", "swing.csv", "--order", "2", "--no-figures")
     assert refused.code == 2
     assert "--order: is for a u that moves" in refused.err
+
+
+@pytest.mark.parametrize(("begin", "end"), [(20.0, 150.0), (90.0, 0.0)])
+def test_a_decay_of_twenty_samples_has_its_time_constant_and_its_end(
+    begin: float, end: float
+) -> None:
+    """A heat-up and a coast-down; it is no swing, however much a damped mode could fit."""
+    t = 5.0 * np.arange(20)
+    y = end + (begin - end) * np.exp(-t / 40.0) + np.random.default_rng(1).standard_normal(20)
+    found = free_decay(y, 5.0)
+    for value, (low, high), truth in (
+        (found.time_constant, found.interval, 40.0),
+        (found.at_rest, found.at_rest_interval, end),
+    ):
+        assert low < value < high
+        assert abs(value - truth) < 1.5 * (high - low)
+    assert found.interval[1] - found.interval[0] < 10.0
+    with pytest.raises(ValueError, match="does not ring"):
+        free_swing(y, 5.0)
+
+
+def test_a_straight_line_has_no_time_constant_and_noise_does_not_decay() -> None:
+    """Both are refused; a decay that the record hardly shows is said with NOT."""
+    noise = 0.5 * np.random.default_rng(0).standard_normal(40)
+    with pytest.raises(ValueError, match="as a straight line or faster"):
+        free_decay(np.arange(40.0) ** 1.2 + noise, 1.0)
+    hardly = free_decay(100.0 * (1.0 - np.exp(-np.arange(40.0) / 150.0)) + 2.0 * noise, 1.0)
+    assert "NOT: the record does not decide the time constant" in str(hardly)
+    with pytest.raises(ValueError, match="y does not decay"):
+        free_decay(np.random.default_rng(0).standard_normal(40), 1.0)
+    with pytest.raises(ValueError, match="y has 5 samples: must have at least 12"):
+        free_decay(np.arange(5.0), 1.0)
+
+
+def test_the_command_finds_the_time_constant_of_a_heat_up(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """With the gain for a start at rest without u."""
+    t = 5.0 * np.arange(20)
+    rows = np.column_stack([t, np.full(20, 50.0), 150.0 - 130.0 * np.exp(-t / 40.0)])
+    np.savetxt(tmp_path / "heat.csv", rows, delimiter=",", header="t [s],u,y", comments="")
+    shown = quell("identify", "heat.csv", "--json", "decay.json", "--no-figures")
+    assert shown.code == 0, shown.err
+    assert "time constant of 40 s" in shown.out
+    assert "the gain is 2.6" in shown.out
+    assert (tmp_path / "decay.json").is_file()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from quell.cli.exit_codes import ExitCode
 from quell.cli.options import (
@@ -62,7 +62,8 @@ def identify(
 ) -> None:
     """Fit a continuous transfer function to recorded input and output.
 
-    Of a record in which u rests and y rings the modes are found: their frequency and damping. A
+    Of a record in which u rests and y rings the modes are found: their frequency and damping; of
+    one in which y decays, as of a heat-up or coast-down, time constant and end. A
     table of frequencies (f, magnitude and phase, or real and imaginary part) is fitted in the same
     way, and the modes of a power spectrum are found.
 
@@ -113,7 +114,7 @@ def identify(
         _frequencies(record, data[0].name, bool(read.columns), outputs)
         return
     if not several and record.u.min() == record.u.max():
-        refuse(unused, "is for a u that moves; here it rests, and the modes of y are found")
+        refuse(unused, "is for a u that moves; here it rests, and the free motion of y is found")
         _modes(record, data[0].name, outputs)
         return
     most = of_model.max_delay
@@ -272,21 +273,36 @@ def _frequencies(record: Measured, name: str, with_reference: bool, outputs: Out
 
 
 def _modes(record: Measured, name: str, outputs: Outputs) -> None:
-    """Print, draw and write the modes of a free swing."""
+    """Print, draw and write the modes of a free swing, or the time constant of a decay."""
     from quell.experiments.common import save_figure
-    from quell.identification import free_swing
+    from quell.identification import free_decay, free_swing
 
     outputs = check_outputs(outputs, ["identified"])
     console = Console()
-    found = free_swing(record.y, record.dt)
-    print_line(console, f"{name}: a free swing, as u rests: {found.y.size} samples")
-    for line in str(found).splitlines():
+    u, decay, shown = float(record.u[0]), None, cast(Any, None)
+    try:
+        shown = free_swing(record.y, record.dt)
+    except ValueError as no_swing:
+        try:
+            shown = decay = free_decay(record.y, record.dt)
+        except ValueError:
+            raise no_swing from None
+    kind = "a free swing, as u rests" if decay is None else f"a decay, as u is {u:g} all through"
+    print_line(console, f"{name}: {kind}: {record.y.size} samples")
+    for line in str(shown).splitlines():
         print_line(console, line)
+    results = shown.to_json()
+    if decay is not None and u != 0.0:
+        results["gain_from_rest"] = (decay.at_rest - decay.begin) / u
+        print_line(
+            console,
+            f"if u was 0 and y at rest before, the gain is {results['gain_from_rest']:.5g}",
+        )
     paths: list[Path] = []
     if outputs.figures:
-        figure = found.plot()[0].figure
+        figure = shown.plot()[0].figure
         paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
-    write_results(console, found.to_json(), outputs, paths)
+    write_results(console, results, outputs, paths)
 
 
 def _look_swapped(model: Identified, order: int, delays: Any) -> bool:

@@ -31,13 +31,14 @@ from quell.identification.structures import (
     decided,
     not_told_apart,
 )
-from quell.identification.swings import FreeSwing, Mode, free_swing
+from quell.identification.swings import FreeDecay, FreeSwing, Mode, free_decay, free_swing
 from quell.identification.validation import Residuals
 
 __all__ = [
     "Alternative",
     "Bandwidth",
     "Excitation",
+    "FreeDecay",
     "FreeSwing",
     "FrequencyModel",
     "FrequencyResponse",
@@ -57,6 +58,7 @@ __all__ = [
     "decided",
     "excitation",
     "excited",
+    "free_decay",
     "free_swing",
     "frequency_response",
     "frequency_table",

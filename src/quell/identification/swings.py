@@ -12,7 +12,10 @@ coloured. With the slope ∂p/∂a of a pole by the coefficients of A the deviat
 
     δω = Re(p̄ δp)/ω,        δζ = −(Re δp + ζ δω)/ω
 
-Each mode must pass the ratio of likelihoods of ``alternatives``. What rings is taken as
+Each mode must pass the ratio of likelihoods of ``alternatives``, the first one against a y that is
+constant or decays as ``y_∞ + (y_0 − y_∞) exp(−t/T)``: a coast-down, or a heat-up under a steady u,
+which ``free_decay`` fits in the same way. With 1/T = a the interval of T is that of 1/a, and y_∞ is
+a ratio of two parameters, with Fieller's interval (``model.gain_interval``). What rings is taken as
 linear: friction makes the damping of a small swing larger than that of a large one.
 """
 
@@ -25,7 +28,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.identification.model import WITHIN_95, Structure, output, pole_slope
+from quell.files import nonfinite_to_none
+from quell.identification.model import (
+    WITHIN_95,
+    Structure,
+    gain_interval,
+    output,
+    pole_slope,
+)
 from quell.identification.output_error import ParameterEstimate, likelihood_ratio, refine
 from quell.identification.starts import with_poles
 from quell.parallel import one_blas_thread
@@ -38,6 +48,8 @@ _MOST_MODES, _PENCIL, _PER_PERIOD = 5, 600, 8.0
 _POWER = 0.999
 # Steps of the refinement, and the least number of samples for a mode: chosen by hand.
 _STEPS, _PER_MODE = 40, 20
+# Samples of a decay at least, and time constants from which its search begins: chosen by hand.
+_LEAST_DECAY, _RATES = 12, 7
 # Relative mean square that counts as zero.
 _ROUNDING = 1e-24
 
@@ -110,6 +122,116 @@ class FreeSwing(NamedTuple):
         }
 
 
+class FreeDecay(NamedTuple):
+    """A y that decays to where it rests, with one time constant."""
+
+    time_constant: float  #: T [s]
+    interval: tuple[float, float]  #: 95 % interval of it [s]; infinite if the record is too short
+    at_rest: float  #: y_∞ [y-unit]
+    at_rest_interval: tuple[float, float]  #: 95 % interval of it [y-unit]
+    begin: float  #: y_0 [y-unit]
+    fit: float  #: NRMSE [%]
+    dt: float  #: sample time [s]
+    y: Vector  #: as measured (N,) [y-unit]
+    simulated: Vector  #: (N,) [y-unit]
+
+    def __str__(self) -> str:
+        """Return the report."""
+        (low, high), (least, most) = self.interval, self.at_rest_interval
+        lines = [
+            f"y decays with a time constant of {self.time_constant:.5g} s, 95 %: {low:.5g} to "
+            f"{high:.5g} s",
+            f"from {self.begin:.5g} to {self.at_rest:.5g}, 95 %: {least:.5g} to {most:.5g}; "
+            f"fit {self.fit:.3f} %",
+        ]
+        if not high < math.inf:
+            lines.append(
+                "NOT: the record does not decide the time constant: y may be a straight line; "
+                "record longer"
+            )
+        return "\n".join(lines)
+
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
+        """Draw y as measured and simulated, and the error, as ``FreeSwing.plot``."""
+        drawn = FreeSwing((), self.at_rest, self.fit, self.dt, self.y, self.simulated)
+        return drawn.plot(axes, ax=ax)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the results for JSON; None for numbers that are not finite."""
+        names = ("time_constant", "interval", "at_rest", "at_rest_interval", "begin", "fit")
+        return dict(nonfinite_to_none({name: getattr(self, name) for name in names}))
+
+
+def free_decay(y: Any, dt: float) -> FreeDecay:
+    """Return time constant and end of a y that decays while u is steady.
+
+    Parameters
+    ----------
+    y
+        record (N,) of a coast-down, or of a heat-up under a steady u [y-unit]; 12 samples at least.
+    dt
+        sample time [s].
+
+    Raises
+    ------
+    ValueError
+        for a y that does not decay, and for a record that is too short.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import quell as ql
+    >>> t = np.arange(20) * 5.0
+    >>> found = ql.identification.free_decay(150.0 - 130.0 * np.exp(-t / 40.0), dt=5.0)
+    >>> round(found.time_constant, 3), round(found.at_rest, 3)
+    (40.0, 150.0)
+    """
+    y, dt = checks.vector("y", y), checks.positive("dt", dt, "s")
+    if y.size < _LEAST_DECAY:
+        raise ValueError(f"y has {y.size} samples: must have at least {_LEAST_DECAY}; record more")
+    structure = Structure(1, 0, (0,))
+    with one_blas_thread(), np.errstate(all="ignore"):
+        estimate = _decay(y)
+        centred = y - np.mean(y)
+        simulated = output(structure, estimate.theta, np.ones((y.size, 1)))
+        ratio = likelihood_ratio((centred, y - simulated), _ROUNDING * float(centred @ centred))
+    a = float(estimate.theta[0])
+    if not math.isfinite(estimate.cost) or a >= math.pi or ratio < 4.0 * math.log(y.size):
+        raise ValueError(
+            "y does not decay: no time constant explains more of it than chance; begin the record "
+            "where u was switched, and keep u steady"
+        )
+    if a <= 0.0:
+        raise ValueError(
+            "y does not decay: it moves on as a straight line or faster; record longer, until it "
+            "comes to rest"
+        )
+    half = WITHIN_95 * math.sqrt(max(float(estimate.covariance[0, 0]), 0.0))
+    spread = float(np.linalg.norm(centred))
+    low, high = gain_interval(
+        estimate.theta[:1], float(estimate.theta[1]), estimate.covariance[:2, :2]
+    )
+    return FreeDecay(
+        dt / a,
+        (dt / (a + half), dt / (a - half) if half < a else math.inf),
+        float(estimate.theta[1]) / a,
+        (low, high),
+        float(simulated[0]),
+        100.0 * (1.0 - float(np.linalg.norm(y - simulated)) / spread),
+        dt,
+        y,
+        simulated,
+    )
+
+
+def _decay(y: Vector) -> ParameterEstimate:
+    """Return the best exponential from several time constants."""
+    structure, v = Structure(1, 0, (0,)), np.ones((y.size, 1))
+    rates = np.geomspace(0.3 / y.size, 1.0, _RATES)
+    tried = [refine(structure, with_poles(structure, np.array([a])), v, y, _STEPS) for a in rates]
+    return min(tried, key=lambda one: one.cost)
+
+
 def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
     """Return frequency and damping of the modes of a y that rings while u rests.
 
@@ -149,6 +271,13 @@ def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
     with one_blas_thread(), np.errstate(all="ignore"):
         least = _ROUNDING * float(np.sum(error**2))
         poles = _pencil(y)
+        decay = _decay(y)
+        left = y - output(Structure(1, 0, (0,)), decay.theta, v)
+        # What decays is no mode that is damped so much that it hardly swings.
+        if math.isfinite(decay.cost) and likelihood_ratio((error, left), least) > 3.0 * math.log(
+            y.size
+        ):
+            error = left
         for count in range(modes or 1, most + 1):
             if poles.size < count or y.size < _PER_MODE * count:
                 break
@@ -165,8 +294,8 @@ def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
         if found is None:
             raise ValueError(
                 "y does not ring: no pole with a frequency that its samples show was found; is it "
-                "a free swing, after a knock, while u rests? For a heat-up or coast-down use a "
-                "record in which u steps (identify)"
+                "a free swing, after a knock, while u rests? A heat-up or coast-down is for "
+                "free_decay"
             )
         return _result(*found, y, dt)
 
