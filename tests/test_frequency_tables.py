@@ -78,6 +78,9 @@ def test_a_record_in_time_is_no_table_of_frequencies(tmp_path: Path) -> None:
     file = tmp_path / "run.csv"
     np.savetxt(file, rows, delimiter=",", header="t,u,frequency,gain", comments="")
     assert frequency_table(file) is None
+    header = "frequency [Hz],power [W]"  # of a drive, without times
+    np.savetxt(tmp_path / "drive.csv", rows[:, 1:3], delimiter=",", header=header, comments="")
+    assert frequency_table(tmp_path / "drive.csv") is None
     asked = frequency_table(file, ["frequency", "gain"])
     assert asked is not None
     assert asked.power is not None

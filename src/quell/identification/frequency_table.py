@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from quell.files import MAX_SIZE
 from quell.identification.frequencies import KNOWN
 from quell.identification.record_file import OpenTable, numbers_of, open_table
-from quell.identification.record_layout import ROLES, listed, name_of
+from quell.identification.record_layout import ROLES, found_in, listed, name_of
 from quell.types import Vector
 
 # Words of the names of columns, in lower case, the first kind that has one of them; made by hand
@@ -46,6 +46,8 @@ _DEGREES = ("deg", "°", "degree", "degrees", "grad")
 _TURNS = 4.5 * math.pi
 # Coherence below which a frequency is left out: noise has more power than the response.
 _COHERENT = 0.5
+# Share of steps from line to line that go the same way in a table of frequencies. By hand.
+_ORDERED = 0.8
 _FEWEST = 8
 
 
@@ -72,8 +74,9 @@ def frequency_table(
 ) -> FrequencyTable | None:
     """Read a table of frequencies; return None if a file is none.
 
-    It is one if a column is named as a frequency (f, freq, Frequency (Hz), omega), none as time,
-    and others as size (magnitude, gain), phase, real and imaginary part, or power spectrum (psd).
+    It is one if a column is named as a frequency (f, freq, Frequency (Hz), omega) and rises or
+    falls, none is named as time, and others are size (magnitude, gain), phase, real and imaginary
+    part, or power spectrum (psd).
     Without a unit frequencies are in Hz, and omega in rad/s. A size is in dB if its name says so or
     a value is negative. A phase without unit is in degrees if it is beyond 4.5 π.
 
@@ -97,6 +100,9 @@ def frequency_table(
         return None
     opened, used = found
     numbers = numbers_of(opened, [one.place for one in used], [one.name for one in used])
+    steps = np.diff(numbers[:, 0])
+    if not columns and max(np.sum(steps > 0.0), np.sum(steps < 0.0)) < _ORDERED * steps.size:
+        return None  # samples of a drive's frequency
     return _table(opened.where, used, numbers)
 
 
@@ -118,7 +124,7 @@ def _opened(
         known = [_column(i, *pair) for i, pair in enumerate(zip(names, units, strict=True))]
         wanted = _asked(names, known, columns) if columns else [*filter(None, known)]
         kinds = [one.kind for one in wanted]
-        timed = any(name_of(*pair).base in ("t", "time") for pair in zip(names, units, strict=True))
+        timed = bool(found_in(names, units, "t", "t"))
         if kinds and ("f" in kinds or "omega" in kinds) and (columns or not timed):
             used = _used(opened.where, wanted)
             if used:
