@@ -4,9 +4,9 @@ Plants: ovens of one lag and of two, tanks (two lags), heat exchangers (three la
 LC filter), rigid servos (position), and flexible ones, measured at the motor and at the load. u
 is steps, a PRBS, a chirp, a relay in the loop, or a proportional loop with a reference that steps.
 On y are white noise of 0.03 to 1 % of its range, and, of a quarter each, a drift of the size of the
-noise, and rounding to a step of 0.1 to 0.5 %; a tenth is clipped at the top; u is late by 0 to 10
-samples, and y has an offset. Each record is taken as ``quell tune RECORD`` takes it, without
-options (``record_model``).
+noise, and rounding to a step of 0.1 to 0.5 %, of a position a hundredth of these; a tenth is
+clipped at the top; u is late by 0 to 10 samples, and y has an offset. Each record is taken
+as ``quell tune RECORD`` takes it, without options (``record_model``).
 
 It is *usable* if its gain and each pole are within 3 half widths or 5 % of the truth; otherwise
 *wrong without NOT*, *said* (a line with NOT), or *refused*. Beside it a least-squares fit of the
@@ -105,7 +105,8 @@ def drawn(rng: np.random.Generator, kind: str, how: str) -> Record:
     A, B, C, _, _ = cont2discrete(tf2ss(num, den), dt)
     x, before, clean = np.zeros(A.shape[0]), [0.0] * late, np.zeros(SAMPLES)
     size = float(np.abs(np.polyval(num, 1j * fast / 2) / np.polyval(den, 1j * fast / 2)))
-    noise, state = 10.0 ** rng.uniform(-3.5, -2.0), 1.0
+    fine = 1e-2 if den[-1] == 0.0 else 1.0  # an encoder has finer steps
+    noise, state = fine * 10.0 ** rng.uniform(-3.5, -2.0), 1.0
     wide = half * float(np.abs(np.polyval(num, 1j / slow) / np.polyval(den, 1j / slow)))
     reference = wide * np.repeat(rng.uniform(-0.5, 0.5, SAMPLES // hold + 1), hold)
     gain = 0.15 / size
@@ -129,7 +130,7 @@ def drawn(rng: np.random.Generator, kind: str, how: str) -> Record:
         top = float(np.min(y) + rng.uniform(0.7, 0.9) * np.ptp(y))
         clipped, y = y > top, np.minimum(y, top)
     if rng.random() < 0.25:
-        step = 10.0 ** rng.uniform(-3.0, -2.3) * span
+        step = fine * 10.0 ** rng.uniform(-3.0, -2.3) * span
         y = step * np.round(y / step)
     return Record(kind, how, u, y + rng.uniform(-1.0, 1.0) * span, clipped, dt, num, den, late)
 
