@@ -274,7 +274,7 @@ def test_the_folder_has_all_files_and_no_placeholder(tmp_path: Path) -> None:
         ("", "must be a C identifier"),
         ("while", "is a keyword of C or C++"),
         ("class", "is a keyword of C or C++"),
-        ("Math", "Math.h would hide the standard header"),
+        ("Math", "is a standard header of C, C++ or Arduino"),
         ("x" * 64, "63 characters"),
         ("test", "is a target of CMake itself"),
         ("Install", "is a target of CMake itself"),

@@ -602,8 +602,8 @@ def test_functions_in_c_come_along(tmp_path: Path, made: Maker) -> None:
     [
         (plain, "servo.zip", {}, "must end in .fmu"),
         (plain, "1st.fmu", {}, "name = '1st': must be a C identifier"),
-        (plain, "while.fmu", {}, "name = 'while': is a keyword of C"),
-        (plain, "model.fmu", {}, "name = 'model': is the name of a file that each FMU has"),
+        (plain, "while.fmu", {}, "name = 'while': is a keyword of C or C++"),
+        (plain, "model.fmu", {}, "name = 'model': is a file that each FMU has"),
         (plain, "none/servo.fmu", {}, "the folder .* must exist"),
         (plain, "servo.fmu", {"dt": 0.5}, "dt = 0.5 s: must be the controller's, 0.01 s"),
         (plain, "servo.fmu", {"x0": [0.0]}, "x0 is given: is the state of a plant"),

@@ -37,10 +37,6 @@ _FILES = {
     "src/NAME_controller.cpp": "controller.cpp",
 }
 
-# Packages that this one needs can't have its name.
-_TAKEN = """ament_cmake controller_interface controller_manager hardware_interface pluginlib rclcpp
-    rclcpp_lifecycle realtime_tools std_msgs"""
-
 # A rate that differs by more from a whole number is another rate.
 _ROUNDING = 1e-9
 
@@ -120,12 +116,9 @@ def ros2(
 
 def _check_name(name: str) -> None:
     """Raise a ``ValueError`` for a name that no package of ROS has (REP 144)."""
-    checked_name(name)
+    checked_name(name, "CMake", "ROS 2")
     if not re.fullmatch(r"[a-z](_?[a-z0-9])+", name):
         rule = "a package of ROS has lower-case letters, digits and single _; choose another name"
-        raise TranslationError(f"name = {name!r}: {rule}")
-    if name in _TAKEN.split():
-        rule = "is a package that this one needs; choose another name"
         raise TranslationError(f"name = {name!r}: {rule}")
 
 

@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import check_controller
+from quell.export import reserved
 from quell.export.c_files import plant_source
 from quell.export.controller_source import c_source
 from quell.export.fmi.parts import (
@@ -514,8 +515,6 @@ def compiled(folder: Path, files: Sequence[str], name: str) -> bytes:
 
 # ---- fmu ----
 
-# Files beside those that have the name of the model.
-_OWN_NAMES = ("fmi3", "fmi3_refused", "model", "refuse")
 # The same files give the same FMU: times in the archive are the first that ZIP knows.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
@@ -578,9 +577,7 @@ def fmu(
     target = Path(path)
     if target.suffix != ".fmu":
         raise ValueError(f"path = {str(target)!r}: must end in .fmu")
-    name = checked_name(name or target.stem)
-    if name in _OWN_NAMES:
-        raise ValueError(f"name = {name!r}: is the name of a file that each FMU has; give another")
+    name = checked_name(name or target.stem, "FMI")
     check_writable(target, checks.flag("overwrite", overwrite))
     plant, controller = _parts(part)
     own = _own_sources(sources)
@@ -635,7 +632,7 @@ def _own_sources(sources: Sequence[str | os.PathLike[str]]) -> dict[str, str]:
     found: dict[str, str] = {}
     for given in sources:
         path = Path(given)
-        if path.suffix not in (".c", ".h") or path.stem in _OWN_NAMES:
+        if path.suffix not in (".c", ".h") or path.stem in reserved.FMI:
             shown = os.fspath(given)  # Path("") would show "."
             raise ValueError(f"sources: {shown!r}: must be a file *.c or *.h, of another name")
         if path.name in found:

@@ -495,10 +495,6 @@ def _edges(calls: str) -> dict[str, set[str]]:
 
 # ---- c ----
 
-# Targets that CMake, or a program for which it writes, has of its own.
-_CMAKE_TARGETS = """all all_build clean edit_cache help install list_install_components package
-    package_source rebuild_cache run_tests test uninstall zero_check"""
-
 
 @dataclass(frozen=True)
 class Exported:
@@ -592,9 +588,7 @@ def c(
     ['servo.h', 'servo.c', 'test_servo.c']
     """
     check_controller(controller, several=True)
-    if checked_name(name).lower() in _CMAKE_TARGETS.split():
-        rule = "is a target of CMake itself, so CMakeLists.txt can't have it; choose another name"
-        raise ValueError(f"name = {name!r}: {rule}")
+    checked_name(name, "CMake")
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
     check_folder(folder, checks.flag("overwrite", overwrite))
     checks.flag("proof", proof)

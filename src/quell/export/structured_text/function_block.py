@@ -28,9 +28,9 @@ from quell.export.controller_source import (
 from quell.export.library.precision import Comparison, checked_comparison
 from quell.export.library.vectors import fill
 from quell.export.structured_text.c_reader import Assign, CFile, Evaluate, Member
-from quell.export.structured_text.places import Node, Place, Record, Variable, Whole, is_keyword
+from quell.export.structured_text.places import Node, Place, Record, Variable, Whole
 from quell.export.structured_text.translator import Translator
-from quell.export.translate.text import TranslationError, wrapped
+from quell.export.translate.text import TranslationError, checked_name, wrapped
 from quell.files import check_folder, write_folder
 from quell.learners.base import NoLearner
 from quell.simulation.driver import Scenario
@@ -162,9 +162,7 @@ def _check_name(name: str) -> None:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name):
         rule = "must be a letter, and then letters, digits and single _, for Structured Text"
         raise TranslationError(f"name = {name!r}: {rule}")
-    if is_keyword(name):
-        rule = "is a keyword of Structured Text; choose another name"
-        raise TranslationError(f"name = {name!r}: {rule}")
+    checked_name(name, "Structured Text")
 
 
 def _check_limits(controller: Any) -> None:

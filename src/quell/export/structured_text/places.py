@@ -9,26 +9,6 @@ from typing import NamedTuple
 from quell.export.structured_text.c_reader import NO_TEXT, Braces, Expr
 from quell.export.translate.text import TranslationError
 
-# ---- Names ----
-
-# Keywords, types and standard functions, which are no names of variables; signs of either case.
-_KEYWORDS = """abs acos action add and any array asin at atan bool by byte case concat configuration
-    constant continue cos ctd ctu date delete dint div do dt dword else elsif en end_case end_for
-    end_function end_function_block end_if end_program end_repeat end_struct end_type end_var
-    end_while eno eq exit exp expt f_edge f_trig false find for from function function_block ge gt
-    if initial_step insert int interval jmp ld le left len limit lint ln log lreal lt lword max mid
-    min mod move mul mux ne non_retain not of on or program r_edge r_trig read_only read_write real
-    repeat replace ret retain return right rol ror rs sel shl shr sin sint sqrt sr st step string
-    struct sub tan task then time to tod tof ton tp transition true trunc type udint uint ulint
-    until usint var var_access var_config var_external var_global var_in_out var_input var_output
-    var_temp while with word wstring xor"""
-
-
-def is_keyword(name: str) -> bool:
-    """Return whether Structured Text uses a name itself."""
-    return name.lower() in _KEYWORDS.split()
-
-
 # ---- Values and places ----
 
 

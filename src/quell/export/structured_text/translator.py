@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from quell.export.reserved import is_taken_in_st
 from quell.export.structured_text.c_reader import (
     NO_TEXT,
     Assign,
@@ -57,7 +58,6 @@ from quell.export.structured_text.places import (
     count,
     flat,
     inside,
-    is_keyword,
     real_text,
 )
 from quell.export.translate.text import TranslationError
@@ -166,7 +166,7 @@ class Translator:
     def name(self, wished: str) -> str:
         """Return a name that no variable has."""
         plain = re.sub(r"_+", "_", wished).strip("_") or "x"
-        plain = f"v_{plain}" if is_keyword(plain) or plain[0].isdigit() else plain
+        plain = f"v_{plain}" if is_taken_in_st(plain) or plain[0].isdigit() else plain
         found, number = plain, 2
         while found.lower() in self._taken:
             found, number = f"{plain}_{number}", number + 1

@@ -684,7 +684,9 @@ class Calls:
     def _c_function(self, body: Expressions, name: str, given: list[Value]) -> Value:
         """Return a call of a function that the user has in C."""
         if identifier(name) != name:
-            raise TranslationError(f"c_function = {name!r}: is a keyword of C or C++")
+            raise TranslationError(
+                f"c_function = {name!r}: is a keyword or macro in C or C++; rename it"
+            )
         body.written.add(given[-1].root)
         kinds = [self._c_parameter(value, value is given[-1]) for value in given]
         self.program.externals[name] = f"void {name}({', '.join(kinds)});"
