@@ -12,8 +12,10 @@ from typing import Any
 import pytest
 
 import quell as ql
+from quell.export.c_files import CSource
 from quell.export.library.exported import Exported
 from quell.export.proof import proof_files, prove, read_findings, structure
+from quell.export.separate import separated
 from quell.features import Custom
 
 from .cases import cases
@@ -77,6 +79,9 @@ MUTANTS = [
     pytest.param("applied < limits->low", "applied > limits->low", "servo_step", id="wrong sign"),
     pytest.param("estimate.x_hat[1] = row[1];", "estimate.x_hat[1] = row[9];", "servo_get_estimate", id="index"),
     pytest.param("for (int i = 0; i < 2; i++) {", "for (int i = 0; i < 40; i++) {", "", id="too many passes"),
+    pytest.param("state->estimates, 3);\n    state->loop", "state->estimates, 4);\n    state->loop", "memory_get_all", id="load of one number too many"),
+    pytest.param("memory_put_all(image, 0, state->z, 3)", "memory_put_all(image, 0, state->z, 4)", "memory_put_all", id="save of one number too many"),
+    pytest.param("    observe(&design->eso, z, ", "    z[3] = before;\n    observe(&design->eso, z, ", "", id="one array into the next"),
     pytest.param("    observe(&design->eso, z, ", "    z[(int)before] = before;\n    observe(&design->eso, z, ", "", id="NaN as an index"),
 ]  # fmt: skip
 
@@ -126,11 +131,60 @@ def test_the_script_comes_to_the_same_result(tmp_path: Path) -> None:
     for old, new, status, shown in (
         ("", "", 0, "proved: no undefined behaviour"),
         ("        applied = limits->high;\n", "", 1, "servo_step: postcondition: Unknown"),
+        (
+            "state->x, 3);\n    memory_get_all",
+            "state->x, 4);\n    memory_get_all",
+            1,
+            "memory_get_all: mem_access",
+        ),
         ("#include <math.h>", "int x = ;", 1, "NOT proved: Frama-C ended without a result"),
     ):
         code.write_text(text.replace(old, new))
         ran = subprocess.run(["sh", script], capture_output=True, text=True, check=False)
         assert (ran.returncode, shown in ran.stdout) == (status, True), ran.stdout
+    code.write_text(text)
+    header = done.folder / "src/servo.h"
+    header.write_text(header.read_text().replace("double x[3];", "double x[2];"))
+    ran = subprocess.run(["sh", script], capture_output=True, text=True, check=False)
+    assert (ran.returncode, "is not the header that was exported" in ran.stdout) == (1, True)
+    assert "the header is not the one" in prove(done.folder, done.source).summary
+
+
+HEADER = """typedef struct {
+    double low[2];
+} a_limits;
+typedef struct {
+    a_limits limits;
+} a_parameters;
+typedef struct {
+    int place[4]; /* of double old[3]; */
+    double P[2][3];
+} a_memory;
+typedef struct {
+    double row[5];
+} a_sample;
+typedef struct {
+    const a_parameters *parameters;
+    double z[3];
+    a_memory memory[2];
+    a_limits limits;
+    a_sample sample;
+} a_state;
+"""
+
+
+def test_arrays_of_the_state_become_objects_of_their_own() -> None:
+    """With their lengths, also within arrays of structs; not what the parameters or a variable have, too."""
+    code = "static void f(void)\n{\n    a_sample sample = {0};\n}\n"
+    found = separated(CSource("a", HEADER, code, "double", (), ()))
+    assert found.left == ("a_limits.low", "a_sample.row")
+    lines = [line.strip() for line in found.header.splitlines()]
+    for line in ("double (*z);", "a_memory (*memory);", "int (*place); /* of double old[3]; */", "double (*P)[3];",
+                 "double low[2];", "double row[5];", "static double separate_0[3];",
+                 "static a_memory separate_1[2];", "separate_1[1].P = separate_5;",
+                 "(void)(memset)(place->P, 0, 6 * sizeof(double));"):  # fmt: skip
+        assert line in lines, line
+    assert found.number == 6
 
 
 @pytest.mark.trial

@@ -40,6 +40,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell.export import separate
 from quell.export.c_files import CSource
 from quell.export.controller_source import at_path, limits_path, parts_of
 from quell.export.translate.text import Literals
@@ -330,8 +331,9 @@ def _operation(sign: ast.operator, one: Interval, other: Interval) -> Interval:
 
 FOLDER = "proof"
 """The folder of these files."""
-PROPERTIES = "properties.csv"
-"""The file with all that Frama-C has looked at."""
+PROPERTIES, SEPARATE = "properties.csv", "separate.csv"
+"""The files with all that Frama-C has looked at, for the state as it is and for separate arrays."""
+_LOGS = {PROPERTIES: "eva.log", SEPARATE: "separate.log"}
 
 # One set of intervals at each place of the code, and short loops pass by pass: so arrays that they
 # fill are known to be filled. Level 1 took four times as long and proved no more. Results that are
@@ -384,10 +386,11 @@ def _returning_u(source: CSource) -> dict[str, str]:
     }
 
 
-def frama_c_options(name: str) -> tuple[str, ...]:
-    """Return the arguments of frama-c, in the folder of the proof."""
+def frama_c_options(name: str, table: str = PROPERTIES) -> tuple[str, ...]:
+    """Return the arguments of frama-c for one of the tables, in the folder of the proof."""
     sources = (f"../src/{name}.c", f"{name}_proof.c")
-    return (*_OPTIONS, "-cpp-extra-args=-I../src", *sources, "-then", "-report-csv", PROPERTIES)
+    more = f",-include,{name}_{separate.HEADER}" if table == SEPARATE else ""
+    return (*_OPTIONS, f"-cpp-extra-args=-I../src{more}", *sources, "-then", "-report-csv", table)
 
 
 def proof_files(controller: Any, source: CSource) -> dict[str, str]:
@@ -405,12 +408,15 @@ def proof_files(controller: Any, source: CSource) -> dict[str, str]:
             "see; leave the proof out, or the c_function: then its translation is proved, too"
         )
     name, path = source.name, limits_path(controller)
-    options = shlex.join(frama_c_options(name))
-    script = (resources.files(__package__) / "templates" / "prove.sh").read_text("utf-8")
+    options, own = (shlex.join(frama_c_options(name, each)) for each in (PROPERTIES, SEPARATE))
+    texts = {"name": name, "options": options, "separate": own,
+             "limits": " within its limits" if path else ""}  # fmt: skip
     return {
         f"{FOLDER}/{name}_contract.h": _contract(source, path),
         f"{FOLDER}/{name}_proof.c": _program(controller, source, path),
-        f"{FOLDER}/prove.sh": script.replace("@name@", name).replace("@options@", options),
+        f"{FOLDER}/{name}_{separate.HEADER}": separate.separated(source).header,
+        f"{FOLDER}/{name}_exported.h": source.header,
+        f"{FOLDER}/prove.sh": _filled("prove.sh", texts),
     }
 
 
@@ -512,6 +518,9 @@ def _program(controller: Any, source: CSource, path: str) -> str:
         "",
         "int main(void)",
         "{",
+        "#ifdef SEPARATE_ARRAYS",
+        "    separate_arrays(&controller);",
+        "#endif",
         f"    {name}_init(&controller);",
         "    operate(&controller);",
         *retuning,
@@ -546,6 +555,7 @@ INSTALL = "there is no frama-c here (Debian and Ubuntu: apt-get install frama-c-
 _PROVED = ("Valid", "Considered valid")  # the second are contracts of the C library
 # What functions of the C library change is an assumption, of which the report names the functions.
 _ASSUMED = ("assigns clause", "from clause")
+# A function of the second run's header that nothing calls is dead.
 # What the contract promises; without these the proof did not look at what it is for.
 _PROMISES = ("a_number: ", "within_limits: ")
 
@@ -610,29 +620,45 @@ class Findings(NamedTuple):
 
 
 def frama_c(folder: Path, name: str, longest: float) -> Findings:
-    """Run Frama-C in ``folder/proof`` for at most ``longest`` seconds."""
+    """Run Frama-C in ``folder/proof``, twice, for at most ``longest`` seconds in all."""
+    first = _run(folder, name, longest, PROPERTIES)
+    if first.failure:
+        return first
+    second = _run(folder, name, max(longest - first.seconds, 1.0), SEPARATE)
+    own = tuple(each for each in second.alarms if each not in first.alarms)
+    return first._replace(
+        seconds=first.seconds + second.seconds,
+        alarms=(*first.alarms, *own),
+        promises=min(first.promises, second.promises),
+        failure=f"with separate arrays {second.failure}" if second.failure else "",
+    )
+
+
+def _run(folder: Path, name: str, longest: float, table: str) -> Findings:
+    """Run Frama-C for one of the tables."""
     program = shutil.which("frama-c")
     if program is None:
         return Findings(failure=INSTALL)
     place = (folder / FOLDER).resolve()  # Frama-C takes the folder from PWD
-    (place / PROPERTIES).unlink(missing_ok=True)
+    found, log = place / table, place / _LOGS[table]
+    found.unlink(missing_ok=True)
     version = _output(program, "-version")
     begin = time.monotonic()
     try:
-        with (place / "eva.log").open("w", encoding="utf-8") as log:
+        with log.open("w", encoding="utf-8") as file:
             code = subprocess.run(
-                [program, *frama_c_options(name)], cwd=place, stdout=log, stderr=subprocess.STDOUT,
-                timeout=longest, check=False, env={**os.environ, "PWD": str(place)},
+                [program, *frama_c_options(name, table)], cwd=place, stdout=file,
+                stderr=subprocess.STDOUT, timeout=longest, check=False,
+                env={**os.environ, "PWD": str(place)},
             ).returncode  # fmt: skip
     except subprocess.TimeoutExpired:
         return Findings(version, longest, failure=f"the analysis did not end in {longest:g} s")
     seconds = time.monotonic() - begin
-    text = (place / "eva.log").read_text(encoding="utf-8", errors="replace")
-    table = place / PROPERTIES
-    if code or not table.exists() or "[eva:summary]" not in text:
+    text = log.read_text(encoding="utf-8", errors="replace")
+    if code or not found.exists() or "[eva:summary]" not in text:
         last = text.strip().splitlines()[-1:] or ["no output"]
         return Findings(version, seconds, failure=f"frama-c ended with {code}: {last[0][:200]}")
-    return read_findings(version, seconds, text, table.read_text(encoding="utf-8"))
+    return read_findings(version, seconds, text, found.read_text(encoding="utf-8"))
 
 
 def read_findings(version: str, seconds: float, log: str, table: str) -> Findings:
@@ -641,7 +667,9 @@ def read_findings(version: str, seconds: float, log: str, table: str) -> Finding
     alarms = [
         Alarm(Path(file).name, int(line), function, kind, status, text)
         for place, file, line, function, kind, status, text in rows
-        if status not in _PROVED and not (place.startswith("FRAMAC_SHARE") and kind in _ASSUMED)
+        if status not in _PROVED
+        and not (place.startswith("FRAMAC_SHARE") and kind in _ASSUMED)
+        and not (status == "Dead" and file.endswith(f"_{separate.HEADER}"))
     ]
     promises = sum(
         status == "Valid" and kind == "postcondition" and text.startswith(_PROMISES)
@@ -728,6 +756,8 @@ class Proof:
         stack and code of each function, in Markdown; empty if nobody has measured them.
     limited
         whether u has limits.
+    left
+        what the text says of arrays of the state that are not separate objects; empty if all are.
     """
 
     folder: Path
@@ -739,6 +769,7 @@ class Proof:
     digest: str
     sizes: str = ""
     limited: bool = False
+    left: str = ""
 
     @property
     def proved(self) -> bool:
@@ -772,7 +803,8 @@ class Proof:
         where = f"Frama-C {self.findings.version}, {self.findings.seconds:.0f} s"
         if not self.proved:
             return f"NOT proved: {len(self.open)} properties are open ({where})"
-        return f"Proved: no undefined behaviour, u is always a number within its limits ({where})"
+        within = " within its limits" if self.limited else ""
+        return f"Proved: no undefined behaviour, u is always a number{within} ({where})"
 
     @property
     def text(self) -> str:
@@ -793,6 +825,7 @@ class Proof:
         found, promising = self.findings, self.promising
         return _filled("results.md", {
             "name": self.name,
+            "left": self.left,
             "head": "What is proved" if self.proved else "What holds but for the open properties",
             "functions": " or ".join(f"`{self.name}_{each}`" for each in promising),
             "limits": _LIMITS if self.limited else " There are no limits of u.",
@@ -840,8 +873,10 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: st
         stack and code of each function for the report, in Markdown.
     """
     contract = (folder / FOLDER / f"{source.name}_contract.h").read_text(encoding="utf-8")
-    found = frama_c(folder, source.name, longest)
     header, code = ((folder / "src" / f"{source.name}{end}").read_bytes() for end in (".h", ".c"))
+    found = frama_c(folder, source.name, longest)
+    if header != source.header.encode("utf-8"):
+        found = found._replace(failure="the header is not the one that was exported; export again")
     read, digest = (
         structure(code.decode("utf-8"), f"{source.name}_step"),
         hashlib.sha256(header + code).hexdigest(),
@@ -849,7 +884,13 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: st
     promising = tuple(_returning_u(source))
     promised = contract.count("ensures ")
     limited = "within_limits" in contract
-    proof = Proof(folder, source.name, found, read, promised, promising, digest, sizes, limited)
+    names = ", ".join(f"`{each}`" for each in separate.separated(source).left)
+    left = f" These arrays are left in their struct, so the text alone is read: {names}." * bool(
+        names
+    )
+    proof = Proof(
+        *(folder, source.name, found, read, promised, promising, digest, sizes, limited, left)
+    )
     with written_atomically(folder / FOLDER / REPORT, overwrite=True) as part:
         part.write_text(proof.text, encoding="utf-8")
     return proof
