@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import math
 import re
+import struct
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from enum import IntEnum
 from importlib import resources
@@ -27,6 +29,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.compensator import samples_to_settle
+from quell.controllers.memory import images_of, named_arrays, start_from_rest, written_image
 from quell.export.c_files import CSource
 from quell.export.controller_source import Parts, at_path, limits_path, parts_of
 from quell.export.translate.text import Literals
@@ -208,6 +211,8 @@ def loop_code(source: CSource, loops: Loops) -> str:
 # Samples of each part of the run: enough for observers to settle in, few enough that the file is
 # read by people and fits into a small flash memory (in single precision 20 bytes each).
 FIRST, PART = 60, 20
+# Samples before the memory image that is compared: all is in motion, and y was missing in the last.
+SAVED = 74
 # A start under load takes twice the samples in which the observer settles; longer ones are left
 # out, because the kernels are interpreted here (20 us a sample).
 LONGEST_START = 4000
@@ -261,6 +266,10 @@ class Vectors(NamedTuple):
         all that the controller knows after the last sample, in the order of ``CSource.channels``.
     loops
         plants of the blocks in which learners take part, if there is a learner.
+    images
+        memory images after ``SAVED`` samples: running, and at rest as a start leaves it.
+    parts
+        number and largest size of the entries of each array in an image.
     """
 
     rows: tuple[Row, ...]
@@ -269,6 +278,8 @@ class Vectors(NamedTuple):
     scale: Vector
     estimate: Vector
     loops: Loops | None
+    images: tuple[bytes, bytes]
+    parts: list[tuple[int, float]]
 
 
 class Player:
@@ -397,6 +408,8 @@ def golden_vectors(controller: Any, source: CSource) -> Vectors:
         at = (i + 1) % r.size
         r[at] = math.nan if i % 7 == 3 else r[at]
         player.play(Action.STEP, r, y)
+        if len(player.rows) == SAVED:
+            images, parts = _images(player)
     for i in range(PART):
         action = Action.APPLIED if i % 5 == 0 else Action.STEP
         given = 0.5 * player.rows[-1].u.astype(float)
@@ -430,7 +443,24 @@ def golden_vectors(controller: Any, source: CSource) -> Vectors:
     widths = (width for _, width in player.parts.controller.channels)
     row = np.zeros(sum(widths), dtype=player.dtype)
     write_row(player.design, player.state, row)
-    return Vectors(tuple(player.rows), path, limit, np.array(scale), row, player.loops)
+    sizes = np.array(scale)
+    return Vectors(*(tuple(player.rows), path, limit, sizes, row, player.loops, images, parts))
+
+
+def _images(player: Player) -> tuple[tuple[bytes, bytes], list[tuple[int, float]]]:
+    """Return the images of a player's state, and numbers and sizes of their parts."""
+    controller, state = player.parts.controller, player.state
+    names = getattr(controller, "names", ())
+    known = images_of(player.design, state, controller.dt, names)
+    running = written_image(known)
+    parts = [(each.size, float(np.max(np.abs(each[np.isfinite(each)]), initial=0.0)))
+             for each in known.arrays.values() if each.size]  # fmt: skip
+    kept = {name: array.copy() for name, array in named_arrays(state).items()}
+    start_from_rest(player.design, state)
+    at_rest = written_image(known)
+    for name, array in named_arrays(state).items():
+        array[...] = kept[name]
+    return (running, at_rest), parts
 
 
 def _play_limited(player: Player, path: str, signals: _AllSignals) -> None:
@@ -593,8 +623,34 @@ def test_program(source: CSource, vectors: Vectors) -> str:
         "loop": loop_code(source, vectors.loops) if vectors.loops else "",
         "samples": f"count + {blocks * (BLOCK - 1)}" if blocks else "count",
         "tolerance": repr(tolerance_of(vectors.loops is not None)),
+        "image_sample": SAVED,
+        "running": _words_of(vectors.images[0]),
+        "at_rest": _words_of(vectors.images[1]),
+        "parts": "\n".join(f"    {{{count}, {size!r}}}," for count, size in vectors.parts),
+        "number": _NUMBER[source.precision],
         "tolerance_reason": TOLERANCE_REASON.replace("\n", "\n * "),
     })  # fmt: skip
+
+
+_NUMBER = {
+    "double": """    unsigned long long bits = 0;
+
+    for (int i = 7; i >= 0; i--)
+        bits = bits << 8 | first[i];
+    memcpy(&x, &bits, sizeof x);""",
+    "single": """    unsigned int bits = 0;
+
+    for (int i = 3; i >= 0; i--)
+        bits = bits << 8 | first[i];
+    memcpy(&x, &bits, sizeof x);""",
+}
+
+
+def _words_of(image: bytes) -> str:
+    """Return the words of an image that are not zero, with their places, as C code."""
+    words = enumerate(struct.unpack(f"<{len(image) // 4}I", image))
+    rows = ", ".join(f"{{{4 * at}, {word:#x}UL}}" for at, word in words if word)
+    return "\n".join(textwrap.wrap(rows, 96, initial_indent="    ", subsequent_indent="    "))
 
 
 def _braces(write: Callable[[Any], str], values: Any) -> str:

@@ -1,7 +1,8 @@
 /* Golden vectors of the controller @name@, in @precision@ precision.
  *
  * The program repeats a run that quell has computed: noise, missing and absurd samples,
- * saturation, other limits, manual operation and back, restarts. It needs no more than a C
+ * saturation, other limits, manual operation and back, restarts. Memory images are compared with
+ * quell's, and damaged ones must be refused. It needs no more than a C
  * compiler, and runs on a target whose printf works:
  *
  *     cc -std=c99 -O2 -ffp-contract=off -Isrc test_@name@.c src/@name@.c -lm -o test_@name@
@@ -17,6 +18,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #ifndef TOLERANCE
 #define TOLERANCE @tolerance@ /* [ulp]; the first argument of the program takes its place */
@@ -73,20 +75,151 @@ static void play(@name@_state *state@limited_parameter@, const sample *now, real
     @step@;
 }
 
-/* Save, forget everything, load: nothing may change; a damaged image must be refused. */
+/* Save, forget everything, load: nothing may change. */
 static int power_cycle(@name@_state *state)
 {
     static unsigned char image[@NAME@_MEMORY_SIZE];
-    int wrong = 0;
 
     @name@_save(state, image);
     @name@_init(state);
-    image[sizeof image / 2] ^= 1;
-    wrong += @name@_load(state, image, sizeof image, true);
-    image[sizeof image / 2] ^= 1;
-    wrong += !@name@_load(state, image, sizeof image, true);
-    if (wrong)
-        printf("the memory image is not loaded as it was saved\n");
+    if (@name@_load(state, image, sizeof image, true))
+        return 0;
+    printf("the memory image is not loaded as it was saved\n");
+    return 1;
+}
+
+/* ---- Memory images that quell has written ---- */
+
+#define NUMBERS ((int)((@NAME@_MEMORY_SIZE - 40) / sizeof(real)))
+/* Each byte of a small image is damaged once, and of a larger one about 4096 of them. */
+#define STRIDE (@NAME@_MEMORY_SIZE / 4096 + 1)
+
+/* The words of an image that are not zero, as four bytes from a place on. */
+typedef struct {
+    unsigned long at;
+    unsigned long word;
+} image_word;
+
+/* Numbers of an array, and the largest of them. */
+typedef struct {
+    int count;
+    double size;
+} image_part;
+
+static const image_word running[] = { /* after @image_sample@ samples */
+@running@
+};
+static const image_word at_rest[] = { /* the same, loaded without resume */
+@at_rest@
+};
+static const image_part parts[] = {
+@parts@
+};
+
+static void put(unsigned char *image, unsigned long at, unsigned long word)
+{
+    for (int i = 0; i < 4; i++)
+        image[at + (unsigned long)i] = (unsigned char)((word >> (8 * i)) & 0xffUL);
+}
+
+static void unpack(const image_word *words, size_t count, unsigned char *image)
+{
+    memset(image, 0, @NAME@_MEMORY_SIZE);
+    for (size_t i = 0; i < count; i++)
+        put(image, words[i].at, words[i].word);
+}
+
+static real number_of(const unsigned char *image, int k)
+{
+    const unsigned char *first = image + 32 + (size_t)k * sizeof(real);
+    real x;
+@number@
+    return x;
+}
+
+/* Write the check of an image whose bytes were changed: FNV-1a with 64 bits over words. */
+static void sign(unsigned char *image)
+{
+    unsigned long long check = 14695981039346656037ULL;
+
+    for (size_t at = 0; at < @NAME@_MEMORY_SIZE - 8; at += 4) {
+        const unsigned long long word = (unsigned long long)image[at]
+            | (unsigned long long)image[at + 1] << 8 | (unsigned long long)image[at + 2] << 16
+            | (unsigned long long)image[at + 3] << 24;
+
+        check = (check ^ word) * 1099511628211ULL & 0xffffffffffffffffULL;
+    }
+    put(image, @NAME@_MEMORY_SIZE - 8, (unsigned long)(check & 0xffffffffULL));
+    put(image, @NAME@_MEMORY_SIZE - 4, (unsigned long)(check >> 32));
+}
+
+static int wrong_if(bool condition, const char *what)
+{
+    if (condition)
+        printf("%s\n", what);
+    return condition;
+}
+
+/* An image must be refused, and nothing may have changed. */
+static int must_refuse(@name@_state *state, const unsigned char *image, size_t length, const char *what)
+{
+    static @name@_state before;
+
+    memcpy(&before, state, sizeof before);
+    return wrong_if(@name@_load(state, image, length, true), what)
+        || wrong_if(memcmp(&before, state, sizeof before) != 0, "a refused image changes the state");
+}
+
+/* Save as quell, take what quell has saved, and refuse what is damaged; continue from quell's. */
+static int images(@name@_state *state, double tolerance)
+{
+    static unsigned char golden[@NAME@_MEMORY_SIZE], image[@NAME@_MEMORY_SIZE];
+    const double most = tolerance > 1.0 / sqrt(EPSILON) ? tolerance : 1.0 / sqrt(EPSILON);
+    int wrong = 0, k = 0;
+
+    unpack(running, sizeof running / sizeof running[0], golden);
+    @name@_save(state, image);
+    wrong += wrong_if(memcmp(image, golden, 32) != 0, "the head of the image is not quell's");
+    for (int i = 0; i < (int)(sizeof parts / sizeof parts[0]); i++) {
+        for (int end = k + parts[i].count; k < end; k++) {
+            const double difference =
+                in_ulps(number_of(image, k), number_of(golden, k), parts[i].size);
+
+            if (!(difference <= most) && wrong++ == 0)
+                printf("number %d of the image is %.@digits@g, must be %.@digits@g\n", k,
+                    (double)number_of(image, k), (double)number_of(golden, k));
+        }
+    }
+    @name@_init(state);
+    wrong += wrong_if(!@name@_load(state, golden, sizeof golden, false), "quell's image is refused");
+    unpack(at_rest, sizeof at_rest / sizeof at_rest[0], golden);
+    @name@_save(state, image);
+    wrong += wrong_if(memcmp(image, golden, sizeof image) != 0, "a loaded image is not at rest");
+    unpack(running, sizeof running / sizeof running[0], golden);
+    for (size_t at = 0; at < sizeof golden && wrong == 0; at += STRIDE) {
+        golden[at] ^= 1;
+        wrong += must_refuse(state, golden, sizeof golden, "a damaged image is taken");
+        golden[at] ^= 1;
+    }
+    wrong += must_refuse(state, golden, sizeof golden - 1, "an image that is cut is taken");
+    for (k = 0; k < NUMBERS && wrong == 0; k += STRIDE) {
+        const unsigned long last = 32 + (unsigned long)((size_t)(k + 1) * sizeof(real)) - 4;
+
+        memcpy(image, golden, sizeof image);
+        put(image, last, sizeof(real) == 8 ? 0x7ff80000UL : 0x7fc00000UL);
+        sign(image);
+        wrong += must_refuse(state, image, sizeof image, "an image with NaN is taken");
+        put(image, last, sizeof(real) == 8 ? 0xfff00000UL : 0xff800000UL);
+        sign(image);
+        wrong += must_refuse(state, image, sizeof image, "an image with an infinite number is taken");
+    }
+    memcpy(image, golden, sizeof image);
+    image[24] ^= 1;
+    sign(image);
+    wrong += must_refuse(state, image, sizeof image, "a loop of other parameters is continued");
+    wrong += wrong_if(!@name@_load(state, golden, sizeof golden, true), "quell's image is refused");
+    @name@_save(state, image);
+    wrong += wrong_if(memcmp(image, golden, sizeof image) != 0, "a loaded image is saved otherwise");
     return wrong;
 }
 
@@ -103,7 +236,9 @@ int main(int argc, char **argv)
         const sample *now = &samples[k];
         real u[ACTUATORS] = {@zero@};
 
-        if (k == 30 || k == count - 1)
+        if (k == @image_sample@)
+            wrong += images(&state, tolerance);
+        if (k == count - 1)
             wrong += power_cycle(&state);
         play(&state@limited_argument@, now, u);
         const int status = @name@_status(&state);
