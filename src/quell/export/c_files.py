@@ -76,6 +76,14 @@ _WITHOUT_VECTORS = [
 ]
 
 
+# What whoever passes the code on keeps with it; the folder has the text of the licence.
+_LICENCE = """
+
+SPDX-License-Identifier: Apache-2.0. Copyright the quell developers, for the parts that are quell's.
+Licensed under the Apache License, Version 2.0, http://www.apache.org/licenses/LICENSE-2.0, and
+distributed on an "AS IS" basis, without warranties or conditions of any kind."""
+
+
 # Stand for the lines of ``init``, ``save`` and ``load``, which are known when all others are.
 _INITIAL, _SAVE, _LOAD = "    initial", "    save", "    load"
 
@@ -256,7 +264,7 @@ class CFiles:
     def _header(self, title: list[str], defines: list[str]) -> str:
         name, upper, structs = self.name, self.name.upper(), self.program.structs
         lines = [
-            *comment_block("\n".join(title)),
+            *comment_block("\n".join(title) + _LICENCE),
             f"#ifndef {upper}_H",
             f"#define {upper}_H",
             "",
