@@ -25,8 +25,8 @@ R = TypeVar("R")
 # Samples from one recorded sample to the next: as many as a scenario may have.
 _MOST_EVERY = 10**12
 # Time that the process may take as a multiple of its processor time: it may have to wait for a disk
-# or a busy machine. Chosen by hand.
-_PATIENCE = 10.0
+# or a busy machine. A file that hangs ends within 20 s for the ``max_size`` that is the default.
+_PATIENCE = 2.5
 
 
 class Stored(NamedTuple):
@@ -93,7 +93,8 @@ def _reader(arguments: Sequence[str], most: int) -> Iterator[IO[bytes]]:
         stderr=subprocess.DEVNULL,
         env=environment,
     ) as process:
-        timer = Timer(_PATIENCE * netcdf_reader.processor_time(most), process.kill)
+        allowed = netcdf_reader.processor_time(most)
+        timer = Timer(_PATIENCE * allowed, process.kill)
         timer.start()
         try:
             assert process.stdout is not None
@@ -102,8 +103,8 @@ def _reader(arguments: Sequence[str], most: int) -> Iterator[IO[bytes]]:
                 raise ValueError(f"reading it failed, exit code {process.returncode}")
         except EOFError:
             if process.wait() in (-9, -24):  # SIGKILL, SIGXCPU
-                seconds = netcdf_reader.processor_time(most)
-                raise ValueError(f"reading it took more than {seconds:.3g} s") from None
+                limits = f"{allowed:.3g} s of processor time, or {_PATIENCE * allowed:.3g} s"
+                raise ValueError(f"reading it took more than {limits} by the clock") from None
             code = process.returncode
             raise ValueError(f"reading it failed, exit code {code}") from None
         finally:
