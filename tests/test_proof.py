@@ -216,7 +216,8 @@ def test_without_frama_c_nothing_is_proved(
     assert "apt-get install frama-c-base" in report
     assert "NOT measured: there is no gcc here" in report
     names = {path.name for path in Path("out/proof").iterdir()}
-    assert names == {"servo_contract.h", "servo_proof.c", "prove.sh", "REPORT.md"}
+    headers = {"servo_contract.h", "servo_separate.h", "servo_exported.h"}
+    assert names == headers | {"servo_proof.c", "prove.sh", "REPORT.md"}
     fmu = in_this_process((*arguments, "--to", "fmu", "--prove"), monkeypatch, capsys)
     assert (fmu.code, "--prove: only with --to c" in fmu.err) == (2, True)
 
