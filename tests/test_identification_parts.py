@@ -11,7 +11,15 @@ import pytest
 from scipy import signal, stats
 
 import quell as ql
-from quell.identification import model, output_error, search, starts, validation
+from quell.identification import (
+    delays,
+    friction_search,
+    model,
+    output_error,
+    search,
+    starts,
+    validation,
+)
 from quell.identification.gain_matrix import _of_u
 from quell.identification.model import (
     Structure,
@@ -206,12 +214,14 @@ def test_the_measured_sign_is_that_of_the_slope_over_ten_samples() -> None:
     t = np.arange(60.0)
     y = np.sin(0.1 * t)
     two = Structure(2, 0, (0, 0, 0))
-    found = search.measured_sign(two, y)
+    found = friction_search.measured_sign(two, y)
     expected = [-np.sign(y[min(k + 10, 59)] - y[max(k - 10, 0)]) for k in range(60)]
     assert found.tolist() == expected
-    apart = search.measured_sign(two._replace(samples=(30, 30)), np.r_[t[:30], -t[:30]])
+    apart = friction_search.measured_sign(two._replace(samples=(30, 30)), np.r_[t[:30], -t[:30]])
     assert apart.tolist() == [-1.0] * 30 + [1.0] * 30
-    assert search.measured_sign(Structure(1, 0, (0, 0)), np.array([1.0, -2.0, 0.0])).tolist() == [
+    assert friction_search.measured_sign(
+        Structure(1, 0, (0, 0)), np.array([1.0, -2.0, 0.0])
+    ).tolist() == [
         -1.0,
         1.0,
         0.0,
@@ -221,9 +231,9 @@ def test_the_measured_sign_is_that_of_the_slope_over_ten_samples() -> None:
 def test_the_resonance_of_a_model_is_its_least_damped_pair() -> None:
     """Its |p|; none for real poles, and none that is unstable."""
     a = np.polymul([1.0, 0.2, 4.0], [1.0, 2.0, 9.0])[:0:-1]
-    assert search._resonance(a) == pytest.approx(2.0)
-    assert search._resonance(np.polymul([1.0, 0.2], [1.0, 3.0])[:0:-1]) == 0.0
-    assert search._resonance(np.array([4.0, -0.2])) == 0.0
+    assert friction_search._resonance(a) == pytest.approx(2.0)
+    assert friction_search._resonance(np.polymul([1.0, 0.2], [1.0, 3.0])[:0:-1]) == 0.0
+    assert friction_search._resonance(np.array([4.0, -0.2])) == 0.0
 
 
 # ---- delays
@@ -233,61 +243,61 @@ def test_an_input_that_is_late_is_the_one_before_and_a_part_is_interpolated() ->
     """By 2 samples the u two before; by 2.25 a line is moved exactly, and a constant stays."""
     u = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
     one = Structure(1, 0, (0,))
-    found = search.with_delay(one, u[:, None], u, 2.0)[:, 0]
+    found = delays.with_delay(one, u[:, None], u, 2.0)[:, 0]
     assert found.tolist() == [1.0, 1.0, 1.0, 2.0, 4.0, 8.0]
     k = np.arange(12.0)
-    moved = search.with_delay(one, k[:, None], k, 2.25)[:, 0]
+    moved = delays.with_delay(one, k[:, None], k, 2.25)[:, 0]
     np.testing.assert_allclose(moved[5:], (k - 2.25)[5:])
-    still = search.with_delay(one, k[:, None], np.full(12, 3.0), 2.25)[:, 0]
+    still = delays.with_delay(one, k[:, None], np.full(12, 3.0), 2.25)[:, 0]
     np.testing.assert_allclose(still, 3.0)
-    both = search.with_delay(one._replace(samples=(6, 6)), k[:, None], k, 2.0)[:, 0]
+    both = delays.with_delay(one._replace(samples=(6, 6)), k[:, None], k, 2.0)[:, 0]
     assert both.tolist() == [0, 0, 0, 1, 2, 3, 6, 6, 6, 7, 8, 9]
 
 
 def test_minima_of_the_error_over_delays_are_the_local_ones() -> None:
     """The least first; those much larger are left out; the range grows while the least is at its end."""
     costs = {0: 3.0, 1: 1.1, 2: 2.0, 3: 1.0, 4: 1.2, 5: 40.0}
-    found = search._minima(costs, 1)
+    found = delays._minima(costs, 1)
     assert found[0] == 3
     assert set(found) <= {1, 3}
-    assert search._minima({0: 2.0, 2: 1.0, 4: 3.0}, 2) == [2]
+    assert delays._minima({0: 2.0, 2: 1.0, 4: 3.0}, 2) == [2]
     asked: list[range] = []
 
     def error(delays: range) -> dict[int, float]:
         asked.append(delays)
         return {each: abs(each - 33.0) + 1.0 for each in delays}
 
-    high, stride, seen = search._scanned(error, (0, 10), 200)
+    high, stride, seen = delays._scanned(error, (0, 10), 200)
     assert (high, stride) == (80, 1)
     assert min(seen, key=lambda one: seen[one]) == 33
     assert [(each.start, each.stop) for each in asked] == [(0, 11), (11, 21), (21, 41), (41, 81)]
-    assert search._scanned(error, (0, 10), 10)[0] == 10
-    assert search.longest(LAG, np.zeros(1000), False) == 0
-    assert search.longest(LAG, np.zeros(1000), True) == int(search.MOST_SHARE * 1000)
+    assert delays._scanned(error, (0, 10), 10)[0] == 10
+    assert delays.longest(LAG, np.zeros(1000), False) == 0
+    assert delays.longest(LAG, np.zeros(1000), True) == int(delays.MOST_SHARE * 1000)
 
 
 def test_the_part_of_a_record_in_which_u_moves_is_taken() -> None:
     """A record that is short is taken whole; else the part with the moves."""
-    assert search._moving_part(LAG, binary(100)) == slice(0, 100)
-    u = np.zeros(20 * search._SAMPLES)
-    at = 9 * search._SAMPLES
-    u[at : at + search._SAMPLES // 4] = binary(search._SAMPLES // 4)
-    part = search._moving_part(LAG, u)
-    assert part.stop - part.start == search._SAMPLES
+    assert delays._moving_part(LAG, binary(100)) == slice(0, 100)
+    u = np.zeros(20 * delays._SAMPLES)
+    at = 9 * delays._SAMPLES
+    u[at : at + delays._SAMPLES // 4] = binary(delays._SAMPLES // 4)
+    part = delays._moving_part(LAG, u)
+    assert part.stop - part.start == delays._SAMPLES
     assert part.start <= at
-    assert at + search._SAMPLES // 4 <= part.stop
+    assert at + delays._SAMPLES // 4 <= part.stop
 
 
 def test_the_delay_near_a_model_is_found_step_by_step() -> None:
     """From 5 to 3 samples by halves of a stride; within the range."""
     u = binary(80)
     v = inputs(u)
-    y = output(LAG, np.array([0.3, 0.6, 0.1, 0.0]), search.with_delay(LAG, v, u, 3.0))
-    start = refine(LAG, np.array([0.3, 0.6, 0.1, 0.0]), search.with_delay(LAG, v, u, 5.0), y, 3)
-    delay, found = search.nearest_delay(LAG, start, u, v, y, (0, 8), 5, 2)
+    y = output(LAG, np.array([0.3, 0.6, 0.1, 0.0]), delays.with_delay(LAG, v, u, 3.0))
+    start = refine(LAG, np.array([0.3, 0.6, 0.1, 0.0]), delays.with_delay(LAG, v, u, 5.0), y, 3)
+    delay, found = delays.nearest_delay(LAG, start, u, v, y, (0, 8), 5, 2)
     assert delay == 3
     assert found.theta[:2].tolist() == pytest.approx([0.3, 0.6], rel=1e-6)
-    assert search.nearest_delay(LAG, start, u, v, y, (4, 8), 5, 2)[0] == 4
+    assert delays.nearest_delay(LAG, start, u, v, y, (4, 8), 5, 2)[0] == 4
 
 
 def test_a_part_of_a_sample_is_taken_where_the_record_shows_it() -> None:
@@ -296,9 +306,9 @@ def test_a_part_of_a_sample_is_taken_where_the_record_shows_it() -> None:
     v = inputs(u)
     noise = 0.002 * np.random.default_rng(8).standard_normal(70)
     for true in (2.5, 2.0):
-        y = output(LAG, theta, search.with_delay(LAG, v, u, true)) + noise
-        start = refine(LAG, theta, search.with_delay(LAG, v, u, 2.0), y, 3)
-        late, found = search.with_part_of_sample(LAG, start, u, v, y, 2.0, (0.0, 4.0))
+        y = output(LAG, theta, delays.with_delay(LAG, v, u, true)) + noise
+        start = refine(LAG, theta, delays.with_delay(LAG, v, u, 2.0), y, 3)
+        late, found = delays.with_part_of_sample(LAG, start, u, v, y, 2.0, (0.0, 4.0))
         if true == 2.0:
             assert late == 2.0
             assert found is start
@@ -310,7 +320,7 @@ def test_a_part_of_a_sample_is_taken_where_the_record_shows_it() -> None:
 def test_a_delay_with_a_part_of_a_sample_has_a_deviation_like_any_parameter() -> None:
     """Its column is the slope of y by the delay; the interval is 1.96 deviations to both sides."""
     u, theta = binary(70), np.array([0.3, 0.6, 0.1, 0.0])
-    v = search.with_delay(LAG, inputs(u), u, 2.4)
+    v = delays.with_delay(LAG, inputs(u), u, 2.4)
     y = output(LAG, theta, v) + 0.01 * np.random.default_rng(8).standard_normal(70)
     estimate = refine(LAG, theta, v, y, 5)
     found, interval, of_delay = search._with_part(LAG, estimate, u, v, y, 2.4, 2)
@@ -320,7 +330,7 @@ def test_a_delay_with_a_part_of_a_sample_has_a_deviation_like_any_parameter() ->
     deviation = 0.5 * (interval[1] - interval[0]) / 1.959964
     assert of_delay.shape == (3,)
     assert of_delay[2] == pytest.approx(deviation**2, rel=1e-3)
-    ends = [output(LAG, estimate.theta, search.with_delay(LAG, v, u, at)) for at in (2.41, 2.39)]
+    ends = [output(LAG, estimate.theta, delays.with_delay(LAG, v, u, at)) for at in (2.41, 2.39)]
     psi = np.column_stack([output_gradient(LAG, estimate.theta, v)[1], (ends[0] - ends[1]) / 0.02])
     plain = 1e-4 * np.linalg.inv(psi.T @ psi)
     assert deviation == pytest.approx(math.sqrt(plain[4, 4]), rel=0.6)
@@ -331,7 +341,7 @@ def test_a_delay_with_a_part_of_a_sample_has_a_deviation_like_any_parameter() ->
 def test_a_delay_of_whole_samples_is_known_to_half_a_sample() -> None:
     """Where the neighbours fit far worse; with much noise the interval has them, too."""
     u, theta = binary(70), np.array([0.3, 0.6, 0.1, 0.0])
-    v = search.with_delay(LAG, inputs(u), u, 3.0)
+    v = delays.with_delay(LAG, inputs(u), u, 3.0)
     clean = output(LAG, theta, v)
     noise = np.random.default_rng(8).standard_normal(70)
     widths = []
@@ -359,12 +369,12 @@ def test_a_delay_under_friction_is_whole_where_its_part_is_hardly_one() -> None:
     u = 1.5 * binary(50)
     v = np.column_stack([inputs(u), np.zeros(50)])
     for true, at in ((2.0, 2.1), (2.4, 2.3)):
-        late = search.with_delay(structure, v, u, true)
+        late = delays.with_delay(structure, v, u, true)
         y = model.free_run(structure, theta, late, own_friction=True)[0]
         near = model.free_run(
-            structure, theta, search.with_delay(structure, v, u, at), own_friction=True
+            structure, theta, delays.with_delay(structure, v, u, at), own_friction=True
         )[1]
-        found = search.simulated_delay(structure, theta, u, near, y, (0.0, 4.0), at)
+        found = friction_search.simulated_delay(structure, theta, u, near, y, (0.0, 4.0), at)
         assert found == (2 if true == 2.0 else pytest.approx(2.4, abs=0.02))
 
 
@@ -633,7 +643,7 @@ def test_a_gain_that_depends_on_u_is_found() -> None:
 def test_another_u_before_the_record_is_found_in_its_delay() -> None:
     """In the first four samples of a delay of four."""
     u, noise = record()
-    before = search.with_delay(LAG, inputs(u), u, 4.0)
+    before = delays.with_delay(LAG, inputs(u), u, 4.0)
     before[:4, 0] = -3.0 * u[0]
     late = fitted(u, output(LAG, TRUTH, before) + noise, delay=4.0)
     assert validation.before_the_record(late)

@@ -14,7 +14,7 @@ import pytest
 from scipy import optimize, signal, stats
 
 import quell as ql
-from quell.identification import Identified, alternatives, free_swing, search
+from quell.identification import Identified, alternatives, free_swing, friction_search
 from quell.identification.identify import delay_range, resolution_of
 from quell.identification.model import Root, gain_interval, poles_of, zeros_of
 from quell.identification.structures import _EQUAL, Alternative, not_told_apart
@@ -203,6 +203,7 @@ def test_another_record_judges_a_model() -> None:
     assert any("worse than the mean of its y" in text for text in wrong.shortcomings)
 
 
+@pytest.mark.trial
 def test_instruments_from_the_reference_find_the_plant_in_a_loop() -> None:
     """With a load that drifts in the loop; the fit without reference is told another plant."""
     rng = np.random.default_rng(11)
@@ -239,6 +240,7 @@ def test_coulomb_friction_of_a_speed_is_found() -> None:
     assert "Coulomb friction 0." in found.describe()
 
 
+@pytest.mark.trial
 def test_coulomb_friction_of_a_position_is_found() -> None:
     """Of y'' = −0.5 y' + 2 u − 0.8 sign y', integrated in 20 steps of a sample: 0.4 in units of u."""
     u, y, x, v = 2.0 * binary(92), [], 0.0, 0.0
@@ -248,7 +250,7 @@ def test_coulomb_friction_of_a_position_is_found() -> None:
             v += 0.005 * (-0.5 * v + 2.0 * value - 0.8 * math.copysign(1.0, v))
             x += 0.005 * v
     how: dict[str, Any] = {"delay": 0.0, "friction": True, "held_out": 0.0, "integrators": 1}
-    with patch.multiple(search, _PASSES=2, _MOST_RUNS=8):
+    with patch.multiple(friction_search, _PASSES=2, _MOST_RUNS=8):
         found = ql.identify(u, y, DT, 2, **how)
     assert found.num[0] == pytest.approx(2.0, rel=0.03)
     assert found.den[1] == pytest.approx(0.5, abs=0.05)
@@ -259,12 +261,13 @@ def test_coulomb_friction_of_a_position_is_found() -> None:
 # ---- free swings
 
 
+@pytest.mark.trial
 def test_a_free_swing_has_its_frequency_damping_and_amplitude() -> None:
     """A decaying cosine about 3: exactly, and with noise within the intervals."""
     t = np.arange(90) * DT
     zeta, omega = 0.05, 4.0
     swing = 0.8 * np.exp(-zeta * omega * t) * np.cos(omega * math.sqrt(1.0 - zeta**2) * t + 0.4)
-    found = free_swing(3.0 + swing, DT)
+    found = free_swing(3.0 + swing, DT, modes=1)
     (mode,) = found.modes
     assert mode.omega == pytest.approx(omega, rel=1e-7)
     assert mode.damping == pytest.approx(zeta, rel=1e-6)
@@ -289,6 +292,7 @@ def test_a_free_swing_has_its_frequency_damping_and_amplitude() -> None:
     assert seen.fit == pytest.approx(100.0 * (1.0 - left))
 
 
+@pytest.mark.trial
 def test_two_modes_come_with_the_larger_one_first_and_in_any_unit() -> None:
     """4 and 9 rad/s; y in mm and t in ms scale amplitudes and frequencies, not damping."""
     t = np.arange(160) * DT
