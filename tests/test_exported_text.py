@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.export import NoCompilerError, TranslationError, c_source, ros2, st, st_source
+from quell.export import NoCompilerError, TranslationError, c_source, reserved, ros2, st, st_source
 from quell.export.axes_source import names_in_c
 from quell.export.controller_source import limits_path
 from quell.export.fmi.fmu import build_description
@@ -243,8 +243,8 @@ def test_an_integer_is_for_flags_or_for_counts() -> None:
     assert places.inside(low, 6) == "a + b"
     assert places.inside(low, 7) == "(a + b)"
     assert places.inside(Node("real", lambda: "-2.0"), 6) == "(-2.0)"
-    assert places.is_keyword("If")
-    assert not places.is_keyword("servo")
+    assert reserved.is_taken_in_st("If")
+    assert not reserved.is_taken_in_st("servo")
 
 
 # ---- ROS
@@ -315,8 +315,8 @@ def test_the_contract_of_a_controller_promises_a_number_within_the_limits() -> N
     """Of each function that returns u; without limits a number alone."""
     pi = MAKERS["PI"]()
     files = proof_files(pi, c_source(pi, "servo"))
-    assert list(files) == ["proof/servo_contract.h", "proof/servo_proof.c", "proof/prove.sh"]
-    contract, program, script = files.values()
+    names = ("servo_contract.h", "servo_proof.c", "prove.sh")
+    contract, program, script = (files[f"proof/{name}"] for name in names)
     path = limits_path(pi)
     low, high = (f"state->parameters->{path}.{end}" for end in ("low", "high"))
     assert "ensures a_number: \\is_finite(\\result);" in contract

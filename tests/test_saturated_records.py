@@ -19,6 +19,7 @@ def stairs(count: int = 1500, of: int = 30) -> Any:
     return np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, count // of + 1), of)[:count]
 
 
+@pytest.mark.trial
 @pytest.mark.parametrize("quantum", [0.0, 0.01])
 def test_samples_at_a_limit_are_named_and_bounded(quantum: float) -> None:
     """A third of them: gain and poles are those of the plant, within three half widths."""

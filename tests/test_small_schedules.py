@@ -40,6 +40,7 @@ def point_by_point() -> TunedSchedule:
     return ql.tune_schedule(plants, DT, tables="all", signal="y", **HOW)
 
 
+@pytest.mark.trial
 def test_a_table_of_b0_is_in_proportion_to_the_gain_and_leaves_one_loop() -> None:
     """L is the same at both points, so y after a load is as large as the gain."""
     found = scheduled()

@@ -92,6 +92,7 @@ def changed(**parts: Any) -> TunedAxes:
 # ---- axes
 
 
+@pytest.mark.trial
 def test_decoupled_axes_are_tuned_as_each_alone_less_the_errors_of_b0() -> None:
     """Both the same; a lag of each costs as a single one, a bit more for 20 %; bounds hold."""
     found = tuned()
