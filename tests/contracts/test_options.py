@@ -120,7 +120,7 @@ CASES: dict[str, dict[str, Case]] = {
     "identify": {
         "DATA": ("record.csv",), "--order": ("--order", "2"), "--delay": ("--delay", "0.05"), "--dt": ("--dt", "0.04"), "--horizon": ("--horizon", "5"),
         "--validate": ("--validate", "other.csv"), "--alternatives": (("real",), ("--no-alternatives",)), "--columns": ("--columns", "t,y,u"), "--time-unit": ("--time-unit", "ms"),
-        "--zeros": ("--zeros", "1"), "--integrators": ("--integrators", "1"), "--friction": ("--friction",), "--rest": ("--rest",), "--max-delay": ("--max-delay", "0.2"), "--held-out": ("--held-out", "0.2"),
+        "--zeros": ("--zeros", "1"), "--integrators": ("--integrators", "1"), "--friction": ("--friction",), "--rest": ("--rest",), "--max-delay": ("--max-delay", "0.2"), "--held-out": ("--held-out", "0.2"), "--frequencies": ("--frequencies",),
     },
     "tune": {
         "SETUP": (_PLANT, _OF_SETUP), "--num": (_PLANT, (*_PLANT, "--num", "3")), "--den": (_PLANT, (*_PLANT, "--den", "1,2")), "--dt": (_PLANT, (*_PLANT, "--dt", "0.06")),
