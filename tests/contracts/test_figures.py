@@ -133,6 +133,17 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     seeded = over_seeds.over_seeds(lags, {"a": axes, "b": axes}, short)
     points = {at: ql.plants.LinearPlant.of(([at], [1.0, 1.0])) for at in (1.0, 2.0)}
     schedule = ql.tune_schedule(points, DT)
+    t = np.arange(120) * DT
+    swing = ql.identification.free_swing(np.exp(-t) * np.cos(30.0 * t), DT, 1)
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(600)
+    y = np.convolve(u, np.exp(-0.1 * np.arange(80)))[:600]
+    response = ql.identification.frequency_response(u, y, DT)
+    omega = np.geomspace(1.0, 60.0, 40)
+    G = 1.0 / (1.0 + 0.02j * omega - (omega / 20.0) ** 2)
+    G = G * (1.0 + 1e-3 * (rng.standard_normal(40) + 1j * rng.standard_normal(40)))
+    table = ql.identification.identify_frequencies(omega, G, 2, 0, integrators=0, delay=0.0)
+    spectrum = ql.identification.modes_of_spectrum(omega, np.abs(G) ** 2, 1)
     plots = {
         "Trajectory": Case(run.plot, 5),
         "axes": Case(machine.plot, 7),
@@ -143,6 +154,10 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         "Tuned": Case(tuned.plot, 4),
         "TunedCompensator": Case(add_on.plot, 1),
         "Identified": Case(model.plot, 7),
+        "free swing": Case(swing.plot, 2),
+        "frequency response": Case(response.plot, 3),
+        "frequency model": Case(table.plot, 3),
+        "modes of a spectrum": Case(spectrum.plot, 1),
         "Verification": Case(step.plot, 2),
         "Sweep": Case(lambda ax=None: swept.plot("b", ax=ax), 2),
         "Sweep in lines": Case(lambda ax=None: swept.plot("b", by="omega_o", ax=ax), 2),
@@ -198,6 +213,10 @@ _PUBLIC = {
     "tuning/tuned_axes.py plot": "tuned axes",
     "tuning/compensator.py plot": "TunedCompensator",
     "identification/result.py plot": "Identified",
+    "identification/swings.py plot": "free swing",
+    "identification/frequencies.py plot": "frequency response",
+    "identification/frequency_model.py plot": "frequency model",
+    "identification/spectra.py plot": "modes of a spectrum",
     "commissioning.py plot": "Verification",
     "sweeping/sweep.py plot": "Sweep",
     "realtime/system.py plot": "Timing",

@@ -101,7 +101,7 @@ def modes_of_spectrum(omega: Any, power: Any, modes: int | None = None) -> Spect
     omega
         frequencies (N,), rising [rad/s].
     power
-        power at them (N,), in any unit; |G|² of a response without phase.
+        power at them (N,), in any unit; ``|G|²`` of a response without phase.
     modes
         number of modes, 1 to 5; by default as many as the spectrum tells apart.
 

@@ -144,7 +144,14 @@ class Scenario:
             raise ValueError(f"rest_at = {self.rest_at!r}: {rule}")
 
     def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
-        """Return the reference, ``inputs`` disturbances and the noise of one axis, seeded."""
+        """Return the reference, ``inputs`` disturbances and the noise of one axis, seeded.
+
+        Setup files and tuning take no list in the place of one signal; ``simulate`` takes one of
+        one.
+        """
+        for name in ("reference", "noise"):
+            if checks.is_sequence(given := getattr(self, name)):
+                raise ValueError(_one_signal(name, given))
         reference, disturbances, noise = self.seeded(1, inputs, 1)
         return reference[0], disturbances, noise[0]
 
@@ -185,13 +192,19 @@ def _one_for_each(name: str, given: Any, count: int) -> tuple[Signal, ...]:
     if len(given) != count:
         have = checks.counted(len(given), "signal")
         if count == 1:
-            raise ValueError(
-                f"{name} = {given!s:.60}: is a list of {have}, and the loop has one output: must "
-                "be one number or signal; several axes are controlled by quell.Axes"
-            )
+            raise ValueError(_one_signal(name, given))
         what = "axes" if name == "reference" else "outputs"
         raise ValueError(f"{name} has {have}: there are {count} {what}, give one each")
     return tuple(as_signal(each, f"{name}[{i}]") for i, each in enumerate(given))
+
+
+def _one_signal(name: str, given: Any) -> str:
+    """Return the error about a list in the place of one signal."""
+    return (
+        f"{name} = {given!s:.60}: is a list of {checks.counted(len(given), 'signal')}, and the "
+        "loop has one output: must be one number or signal, without brackets; several axes are "
+        "controlled by quell.Axes"
+    )
 
 
 def check_scenario(value: Any, name: str = "scenario") -> None:
