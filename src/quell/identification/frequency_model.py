@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 
 from quell.files import nonfinite_to_none
 from quell.identification.model import WITHIN_95, Root
-from quell.identification.result import describe_root, gain_of_s, polynomial_text
-from quell.plants.base import labelled
+from quell.identification.result import (
+    describe_root,
+    fitted_plant,
+    gain_of_s,
+    polynomial_text,
+)
 from quell.plants.linear import LinearPlant
 from quell.quantities import UNKNOWN, Signals
 from quell.records.plotting import draw_line, given_axes, grid_of_axes, new_figure
@@ -71,13 +75,8 @@ class FrequencyModel:
         ValueError
             for a model with direct feedthrough.
         """
-        if self.num.size == self.den.size:
-            raise ValueError(
-                f"zeros = {self.num.size - 1}: the model has direct feedthrough, u acts on y at "
-                "once; observers and simulated loops need a plant without it; give fewer zeros"
-            )
-        plant = LinearPlant.of((self.num, self.den), name="plant of a table of frequencies")
-        return labelled(plant, self.signals.y, self.signals.u)
+        name = "plant of a table of frequencies"
+        return fitted_plant(self.num, self.den, name, self.signals)
 
     def response_at(self, omega: Any) -> Any:
         """Return the model's response at ``omega`` [rad/s], with delay and hold."""

@@ -318,14 +318,7 @@ class Identified:
         ValueError
             for a model with direct feedthrough.
         """
-        if self.num.size == self.den.size:
-            raise ValueError(
-                f"zeros = {self.num.size - 1}: the model has direct feedthrough, u acts on y at "
-                "once; observers and simulated loops need a plant without it. Identify with fewer "
-                "zeros, or use num, den and response"
-            )
-        plant = LinearPlant.of((self.num, self.den), name="identified plant")
-        return labelled(plant, self.signals.y, self.signals.u)
+        return fitted_plant(self.num, self.den, "identified plant", self.signals)
 
     @property
     def shortcomings(self) -> tuple[str, ...]:
@@ -598,6 +591,18 @@ class Identified:
             "method": self.method,
         }
         return dict(nonfinite_to_none(value))
+
+
+def fitted_plant(num: Vector, den: Vector, name: str, signals: Signals) -> LinearPlant:
+    """Return a fitted transfer function as a plant; a ``ValueError`` refuses direct feedthrough."""
+    if num.size == den.size:
+        raise ValueError(
+            f"zeros = {num.size - 1}: the model has direct feedthrough, u acts on y at once; "
+            "observers and simulated loops need a plant without it. Identify with fewer zeros, or "
+            "use num, den and response"
+        )
+    plant = LinearPlant.of((num, den), name=name)
+    return labelled(plant, signals.y, signals.u)
 
 
 def gain_of_s(integrators: int) -> str:

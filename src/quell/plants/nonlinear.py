@@ -259,16 +259,37 @@ class PythonNonlinear(NamedTuple):
     substeps: int
 
 
+class CompiledOfMany(NamedTuple):
+    """A nonlinear plant with several signals and compiled functions, given by address."""
+
+    rate: int
+    output: int
+    step: float  # length of a sub-step [s]
+    substeps: int
+    parameters: Buffer  # those of the rate, then those of the output
+
+
+class PythonOfMany(NamedTuple):
+    """A nonlinear plant with several signals whose functions only Python can run."""
+
+    rate: Callable[..., Any]
+    output: Callable[..., Any]
+    step: float
+    substeps: int
+
+
 @generic
-def derivatives(plant: Any, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
-    """Write the derivatives of the state into ``dx`` (n,)."""
+def derivatives(plant: Any, t: float, x: Vector, u: Any, w: Vector, dx: Vector) -> None:
+    """Write the derivatives of the state into ``dx`` (n,); u is as ``advance`` takes it."""
     raise TypeError
 
 
 @advance.register(CompiledNonlinear)
 @advance.register(CompiledParametric)
+@advance.register(CompiledOfMany)
 @advance.register(PythonNonlinear)
-def runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+@advance.register(PythonOfMany)
+def runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: Any, w: Vector) -> None:
     """Take ``substeps`` classical Runge-Kutta steps.
 
     Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, table II.1.2.
@@ -311,8 +332,9 @@ def _measure_parametric(plant: CompiledParametric, x: Vector) -> float:
 
 
 @derivatives.register(CompiledParametric)
+@derivatives.register(CompiledOfMany)
 def _derivatives_parametric(
-    plant: CompiledParametric, t: float, x: Vector, u: float, w: Vector, dx: Vector
+    plant: CompiledParametric | CompiledOfMany, t: float, x: Vector, u: Any, w: Vector, dx: Vector
 ) -> None:
     call(plant.rate, t, x, u, w, plant.parameters, dx)
 
@@ -323,56 +345,20 @@ def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
 
 
 @derivatives.register(PythonNonlinear)
+@derivatives.register(PythonOfMany)
 def _derivatives_python(
-    plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
+    plant: PythonNonlinear | PythonOfMany, t: float, x: Vector, u: Any, w: Vector, dx: Vector
 ) -> None:
     dx[:] = value_or_nan(plant.rate, t, x, u, w)
-
-
-class CompiledOfMany(NamedTuple):
-    """A nonlinear plant with several signals and compiled functions, given by address."""
-
-    rate: int
-    output: int
-    step: float  # length of a sub-step [s]
-    substeps: int
-    parameters: Buffer  # those of the rate, then those of the output
-
-
-class PythonOfMany(NamedTuple):
-    """A nonlinear plant with several signals whose functions only Python can run."""
-
-    rate: Callable[..., Any]
-    output: Callable[..., Any]
-    step: float
-    substeps: int
 
 
 as_input.register(CompiledOfMany)(all_signals)
 as_input.register(PythonOfMany)(all_signals)
 
 
-advance.register(CompiledOfMany)(runge_kutta)
-advance.register(PythonOfMany)(runge_kutta)
-
-
-@derivatives.register(CompiledOfMany)
-def _derivatives_many(
-    plant: CompiledOfMany, t: float, x: Vector, u: Any, w: Vector, dx: Vector
-) -> None:
-    call(plant.rate, t, x, u, w, plant.parameters, dx)
-
-
 @measure_all.register(CompiledOfMany)
 def _measure_many(plant: CompiledOfMany, x: Vector, y: Vector) -> None:
     call(plant.output, x, plant.parameters, y)
-
-
-@derivatives.register(PythonOfMany)
-def _derivatives_python_many(
-    plant: PythonOfMany, t: float, x: Vector, u: Any, w: Vector, dx: Vector
-) -> None:
-    dx[:] = value_or_nan(plant.rate, t, x, u, w)
 
 
 @measure_all.register(PythonOfMany)
@@ -515,7 +501,10 @@ class NonlinearPlant(Described):
                 f"f returns shape {np.shape(returned)}: must return the {n} derivatives of x"
             )
         if callable(self.output):
-            shape = np.shape(self._output_at_rest(rule))
+            found = self._output_at_rest(rule)
+            if found is None:
+                raise ValueError("output(x) returns None: must return one number, or a vector")
+            shape = np.shape(found)
             if len(shape) > 1:
                 raise ValueError(
                     f"output(x) returns shape {shape}: must return one number, or a vector"
