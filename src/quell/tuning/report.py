@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from quell.analysis.linearise import linear_law
 from quell.analysis.loop import duration
 from quell.controllers.base import Controller
 from quell.controllers.feedforward import Feedforward
@@ -32,7 +33,7 @@ from quell.files import nonfinite_to_none
 from quell.quantities import Signals
 from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
-from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of, load_step, response
+from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, load_step, response
 from quell.tuning.optimiser.requirements import (
     USUAL_DAMPING,
     Active,
@@ -407,7 +408,7 @@ def draw(
         phase.semilogx(omega, np.where(np.abs(L) >= _PHASE_FROM, phase_of(L), np.nan), **dashed)
         crossover = _crossover(L, omega, plants.crossover)
         lowest = min(lowest, crossover)
-        law, scaled = law_of(design.controller), plants.scaled()
+        law, scaled = linear_law(design.controller), plants.scaled()
         count = min(int(_LASTS / crossover / plants.dt) + 2, _MOST)
         unit, none, t = np.ones(count), np.zeros(count), np.arange(count) * plants.dt
         for j in shown:

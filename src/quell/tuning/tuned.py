@@ -27,7 +27,7 @@ from quell.tuning import report
 from quell.tuning.acceptance import Judged, Loop, conditionally_stable, judge, prefilter_table
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, noise_curve, tradeoff
-from quell.tuning.optimiser.loops import PlantSet, law_of
+from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.requirements import all_peaks, beside_poles, closed_loop_poles, counted
 from quell.tuning.optimiser.search import Problem, Solution
 from quell.tuning.report import Design, draw, toml_text
@@ -336,7 +336,7 @@ class Tuned:
         """Return the margins of gain of the loops with all plants, where they are stable."""
         found = [self.analysis.margins.gain] if self.analysis.stable else []
         if self.design.controller is not None and len(self.plants.plants) > 1:
-            law = law_of(self.design.controller)
+            law = self.analysis.law
             loops = [LoopAnalysis(each, law, self.plants.dt) for each in self.plants.scaled()]
             found += [each.margins.gain for each in loops if each.stable]
         return found
