@@ -212,7 +212,7 @@ class TestC:
          "reference has 2 signals"),
         (lambda: ql.export.c_source(controller(), resolution=1e-6), "StateFeedback takes y in its"),
         (lambda: ql.export.c(controller(), "firmware", precision="single"), "needs plant"),
-        (lambda: ql.analysis.analyse(drive(), controller()), "1 inputs and 2 outputs, here there is one of each; several: quell.plants"),
+        (lambda: ql.analysis.analyse(drive(), controller()), "1 control signal and 2 outputs, here there is one of each; several: quell.Axes"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_named(wrong, message: str) -> None:  # type: ignore[no-untyped-def]

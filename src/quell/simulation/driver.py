@@ -167,8 +167,9 @@ class Scenario:
             have = checks.counted(len(given), "signal")
             most = checks.counted(inputs, "disturbance input")
             raise ValueError(f"disturbances has {have}: the plant has {most}{named(plant, 'w')}")
-        reference = _one_for_each("reference", self.reference, references)
-        noise = _one_for_each("noise", self.noise, outputs)
+        alone = references == outputs == 1
+        reference = _one_for_each("reference", self.reference, references, alone)
+        noise = _one_for_each("noise", self.noise, outputs, alone)
         if outputs == 1:
             # The noise has the seed itself: its bits must not depend on the number of disturbances.
             noise = (noise[0].seeded(self.seed),)
@@ -185,13 +186,16 @@ class Scenario:
         )
 
 
-def _one_for_each(name: str, given: Any, count: int) -> tuple[Signal, ...]:
-    """Return a signal for each axis or output, from one for all or one for each."""
+def _one_for_each(name: str, given: Any, count: int, alone: bool) -> tuple[Signal, ...]:
+    """Return a signal for each axis or output, from one for all or one for each.
+
+    ``alone`` says whether the loop has one of each.
+    """
     if not checks.is_sequence(given):
         return (as_signal(given, name),) * count
     if len(given) != count:
         have = checks.counted(len(given), "signal")
-        if count == 1:
+        if alone:
             raise ValueError(_one_signal(name, given))
         what = "axes" if name == "reference" else "outputs"
         raise ValueError(f"{name} has {have}: there are {count} {what}, give one each")
