@@ -227,7 +227,7 @@ def test_plants_follow_what_their_equation_takes_from_outside(
 
     numbers: dict[str, Any] = {"parameters": {"mass": 4.0}} if parametric else {}
     make: Any = (
-        partial(ql.plants.NonlinearPlant, f, 2, 1, h_of_several, **numbers)
+        partial(ql.plants.NonlinearPlant, f, 2, h_of_several, **numbers)
         if several
         else partial(ql.plants.NonlinearPlant, f, 2, h, **numbers)
     )

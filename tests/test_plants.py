@@ -258,6 +258,14 @@ def test_methods_and_callable_objects_are_served_too() -> None:
             r"output has shape \(1,\)",
         ),
         (
+            lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=lambda x: None),
+            r"output\(x\) returns None: must return one number",
+        ),
+        (
+            lambda: ql.plants.LinearPlant.of((np.eye(2), [[0.0, 1.0], [1.0]], [1.0, 0.0])),
+            "B: must be an array of numbers, got list",
+        ),
+        (
             lambda: ql.plants.NonlinearPlant(pendulum, order=2, substeps=0),
             "substeps = 0: must be a whole number of at least 1",
         ),

@@ -173,6 +173,7 @@ def check_matrices(A: Any, B: Any, C: Any, several: bool = False) -> tuple[Matri
     A = checks.matrix("A", A)
     n = A.shape[0]
     checks.matrix("A", A, n, n)
+    B, C = checks.numbers("B", B), checks.numbers("C", C)
     inputs = np.shape(B)[1] if np.ndim(B) == 2 else 1
     outputs = np.shape(C)[0] if np.ndim(C) == 2 else 1
     if max(inputs, outputs) > 1 and not several:
@@ -214,7 +215,7 @@ def several_matrices(model: Any, E: Any = None) -> tuple[Any, Any, Any, Any] | N
         D = getattr(model, "D", 0.0)
     if of_model is None:
         return None
-    _, B, C = of_model
+    B, C = checks.numbers("B", of_model[1]), checks.numbers("C", of_model[2])
     if not ((np.ndim(B) == 2 and np.shape(B)[1] > 1) or (np.ndim(C) == 2 and np.shape(C)[0] > 1)):
         return None
     _check_time(model, None)
