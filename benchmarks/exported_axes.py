@@ -170,10 +170,9 @@ def played(program: Path, rows: np.ndarray, axes: ql.Axes, single: bool) -> np.n
 
 def authorities(states: Any) -> Iterator[float]:
     """Yield the authority of the learner of each axis, 0 without a guard."""
-    while hasattr(states, "axis"):
-        guard = states.axis.guard
+    for state in states:
+        guard = state.guard
         yield float(guard.sample[0].authority) if hasattr(guard, "sample") else 0.0
-        states = states.others
 
 
 def replayed(

@@ -299,8 +299,8 @@ class TestMemory:
         """The coefficients are in the state before the first sample."""
         axes = taught(learning())
         state = parts_of(axes).state
-        assert np.array_equal(state.axes.axis.learner.theta, axes.axes[0]._state.learner.theta)
-        assert np.any(state.axes.axis.learner.theta != 0.0)
+        assert np.array_equal(state.axes[0].learner.theta, axes.axes[0]._state.learner.theta)
+        assert np.any(state.axes[0].learner.theta != 0.0)
 
     def test_limits_may_be_others(self) -> None:
         """A running loop continues with other limits, not with another law."""

@@ -159,6 +159,39 @@ def test_what_is_registered_for_object_serves_all_types_without_their_own() -> N
     )
 
 
+def add_area(shape: Any, sides: Any, i: int, sum_so_far: float, factor: float) -> float:
+    """Return the sum with the area of one more shape, weighted by its place."""
+    sides[0] += 10.0 * i
+    return 2.0 * sum_so_far + area(shape, factor)
+
+
+def set_side(shape: Any, sides: Any, i: int, factor: float) -> None:
+    """Write the place of a shape, times a factor."""
+    sides[0] = i * factor
+
+
+add_areas = dispatch.for_each("add_areas", add_area)
+set_sides = dispatch.for_each("set_sides", set_side)
+
+
+@dispatch.compiled
+def total_of_all(shapes: Any, sides: Any) -> float:
+    """Return the weighted sum of shapes of any types."""
+    found = add_areas(shapes, sides, 1.0, 0.5)
+    set_sides(shapes, sides, 4.0)
+    return float(found)
+
+
+def test_what_is_done_for_each_entry_of_a_tuple_hands_its_value_on() -> None:
+    """1 → 2·1 + 6 = 8 → 2·8 + 4.5 = 20.5, with the places 0 and 1, compiled and interpreted."""
+    for call in (total_of_all, dispatch.interpreted(total_of_all)):
+        sides = (np.zeros(1), np.zeros(1))
+        assert call((Circle(2.0), Square(3.0)), sides) == 20.5
+        assert [float(each[0]) for each in sides] == [0.0, 4.0]
+    assert add_areas((), (), 1.0, 0.5) == 1.0
+    assert add_areas.__doc__ == add_area.__doc__
+
+
 def test_a_second_call_with_the_same_types_does_not_compile_again() -> None:
     """One compilation serves all values of the same types."""
     total(Circle(1.0), Circle(2.0))

@@ -42,22 +42,6 @@ from quell.controllers.allocation import (
     range_memory,
     update_gain,
 )
-from quell.controllers.axes_chain import (
-    AxisDesigns,
-    AxisStates,
-    NoAxis,
-    NoAxisMemory,
-    ask_axes,
-    continue_axes,
-    have_started,
-    hold_axis,
-    reset_axes,
-    set_axes_derivatives,
-    set_axes_manual,
-    start_axes,
-    tell_axes,
-    write_axes,
-)
 from quell.controllers.axes_learning import (
     LearningOfAxes,
     learn_of_all,
@@ -78,6 +62,18 @@ from quell.controllers.compensator import (
     Compensator,
     Estimate,
     samples_to_settle,
+)
+from quell.controllers.each_axis import (
+    ask_axes,
+    axes_started,
+    continue_axes,
+    hold_axes,
+    reset_axes,
+    set_axes_derivatives,
+    set_axes_manual,
+    start_axes,
+    tell_axes,
+    write_axes,
 )
 from quell.controllers.given_controls import (
     ANY_CUT,
@@ -124,7 +120,7 @@ class AxesLoop(Scalars):
 class AxesDesign(NamedTuple):
     """Parameters of several axes."""
 
-    axes: Any  # each axis with those behind it
+    axes: tuple[Any, ...]  # of each axis
     gain: Any  # B0
     rule: Any  # what is done at the limits
     limits: ActuatorLimits
@@ -138,7 +134,7 @@ class AxesDesign(NamedTuple):
 class AxesState(NamedTuple):
     """State of several axes."""
 
-    axes: Any  # each axis with those behind it
+    axes: tuple[Any, ...]  # of each axis
     learning: Any
     gain: GainMemory
     range: RangeMemory
@@ -161,7 +157,7 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
         design.given, state.given, design.axes, state.axes, state.gain, r, y, state.wish
     )
     look_at_all(design.learning, state.learning, design.axes, state.axes)
-    flags |= ask_axes(design.axes, state.axes, 0, state.wish, y, state.v, state.x)
+    flags = ask_axes(design.axes, state.axes, flags, state.wish, y, state.v, state.x)
     flags |= learn_of_all(design.learning, state.learning, design.axes, state.axes)
     flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
@@ -180,7 +176,7 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
         u[k] = state.u[k]
     apply_to_axes(state.gain, state.u, state.v)
     tell_given(design.given, state.given, design.axes, state.axes, state.gain, state.u, flags)
-    tell_axes(design.axes, state.axes, 0, state.v)
+    tell_axes(design.axes, state.axes, state.v)
     loop.status, loop.started = flags, 1.0
 
 
@@ -188,7 +184,7 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
 def _tell_applied(design: AxesDesign, state: AxesState) -> None:
     apply_to_axes(state.gain, state.u, state.v)
     tell_given(design.given, state.given, design.axes, state.axes, state.gain, state.u, ANY_CUT)
-    tell_axes(design.axes, state.axes, 0, state.v)
+    tell_axes(design.axes, state.axes, state.v)
 
 
 @start_all.register(AxesDesign)
@@ -204,20 +200,20 @@ def _start_all(
         state.u[k] = u[k]
     apply_to_axes(state.gain, state.u, state.v)
     start_given(design.given, state.given, state.gain, u, r, state.wish)
-    start_axes(design.axes, state.axes, samples, 0, y, state.v, state.wish)
+    start_axes(design.axes, state.axes, samples, y, state.v, state.wish)
     state.loop[0].started = 1.0
 
 
 def begin_manual(design: AxesDesign, state: AxesState) -> None:
     """Let the axes run in manual operation under the v in the state."""
     state.loop[0].manual = 1.0
-    set_axes_manual(design.axes, state.axes, 1.0, 0, state.v)
+    set_axes_manual(design.axes, state.axes, 1.0, state.v)
 
 
 def end_manual(design: AxesDesign, state: AxesState) -> None:
     """End manual operation of a sample."""
     state.loop[0].manual = 0.0
-    set_axes_manual(design.axes, state.axes, 0.0, 0, state.v)
+    set_axes_manual(design.axes, state.axes, 0.0, state.v)
 
 
 def hand_over_all(design: AxesDesign, state: AxesState) -> bool:
@@ -225,7 +221,7 @@ def hand_over_all(design: AxesDesign, state: AxesState) -> bool:
 
     Return false before the first sample of one of the axes: then nothing has changed.
     """
-    if state.loop[0].started == 0.0 or not have_started(design.axes, state.axes):
+    if state.loop[0].started == 0.0 or axes_started(design.axes, state.axes, 0) < state.v.size:
         return False
     continue_axes(design.axes, state.axes)
     return True
@@ -252,17 +248,17 @@ def _write_row(design: AxesDesign, state: AxesState, row: Vector) -> None:
     for i in range(n):
         row[i] = state.v[i]
     row[n] = state.loop[0].status
-    write_axes(design.axes, state.axes, design.widths, 0, row[n + 1 :])
+    write_axes(design.axes, state.axes, n + 1, design.widths, row)
 
 
 @set_reference_derivatives.register(AxesDesign)
 def _set_derivatives(design: AxesDesign, state: AxesState, derivatives: Vector) -> None:
-    set_axes_derivatives(design.axes, state.axes, design.derivatives, 0, derivatives)
+    set_axes_derivatives(design.axes, state.axes, 0, design.derivatives, derivatives)
 
 
 @set_axis_held.register(AxesDesign)
 def _set_axis_held(design: AxesDesign, state: AxesState, axis: int, held: bool) -> None:
-    hold_axis(design.axes, state.axes, 0, axis, held)
+    hold_axes(design.axes, state.axes, axis, held)
 
 
 # ---- The controller ----
@@ -456,12 +452,9 @@ class Axes(StatefulController):
         check_safe_sets(safe_sets, self.names, self._gain.first, limits)
 
     def _update_parameters(self) -> None:
-        designs: Any = NoAxis()
-        for axis in reversed(self.axes):
-            designs = AxisDesigns(axis.parameters, designs)
         widths = [sum(width for _, width in axis.channels) for axis in self.axes]
         self.parameters = AxesDesign(
-            designs,
+            tuple(axis.parameters for axis in self.axes),
             self._gain.design,
             self._rule,
             self._actuators,
@@ -475,11 +468,8 @@ class Axes(StatefulController):
     def initial_state(self) -> AxesState:
         """Return a state before the first sample, with nothing learned."""
         n, m = self._gain.shape
-        states: Any = NoAxisMemory(np.zeros(0))
-        for axis in reversed(self.axes):
-            states = AxisStates(axis.initial_state(), states)
         return AxesState(
-            axes=states,
+            axes=tuple(axis.initial_state() for axis in self.axes),
             learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
             range=range_memory(n, m, self._rule),
@@ -497,17 +487,9 @@ class Axes(StatefulController):
 
     def _use_state(self, state: AxesState) -> None:
         super()._use_state(state)
-        for name, axis, own in zip(self.names, self.axes, self._states(state), strict=True):
+        for name, axis, own in zip(self.names, self.axes, state.axes, strict=True):
             axis._use_state(own)
             axis._axis = name
-
-    @staticmethod
-    def _states(state: AxesState) -> Iterator[Any]:
-        """Yield the state of each axis."""
-        inner = state.axes
-        while isinstance(inner, AxisStates):
-            yield inner.axis
-            inner = inner.others
 
     # ---- Sample by sample ----
 
@@ -678,7 +660,7 @@ class Axes(StatefulController):
 
     def read(self, state: AxesState) -> dict[str, Estimate]:
         """Return the estimates and status of each axis in ``state``, by its name."""
-        parts = zip(self.names, self.axes, self._states(state), strict=True)
+        parts = zip(self.names, self.axes, state.axes, strict=True)
         return {name: axis.read(own) for name, axis, own in parts}
 
     @property

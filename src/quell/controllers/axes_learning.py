@@ -14,10 +14,9 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.adrc import ADRC
-from quell.controllers.axes_chain import AxisDesigns, AxisStates
 from quell.controllers.law import start_learning_again
 from quell.guard import Guard
-from quell.kernels.dispatch import generic_with_default
+from quell.kernels.dispatch import for_each, generic_with_default
 from quell.kernels.sized import Size, Work
 from quell.learners.all_axes import (
     AxesView,
@@ -97,64 +96,25 @@ def restart_of_all(learning: Any, memory: Any) -> None:
     """Start from rest at the next sample; what was learned stays."""
 
 
-@generic_with_default
-def gather_axes(
-    axes: Any, states: Any, learning: Any, at: int, i: int, before: Vector, now: Vector
-) -> None:
-    """Write the signals of the axes from the i-th on, whose states begin at ``at``.
+def gather_axis(
+    axis: Any,
+    state: Any,
+    i: int,
+    at: int,
+    learning: LearningDesign,
+    before: Vector,
+    now: Vector,
+) -> int:
+    """Write the signals of an axis, whose states begin at ``at``; return where those behind begin.
 
     Both arrays have the states of all axes, then v, y and y − x̂_1 of each.
     """
-
-
-@generic_with_default
-def show_axes(axes: Any, states: Any, before: Vector, now: Vector) -> None:
-    """Show the learners of the axes the signals of all."""
-
-
-@generic_with_default
-def share_with_axes(axes: Any, states: Any, shared: Any, memory: Any) -> None:
-    """Hand the features of a shared learner to its outputs."""
-
-
-@generic_with_default
-def least_confidence(axes: Any, states: Any, i: int, shared: Any, memory: Any) -> float:
-    """Return the least confidence of the axes from the i-th on that learn in this sample; or 2."""
-    return 2.0
-
-
-@generic_with_default
-def take_gains(axes: Any, states: Any, shared: Any, memory: Any) -> None:
-    """Move θ of all outputs by their errors."""
-
-
-@generic_with_default
-def has_forgotten(axes: Any, states: Any) -> bool:
-    """Return whether the θ of an output was forgotten in this sample, or in a restart before."""
-    return False
-
-
-@generic_with_default
-def start_all_again(axes: Any, states: Any) -> None:
-    """Let all axes start learning again; those that have not forgotten their θ do it now."""
-
-
-@gather_axes.register(AxisDesigns)
-def _gather(
-    axes: AxisDesigns,
-    states: AxisStates,
-    learning: LearningDesign,
-    at: int,
-    i: int,
-    before: Vector,
-    now: Vector,
-) -> None:
-    own, loop, estimates = axes.axis, states.axis.loop[0], states.axis.estimates
-    order, dt = own.law.size, learning.dt
+    loop, estimates = state.loop[0], state.estimates
+    order, dt = axis.law.size, learning.dt
     # y^(n) as the observer has it, for f that enters where v does.
-    rate = own.cancel_f * (loop.u + estimates[order] + loop.f_learned + loop.f_known)
+    rate = axis.cancel_f * (loop.u + estimates[order] + loop.f_learned + loop.f_known)
     for j in range(order):
-        rate -= own.cancel_f * own.cancel[j] * estimates[j]
+        rate -= axis.cancel_f * axis.cancel[j] * estimates[j]
         before[at + j] = estimates[j]
     for j in range(order - 1):
         now[at + j] = estimates[j] + dt * estimates[j + 1]
@@ -163,54 +123,59 @@ def _gather(
     before[place] = now[place] = loop.u
     before[place + step] = now[place + step] = loop.y
     before[place + 2 * step] = now[place + 2 * step] = loop.y - estimates[0]
-    gather_axes(axes.others, states.others, learning, at + order, i + 1, before, now)
+    return at + order
 
 
-@show_axes.register(AxisDesigns)
-def _show(axes: AxisDesigns, states: AxisStates, before: Vector, now: Vector) -> None:
-    show(axes.axis.learner, states.axis.learner, before, now)
-    show_axes(axes.others, states.others, before, now)
+def show_axis(axis: Any, state: Any, i: int, before: Vector, now: Vector) -> None:
+    """Show the learner of an axis the signals of all."""
+    show(axis.learner, state.learner, before, now)
 
 
-@share_with_axes.register(AxisDesigns)
-def _share(
-    axes: AxisDesigns, states: AxisStates, shared: SharedDesign, memory: SharedMemory
+def share_with_axis(
+    axis: Any, state: Any, i: int, shared: SharedDesign, memory: SharedMemory
 ) -> None:
-    share(shared, memory, axes.axis.learner, states.axis.learner)
-    share_with_axes(axes.others, states.others, shared, memory)
+    """Hand the features of a shared learner to the output of an axis."""
+    share(shared, memory, axis.learner, state.learner)
 
 
-@least_confidence.register(AxisDesigns)
-def _least_confidence(
-    axes: AxisDesigns, states: AxisStates, i: int, shared: SharedDesign, memory: SharedMemory
+def least_confidence_with(
+    axis: Any, state: Any, i: int, least: float, shared: SharedDesign, memory: SharedMemory
 ) -> float:
-    others = least_confidence(axes.others, states.others, i + 1, shared, memory)
-    if states.axis.learner.loop[0].learns == 0.0:
-        return others
-    return min(confidence_in(shared, memory, axes.axis.learner, i), others)
+    """Return the least confidence of axes that learn in this sample, this one included."""
+    if state.learner.loop[0].learns == 0.0:
+        return least
+    return min(confidence_in(shared, memory, axis.learner, i), least)
 
 
-@take_gains.register(AxisDesigns)
-def _take(
-    axes: AxisDesigns, states: AxisStates, shared: SharedDesign, memory: SharedMemory
-) -> None:
-    take_gain(memory, states.axis.learner)
-    take_gains(axes.others, states.others, shared, memory)
+def take_gain_of_axis(axis: Any, state: Any, i: int, memory: SharedMemory) -> None:
+    """Move θ of an output by its error."""
+    take_gain(memory, state.learner)
 
 
-@has_forgotten.register(AxisDesigns)
-def _has_forgotten(axes: AxisDesigns, states: AxisStates) -> bool:
-    return states.axis.learner.loop[0].forgot != 0.0 or has_forgotten(axes.others, states.others)
+def count_forgotten(axis: Any, state: Any, i: int, count: int) -> int:
+    """Return the count of outputs whose θ was forgotten in this sample or in a restart before it.
+
+    This one is included.
+    """
+    return count + (1 if state.learner.loop[0].forgot != 0.0 else 0)
 
 
-@start_all_again.register(AxisDesigns)
-def _start_again(axes: AxisDesigns, states: AxisStates) -> None:
+def start_axis_again(axis: Any, state: Any, i: int) -> None:
+    """Let an axis start learning again; one that has not forgotten its θ does it now."""
     # The observers of these axes take over what was fed forward, as after an overflow of their own.
-    if states.axis.learner.loop[0].forgot == 0.0:
-        start_learning_again(axes.axis, states.axis)
-        states.axis.loop[0].status = int(states.axis.loop[0].status) | _OVERFLOWED
-    states.axis.learner.loop[0].forgot = 0.0
-    start_all_again(axes.others, states.others)
+    if state.learner.loop[0].forgot == 0.0:
+        start_learning_again(axis, state)
+        state.loop[0].status = int(state.loop[0].status) | _OVERFLOWED
+    state.learner.loop[0].forgot = 0.0
+
+
+gather_axes = for_each("gather_axes", gather_axis)
+show_axes = for_each("show_axes", show_axis)
+share_with_axes = for_each("share_with_axes", share_with_axis)
+least_confidence = for_each("least_confidence", least_confidence_with)
+take_gains = for_each("take_gains", take_gain_of_axis)
+axes_forgotten = for_each("axes_forgotten", count_forgotten)
+start_all_again = for_each("start_all_again", start_axis_again)
 
 
 @generic_with_default
@@ -234,20 +199,20 @@ def end_shared(shared: Any, memory: Any, axes: Any, states: Any) -> int:
 
 @end_shared.register(SharedDesign)
 def _end_shared(shared: SharedDesign, memory: SharedMemory, axes: Any, states: Any) -> int:
-    if has_forgotten(axes, states):
+    if axes_forgotten(axes, states, 0) > 0:
         forget(shared, memory)
         start_all_again(axes, states)
         return _OVERFLOWED
-    least = least_confidence(axes, states, 0, shared, memory)
+    least = least_confidence(axes, states, 2.0, shared, memory)
     if least <= 1.0 and find_gain(shared, memory, least):
-        take_gains(axes, states, shared, memory)
+        take_gains(axes, states, memory)
     return 0
 
 
 @look_at_all.register(LearningDesign)
 def _look_at_all(learning: LearningDesign, memory: LearningMemory, axes: Any, states: Any) -> None:
     before, now = memory.before, memory.now
-    gather_axes(axes, states, learning, 0, 0, before, now)
+    gather_axes(axes, states, 0, learning, before, now)
     show_axes(axes, states, before, now)
     begin_shared(learning.shared, memory.shared, axes, states, before, now)
 
@@ -265,7 +230,7 @@ def _restart_of_all(learning: LearningDesign, memory: LearningMemory) -> None:
 # ---- Learners and guards that users give to Axes ----
 
 
-def for_each(what: str, given: Any, names: Sequence[str]) -> list[Any]:
+def given_for_each(what: str, given: Any, names: Sequence[str]) -> list[Any]:
     """Return what is given for each axis: a list, or a dictionary by name; None where it is not."""
     if isinstance(given, Mapping):
         for name in given:
@@ -312,10 +277,10 @@ class LearningOfAxes:
             )
         self._learners = [learner] * count
         if not self.is_shared:
-            self._learners = for_each("learner", learner, names)
+            self._learners = given_for_each("learner", learner, names)
         self._guards = [None if own is None else guard for own in self._learners]
         if isinstance(guard, Mapping) or checks.is_sequence(guard):
-            self._guards = for_each("guard", guard, names)
+            self._guards = given_for_each("guard", guard, names)
         for name, axis, own, watch in zip(names, axes, self._learners, self._guards, strict=True):
             _check_parts(name, axis, own, watch, self.is_shared)
         self._names = tuple(names)

@@ -38,7 +38,6 @@ from quell.controllers.allocation import (
     apply_to_axes,
     set_range,
 )
-from quell.controllers.axes_chain import AxisDesigns, AxisStates
 from quell.controllers.base import (
     check_controller,
     control,
@@ -55,7 +54,7 @@ from quell.controllers.compensated import (
 )
 from quell.controllers.compensator import Compensator
 from quell.controllers.law import unlimited_control
-from quell.kernels.dispatch import generic, generic_with_default, kernel
+from quell.kernels.dispatch import for_each, generic, generic_with_default, kernel
 from quell.kernels.sized import Work
 from quell.types import Status, Vector
 
@@ -63,47 +62,49 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _HELD = int(Status.HELD)
 ANY_CUT = int(Status.SATURATED | Status.RATE_LIMITED | Status.SAFE_SET_ACTED)
 
-# ---- The controllers that give u_0, one inside of the other ----
+# ---- The controllers that give u_0 ----
 
 
 class FromOutside(NamedTuple):
     """U_0 takes the place of the references."""
 
 
-class NoDrive(NamedTuple):
-    """The end of the drives."""
+def ask_drive(drive: Any, state: Any, k: int, flags: int, r: Vector, y: Vector, u_0: Vector) -> int:
+    """Write the u_0 of a drive; return the flags."""
+    u_0[k] = control(drive, state, r[k], y[k])
+    return flags | int(status_flags(drive, state))
 
 
-class NoDriveMemory(NamedTuple):
-    """The state of none."""
+def tell_drive(drive: Any, state: Any, k: int, u: Vector, held: Vector, undoes: bool) -> None:
+    """Tell a drive what was applied.
 
-    nothing: Work  # (0,)
+    The integrator of one whose axis is held stays as it is: what the last sample has added to it is
+    undone if ``undoes``.
+    """
+    if held[k] == 0.0:
+        set_applied_control(drive, state, u[k])
+    elif undoes:
+        hold_integrators(drive, state, u[k])
 
 
-class Drives(NamedTuple):
-    """Parameters of a controller, and of those behind it."""
-
-    controller: Any
-    others: Any
+def reset_drive(drive: Any, state: Any, k: int) -> None:
+    """Start a drive from rest."""
+    reset_loop(drive, state)
 
 
-class DriveStates(NamedTuple):
-    """State of a controller, and of those behind it."""
-
-    controller: Any
-    others: Any
+_ask_each = for_each("ask_each_drive", ask_drive)
+_tell_each = for_each("tell_each_drive", tell_drive)
+_reset_each = for_each("reset_each_drive", reset_drive)
 
 
 @generic
-def ask_drives(drives: Any, states: Any, k: int, r: Vector, y: Vector, u_0: Vector) -> int:
-    """Write the u_0 of the drives from the k-th on; return the flags."""
+def ask_drives(drives: Any, states: Any, r: Vector, y: Vector, u_0: Vector) -> int:
+    """Write the u_0 of all drives; return the flags."""
     raise TypeError
 
 
 @ask_drives.register(FromOutside)
-def _from_outside(
-    drives: FromOutside, states: Any, k: int, r: Vector, y: Vector, u_0: Vector
-) -> int:
+def _from_outside(drives: FromOutside, states: Any, r: Vector, y: Vector, u_0: Vector) -> int:
     flags = 0
     for i in range(u_0.size):
         if is_usable(r[i]):
@@ -113,36 +114,19 @@ def _from_outside(
     return flags
 
 
-@ask_drives.register(NoDrive)
-def _ask_none(drives: NoDrive, states: Any, k: int, r: Vector, y: Vector, u_0: Vector) -> int:
-    return 0
-
-
-@ask_drives.register(Drives)
-def _ask(drives: Drives, states: DriveStates, k: int, r: Vector, y: Vector, u_0: Vector) -> int:
-    u_0[k] = control(drives.controller, states.controller, r[k], y[k])
-    flags = int(status_flags(drives.controller, states.controller))
-    return flags | ask_drives(drives.others, states.others, k + 1, r, y, u_0)
+@ask_drives.register(tuple)
+def _ask(drives: Any, states: Any, r: Vector, y: Vector, u_0: Vector) -> int:
+    return _ask_each(drives, states, 0, r, y, u_0)
 
 
 @generic_with_default
-def tell_drives(drives: Any, states: Any, k: int, u: Vector, held: Vector, undoes: bool) -> None:
-    """Tell the drives from the k-th on what was applied.
-
-    Integrators of those whose axis is held stay as they are: what the last sample has added to
-    them is undone if ``undoes``.
-    """
+def tell_drives(drives: Any, states: Any, u: Vector, held: Vector, undoes: bool) -> None:
+    """Tell all drives what was applied."""
 
 
-@tell_drives.register(Drives)
-def _tell(
-    drives: Drives, states: DriveStates, k: int, u: Vector, held: Vector, undoes: bool
-) -> None:
-    if held[k] == 0.0:
-        set_applied_control(drives.controller, states.controller, u[k])
-    elif undoes:
-        hold_integrators(drives.controller, states.controller, u[k])
-    tell_drives(drives.others, states.others, k + 1, u, held, undoes)
+@tell_drives.register(tuple)
+def _tell(drives: Any, states: Any, u: Vector, held: Vector, undoes: bool) -> None:
+    _tell_each(drives, states, u, held, undoes)
 
 
 @generic_with_default
@@ -150,10 +134,9 @@ def reset_drives(drives: Any, states: Any) -> None:
     """Start the drives from rest."""
 
 
-@reset_drives.register(Drives)
-def _reset_drives(drives: Drives, states: DriveStates) -> None:
-    reset_loop(drives.controller, states.controller)
-    reset_drives(drives.others, states.others)
+@reset_drives.register(tuple)
+def _reset_drives(drives: Any, states: Any) -> None:
+    _reset_each(drives, states)
 
 
 # ---- What axes are asked for, and what they are given ----
@@ -198,32 +181,20 @@ class GivenMemory(NamedTuple):
     limits: Any  # LimitsOfChange, in the place of ActuatorLimits
 
 
-@generic_with_default
-def write_unlimited(axes: Any, states: Any, i: int, v: Vector, held: Vector) -> None:
-    """Write what the axes from the i-th on ask for before limits and bands, and who is held."""
+def write_unlimited_of_axis(axis: Any, state: Any, i: int, v: Vector, held: Vector) -> None:
+    """Write what an axis asks for before limits and bands, and whether it is held."""
+    loop = state.loop[0]
+    held[i] = loop.held
+    v[i] = unlimited_control(axis, state, loop.constant, loop.slope) + loop.offset
 
 
-@write_unlimited.register(AxisDesigns)
-def _write_unlimited(
-    axes: AxisDesigns, states: AxisStates, i: int, v: Vector, held: Vector
-) -> None:
-    own = states.axis.loop[0]
-    held[i] = own.held
-    v[i] = unlimited_control(axes.axis, states.axis, own.constant, own.slope) + own.offset
-    write_unlimited(axes.others, states.others, i + 1, v, held)
+def write_expected_of_axis(axis: Any, state: Any, i: int, y: Vector, expected: Vector) -> None:
+    """Write the measurement of an axis, or what its observer expects."""
+    expected[i] = measured_or_expected(axis, state, y[i])
 
 
-@generic_with_default
-def write_expected(axes: Any, states: Any, i: int, y: Vector, expected: Vector) -> None:
-    """Write the measurements of the axes from the i-th on, or what their observers expect."""
-
-
-@write_expected.register(AxisDesigns)
-def _write_expected(
-    axes: AxisDesigns, states: AxisStates, i: int, y: Vector, expected: Vector
-) -> None:
-    expected[i] = measured_or_expected(axes.axis, states.axis, y[i])
-    write_expected(axes.others, states.others, i + 1, y, expected)
+write_unlimited = for_each("write_unlimited", write_unlimited_of_axis)
+write_expected = for_each("write_expected", write_expected_of_axis)
 
 
 @generic_with_default
@@ -254,8 +225,8 @@ def _take_controls(
     y: Vector,
     wish: Vector,
 ) -> int:
-    write_expected(axes, states, 0, y, memory.y)
-    flags = ask_drives(given.drives, memory.drives, 0, r, memory.y, memory.u_0)
+    write_expected(axes, states, y, memory.y)
+    flags = ask_drives(given.drives, memory.drives, r, memory.y, memory.u_0)
     _act(gain, memory, wish)
     return flags
 
@@ -332,14 +303,14 @@ def _tell_given(
         for k in range(m):
             memory.told[k] = memory.u_0[k]
         return
-    write_unlimited(axes, states, 0, memory.free, memory.held)
+    write_unlimited(axes, states, memory.free, memory.held)
     for k in range(m):
         if memory.held[k] == 0.0:
             memory.told[k] = u[k]
             for i in range(n):
                 memory.told[k] -= gain.inverse[k, i] * (memory.free[i] - memory.v_0[i])
     undoes = flags & _HELD != 0
-    tell_drives(given.drives, memory.drives, 0, memory.told, memory.held, undoes)
+    tell_drives(given.drives, memory.drives, memory.told, memory.held, undoes)
 
 
 @generic_with_default
@@ -474,19 +445,14 @@ def given_design(compensates: bool, drives: Sequence[Any]) -> Any:
         return References()
     if not drives:
         return GivenControls(FromOutside())
-    chain: Any = NoDrive()
-    for drive in reversed(drives):
-        chain = Drives(drive.parameters, chain)
-    return GivenControls(chain)
+    return GivenControls(tuple(drive.parameters for drive in drives))
 
 
 def given_memory(design: Any, drives: Sequence[Any], n: int, m: int) -> Any:
     """Return the state before the first sample, for n axes and m actuators."""
     if isinstance(design, References):
         return NoGivenMemory(np.zeros(0))
-    states: Any = NoDriveMemory(np.zeros(0))
-    for drive in reversed(drives):
-        states = DriveStates(drive.initial_state(), states)
+    states = tuple(drive.initial_state() for drive in drives)
     limits = LimitsOfChange(*(np.zeros(m) for _ in range(4)))
     u_0, before, told, held = (np.zeros(m) for _ in range(4))
     v_0, free, y = (np.zeros(n) for _ in range(3))

@@ -52,7 +52,7 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -109,39 +109,69 @@ class Layout(NamedTuple):
         return HEADER.size + self.width * self.numbers + CHECK.size
 
 
-def named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Return the arrays of a nested NamedTuple by dotted name, ``Scalars`` as a vector."""
-    found: dict[str, NDArray[Any]] = {}
-    for name, value in state._asdict().items():
-        if isinstance(value, tuple):
-            found |= named_arrays(value, f"{prefix}{name}.")
+class Leaf(NamedTuple):
+    """An array of a state.
+
+    Attributes
+    ----------
+    name
+        dotted, as images have it.
+    path
+        fields of NamedTuples, and places in other tuples, that lead to it.
+    array
+        itself.
+    is_work
+        whether no later sample reads it.
+    """
+
+    name: str
+    path: tuple[str | int, ...]
+    array: NDArray[Any]
+    is_work: bool
+
+
+# In an image the axes, and the drives below compensators, are pairs of one and those behind it: the
+# kind of a pair, what it calls the first one, and the kind of the end.
+_PAIRS = {"axes": ("AxisDesigns", "axis", "NoAxis"), "drives": ("Drives", "controller", "NoDrive")}
+
+
+def leaves(state: Any, name: str = "", path: tuple[str | int, ...] = ()) -> Iterator[Leaf]:
+    """Yield the arrays of a nested NamedTuple in the order of an image."""
+    work = work_fields(type(state))
+    for field, part in zip(state._fields, state, strict=True):
+        here = (*path, field)
+        if not isinstance(part, tuple):
+            yield Leaf(f"{name}{field}", here, part, field in work)
+        elif hasattr(part, "_fields"):
+            yield from leaves(part, f"{name}{field}.", here)
         else:
-            is_record = value.dtype.names is not None
-            found[prefix + name] = value.view(value.dtype[0]) if is_record else value
-    return found
+            behind = f"{name}{field}."
+            for i, each in enumerate(part):
+                yield from leaves(each, f"{behind}{_PAIRS[field][1]}.", (*here, i))
+                behind += "others."
+
+
+def named_arrays(state: Any) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a nested NamedTuple by dotted name, ``Scalars`` as a vector."""
+    return {leaf.name: _as_vector(leaf.array) for leaf in leaves(state)}
+
+
+def _as_vector(array: NDArray[Any]) -> NDArray[Any]:
+    return array if array.dtype.names is None else array.view(array.dtype[0])
 
 
 def kept_arrays(state: Any) -> dict[str, NDArray[Any]]:
     """Return the arrays of an image: without work space, and each place in memory once."""
     kept: dict[str, NDArray[Any]] = {}
-    work = _work_of(state, "")
     taken: list[tuple[int, int]] = []
-    for name, array in named_arrays(state).items():
-        begin = array.__array_interface__["data"][0]
-        end = begin + array.nbytes
-        if name not in work and all(end <= low or begin >= high for low, high in taken):
-            kept[name] = array
-            if array.size:
+    for leaf in leaves(state):
+        begin = leaf.array.__array_interface__["data"][0]
+        end = begin + leaf.array.nbytes
+        if not leaf.is_work and all(end <= low or begin >= high for low, high in taken):
+            kept[leaf.name] = _as_vector(leaf.array)
+            if leaf.array.size:
                 taken.append((begin, end))
     return kept
-
-
-def _work_of(state: Any, prefix: str) -> set[str]:
-    found = {prefix + name for name in work_fields(type(state))}
-    for name, value in state._asdict().items():
-        if isinstance(value, tuple):
-            found |= _work_of(value, f"{prefix}{name}.")
-    return found
 
 
 def images_of(parameters: Any, state: Any, dt: float, names: Sequence[str] = ()) -> Layout:
@@ -151,9 +181,12 @@ def images_of(parameters: Any, state: Any, dt: float, names: Sequence[str] = ())
     """
     arrays = kept_arrays(state)
     single = any(array.dtype == np.float32 for array in arrays.values())
-    shapes = tuple((name, array.shape) for name, array in arrays.items())
+    shapes = [(name, array.shape) for name, array in arrays.items()]
+    if names:  # behind the last axis was an empty array, which is in the hash
+        last = max(i for i, (name, _) in enumerate(shapes) if name.startswith("axes."))
+        shapes.insert(last + 1, (f"axes.{'others.' * len(names)}nothing", (0,)))
     digits, width = (6, 4) if single else (9, 8)
-    what = _what(parameters), float(dt), shapes, *names
+    what = _what(parameters), float(dt), tuple(shapes), *names
     layout, design = _hash(what, digits), _hash((what, parameters), digits)
     return Layout(arrays, width, layout, design, _zero_places(state, arrays))
 
@@ -165,15 +198,20 @@ def _what(design: Any) -> Any:
         return kinds, meaning(design.learner), design.b0, design.cancel, design.cancel_f
     if hasattr(design, "axes"):  # several axes: what they learn is relative to B0
         together = (meaning(design.learning),) if design.learning else ()
-        return type(design).__name__, meaning(design.gain), *together, _what(design.axes)
+        kind, _, end = _PAIRS["axes"]
+        inner: Any = end, "NoneType", ()
+        for axis in reversed(design.axes):
+            inner = kind, "NoneType", (_what(axis), inner)
+        return type(design).__name__, meaning(design.gain), *together, inner
     inner = tuple(_what(each) for each in _inside(design))
     return type(design).__name__, type(getattr(design, "prefilter", None)).__name__, inner
 
 
 def _inside(whole: Any) -> tuple[Any, ...]:
     """Return the controllers inside of a wrapper or of axes, by their parameters or states."""
-    names = ("controller", "compensator", "axes", "axis", "others")
-    return tuple(getattr(whole, name) for name in names if hasattr(whole, name))
+    names = ("controller", "compensator")
+    inner = tuple(getattr(whole, name) for name in names if hasattr(whole, name))
+    return (*inner, *getattr(whole, "axes", ()))
 
 
 def _adrc_states(state: Any) -> list[AdrcState]:
@@ -210,13 +248,27 @@ def _text(value: Any, digits: int) -> str:
         return f"{value.shape}[{entries}]"
     if isinstance(value, tuple):
         kind = type(value).__name__ if hasattr(value, "_fields") else ""
-        return f"{kind}({','.join(_text(part, digits) for part in value)})"
+        fields = getattr(value, "_fields", range(len(value)))
+        parts = (
+            _text_of_pairs(part, digits, *_PAIRS[field])
+            if field in _PAIRS and type(part) is tuple
+            else _text(part, digits)
+            for field, part in zip(fields, value, strict=True)
+        )
+        return f"{kind}({','.join(parts)})"
     if isinstance(value, str) or value is None:
         return repr(value)
     if (origin := origin_of(value)) is not None:  # the address of a function of the user
         return repr(origin.c_function or origin.function.__qualname__)
     # 1 and 1.0 are the same number: whether a value is an integer does not survive all ways.
     return f"{float(value) + 0.0:.{digits}g}"
+
+
+def _text_of_pairs(parts: tuple[Any, ...], digits: int, kind: str, _: str, end: str) -> str:
+    text = f"{end}()"
+    for part in reversed(parts):
+        text = f"{kind}({_text(part, digits)},{text})"
+    return text
 
 
 def check_of(data: bytes) -> int:

@@ -64,8 +64,8 @@ from quell.controllers.allocation import (
     RangeMemory,
     solve_free,
 )
-from quell.controllers.safe_set import BOUNDS
-from quell.kernels.dispatch import generic_with_default, is_finite, kernel
+from quell.controllers.safe_set import BOUNDS, write_bounds
+from quell.kernels.dispatch import for_each, generic_with_default, is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.sized import Work
 from quell.types import Matrix, Status, Vector
@@ -166,14 +166,19 @@ def safe_axes_memory(design: Any, n: int, m: int) -> Any:
     return SafeAxesMemory(bounds, low, high, multipliers, held, slope, step, G, L, start, flags)
 
 
-@generic_with_default
-def write_axes_bounds(axes: Any, states: Any, i: int, bounds: Matrix) -> None:
-    """Write the bounds of v that the safe sets of the axes from the i-th on have."""
+def write_axis_bounds(axis: Any, state: Any, i: int, bounds: Matrix) -> None:
+    """Write the bounds of v that the safe set of an axis has."""
+    write_bounds(axis.safe_set, state.safe_set, bounds[i])
 
 
-@generic_with_default
-def add_axes_flags(axes: Any, states: Any, i: int, flags: Vector) -> None:
-    """Add flags to the status of the axes from the i-th on."""
+def add_axis_flags(axis: Any, state: Any, i: int, flags: Vector) -> None:
+    """Add flags to the status of an axis."""
+    loop = state.loop[0]
+    loop.status = int(loop.status) | int(flags[i])
+
+
+write_axes_bounds = for_each("write_axes_bounds", write_axis_bounds)
+add_axes_flags = for_each("add_axes_flags", add_axis_flags)
 
 
 @generic_with_default
@@ -205,7 +210,7 @@ def _keep_in_bands(
     n, m = gain.B.shape
     for k in range(m):
         memory.low[k], memory.high[k], memory.start[k] = within.low[k], within.high[k], u[k]
-    write_axes_bounds(axes, states, 0, memory.bounds)
+    write_axes_bounds(axes, states, memory.bounds)
     _take_bounds(memory, 2)
     outside = False
     for i in range(n):
@@ -259,7 +264,7 @@ def _flag_axes(
             memory.flags[i] = _UNSAFE
             flags |= _UNSAFE
     if flags != 0:
-        add_axes_flags(axes, states, 0, memory.flags)
+        add_axes_flags(axes, states, memory.flags)
     return flags
 
 

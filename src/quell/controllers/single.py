@@ -13,7 +13,7 @@ state feedback run so, too, with arrays of r, y and u.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numba
@@ -22,7 +22,6 @@ import numpy as np
 from quell import checks
 from quell.controllers.allocation import FunctionGain
 from quell.controllers.axes import Axes, AxesDesign
-from quell.controllers.axes_chain import AxisDesigns
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
@@ -100,8 +99,9 @@ def _in_delta_form(design: Any) -> Any:
         # β is rounded first, so that the gain of a stage at rest, (1−β)/(1−β), remains one.
         pole = float(np.float32(design.pole))
         return design._replace(pole=pole, rise=1.0 - pole)
-    if hasattr(design, "_fields"):
-        return type(design)(*map(_in_delta_form, design))
+    if isinstance(design, tuple):
+        parts = map(_in_delta_form, design)
+        return type(design)(*parts) if hasattr(design, "_fields") else tuple(parts)
     return design
 
 
@@ -118,7 +118,7 @@ def _check(value: Any, name: str) -> None:
     if isinstance(value, PythonDesign | CustomDesign):
         what = "a model in Python" if isinstance(value, PythonDesign) else "features.Custom"
         raise ValueError(f"{name} is {what}: it works in double precision only; {_OTHERS}")
-    for field, part in zip(getattr(value, "_fields", ()), value, strict=False):
+    for field, part in zip(getattr(value, "_fields", range(len(value))), value, strict=True):
         if isinstance(part, tuple):
             _check(part, f"{name}.{field}" if name else field)
         elif field in _RATES.get(type(value), ()):
@@ -140,12 +140,8 @@ def _with_carries(design: Any, state: Any) -> Any:
         given = _with_carries(design.controller, state.controller)
         return state._replace(controller=given, compensator=inner)
     if isinstance(design, AxesDesign):
-        axes = _with_carries(design.axes, state.axes)
+        axes = tuple(map(_with_carries, design.axes, state.axes))
         return state._replace(axes=axes, learning=_with_longer(state.learning))
-    if isinstance(design, AxisDesigns):
-        own, others = design.axis, design.others
-        behind = _with_carries(others, state.others)
-        return state._replace(axis=_with_carries(own, state.axis), others=behind)
     if isinstance(design, AdrcDesign):
         state = state._replace(z=np.zeros(design.eso.states))
         if isinstance(design.safe_set, SafeSetDesign):
@@ -379,14 +375,8 @@ def _acting_on(controller: Any, design: Any, state: Any) -> Any:
         parts = design.compensator, state.compensator
         acting.compensator = _acting_on(controller.compensator, *parts)
     elif isinstance(controller, Axes):
-        acting.axes = tuple(_axes_acting_on(controller.axes, design.axes, state.axes))
+        acting.axes = tuple(map(_acting_on, controller.axes, design.axes, state.axes))
     return acting
-
-
-def _axes_acting_on(axes: tuple[Any, ...], design: Any, state: Any) -> Iterator[Any]:
-    for axis in axes:
-        yield _acting_on(axis, design.axis, state.axis)
-        design, state = design.others, state.others
 
 
 # ---- Several axes, and state feedback ----

@@ -276,9 +276,5 @@ def places_of_actions(controller: Any, state: Any) -> list[Vector]:
         return [state.u]
     if isinstance(controller, ADRC):
         return [state.learner.output]
-    found, chain = [], state.axes
-    for axis in controller.axes:
-        if isinstance(axis.learner, Policy):
-            found.append(chain.axis.learner.output)
-        chain = chain.others
-    return found
+    pairs = zip(controller.axes, state.axes, strict=True)
+    return [own.learner.output for axis, own in pairs if isinstance(axis.learner, Policy)]

@@ -18,7 +18,6 @@ from quell.controllers.axes import (
     begin_manual,
     end_manual,
 )
-from quell.controllers.axes_chain import AxisDesigns, AxisStates, NoAxis
 from quell.controllers.base import (
     change_parameters,
     is_usable,
@@ -37,7 +36,7 @@ from quell.export.translate.text import (
     unique,
     wrapped,
 )
-from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.dispatch import for_each, is_finite, kernel
 from quell.types import Channels, Status, Vector
 
 # ---- Operations besides a step ----
@@ -110,20 +109,17 @@ def track_axes(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: Ve
     add_flag_of_axes(design, state, missing)
 
 
-@change_parameters.register(NoAxis)
-def _retune_none(old: NoAxis, new: NoAxis, state: Any) -> None:
-    pass
+def retune_axis(old: Any, new: Any, state: Any, i: int) -> None:
+    """Continue an axis with other parameters."""
+    change_design(old, new, state)
 
 
-@change_parameters.register(AxisDesigns)
-def _retune_axis(old: AxisDesigns, new: AxisDesigns, state: AxisStates) -> None:
-    change_design(old.axis, new.axis, state.axis)
-    change_parameters(old.others, new.others, state.others)
+retune_axes = for_each("retune_axes", retune_axis, tuples=3)
 
 
 @change_parameters.register(AxesDesign)
 def _retune_axes(old: AxesDesign, new: AxesDesign, state: AxesState) -> None:
-    change_parameters(old.axes, new.axes, state.axes)
+    retune_axes(old.axes, new.axes, state.axes)
 
 
 # ---- Names of axes in C, and what is known of each ----
@@ -146,11 +142,9 @@ def names_in_c(names: tuple[str, ...]) -> tuple[str, ...]:
 def each_axis(files: CFiles, count: int) -> Iterator[tuple[Value, Value]]:
     """Yield parameters and state of each axis as arguments of kernels."""
     structs = files.program.structs
-    inner = [structs.field(each, "axes") for each in files.both]
-    for _ in range(count):
-        design, state = (structs.field(_known(each), "axis") for each in inner)
-        yield _known(design), _known(state)
-        inner = [structs.field(_known(each), "others") for each in inner]
+    design, state = (_known(structs.field(each, "axes")) for each in files.both)
+    for i in range(count):
+        yield structs.entry(design, i), structs.entry(state, i)
 
 
 def places_of_axes(name: str, members: tuple[str, ...]) -> list[str]:

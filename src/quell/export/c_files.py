@@ -364,8 +364,8 @@ def check_parts(controller: Any) -> None:
                 "C can not; use Kalman, RLS, NLMS, MLP or GaussianProcess, or a model whose "
                 "functions Numba compiles (docs/extend)"
             )
-        if isinstance(value, tuple) and hasattr(value, "_fields"):
-            parts += zip(value._fields, value, strict=True)
+        if isinstance(value, tuple):
+            parts += zip(getattr(value, "_fields", [name] * len(value)), value, strict=True)
 
 
 def translated(write: Callable[[Findings], CSource]) -> CSource:

@@ -23,6 +23,7 @@ from quell.controllers.memory import (
     MAGIC,
     VERSION,
     Layout,
+    leaves,
 )
 from quell.export.translate.structs import Structs
 from quell.export.translate.text import Array, Number, Struct, Value, wrapped
@@ -169,7 +170,6 @@ _ARRAYS = _CODE[_CODE.index("/* Write the numbers") : _CODE.index("/* Return the
 class _Part(NamedTuple):
     """Numbers of the image that follow each other, and what they are in C."""
 
-    name: str  # of the array in Python
     values: Any  # initial values (n,)
     value: Value | None  # in C; None if it has none
 
@@ -314,31 +314,25 @@ class ImageCode:
 
 def _parts(structs: Structs, memory: Value, state: Any, known: Layout) -> Iterator[_Part]:
     """Yield the numbers of a state in the order of the image."""
-    for name, array, value in _leaves(structs, memory, state, ""):
-        if name.removesuffix("[]") in known.arrays:
-            yield _Part(name, np.ravel(array), value)
-
-
-def _leaves(
-    structs: Structs, owner: Value | None, state: Any, prefix: str
-) -> Iterator[tuple[str, Any, Value | None]]:
-    """Yield name, initial values and code of each array, and of each number of a record."""
-    for field in state._fields:
-        part, name = getattr(state, field), prefix + field
-        value = _member(structs, owner, field)
-        if isinstance(part, tuple):
-            yield from _leaves(structs, value, part, f"{name}.")
-        elif part.dtype.names is None:
-            yield name, part, value
+    for leaf in leaves(state):
+        if leaf.name not in known.arrays:
+            continue
+        value: Value | None = memory
+        for step in leaf.path:
+            value = _member(structs, value, step)
+        if leaf.array.dtype.names is None:
+            yield _Part(np.ravel(leaf.array), value)
         else:
-            for each in part.dtype.names:
-                yield f"{name}[]", part[each], _member(structs, value, each)
+            for each in leaf.array.dtype.names:
+                yield _Part(np.ravel(leaf.array[each]), _member(structs, value, each))
 
 
-def _member(structs: Structs, owner: Value | None, name: str) -> Value | None:
+def _member(structs: Structs, owner: Value | None, name: str | int) -> Value | None:
     """Return a member of a struct in C; None if C has no memory for it."""
     if owner is None or not isinstance(owner.kind, Struct):
         return None
+    if isinstance(name, int):
+        return structs.entry(owner, name)
     layout = structs.layouts[owner.kind.name]
     value = structs.field(owner, name)
     if value is None or name in layout.scratch or name in layout.absent:

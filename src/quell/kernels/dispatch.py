@@ -8,6 +8,8 @@ and arrays) and explicit state (a NamedTuple of arrays), under one of these deco
 ``generic``
     a function with one implementation for each NamedTuple type of its first argument. Compiled code
     selects it by Numba's overload resolution, at no cost at run time; interpreted code by a table.
+``for_each``
+    makes a function of one entry of tuples, as of the axes of a machine, one of all entries.
 ``compiled``
     an entry point, compiled once for each combination of types and cached on disk (``cache``).
 """
@@ -214,8 +216,9 @@ def generic(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
         return implementation(head, *rest)
 
     def resolve(head: Any, *rest: Any) -> Any:
-        is_named_tuple = isinstance(head, nb_types.BaseNamedTuple)
-        cls = getattr(head, "instance_class", None) if is_named_tuple else None
+        cls = tuple if isinstance(head, nb_types.BaseTuple) else None
+        if isinstance(head, nb_types.BaseNamedTuple):
+            cls = getattr(head, "instance_class", None)
         return table.get(cls) or table.get(object)
 
     def register(cls: type) -> Callable[[F], F]:
@@ -238,6 +241,60 @@ def generic_with_default(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
     function = generic(declaration)
     function.register(object)(declaration)
     return function
+
+
+def for_each(name: str, function: Callable[..., Any], tuples: int = 2) -> Callable[..., Any]:
+    """Return a function of tuples that calls ``function`` for their entries, one after the other.
+
+    The entries may be of different types, so a loop can't be compiled: the calls stand in a row, in
+    compiled code and in C, too::
+
+        def ask_axis(axis, state, i, flags, r, y): ...      # returns the flags, own ones added
+        ask_axes = for_each("ask_axes", ask_axis)
+
+        flags = ask_axes(axes, states, flags, r, y)
+
+    Parameters
+    ----------
+    name
+        of the returned function.
+    function
+        takes an entry of each tuple, their index i, and what all entries share. If it returns a
+        value, that is the first of these for the next entry, and of the last entry the result.
+    tuples
+        number of the tuples, all of one length.
+    """
+    parameters = inspect.signature(function).parameters
+    heads, shared = [*parameters][:tuples], [*parameters][tuples + 1 :]
+    returns = function.__annotations__["return"] != "None"
+    of_one = kernel(function)
+    floats = {each for each in shared if function.__annotations__[each] == "float"}
+    typed = [f"{each}: float" if each in floats else each for each in shared]
+
+    @functools.cache
+    def unrolled(count: int) -> Any:
+        lines = [f"def {name}({', '.join([*heads, *typed])}):"]
+        for i in range(count):
+            entries = [f"{head}[{i}]" for head in heads]
+            call = f"{function.__name__}({', '.join([*entries, str(i), *shared])})"
+            lines.append(f"    {f'{shared[0]} = ' if returns else ''}{call}")
+        lines.append(f"    return {shared[0]}" if returns else "    return")
+        names = {function.__name__: of_one, "__name__": function.__module__}
+        exec("\n".join(lines), names)
+        found: Any = names[name]
+        found.source = "\n".join(lines)
+        return found
+
+    def call(head: Any, *rest: Any) -> Any:
+        return unrolled(len(head))(head, *rest)
+
+    def resolve(head: Any, *rest: Any) -> Any:
+        return unrolled(len(head))
+
+    call.__name__, call.__module__, call.__doc__ = name, function.__module__, function.__doc__
+    overload(call, strict=False, jit_options=OPTIONS | KERNEL_OPTIONS)(resolve)
+    call.unrolled = unrolled  # type: ignore[attr-defined]
+    return call
 
 
 @kernel

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.controllers.axes import AxesDesign, AxesState
-from quell.controllers.axes_chain import AxisDesigns, AxisStates
 from quell.controllers.base import bumpless_transfer
 from quell.controllers.several import tell_applied
-from quell.kernels.dispatch import generic_with_default, is_finite, kernel
+from quell.kernels.dispatch import for_each, is_finite, kernel
 from quell.kernels.sized import Work
 from quell.realtime.supervisor import (
     AxesLimits,
@@ -37,15 +36,12 @@ from quell.types import Vector
 # ---- What the loop tells several axes ----
 
 
-@generic_with_default
-def transfer_axes(axes: Any, states: Any) -> None:
-    """Continue each axis from what was applied, as if it had been at rest until now."""
+def transfer_axis(axis: Any, state: Any, i: int) -> None:
+    """Continue an axis from what was applied, as if it had been at rest until now."""
+    bumpless_transfer(axis, state)
 
 
-@transfer_axes.register(AxisDesigns)
-def _transfer(axes: AxisDesigns, states: AxisStates) -> None:
-    bumpless_transfer(axes.axis, states.axis)
-    transfer_axes(axes.others, states.others)
+transfer_axes = for_each("transfer_axes", transfer_axis)
 
 
 @kernel

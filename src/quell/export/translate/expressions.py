@@ -232,8 +232,10 @@ class Expressions:
         if isinstance(base.kind, Several):
             found: Value = base.items[self.translate(node.slice).constant]
             return found
-        if isinstance(base.kind, Struct):  # the only record of an array
-            if self.translate(node.slice).constant == 0:
+        if isinstance(base.kind, Struct):
+            if base.kind.python is tuple:
+                return self.program.structs.entry(base, self.translate(node.slice).constant)
+            if self.translate(node.slice).constant == 0:  # the only record of an array
                 return base
             raise self.fail(node, "a record has only the index 0")
         if not isinstance(base.kind, Array):
@@ -654,6 +656,8 @@ class Calls:
             if implementation is None:
                 raise body.fail(node, f"has no implementation for {arguments[0].kind}")
             return implementation, function
+        if hasattr(function, "unrolled"):
+            return function.unrolled(self.program.structs.count(arguments[0])), function
         plain = interpreted(function)
         if not inspect.isfunction(plain):
             raise body.fail(node, f"{plain!r} is no function that can be translated")

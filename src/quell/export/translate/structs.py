@@ -181,7 +181,7 @@ def read_function(function: Callable[..., Any]) -> Source:
     if name == "<lambda>":
         return _read_lambda(function)
     try:
-        text = textwrap.dedent(inspect.getsource(function))
+        text = getattr(function, "source", "") or textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError):
         rule = "its source is not in a file; define it in a module"
         raise TranslationError(f"{module}.{name}: {rule}") from None
@@ -359,6 +359,22 @@ def module_doc(module: str) -> str:
 
 # ---- C structs for NamedTuples and records, their initialisers and initial values ----
 
+# What a tuple without names of fields calls its entries in C, with their numbers.
+_ENTRY = "entry"
+
+
+def member_of(i: int) -> str:
+    """Return the name of an entry of a tuple in C."""
+    return f"{_ENTRY}{i + 1}"
+
+
+def part_of(value: Any, name: str) -> Any:
+    """Return a field of a NamedTuple, or an entry of another tuple by its name in C."""
+    if hasattr(value, "_fields"):
+        return getattr(value, name)
+    return value[int(name.removeprefix(_ENTRY)) - 1]
+
+
 # Name of the union of arrays that lie in the same memory.
 _SHARED = "shared"
 
@@ -412,8 +428,9 @@ class Structs:
             if issubclass(value.dtype.type, np.void):
                 return self._record(value)
             return Array(value.shape, _element(value, name))
-        if isinstance(value, tuple) and hasattr(value, "_fields"):
-            return self._named_tuple(value, name)
+        if isinstance(value, tuple):
+            named = hasattr(value, "_fields")
+            return self._named_tuple(value, name) if named else self._tuple(value, name)
         if isinstance(value, bool | np.bool_):
             return Number.BOOL
         if isinstance(value, int | np.integer):
@@ -439,6 +456,32 @@ class Structs:
             number = array[0][member].item()
             if self._initial.setdefault((found.name, member), number) != number:
                 self.vary((found.name, member), whole_kind(number))
+        return found
+
+    def _tuple(self, value: tuple[Any, ...], name: str) -> Struct:
+        """Return the struct of a tuple, whose members are numbered."""
+        kinds = {member_of(i): self.of(entry, f"{name}[{i}]") for i, entry in enumerate(value)}
+        signature = (tuple, tuple(kinds.items()))
+        found = self._by_signature.get(signature)
+        if found is None:
+            absent = {part: kind for part, kind in kinds.items() if is_empty(Value(kind))}
+            found = self._new(tuple, name.rsplit(".", 1)[-1], len(absent) == len(kinds))
+            self._by_signature[signature] = found
+            layout = self.layouts[found.name]
+            layout.doc, layout.absent = "One for each.", absent
+            layout.members = {part: kind for part, kind in kinds.items() if part not in absent}
+        return found
+
+    def count(self, owner: Value) -> int:
+        """Return the number of entries of a tuple."""
+        layout = self.layouts[owner.kind.name]
+        return len(layout.members) + len(layout.absent)
+
+    def entry(self, owner: Value, i: int) -> Value:
+        """Return an entry of a tuple."""
+        found = self.field(owner, member_of(i))
+        if found is None:
+            raise AssertionError
         return found
 
     def _named_tuple(self, value: Any, name: str) -> Struct:
@@ -580,7 +623,7 @@ class Structs:
             layout = self.layouts[kind.name]
             lines = [f"{pad}{{{end}"]
             for name, member in layout.members.items():
-                lines += self.initialiser(member, getattr(value, name), indent + 4, name)
+                lines += self.initialiser(member, part_of(value, name), indent + 4, name)
                 lines[-1] += ","
             return _comma_before_comment([*lines, f"{pad}}}"])
         if isinstance(kind, Array):
@@ -670,7 +713,7 @@ def _arrays(structs: Structs, owner: Value, state: Any) -> Iterator[tuple[Value,
     layout = structs.layouts[owner.kind.name]
     names = [name for name in layout.members if name not in layout.shared[1:]]
     for name in names:
-        value, part = structs.field(owner, name), getattr(state, name)
+        value, part = structs.field(owner, name), part_of(state, name)
         if value is None:
             raise AssertionError
         if isinstance(value.kind, Array):
