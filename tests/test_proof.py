@@ -212,6 +212,8 @@ def test_without_frama_c_nothing_is_proved(
     shown = in_this_process((*arguments, "--prove", "--overwrite"), monkeypatch, capsys)
     assert shown.code == 5
     assert "NOT proved: there is no frama-c here" in shown.out
+    assert "Stable: the loop with two-mass-spring in double precision" in shown.out
+    assert "Rounding changes u by at most" in shown.out
     report = Path("out/proof/REPORT.md").read_text()
     assert "apt-get install frama-c-base" in report
     assert "NOT measured: there is no gcc here" in report
@@ -220,6 +222,8 @@ def test_without_frama_c_nothing_is_proved(
     assert names == headers | {"servo_proof.c", "prove.sh", "REPORT.md"}
     fmu = in_this_process((*arguments, "--to", "fmu", "--prove"), monkeypatch, capsys)
     assert (fmu.code, "--prove: only with --to c" in fmu.err) == (2, True)
+    alone = in_this_process((*arguments, "--spread", "0.1"), monkeypatch, capsys)
+    assert (alone.code, "--spread: goes with --prove" in alone.err) == (2, True)
 
 
 @pytest.mark.trial

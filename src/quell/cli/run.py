@@ -325,6 +325,7 @@ def export(
     memory: Path | None = None,
     accept: Switch = False,
     prove: Switch = False,
+    spread: float = 0.0,
     trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -360,7 +361,11 @@ def export(
     prove
         Write the folder proof beside the C code, and prove with Frama-C that no behaviour is
         undefined and u is always a number within its limits. What is not proved is printed, and the
-        exit code is not 0.
+        exit code is not 0. With a linear plant in the setup, without limits and learner: whether
+        the loop is stable with the numbers of the code, and how much rounding changes u.
+    spread
+        With --prove: share of each coefficient of the plant and of its gain within which the loop
+        shall be stable, too.
     """
     from quell.export import c
     from quell.setup import read
@@ -368,6 +373,8 @@ def export(
 
     if to != "c":
         refuse({"resolution": (resolution, None), "prove": (prove, False)}, "only with --to c")
+    if not prove:
+        refuse({"spread": (spread, 0.0)}, "goes with --prove")
     if to in ("fmu", "ros2"):
         single = {"precision": (precision, "double"), "accept": (accept, False)}
         refuse(single, f"only with --to c or --to st; --to {to} is in double")
@@ -391,7 +398,7 @@ def export(
         given.needed("scenario")
     loop: dict[str, Any] = {"plant": given.plant, "scenario": given.scenario}
     if precision == "double" or None in loop.values():
-        loop = {}
+        loop = {"plant": given.plant} if prove else {}
     if to == "st":
         options: dict[str, Any] = loop | {"accept": accept, "overwrite": overwrite}
         _to_st(controller, given.title, precision, out, name or "controller", options)
@@ -404,11 +411,15 @@ def export(
         resolution=resolution,
         accept=accept,
         proof=prove,
+        spread=spread,
         overwrite=overwrite,
         **loop,
     )
     _print(given.title, exported)
-    if exported.proof is not None and not exported.proof.proved:
+    stable = exported.stability
+    if exported.proof is not None and not (
+        exported.proof.proved and (stable is None or stable.stable)
+    ):
         sys.exit(ExitCode.NOT_PROVED)
 
 
@@ -476,6 +487,8 @@ def _print(title: str, exported: Exported) -> None:
         print_line(console, exported.proof.summary)
         for line in exported.proof.open:
             print_line(console, f"NOT proved: {line}")
+        for line in [] if exported.stability is None else exported.stability.lines:
+            print_line(console, line)
         print_line(console, f"Report: {folder}/proof/REPORT.md; again: {folder}/proof/prove.sh")
     print_line(console, f"Test: {folder}/test_{name}.c; how to use it: {folder}/README.md")
 

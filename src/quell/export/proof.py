@@ -33,6 +33,7 @@ import shlex
 import shutil
 import subprocess
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -758,6 +759,8 @@ class Proof:
         whether u has limits.
     left
         what the text says of arrays of the state that are not separate objects; empty if all are.
+    loop
+        what is certain of the stability of a loop with it, a sentence each (``export.stability``).
     """
 
     folder: Path
@@ -770,6 +773,7 @@ class Proof:
     sizes: str = ""
     limited: bool = False
     left: str = ""
+    loop: tuple[str, ...] = ()
 
     @property
     def proved(self) -> bool:
@@ -811,6 +815,7 @@ class Proof:
         """The report in Markdown."""
         library = self.findings.assumed
         lines = "".join(f"- NOT proved: {each}\n" for each in self.open)
+        loop = "".join(f"- {each}.\n" for each in self.loop)
         return _filled("REPORT.md", {
             "name": self.name,
             "summary": self.summary,
@@ -818,6 +823,7 @@ class Proof:
             "results": "" if self.findings.failure else self._results(),
             "open": f"## What is open\n\n{lines}\n{_OPEN}" if lines else "",
             "library": ", ".join(f"`{each}`" for each in library) or "none",
+            "loop": f"## The loop\n\n{loop}\n" if loop else "",
             "sizes": f"## Stack and code\n\n{self.sizes}\n" if self.sizes else "",
         })  # fmt: skip
 
@@ -858,7 +864,14 @@ def _meaning(alarm: Alarm) -> str:
     return known if alarm.status == "Unknown" else f"{known}, status {alarm.status}"
 
 
-def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: str = "") -> Proof:
+def prove(
+    folder: Path,
+    source: CSource,
+    *,
+    longest: float = _LONGEST,
+    sizes: str = "",
+    loop: Sequence[str] = (),
+) -> Proof:
     """Run the proof whose files are in ``folder/proof``, and write its report there.
 
     Parameters
@@ -871,6 +884,8 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: st
         time after which the analysis is ended, and nothing is proved [s].
     sizes
         stack and code of each function for the report, in Markdown.
+    loop
+        what is certain of the stability of a loop, a sentence each.
     """
     contract = (folder / FOLDER / f"{source.name}_contract.h").read_text(encoding="utf-8")
     header, code = ((folder / "src" / f"{source.name}{end}").read_bytes() for end in (".h", ".c"))
@@ -889,7 +904,8 @@ def prove(folder: Path, source: CSource, *, longest: float = _LONGEST, sizes: st
         names
     )
     proof = Proof(
-        *(folder, source.name, found, read, promised, promising, digest, sizes, limited, left)
+        *(folder, source.name, found, read, promised, promising, digest, sizes, limited, left),
+        tuple(loop),
     )
     with written_atomically(folder / FOLDER / REPORT, overwrite=True) as part:
         part.write_text(proof.text, encoding="utf-8")

@@ -37,6 +37,7 @@ from quell.export.library.vectors import (
     test_program,
 )
 from quell.export.proof import Proof, proof_files, prove
+from quell.export.stability import Stability, stability
 from quell.export.translate.text import checked_name
 from quell.files import check_folder, write_folder
 from quell.simulation.driver import Scenario
@@ -505,6 +506,7 @@ class Exported:
     source: CSource  #: texts of header and source
     comparison: Comparison | None  #: single to double precision, if they were compared
     proof: Proof | None = None  #: what was proved, if it was asked for
+    stability: Stability | None = None  #: of the loop, if a proof and a plant were given
 
     def sizes(self) -> Sizes:
         """Return the bytes of code, state and stack, as gcc tells: for ARM if it can.
@@ -529,6 +531,7 @@ def c(
     resolution: float | None = None,
     accept: bool = False,
     proof: bool = False,
+    spread: float = 0.0,
     overwrite: bool = False,
 ) -> Exported:
     """Write a controller as a library in C99, translated from the kernels that simulate it.
@@ -553,7 +556,7 @@ def c(
         ``"double"`` or ``"single"``.
     plant, scenario
         for single precision, both: the loop in which it is compared with double; of several axes
-        with a plant of as many signals.
+        with a plant of as many signals. With ``proof`` a plant alone will do.
     resolution
         of an encoder [y-unit per count]: adds ``NAME_step_counts``, which takes r and y as integers
         and computes with differences to the last count. For an ADRC without model of the position.
@@ -563,7 +566,12 @@ def c(
         also write the folder ``proof``, and prove with Frama-C, where it is installed, that no
         behaviour of the code is undefined and that u is always a number within its limits. It takes
         seconds for an observer of order 2, minutes with a learner; ``Exported.proof`` and
-        ``proof/REPORT.md`` have the result.
+        ``proof/REPORT.md`` have the result. With a linear ``plant`` the report says whether the
+        loop is stable with the numbers of the C code, and how much rounding changes u
+        (``export.stability``; the extra ``proof`` installs what it needs).
+    spread
+        share of each coefficient of the plant and of its gain within which the loop shall be
+        stable, too.
     overwrite
         whether files of the same names in the folder may be replaced.
 
@@ -572,9 +580,9 @@ def c(
     ValueError
         for a name that C, C++, their headers or CMake use; a folder with files; a controller with
         parts in Python (``TranslationError``); parameters out of the range of single precision;
-        a plant or a scenario alone, or for double precision; single precision that differs too
-        much, or is not compared, without ``accept``; and a proof of a controller that calls
-        functions in C. Nothing is written then.
+        a plant or a scenario alone, or for double precision, without a proof; single precision
+        that differs too much, or is not compared, without ``accept``; a proof of a controller that
+        calls functions in C; and a spread without a proof and a plant. Nothing is written then.
 
     Examples
     --------
@@ -594,12 +602,26 @@ def c(
     checks.flag("proof", proof)
     single = single or is_in_single(controller)
     source = c_source(controller, name, precision=precision, resolution=resolution)
-    comparison = checked_comparison(controller, single, plant, scenario, accept)
+    if spread and (not proof or plant is None):
+        raise ValueError(f"spread = {spread!r}: goes with proof=True and a plant")
+    compared = plant if scenario is not None or not proof else None
+    comparison = checked_comparison(controller, single, compared, scenario, accept)
+    stable, lines = None, []
+    if proof and plant is not None:
+        number = "single" if single else "double"
+        try:
+            stable = stability(controller, plant, precision=number, spread=spread)
+            lines = stable.lines
+        except (ValueError, ImportError) as error:
+            if spread:
+                raise
+            lines = [f"NOT judged: whether the loop is stable: {error}"]
     proving = proof_files(controller, source) if proof else {}
     vectors = golden_vectors(controller, source)
     files = write_folder(folder, library_files(controller, source, vectors) | proving, overwrite)
-    done = prove(Path(folder), source, sizes=_function_table(source)) if proof else None
-    return Exported(Path(folder), files, source, comparison, done)
+    table = _function_table(source) if proof else ""
+    done = prove(Path(folder), source, sizes=table, loop=lines) if proof else None
+    return Exported(Path(folder), files, source, comparison, done, stable)
 
 
 def _function_table(source: CSource) -> str:
