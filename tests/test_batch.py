@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import quell as ql
 from quell.parallel import in_parallel, one_blas_thread
 from quell.plants import PlantBatch, batch, two_mass_spring
-from quell.simulation import driver
+from quell.simulation import scenario as scenario_module
 
 from .cases import cases
 
@@ -55,7 +55,7 @@ def test_each_run_of_a_batch_is_the_run_alone(
 ) -> None:
     """Bit for bit, in all channels, with rests, noise, a thinned record, and segments of any length."""
     law = controller(learner=learner, guard=ql.Guard() if learner else None)
-    monkeypatch.setattr(driver, "_SEGMENT", 1001)
+    monkeypatch.setattr(scenario_module, "_SEGMENT", 1001)
     runs = ql.simulate(PLANTS, law, two_mass_scenario, record="all", record_every=7, workers=2)
     monkeypatch.undo()
     assert runs["y"].shape == (3, len(runs.t))

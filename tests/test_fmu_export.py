@@ -23,7 +23,7 @@ from quell.controllers.base import set_reference_derivatives
 from quell.export import TranslationError, fmu
 from quell.export.fmi.parts import bandwidths, gain_coefficients
 from quell.kernels.dispatch import as_python
-from quell.simulation.driver import SampledScenario
+from quell.simulation.scenario import SampledScenario
 
 from .cases import cases
 from .contracts.test_controllers import SEVERAL

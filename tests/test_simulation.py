@@ -8,8 +8,8 @@ import pytest
 import quell as ql
 from quell.plants.linear import DelayedPlantModel
 from quell.plants.nonlinear import PythonNonlinear
-from quell.simulation import driver
-from quell.simulation.driver import LARGEST_ERROR, IntegrationCheck, Samples, chosen_samples
+from quell.simulation import scenario as scenario_module
+from quell.simulation.integration import LARGEST_ERROR, IntegrationCheck, Samples, chosen_samples
 
 from .cases import cases
 
@@ -36,7 +36,7 @@ def test_the_segment_length_changes_nothing(
 ) -> None:
     """Signals are made in pieces, the record is one."""
     whole = ql.simulate(PLANT, controller(), two_mass_scenario)
-    monkeypatch.setattr(driver, "_SEGMENT", 77)
+    monkeypatch.setattr(scenario_module, "_SEGMENT", 77)
     np.testing.assert_array_equal(
         ql.simulate(PLANT, controller(), two_mass_scenario).log, whole.log
     )
@@ -226,7 +226,7 @@ def test_samples_are_checked_all_over_a_segment_and_where_states_turn() -> None:
 @pytest.mark.lost
 def test_the_check_gets_the_samples_that_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Times, u, w and states, over all segments of a thinned record; only the usual range of a run that diverged."""
-    monkeypatch.setattr(driver, "_SEGMENT", 10)
+    monkeypatch.setattr(scenario_module, "_SEGMENT", 10)
     seen: list[Samples] = []
     monkeypatch.setattr(
         IntegrationCheck, "add", lambda self, samples, all_of_them: seen.append(samples)
@@ -241,7 +241,7 @@ def test_the_check_gets_the_samples_that_are_recorded(monkeypatch: pytest.Monkey
     np.testing.assert_allclose(whole.t, run.t, atol=1e-12)
     for part, channel in ((whole.u[:, 0], "u"), (whole.w, "w"), (whole.x, "x")):
         np.testing.assert_array_equal(part, run[channel])
-    monkeypatch.setattr(driver, "_SEGMENT", 10_000)
+    monkeypatch.setattr(scenario_module, "_SEGMENT", 10_000)
     seen.clear()
     wild = interpreted_run(lambda t, x, u, w: (x[1], u), b0=-1.0, seconds=2.0)
     usual = np.abs(wild["y"]) <= 10.0
@@ -316,7 +316,7 @@ def test_a_plant_that_varies_in_time_gets_the_time_of_each_sample(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """``x' = t`` gives ``t²/2``, within a block of samples and over its end; Runge-Kutta is exact there."""
-    monkeypatch.setattr(driver, "_SEGMENT", 7)
+    monkeypatch.setattr(scenario_module, "_SEGMENT", 7)
     plant = ql.plants.NonlinearPlant(lambda t, x, u, w: (t,), order=1)
     law = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=1.0, dt=0.5), omega_c=1.0)
     run = ql.simulate(plant, law, ql.Scenario(duration=10.0), interpret=True)

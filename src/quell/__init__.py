@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from quell.records import metrics
     from quell.records.plotting import style
     from quell.records.trajectory import BatchTrajectory, Trajectory
-    from quell.simulation.driver import Scenario
+    from quell.simulation.scenario import Scenario
     from quell.simulation.simulate import simulate
     from quell.sweeping.sweep import sweep
     from quell.tuning.schedules import tune_schedule
@@ -80,7 +80,7 @@ _HOMES = {
     "Reason": "guard",
     "SafeSet": "controllers.safe_set",
     "Schedule": "controllers.schedule",
-    "Scenario": "simulation.driver",
+    "Scenario": "simulation.scenario",
     "Status": "types",
     "Trajectory": "records.trajectory",
     "Tuned": "tuning.tuned",

@@ -51,7 +51,7 @@ from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory
 from quell.records.units import runs_in_common_units
 from quell.signals import Signal, Step
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
 from quell.types import Matrix, Vector, warn
 

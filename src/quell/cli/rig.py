@@ -564,7 +564,7 @@ def _device(url: str, setup: Setup) -> Any:
     It gives the signals of its scenario's schedule, from when it is opened.
     """
     from quell import realtime
-    from quell.simulation.driver import sampled_schedule
+    from quell.simulation.scenario import sampled_schedule
 
     if url == "twin:":
         dt, scenario = setup.controller.dt, setup.scenario

@@ -29,7 +29,7 @@ from quell.learners.base import (
 )
 from quell.observers.eso import ESO
 from quell.plants.base import inputs_of, outputs_of
-from quell.simulation.driver import check_fit
+from quell.simulation.scenario import check_fit
 from quell.types import Channels, Vector
 
 # ---- A learner whose output a policy sets ----

@@ -26,7 +26,7 @@ from quell.plants.base import check_plant, inputs_of, outputs_of, signals_of
 from quell.plants.linear import LinearPlant
 from quell.quantities import UNKNOWN, Signals
 from quell.records.record import columns_of
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.types import Vector
 
 # ---- Spaces of observations and actions, with finite bounds ----

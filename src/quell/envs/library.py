@@ -20,7 +20,7 @@ from quell.envs.env import Env, VectorEnv
 from quell.guard import Guard
 from quell.observers.eso import ESO
 from quell.signals import BandLimitedNoise, Constant, Sinusoid, Step, Sum
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 
 # Bandwidths and b0 of the loops are those of the library's studies: two masses and the torsional
 # testbed of the paper (experiments/), the motor of benchmarks/cogging.py.

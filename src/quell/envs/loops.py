@@ -54,15 +54,12 @@ from quell.plants.base import (
 from quell.records.record import columns_of
 from quell.simulation.driver import (
     Sample,
-    SampledScenario,
-    Scenario,
-    check_scenario,
-    is_random,
     logged_channels,
     run_samples,
     sample_of,
     width_of_signals,
 )
+from quell.simulation.scenario import SampledScenario, Scenario, check_scenario, is_random
 from quell.types import Channels, Matrix, Vector
 
 # ---- Scenarios of episodes ----

@@ -43,7 +43,7 @@ from quell.setup.axes import signals_in
 from quell.setup.description import is_of_axes
 from quell.setup.loading import Setup, check_window
 from quell.simulation import Scenario, simulate
-from quell.simulation.driver import is_random
+from quell.simulation.scenario import is_random
 from quell.sweeping.measures import Measure, measure_run
 from quell.sweeping.sweep import share_interval
 from quell.tuning.simulated.problem import half_width_of_mean

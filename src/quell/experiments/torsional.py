@@ -55,7 +55,7 @@ from quell.records.plotting import draw_line, grid_of_axes
 from quell.records.trajectory import Trajectory
 from quell.signals import Sinusoid, Trapezoid
 from quell.simulation import simulate
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.types import Progress, Vector
 
 # ---- The paper's hardware experiment (section V) on a twin of the ECP 205 torsional testbed ----

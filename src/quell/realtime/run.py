@@ -72,7 +72,7 @@ from quell.realtime.system import (
 from quell.realtime.telemetry import TelemetryWriter
 from quell.records.record import signals_of_loop
 from quell.signals import Signal
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 
 # ---- The result of a run at a rig ----
 

@@ -25,7 +25,7 @@ from quell.realtime.supervisor import AxesLimits, AxesRules, Rules
 from quell.records.record import in_steps
 from quell.signals import as_signal
 from quell.signals.shapes import check_derivative
-from quell.simulation.driver import Scenario, derivatives_in
+from quell.simulation.scenario import Scenario, derivatives_in
 from quell.types import Matrix, Vector
 
 # ---- Default bounds of y, derived from the reference and from what the control signal can do ----

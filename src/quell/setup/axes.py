@@ -56,7 +56,7 @@ from quell.setup.schema import (
     one_of,
     read,
 )
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.tuning.axes import OBJECTIVES
 from quell.tuning.constraints import Constraints
 from quell.types import Matrix
@@ -515,7 +515,7 @@ def _scenario(builder: Builder, tables: AxesDescription, dt: float) -> Scenario 
 
 def _check_fit(plant: Any, controller: Axes, scenario: Scenario | None) -> None:
     """Check that plant, controller and scenario have the same signals."""
-    from quell.simulation.driver import SampledScenario, check_fit
+    from quell.simulation.scenario import SampledScenario, check_fit
 
     check_fit(plant, controller)
     if scenario is not None:

@@ -50,7 +50,7 @@ from quell.setup.schema import (
     read,
 )
 from quell.signals import as_signal
-from quell.simulation.driver import Scenario, check_schedule, checked_start
+from quell.simulation.scenario import Scenario, check_schedule, checked_start
 from quell.sweeping.measures import Measure, as_measures
 from quell.sweeping.runs import Job, Plan, as_values, check_draws, hash_of
 from quell.tuning.constraints import Constraints

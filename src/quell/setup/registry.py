@@ -46,7 +46,7 @@ from quell.records.trajectory import Trajectory
 from quell.setup.schema import AXES_PLANTS as AXES_PLANTS
 from quell.setup.schema import PLANTS as PLANTS
 from quell.setup.schema import CallTable, Plant, Table, call_table, list_of, one_of
-from quell.simulation.driver import Scenario as SimulationScenario
+from quell.simulation.scenario import Scenario as SimulationScenario
 from quell.sweeping.runs import Normal, Range
 from quell.tuning.constraints import Constraints
 from quell.tuning.tune import tune

@@ -3,7 +3,7 @@
 May import ``controllers``, ``plants``, ``signals``, ``records`` and what they import.
 """
 
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
 
 __all__ = ["Scenario", "simulate"]

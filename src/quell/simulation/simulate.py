@@ -38,17 +38,19 @@ from quell.records.record import columns_of, readable_names, signals_of_loop
 from quell.records.trajectory import BatchTrajectory, Trajectory
 from quell.simulation.driver import (
     Loop,
+    judge_integration,
+    judged,
+    logged_channels,
+    warn_of_lost,
+    width_of_signals,
+)
+from quell.simulation.scenario import (
     SampledScenario,
     Scenario,
     Segment,
     check_fit,
     check_scenario,
-    judge_integration,
-    judged,
-    logged_channels,
     segment_bounds,
-    warn_of_lost,
-    width_of_signals,
 )
 from quell.types import Channels, Status
 

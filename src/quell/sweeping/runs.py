@@ -37,7 +37,7 @@ from quell.parallel import one_blas_thread
 from quell.plants.base import Plant, check_plant
 from quell.plants.linear import LinearPlant
 from quell.records.record import netcdf_of
-from quell.simulation.driver import Scenario, check_scenario, is_random
+from quell.simulation.scenario import Scenario, check_scenario, is_random
 from quell.simulation.simulate import simulate
 from quell.sweeping.measures import (
     Measure,

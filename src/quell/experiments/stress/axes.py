@@ -111,7 +111,7 @@ from quell.parallel import in_parallel
 from quell.plants import LinearPlant, NonlinearPlant, delayed, n_mass, two_mass_spring
 from quell.plants.base import advance
 from quell.plants.linear import DelayedPlant
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
 from quell.types import Matrix, Vector
 

@@ -97,7 +97,7 @@ from quell.observers import ESO
 from quell.parallel import in_parallel, part_of
 from quell.plants import LinearPlant, delayed
 from quell.signals import Constant, Ramp, Step
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
 from quell.types import Matrix, Vector
 

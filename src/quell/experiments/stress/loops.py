@@ -49,7 +49,7 @@ from quell.observers import ESO
 from quell.plants import LinearPlant, two_mass_spring
 from quell.plants.base import advance, measure
 from quell.signals import Signal
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.types import Matrix, Vector
 
 # ---- Loads of the trial, each a table of one value for each sample ----

@@ -39,7 +39,7 @@ from quell.observers import ESO
 from quell.parallel import in_parallel
 from quell.plants import LinearPlant, two_mass_spring
 from quell.signals import BandLimitedNoise, Sinusoid, Step
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
 from quell.types import Vector
 

@@ -40,7 +40,7 @@ from quell.export.proof import Proof, proof_files, prove
 from quell.export.stability import Stability, stability
 from quell.export.translate.text import checked_name
 from quell.files import check_folder, write_folder
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 
 # ---- The files around an exported controller ----
 

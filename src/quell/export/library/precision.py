@@ -14,7 +14,7 @@ from quell.controllers.prefilters import without_prefilters
 from quell.export.controller_source import in_double_precision
 from quell.learners.gaussian_process import SINGLE_NOVELTY, GaussianProcess
 from quell.records.metrics import WORSE
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
 from quell.types import Status
 

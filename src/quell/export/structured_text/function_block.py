@@ -33,7 +33,7 @@ from quell.export.structured_text.translator import Translator
 from quell.export.translate.text import TranslationError, checked_name, wrapped
 from quell.files import check_folder, write_folder
 from quell.learners.base import NoLearner
-from quell.simulation.driver import Scenario
+from quell.simulation.scenario import Scenario
 
 # Inputs besides r, y and what a step takes further: when they act is in the README.
 _MANUAL = (("manual", "BOOL"), ("u_manual", "REAL"))

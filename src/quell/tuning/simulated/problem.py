@@ -26,7 +26,7 @@ from quell.controllers.base import Controller
 from quell.plants.base import Plant
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
-from quell.simulation.driver import check_scenario
+from quell.simulation.scenario import check_scenario
 from quell.sweeping.sweep import share_interval
 from quell.types import Matrix, Vector
 
