@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 
 from quell.checks import import_extra
 from quell.kernels.dispatch import kernel
+from quell.realtime.authenticated import authenticated, read_key
 from quell.realtime.system import external
 from quell.realtime.wire import (
     LENGTH,
@@ -141,11 +142,13 @@ class UdpDevice(WireDevice):
     """A device that listens at a UDP port, for example ``udp://127.0.0.1:5005``.
 
     It may be ``quell rig`` or a microcontroller, on this computer or another. Parameters and errors
-    are those of ``WireDevice``.
+    are those of ``WireDevice``. With ``?key=FILE`` both sides need the key in that file
+    (``realtime/authenticated.py``).
     """
 
-    def _connect(self) -> UdpTransport:
-        family, address = resolved(self.url)
+    def _connect(self) -> Any:
+        url, key = key_of(self.url)
+        family, address = resolved(url)
         if address[1] == 0:
             raise ValueError(f"device = {self.url!r}: must have a port from 1 to 65535")
         self._socket = _socket(family)
@@ -154,17 +157,23 @@ class UdpDevice(WireDevice):
         except OSError as error:
             self._socket.close()
             raise ConnectionError(f"{self.url}: can't be reached ({error.strerror})") from None
-        return udp_transport(self._socket)
+        ask_for_key(self.url)
+        plain = udp_transport(self._socket)
+        return plain if key is None else authenticated(plain, key, is_device=False)
 
     def _release(self) -> None:
         self._socket.close()
 
 
 class UdpListener:
-    """The device's end: a port at which it listens. Port 0 takes a free one, see ``url``."""
+    """The device's end: a port at which it listens. Port 0 takes a free one, see ``url``.
+
+    With ``?key=FILE`` it takes frames with the key in that file alone.
+    """
 
     def __init__(self, url: str) -> None:
-        family, address = resolved(url)
+        plain, key = key_of(url)
+        family, address = resolved(plain)
         self.socket = _socket(family)
         try:
             self.socket.bind(address)
@@ -176,11 +185,37 @@ class UdpListener:
             ) from None
         host, port = self.socket.getsockname()[:2]
         self.url = f"udp://[{host}]:{port}" if ":" in host else f"udp://{host}:{port}"
-        self.transport = udp_transport(self.socket)
+        ask_for_key(url)
+        self.transport: Any = udp_transport(self.socket)
+        if key is not None:
+            self.transport = authenticated(self.transport, key, is_device=True)
+            self.url += f"?{urlsplit(url).query}"
 
     def close(self) -> None:
         """Release the port."""
         self.socket.close()
+
+
+def key_of(url: str) -> tuple[str, NDArray[np.uint64] | None]:
+    """Return a URL of UDP without its key, and the key in the file that ``?key=FILE`` names."""
+    parts = urlsplit(url)
+    given = dict(parse_qsl(parts.query, keep_blank_values=True))
+    file = given.pop("key", None)
+    if given:
+        raise ValueError(f"device = {url!r}: has {', '.join(given)}; udp://HOST:PORT takes key")
+    plain = url.split("?")[0]
+    return plain, None if file in (None, "none") else read_key(file)
+
+
+def ask_for_key(url: str) -> None:
+    """Warn of a port that other computers reach, without a key and without ``?key=none``."""
+    parts = urlsplit(url)
+    host = parts.hostname or ""
+    if not parts.query and host != "localhost" and not host.startswith("127.") and host != "::1":
+        warn(
+            f"device = {url!r}: who can send to this port can drive the machine; give both sides "
+            "a key, ?key=FILE, or ?key=none where nobody else is on this network"
+        )
 
 
 def resolved(url: str) -> tuple[int, tuple[Any, ...]]:
