@@ -50,8 +50,9 @@ _POWER = 0.999
 _STEPS, _PER_MODE = 40, 20
 # Samples of a decay at least, and time constants from which its search begins: chosen by hand.
 _LEAST_DECAY, _RATES = 12, 7
-# Relative mean square that counts as zero.
-_ROUNDING = 1e-24
+# Relative mean square that counts as zero, and samples over time constant of a straight line: an
+# exact one has a time constant of rounding.
+_ROUNDING, _STRAIGHT = 1e-24, 1e-9
 
 
 class Mode(NamedTuple):
@@ -201,7 +202,7 @@ def free_decay(y: Any, dt: float) -> FreeDecay:
             "y does not decay: no time constant explains more of it than chance; begin the record "
             "where u was switched, and keep u steady"
         )
-    if a <= 0.0:
+    if a * y.size <= _STRAIGHT:
         raise ValueError(
             "y does not decay: it moves on as a straight line or faster; record longer, until it "
             "comes to rest"
