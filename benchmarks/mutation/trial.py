@@ -102,7 +102,8 @@ NEAR = {
     "metrics": ("metrics",),
     "margins": ("analysis_margins", "analysis_loop", "advice"),
     "identification": (
-        *("alternatives", "awkward_records", "commissioning", "drawn_results", "excitation"),
+        *("acceptance_parts", "alternatives", "awkward_records", "commissioning"),
+        *("drawn_results", "excitation"),
         *("free_swing", "frequencies", "frequency_fits", "frequency_tables", "hostile_files"),
         *(
             "identification",
@@ -116,7 +117,8 @@ NEAR = {
         *("tests_of_errors", "times_of_records", "published/test_identification"),
     ),
     "tuning": (
-        *("cli_tune", "compensator", "drawn_results", "feedforward", "from_pid", "generalised"),
+        *("acceptance_parts", "cli_tune", "compensator", "drawn_results", "feedforward"),
+        *("from_pid", "generalised"),
         *("over_seeds", "p_pi", "reduction", "refused_arguments", "schedule", "schedule_of_loads"),
         *("small_schedules", "tuned_files", "tuned_limits", "tuned_loops", "tuning"),
         *("tuning_axes", "tuning_choice", "tuning_damping", "tuning_lqg", "tuning_parts"),
