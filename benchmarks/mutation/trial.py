@@ -117,8 +117,8 @@ NEAR = {
         *("tests_of_errors", "times_of_records", "published/test_identification"),
     ),
     "tuning": (
-        *("acceptance_parts", "cli_tune", "compensator", "drawn_results", "feedforward"),
-        *("from_pid", "generalised"),
+        *("acceptance_parts", "at_limits", "cli_tune", "compensator", "drawn_results"),
+        *("feedforward", "from_pid", "generalised"),
         *("over_seeds", "p_pi", "reduction", "refused_arguments", "schedule", "schedule_of_loads"),
         *("small_schedules", "tuned_files", "tuned_limits", "tuned_loops", "tuning"),
         *("tuning_axes", "tuning_choice", "tuning_damping", "tuning_lqg", "tuning_parts"),
