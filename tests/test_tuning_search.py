@@ -19,6 +19,7 @@ from quell.plants.linear import LinearPlant
 from quell.tuning import Constraints
 from quell.tuning.optimiser import loops as responses
 from quell.tuning.optimiser import requirements, search
+from quell.tuning.optimiser.coupled import CoupledLoops, Limits, Plant
 from quell.tuning.optimiser.loops import (
     Inputs,
     PlantSet,
@@ -593,6 +594,67 @@ def test_results_are_ordered_by_what_they_exceed_and_cost() -> None:
     assert search.merit(far) == pytest.approx(-5.0 + 20.0 * 0.1)
     assert search._agree([solution(1.0, 0.0), solution(1.00099, 0.0)])
     assert not search._agree([solution(1.0, 0.0), solution(1.0011, 0.0)])
+
+
+# ---- coupled axes
+
+
+def coupled(objective: str = "load", plants: int = 1, **limits: Any) -> CoupledLoops:
+    """Return two lags with gains of 1 and 0.5, each times the gain of a plant, and ADRC of order 1."""
+    a = math.exp(-DT)
+    B = (1.0 - a) * np.diag([1.0, 0.5])
+    one = Plant(a * np.eye(2), B, np.eye(2), np.diag([1.0, 2.0]))
+    parts = [ql.ADRC(ql.ESO.model_free(1, 1.0, 4.0, DT), 2.0)] * 2
+    given = {"m_s": 1.6, "m_t": 1.7, "m_ks": (3.0, 4.0), "disk": 0.6, "damping": 0.4}
+    each = [one._replace(B=(1.0 + 0.3 * j) * B) for j in range(plants)]
+    return CoupledLoops(each, parts, Limits(**{**given, **limits}), DT, 0, np.ones(2), objective)
+
+
+def test_slacks_of_decoupled_axes_are_those_of_each_loop_and_its_disk() -> None:
+    """|S|, |T| at outputs and inputs, |C S|, |S − 1/2| of the disk, the damping; of each plant."""
+    values = np.array([[2.0, 3.0], [6.0, 4.0]])
+    many = coupled(plants=2)
+    found = many.measured(values)
+    omega = np.geomspace(0.05, math.pi / DT * 0.999, 4001)
+    for j, gain in enumerate((1.0, 1.3)):
+        expected, disk, dampings = np.zeros((3, 2)), [], []
+        for i, (omega_c, omega_o) in enumerate(values.tolist()):
+            one = ql.ADRC(ql.ESO.model_free(1, 1.0, omega_o, DT), omega_c)
+            loop = analyse(([gain], [1.0, 1.0]), one)
+            S = loop.response("S", omega)
+            C = loop.response("C_y", omega)
+            expected[:, i] = [float(np.max(np.abs(x))) for x in (S, 1.0 - S, C * S)]
+            disk.append(float(np.max(np.abs(S - 0.5))))
+            s = np.log(np.asarray(loop.poles, dtype=complex)[np.abs(loop.poles) > 1e-9]) / DT
+            s = s[(s.imag > 1e-6) & (s.imag < math.pi / (2.0 * DT))]
+            dampings += (-s.real / np.abs(s)).tolist()
+        slack = found.slacks[j]
+        at = -np.log(expected / np.array([[1.6] * 2, [1.7] * 2, [3.0, 4.0]]))
+        np.testing.assert_allclose(slack[:4], at[:2].ravel(), atol=3e-3)
+        np.testing.assert_allclose(slack[4:8], at[:2].ravel(), atol=3e-3)
+        np.testing.assert_allclose(slack[8:10], at[2], atol=3e-3)
+        np.testing.assert_allclose(slack[10:12], -math.log(max(disk) * 0.6), atol=1e-3)
+        least = min(dampings, default=1.0)
+        wanted = 1.0 if not dampings else 1.0 - (1.0 - least) / 0.6
+        assert slack[12] == pytest.approx(wanted, abs=1e-6)
+    assert found.stable
+    fewer = coupled(m_s=None, m_ks=None, damping=None).measured(values)
+    assert fewer.slacks.shape == (1, 2 + 2 + 2 + 1)
+    pole = many.least_damped(values, 0)
+    assert (pole is None) == (not dampings)
+
+
+def test_starts_and_the_optimum_of_coupled_axes_keep_their_bounds() -> None:
+    """The costs are those of single loops; an unstable set has a hundred times the cost alone."""
+    values = np.array([[2.0, 3.0], [2.5, 4.0]])
+    found = coupled().measured(values)
+    assert found.cost == pytest.approx(float(np.mean(np.log(found.costs))))
+    assert found.violation == pytest.approx(max(math.expm1(-float(np.min(found.slacks))), 0.0))
+    both = coupled("load-iae").measured(values)
+    for i, (omega_c, omega_o) in enumerate(values.tolist()):
+        one = ql.ADRC(ql.ESO.model_free(1, 1.0, omega_o, DT), omega_c)
+        y = response(sampled("lag").scaled()[0], law_of(one), load_step(sampled("lag"), 1.0, 60.0))
+        assert both.costs[i] == pytest.approx(DT * float(np.sum(np.abs(y))), rel=1e-4)
 
 
 # ---- structures

@@ -1,0 +1,334 @@
+"""Which designs tune makes, and why there is none: damping that is given up, contradictions, trade-offs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import cache
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.tuning import Constraints, designs
+from quell.tuning.designs import Task
+from quell.tuning.optimiser.loops import load_step
+from quell.tuning.optimiser.requirements import Active
+from quell.tuning.optimiser.search import Solution
+from quell.tuning.plants import given_plants, model_of, plant_set
+from quell.tuning.report import Design
+from quell.tuning.structures.registry import make_structure
+
+from .cases import cases
+
+DT = 0.05
+LAG = ([1.0], [1.0, 1.0])
+
+
+def task(objective: str = "load", **constraints: Any) -> Task:
+    """Return the task of a lag."""
+    given = given_plants(LAG, DT)
+    plants = plant_set(given, DT)
+    bounds = Constraints(**{"m_ks": 3.0, **constraints})
+    return Task(
+        plants, model_of(given, plants, bounds), bounds, objective, load_step(plants), 1.0, None, {}
+    )
+
+
+@cache
+def tuned() -> ql.Tuned:
+    """Return a lag with a PI controller."""
+    return ql.tune(LAG, DT, structure="pi", compare=(), written=False, objective="load",
+                   constraints=Constraints(m_ks=3.0))  # fmt: skip
+
+
+def solution(
+    cost: float, violation: float = 0.0, name: str = "pi", values: Any = (1.5, 0.8, 0.2)
+) -> Solution:
+    """Return a solution of a structure for the lag."""
+    whole = task()
+    return Solution(make_structure(name, whole.model, 0), np.array(values), cost, violation)
+
+
+# ---- with and without damping
+
+
+def made(results: Any, **constraints: Any) -> tuple[dict[str, Design], list[Any], list[Any]]:
+    """Return the designs of ``pi`` for what ``_solutions`` returns, its calls, and the progress."""
+    asked, told, own = [], [], tuned().design
+
+    def solutions(name: str, given: Task, known: Any) -> list[Solution]:
+        asked.append((name, given.constraints.damping, sorted(known)))
+        return results(name, given.constraints.damping)
+
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(designs, "_solutions", solutions))
+        stack.enter_context(patch.object(designs, "contradiction", lambda *_: "they contradict"))
+        stack.enter_context(
+            patch.object(
+                designs, "design_of",
+                lambda name, problem, best, bounds, options: replace(
+                    own, name=name, objective=best.cost, undamped=False),
+            )
+        )  # fmt: skip
+        found = designs.tuned_designs(
+            ["pid", "pi"], task(**constraints), lambda name, share: told.append((name, share))
+        )
+    return found, asked, told
+
+
+def test_a_bound_of_damping_that_none_keeps_is_given_up_and_said() -> None:
+    """Where a design without it keeps all others; else the contradiction is told."""
+    found, asked, told = made(lambda name, damping: [solution(1.0, 0.2 if damping else 0.0)])
+    assert [*found] == ["pid", "pi"]
+    assert all(each.undamped for each in found.values())
+    assert asked == [
+        ("pi", 0.4, []), ("pi", None, []), ("pid", 0.4, ["pi"]), ("pid", None, ["pi"]),
+    ]  # fmt: skip
+    assert told == [("pi", 0.0), ("pid", 0.5)]
+    found, asked, _ = made(lambda name, damping: [solution(1.0, 0.0)])
+    assert not any(each.undamped for each in found.values())
+    assert [each[1] for each in asked] == [0.4, 0.4]
+    found, _, _ = made(lambda name, damping: [solution(1.0, 0.2)])
+    assert [each.reason for each in found.values()] == ["they contradict"] * 2
+    found, asked, _ = made(lambda name, damping: [solution(1.0, 0.2)], damping=None)
+    assert [each[1] for each in asked] == [None, None]
+
+
+def test_of_several_orders_the_best_that_keeps_its_bounds_is_taken() -> None:
+    """The least cost; one that keeps none loses; without any solution the plant is not stabilised."""
+    several = [solution(0.5, 0.1), solution(2.0), solution(1.0), solution(3.0)]
+    found, _, _ = made(lambda name, damping: several)
+    assert [each.objective for each in found.values()] == [1.0, 1.0]
+    found, _, _ = made(lambda name, damping: [])
+    assert found["pi"].controller is None
+    assert found["pi"].reason == (
+        "no controller of this structure was found that stabilises the plant"
+    )
+
+    def refuse(name: str, damping: Any) -> Any:
+        raise ValueError(f"{name} has no model")
+
+    found, _, _ = made(refuse)
+    assert [each.reason for each in found.values()] == ["pid has no model", "pi has no model"]
+
+
+def test_an_infinite_gain_is_no_objective() -> None:
+    """Two integrators go with the integral of |y|."""
+    with pytest.raises(
+        ValueError, match="k_i is infinite with 2 integrators: after a step of the load"
+    ):
+        designs._solutions("bandwidths-2", task(), {})
+
+
+# ---- limits that are moved
+
+
+def test_limits_are_relaxed_by_one_factor() -> None:
+    """All bounds and extras; the damping by what is left to one."""
+    problem = task().problem()
+    found = designs.relaxed(problem, 1.5)
+    assert [bound.limit for bound in found.bounds] == pytest.approx(
+        [1.5 * bound.limit for bound in problem.bounds]
+    )
+    assert [extra.limit for extra in found.extras] == pytest.approx(
+        [1.5 * extra.limit for extra in problem.extras]
+    )
+    one, values = make_structure("model-based", task().model, 0), np.array([[1.0, 2.0, 5.0]])
+    for before, after in zip(problem.extras, found.extras, strict=True):
+        np.testing.assert_allclose(after.ratio(one, values), before.ratio(one, values) / 1.5)
+    assert found.damping == pytest.approx(1.0 - 1.5 * 0.6)
+    assert designs.relaxed(problem, 1.7).damping is None
+    assert designs.relaxed(replace(problem, damping=None), 1.1).damping is None
+
+
+def test_constraints_that_contradict_are_told_with_the_least_excess() -> None:
+    """By bisection, to what the search reaches; or that none was found with all relaxed."""
+    problem, best = task(m_s=1.6, m_ks=3.0).problem(), solution(1.0, 0.3)
+    edge = 1.23
+
+    def search(near: Any, structure: Any, values: Any, rounds: int) -> Any:
+        factor = near.bounds[0].limit / problem.bounds[0].limit
+        return solution(1.0, 0.0 if factor >= edge else 0.1)
+
+    active = (Active("M_s", 1.9, 1.9, 1.0, 0), Active("|p| dt", 0.5, 0.5, math.nan, 0))
+    with (
+        patch.object(designs, "search", search),
+        patch.object(designs, "measured", lambda *_: ({}, active, None)),
+    ):
+        text = designs.contradiction(problem, best, task().constraints)
+    before, share = text.rsplit(" is ", 1)
+    assert before == (
+        "the constraints contradict each other for this structure: M_s 1.6, |p| dt 0.5; the least "
+        "excess that was found"
+    )
+    assert float(share.split(" %")[0]) == pytest.approx(23.0, abs=1.0)
+    assert share.endswith(" % for each")
+    with patch.object(designs, "search", lambda *_: None):
+        text = designs.contradiction(problem, best, task().constraints)
+    assert text == (
+        "the constraints contradict each other for this structure: no controller was found even "
+        f"with all limits relaxed by a factor of {designs._RELAXED[-1]:g}"
+    )
+
+
+def test_a_limit_over_time_is_told_with_the_least_that_was_found() -> None:
+    """Raised, or a smaller load."""
+    problem, best = task(u_max=0.5).problem(), solution(1.0, 0.3)
+    active = (Active("u_max", 0.6, 0.5, math.nan, 0),)
+    factor = designs._RELAXED[0]
+
+    def search(near: Any, *_: Any) -> Any:
+        return solution(
+            1.0, 0.0 if near.bounds[0].limit >= factor * problem.bounds[0].limit else 0.1
+        )
+
+    with (
+        patch.object(designs, "search", search),
+        patch.object(designs, "measured", lambda *_: ({}, active, None)),
+    ):
+        text = designs.contradiction(problem, best, task().constraints)
+    assert text.startswith(
+        "the constraints contradict each other for this structure: u_max 0.5; the least"
+    )
+    least = factor * 0.5
+    assert text.endswith(
+        f"; u_max bounds the response to the load or the reference, and the least that was found is "
+        f"{least:.3g}, with the other bounds relaxed as much: raise it, or give a smaller load or "
+        "reference"
+    )
+
+
+@cases("objective", ["load", "load-iae"])
+def test_a_tradeoff_moves_each_active_limit_by_a_tenth(objective: str) -> None:
+    """The objective with 0.9 and 1.1 times of it; no M_s of one or less; what fails is left out."""
+    asked = []
+
+    def search(near: Any, structure: Any, values: Any, rounds: int) -> Any:
+        limits = {bound.kind: bound.limit for bound in near.bounds} | {"damping": near.damping}
+        asked.append(limits)
+        return solution(math.log(2.0), 0.1 if limits["M_ks"] > 3.0 else 0.0)
+
+    active = (
+        Active("M_s", 1.05, 1.05, 1.0, 0), Active("M_ks", 3.0, 3.0, 1.0, 0),
+        Active("damping", 0.4, 0.4, 1.0, 0), Active("|p| dt", 0.5, 0.5, math.nan, 0),
+    )  # fmt: skip
+    design = replace(tuned().design, active=active)
+    with patch.object(designs, "search", search):
+        found = designs.tradeoff(task(objective, m_s=1.05), design)
+    size = 0.5 if objective == "load" else 2.0
+    assert found == [
+        ("M_s", pytest.approx(1.155), pytest.approx(size)),
+        ("M_ks", pytest.approx(2.7), pytest.approx(size)),
+        ("damping", pytest.approx(0.36), pytest.approx(size)),
+        ("damping", pytest.approx(0.44), pytest.approx(size)),
+    ]
+    assert [each["M_s"] for each in asked] == pytest.approx([1.155, 1.05, 1.05, 1.05, 1.05])
+    assert [each["damping"] for each in asked] == pytest.approx([0.4, 0.4, 0.4, 0.36, 0.44])
+
+
+def test_the_curve_of_the_noise_goes_from_its_bound_up_and_down() -> None:
+    """By factors of two, each search from the one before; it ends where there is no design."""
+    starts: list[Any] = []
+
+    def search(near: Any, structure: Any, values: Any, rounds: int) -> Any:
+        (limit,) = [bound.limit for bound in near.bounds if bound.kind == "M_ks"]
+        starts.append((limit, float(values[0])))
+        return solution(-math.log(limit), 0.1 if limit < 1.0 else 0.0, values=(limit, 0.8, 0.2))
+
+    own = replace(solution(-math.log(3.0)), values=np.array([9.0, 0.8, 0.2]))
+    design = replace(tuned().design, solution=own)
+    with patch.object(designs, "search", search):
+        found = designs.noise_curve(task(), design)
+    assert found == [pytest.approx((x, x)) for x in (1.5, 3.0, 6.0, 12.0)]
+    assert starts == [(6.0, 9.0), (12.0, 6.0), (1.5, 9.0), (0.75, 1.5)]
+
+
+# ---- the best of a structure
+
+
+def ran(
+    whole: Task, gains: list[Solution], known: Any = (), each_of: Any = None, end: Any = None
+) -> tuple[Any, list[Any]]:
+    """Return the result of ``_best`` with stand-ins for its searches, and where these began."""
+    begun: list[Any] = []
+    structure = make_structure("pi", whole.model, 0)
+
+    def at(problem: Any, structure: Any, row: Any) -> Any:
+        return solution(float(row[0]), 0.0, values=row)
+
+    def search(problem: Any, structure: Any, values: Any, rounds: int) -> Any:
+        begun.append(float(values[0]))
+        return None if end is None else end(values)
+
+    with (
+        patch.object(designs, "_best_gains", lambda *_: gains),
+        patch.object(designs, "solution_at", at),
+        patch.object(designs, "search", search),
+    ):
+        rows = np.array([*known]).reshape(-1, 3)
+        return designs._best(whole, structure, rows), begun
+
+
+def test_of_optima_for_the_gain_the_best_is_the_result_where_nothing_is_slow() -> None:
+    """None without any; for other objectives it is where a search starts, with those known."""
+    gains = [solution(3.0, 0.0, values=(3.0, 1.0, 1.0)), solution(2.0, 0.0, values=(2.0, 1.0, 1.0)),
+             solution(1.0, 0.2, values=(1.0, 1.0, 1.0))]  # fmt: skip
+    found, begun = ran(task(), gains)
+    assert (found.cost, begun) == (2.0, [])
+    assert ran(task(), [])[0] is None
+    slow = task("load-iae")
+
+    def better(values: Any) -> Solution:
+        return solution(float(values[0]) - 0.5, 0.0, values=values)
+
+    found, begun = ran(slow, gains, [(0.7, 1.0, 1.0)], end=better)
+    assert begun == [0.7]
+    assert found.cost == pytest.approx(0.2)
+    worse, begun = ran(slow, gains, end=lambda values: solution(9.0, 0.0))
+    assert (worse.cost, begun) == (1.0, [1.0])
+    none, _ = ran(slow, gains)
+    assert none.cost == 1.0
+
+
+def members(scores: list[list[float]]) -> Iterator[Any]:
+    """Return scores of a set in turn."""
+    return iter([np.array(each) for each in scores])
+
+
+def test_of_a_large_set_the_worst_plants_are_searched_for_until_no_other_is_worse() -> None:
+    """Those of each round are added; the cost is that of all."""
+    count = designs._MEMBERS + 3
+    plants = [([1.0 + 0.01 * i], [1.0, 1.0]) for i in range(count)]
+    given = given_plants(plants, DT)
+    whole = replace(task("load-iae"), plants=plant_set(given, DT))
+    flat = [1.0] * count
+    first, second = [*flat], [*flat]
+    for i in range(designs._MEMBERS):
+        first[i] = 5.0 + i
+    second[count - 1] = 9.0
+    turns = members([first, second, flat])
+    asked: list[Any] = []
+    problem = Task.problem
+
+    def noted(self: Task, of: Any = None) -> Any:
+        asked.append(None if of is None else sorted(of))
+        return problem(self) if of is None else problem(self, of)
+
+    with (
+        patch.object(designs, "scores", lambda *_: next(turns)),
+        patch.object(Task, "problem", noted),
+        patch.object(Solution, "feasible", True),
+    ):
+        found, begun = ran(whole, [solution(1.0)], end=lambda values: solution(0.5, values=values))
+    rounds = [each for each in asked if each is not None]
+    assert rounds[0] == [*range(designs._MEMBERS)]
+    assert count - 1 in rounds[1]
+    assert set(rounds[1]) > set(rounds[0])
+    assert len(rounds) == 2
+    assert found is not None
+    assert len(begun) == 2
