@@ -21,6 +21,7 @@ from quell.plants.linear import LinearPlant
 from quell.tuning import Constraints, acceptance, axes_at_limits
 from quell.tuning import plants as tuning_plants
 from quell.tuning.acceptance import Loop, judge
+from quell.tuning.axes import _made
 from quell.tuning.optimiser.coupled import Found, Measured, Plant
 from quell.tuning.plants import RecordModel, given_plants, model_of, plant_set, record_model
 from quell.tuning.reference import Shaped
@@ -154,6 +155,25 @@ def test_axes_are_judged_each_by_its_step_and_after_overloads() -> None:
         assert each.step.settling < 10.0
         assert each.step.overshoot < 0.05
         assert each.overloads == ()
+
+
+def test_axes_with_other_bandwidths_are_as_if_they_were_made_with_them() -> None:
+    """Also what learners see of all axes; those that are given stay as they are."""
+
+    def with_learners(*bandwidths: tuple[float, float]) -> ql.Axes:
+        parts = [ql.ADRC(ql.ESO.model_free(1, 1.0, o, DT), c) for c, o in bandwidths]
+        learners = [ql.learners.RLS(ql.features.AllAxes(ql.features.State())) for _ in parts]
+        return ql.Axes(parts, B0=B0, learner=learners)
+
+    values = np.array([[1.5, 7.0], [2.5, 5.0]])
+    given, fresh = with_learners((2.0, 4.0), (3.0, 4.0)), with_learners((1.5, 7.0), (2.5, 5.0))
+    made = _made(given, values)
+    for mine, theirs, before in zip(made.axes, fresh.axes, given.axes, strict=True):
+        assert (mine.omega_c, mine.observer.omega_o) == (theirs.omega_c, theirs.observer.omega_o)
+        assert repr(mine.parameters.learner) == repr(theirs.parameters.learner)
+        assert before.observer.omega_o == 4.0
+        view = mine.learner.view
+        assert [each.omega_o for each in view.observers] == [7.0, 5.0]
 
 
 # ---- one loop

@@ -18,7 +18,7 @@ from quell.identification.identify import _explains_more, known_of, resolution_o
 from quell.identification.model import Structure, free_run, output
 from quell.identification.output_error import ParameterEstimate
 from quell.identification.search import _without_one
-from quell.identification.starts import best_start, with_poles
+from quell.identification.starts import best_start, from_rest, general, with_poles
 
 from .cases import cases
 
@@ -95,6 +95,16 @@ def test_a_step_soon_after_the_start_is_fitted_from_rest() -> None:
     assert free.gain_interval[1] - free.gain_interval[0] > 1.5 * (high - low)
 
 
+def test_a_model_with_a_zero_that_starts_at_rest_away_from_zero_is_simulated_so() -> None:
+    """From u = 2 the record of a step to 3 has the fit of its error; a zero acts on no first step."""
+    u = np.concatenate([np.full(3, 2.0), np.full(100, 3.0)])
+    y = 1.5 + answer(([2.0, 3.0], [1.0, 1.4, 4.0]), u - 2.0) + noise(103, 0.001)
+    found = ql.identify(u, y, DT, 2, 1, delay=0.0, rest=True, held_out=0.0)
+    assert found.num.tolist() == pytest.approx([2.0, 3.0], rel=2e-3)
+    np.testing.assert_allclose(found.simulated, y, atol=0.004)
+    assert found.fits["estimation"] > 99.4
+
+
 def test_a_record_that_begins_in_motion_is_not_taken_for_one_at_rest() -> None:
     """From a start of 2 the model at rest is contradicted; with many swings it is not even tried."""
     u = np.concatenate([np.zeros(2), np.ones(68)])
@@ -103,6 +113,31 @@ def test_a_record_that_begins_in_motion_is_not_taken_for_one_at_rest() -> None:
     many = binary(70)
     noisy = answer(LAG, many) + noise(70, 0.3)
     assert not ql.identify(many, noisy, DT, 1, delay=0.0, held_out=0.0).rest
+
+
+@cases("direct", [False, True])
+def test_a_model_at_rest_has_forces_and_starts_that_hold_its_levels(direct: bool) -> None:
+    """Each record stays at its level under its first u; the covariance of A, B and D_u is kept."""
+    rest = Structure(2, 0, (1,), direct=direct, at_rest=True, samples=(40, 50))
+    theta = np.array([0.06, 0.3, 0.5, 2.0, *[0.4] * direct, 7.0, -3.0])
+    u = np.concatenate([2.0 + binary(40), -1.0 + binary(50, 3)])
+    covariance = np.arange(float(theta.size**2)).reshape(theta.size, theta.size)
+    free, found = general(rest, ParameterEstimate(theta, covariance, 0.5, True), u)
+    assert (free.degrees, free.at_rest, free.direct) == ((1, 0, 0), False, direct)
+    v = np.zeros((90, 3))
+    v[:, 0], v[:40, 1], v[40:, 2] = u, 1.0, 1.0
+    held = v.copy()
+    held[:40, 0], held[40:, 0] = u[0], u[40]
+    level = output(free, found.theta, held)
+    np.testing.assert_allclose(level, np.repeat([7.0, -3.0], [40, 50]), atol=1e-9)
+    same = output(rest, theta, from_rest(rest, u)[:, None])
+    np.testing.assert_allclose(output(free, found.theta, v), same, atol=1e-9)
+    known = np.r_[:4, 6] if direct else np.r_[:4]
+    of_rest = covariance[: known.size, : known.size]
+    np.testing.assert_array_equal(found.covariance[np.ix_(known, known)], of_rest)
+    others = np.setdiff1d(np.arange(found.theta.size), known)
+    assert not found.covariance[others].any()
+    assert (found.cost, found.converged) == (0.5, True)
 
 
 # ---- limits, loops, several records

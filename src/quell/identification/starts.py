@@ -217,8 +217,9 @@ def general(
 ) -> tuple[Structure, ParameterEstimate]:
     """Return a model at rest as one with constant forces and initial states, from ``u``.
 
-    ``A y_0 = B u_0 + c`` at rest gives the force c of each record; ``D = y_0 (A − a_0)/p`` keeps
-    y at y_0. The covariance of A and B is the same; that of c and D is not used.
+    ``A y_0 = B u_0 + c`` at rest gives the force c of each record, and ``D = (y_0 (A − a_0) − u_0
+    (B − b_0))/p`` keeps y at y_0. The covariance of A and B is the same; that of c and D is not
+    used.
     """
     theta, forces = estimate.theta, max(len(structure.samples), 1)
     degrees = (*structure.degrees, *[0] * forces)
@@ -228,13 +229,14 @@ def general(
     starts = np.array([u[place.start] for place in structure.records(u.size)])
     inner = levels - structure.feedthrough(theta) * starts
     at = structure.free + structure.degrees[0] + 1
-    above = np.append(a[1:], 1.0)
+    above, above_b = np.append(a[1:], 1.0), np.append(b[1:], 0.0)
+    held = zip(inner.tolist(), starts.tolist(), strict=True)
     found = np.concatenate(
         [
             theta[:at],
             a[0] * inner - b[0] * starts,
             theta[at : structure.common],
-            *[level * above for level in inner],
+            *[level * above - first * above_b for level, first in held],
         ]
     )
     covariance = np.zeros((found.size, found.size))
