@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from quell.export import proof
+from quell.export import image_code, proof
 from quell.export.controller_source import _Writer
 from quell.export.fmi.parts import Bandwidths, Variable, constant_of, ordered, several, tuning_lines
 from quell.export.library import exported
@@ -423,3 +423,107 @@ def test_a_proof_is_run_with_arrays_in_their_structs_and_separate(tmp_path: Path
     assert second.failure == "with separate arrays frama-c ended with 3: bad"
     with patch.object(proof.shutil, "which", lambda name: None):
         assert proof.frama_c(tmp_path, "servo", 60.0).failure == proof.INSTALL
+
+
+# ---- images of a memory
+
+
+def image_of(width: int = 8, has_origin: bool = False, zeros: Any = ()) -> Any:
+    """Return the code for images of a layout of numbers, without any."""
+    known = SimpleNamespace(width=width, size=32 + 5 * width + 8, layout=0x1122334455667788,
+                            design=0x99AABBCCDDEEFF01, numbers=5, zeros=zeros)  # fmt: skip
+    code: Any = object.__new__(image_code.ImageCode)
+    literals = SimpleNamespace(real="double" if width == 8 else "float",
+                               math_function=lambda name: name if width == 8 else f"{name}f",
+                               write_real=lambda x: f"{float(x):g}")  # fmt: skip
+    code.known, code.structs = known, SimpleNamespace(literals=literals, prefix="servo_")
+    code.has_origin, code.write = has_origin, literals.write_real
+    code.save, code.load, code._ranges = [], [], []
+    return code
+
+
+def test_the_head_of_an_image_has_its_kind_size_layout_and_design() -> None:
+    """In words of 32 bits, low ones first; the origin, and the check of 64 bits at the end."""
+    code = image_of()
+    magic = int.from_bytes(image_code.MAGIC, "little")
+    assert code.save_lines() == [
+        f"    memory_put_word(image, 0, {magic:#x}U);",
+        f"    memory_put_word(image, 4, {(8 << 16) | image_code.VERSION:#x}U);",
+        "    memory_put_word(image, 8, 0x50U);",
+        "    memory_put_word(image, 16, 0x55667788U);",
+        "    memory_put_word(image, 20, 0x11223344U);",
+        "    memory_put_word(image, 24, 0xddeeff01U);",
+        "    memory_put_word(image, 28, 0x99aabbccU);",
+        "    memory_put_word(image, 12, 0U);",
+        "    check = memory_check(image);",
+        "    memory_put_word(image, 72, (uint32_t)(check & 0xffffffffU));",
+        "    memory_put_word(image, 76, (uint32_t)(check >> 32));",
+    ]
+    counted = image_of(has_origin=True)
+    assert "    memory_put_word(image, 12, (uint32_t)state->origin);" in counted.save_lines()
+    assert counted.load_lines() == ["    state->origin = (int32_t)memory_get_word(image, 12);"]
+    assert code.load_lines() == []
+
+
+def test_numbers_of_an_image_are_written_and_read_by_their_kind() -> None:
+    """Arrays whole, constants checked, integers and flags within their range, zeros set."""
+    code = image_of(zeros=(9,))
+
+    def add(at: int, values: Any, value: Any) -> None:
+        code._add(at, image_code._Part("x", np.array(values, dtype=float), value))
+
+    add(0, [1.0, 2.0], Value(Array((1, 2), Number.REAL), "s->x"))
+    add(2, [3.0], Value(Number.REAL, "s->a"))
+    add(3, [4.0], Value(Number.INT, "s->n"))
+    add(4, [1.0], Value(Number.BOOL, "s->on"))
+    add(5, [7.0], Value(Number.REAL, "s->c", constant=7.0))
+    add(6, [8.0], None)
+    add(9, [5.0], Value(Number.BOOL, "s->z"))
+    largest = image_code._LARGEST_INTEGER
+    assert code.save == [
+        "    memory_put_all(image, 0, s->x[0], 2);",
+        "    memory_put(image, 2, s->a);",
+        "    memory_put(image, 3, (double)s->n);",
+        "    memory_put(image, 4, s->on ? 1 : 0);",
+        "    memory_put(image, 5, 7);",
+        "    memory_put(image, 6, 8);",
+        "    memory_put(image, 9, 5);",
+    ]
+    assert code.load == [
+        "    memory_get_all(image, 0, s->x[0], 2);",
+        "    s->a = memory_get(image, 2);",
+        "    s->n = memory_whole(memory_get(image, 3));",
+        "    s->on = memory_get(image, 4) != 0;",
+        "    s->z = false;",
+    ]
+    assert code._ranges == [
+        (3, -float(largest), float(largest)), (4, 0.0, 1.0), (5, 7.0, 7.0), (9, 5.0, 5.0),
+    ]  # fmt: skip
+    text = "\n".join(code.functions())
+    assert "memory_ranges[4] = {" in text
+    assert "{3, " in text
+    assert "for (int i = 0; i < 4; i++) {" in text
+    assert "for (int k = 0; k < 5; k++) {" in text
+    assert "for (int at = 0; at < 72; at += 4) {" in text
+    assert (
+        "memory_get_word(image, 12) != 0U || memory_get_long(image, 24) != 0x99aabbccddeeff01ULL"
+        in text
+    )
+    assert "memory_get_long(image, 16) != 0x1122334455667788ULL" in text
+    assert "    memory_put_word(image, 36 + 8 * k, (uint32_t)(bits >> 32));" in text
+    assert "const uint64_t bits = memory_get_long(image, 32 + 8 * k);" in text
+
+
+def test_images_of_single_precision_have_one_word_for_a_number() -> None:
+    """And no code for integers or arrays where there are none."""
+    code = image_of(4, has_origin=True)
+    code._add(0, image_code._Part("x", np.array([1.0]), Value(Number.REAL, "s->a")))
+    text = "\n".join(code.functions())
+    assert "memory_put_word(image, 32 + 4 * k, bits);" in text
+    assert "const uint32_t bits = memory_get_word(image, 32 + 4 * k);" in text
+    assert "fabsf(x) <= FLT_MAX" in text
+    assert "memory_whole" not in text
+    assert "memory_put_all" not in text
+    assert "memory_ranges" not in text
+    assert "memory_get_word(image, 12) != 0U" not in text
+    assert text.endswith("return true;\n}")
