@@ -396,6 +396,19 @@ def test_skipped_deadlines_are_samples_without_measurement() -> None:
     )
 
 
+def test_skipped_deadlines_are_observed_under_the_u_that_was_held() -> None:
+    """While u moves: the estimates are those of a replay in each sample that was taken."""
+    late = np.zeros(90, dtype=np.int64)
+    late[14] = 3_500_000 * 10
+    found = Outcome(duration=0.4, late=late)
+    ran = found.run["mode"] == Mode.RUN
+    back = replay(found.run, gantry())
+    taken = ran & np.isin(np.arange(len(found.run)), found.rows[:, 0] - found.rows[0, 0])
+    assert 5 < np.sum(taken) < np.sum(ran)
+    for name in ("x.x_hat", "y.x_hat", "x.f_residual", "y.f_residual"):
+        np.testing.assert_allclose(back[name][taken], found.run[name][taken], rtol=1e-9, atol=1e-12)
+
+
 # ---- Rules ----
 
 

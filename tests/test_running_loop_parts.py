@@ -490,6 +490,16 @@ def test_the_deviation_of_a_bandwidth_follows_from_those_of_the_plant() -> None:
     assert found.ratio == 5.0
 
 
+def test_a_lag_and_a_delay_that_may_be_none_are_not_negative() -> None:
+    """Beyond zero the loop is that without them."""
+    at, loops = result(lag=1e-3, delay=0.01)._loops()
+    assert at[-2:].tolist() == [1e-3, 0.01]
+    early, none = loops(at - [0.0, 0.0, 2e-3, 0.05]), loops(at - [0.0, 0.0, 1e-3, 0.01])
+    for name in ("N", "B", "C"):
+        np.testing.assert_array_equal(getattr(early.plant, name), getattr(none.plant, name))
+    assert loops(at).plant.N.shape != none.plant.N.shape
+
+
 @cases(
     ("given", "message"),
     [

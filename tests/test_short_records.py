@@ -13,12 +13,19 @@ import pytest
 from scipy import optimize, signal
 
 import quell as ql
-from quell.identification import Identified, delays, friction_search, structures
+from quell.identification import Identified, delays, friction_search, search, structures
 from quell.identification.identify import _explains_more, known_of, resolution_of
 from quell.identification.model import Structure, free_run, output
 from quell.identification.output_error import ParameterEstimate
-from quell.identification.search import _without_one
-from quell.identification.starts import best_start, from_rest, general, with_poles
+from quell.identification.search import Known, _without_one
+from quell.identification.starts import (
+    Start,
+    _impulse_response,
+    best_start,
+    from_rest,
+    general,
+    with_poles,
+)
 
 from .cases import cases
 
@@ -335,6 +342,45 @@ def test_a_known_model_has_poles_per_sample_and_the_delays_that_were_searched() 
     assert told
 
 
+@cases(("grows", "searched"), [(True, (0, 5)), (False, (2, 4))])
+def test_a_search_from_a_known_model_has_its_range_of_delays_if_that_may_grow(
+    grows: bool, searched: Any
+) -> None:
+    """Else the range that is given; for another order all starts are tried at the best delay."""
+    structure, u = Structure(1, 0, (0, 0)), binary(40)
+    v, asked = np.column_stack([u, np.ones(40)]), list[Any]()
+
+    def estimate(cost: float) -> ParameterEstimate:
+        return ParameterEstimate(np.zeros(4), np.eye(4), cost, True)
+
+    def from_poles(
+        structure: Any, poles: Any, u: Any, v: Any, y: Any, delays: Any, report: Any
+    ) -> Any:
+        asked.append((len(poles), delays))
+        return 5 if last else 3, estimate(2.0)
+
+    for a, last, near, expected in (  # noqa: B007
+        (np.array([0.2]), False, 1.0, (searched, 3, 2.0)),
+        (np.array([0.4, 2.2]), False, 1.0, (searched, 4, 1.0)),
+        (np.array([0.4, 2.2]), False, 3.0, (searched, 3, 2.0)),
+        (np.array([0.2]), True, 1.0, ("again", 6, 0.5) if grows else (searched, 5, 2.0)),
+    ):
+        wanted: Any = SimpleNamespace(grows=grows, delays=(2, 4), report=lambda: None)
+        with (
+            patch.object(search, "from_poles", from_poles),
+            patch.object(search, "longest", lambda *_: 10),
+            patch.object(search, "best_start", lambda *_: Start(estimate(9.0), True)),
+            patch.object(search, "nearest_delay", lambda *_, near=near: (4, estimate(near))),
+            patch.object(
+                search, "start_with_delay", lambda *_: ("again", 6, Start(estimate(0.5), True))
+            ),
+        ):
+            found = search._from_known(structure, Known(a, (0, 5)), u, v, u, wanted)
+        assert (found[0], found[1], found[2].estimate.cost) == expected
+        assert asked[-1] == (a.size, searched)
+        assert found[2].confirmed
+
+
 def test_a_pole_less_is_each_one_left_out_or_a_real_one_for_a_pair() -> None:
     """Coefficients in ascending powers without the highest."""
     a = np.poly([-1.0, -2.0 + 3.0j, -2.0 - 3.0j]).real[:0:-1]
@@ -441,6 +487,17 @@ def test_the_best_start_of_a_short_record_is_its_plant() -> None:
     assert theta.tolist() == [0.5, 0.0, 0.0, 0.0, 0.0]
     two = best_start(Structure(2, 0, (1, 0)), v, y)
     assert two.estimate.cost <= 1e-12 * float(np.var(y))
+
+
+def test_the_impulse_response_of_a_model_with_many_lags_is_that_of_u_alone() -> None:
+    """Of a lag with a constant force, which has no part in it; over three times the lags, twice."""
+    u = binary(120)
+    y = of_lag((2.0, 3.0, 0.7, 0.0), u)
+    g = _impulse_response(1, np.column_stack([u, np.ones(120)]), y)
+    lags = int(min(20, max(0.05 * 120, 2)))
+    assert g.size == 6 * lags
+    p = math.exp(-0.2)
+    np.testing.assert_allclose(g, 1.5 * (1.0 - p) * p ** np.arange(g.size), atol=1e-6)
 
 
 @cases(

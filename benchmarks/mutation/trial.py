@@ -130,7 +130,14 @@ NEAR = {
         *("rig", "rig_axes"),
         *("rig_compensators", "ring", "run_rig", "safety", "security", "serial_device"),
         *("serial_line", "setup_rules", "supervisor", "supervisor_rules", "target", "telemetry"),
-        *("twin", "watch", "wire", "contracts/test_devices", "contracts/test_memory"),
+        *(
+            "system_calls",
+            "twin",
+            "watch",
+            "wire",
+            "contracts/test_devices",
+            "contracts/test_memory",
+        ),
     ),
     "setup": (
         *("axes_channels", "cli", "cli_run", "compare", "fuzzed", "hostile_files"),
