@@ -13,10 +13,11 @@ import pytest
 from scipy import optimize, signal
 
 import quell as ql
-from quell.identification import Identified, delays, friction_search, search, structures
+from quell.identification import Identified, delays, friction_search, input_gain, search, structures
 from quell.identification.identify import _explains_more, known_of, resolution_of
 from quell.identification.model import Structure, free_run, output
-from quell.identification.output_error import ParameterEstimate
+from quell.identification.output_error import ParameterEstimate, gauss_newton
+from quell.identification.running_loop import Form
 from quell.identification.search import Known, _without_one
 from quell.identification.starts import (
     Start,
@@ -588,3 +589,44 @@ def test_records_that_are_short_or_rest_are_refused() -> None:
         ValueError, match="held_out = 0.4: u is 1 all through these samples, must move;"
     ):
         ql.identify(ends, rests, DT, 1, delay=0.0, held_out=0.4)
+
+
+def test_a_gauss_newton_step_solves_a_linear_problem_and_predicts_its_error() -> None:
+    """Of numerator, force and start, with the pole that is right."""
+    u = binary(50)
+    v = np.column_stack([u, np.ones(50)])
+    structure, truth = Structure(1, 0, (0, 0)), np.array([0.2, 0.3, 0.05, 0.4])
+    y = output(structure, truth, v) + noise(50, 0.01)
+    predicted, theta = gauss_newton(structure, truth, v, y)
+    J = np.column_stack([
+        (output(structure, truth + step, v) - output(structure, truth - step, v)) / 2e-6
+        for step in 1e-6 * np.eye(4)
+    ])  # fmt: skip
+    e = y - output(structure, truth, v)
+    step, *_ = np.linalg.lstsq(J, e, rcond=None)
+    np.testing.assert_allclose(theta, truth + step, atol=1e-6)
+    assert predicted == pytest.approx(float(np.mean((e - J @ step) ** 2)), rel=1e-6)
+    wild = gauss_newton(structure, np.array([-1e3, 1.0, 0.0, 1.0]), v, y)
+    assert wild[0] == math.inf
+
+
+def test_a_search_is_confirmed_by_a_wider_form_at_the_same_error() -> None:
+    """One that converged, with each part that the best has, and no share."""
+
+    def model(flags: Any, size: float, converged: bool, share: Any = None) -> Any:
+        form = Form(1, *flags)._replace(share=share)
+        return SimpleNamespace(form=form, error=np.full(100, size), converged=converged)
+
+    lag = (True, False, False, False)
+    both = (True, True, False, False)
+    best = model(lag, 1.0, False)
+    same = math.sqrt(1.0 + 0.5 * input_gain._SAME_ERROR / 100.0)
+    other = math.sqrt(1.0 + 2.0 * input_gain._SAME_ERROR / 100.0)
+    for one, confirmed in (
+        (model(both, same, True), True), (model(both, same, False), False),
+        (model(both, other, True), False), (model((False,) * 4, same, True), False),
+        (model(both, same, True, 0.5), False), (model(lag, 1.0, True), True),
+    ):  # fmt: skip
+        assert input_gain._confirmed(best, [one]) == confirmed
+    assert input_gain._confirmed(model(lag, 1.0, True), [])
+    assert not input_gain._confirmed(best, [])

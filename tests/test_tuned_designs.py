@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import itertools
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -14,7 +17,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.tuning import Constraints, designs
+from quell.tuning import Constraints, compensator, designs, report
 from quell.tuning.designs import Task
 from quell.tuning.optimiser.loops import load_step
 from quell.tuning.optimiser.requirements import Active
@@ -24,6 +27,8 @@ from quell.tuning.report import Design
 from quell.tuning.structures.registry import make_structure
 
 from .cases import cases
+
+tune_module: Any = importlib.import_module("quell.tuning.tune")
 
 DT = 0.05
 LAG = ([1.0], [1.0, 1.0])
@@ -332,3 +337,94 @@ def test_of_a_large_set_the_worst_plants_are_searched_for_until_no_other_is_wors
     assert len(rounds) == 2
     assert found is not None
     assert len(begun) == 2
+
+
+# ---- in place of one that fails
+
+
+def test_designs_that_are_not_much_worse_may_take_the_place_of_one_that_fails() -> None:
+    """Named by default, not undamped, with a controller, the best first; none of a named structure."""
+    own = tuned().design
+    first = replace(own, name="first", objective=3.0)
+    designs_of = {
+        "pi": first,
+        "pid": replace(own, name="pid", objective=2.5),
+        "bandwidths": replace(own, name="bandwidths", objective=2.9),
+        "poles": replace(own, name="poles", objective=2.99, undamped=True),
+        "half-gain": replace(own, name="half-gain", objective=1.9),
+        "lqg": replace(own, name="lqg", objective=2.95, controller=None),
+    }
+    asked: list[Any] = []
+
+    def accepted(one: Design, others: Any, judged: Any, name: str) -> Any:
+        asked.append(([each.name for each in others], name, judged(one)))
+        return one, "judged", ""
+
+    with (
+        patch.object(tune_module, "accepted", accepted),
+        patch.object(tune_module, "judge", lambda loop, controller, analysis: (loop, analysis)),
+        patch.object(tune_module, "_analysis", lambda given, plants, design: design.name),
+    ):
+        for structure, expected in ((tune_module.SIMPLEST, ["bandwidths", "pid"]), ("pi", [])):
+            tune_module._accepted(first, designs_of, structure, task(), None, "loop")  # type: ignore[arg-type]
+            names = [name for name in asked[-1][0] if name in ("pid", "bandwidths")]
+            assert names == expected
+            assert not {"poles", "half-gain", "lqg", "first"} & set(asked[-1][0])
+            assert asked[-1][1:] == ("first", ("loop", "first"))
+
+
+def test_several_integrators_that_bring_nothing_are_said() -> None:
+    """One integrator is at least as good; for a load or a reference."""
+    own = tuned().design
+    with patch.object(report, "_integrators", lambda design: 2 if design.name == "two" else 1):
+        two, one = replace(own, name="two", objective=3.0), replace(own, name="one", objective=3.0)
+        (line,) = report._integrators_line(two, {"one": one}, "load")
+        assert line == (
+            "NOT better with 2 integrators: one has one, and is at least as good for a step of the "
+            "load; take it, unless the load is a ramp or a slow sinusoid"
+        )
+        assert "for this reference;" in report._integrators_line(two, {"one": one}, "tracking")[0]
+        worse = replace(one, objective=2.9)
+        assert report._integrators_line(two, {"one": worse}, "load") == []
+        assert report._integrators_line(two, {}, "load") == []
+        assert report._integrators_line(one, {"one": one}, "load") == []
+    assert report._integrators(own) == 1
+
+
+def test_candidates_behind_the_best_are_the_slowest_of_each_part() -> None:
+    """Of integrals up to 1.5 times the best one."""
+
+    def candidate(iae: float, omega_o: float) -> Any:
+        return SimpleNamespace(
+            measures=SimpleNamespace(iae=iae), observer=SimpleNamespace(omega_o=omega_o)
+        )
+
+    count = compensator._MOST_OTHERS
+    ends = np.geomspace(1.0, 1.5, count + 1)
+    best = candidate(2.0, 9.0)
+    parts = []
+    for low, high in itertools.pairwise(ends.tolist()):
+        middle = 2.0 * math.sqrt(low * high)
+        parts.append((candidate(middle, 5.0), candidate(middle * 1.001, 4.0)))
+    far = candidate(3.1, 1.0)
+    found = compensator._less_and_less([best, *(each for pair in parts for each in pair), far])
+    assert found == [slow for _, slow in parts]
+    assert compensator._less_and_less([best, candidate(2.0, 1.0)]) == []
+
+
+def test_bandwidths_beside_an_infinite_gain_lie_on_its_positive_side() -> None:
+    """A tenth beyond the observer's bandwidth at which 1/k_i is zero."""
+    based = make_structure("model-based", model_of(
+        given_plants(([1.0], [1.0, 0.02, 1.0]), DT), plant_set(given_plants(([1.0], [1.0, 0.02, 1.0]), DT), DT),
+        Constraints()), 0)  # fmt: skip
+
+    def gain(values: np.ndarray) -> np.ndarray:
+        return 1.0 / np.log(values[:, 2] / 0.5)
+
+    with patch.object(type(based), "integral_gain", lambda self, values: gain(values)):
+        rows = based.beside(np.array([1.0, 2.0, 3.0]))
+    assert rows[:, 1].tolist() == pytest.approx([1.0, 2.0, 4.0])
+    assert rows[:, 2].tolist() == pytest.approx([0.55] * 3, rel=1e-3)
+    with patch.object(type(based), "integral_gain", lambda self, values: -gain(values)):
+        rows = based.beside(np.array([1.0, 2.0, 3.0]))
+    assert rows[:, 2].tolist() == pytest.approx([0.5 / 1.1] * 3, rel=1e-3)
