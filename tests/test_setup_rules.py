@@ -23,7 +23,7 @@ from quell.realtime.viewers import Viewers, is_local
 from quell.setup import SetupError, registry
 from quell.setup import json_schema as rules
 from quell.setup.axes import _markov, axes_task, made_axes
-from quell.setup.loading import tuning_task
+from quell.setup.loading import _type, tuning_task
 from quell.setup.points import _merged, schedule_task
 
 from .cases import cases
@@ -528,3 +528,22 @@ def test_a_request_from_another_origin_and_one_too_many_are_refused() -> None:
     viewers._all = set(many)  # type: ignore[arg-type]
     assert asked() == "no"
     assert answers[-1] == (503, "Too many viewers.\n")
+
+
+@cases(
+    ("annotation", "name"),
+    [
+        (float, "number"),
+        (float | None, "number"),
+        (float | str, "number, text"),
+        (tuple[float, ...], "list"),
+        (tuple[float, ...] | float, "list, number"),
+        (dict[str, float], "table"),
+        (dict[str, float] | None, "table"),
+        (dict[str, float] | str, "table, text"),
+        (int | bool, "whole number, true or false"),
+    ],
+)
+def test_the_types_of_keys_are_those_of_toml(annotation: Any, name: str) -> None:
+    """Of several each once; None is a key that is left out."""
+    assert _type(annotation) == name

@@ -12,7 +12,6 @@ import pytest
 
 from quell.setup import EXAMPLES, registry
 from quell.setup.json_schema import json_schema
-from quell.setup.loading import _type
 
 from .benchmark_module import benchmark
 from .cases import cases
@@ -119,21 +118,3 @@ def test_limits_that_may_be_infinite_are_so_in_the_schema(schema: dict[str, Any]
         assert judge.is_valid(data) == taken
         told = trial.refusal("two_mass.toml", data)
         assert ("largest_u" not in (told or "")) == taken
-
-
-@pytest.mark.parametrize(
-    ("annotation", "name"),
-    [
-        (float, "number"),
-        (float | None, "number"),
-        (float | str, "number, text"),
-        (tuple[float, ...], "list"),
-        (tuple[float, ...] | float, "list, number"),
-        (dict[str, float], "table"),
-        (dict[str, float] | None, "table"),
-        (dict[str, float] | str, "table, text"),
-    ],
-)
-def test_the_types_of_keys_are_those_of_toml(annotation: Any, name: str) -> None:
-    """Of several each once; None is a key that is left out."""
-    assert _type(annotation) == name
