@@ -224,13 +224,14 @@ def test_a_calm_step_is_judged_as_it_is() -> None:
 def test_a_step_that_overshoots_gets_a_reference_model_with_limits_and_an_offer_without() -> None:
     """In the file it stands before the controller; the offer is a line alone."""
     quick = pi(4.0, 20.0, u_min=-1.0, u_max=1.0)
-    found = judge(loop_of(shaped=True), quick, of(quick))
+    with patch.object(Written, "overloads", lambda *_: []):
+        found = judge(loop_of(shaped=True, duration=3.0), quick, of(quick))
     assert isinstance(found.prefilter, ReferenceModel)
     assert isinstance(found.controller, Prefiltered)
     assert found.step is not None
     assert found.step.overshoot <= 0.05
     free = pi(4.0, 20.0)
-    offer = judge(loop_of((-math.inf, math.inf)), free, of(free))
+    offer = judge(loop_of((-math.inf, math.inf), duration=3.0), free, of(free))
     assert offer.prefilter is None
     assert offer.controller is free
     assert isinstance(offer.offered, ReferenceModel)
@@ -238,24 +239,29 @@ def test_a_step_that_overshoots_gets_a_reference_model_with_limits_and_an_offer_
     assert offer.offered_step.overshoot <= 0.05 + 1e-6
     assert offer.step is not None
     assert offer.step.overshoot > 0.05
-    plain = judge(loop_of(shaped=False), quick, of(quick))
+    with patch.object(Written, "overloads", lambda *_: []):
+        plain = judge(loop_of(shaped=False, duration=3.0), quick, of(quick))
     assert (plain.prefilter, plain.offered) == (None, None)
 
 
 def test_a_file_without_a_step_gets_one_that_uses_two_fifths_of_the_room() -> None:
     """0.4 of what u has, over what holds a step of 1; 1 without limits."""
-    controller = pi(u_min=-1.0, u_max=1.0)
-    found = judge(loop_of(shaped=False, reference=0.0), controller, of(controller))
-    assert found.step is not None
-    assert found.step.size == pytest.approx(0.8)
-    wide = pi(u_min=-1.0, u_max=3.0)
-    loop = loop_of((-1.0, 3.0), False, reference=0.0)._replace(rest=0.5)
-    found = judge(loop, wide, of(wide))
-    assert found.step is not None
-    assert found.step.size == pytest.approx(1.2)
-    free = judge(loop_of((-math.inf, math.inf), False, reference=0.0), pi(), of(pi()))
-    assert free.step is not None
-    assert free.step.size == 1.0
+    controller, wide = pi(u_min=-1.0, u_max=1.0), pi(u_min=-1.0, u_max=3.0)
+    above = loop_of((-1.0, 3.0), False, reference=0.0)._replace(rest=0.5)
+    free = loop_of((-math.inf, math.inf), False, reference=0.0)
+    with (
+        patch.object(Written, "overloads", lambda *_: []),
+        patch.object(acceptance, "_LOOKED", 20.0),
+    ):
+        for loop, own, size in (
+            (loop_of(shaped=False, reference=0.0), controller, 0.8),
+            (above, wide, 1.2),
+            (free, pi(), 1.0),
+        ):
+            found = judge(loop, own, of(own))
+            assert found.step is not None
+            assert found.step.size == pytest.approx(size)
+            assert found.step.at == pytest.approx(10 * DT)
 
 
 def test_an_axis_with_limits_gets_a_profile_generator() -> None:

@@ -94,9 +94,18 @@ def test_columns_that_may_be_several_are_named_and_can_be_chosen(tmp_path: Path)
     np.savetxt(file, rows, delimiter=",", header="freq,psd_x,psd_y", comments="")
     with pytest.raises(ValueError, match="power spectrum may be psd_x, psd_y; name the columns"):
         frequency_table(file)
-    table = frequency_table(file, ["freq", "psd_y"])
-    assert table is not None
-    np.testing.assert_allclose(table.power, f**2)
+    for columns, power in (
+        (["freq", "psd_y"], f**2),
+        (["FREQ", "PSD_X"], f),
+        (["1", "3"], f**2),
+        (["1", "2"], f),
+    ):
+        table = frequency_table(file, columns)
+        assert table is not None
+        np.testing.assert_allclose(table.power, power)
+        np.testing.assert_allclose(table.omega, TURN * f)
+    for columns in (["1", "4"], ["0", "2"]):
+        assert frequency_table(file, columns) is None
 
 
 def test_lines_that_tell_nothing_are_left_out_and_counted(tmp_path: Path) -> None:

@@ -98,9 +98,6 @@ def test_a_step_soon_after_the_start_is_fitted_from_rest() -> None:
     given = ql.identify(u, y, DT, 1, delay=0.0, rest=True)
     assert (given.rest, given.rest_given) == (True, True)
     assert given.den[1] == pytest.approx(a, rel=1e-4)
-    free = ql.identify(u, y, DT, 1, delay=0.0, rest=False)
-    assert not free.rest
-    assert free.gain_interval[1] - free.gain_interval[0] > 1.5 * (high - low)
 
 
 def test_a_model_with_a_zero_that_starts_at_rest_away_from_zero_is_simulated_so() -> None:
@@ -114,13 +111,10 @@ def test_a_model_with_a_zero_that_starts_at_rest_away_from_zero_is_simulated_so(
 
 
 def test_a_record_that_begins_in_motion_is_not_taken_for_one_at_rest() -> None:
-    """From a start of 2 the model at rest is contradicted; with many swings it is not even tried."""
+    """From a start of 2 the model at rest is contradicted."""
     u = np.concatenate([np.zeros(2), np.ones(68)])
     moving = answer(LAG, u) + 2.0 * np.exp(-0.2 * np.arange(70.0)) + noise(70, 0.02)
     assert not ql.identify(u, moving, DT, 1, delay=0.0).rest
-    many = binary(70)
-    noisy = answer(LAG, many) + noise(70, 0.3)
-    assert not ql.identify(many, noisy, DT, 1, delay=0.0, held_out=0.0).rest
 
 
 @cases("direct", [False, True])
@@ -153,9 +147,9 @@ def test_a_model_at_rest_has_forces_and_starts_that_hold_its_levels(direct: bool
 
 def test_samples_at_a_limit_are_bounded_and_not_fitted() -> None:
     """The least error of free samples, and of those at the limit where the model is below it."""
-    k = np.arange(100.0)
+    k = np.arange(80.0)
     u = 1.4 * np.sin(0.13 * k) + 0.5 * np.sin(0.71 * k)
-    full = answer(LAG, u) + noise(100, 0.01)
+    full = answer(LAG, u) + noise(80, 0.01)
     y = np.minimum(full, 1.0)
     found = ql.identify(u, y, DT, 1, delay=0.0, held_out=0.0)
     at = y == 1.0
@@ -169,10 +163,6 @@ def test_samples_at_a_limit_are_bounded_and_not_fitted() -> None:
     assert found.den[1] == pytest.approx(best.x[0], rel=2e-3)
     assert found.num[0] == pytest.approx(best.x[1], rel=2e-3)
     assert found.num[0] == pytest.approx(3.0, rel=0.02)
-    plain = ql.identify(u, full, DT, 1, delay=0.0, held_out=0.0)
-    factor = 100.0 / (100.0 - found.at_limits)
-    ratio = np.sqrt(np.diag(found.covariance) / np.diag(plain.covariance))
-    assert np.all((ratio > 0.5 * factor) & (ratio < 2.0 * factor))
     low, high = found.gain_interval
     assert 0.5 * (low + high) == pytest.approx(found.gain, rel=1e-2)
     assert found.poles[0].real_std == pytest.approx(math.sqrt(found.covariance[0, 0]), rel=1e-6)
@@ -234,6 +224,7 @@ def test_several_records_have_forces_and_starts_of_their_own() -> None:
         ),
         ((one, y), "u, y: must both be arrays, or lists of as many arrays, one for each record"),
         (([one, two], [y[0], y[1][:-1]]), r"y\[1\]"),
+        (([one[:, None]], [y[0][:, None]]), r"^u has shape \(1, 60, 1\): must be a vector"),
     ):
         with pytest.raises(ValueError, match=message):
             ql.identify(*given, DT, 1)
@@ -467,8 +458,8 @@ def test_friction_of_a_speed_is_the_force_that_turns_with_it() -> None:
 
 def test_a_model_fits_better_where_chance_and_size_say_so() -> None:
     """The likelihood ratio of a lag and of one more pole."""
-    u = binary(100)
-    y = answer(([4.0], np.polymul([1.0, 2.0], [1.0, 4.0])), u) + noise(100, 0.005)
+    u = binary(90)
+    y = answer(([4.0], np.polymul([1.0, 2.0], [1.0, 4.0])), u) + noise(90, 0.005)
     how: dict[str, Any] = {"delay": 0.0, "held_out": 0.0}
     one, two = ql.identify(u, y, DT, 1, **how), ql.identify(u, y, DT, 2, **how)
     assert structures.fits_better(one, two)

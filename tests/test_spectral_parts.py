@@ -435,14 +435,14 @@ def test_as_many_modes_as_are_given_come_highest_first() -> None:
 # ---- free swings and decays
 
 
-T = np.arange(60.0) * 0.1
+T = np.arange(45.0) * 0.12
 
 
 @cache
 def swing() -> FreeSwing:
     """Return the swing of one mode, with noise."""
     y = 2.0 + 1.5 * np.exp(-0.15 * T) * np.cos(3.0 * T + 0.4) + noise(T.size, 0.02)
-    return free_swing(y, 0.1)
+    return free_swing(y, 0.12)
 
 
 def test_a_swing_has_the_values_and_intervals_of_least_squares() -> None:
