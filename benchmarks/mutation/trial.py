@@ -116,7 +116,7 @@ NEAR = {
         *("refused_arguments", "schedule", "schedule_of_loads", "small_schedules"),
         *("tuned_designs", "tuned_files", "tuned_limits", "tuned_loops", "tuning", "tuning_axes"),
         *("tuning_choice", "tuning_damping", "tuning_lqg", "tuning_parts", "tuning_search"),
-        *("tuning_simulated", "written_loop", "published/test_tuning"),
+        *("tuning_simulated", "tuning_structures", "written_loop", "published/test_tuning"),
     ),
     "export": (
         *("axes_export", "axes_in_single", "export", "exported_text", "fmu_export"),
