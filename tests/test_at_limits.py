@@ -11,6 +11,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy import stats
 
 import quell as ql
 from quell.analysis import analyse
@@ -418,3 +419,37 @@ def test_the_report_says_what_is_not_held_out_and_what_a_larger_model_lacks() ->
         "the record does not tell it from 'M', which is tuned for, too",
     ]
     assert len(_report(0.0)) == 4
+
+
+def test_the_plants_of_a_model_are_the_ends_of_an_ellipsoid_in_each_direction() -> None:
+    """Of each coefficient, the gain and the delay, at 95 % of all together; what is open is refused."""
+    P = np.array([[0.04, 0.01], [0.01, 0.09]])
+    late = np.array([0.002, 0.003, 4e-4])
+    found: Any = SimpleNamespace(
+        num=np.array([3.0]), den=np.array([1.0, 2.0]), integrators=0, delay=0.1, covariance=P,
+        delay_covariance=late, undecided=(), plant=None,
+    )  # fmt: skip
+    other: Any = SimpleNamespace(num=np.array([5.0]), den=np.array([1.0, 4.0]), delay=0.7)
+    plants, delays = tuning_plants.identified_plants(found, [other])
+    whole = np.block([[P, late[:2, None]], [late[None, :2], late[2:, None]]])
+    k = math.sqrt(stats.chi2.ppf(0.95, 3))
+    theta = np.array([2.0, 3.0, 0.1])
+    points = [theta]
+    for c in (*np.eye(3), np.array([-3.0 / 4.0, 0.5, 0.0])):
+        step = k * whole @ c / math.sqrt(c @ whole @ c)
+        points += [theta + step, theta - step]
+    assert len(plants) == len(delays) == 10
+    for (num, den), delay, point in zip(plants, delays, points, strict=False):
+        assert (float(den[1]), float(num[0]), delay) == pytest.approx(
+            (point[0], point[1], max(point[2], 0.0))
+        )
+    assert (plants[-1], delays[-1]) == ((other.num, other.den), 0.7)
+    for change, message in (
+        ({"undecided": ("a", "b")}, "^found: a; b$"),
+        (
+            {"covariance": np.full((2, 2), np.nan)},
+            "found: its deviations are not finite; identify with",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            tuning_plants.identified_plants(SimpleNamespace(**{**vars(found), **change}))  # type: ignore[arg-type]

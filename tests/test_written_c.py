@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from quell.export import image_code, proof
+from quell.export import image_code, proof, separate
 from quell.export.controller_source import _Writer
 from quell.export.fmi.parts import Bandwidths, Variable, constant_of, ordered, several, tuning_lines
 from quell.export.library import exported
@@ -527,3 +527,41 @@ def test_images_of_single_precision_have_one_word_for_a_number() -> None:
     assert "memory_ranges" not in text
     assert "memory_get_word(image, 12) != 0U" not in text
     assert text.endswith("return true;\n}")
+
+
+def test_properties_that_are_not_proved_are_alarms_and_valid_promises_count() -> None:
+    """But for assumptions of the C library, and dead ones of the separate arrays' header."""
+    assumed = sorted(proof._ASSUMED)[0]
+    proved_as = sorted(proof._PROVED)[0]
+    rows = [
+        ("src", "a/servo.c", "12", "step", "division_by_zero", "Unknown", "x != 0"),
+        ("src", "a/servo.c", "13", "step", "overflow", proved_as, "fits"),
+        ("FRAMAC_SHARE/libc", "math.h", "5", "sqrt", assumed, "Unknown", "x >= 0"),
+        ("FRAMAC_SHARE/libc", "math.h", "6", "sqrt", "division_by_zero", "Unknown", "y"),
+        ("src", "a/servo.c", "14", "step", assumed, "Unknown", "z"),
+        ("src", f"a/servo_{separate.HEADER}", "15", "step", "overflow", "Dead", "w"),
+        ("src", "a/servo.c", "16", "step", "overflow", "Dead", "w"),
+        ("src", "c.h", "20", "step", "postcondition", "Valid", "a_number: ok"),
+        ("src", "c.h", "21", "step", "postcondition", "Valid", "within_limits: ok"),
+        ("src", "c.h", "22", "step", "postcondition", "Valid", "other: ok"),
+        ("src", "c.h", "23", "step", "assertion", "Valid", "a_number: ok"),
+        ("src", "c.h", "24", "step", "precondition", "Valid", "a_number: ok"),
+    ]
+    table = "\n".join(["head", *("\t".join(row) for row in rows)])
+    log = (
+        "3 functions analyzed (out of 5)\n10 statements reached (out of 11)\n"
+        "using specification for function sqrt\nusing specification for function fabs\n"
+    )
+    found = proof.read_findings("30.0", 2.0, log, table)
+    valid = "Valid" in proof._PROVED
+    own = [each.line for each in found.alarms if each.line < 20]
+    assert own == [12, 6, 14, 16]
+    assert valid
+    assert found.alarms[0] == Alarm("servo.c", 12, "step", "division_by_zero", "Unknown", "x != 0")
+    assert (found.promises, found.functions, found.statements) == (2, "3 of 5", "10 of 11")
+    assert (found.assumed, found.failure) == (("fabs", "sqrt"), "")
+    failed = proof.read_findings("30.0", 2.0, "by the Frama-C kernel: 12 errors", table)
+    assert failed.failure == "12 errors of the Frama-C kernel, see eva.log"
+    assert failed.functions == "unknown"
+    recursive = proof.read_findings("30.0", 2.0, "recursive call", table)
+    assert recursive.failure == "the analysis found a recursive call, see eva.log"
