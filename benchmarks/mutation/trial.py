@@ -122,7 +122,7 @@ NEAR = {
         *("axes_export", "axes_in_single", "export", "exported_text", "fmu_export"),
         *("hostile_exports", "packages"),
         *("plants_in_c", "profile", "proof", "ros2", "structured_text", "target", "translate"),
-        *("recorded_targets", "written_c", "contracts/test_exported_options"),
+        *("recorded_targets", "untranslatable", "written_c", "contracts/test_exported_options"),
     ),
     "realtime": (
         *("axes_channels", "cli_rig", "cobs", "device_channels", "fault_injection", "frames"),
