@@ -6,6 +6,7 @@ import errno
 import gc
 import os
 import sys
+import warnings
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from quell.realtime import cycle, recordings, system, wire
+from quell.realtime import cycle, recordings, system, transports, wire
 from quell.realtime.supervisor import Mode
 
 
@@ -245,3 +246,73 @@ def test_axes_are_told_of_a_u_that_acts_in_place_of_theirs() -> None:
     assert run([0.5, 2.0], Mode.STOPPED).tolist() == [0.5, 2.0]
     assert told == []
     assert run([0.5, 2.0], u=float("nan")).tolist() == [1.0, 2.0]
+
+
+def port_of(error: Any = None, latency_error: Any = None) -> tuple[Any, list[Any]]:
+    """Return what opens ports, and what was asked of it."""
+    calls: list[Any] = []
+
+    def low_latency(mode: bool) -> None:
+        calls.append(mode)
+        if latency_error is not None:
+            raise latency_error
+
+    def opened(path: str, baud: int, **options: Any) -> Any:
+        calls.append((path, baud, options))
+        if error is not None:
+            raise error
+        return SimpleNamespace(set_low_latency_mode=low_latency)
+
+    return SimpleNamespace(Serial=opened), calls
+
+
+def test_a_serial_port_is_opened_alone_without_waiting_and_with_low_latency() -> None:
+    """A driver that has no such mode is taken as it is; why a port is not opened is said."""
+    options = {"timeout": 0.0, "write_timeout": 0.0, "exclusive": True}
+    for refused in (None, NotImplementedError(), OSError(), ValueError()):
+        module, calls = port_of(latency_error=refused)
+        with patch.object(transports, "import_extra", lambda *_, module=module: module):
+            transports._opened("serial:/dev/a", "/dev/a", 115200)
+        assert calls == [("/dev/a", 115200, options), True]
+    for code, reason in (
+        (errno.EACCES, "no permission: join the group dialout, or the group that owns the port"),
+        (errno.EBUSY, "another program uses it"),
+        (errno.EAGAIN, "another program uses it"),
+    ):
+        module, _ = port_of(OSError(code, "no"))
+        with (
+            patch.object(transports, "import_extra", lambda *_, module=module: module),
+            pytest.raises(ValueError) as caught,
+        ):
+            transports._opened("serial:/dev/a", "/dev/a", 9600)
+        assert str(caught.value) == f"device = 'serial:/dev/a': can't be opened ({reason})"
+    module, _ = port_of(ValueError("no such rate"))
+    with (
+        patch.object(transports, "import_extra", lambda *_: module),
+        pytest.raises(ValueError, match="can't be opened .no such rate.$"),
+    ):
+        transports._opened("serial:/dev/a", "/dev/a", 9601)
+    with (
+        patch.object(transports.sys, "platform", "win32"),
+        pytest.raises(ValueError, match="need Linux"),
+    ):
+        transports._opened("serial:COM1", "COM1", 9600)
+
+
+def test_a_rate_is_high_enough_for_a_frame_each_way() -> None:
+    """Else it is refused, or u acts a sample later, which is said; both limits from both sides."""
+    bits = transports.FRAME_BITS + 80
+    baud = 100_000
+    frame = bits / baud
+    with pytest.raises(ValueError) as caught:
+        transports._check_rate(baud, 0.99 * frame, 2)
+    assert str(caught.value) == (
+        f"dt = {0.99 * frame!r} s: a frame takes {frame * 1e3:.3g} ms at {baud} baud, which is longer "
+        f"than a sample; give at least {bits / (0.99 * frame):.0f} baud, or dt from {frame:.3g} s on"
+    )
+    with pytest.warns(UserWarning, match=f"each way; that is longer than a sample: u acts a sample later than "
+                                         f"it could; it does not from {2.0 * bits / (1.5 * frame):.0f} baud on"):  # fmt: skip
+        transports._check_rate(baud, 1.5 * frame, 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        transports._check_rate(baud, 2.0 * frame, 2)

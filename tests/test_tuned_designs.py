@@ -428,3 +428,22 @@ def test_bandwidths_beside_an_infinite_gain_lie_on_its_positive_side() -> None:
     with patch.object(type(based), "integral_gain", lambda self, values: -gain(values)):
         rows = based.beside(np.array([1.0, 2.0, 3.0]))
     assert rows[:, 2].tolist() == pytest.approx([0.5 / 1.1] * 3, rel=1e-3)
+
+
+def test_the_simplest_of_those_that_can_do_what_is_asked_is_chosen() -> None:
+    """With a feedforward of those that feed forward; a named one, or the reason why there is none."""
+    own = tuned().design
+    named = {name: replace(own, name=name, objective=3.0) for name in ("pi", "poles", "lqg")}
+    assert tune_module._chosen(named, tune_module.SIMPLEST, task()).name == "pi"
+    assert tune_module._chosen(named, "lqg", task()).name == "lqg"
+    feeding = replace(task(), feedforward=ql.Feedforward.rigid(1.0))
+    assert (
+        tune_module._chosen(named, tune_module.SIMPLEST, feeding).name
+        in tune_module.FEEDING_FORWARD
+    )
+    none = {"pi": report.impossible("pi", "it rings")}
+    with pytest.raises(ValueError) as caught:
+        tune_module._chosen(none, "pi", task())
+    assert str(caught.value) == f"structure = 'pi': it rings ({task().constraints})"
+    with pytest.raises(ValueError, match="it rings"):
+        tune_module._chosen(none, tune_module.SIMPLEST, task())
