@@ -257,6 +257,8 @@ def test_a_tuned_loop_is_drawn_with_its_sensitivities_bounds_and_responses() -> 
         "step of a load at the plant's input",
     )
     assert texts(load) == ["pi"]
+    for ax in figure.axes:
+        assert all(line.get_linewidth() > 0.0 for line in ax.lines)
     for ax in (bode, sensitivity):
         assert ax.get_xlabel() == "ω [rad/s]"
         assert omega[0] <= ax.get_xlim()[0] < 1.0

@@ -13,7 +13,14 @@ import pytest
 from scipy import optimize, signal
 
 import quell as ql
-from quell.identification import Identified, delays, friction_search, input_gain, search, structures
+from quell.identification import (
+    Identified,
+    delays,
+    friction_search,
+    input_gain,
+    search,
+    structures,
+)
 from quell.identification.identify import _explains_more, known_of, resolution_of
 from quell.identification.model import Structure, free_run, output
 from quell.identification.output_error import ParameterEstimate, gauss_newton

@@ -138,17 +138,22 @@ def test_memory_is_locked_or_the_note_says_how(code: int) -> None:
 def test_a_real_time_process_leaves_all_as_it_was() -> None:
     """Collector, switch interval, locked memory and the file of the processors."""
     was, done = (gc.isenabled(), sys.getswitchinterval()), list[Any]()
+    frozen: list[str] = []
     gc.enable()
     with (
         patch.object(system, "_lock_memory", lambda notes: done.append("locked") or True),
         patch.object(system, "_stay_awake", lambda notes: 77),
         patch.object(system.os, "close", lambda file: done.append(file)),
         patch.object(system, "_munlockall", lambda: done.append("unlocked")),
+        patch.object(system.gc, "freeze", lambda: frozen.append("frozen")),
+        patch.object(system.gc, "unfreeze", lambda: frozen.append("free")),
     ):
         with system.real_time_process(5, True) as notes:
             assert not gc.isenabled()
             assert sys.getswitchinterval() == pytest.approx(1e-4)
             assert notes == []
+            assert frozen == ["frozen"]
+        assert frozen == ["frozen", "free"]
         assert done == ["locked", 77, "unlocked"]
         assert gc.isenabled()
         assert sys.getswitchinterval() == was[1]
