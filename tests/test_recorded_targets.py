@@ -159,7 +159,7 @@ def test_a_device_that_is_gone_or_not_followed_ends_the_record() -> None:
 _TABLE = (1.5, -2.0, 4.0)
 _MATRIX = np.array([[1.0, 2.0], [3.0, -4.0]])
 _SCALE = np.float64(0.25)
-_ON = True
+_ON, _OFF = True, False
 _COUNT = 3
 _FAR = math.inf
 
@@ -171,6 +171,9 @@ def constants(design: Design, state: State, a: float, b: float) -> float:
     )
     found += max(_COUNT, 1, 7) - min(2.0, _SCALE) + 7 // 2 + (-7) // 2 + 7 % 3 + 2.0**3
     found += math.sqrt(16.0) + math.floor(2.5) + (1.0 if _ON else 0.0)
+    found += (8.0 if a > 0.0 and _ON else 0.0) + (16.0 if _ON and a > b else 0.0)
+    found += (32.0 if a > 1.0 and _OFF else 0.0) + (64.0 if a > 1.0 or _OFF else 0.0)
+    found += (128.0 if _OFF or b > 0.0 else 0.0) + (256.0 if b > 0.0 or _ON else 0.0)
     if a == _FAR:
         found += 100.0
     n = 2

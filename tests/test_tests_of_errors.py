@@ -192,7 +192,7 @@ def moved(u: np.ndarray, early: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_y_that_is_early_by_two_samples_is_told() -> None:
     """By u of the same sample and of the next one, which explain a fifth or more of what is left."""
-    assert validation.early_samples(fitted(*moved(binary(82), 2))) == 2
+    assert validation.early_samples(fitted(*moved(binary(66), 2))) == 2
 
 
 def test_u_of_the_same_sample_explains_a_share_of_the_error_or_none() -> None:
