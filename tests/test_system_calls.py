@@ -16,7 +16,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from quell.realtime import cycle, recordings, system, transports, wire
+from quell.realtime import cycle, proxy, recordings, system, transports, wire
 from quell.realtime.supervisor import Mode
 
 
@@ -321,3 +321,17 @@ def test_a_rate_is_high_enough_for_a_frame_each_way() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         transports._check_rate(baud, 2.0 * frame, 2)
+
+
+def test_a_drive_behind_a_proxy_has_the_sample_time_of_its_compensator() -> None:
+    """To rounding; another one is refused."""
+    stands: Any = SimpleNamespace(
+        compensator=SimpleNamespace(dt=0.01), _handle="h", _controller="c", _drive="d"
+    )
+    for dt in (0.01, 0.01 * (1.0 + 5e-10)):
+        design = proxy.CompensatedDrive.sampled(stands, dt)
+        assert (design[0], design[2], design[3]) == ("h", "c", "d")
+    for dt in (0.02, 0.01 * (1.0 + 2e-9)):
+        with pytest.raises(ValueError) as caught:
+            proxy.CompensatedDrive.sampled(stands, dt)
+        assert str(caught.value) == f"dt = {dt!r} s: must be the compensator's, 0.01 s"
