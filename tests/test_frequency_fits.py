@@ -359,6 +359,19 @@ def test_a_lag_with_delay_has_the_values_and_deviations_of_least_squares() -> No
     np.testing.assert_allclose(it.response_at(OMEGA), b / (s + a) * np.exp(-s * late), rtol=1e-6)
 
 
+def test_a_negative_gain_has_the_same_model_with_the_other_sign() -> None:
+    """Its phase begins at half a turn; the delay is the same, given or found."""
+    for delay in (None, found().delay):
+        how: dict[str, Any] = {"integrators": 0, "deviation": np.full(40, 5e-3), "delay": delay}
+        one, other = (identify_frequencies(OMEGA, G, 1, 0, **how) for G in (noisy(), -noisy()))
+        assert other.num[0] == pytest.approx(-one.num[0], rel=1e-6)
+        assert other.den[1] == pytest.approx(one.den[1], rel=1e-6)
+        assert other.delay == pytest.approx(one.delay, rel=1e-6)
+        assert other.gain_interval == pytest.approx(
+            (-one.gain_interval[1], -one.gain_interval[0]), rel=1e-5
+        )
+
+
 def test_the_report_of_a_table_has_all_numbers() -> None:
     """Lines in order; JSON."""
     it = found()

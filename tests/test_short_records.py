@@ -626,3 +626,23 @@ def test_a_search_is_confirmed_by_a_wider_form_at_the_same_error() -> None:
         assert input_gain._confirmed(best, [one]) == confirmed
     assert input_gain._confirmed(model(lag, 1.0, True), [])
     assert not input_gain._confirmed(best, [])
+
+
+@cases(
+    ("z", "gain", "by_likelihood", "expected"),
+    [
+        (-1.4, -0.5, False, True),
+        (-1.6, -0.5, False, False),
+        (1.4, -0.5, False, True),
+        (-9.0, -0.019, False, True),
+        (-9.0, -0.021, False, False),
+        (-2.9, -0.5, True, True),
+        (-3.1, 0.5, True, False),
+    ],
+)
+def test_an_alternative_may_be_as_good_without_a_hint_of_the_contrary(
+    z: float, gain: float, by_likelihood: bool, expected: bool
+) -> None:
+    """From half of the limit on, with a gain of 2 %; by the likelihood from the whole on."""
+    one = structures.Alternative("order 2", False, gain, z, 3.0, by_likelihood, step(), "")
+    assert one.may_be_as_good == expected

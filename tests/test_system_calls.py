@@ -335,3 +335,11 @@ def test_a_drive_behind_a_proxy_has_the_sample_time_of_its_compensator() -> None
         with pytest.raises(ValueError) as caught:
             proxy.CompensatedDrive.sampled(stands, dt)
         assert str(caught.value) == f"dt = {dt!r} s: must be the compensator's, 0.01 s"
+
+
+def test_a_hello_for_several_signals_has_the_sample_time_and_zeros() -> None:
+    """As many numbers as a frame of so many measurements."""
+    out = wire.buffer(wire.MOST_SIGNALS)
+    out.doubles[:] = 7.0
+    wire.write_hello(out, 5, 9, 0.01, 3, 2)
+    assert out.doubles[3:6].tolist() == [0.01, 0.0, 0.0]

@@ -29,6 +29,7 @@ from quell.tuning.structures.registry import make_structure
 from .cases import cases
 
 tune_module: Any = importlib.import_module("quell.tuning.tune")
+simulated: Any = importlib.import_module("quell.tuning.simulated.search")
 
 DT = 0.05
 LAG = ([1.0], [1.0, 1.0])
@@ -447,3 +448,33 @@ def test_the_simplest_of_those_that_can_do_what_is_asked_is_chosen() -> None:
     assert str(caught.value) == f"structure = 'pi': it rings ({task().constraints})"
     with pytest.raises(ValueError, match="it rings"):
         tune_module._chosen(none, tune_module.SIMPLEST, task())
+
+
+def test_a_strategy_goes_on_after_the_finished_trials_of_a_study() -> None:
+    """In generations; a trial that was given up comes last, unfinished ones and others not at all."""
+    told: list[Any] = []
+
+    class Strategy:
+        population_size = 2
+
+        def __init__(self, **options: Any) -> None:
+            told.append(options)
+
+        def tell(self, generation: Any) -> None:
+            told.append([(point.tolist(), value) for point, value in generation])
+
+    def trial(x: float, value: Any, name: str = "COMPLETE", **more: Any) -> Any:
+        state = SimpleNamespace(is_finished=lambda: name != "RUNNING", name=name)
+        return SimpleNamespace(state=state, params={"x": x, **more} if x else more, value=value)
+
+    with patch.object(simulated, "import_extra", lambda *_: SimpleNamespace(CMA=Strategy)):
+        sampler = simulated.Generations({"x": simulated.SearchRange(0.0, 10.0)}, {"x": 2.5})
+        trials = [trial(1.0, 3.0), trial(2.0, None, "RUNNING"), trial(4.0, None, "PRUNED"),
+                  trial(0.0, 1.0, other=2.0), trial(6.0, 5.0), trial(8.0, 2.0), trial(9.0, 1.0)]  # fmt: skip
+        sampler.after(SimpleNamespace(get_trials=lambda deepcopy: trials))
+    assert told[0]["mean"].tolist() == [0.25]
+    assert told[0]["bounds"].tolist() == [[0.0, 1.0]]
+    assert told[1][0] == ([pytest.approx(0.1)], 3.0)
+    assert told[1][1] == ([pytest.approx(0.4)], simulated._LARGEST)
+    assert told[2] == [([pytest.approx(0.6)], 5.0), ([pytest.approx(0.8)], 2.0)]
+    assert len(told) == 3
