@@ -350,6 +350,7 @@ def test_the_delay_margin_of_a_set_is_the_least() -> None:
     assert both < one
     loop = analyse(LAG, structure.controller(PI[0]))
     assert one == pytest.approx(loop.margins.delay, rel=1e-5)
+    assert search.delay_margin(sampled("lag"), structure, PI * [1e-9, 1.0, 1.0])[0] == math.inf
 
 
 def test_slacks_and_their_slopes_are_those_of_the_ratios() -> None:
