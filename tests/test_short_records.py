@@ -416,6 +416,15 @@ def test_poles_have_the_deviations_of_a_model_without_fast_poles() -> None:
         0.2
     )
     assert _with_deviations((Root(-31.5 + 0j, 9.0, 0.0),), shown, DT)[0].real_std == 9.0
+    # Of two poles −2 and −8, by the slopes ∂p/∂a of (s + 2)(s + 8).
+    theta = np.array([0.16, 1.0, 0.3, 0.0, 0.0, 0.0])
+    both = ParameterEstimate(theta, np.diag([1e-6, 4e-4, 1.0, 1.0, 1.0, 1.0]), 0.0, True)
+    shown = SimpleNamespace(structure=Structure(2, 0, (0, 0)), estimate=both)
+    near = (Root(-2.1 + 0j, 9.0, 0.0), Root(-7.9 + 0j, 9.0, 0.0))
+    for pole, p in zip(_with_deviations(near, shown, DT), (-2.0, -8.0), strict=True):
+        slope = -np.array([1.0, p]) / (2.0 * p + 10.0)
+        std = np.array([1e-3 / DT**2, 0.02 / DT])
+        assert pole.real_std == pytest.approx(math.hypot(*(slope * std)), rel=1e-6)
 
 
 def test_direct_feedthrough_is_b_plus_d_times_a() -> None:
