@@ -122,6 +122,7 @@ def test_a_model_with_a_zero_that_starts_at_rest_away_from_zero_is_simulated_so(
     assert found.fits["estimation"] > 99.4
 
 
+@pytest.mark.trial
 def test_a_record_that_begins_in_motion_is_not_taken_for_one_at_rest() -> None:
     """From a start of 2 the model at rest is contradicted."""
     u = np.concatenate([np.zeros(2), np.ones(68)])
@@ -183,10 +184,10 @@ def test_samples_at_a_limit_are_bounded_and_not_fitted() -> None:
 
 def loop(size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return u, y and r of the lag behind u = 2 (r − y), with coloured noise in y."""
-    r = binary(120, hold=4)
-    e = signal.lfilter([1.0], [1.0, -0.8], noise(120, size))
-    x, u, y, p = 0.0, np.zeros(120), np.zeros(120), math.exp(-0.2)
-    for k in range(120):
+    r = binary(84, hold=4)
+    e = signal.lfilter([1.0], [1.0, -0.8], noise(84, size))
+    x, u, y, p = 0.0, np.zeros(84), np.zeros(84), math.exp(-0.2)
+    for k in range(84):
         y[k] = x + e[k]
         u[k] = 2.0 * (r[k] - y[k])
         x = p * x + 1.5 * (1.0 - p) * u[k]
@@ -208,13 +209,13 @@ def test_a_loop_with_its_reference_has_the_plant_without_bias() -> None:
     assert abs(found.num[0] - 3.0) < 3.0 * std[1] < 3.0
     assert found.converged
     for reference, message in (
-        (np.ones(120), "reference is 1 all through: must move; without one leave it out"),
+        (np.ones(84), "reference is 1 all through: must move; without one leave it out"),
         (r[:-1], "reference"),
     ):
         with pytest.raises(ValueError, match=message):
             ql.identify(u, y, DT, 1, delay=0.0, reference=reference, held_out=0.0)
     with pytest.raises(ValueError, match="reference: goes with one record, not with several"):
-        ql.identify([u[:60], u[60:]], [y[:60], y[60:]], DT, 1, delay=0.0, reference=r)
+        ql.identify([u[:42], u[42:]], [y[:42], y[42:]], DT, 1, delay=0.0, reference=r)
     with pytest.raises(ValueError, match="zeros = 1: with reference must be less than order = 1"):
         ql.identify(u, y, DT, 1, 1, delay=0.0, reference=r)
 
@@ -249,8 +250,8 @@ def test_several_records_have_forces_and_starts_of_their_own() -> None:
 
 def test_a_delay_explains_more_where_it_is_there() -> None:
     """The likelihood ratio of both errors against 3 ln N, and no more faults."""
-    u = binary(70)
-    y = np.concatenate([np.zeros(2), answer(LAG, u)[:-2]]) + noise(70, 0.01)
+    u = binary(56)
+    y = np.concatenate([np.zeros(2), answer(LAG, u)[:-2]]) + noise(56, 0.01)
     how: dict[str, Any] = {"held_out": 0.0, "horizon": 1, "rest": False}
     plain, late = (ql.identify(u, y, DT, 1, delay=delay, **how) for delay in (0.0, 0.2))
     assert late.num[0] == pytest.approx(3.0, rel=0.03)

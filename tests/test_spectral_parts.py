@@ -518,8 +518,8 @@ def test_twenty_samples_are_needed_for_each_mode() -> None:
 
 def test_a_decay_has_the_values_and_intervals_of_least_squares() -> None:
     """Time constant, end, begin and fit; twelve samples at least, and no straight line."""
-    t = 0.5 * np.arange(40.0)
-    y = 20.0 - 15.0 * np.exp(-t / 8.0) + noise(40, 0.05)
+    t = 0.5 * np.arange(30.0)
+    y = 20.0 - 15.0 * np.exp(-t / 8.0) + noise(30, 0.05)
     found = free_decay(y, 0.5)
     best, covariance = optimize.curve_fit(
         lambda t, a, end, begin: end + (begin - end) * np.exp(-a * t), t, y, [0.1, 20.0, 5.0]
@@ -544,7 +544,7 @@ def test_a_decay_has_the_values_and_intervals_of_least_squares() -> None:
         (exact_y[:11], "y has 11 samples: must have at least 12; record more"),
         (t, "y does not decay: it moves on as a straight line or faster; record longer"),
         (np.exp(0.05 * t), "y does not decay: it moves on as a straight line or faster"),
-        (noise(40, 1.0), "y does not decay: no time constant explains more of it than chance;"),
+        (noise(30, 1.0), "y does not decay: no time constant explains more of it than chance;"),
     ):
         with pytest.raises(ValueError, match=message):
             free_decay(record, 0.5)

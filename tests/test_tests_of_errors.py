@@ -190,6 +190,7 @@ def moved(u: np.ndarray, early: int) -> tuple[np.ndarray, np.ndarray]:
     return u[: u.size - early], y[early:]
 
 
+@pytest.mark.trial
 def test_a_y_that_is_early_by_two_samples_is_told() -> None:
     """By u of the same sample and of the next one, which explain a fifth or more of what is left."""
     assert validation.early_samples(fitted(*moved(binary(66), 2))) == 2
