@@ -21,6 +21,8 @@ DT = 1e-3
 MOVE = ql.signals.SmoothMove(1.5, 0.5, smoothness=4, start=0.1)
 B = 800.0
 AXIS = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, B], [1.0, 0.0])
+# Two masses of 1 and 2 on a spring of 50 with a damper of 0.1, y that of the first.
+TWO_MASSES = ([2.0, 0.1, 50.0], [2.0, 0.3, 150.0, 0.0, 0.0])
 SPRING = ql.plants.LinearPlant([[0.0, 1.0], [-30.0, -4.0]], [0.0, B], [1.0, 0.0])
 
 
@@ -183,6 +185,40 @@ def test_a_model_based_observer_with_zeros_is_told_the_same() -> None:
     assert errors[0] < 0.05 * errors[1]
 
 
+def test_the_flat_output_of_two_masses_is_the_second_one() -> None:
+    """d(s)/n(0) and n(s)/n(0) by hand: the inertia of both, and y ahead of z by z''/ω_a²."""
+    found = ql.Feedforward.of(TWO_MASSES, flat=True)
+    assert found.coefficients == pytest.approx((0.0, 0.0, 3.0, 0.006, 0.04))
+    assert found.numerator == pytest.approx((1.0, 0.002, 0.04))
+    assert ql.Feedforward.of(SPRING, flat=True) == ql.Feedforward.of(SPRING)
+    assert "for y = r + … + 0.04 r^(2)" in found.describe()
+
+
+@pytest.mark.parametrize("model", [False, True])
+def test_a_move_of_the_flat_output_leaves_no_mode_swinging(model: bool) -> None:
+    """In 1.2 periods of the mode: y is n(s) r on the way, and the feedback has nothing to do."""
+    plant, dt = ql.plants.LinearPlant.of(TWO_MASSES), 2e-3
+    move = ql.signals.SmoothMove(1.0, 0.87, smoothness=4, start=0.02)
+    observer = ql.ESO.model_free(2, 0.5, 40.0, dt)
+    if model:
+        observer = ql.ESO.model_based(plant, 40.0, dt, b0=2.0)
+    forward = ql.Feedforward.of(plant, flat=True)
+    runs = [
+        ql.simulate(
+            plant,
+            ql.ADRC(observer, 8.0, feedforward=each),
+            ql.Scenario(move, duration=1.2),
+            interpret=True,
+        )
+        for each in (forward, ql.Feedforward.of(plant, terms=2))
+    ]
+    y, _ = forward.linear_part(move, runs[0].t, dt)
+    errors = [float(np.max(np.abs(run["y"] - y))) for run in runs]
+    assert errors[0] < 2e-3
+    assert errors[1] > 30.0 * errors[0]
+    assert np.max(np.abs(y - runs[0]["r"])) > 0.1
+
+
 def test_a_retuned_or_handed_over_loop_keeps_what_the_model_knows() -> None:
     """In the middle of the move u does not jump, and the observer finds no new disturbance."""
     model = ql.Feedforward.of(AXIS)
@@ -213,6 +249,17 @@ def test_a_retuned_or_handed_over_loop_keeps_what_the_model_knows() -> None:
         (lambda: ql.Feedforward((1.0,), coulomb_speed=0.1), "without coulomb: has no effect"),
         (lambda: ql.Feedforward((1.0,), derivatives=0), "derivatives = 0"),
         (lambda: ql.Feedforward.rigid(0.0), "inertia = 0.0"),
+        (lambda: ql.Feedforward((1.0,), numerator=(2.0, 1.0)), "must begin with 1"),
+        (lambda: ql.Feedforward.of(TWO_MASSES, flat=True, terms=2), "terms = 2"),
+        (
+            lambda: ql.ADRC(
+                ql.ESO.model_free(2, 1.0, 9.0, 0.01),
+                3.0,
+                feedforward=ql.Feedforward.of(TWO_MASSES, flat=True),
+                feedback=ql.controllers.NonlinearFeedback((0.5, 1.0), (0.1, 0.1)),
+            ),
+            "numerator with a schedule or a nonlinear feedback",
+        ),
         (lambda: ql.Feedforward.of(([1.0, 0.0], [1.0, 1.0, 1.0])), "zero at s = 0"),
         (lambda: ql.ADRC(ql.ESO.model_free(2, 1.0, 9.0, 0.01), 3.0, feedforward=1.0), "quell.Feed"),
         (
@@ -308,8 +355,8 @@ controller = { omega_c = 20.0, feedforward = GIVEN }
             ql.Feedforward.rigid(0.5, coulomb=0.1),
         ),
         (
-            '{ kind = "series", coefficients = [1.0], delay = 0.1 }',
-            ql.Feedforward((1.0,), delay=0.1),
+            '{ kind = "series", coefficients = [1.0], delay = 0.1, numerator = [1.0, 0.2] }',
+            ql.Feedforward((1.0,), delay=0.1, numerator=(1.0, 0.2)),
         ),
     ],
 )

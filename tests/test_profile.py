@@ -226,20 +226,23 @@ def test_a_loop_moves_as_with_the_signal_of_the_same_move() -> None:
         np.testing.assert_allclose(on_line[name], signal[name], atol=1e-6 * scale)
 
 
-def controller() -> Prefiltered:
+def controller(smoothing: float = 0.0) -> Prefiltered:
     """A controller with feedforward behind the generator."""
     observer = ql.ESO.model_free(2, 5.0, 60.0, DT)
     model = ql.Feedforward.rigid(0.2, viscous=0.1)
     inner = ql.ADRC(observer, 15.0, feedforward=model, u_min=-9.0, u_max=9.0)
-    return Prefiltered(inner, ProfileGenerator(*LIMITS))
+    return Prefiltered(inner, ProfileGenerator(*LIMITS, smoothing))
 
 
 @pytest.mark.trial
 @needs_gcc
+@pytest.mark.parametrize("smoothing", [0.0, 0.02])
 @pytest.mark.parametrize("precision", ["double", "single"])
-def test_exported_moves_are_the_same_bit_for_bit(tmp_path: Path, precision: str) -> None:
+def test_exported_moves_are_the_same_bit_for_bit(
+    tmp_path: Path, precision: str, smoothing: float
+) -> None:
     """With targets that change during moves, a stop, a missing target, and another limit."""
-    given: Any = controller()
+    given: Any = controller(smoothing)
     if precision == "single":
         given = ql.controllers.in_single_precision(given)
     code, player = InC(c_source(given, "servo"), tmp_path), Player(given)
@@ -269,6 +272,42 @@ def test_only_a_generator_plans_a_stop() -> None:
     shaped = Prefiltered(given.controller, ql.controllers.ReferenceModel(3.0))
     with pytest.raises(ValueError, match="ReferenceModel: plans no stop; take ProfileGenerator"):
         _ = shaped.stopping_point
+
+
+def test_a_smoothed_move_is_the_mean_of_the_move_with_its_derivatives() -> None:
+    """From its beginning to its end, with a target that changes; at rest it is the target."""
+    plain, length = ProfileGenerator(*LIMITS), 25
+    smooth = replace(plain, smoothing=length * DT)
+    design, fine = smooth.design(DT), plain.design(DT)
+    memory, whole = smooth.memory(design), plain.memory(fine)
+    settle(design, memory, 0.2)
+    settle(fine, whole, 0.2)
+    rows, means = [], []
+    for k in range(1500):
+        r, derivatives = (0.2 if k < 5 else 0.9 if k < 60 else 0.4), np.zeros(4)
+        means.append(prefilter(fine, whole, r))
+        p = prefilter(design, memory, r)
+        write_derivatives(design, memory, derivatives)
+        rows.append([p, *derivatives])
+    found = np.array(rows)
+    box = np.convolve([0.5, *np.ones(length - 1), 0.5], [1.0 / length])
+    padded = np.concatenate([np.full(length, 0.2), means])
+    np.testing.assert_allclose(found[:, 0], np.convolve(padded, box, "valid"), atol=1e-13)
+    assert found[-1].tolist() == [0.4, 0.0, 0.0, 0.0, 0.0]
+    for i in range(3):
+        slope, middle = np.diff(found[:, i]) / DT, 0.5 * (found[1:, i + 1] + found[:-1, i + 1])
+        assert np.max(np.abs(slope - middle)) < 0.01 * np.max(np.abs(middle))
+    assert stopping_point(design, memory) == 0.4
+    assert np.max(np.abs(found[:, 4])) <= 2.0 * LIMITS[2] / (length * DT) * (1.0 + 1e-9)
+
+
+def test_a_smoothing_out_of_range_is_refused() -> None:
+    """With its name, its value and the rule."""
+    with pytest.raises(ValueError, match="smoothing = -1.0"):
+        ProfileGenerator(*LIMITS, smoothing=-1.0)
+    with pytest.raises(ValueError, match="smoothing = 1.0 s with dt = 1e-08 s: must be at most"):
+        ProfileGenerator(*LIMITS, smoothing=1.0).design(1e-8)
+    assert ProfileGenerator(*LIMITS, smoothing=1e-9).design(DT).length == 1
 
 
 @pytest.mark.parametrize("name", ["v_max", "a_max", "j_max"])

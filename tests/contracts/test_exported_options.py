@@ -249,14 +249,14 @@ PARTS: dict[str, Part] = {
     }),
     "Feedforward": Part(ql.Feedforward, _fed, {"coefficients": (0.3, 0.1, 0.7)}, {
         "coefficients": Several(((0.3,), (0.0, 0.1), (0.3, 0.1, 0.7, 0.2))), "coulomb": 0.2, "coulomb_speed": With(0.5, {"coulomb": 0.2}),
-        "constant": -0.1, "delay": 0.03, "derivatives": Several((1, 4)),
+        "constant": -0.1, "delay": 0.03, "derivatives": Several((1, 4)), "numerator": Several(((1.0, 0.2, 0.05),)),
     }),
     "Feedforward.rigid": Part(ql.Feedforward.rigid, _fed, {"inertia": 0.7}, {
         "inertia": 0.5, "viscous": 0.1, "coulomb": 0.2, "coulomb_speed": With(0.5, {"coulomb": 0.2}), "constant": -0.1, "delay": 0.03, "derivatives": 2,
     }),
     "Feedforward.of": Part(ql.Feedforward.of, _fed, {"plant": PLANT}, {
         "plant": ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), "terms": 1, "coulomb": 0.2, "coulomb_speed": With(0.5, {"coulomb": 0.2}),
-        "constant": -0.1, "delay": 0.03, "derivatives": 2,
+        "constant": -0.1, "delay": 0.03, "derivatives": 2, "flat": With(True, {"plant": ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -1.0]], [0.5, 1.0], [1.0, 0.0])}),
     }),
     "LinearController": Part(room.LinearController, _itself, {"law": PID.law, "dt": DT, **LIMITS}, {
         "law": baseline_room.PID(4.0, dt=DT).law, "dt": 0.02, **_RANGE, "name": "law",
@@ -305,7 +305,7 @@ PARTS: dict[str, Part] = {
     }),
     "ReferenceModel": Part(room.ReferenceModel, _shaped, {"omega": 3.0}, {"omega": 2.0, "order": Several((1, 3)), "rate_limit": 0.5}),
     "TrackingDifferentiator": Part(room.TrackingDifferentiator, _shaped, {"acceleration": 2.0}, {"acceleration": 1.0, "horizon": 0.05}),
-    "ProfileGenerator": Part(room.ProfileGenerator, _shaped, {"v_max": 0.5, "a_max": 2.0, "j_max": 5.0}, {"v_max": 0.4, "a_max": 1.0, "j_max": 4.0}),
+    "ProfileGenerator": Part(room.ProfileGenerator, _shaped, {"v_max": 0.5, "a_max": 2.0, "j_max": 5.0}, {"v_max": 0.4, "a_max": 1.0, "j_max": 4.0, "smoothing": 0.05}),
 }  # fmt: skip
 # Public classes that are no part of a controller: protocols and base classes, values that parts
 # return, sums of features (the rows of learners), and learners that call Python, which are refused.

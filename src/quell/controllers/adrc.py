@@ -326,7 +326,7 @@ class ADRC(Compensator):
             law=law,
             cancel=observer.cancel,
             feedback=feedback_design(self.feedback, observer.degree, omega_c),
-            feedforward=feedforward_design(self.feedforward, observer),
+            feedforward=feedforward_design(self.feedforward, observer, law),
             fade=math.exp(-omega_c * observer.dt),
         )
 
@@ -357,6 +357,12 @@ class ADRC(Compensator):
 
     def _check_law_of_schedule(self) -> None:
         """Raise a ``ValueError`` for parts of the law that a schedule does not reach."""
+        flat = isinstance(self.feedforward, Feedforward) and len(self.feedforward.numerator) > 1
+        if flat and (self.schedule is not None or self.feedback is not None):
+            raise ValueError(
+                "feedforward.numerator with a schedule or a nonlinear feedback: their law takes r "
+                "for y; leave numerator out"
+            )
         if self.schedule is None:
             return
         if isinstance(self.schedule, OnlineGain) and isinstance(self.feedforward, Feedforward):

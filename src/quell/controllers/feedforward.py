@@ -12,6 +12,12 @@ With zeros the series converges for moves that are slow against the slowest zero
 rigid part it is the feedforward of inertia and friction that drives have. u is held for a sample,
 so it acts half a sample late: T is the delay plus dt/2, and the derivatives of r give r(t + T).
 
+With zeros, ``G = n(s)/d(s)`` with n(0) = 1, an exact inverse takes r for the flat output z in the
+place of y: ``u_ff = d(s) z`` and ``y = n(s) z``, both polynomials. Of a motor that drives a load
+through a spring, with its encoder at the motor, z is the position of the load: a move of z that is
+smooth enough leaves neither of them swinging, however quick it is, as long as u keeps within its
+limits. Below, r and its derivatives are then those of ``n(s) z``.
+
 **The observer** models the plant with its own b_0 and a, ``y^(n) = −a·(y … y^(n−1)) + b_0 u + f``,
 and b_0 is a number for robustness, not the gain of the plant. On the reference, with u = u_ff, the
 model of the feedforward and that of the observer together say what f is::
@@ -36,6 +42,7 @@ that acts then; an observer that knows the delay gets the one of the same time.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -84,6 +91,9 @@ class Feedforward:
         highest derivative of the reference that is used; by default one more than the highest
         coefficient's, so that delay and hold are compensated in the highest term, too: with it the
         error that they leave was a hundredth in the trials.
+    numerator
+        1, n_1, n_2, … of ``y = r + n_1 r' + n_2 r'' + …`` [s^i]: where y goes while the reference
+        is that of a flat output, as the load behind a spring; by default y = r.
 
     Raises
     ------
@@ -106,6 +116,7 @@ class Feedforward:
     constant: float = 0.0
     delay: float | None = None
     derivatives: int | None = None
+    numerator: Sequence[float] = (1.0,)
 
     def __post_init__(self) -> None:
         found = checks.vector("coefficients", self.coefficients)
@@ -114,6 +125,13 @@ class Feedforward:
                 f"coefficients has {found.size} numbers: must have 1 to {_MOST + 1}, of r, r', …"
             )
         object.__setattr__(self, "coefficients", tuple(found.tolist()))
+        of_y = checks.vector("numerator", self.numerator)
+        if not 1 <= of_y.size <= _MOST + 1 or of_y[0] != 1.0:
+            raise ValueError(
+                f"numerator = {self.numerator!r}: must begin with 1, as y is r at rest, and have "
+                f"at most {_MOST + 1} numbers"
+            )
+        object.__setattr__(self, "numerator", tuple(of_y.tolist()))
         checks.finite("coulomb", self.coulomb)
         checks.non_negative("coulomb_speed", self.coulomb_speed, "y-unit/s")
         checks.finite("constant", self.constant)
@@ -164,6 +182,7 @@ class Feedforward:
         constant: float = 0.0,
         delay: float | None = None,
         derivatives: int | None = None,
+        flat: bool = False,
     ) -> Feedforward:
         """Return the feedforward of a plant: the series of its inverse.
 
@@ -181,11 +200,15 @@ class Feedforward:
             as for ``Feedforward``; by default those of the plant.
         constant, derivatives
             as for ``Feedforward``.
+        flat
+            whether the reference is that of the flat output, with which the inverse of a plant with
+            zeros is exact: ``numerator`` is then that of the plant.
 
         Raises
         ------
         ValueError
-            also for a plant with a zero at s = 0, whose output can't follow a constant.
+            also for a plant with a zero at s = 0, whose output can't follow a constant, and for
+            ``terms`` of a flat output.
 
         Examples
         --------
@@ -199,14 +222,23 @@ class Feedforward:
         if isinstance(plant, FrictionPlant):
             friction, width = plant.signed_force, plant.width
         model = canonical(linear_model(plant))
+        if flat and terms is not None:
+            raise ValueError(f"terms = {terms!r}: the inverse of a flat output ends; leave it out")
         highest = model.a.size if terms is None else checks.whole("terms", terms, 1, _MOST)
         friction = friction if coulomb is None else coulomb
         if coulomb_speed is None:
             coulomb_speed = width if friction != 0.0 else 0.0
         if delay is None and late > 0.0:
             delay = late
-        series = inverse_series(model, highest) / model.b
-        return cls(tuple(series.tolist()), friction, coulomb_speed, constant, delay, derivatives)
+        of_y: Sequence[float] = (1.0,)
+        if flat:
+            denominator, numerator = polynomials(model, highest)
+            series = denominator / (model.b * numerator[0])
+            of_y = (numerator / numerator[0])[: model.zeros.size + 1].tolist()
+        else:
+            series = inverse_series(model, highest) / model.b
+        rest = friction, coulomb_speed, constant, delay, derivatives, of_y
+        return cls(tuple(series.tolist()), *rest)
 
     @property
     def order(self) -> int:
@@ -238,17 +270,18 @@ class Feedforward:
         heavier = tuple(ratio * c if i >= degree else c for i, c in enumerate(own))
         return replace(self, coefficients=heavier)
 
-    def linear_part(self, reference: Signal, t: Vector, dt: float) -> Vector:
-        """Return u_ff without friction and constant at times (k,) [s], of a sampled controller.
+    def linear_part(self, reference: Signal, t: Vector, dt: float) -> tuple[Vector, Vector]:
+        """Return y, and u_ff without friction and constant, at times (k,) [s].
 
-        The derivatives of the reference give it at the time when u acts, half a sample and
-        ``delay`` later.
+        The derivatives of the reference give u_ff of a sampled controller at the time when u acts,
+        half a sample and ``delay`` later.
         """
-        total, lead = np.zeros(t.shape), (self.delay or 0.0) + 0.5 * dt
-        for coefficient in shifted(self.series(self.order), lead).tolist():
-            total += coefficient * reference(t)
-            reference = reference.derivative()
-        return total
+        y, u, lead = np.zeros(t.shape), np.zeros(t.shape), (self.delay or 0.0) + 0.5 * dt
+        series = shifted(self.series(self.order), lead).tolist()
+        for of_y, of_u in itertools.zip_longest(self.numerator, series, fillvalue=0.0):
+            values = reference(t)
+            y, u, reference = y + of_y * values, u + of_u * values, reference.derivative()
+        return y, u
 
     def describe(self) -> str:
         """Return u_ff as a formula."""
@@ -258,20 +291,22 @@ class Feedforward:
         terms += [f"{self.constant:.4g}"] if self.constant else []
         late = "the delay that the observer knows" if self.delay is None else f"{self.delay:g} s"
         total = " + ".join(terms).replace("+ -", "- ") or "0"
+        if len(self.numerator) > 1:
+            total += f" for y = r + … + {self.numerator[-1]:.4g} r^({len(self.numerator) - 1})"
         return f"u = {total}, ahead by half a sample and {late}"
 
     def table(self) -> dict[str, Any]:
         """Return it as a table of a setup file."""
         found: dict[str, Any] = {"kind": "series", "coefficients": list(self.coefficients)}
         defaults = Feedforward((0.0,))
-        for name in ("coulomb", "coulomb_speed", "constant", "delay", "derivatives"):
+        for name in ("coulomb", "coulomb_speed", "constant", "delay", "derivatives", "numerator"):
             value = getattr(self, name)
             if value != getattr(defaults, name):
-                found[name] = value
+                found[name] = list(value) if isinstance(value, tuple) else value
         return found
 
-    def design(self, observer: ESO) -> ModelFeedforward:
-        """Return the parameters for an observer.
+    def design(self, observer: ESO, law: Sequence[float] = ()) -> ModelFeedforward:
+        """Return the parameters for an observer, and the gains of the law (n,).
 
         Raises ``ValueError`` for an observer whose f enters elsewhere than u.
         """
@@ -287,9 +322,12 @@ class Feedforward:
         half = 0.5 * observer.dt
         lead = (known if self.delay is None else self.delay) + half
         own = self.series(m)
-        inverse = inverse_series(plant, m)
-        wish = np.zeros(m + 1)
+        inverse = self._of_y(inverse_series(plant, m))
+        errors, wish = np.zeros(m + 1), np.zeros(m + 1)
+        errors[:degree] = law[:degree] if len(law) else 0.0
         wish[degree] = 1.0
+        # The law adds its gains times the reference's own derivatives; y has those of n(s) r.
+        wish = self._of_y(errors + wish) - errors
         acting = shifted(own, lead - known)
         return ModelFeedforward(
             control=shifted(own, lead),
@@ -303,9 +341,14 @@ class Feedforward:
             lead_acting=lead - known,
         )
 
+    def _of_y(self, series: Vector) -> Vector:
+        """Return a series in derivatives of y as one in those of r, up to the same power."""
+        found: Vector = np.convolve(series, self.numerator)[: series.size]
+        return found
 
-def inverse_series(plant: Canonical, highest: int) -> Vector:
-    """Return the series of ``b/G(s)`` about s = 0 up to a power (highest + 1,), lowest first.
+
+def polynomials(plant: Canonical, highest: int) -> tuple[Vector, Vector]:
+    """Return d(s) and n(s)/b of ``G = n/d``, lowest power first, d (highest + 1,) or longer.
 
     Raises ``ValueError`` for a zero at s = 0.
     """
@@ -321,7 +364,15 @@ def inverse_series(plant: Canonical, highest: int) -> Vector:
         numerator[n - 1 - k] += plant.B[k]
     denominator = np.zeros(max(n, highest) + 1)
     denominator[: n + 1] = np.append(plant.a, 1.0)
-    numerator = numerator / plant.b
+    return denominator, numerator / plant.b
+
+
+def inverse_series(plant: Canonical, highest: int) -> Vector:
+    """Return the series of ``b/G(s)`` about s = 0 up to a power (highest + 1,), lowest first.
+
+    Raises ``ValueError`` for a zero at s = 0.
+    """
+    denominator, numerator = polynomials(plant, highest)
     series = np.zeros(highest + 1)
     for i in range(highest + 1):
         rest = sum(series[j] * numerator[i - j] for j in range(i))
@@ -351,10 +402,10 @@ def checked_feedforward(feedforward: Any) -> bool | Feedforward:
     )
 
 
-def feedforward_design(feedforward: bool | Feedforward, observer: ESO) -> Any:
-    """Return the parameters of the feedforward, also without a model."""
+def feedforward_design(feedforward: bool | Feedforward, observer: ESO, law: Vector) -> Any:
+    """Return the parameters of the feedforward, also without a model, beside a law (n,)."""
     if isinstance(feedforward, Feedforward):
-        return feedforward.design(observer)
+        return feedforward.design(observer, law.tolist())
     return ReferenceOnly()
 
 

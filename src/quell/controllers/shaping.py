@@ -23,6 +23,14 @@ exactly.
 Within a part of constant jerk the motion is computed from the beginning of the part, so that
 rounding does not add up, and in the last one from its end: the way there has no overshoot, not even
 of rounding.
+
+With smoothing it is the mean of the move over a time W, of which the derivatives are differences::
+
+    z^(i)(t) = ( p^(i−1)(t) − p^(i−1)(t − W) ) / W
+
+So a jerk that jumps becomes one that changes at a bounded rate: there is a fourth derivative, for
+the feedforward of a plant with a resonance. The mean is taken by the trapezoidal rule, beside the
+present p: at rest it is p exactly.
 """
 
 from __future__ import annotations
@@ -344,6 +352,70 @@ def _settle_profile(design: ProfileDesign, memory: ProfileMemory, value: float) 
     loop.part = PARTS
 
 
+class SmoothedDesign(NamedTuple):
+    """Parameters with smoothing."""
+
+    profile: ProfileDesign
+    length: int  # samples of which the mean is taken
+    width: float  # W [s]
+
+
+class SmoothedMemory(NamedTuple):
+    """State with smoothing: the motions of the last samples as rings, and the mean."""
+
+    profile: ProfileMemory
+    p: Buffer
+    v: Buffer
+    a: Buffer
+    jerk: Buffer
+    at: Vector  # (1,): index of the newest
+    changes: Vector  # (4,): derivatives of the mean
+
+
+@prefilter.register(SmoothedDesign)
+def _prefilter_smoothed(design: SmoothedDesign, memory: SmoothedMemory, r: float) -> float:
+    prefilter(design.profile, memory.profile, r)
+    loop, changes, size = memory.profile.loop[0], memory.changes, memory.p.size
+    at = min(max(int(memory.at[0]), 0), size - 1)
+    at = at + 1 if at < size - 1 else 0
+    # The oldest, W ago, gives its place to the newest.
+    oldest = memory.p[at]
+    changes[0] = (loop.p - oldest) / design.width
+    changes[1] = (loop.v - memory.v[at]) / design.width
+    changes[2] = (loop.a - memory.a[at]) / design.width
+    changes[3] = (loop.jerk - memory.jerk[at]) / design.width
+    memory.p[at], memory.v[at], memory.a[at] = loop.p, loop.v, loop.a
+    memory.jerk[at] = loop.jerk
+    memory.at[0] = at
+    total = 0.5 * (oldest - loop.p)
+    for i in range(size):
+        total += memory.p[i] - loop.p
+    return loop.p + total / design.length
+
+
+@write_derivatives.register(SmoothedDesign)
+def _write_derivatives_smoothed(
+    design: SmoothedDesign, memory: SmoothedMemory, derivatives: Vector
+) -> None:
+    for i in range(derivatives.size):
+        derivatives[i] = memory.changes[i]
+
+
+@stopping_point.register(SmoothedDesign)
+def _stopping_point_smoothed(design: SmoothedDesign, memory: SmoothedMemory) -> float:
+    return stopping_point(design.profile, memory.profile)
+
+
+@settle.register(SmoothedDesign)
+def _settle_smoothed(design: SmoothedDesign, memory: SmoothedMemory, value: float) -> None:
+    settle(design.profile, memory.profile, value)
+    for i in range(memory.p.size):
+        memory.p[i] = value
+        memory.v[i] = memory.a[i] = memory.jerk[i] = 0.0
+    for i in range(memory.changes.size):
+        memory.changes[i] = 0.0
+
+
 @dataclass(frozen=True)
 class ProfileGenerator:
     """A prefilter that moves to r within limits of speed, acceleration and jerk, on line.
@@ -359,11 +431,15 @@ class ProfileGenerator:
     ----------
     v_max, a_max, j_max
         limits of speed [y-unit/s], acceleration [y-unit/s²] and jerk [y-unit/s³] of the reference.
+    smoothing
+        time of which the mean of the move is taken [s], rounded to samples; it is added to the
+        duration, and there is a fourth derivative; none by default.
 
     Raises
     ------
     ValueError
-        for a limit that is not positive.
+        for a limit that is not positive, a smoothing that is negative, or in ``design`` one of more
+        than ten million samples.
 
     Notes
     -----
@@ -386,24 +462,37 @@ class ProfileGenerator:
     v_max: float
     a_max: float
     j_max: float
+    smoothing: float = 0.0
 
     def __post_init__(self) -> None:
         checks.positive("v_max", self.v_max, "y-unit/s")
         checks.positive("a_max", self.a_max, "y-unit/s²")
         checks.positive("j_max", self.j_max, "y-unit/s³")
+        checks.non_negative("smoothing", self.smoothing, "s")
 
     @property
     def derivatives(self) -> int:
-        """Number of derivatives of its output: three."""
-        return 3
+        """Number of derivatives of its output: three, with smoothing four."""
+        return 4 if self.smoothing > 0.0 else 3
 
-    def design(self, dt: float) -> ProfileDesign:
+    def design(self, dt: float) -> ProfileDesign | SmoothedDesign:
         """Return the parameters for a sample time [s]."""
         dt = checks.positive("dt", dt, "s")
-        return ProfileDesign(float(self.v_max), float(self.a_max), float(self.j_max), dt)
+        plain = ProfileDesign(float(self.v_max), float(self.a_max), float(self.j_max), dt)
+        if not self.smoothing > 0.0:
+            return plain
+        if self.smoothing / dt > _MOST_SAMPLES:
+            rule = f"must be at most {_MOST_SAMPLES} samples"
+            raise ValueError(f"smoothing = {self.smoothing!r} s with dt = {dt!r} s: {rule}")
+        length = max(round(self.smoothing / dt), 1)
+        return SmoothedDesign(plain, length, length * dt)
 
-    def memory(self, design: ProfileDesign) -> ProfileMemory:
+    def memory(self, design: ProfileDesign | SmoothedDesign) -> ProfileMemory | SmoothedMemory:
         """Return the state at rest at zero."""
+        plain = design.profile if isinstance(design, SmoothedDesign) else design
         memory = ProfileMemory(np.zeros(PARTS), np.zeros(PARTS), ProfileLoop.zeros())
-        settle(design, memory, 0.0)
-        return memory
+        settle(plain, memory, 0.0)
+        if not isinstance(design, SmoothedDesign):
+            return memory
+        p, v, a, jerk = np.zeros((4, design.length))
+        return SmoothedMemory(memory, p, v, a, jerk, np.zeros(1), np.zeros(4))
