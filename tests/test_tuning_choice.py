@@ -281,11 +281,21 @@ def test_a_feedforward_is_that_of_the_plant_with_the_delay_of_u() -> None:
     given = ql.Feedforward.rigid(2.0)
     assert _by_model(given, linear, 0.1) is given
     assert not _by_model(True, linear, 0.0).delay  # type: ignore[union-attr]
-    own = _of_axis(given_plants(AXIS, DT, delay=0.1, actuator_lag=0.02), True)
+    own = _of_axis(given_plants(AXIS, DT, delay=0.1, actuator_lag=0.02), True, False)
     assert own is not None
     assert own.coefficients[1:3] == pytest.approx((0.125, 0.25))
     assert own.delay == pytest.approx(0.12)
-    assert _of_axis(given_plants(LAG, DT), True) is None
+    assert _of_axis(given_plants(LAG, DT), True, False) is None
+    two_masses = ([2.0, 0.1, 50.0], [2.0, 0.3, 150.0, 0.0, 0.0])
+    flat = _of_axis(given_plants(two_masses, DT), True, True)
+    assert flat is not None
+    assert flat.coefficients == pytest.approx((0.0, 0.0, 3.0, 0.006, 0.04))
+    assert flat.numerator == pytest.approx((1.0, 0.002, 0.04))
+    assert flat.derivatives == 4
+    slow_zero = ([1.0, 1.0], [1.0, 0.2, 90.0, 0.0, 0.0])  # y would run far ahead of r
+    rigid = _of_axis(given_plants(slow_zero, DT), True, True)
+    assert rigid is not None
+    assert (len(rigid.coefficients), rigid.numerator, rigid.derivatives) == (3, (1.0,), 3)
     with pytest.raises(
         ValueError, match="feedforward: pi, pid has none; give a structure that has"
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -460,7 +461,7 @@ def test_a_profile_generator_moves_an_axis_within_its_room() -> None:
 def test_profiles_are_tried_from_the_quickest_on() -> None:
     """Three shares of the room, each with the ramps that are given."""
     axis = Axis(0.125, 0.25)
-    tried = [*reference._profiles(axis, 2.0, 0.5, (4 * DT, 0.3, 0.9))]
+    tried = [*reference._profiles(axis, 2.0, 0.5, [(4 * DT, 0.0), (0.3, 0.1), (0.9, 0.0)])]
     times = [reference._duration(each, 2.0) for each in tried]
     assert times == sorted(times)
     assert len(tried) == 9
@@ -478,6 +479,8 @@ def test_the_table_of_a_prefilter_has_its_numbers() -> None:
     profile = ql.controllers.ProfileGenerator(1.0, 2.0, 3.0)
     assert prefilter_table(profile)["kind"] == "profile-generator"
     assert prefilter_table(profile)["a_max"] == 2.0
+    assert "smoothing" not in prefilter_table(profile)
+    assert prefilter_table(replace(profile, smoothing=0.5))["smoothing"] == 0.5
     step = StepFigures(1.0, 0.0, 0.03, 1.5, 0.02, 4.0, 0.0)
     lines = Judged(
         pi(), model, step, None, None, None, (Overload(1.4, 2.0, 0.1, 3.0, 1.0),), ("NOT so",)

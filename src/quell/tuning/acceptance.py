@@ -167,7 +167,8 @@ def _described(prefilter: Any) -> str:
 def prefilter_table(prefilter: Any) -> dict[str, Any]:
     """Return the table of a prefilter in a setup file."""
     model = isinstance(prefilter, ReferenceModel)
-    known = {key: value for key, value in vars(prefilter).items() if value != math.inf}
+    without = {"rate_limit": math.inf, "smoothing": 0.0}
+    known = {key: value for key, value in vars(prefilter).items() if value != without.get(key)}
     return {"kind": "reference-model" if model else "profile-generator"} | known
 
 

@@ -9,10 +9,14 @@ and of the v_max those are taken with which the largest step of the scenario tak
 ``share`` and the ramp t_j of the acceleration are tried in simulations of the file: the quickest
 move that keeps u within its limits and overshoots by 5 % at most.
 
-Of an axis with a resonance the ramp of the acceleration takes whole periods of the lowest mode:
-its ends then cancel each other in the mode (Singer & Seering, *J. Dyn. Syst. Meas. Control* 112,
-1990). A small step behind a generator is quicker than the mode, and feedforward of the whole
-inertia then moves the motor alone: so smaller steps have to overshoot little, too.
+Of an axis with a resonance a controller has the feedforward of the flat output, with which a move
+leaves no mode swinging (``controllers/feedforward.py``). It needs four derivatives, so the move is
+smoothed, and the ramp of the acceleration is a part of a period of the lowest mode. Beside them
+ramps of whole periods are tried, for a controller with the inertia alone: the ends of a ramp then
+cancel each other in the mode (Singer & Seering, *J. Dyn. Syst. Meas. Control* 112, 1990). A small
+step behind a generator is quicker than the mode: what it needs beyond the inertia may reach a limit
+of u, and feedforward of the whole inertia moves the motor alone. So smaller steps have to overshoot
+little, too.
 
 Another plant gets a ``ReferenceModel``, the fastest with which u keeps within its limits and the
 step overshoots by 5 % at most. So does an axis for which no generator is quicker. A reference model
@@ -52,9 +56,12 @@ _NO_U = 1e-6
 # the acceleration: in samples and in time constants of the loop. Chosen by hand; each is simulated.
 _SHARES, _MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
 _SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
-# Beside a resonance: in periods of it, and the shares of the step that are looked at, too, for so
-# many periods behind so many samples.
-_PERIODS, _SMALLER, _RINGING, _BEFORE = (1.0, 1.5, 2.0), (0.3, 0.1, 0.03), 60.0, 10
+# Beside a resonance: ramps and smoothing in periods of it.
+_PERIODS = (
+    (0.3, 0.1), (0.15, 0.3), (0.3, 0.3), (0.6, 0.3), (1.0, 0.3), (1.0, 0.0), (1.5, 0.0), (2.0, 0.0)
+)  # fmt: skip
+# The shares of the step that are looked at there, too, for so many periods behind so many samples.
+_SMALLER, _RINGING, _BEFORE = (0.3, 0.1, 0.03), 60.0, 10
 # Steps of v_max between nothing and what the room allows. Without viscous friction u bounds no
 # speed: then v_max is this multiple of the one that the largest step reaches.
 _SPEEDS, _FASTER = 40, 10.0
@@ -181,9 +188,10 @@ def profile_for(
     if period > 0.0:
         how = max(_RINGING * period, _AFTER * tau), _BEFORE
         small = [written.stepping(share * step, *how) for share in _SMALLER]
-        ramps = [n * period for n in _PERIODS]
+        ramps = [(ramp * period, smoothing * period) for ramp, smoothing in _PERIODS]
     else:
-        ramps = [*(n * written.dt for n in _SAMPLES), *(n * tau for n in _CONSTANTS)]
+        plain = *(n * written.dt for n in _SAMPLES), *(n * tau for n in _CONSTANTS)
+        ramps = [(ramp, 0.0) for ramp in plain]
     for generator in _profiles(axis, size, room, ramps):
         own = _duration(generator, size)
         last = min(end, first + math.ceil((_LOOKED * own + _AFTER * tau) / written.dt))
@@ -216,17 +224,21 @@ def profile_for(
 
 
 def _profiles(
-    axis: Axis, size: float, room: float, ramps: Sequence[float]
+    axis: Axis, size: float, room: float, ramps: Sequence[tuple[float, float]]
 ) -> Iterator[ProfileGenerator]:
-    """Yield the generators to try, quick ones first, with these ramps of the acceleration [s]."""
-    made = [axis.profile(size, share * room, ramp) for share in _SHARES for ramp in ramps]
+    """Yield the generators to try, quick ones first, with these ramps and this smoothing [s]."""
+    made = [
+        replace(axis.profile(size, share * room, ramp), smoothing=smoothing)
+        for share in _SHARES
+        for ramp, smoothing in ramps
+    ]
     yield from sorted(made, key=lambda each: _duration(each, size))
 
 
 def _duration(generator: ProfileGenerator, size: float) -> float:
     """Return how long a move from rest takes [s]."""
     v, a, j = generator.v_max, generator.a_max, generator.j_max
-    return LimitedMove(size, v, a, j).duration
+    return LimitedMove(size, v, a, j).duration + generator.smoothing
 
 
 def _with(written: Written, controller: Controller, prefilter: Any, last: int) -> StepFigures:

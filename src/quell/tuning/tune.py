@@ -284,7 +284,7 @@ def tune(
     by_default &= not (isinstance(written, Written) and written.moves)
     by_default &= bool(set(names) & set(FEEDING_FORWARD))
     if by_default and math.isfinite(u_limits[1] - u_limits[0]):
-        forward = _of_axis(given, written)
+        forward = _of_axis(given, written, bool(resonances(model)))
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task)
@@ -405,7 +405,8 @@ def _inputs(
             f"reference = {reference!r}: must be a signal of quell.signals, whose derivatives the "
             "feedforward uses"
         )
-    return Inputs(r, none, feedforward.linear_part(reference, t, plants.dt), load=load)
+    followed, u_ff = feedforward.linear_part(reference, t, plants.dt)
+    return Inputs(followed, none, u_ff, load=load)
 
 
 # ---- Options without effect ----
@@ -609,18 +610,27 @@ def _file(
     return tables, Loop(file, linear, task.model, plants, limits, at, shaped)
 
 
-def _of_axis(given: Given, written: Written | bool) -> Feedforward | None:
+def _of_axis(given: Given, written: Written | bool, flexible: bool) -> Feedforward | None:
     """Return the feedforward of an axis, which needs no u at rest; None for another plant.
 
-    Of a plant with zeros it is the rigid part: the series of its inverse would not end.
+    Of a plant with zeros it is the rigid part: the series of its inverse would not end. But one
+    with a resonance whose zeros swing, too, as a motor with a load behind a spring, has a flat
+    output, with which it is exact.
     """
     linear = LinearPlant.of(given.linear[0])
     if np.linalg.matrix_rank(linear.A) == linear.order:
         return None
     plant = written.plant if isinstance(written, Written) else linear
-    rigid = 2 if canonical(linear).zeros.size else min(linear.order, 3)
+    zeros = canonical(linear).zeros
+    rigid = 2 if zeros.size else min(linear.order, 3)
+    flexible = flexible and bool(np.all(zeros.imag != 0.0))
     try:
-        found = Feedforward.of(plant, terms=rigid, derivatives=3)
+        found = Feedforward.of(
+            plant,
+            terms=None if flexible else rigid,
+            derivatives=4 if flexible else 3,
+            flat=flexible,
+        )
     except ValueError:
         return None
     late = 0.0 if isinstance(written, Written) else float(given.delays[0]) + given.actuator_lag
