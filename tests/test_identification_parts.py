@@ -20,6 +20,7 @@ from quell.identification import (
     starts,
     validation,
 )
+from quell.identification.frequency_starts import continuous
 from quell.identification.gain_matrix import _of_u
 from quell.identification.model import (
     Structure,
@@ -512,7 +513,7 @@ def test_the_poles_of_an_impulse_response_are_found() -> None:
     np.testing.assert_allclose(sorted(starts._poles(g, 2).real), [0.5, 0.9], rtol=1e-8)
     assert starts._poles(np.full(40, np.nan), 2).size == 0
     assert starts._poles(g[:3], 2).size == 0
-    p = starts._continuous(np.array([0.9 + 0j, 1.1 + 0j, -0.5 + 0j, 0.5j]), 2)
+    p = continuous(np.array([0.9 + 0j, 1.1 + 0j, -0.5 + 0j, 0.5j]), 2)
     assert p[0] == pytest.approx(math.log(0.9) / 2)
     assert p[1] == pytest.approx(-math.log(1.1) / 2)
     assert p[2] == pytest.approx(-math.pi / 2)

@@ -92,6 +92,7 @@ def identify(
     from quell.commissioning import measured_records
     from quell.identification import alternatives as other_structures
     from quell.identification import identify
+    from quell.identification.result import NOTHING_HELD_OUT
 
     how = read.columns, dt, read.time_unit, read.max_size
     if len(data) == 1 and (table := frequencies_in(data[0], read)) is not None:
@@ -150,7 +151,7 @@ def identify(
         )
     _print(console, model, ", ".join(path.name for path in data))
     if model.held_from == model.y.size and of_model.held_out is None and not several:
-        print_line(console, "nothing is held out: u does not move at the end of the record")
+        print_line(console, NOTHING_HELD_OUT)
     if not several and _look_swapped(model, order, delays):
         print_line(console, "NOT: u and y look swapped: the reverse fits well; see --columns")
     others: tuple[Alternative, ...] = ()
@@ -195,7 +196,7 @@ def _of_table(
     table: FrequencyTable,
     name: str,
     order: int | None,
-    zeros: int,
+    zeros: int | None,
     integrators: int | None,
     delay: float | None,
     dt: float | None,
@@ -210,7 +211,7 @@ def _of_table(
     found: Any
     if table.response is None:
         assert table.power is not None
-        unused: dict[str, tuple[Any, Any]] = {"order": (order, None), "zeros": (zeros, 0)}
+        unused: dict[str, tuple[Any, Any]] = {"order": (order, None), "zeros": (zeros, None)}
         unused |= {"integrators": (integrators, None), "delay": (delay, None), "dt": (dt, None)}
         refuse(unused, "is for a table with phase; of this one the modes are found")
         found = modes_of_spectrum(table.omega, table.power)
@@ -219,7 +220,7 @@ def _of_table(
             table.omega,
             table.response,
             order,
-            None if order is None and not zeros else zeros,
+            zeros,
             integrators=integrators,
             delay=delay,
             deviation=table.deviation,

@@ -143,7 +143,8 @@ class ModelOptions:
     Parameters
     ----------
     zeros
-        Number of zeros; as many as poles if u acts on y at once.
+        Number of zeros; as many as poles if u acts on y at once. By default none, or two from order
+        4 on where the record shows a resonance with them.
     integrators
         Number of poles at s = 0; by default as many as the record shows.
     friction
@@ -158,7 +159,7 @@ class ModelOptions:
         where u does not move there.
     """
 
-    zeros: Whole = 0
+    zeros: WholeOrNone = None
     integrators: WholeOrNone = None
     friction: bool | None = None
     rest: bool | None = None

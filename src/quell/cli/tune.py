@@ -191,12 +191,11 @@ def from_frequencies(
         raise ValueError(f"{path.name}: has no sample time; give that of the controller (--dt)")
     of_time = only_in_time(asked.read, asked.model)
     refuse(of_time, "is for a record in time; this is a table of frequencies")
-    zeros = asked.model.zeros
     found = identify_frequencies(
         table.omega,
         table.response,
         asked.order,
-        None if asked.order is None and not zeros else zeros,
+        asked.model.zeros,
         integrators=asked.model.integrators,
         deviation=table.deviation,
     )

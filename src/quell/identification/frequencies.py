@@ -240,6 +240,13 @@ def frequency_response(
     return _welch(u, y, r, dt, 8 if segments is None else segments)
 
 
+def hold_of(s: NDArray[Any], dt: float | None) -> NDArray[Any] | float:
+    """Return the response of a hold of u for ``dt``, 1 without one."""
+    if dt is None:
+        return 1.0
+    return np.asarray(np.exp(-0.5 * s * dt) * np.sinc(s.imag * dt / (2.0 * np.pi)))
+
+
 def _welch(u: Vector, y: Vector, r: Vector, dt: float, segments: int) -> FrequencyResponse:
     from scipy.signal import csd, welch
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.files import nonfinite_to_none
+from quell.identification.frequencies import hold_of
 from quell.identification.model import WITHIN_95, Root
 from quell.identification.result import (
     describe_root,
@@ -201,13 +202,6 @@ def _root_json(root: Root) -> dict[str, float]:
     names = ("real_std", "imag_std", "omega", "damping")
     place = {"real": root.value.real, "imag": root.value.imag}
     return place | {name: getattr(root, name) for name in names}
-
-
-def hold_of(s: Complex, dt: float | None) -> Complex | float:
-    """Return the response of a hold of u for ``dt``, 1 without one."""
-    if dt is None:
-        return 1.0
-    return np.asarray(np.exp(-0.5 * s * dt) * np.sinc(s.imag * dt / (2.0 * np.pi)))
 
 
 def _faults(poles: tuple[Root, ...], zeros: tuple[Root, ...], omega: Vector) -> list[str]:

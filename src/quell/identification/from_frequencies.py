@@ -9,10 +9,8 @@ the logarithm, ``e = ln G_model − ln G``, whose parts are the relative error o
 error of the phase: a resonance and its foot count alike. The derivatives of ``ln G`` by ``ln ω``,
 ``ζ``, ``ln K`` and τ are sums over sections, so ``scipy.optimize.least_squares`` has them exactly.
 
-Starts are found by vector fitting (Gustavsen & Semlyen, *IEEE Trans. Power Delivery* 14, 1999):
-with known poles p_i the equation ``(1 + Σ c_i/(s − p_i)) G = Σ r_i/(s − p_i) + d`` is linear, and
-the zeros of its first factor are better poles. Of the zeros of G the small ones are kept. A delay
-is tried at several values up to the slope of the phase.
+Starts are found by vector fitting (``vector_fitting``); of the zeros of G the small ones are kept.
+A delay is tried at several values up to the slope of the phase.
 
 Points may have deviations of their own; else each is weighted by how much its neighbours scatter.
 Neighbours whose errors are alike, as those of a model that is not quite right, are fewer points:
@@ -31,23 +29,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.identification.frequencies import hold_of
 from quell.identification.frequency_model import (
     DEVIATIONS,
     MOST_ORDER,
     OUTSIDE,
     POOR,
     FrequencyModel,
-    hold_of,
 )
 from quell.identification.model import gain_interval, poles_of, zeros_of
+from quell.identification.vector_fitting import ROUNDS, vector_fit
 from quell.quantities import UNKNOWN, Signals
 from quell.types import Matrix, Vector
 
 Complex = NDArray[Any]
 
 _MOST_INTEGRATORS = 2
-# Rounds of vector fitting, delays that are tried, and those that are refined. Chosen by hand.
-_ROUNDS, _DELAYS, _KEPT = 12, 12, 2
+# Rounds of vector fitting on the way, delays that are tried, and those that are refined. By hand.
+_FEW_ROUNDS, _DELAYS, _KEPT = 4, 12, 2
 # Errors of delays up to this factor of the least may become the least. By hand.
 _NEARLY = 2.0
 # Least relative error that counts: that of five digits, as tables have. Chosen by hand.
@@ -339,7 +338,7 @@ def _delays(data: _Data, order: int) -> list[float]:
 
 
 def _vf_error(data: _Data, order: int, delay: float) -> float:
-    poles, roots = _vector_fit(data, order, delay, 4)
+    poles, roots = _vector_fit(data, order, delay, _FEW_ROUNDS)
     with np.errstate(all="ignore"):
         s = data.s[:, None]
         model = np.sum(np.log(s - roots), axis=1) - np.sum(np.log(s - poles), axis=1)
@@ -353,84 +352,12 @@ def _vf_error(data: _Data, order: int, delay: float) -> float:
 
 
 def _vector_fit(
-    data: _Data, order: int, delay: float, rounds: int = _ROUNDS
+    data: _Data, order: int, delay: float, rounds: int = ROUNDS
 ) -> tuple[Complex, Complex]:
     """Return poles and zeros of a rational model of ``order``, as many of both."""
-    s, H = data.s, np.exp(data.log + data.s * delay)
-    weight = 1.0 / (np.abs(H) * data.std)
-    low, high = abs(s[0]), abs(s[-1])
-    pairs = np.geomspace(low, high, order // 2 + 2)[1:-1] if order > 1 else np.zeros(0)
-    poles = np.concatenate([pairs * (-0.02 + 1j), pairs * (-0.02 - 1j)])
-    if order % 2:
-        poles = np.append(poles, -math.sqrt(low * high))
-    for _ in range(rounds):
-        basis, real = _basis(s, poles)
-        n = real.size
-        left = np.hstack([basis, np.ones((s.size, 1)), -basis * H[:, None]]) * weight[:, None]
-        right = H * weight
-        x = _solved(left, right)
-        A, b = _state(real)
-        poles = np.linalg.eigvals(A - np.outer(b, x[n + 1 :]))
-        poles = np.where(poles.real > 0.0, -poles.conjugate(), poles)
-        poles = _cleaned(poles)
-    basis, real = _basis(s, poles)
-    left = np.hstack([basis, np.ones((s.size, 1))]) * weight[:, None]
-    x = _solved(left, H * weight)
-    A, b = _state(real)
-    d = x[-1] or 1e-12
-    roots = _cleaned(np.linalg.eigvals(A - np.outer(b, x[:-1]) / d))
-    return poles, roots
-
-
-def _cleaned(roots: Complex) -> Complex:
-    """Return roots, the pairs next to each other and exact; no root is at zero."""
-    roots = np.asarray(roots, dtype=np.complex128)
-    upper = roots[roots.imag > 1e-9 * np.abs(roots)]
-    real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
-    real = np.where(np.abs(real) < 1e-9, -1e-9, real)
-    return np.concatenate([np.column_stack([upper, upper.conjugate()]).ravel(), real])
-
-
-def _basis(s: Complex, poles: Complex) -> tuple[Complex, Complex]:
-    """Return the columns of the partial fractions with real coefficients, and ordered poles."""
-    columns, i = [], 0
-    while i < poles.size:
-        p = poles[i]
-        if p.imag != 0.0:
-            one, other = 1.0 / (s - p), 1.0 / (s - p.conjugate())
-            columns += [one + other, 1j * (one - other)]
-            i += 2
-        else:
-            columns.append(1.0 / (s - p))
-            i += 1
-    return np.column_stack(columns), poles
-
-
-def _state(poles: Complex) -> tuple[Matrix, Vector]:
-    """Return A and b of the real partial fractions."""
-    n = poles.size
-    A: Matrix = np.zeros((n, n))
-    b: Vector = np.zeros(n)
-    i = 0
-    while i < n:
-        p = poles[i]
-        if p.imag != 0.0:
-            A[i : i + 2, i : i + 2] = [[p.real, p.imag], [-p.imag, p.real]]
-            b[i] = 2.0
-            i += 2
-        else:
-            A[i, i], b[i] = p.real, 1.0
-            i += 1
-    return A, b
-
-
-def _solved(left: Complex, right: Complex) -> Vector:
-    """Return the real least-squares solution of a complex equation."""
-    both = np.vstack([left.real, left.imag])
-    size = np.linalg.norm(both, axis=0)
-    size = np.where(size > 0.0, size, 1.0)
-    target = np.concatenate([right.real, right.imag])
-    return np.asarray(np.linalg.lstsq(both / size, target, rcond=1e-13)[0] / size)
+    H = np.exp(data.log + data.s * delay)
+    found = vector_fit(data.s, H, 1.0 / (np.abs(H) * data.std), order, rounds)
+    return found.poles, found.zeros
 
 
 def _sections(roots: Complex) -> tuple[tuple[float, ...], list[float], list[float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,11 +12,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.identification.delays import delayed
+from quell.identification.frequency_starts import resonant_poles
 from quell.identification.model import (
     Root,
     Structure,
+    chains,
     free_run,
     gain_interval,
+    nonzero_lengths,
     poles_of,
     zeros_of,
 )
@@ -44,6 +49,9 @@ from quell.types import Matrix, Vector
 
 # Share of a record that is held out, and longest delay at first [samples], by default: by hand.
 _HELD_OUT, _MOST_DELAY = 0.3, 20
+# Held-out samples that have a spectrum, and the power of u before them, relative to that in them,
+# which is none. By hand.
+_LEAST_SPECTRUM, _MISSING = 64, 0.01
 # Relative error of a range of delays by the rounding of the sample time.
 _ROUNDED = 1e-9
 
@@ -112,6 +120,11 @@ def delay_range(delay: Any, dt: float, size: int) -> tuple[float, float]:
     """
     if delay is None:
         return 0, max(min(_MOST_DELAY, size // 4), 0)
+    if isinstance(delay, str):
+        raise ValueError(
+            f"delay = {delay!r}: must be a number of seconds, two of them to search between, None "
+            f'to search, or "{_IF_NEEDED}"'
+        )
     if np.ndim(delay) == 0:
         samples = checks.non_negative("delay", delay, "s") / dt
         samples = round(samples) if abs(samples - round(samples)) <= _ROUNDED else samples
@@ -139,8 +152,9 @@ def first_held_out(
             f"held_out = {held_out!r}: goes with one record; of several give one as validation"
         )
     held = 0 if records.samples else int(share * u.size)
-    if held_out is None and held and _rests_at_end(u, held):
-        held = 0
+    if held_out is None and held:
+        stands = np.ptp(y[-held:]) == 0.0  # as of a saturated sensor
+        held *= not (stands or _rests_at_end(u, held) or _moves_otherwise(u, held))
     held_from = u.size - held
     if held_from < least:
         raise ValueError(
@@ -170,6 +184,22 @@ def _rests_at_end(u: Vector, held: int) -> bool:
     return bool(np.ptp(u[-held:]) == 0.0 or np.ptp(u[:-held]) == 0.0)
 
 
+def _moves_otherwise(u: Vector, held: int) -> bool:
+    """Return whether the frequencies of u in held-out samples are not in those for the fit.
+
+    So it is at the end of a chirp: what the fit has not seen says nothing about it.
+    """
+    from scipy.signal import welch
+
+    if held < _LEAST_SPECTRUM:
+        return False
+    before, held_out = (
+        welch(part - np.mean(part), nperseg=held)[1] for part in (u[:-held], u[-held:])
+    )
+    missing = before < _MISSING * held_out
+    return bool(np.sum(held_out[missing]) > 0.5 * np.sum(held_out))
+
+
 # ---- The public function identify ----
 
 _METHODS = (
@@ -179,6 +209,8 @@ _METHODS = (
 # Number of lags in the tests of the error, fewer for short records: chosen by hand.
 _LAGS = 50
 _IF_NEEDED: Literal["if needed"] = "if needed"
+ZEROS, LEAST_WITH_ZEROS = 2, 4
+"""Zeros of a flexible axis that is measured where u acts, and least order in which they are."""
 # How often first samples are left out: with u of before in them, the delay is not found at once.
 _CUTS = 3
 # Most rounds in which samples at a limit are bounded, and the change of y, as a share of its range,
@@ -195,7 +227,7 @@ def identify(
     y: Any,
     dt: float,
     order: int = 4,
-    zeros: int = 0,
+    zeros: int | None = None,
     *,
     integrators: int | None = None,
     delay: float | tuple[float, float] | Literal["if needed"] | None = "if needed",
@@ -232,7 +264,10 @@ def identify(
     order, zeros
         number of poles n, 1 to 8, and of zeros, at most n. With n zeros u also acts on y at once
         (direct feedthrough, as for an acceleration behind a force). Such a model describes and
-        simulates the record, but is no plant for an observer or a simulated loop.
+        simulates the record, but is no plant for an observer or a simulated loop. By default there
+        are none, or two, from order 4 on, where the model without them has ``shortcomings`` and the
+        frequency response shows a resonance, as of a motor with its encoder before a flexible
+        coupling, if they explain more than chance.
     integrators
         number of poles at s = 0. By default a pole is set there if it can't be distinguished from s
         = 0: if it is within three of its standard deviations, or slower than ten times the record;
@@ -297,23 +332,39 @@ def identify(
     >>> found.num.round(6).tolist(), found.den.round(6).tolist()
     ([3.0], [1.0, 2.0])
     """
-    none = 0.0 if delay == _IF_NEEDED else delay
-    options = Options(order, zeros, integrators, none, bias, friction, rest, held_out, horizon)
+    wants_delay, wants_zeros = delay == _IF_NEEDED, zeros is None
+    none = 0.0 if wants_delay else delay
+    count = 0 if zeros is None else zeros
+    options = Options(order, count, integrators, none, bias, friction, rest, held_out, horizon)
     records = given_records(u, y)
-
-    def fitted(options: Options, progress: Callable[[float], None] | None) -> Identified:
-        return identified(records, dt, options, reference, validation, signals, progress=progress)
-
-    if delay != _IF_NEEDED:
-        return fitted(options, progress)
-    found = fitted(options, part_of(progress, 0.0, 0.3, 1.0))
-    if not found.shortcomings or found.early or found.bends:
+    given = reference, validation, signals
+    found = identified(records, dt, options, *given, progress=part_of(progress, 0.0, 0.3, 1.0))
+    wants_zeros = wants_zeros and order >= LEAST_WITH_ZEROS and not (friction or records.samples)
+    good = not found.shortcomings
+    if found.bends or (good and not (wants_zeros and not found.residuals.white)):
         return found
-    try:
-        late = fitted(options._replace(delay=None), part_of(progress, 0.3, 1.0, 1.0))
-    except ValueError:  # too short a record for it
-        return found
-    return late if late.delay > 0.0 and _explains_more(found, late) else found
+    # With a delay, and with zeros and poles that the frequency response shows, in turn.
+    tried: list[tuple[Options, Known | None]] = []
+    late = options._replace(delay=None) if wants_delay else options
+    if wants_zeros:
+        most = int(delay_range(late.delay, dt, records.u.size)[1])
+        part = standing(records.y, resolution_of(records.y), records.u).longest_free
+        with one_blas_thread():
+            poles = resonant_poles(records.u[part], records.y[part], order, min(most, _MOST_DELAY))
+        if poles is not None:
+            known = Known(poles, delay_range(late.delay, dt, records.u.size))
+            tried.append((late._replace(zeros=ZEROS), known))
+    if wants_delay and not good:
+        tried.append((late, None))
+    for i, (other, start) in enumerate(tried):
+        share = part_of(progress, 0.3 + 0.7 * i / len(tried), 0.3 + 0.7 * (i + 1) / len(tried), 1.0)
+        with contextlib.suppress(ValueError):  # too short a record for it
+            model = identified(records, dt, other, *given, start, share)
+            if (model.delay > 0.0 or other.zeros > count) and _explains_more(found, model):
+                found = model
+        if not found.shortcomings:
+            break
+    return found
 
 
 def _explains_more(found: Identified, late: Identified) -> bool:
@@ -357,7 +408,7 @@ def identified(
     given = dt, options, reference, validation, signals, known, progress
     at_limits = None
     if not records.samples and reference is None:
-        at_limits = standing(records.y, resolution_of(records.y))
+        at_limits = standing(records.y, resolution_of(records.y), records.u)
     if at_limits is not None and at_limits.is_usable:
         return _bounded(records, at_limits, given)
     found = whole = _identified(records, *given)
@@ -379,7 +430,7 @@ def identified(
 
 def _bounded(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> Identified:
     """Return the result where y stands at a limit, which is bounded there and not fitted."""
-    y, model = records.y, None
+    y, model = _over_limits(records, at_limits, given), None
     before: list[tuple[Vector, Vector]] = []
     for _ in range(_ROUNDS):
         found = _identified(records._replace(y=y), *given)
@@ -421,6 +472,27 @@ def _bounded(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> I
         poles=poles,
         zeros=zeros,
     )
+
+
+def _over_limits(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> Vector:
+    """Return y with a model beyond its limits, that of the longest part that is at none.
+
+    From y as it is the search may lead to a model of the limits.
+    """
+    u, y, part, options = records.u, records.y, at_limits.longest_free, given[1]
+    try:
+        options = options._replace(held_out=0.0)
+        model = _identified(Records(u[part], y[part], ()), given[0], options, *given[2:])
+    except ValueError:  # too short
+        return y
+    late = delayed(u, model.delay / model.dt)
+    bank = chains(known_of(model).a, np.column_stack([late, np.ones(u.size)]))
+    columns = np.column_stack([bank[:, : model.num.size, 0], bank[:, 0, 1], bank[:, :, 2]])
+    columns /= nonzero_lengths(columns)
+    if not np.all(np.isfinite(columns)):
+        return y
+    theta = np.linalg.lstsq(columns[at_limits.free], y[at_limits.free], rcond=1e-12)[0]
+    return at_limits.bounded(y, columns @ theta)
 
 
 def known_of(found: Identified) -> Known:

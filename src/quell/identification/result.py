@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.identification.frequencies import FrequencyResponse, frequency_response
+from quell.identification.frequencies import FrequencyResponse, frequency_response, hold_of
 from quell.identification.model import (
     WITHIN_95,
     Root,
@@ -138,6 +138,12 @@ def draw_tests(axes: list[Any], residuals: Residuals, samples: int) -> None:
 
 
 # ---- The result of an identification ----
+
+NOTHING_HELD_OUT = (
+    "nothing is held out: at the end of the record u does not move, or at other frequencies than "
+    "before"
+)
+"""The line of a report where by default no samples are held out."""
 
 # Width of the smooth sign of the speed, relative to the RMS speed in the record: by hand, so that
 # creeping within it is far slower than motion.
@@ -428,11 +434,10 @@ class Identified:
         matter near half the sampling rate, are left out.
         """
         s = 1j * np.asarray(omega, dtype=np.float64)
-        hold = np.exp(-0.5 * s * self.dt) * np.sinc(s.imag * self.dt / (2.0 * np.pi))
         # What acts at once is not delayed by the hold.
         direct = self.num[0] if self.num.size == self.den.size else 0.0
         rest = np.polyval(self.num, s) / np.polyval(self.den, s) - direct
-        return (rest * hold + direct) * np.exp(-s * self.delay)
+        return (rest * hold_of(s, self.dt) + direct) * np.exp(-s * self.delay)
 
     def empirical(self, segments: int = 8) -> FrequencyResponse:
         """Return the frequency response of the record itself; see ``frequency_response``."""

@@ -22,6 +22,9 @@ from quell.types import Vector
 # Samples at a limit at least, times as many as at a value below it, and values of a signal that has
 # no levels. All chosen by hand.
 _FEWEST, _PILED, _VALUES = 10, 4.0, 20
+# Share of a rest at the begin in which u is looked at, and how often it moves through its range
+# in a rest at begin or end that is none. By hand.
+_FIRST, _SWINGS = 0.8, 1.0
 # Share of the samples beyond which too little is left.
 _MOST = 0.6
 
@@ -42,22 +45,37 @@ class Standing(NamedTuple):
         """Whether some samples are at a limit, and enough are not."""
         return 0 < self.samples <= _MOST * self.upper.size
 
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Where the signal is at no limit (N,)."""
+        return ~(self.upper | self.lower)
+
+    @property
+    def longest_free(self) -> slice:
+        """The longest part without a sample at a limit."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.free, [False]])))
+        i = int(np.argmax(edges[1::2] - edges[::2]))
+        return slice(int(edges[2 * i]), int(edges[2 * i + 1]))
+
     def bounded(self, y: Vector, model: Vector) -> Vector:
         """Return y with the model in place of a limit that it is beyond."""
         found = np.where(self.upper, np.maximum(y, model), y)
         return np.where(self.lower, np.minimum(y, model), found)
 
 
-def standing(x: Vector, resolution: float) -> Standing:
-    """Return where a signal stands at its limits; ``resolution`` is the step it is rounded to."""
+def standing(x: Vector, resolution: float, u: Vector | None = None) -> Standing:
+    """Return where a signal stands at its limits; ``resolution`` is the step it is rounded to.
+
+    A y that does not answer a ``u`` that moves stands at its limit, at begin and end, too.
+    """
     none = np.zeros(x.size, dtype=bool)
     held = resolution == 0.0 and np.median(np.abs(np.diff(x))) == 0.0
     if held or np.unique(x).size <= _VALUES:
         return Standing(none, none)
-    return Standing(_at_top(x, resolution), _at_top(-x, resolution))
+    return Standing(_at_top(x, resolution, u), _at_top(-x, resolution, u))
 
 
-def _at_top(x: Vector, resolution: float) -> NDArray[np.bool_]:
+def _at_top(x: Vector, resolution: float, u: Vector | None) -> NDArray[np.bool_]:
     """Return where a signal stands at its largest value; nowhere if it does not."""
     top, span = float(np.max(x)), float(np.ptp(x))
     same = max(0.25 * resolution, 1e-9 * span)
@@ -66,6 +84,12 @@ def _at_top(x: Vector, resolution: float) -> NDArray[np.bool_]:
     # A plant that rests at the begin or the end of a record may stand at an extreme, too.
     away = np.flatnonzero(~at)
     if away.size:
+        if u is not None and resolution == 0.0:
+            # A delay may be as long as the rest of the first part.
+            ends = u[: int(_FIRST * away[0])], u[away[-1] + 1 :]
+            moved = max(float(np.sum(np.abs(np.diff(part)))) for part in ends)
+            if moved > _SWINGS * float(np.ptp(u)) and np.sum(every) >= _FEWEST:
+                return every
         at[: away[0]] = at[away[-1] :] = False
     count = int(np.sum(at))
     if count < _FEWEST:

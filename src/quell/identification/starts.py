@@ -100,6 +100,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.identification.frequency_starts import continuous, poles_of_record
 from quell.identification.model import (
     Structure,
     autocorrelation,
@@ -405,8 +406,6 @@ _LONGER = 3
 _EXTRA = 2
 # Relative singular value of the equations that counts as zero.
 _RANK_REDUCED = 1e-10
-# Slowest and fastest pole that is passed on [1/sample]: beyond any that samples show.
-_SLOWEST, _FASTEST = 1e-6, 10.0
 
 
 def reduced_models(structure: Structure, v: Matrix, y: Vector) -> Iterator[Vector]:
@@ -419,7 +418,7 @@ def reduced_models(structure: Structure, v: Matrix, y: Vector) -> Iterator[Vecto
         for order in (structure.order, structure.order + _EXTRA):
             poles = _poles(response, order)
             if poles.size:
-                yield _with_poles(structure, _continuous(poles, every))
+                yield _with_poles(structure, continuous(poles, every))
         every *= _FACTOR
 
 
@@ -454,15 +453,6 @@ def _poles(g: Vector, order: int) -> NDArray[np.complex128]:
     root = np.sqrt(S[:order])
     A = (U[:, :order] / root).T @ g[entries + 1] @ (V[:order].T / root)
     return np.asarray(np.linalg.eigvals(A), dtype=complex)
-
-
-def _continuous(z: NDArray[np.complex128], every: int) -> NDArray[np.complex128]:
-    """Return stable poles [1/sample] of poles z of averages over ``every`` samples."""
-    with np.errstate(all="ignore"):
-        p = np.log(z) / every
-    # A real z that is not positive has no real logarithm: a pole at half the sampling rate.
-    p = np.where((z.imag == 0.0) & (z.real <= 0.0), -np.pi / every, p)
-    return np.asarray(-np.clip(np.abs(p.real), _SLOWEST, _FASTEST) + 1j * p.imag)
 
 
 def _with_poles(structure: Structure, poles: NDArray[np.complex128]) -> Vector:
@@ -509,7 +499,11 @@ def best_start(structure: Structure, v: Matrix, y: Vector) -> Start:
     ]
     if _agree(found, y) and _best(found).cost <= _SMALL * float(np.var(y)):
         return Start(_best(found), True)
-    others = itertools.chain(filtered[2:], reduced_models(structure, v, y))
+    # A pair of poles alone is found from the other starts.
+    wanted = structure.order > 2
+    shown = poles_of_record(v[:, 0], y, structure.order) if wanted else []
+    of_record = (_with_poles(structure, poles) for poles in shown)
+    others = itertools.chain(filtered[2:], reduced_models(structure, v, y), of_record)
     starts = sorted((refined(structure, theta, v, y) for theta in others), key=lambda pair: pair[0])
     near = [descend(structure, theta, v, y, _FEW_STEPS) for _, theta in starts[:_KEPT]]
     near.sort(key=lambda one: one.cost)

@@ -32,7 +32,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quell.identification.identify import Options, Records, identified, known_of
+from quell.identification.identify import (
+    LEAST_WITH_ZEROS,
+    ZEROS,
+    Options,
+    Records,
+    identified,
+    known_of,
+)
 from quell.identification.output_error import likelihood_ratio
 from quell.identification.result import Identified
 from quell.parallel import part_of
@@ -53,8 +60,6 @@ _HINT = 0.5
 _RIGID = "order 2 with friction"
 # Least and largest order that ``identify`` fits, and least order in which friction has a place.
 _LEAST_ORDER, _MOST_ORDER, _LEAST_WITH_FRICTION = 1, 8, 2
-# The zeros of a flexible axis that is measured where u acts, and least order in which they are.
-_ZEROS, _LEAST_WITH_ZEROS = 2, 4
 
 
 OF_MODEL: Literal["of model"] = "of model"
@@ -190,9 +195,9 @@ def alternatives(
     doubtful = not found.explained or bool(found.undecided)
     if order < _MOST_ORDER and doubtful and not found.faults:
         tried.append((f"order {order + 1}", False, {"order": order + 1, "zeros": zeros + direct}))
-    if order >= _LEAST_WITH_ZEROS and zeros < _ZEROS and (not found.explained or found.faults):
-        name = f"order {order} with {_ZEROS} zeros"
-        tried.append((name, False, {"order": order, "zeros": _ZEROS}))
+    if order >= LEAST_WITH_ZEROS and zeros < ZEROS and (not found.explained or found.faults):
+        name = f"order {order} with {ZEROS} zeros"
+        tried.append((name, False, {"order": order, "zeros": ZEROS}))
     held_out = None if found.samples else 1.0 - found.held_from / found.y.size
     same = Options(
         order,

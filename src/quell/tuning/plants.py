@@ -34,7 +34,7 @@ import numpy as np
 
 from quell import checks
 from quell.identification import FrequencyModel, Measured, identify, not_told_apart
-from quell.identification.result import Identified, percent
+from quell.identification.result import NOTHING_HELD_OUT, Identified, percent
 from quell.identification.structures import fits_better
 from quell.lti.canonical import canonical
 from quell.parallel import part_of
@@ -285,7 +285,7 @@ class RecordModel:
         model = self.model
         found = model.describe().splitlines()
         if model.held_from == model.y.size and self.held_out is None:
-            found.append("nothing is held out: u does not move at the end of the record")
+            found.append(NOTHING_HELD_OUT)
         if self.larger is not None:
             key = "held out" if "held out" in model.fits else "estimation"
             found.append(
@@ -329,7 +329,7 @@ def _why_not(model: Identified) -> str:
 def record_model(
     record: Measured,
     order: int = _ORDER,
-    zeros: int = 0,
+    zeros: int | None = None,
     *,
     integrators: int | None = None,
     friction: bool | None = None,
@@ -369,7 +369,7 @@ def record_model(
             record.y,
             record.dt,
             poles,
-            min(zeros, poles - (zeros < order)),
+            None if zeros is None else min(zeros, poles - (zeros < order)),
             delay=delay,
             integrators=integrators,
             friction=friction,
