@@ -414,7 +414,8 @@ def test_the_report_says_what_is_not_held_out_and_what_a_larger_model_lacks() ->
     assert _report(None) == [
         "a",
         "b",
-        "nothing is held out: u does not move at the end of the record",
+        "nothing is held out: at the end of the record u does not move, or at other frequencies "
+        "than before",
         "order 4 has a fit of 97.5 instead of 88.0 % (estimation), but does not hold: it rings",
         "the record does not tell it from 'M', which is tuned for, too",
     ]

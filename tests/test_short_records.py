@@ -269,7 +269,7 @@ def test_a_delay_explains_more_where_it_is_there() -> None:
         ({}, {"delay": 0.3}, False, 1),
         ({"shortcomings": ("a",)}, {"delay": 0.3}, True, 2),
         ({"shortcomings": ("a",)}, {"delay": 0.0}, False, 2),
-        ({"shortcomings": ("a",), "early": 1}, {"delay": 0.3}, False, 1),
+        ({"shortcomings": ("a",), "early": 1}, {"delay": 0.3}, True, 2),
         ({"shortcomings": ("a",), "bends": True}, {"delay": 0.3}, False, 1),
         ({"shortcomings": ("a",)}, None, False, 2),
     ],
@@ -277,15 +277,15 @@ def test_a_delay_explains_more_where_it_is_there() -> None:
 def test_a_delay_is_looked_for_where_the_model_without_it_has_shortcomings(
     first: Any, late: Any, takes: bool, asked: int
 ) -> None:
-    """Not where y is early or bends; a record that is too short for it keeps the model without."""
+    """Not where y bends; a record that is too short for it keeps the model without."""
     none = {"shortcomings": (), "early": 0, "bends": False, "delay": 0.0}
     models = [SimpleNamespace(**{**none, **first})]
     models += [] if late is None else [SimpleNamespace(**{**none, **late})]
     calls: list[Any] = []
 
-    def identified(records: Any, dt: float, options: Any, *_: Any, progress: Any) -> Any:
+    def identified(records: Any, dt: float, options: Any, *rest: Any, progress: Any = None) -> Any:
         calls.append(options.delay)
-        progress(0.5)
+        (progress or rest[-1])(0.5)
         if len(calls) > len(models):
             raise ValueError("too short")
         return models[len(calls) - 1]

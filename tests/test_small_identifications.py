@@ -151,6 +151,7 @@ def test_a_model_has_the_units_of_its_record(
         assert other.fits[name] == pytest.approx(fit, abs=1e-4), name
 
 
+@pytest.mark.trial
 def test_a_delay_is_searched_in_whole_samples_and_in_parts() -> None:
     """Of 0.3 s between 0.2 and 0.4 s; the start of the record waits, so nothing is before it."""
     u = np.concatenate([np.zeros(6), binary(90)[6:]])

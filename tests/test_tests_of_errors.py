@@ -174,7 +174,7 @@ def test_a_misfit_is_looked_at_up_to_where_a_lead_could_cross_over() -> None:
     for delay in (6.0, 2.0):
         fit = Fit(G, ParameterEstimate(theta, np.eye(3), 1.0, True), delay, (delay, delay),
                   (delay, delay), np.zeros(3), True, AtRest(False, False, math.nan))  # fmt: skip
-        size, at = validation._misfit(fit, found, np.array([1e9]), 100)
+        size, at = validation._misfit(fit, found, np.array([1e9]), None, 100)
         omega = np.geomspace(2.0 * np.pi / 100, 0.6, 80)
         # The phase falls by the delay alone from the first frequency on, less 90°.
         fall = (omega - omega[0]) * (delay + 0.5)

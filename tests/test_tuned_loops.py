@@ -321,6 +321,7 @@ def test_bounds_that_contradict_each_other_are_named_with_the_least_excess() -> 
 # ---- what a result says
 
 
+@pytest.mark.trial
 def test_other_limits_give_what_a_tuning_with_them_gives() -> None:
     """The trade-off of M_ks at 2.7 and 3.3."""
     found = tune(LAG, "pi")

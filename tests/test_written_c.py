@@ -470,7 +470,7 @@ def test_numbers_of_an_image_are_written_and_read_by_their_kind() -> None:
     code = image_of(zeros=(9,))
 
     def add(at: int, values: Any, value: Any) -> None:
-        code._add(at, image_code._Part("x", np.array(values, dtype=float), value))
+        code._add(at, image_code._Part(np.array(values, dtype=float), value))
 
     add(0, [1.0, 2.0], Value(Array((1, 2), Number.REAL), "s->x"))
     add(2, [3.0], Value(Number.REAL, "s->a"))
@@ -517,7 +517,7 @@ def test_numbers_of_an_image_are_written_and_read_by_their_kind() -> None:
 def test_images_of_single_precision_have_one_word_for_a_number() -> None:
     """And no code for integers or arrays where there are none."""
     code = image_of(4, has_origin=True)
-    code._add(0, image_code._Part("x", np.array([1.0]), Value(Number.REAL, "s->a")))
+    code._add(0, image_code._Part(np.array([1.0]), Value(Number.REAL, "s->a")))
     text = "\n".join(code.functions())
     assert "memory_put_word(image, 32 + 4 * k, bits);" in text
     assert "const uint32_t bits = memory_get_word(image, 32 + 4 * k);" in text

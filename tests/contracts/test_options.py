@@ -101,6 +101,7 @@ _TWIN = (
     *_FIGURES,
 )
 _TWIN = (*_TWIN, "--y-min=-9", "--y-max=9")
+_EXPORT = (*_SETUP, "--out", "c")
 _PLANT = ("--num", "2", "--den", "1,1", "--dt", "0.05", *_FIGURES)
 _BENCHMARK = ("--controllers", "pid", *_FIGURES)
 _OF_SETUP = (*_SETUP, *_FIGURES)
@@ -174,7 +175,7 @@ CASES: dict[str, dict[str, Case]] = {
     "export": {
         "SETUP": ("other.toml",), "--to": ("--to", "fmu"), "--out": ("--out", "d"), "--name": ("--name", "servo"), "--precision": ("--precision", "single"), "--what": ("--what", "loop"),
         "--resolution": ("--resolution", "0.01"), "--memory": ("--memory", "servo.qllm"), "--accept": ("--accept",),
-        "--prove": ("--prove",),
+        "--prove": ("--prove",), "--spread": ((*_EXPORT, "--prove"), (*_EXPORT, "--prove", "--spread", "0.2")),
     },
     "studio": {"SETUP": (("--no-browser",), ("setup.toml", "--no-browser")), "--port": ("--port", "0"), "--browser": (_SETUP, (*_SETUP, "--no-browser"))},
     "doctor": {}, "completion": {"SHELL": (("bash",), ("fish",))},
