@@ -478,6 +478,7 @@ def test_the_report_of_b0_has_units_and_times() -> None:
     assert shown["interval_95"] == pytest.approx([2.804, 3.196])
 
 
+@pytest.mark.trial
 def test_the_deviation_of_a_bandwidth_follows_from_those_of_the_plant() -> None:
     """Of an exact plant it is none; of an uncertain delay by the slope of omega_c, as differences."""
     exact = result(covariance=np.zeros((4, 4)), lag=0.0, lag_std=0.0).omega_c(50.0, ratio=5.0)
@@ -791,6 +792,7 @@ def test_b0_has_the_units_of_its_record() -> None:
     assert other.shortcomings == one.shortcomings
 
 
+@pytest.mark.trial
 def test_a_delay_in_a_loop_is_found_beside_b0() -> None:
     """Two samples, within its deviation; the lag is none. By a search from fewer starts."""
     few = {"_RATES": (0.05,), "_GRID": 4, "_DENOMINATORS": 1, "_SHARES": (0.5,)}

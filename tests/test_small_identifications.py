@@ -323,6 +323,7 @@ def test_two_modes_come_with_the_larger_one_first_and_in_any_unit() -> None:
         (np.cos(np.arange(100.0)), 6, "modes"),
     ],
 )
+@pytest.mark.trial
 def test_a_record_that_does_not_ring_is_refused(y: Any, modes: Any, message: str) -> None:
     """At rest, a mere decay, too short for its modes, more modes than five."""
     with pytest.raises(ValueError, match=message):
