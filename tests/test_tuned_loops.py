@@ -122,10 +122,10 @@ def test_measures_are_those_of_an_independent_analysis() -> None:
     [
         ("pi-unfiltered", LAG, None),
         ("pi", LAGS, None),
-        ("bandwidths", LAG, 1),
-        ("bandwidths", ([1.0], [1.0, 0.3, 0.0]), 2),
-        ("half-gain", ([1.0], [1.0, 0.3, 0.0]), 2),
-        ("p-pi-notch", ([1.0], [1.0, 0.3, 0.0]), None),
+        pytest.param("bandwidths", LAG, 1, marks=pytest.mark.trial),
+        pytest.param("bandwidths", ([1.0], [1.0, 0.3, 0.0]), 2, marks=pytest.mark.trial),
+        pytest.param("half-gain", ([1.0], [1.0, 0.3, 0.0]), 2, marks=pytest.mark.trial),
+        pytest.param("p-pi-notch", ([1.0], [1.0, 0.3, 0.0]), None, marks=pytest.mark.trial),
     ],
 )
 def test_a_tuning_has_the_units_of_its_plant(structure: str, plant: Any, order: Any) -> None:
@@ -338,6 +338,7 @@ def test_other_limits_give_what_a_tuning_with_them_gives() -> None:
     assert repr(found) == f"Tuned pi:\n{text}"
 
 
+@pytest.mark.trial
 def test_a_guess_of_the_noise_has_a_curve_of_five_bounds() -> None:
     """Ten times the M_ks of the optimal PI controller, halves and doubles; more noise gives more k_i."""
     found = tune(LAG, "pi", constraints=None)
@@ -375,6 +376,7 @@ def test_the_setup_file_has_plant_scenario_and_controller() -> None:
     assert text.startswith("# pi, tuned by quell\n# constraints: M_s ≤ 1.6")
 
 
+@pytest.mark.trial
 def test_the_json_has_the_numbers_of_the_design() -> None:
     """As a file reads them: finite numbers, and None for what is infinite."""
     found = tune(LAG, "pi-unfiltered")

@@ -38,7 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.controllers.several import outputs_of
-from quell.export.exact_law import ExactLaw
+from quell.export.exact import ExactLaw
 from quell.plants.linear import DelayedPlant, EncodedPlant, LinearPlant
 
 MOST_PARTS = 20_000

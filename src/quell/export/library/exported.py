@@ -36,8 +36,8 @@ from quell.export.library.vectors import (
     golden_vectors,
     test_program,
 )
+from quell.export.loop_stability import Stability, stability
 from quell.export.proof import Proof, proof_files, prove
-from quell.export.stability import Stability, stability
 from quell.export.translate.text import checked_name
 from quell.files import check_folder, write_folder
 from quell.simulation.scenario import Scenario

@@ -1,6 +1,6 @@
 """Stability of an exported linear loop, and the effect of rounding, from the numbers of its C code.
 
-The law is that of ``exact_law.py``, the enclosure of the spectral radius that of ``enclosure.py``.
+The law is that of ``exact.py``, the enclosure of the spectral radius that of ``enclosure.py``.
 
 **Rounding.** Each operation of a step changes its result by at most ε of its size, ε = 2⁻⁵³ or
 2⁻²⁴. The same kernel runs with magnitudes in place of numbers, which gives a bound e_i of what
@@ -37,7 +37,7 @@ from quell.export.enclosure import (
     plant_of,
     radius_of,
 )
-from quell.export.exact_law import (
+from quell.export.exact import (
     PRECISIONS,
     Bounded,
     Exact,
