@@ -163,8 +163,16 @@ def test_axes_that_do_not_touch_have_the_larger_radius_of_both() -> None:
 def test_what_has_no_linear_law_or_does_not_fit_is_named() -> None:
     """Han's law, a schedule, a nonlinear plant, another number of signals, another dt, a spread."""
     han = adrc(2, feedback=ql.controllers.NonlinearFeedback(alpha=(0.5, 0.5), delta=0.1))
-    with pytest.raises(ValueError, match="its law is not linear"):
-        exact_law(han)
+    for bent in (han, adrc(2, held=ql.HeldPlant())):
+        with pytest.raises(ValueError, match="its law is not linear"):
+            exact_law(bent)
+    single = in_single_precision(adrc())
+    pairs = zip(exact_law(single, "single"), exact_law(adrc(), "single"), strict=True)
+    assert all(np.array_equal(one, other) for one, other in pairs)
+    with pytest.raises(ValueError, match="precision = 'double': this controller calculates in"):
+        exact_law(single)
+    with pytest.raises(ValueError, match="must be a controller, for example"):
+        exact_law("adrc")
     table = ql.controllers.Schedule(points=[0.0, 1.0], b0=[1.0, 2.0])
     with pytest.raises(ValueError, match="follow a schedule"):
         exact_law(adrc(b0=1.0, schedule=table))

@@ -55,6 +55,7 @@ from quell.kernels.functions import single
 from quell.kernels.linking import KERNEL_OPTIONS, in_both_precisions
 from quell.kernels.numba_internals import REMEDY
 from quell.kernels.single import in_single
+from quell.kernels.sized import remade
 from quell.learners.all_axes import NoiseGateOfAxes
 from quell.learners.base import Lag, NoiseGate, NoiseGateMemory
 from quell.learners.kalman import KalmanDesign, KalmanMemory, needs_carries
@@ -100,8 +101,7 @@ def _in_delta_form(design: Any) -> Any:
         pole = float(np.float32(design.pole))
         return design._replace(pole=pole, rise=1.0 - pole)
     if isinstance(design, tuple):
-        parts = map(_in_delta_form, design)
-        return type(design)(*parts) if hasattr(design, "_fields") else tuple(parts)
+        return remade(design, map(_in_delta_form, design))
     return design
 
 

@@ -41,7 +41,7 @@ from quell.kernels.dispatch import (
 )
 from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS
 from quell.kernels.numba_internals import pointer_add
-from quell.kernels.sized import layout_of
+from quell.kernels.sized import layout_of, remade
 from quell.plants.base import (
     Plant,
     PlantBatch,
@@ -187,8 +187,7 @@ class Stacked:
                 there[...] = part
                 return there
             if isinstance(part, tuple):
-                parts = [copy(entry) for entry in part]
-                return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+                return remade(part, map(copy, part))
             return part
 
         return copy(value)

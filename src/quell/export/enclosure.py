@@ -122,7 +122,7 @@ def _fmpq_matrix(rows: list[list[Fraction]], flint: Any) -> Any:
 
 def _balls(rows: Any, flint: Any) -> Any:
     """Return a matrix of balls: of numbers, or of pairs (middle, radius)."""
-    return flint.arb_mat([[_ball(each, flint) for each in row] for row in rows])
+    return flint.arb_mat(_rows(rows, flint))
 
 
 def _ball(number: Any, flint: Any) -> Any:

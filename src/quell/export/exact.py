@@ -30,17 +30,26 @@ from quell.controllers.axes_learning import (
     NoLearning,
     NoLearningMemory,
 )
-from quell.controllers.base import NO_LIMITS, Limits
+from quell.controllers.base import NO_LIMITS, Limits, check_controller
+from quell.controllers.held import NoHeldPlant
 from quell.controllers.law import AdrcDesign, AdrcState
 from quell.controllers.prefilters import without_prefilters
+from quell.controllers.safe_set import NoSafeSet
 from quell.controllers.schedule import is_scheduled
 from quell.controllers.several import control_all, outputs_of, references_of
 from quell.controllers.single import in_single_precision
+from quell.export.controller_source import is_in_single, parameters_of
 from quell.guard import UnguardedDesign, UnguardedMemory
+from quell.kernels.sized import remade
 from quell.learners.base import NoLearnerDesign, NoLearnerMemory
 
 PRECISIONS = {"double": 2.0**-53, "single": 2.0**-24}
 """Largest relative change of a number by rounding."""
+
+_NOT_LINEAR = (
+    "controller: its law is not linear (a nonlinear feedback, a nonlinear observer, a safe set or "
+    "the detection of a held plant); leave that out"
+)
 
 # ---- Numbers that run through the kernels ----
 
@@ -195,7 +204,7 @@ class Sample:
                 self._copied(each, f"{name}.{field}" if name else str(field))
                 for field, each in zip(fields, part, strict=True)
             ]
-            return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+            return remade(part, parts)
         if part.dtype.names is not None:
             record = SimpleNamespace(**{each: Exact(as_rational(part[0][each].item()))
                                         for each in part.dtype.names})  # fmt: skip
@@ -224,7 +233,10 @@ class Sample:
     def run(self, r: Iterable[Any], y: Iterable[Any]) -> list[Any]:
         """Take a sample; return u."""
         u = np.full(self.inputs, Exact(Fraction(0)), dtype=object)
-        control_all(self.design, self._state, _as_objects(r), _as_objects(y), u)
+        try:
+            control_all(self.design, self._state, _as_objects(r), _as_objects(y), u)
+        except (AttributeError, TypeError):  # a power, a function of math, a reset of a part
+            raise ValueError(_NOT_LINEAR) from None
         return [*u]
 
     def moved(self, x: dict[int, Any], given: dict[int, Any]) -> tuple[list[Any], list[Any]]:
@@ -260,8 +272,7 @@ def _with_numbers(part: Any) -> Any:
         ends = (-math.inf, math.inf, math.inf, -math.inf)
         return ActuatorLimits(*(np.full(part.low.shape, end) for end in ends))
     if isinstance(part, tuple):
-        parts = map(_with_numbers, part)
-        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+        return remade(part, map(_with_numbers, part))
     if isinstance(part, np.ndarray):
         return _as_exact(part) if part.dtype.kind == "f" else part
     if isinstance(part, float | np.floating) and math.isfinite(part):
@@ -271,7 +282,14 @@ def _with_numbers(part: Any) -> Any:
 
 def sample_of(controller: Any, precision: str) -> Sample:
     """Return a sample of a controller in a precision, without prefilters and learners."""
+    check_controller(controller, several=True)
     checks.one_of("precision", precision, tuple(PRECISIONS))
+    if is_in_single(controller):
+        if precision != "single":
+            raise ValueError(
+                f"precision = {precision!r}: this controller calculates in single; give 'single'"
+            )
+        controller = controller.controller  # in double, of which the parameters are made again
     plain = without_prefilters(controller)
     if is_scheduled(plain):
         raise ValueError(
@@ -279,9 +297,12 @@ def sample_of(controller: Any, precision: str) -> Sample:
             "linear law; take it at fixed signals, controller.at(…)"
         )
     given = in_single_precision(plain) if precision == "single" else plain
-    design = given.parameters.controller if precision == "single" else given.parameters
     signals = references_of(plain), outputs_of(plain), int(getattr(plain, "inputs", 1))
-    return Sample(_without_learning(design), _without_learning(given.initial_state()), signals)
+    design, state = map(_without_learning, (parameters_of(given), given.initial_state()))
+    if any(not isinstance(each.held, NoHeldPlant) or not isinstance(each.safe_set, NoSafeSet)
+           for each in _adrc_designs(design)):  # fmt: skip
+        raise ValueError(_NOT_LINEAR)  # a sample would not show it
+    return Sample(design, state, signals)
 
 
 def learns(controller: Any) -> bool:
@@ -309,8 +330,7 @@ def _without_learning(part: Any) -> Any:
     if isinstance(part, LearningMemory):
         return NoLearningMemory(nothing)
     if isinstance(part, tuple):
-        parts = map(_without_learning, part)
-        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+        return remade(part, map(_without_learning, part))
     return part
 
 
@@ -336,10 +356,10 @@ def exact_law(controller: Any, precision: str = "double") -> ExactLaw:
     >>> law.D.tolist()
     [[Fraction(3, 1), Fraction(-3, 1)]]
     """
-    return law_of(sample_of(controller, precision), controller)
+    return law_of(sample_of(controller, precision))
 
 
-def law_of(sample: Sample, controller: Any) -> ExactLaw:
+def law_of(sample: Sample) -> ExactLaw:
     """Return the law of the entries that y or r reaches, and that reach u."""
     count = sample.references + sample.outputs
     still, rest = sample.moved({}, {})
@@ -374,7 +394,7 @@ def law_of(sample: Sample, controller: Any) -> ExactLaw:
         D=_matrix([[u[k] for _, u in inputs] for k in range(sample.inputs)], count),
         names=tuple(sample.places[sample.free[i]][2] for i in at),
     )
-    _check_linear(sample, law, at, controller, (still, rest))
+    _check_linear(sample, law, at, (still, rest))
     return law
 
 
@@ -382,29 +402,18 @@ def _matrix(rows: list[list[Fraction]], columns: int) -> Any:
     return np.array(rows, dtype=object).reshape(len(rows), columns)
 
 
-def _check_linear(
-    sample: Sample, law: ExactLaw, at: list[int], controller: Any, rest: tuple[Any, Any]
-) -> None:
+def _check_linear(sample: Sample, law: ExactLaw, at: list[int], rest: tuple[Any, Any]) -> None:
     """Check that samples from small and from large numbers in all places go where the law says."""
     drawn = np.random.default_rng(0).integers(1, 1000, len(at) + law.D.shape[1])
     for unit in (Fraction(1, 2**70), Fraction(1)):
         values = np.array([int(each) * unit for each in drawn], dtype=object)
         x, given = values[: len(at)], values[len(at) :]
         expected = [*(law.A @ x + law.B @ given), *(law.C @ x + law.D @ given)]
-        try:
-            moved, u = sample.moved(
-                {sample.free[i]: Exact(each) for i, each in zip(at, x, strict=True)},
-                {k: Exact(each) for k, each in enumerate(given)},
-            )
-            found = [moved[i] - rest[0][i] for i in at]
-            found += [
-                as_rational(one) - as_rational(own) for one, own in zip(u, rest[1], strict=True)
-            ]
-            if found == expected:
-                continue
-        except TypeError:  # a power, or a function of math
-            pass
-        raise ValueError(
-            f"controller = {controller!r}: its law is not linear (a nonlinear feedback, a "
-            "nonlinear observer, a safe set or the detection of a held plant); leave that out"
+        moved, u = sample.moved(
+            {sample.free[i]: Exact(each) for i, each in zip(at, x, strict=True)},
+            {k: Exact(each) for k, each in enumerate(given)},
         )
+        found = [moved[i] - rest[0][i] for i in at]
+        found += [as_rational(one) - as_rational(own) for one, own in zip(u, rest[1], strict=True)]
+        if found != expected:
+            raise ValueError(_NOT_LINEAR)

@@ -15,7 +15,8 @@ The magnitudes of the states are bounded by l1 norms from r. Norms are computed 
 precision, so (4) is a bound up to its own digits, not a proof. A compiler that fuses a product and
 a sum rounds less often.
 
-What is not in it: limits of u, learners, quantised measurements, and a plant that is not linear.
+What is not in it: limits of u, learners, derivatives of r that are fed forward, quantised
+measurements, and a plant that is not linear.
 """
 
 from __future__ import annotations
@@ -302,7 +303,7 @@ def stability(
         raise ValueError(f"spread = {spread!r}: must be below 1, a share of each coefficient")
     size = checks.positive("size", size, "y-unit")
     sample = sample_of(controller, precision)
-    law, found = law_of(sample, controller), plant_of(plant, controller)
+    law, found = law_of(sample), plant_of(plant, controller)
     dt = float(controller.dt)
     radius = radius_of(law, found, dt, flint)
     stable: bool | None = radius[1] < 1.0 or (False if radius[0] >= 1.0 else None)

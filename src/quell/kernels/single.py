@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
-from quell.kernels.sized import single_dtype
+from quell.kernels.sized import remade, single_dtype
 from quell.types import Matrix, Vector
 
 _LARGEST, _SMALLEST = (float(getattr(np.finfo(np.float32), name)) for name in ("max", "tiny"))
@@ -51,7 +51,7 @@ def _rounded(value: Any, name: str, owners: dict[int, Any]) -> Any:
             _rounded(part, f"{name}.{field}" if name else f"{field}", owners)
             for field, part in zip(fields, value, strict=True)
         ]
-        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+        return remade(value, parts)
     if isinstance(value, np.ndarray):
         return _rounded_array(value, name, owners)
     if isinstance(value, float):  # np.float64 is one, np.float32 is not

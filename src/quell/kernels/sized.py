@@ -40,6 +40,7 @@ have the name of an attribute that NumPy needs (``dtype``, ``view``, ``copy`` â€
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from itertools import repeat
 from math import prod
 from operator import itemgetter
@@ -263,6 +264,11 @@ class _Annotations(NamedTuple):
     sized: tuple[bool, ...]  # for each field, whether an array in it has a known shape
     scratch: tuple[int, ...]  # indices of arrays that no later call reads
     work: tuple[int, ...]  # indices of arrays that no later sample reads
+
+
+def remade(value: tuple[Any, ...], parts: Iterable[Any]) -> Any:
+    """Return a tuple of the type of ``value``, a NamedTuple or a plain one, with other entries."""
+    return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
 
 
 def constant_fields(kind: type) -> tuple[str, ...]:
