@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers.prefilters import Prefiltered, ReferenceModel
 from quell.controllers.several import control_all
+from quell.controllers.shaping import ProfileGenerator
 from quell.export import TranslationError, c_source
 from quell.export.axes_source import names_in_c
 from quell.export.controller_source import parts_of
@@ -78,6 +80,14 @@ def drives() -> list[Any]:
     return [pid, ql.baselines.PPI(kv=5.0, kp=1.0, tn=0.1, dt=DT), pid]
 
 
+def shaped() -> list[Any]:
+    """Return axes with a profile generator, without a prefilter, and with a reference model."""
+    generator = ProfileGenerator(v_max=2.0, a_max=10.0, j_max=400.0)
+    model = ReferenceModel(20.0, rate_limit=3.0)
+    moved = Prefiltered(joint(feedforward=True), generator)
+    return [moved, joint(), Prefiltered(joint(), model)]
+
+
 def two() -> list[ql.ADRC]:
     """Return two axes with learners and guards."""
     learners = (ql.learners.Kalman(), ql.learners.Harmonic())
@@ -114,6 +124,7 @@ ROWS: dict[str, Any] = {
     ),
     "orders 1, 3 and 2": lambda: ql.Axes([joint(1), joint(3), joint(2)], SQUARE, u_max=5.0),
     "one axis": lambda: ql.Axes([joint()]),
+    "prefilters": lambda: ql.Axes(shaped(), SQUARE, rate_limit=8000.0, **LIMITS),
     "nested tuples": lambda: ql.Axes([joint(), joint()], gain_functions.nested_tuples, **LIMITS),
     "an array as M": lambda: ql.Axes([joint(), joint()], M=gain_functions.array, **LIMITS),
     "a function, whose v may be larger than stated": lambda: ql.Axes(
@@ -144,6 +155,7 @@ SINGLE = (
     "more actuators, priority",
     "priority",
     "orders 1, 3 and 2",
+    "prefilters",
 )
 
 

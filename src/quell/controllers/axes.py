@@ -77,6 +77,8 @@ from quell.controllers.each_axis import (
 )
 from quell.controllers.given_controls import (
     ANY_CUT,
+    NoGivenMemory,
+    References,
     allocate_given,
     check_axes,
     check_compensates,
@@ -87,6 +89,7 @@ from quell.controllers.given_controls import (
     start_given,
     take_references,
     tell_given,
+    write_given,
 )
 from quell.controllers.memory import Layout
 from quell.controllers.safe_axes import (
@@ -101,6 +104,14 @@ from quell.controllers.several import (
     start_all,
     take_signals,
     tell_applied,
+)
+from quell.controllers.shaped_references import (
+    plan_stops,
+    shaped_design,
+    shaped_memory,
+    stop_of_moves,
+    with_prefilter,
+    without_prefilter,
 )
 from quell.controllers.stateful import StatefulController
 from quell.kernels.sized import Scalars, Work, clear
@@ -199,7 +210,7 @@ def _start_all(
     for k in range(state.u.size):
         state.u[k] = u[k]
     apply_to_axes(state.gain, state.u, state.v)
-    start_given(design.given, state.given, state.gain, u, r, state.wish)
+    start_given(design.given, state.given, state.gain, y, u, r, state.wish)
     start_axes(design.axes, state.axes, samples, y, state.v, state.wish)
     state.loop[0].started = 1.0
 
@@ -248,7 +259,8 @@ def _write_row(design: AxesDesign, state: AxesState, row: Vector) -> None:
     for i in range(n):
         row[i] = state.v[i]
     row[n] = state.loop[0].status
-    write_axes(design.axes, state.axes, n + 1, design.widths, row)
+    end = write_axes(design.axes, state.axes, n + 1, design.widths, row)
+    write_given(design.given, state.given, end, row)
 
 
 @set_reference_derivatives.register(AxesDesign)
@@ -272,8 +284,9 @@ class Axes(StatefulController):
     axes
         an ``ADRC`` for each axis, all with one ``dt``, with an observer of ``b0 = 1`` and without
         limits of u: what it calls u is v_i, the acceleration (for order 2) that it asks for. In a
-        dictionary each has a name. They are copied. Or a ``Compensator`` for each: then control
-        signals u_0 of the actuators (m,) take the place of the references r, and
+        dictionary each has a name. They are copied. One that is ``Prefiltered`` follows its shaped
+        reference; ``prefilters`` has them, None for an axis without. Or a ``Compensator`` for each:
+        then control signals u_0 of the actuators (m,) take the place of the references r, and
         ``u = u_0 − B0⁺ f̂`` (``controllers/given_controls.py``).
     B0
         from the control signals to the axes (n, m) [y-unit/s^n per u-unit]: a matrix, or a function
@@ -356,7 +369,9 @@ class Axes(StatefulController):
         if not isinstance(axes, Mapping) and not checks.is_sequence(axes):
             raise ValueError(f"axes = {axes!r:.60}: must be an ADRC for each axis, in a list")
         given = axes if isinstance(axes, Mapping) else {}
-        parts: list[Any] = list(given.values()) if given else list(axes)
+        pairs = [without_prefilter(each) for each in (given.values() if given else axes)]
+        parts = [axis for axis, _ in pairs]
+        self.prefilters = tuple(prefilter for _, prefilter in pairs)
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
         check_axes(parts, self.names)
         self.axes: tuple[Any, ...] = tuple(copy.copy(axis) for axis in parts)
@@ -425,7 +440,13 @@ class Axes(StatefulController):
         """Number of derivatives of each reference that are fed forward; of u_0 none."""
         if self.takes_u_0:
             return (0,) * self.inputs
-        return tuple(axis.derivatives for axis in self.axes)
+        return self._own_derivatives
+
+    @property
+    def _own_derivatives(self) -> tuple[int, ...]:
+        """Derivatives that each axis takes from outside: a prefilter makes them itself."""
+        each = zip(self.axes, self.prefilters, strict=True)
+        return tuple(axis.derivatives if p is None else 0 for axis, p in each)
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -440,7 +461,8 @@ class Axes(StatefulController):
             for name, axis in zip(self.names, self.axes, strict=True)
             for channel, width in axis.channels
         ]
-        return (("v", self.outputs), ("status", 1), *own)
+        shaped = [("r_shaped", self.outputs)] if any(self.prefilters) else []
+        return (("v", self.outputs), ("status", 1), *own, *shaped)
 
     @property
     def limits(self) -> Any:
@@ -453,6 +475,11 @@ class Axes(StatefulController):
 
     def _update_parameters(self) -> None:
         widths = [sum(width for _, width in axis.channels) for axis in self.axes]
+        given: Any = (
+            given_design(self.drives)
+            if self.compensates
+            else shaped_design(self.prefilters, self.dt)
+        )
         self.parameters = AxesDesign(
             tuple(axis.parameters for axis in self.axes),
             self._gain.design,
@@ -460,9 +487,9 @@ class Axes(StatefulController):
             self._actuators,
             self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
-            np.array([axis.derivatives for axis in self.axes], dtype=np.int64),
+            np.array(self._own_derivatives, dtype=np.int64),
             safe_axes_design([axis.safe_set for axis in self.axes], self._gain.weights),
-            given_design(self.compensates, self.drives),
+            given,
         )
 
     def initial_state(self) -> AxesState:
@@ -474,7 +501,7 @@ class Axes(StatefulController):
             gain=self._gain.memory(),
             range=range_memory(n, m, self._rule),
             safe=safe_axes_memory(self.parameters.safe, n, m),
-            given=given_memory(self.parameters.given, self.drives, n, m),
+            given=self._given_memory(n, m),
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
             v=np.zeros(n),
@@ -484,6 +511,14 @@ class Axes(StatefulController):
             r_given=np.zeros(self.references),
             y_given=np.zeros(n),
         )
+
+    def _given_memory(self, n: int, m: int) -> Any:
+        design = self.parameters.given
+        if isinstance(design, References):
+            return NoGivenMemory(np.zeros(0))
+        if self.compensates:
+            return given_memory(self.drives, n, m)
+        return shaped_memory(design, self.prefilters, self.axes)
 
     def _use_state(self, state: AxesState) -> None:
         super()._use_state(state)
@@ -530,9 +565,9 @@ class Axes(StatefulController):
     def _set_derivatives(self, derivatives: Sequence[Any]) -> None:
         for given in derivatives:
             checks.vector("derivatives", given, self.outputs)
-        for i, axis in enumerate(self.axes):
-            if axis.derivatives:
-                own = np.array([float(each[i]) for each in derivatives[: axis.derivatives]])
+        for i, (axis, count) in enumerate(zip(self.axes, self._own_derivatives, strict=True)):
+            if count:
+                own = np.array([float(each[i]) for each in derivatives[:count]])
                 set_reference_derivatives(axis.parameters, axis._state, own)
 
     def applied(self, u: Sequence[float] | Vector) -> None:  # type: ignore[override]
@@ -645,6 +680,19 @@ class Axes(StatefulController):
         self._update_parameters()
         self._pack_again()
 
+    @property
+    def stopping_point(self) -> Vector:
+        """Where the references can come to rest soonest (n,): as r of a step the moves stop.
+
+        Of an axis without a ``ProfileGenerator`` it is the reference that it followed last. Raises
+        ``ValueError`` if no axis has one.
+        """
+        if not plan_stops(self.parameters.given):
+            raise ValueError("no axis plans a stop; take axes behind ProfileGenerator")
+        r: Vector = np.zeros(self.outputs)
+        stop_of_moves(self.parameters, self._state, r)
+        return r
+
     def index(self, axis: int | str) -> int:
         """Return the number of an axis, from 0, given its name or number."""
         if isinstance(axis, str):
@@ -670,7 +718,10 @@ class Axes(StatefulController):
 
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints."""
-        found: dict[str, Any] = {"axes": dict(zip(self.names, self.axes, strict=True))}
+        each = zip(self.names, self.axes, self.prefilters, strict=True)
+        found: dict[str, Any] = {
+            "axes": {name: with_prefilter(axis, shaper) for name, axis, shaper in each}
+        }
         if self.drives:
             found["drives"] = list(self.drives)
         for name in ("B0", "M"):

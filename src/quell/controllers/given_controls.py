@@ -327,20 +327,31 @@ def _reset_given(given: GivenControls, memory: GivenMemory) -> None:
 
 @generic_with_default
 def start_given(
-    given: Any, memory: Any, gain: GainMemory, u: Vector, r: Vector, wish: Vector
+    given: Any, memory: Any, gain: GainMemory, y: Vector, u: Vector, r: Vector, wish: Vector
 ) -> None:
-    """Write what each axis is asked for in the sample after a start under u."""
+    """Write what each axis is asked for in the sample after a start at rest at y under u."""
     for i in range(wish.size):
         wish[i] = r[i]
 
 
 @start_given.register(GivenControls)
 def _start_given(
-    given: GivenControls, memory: GivenMemory, gain: GainMemory, u: Vector, r: Vector, wish: Vector
+    given: GivenControls,
+    memory: GivenMemory,
+    gain: GainMemory,
+    y: Vector,
+    u: Vector,
+    r: Vector,
+    wish: Vector,
 ) -> None:
     for k in range(u.size):
         memory.u_0[k] = u[k]
     _act(gain, memory, wish)
+
+
+@generic_with_default
+def write_given(given: Any, memory: Any, at: int, row: Vector) -> None:
+    """Write the shaped references that the axes followed into a row from ``at`` on."""
 
 
 # ---- What users give, checked ----
@@ -355,7 +366,10 @@ def check_axes(axes: Sequence[Any], names: Sequence[str]) -> None:
             raise ValueError(f"axes: name {name!r} must be a text without a dot")
         checks.printable("axes", name)
         if not isinstance(axis, Compensator):
-            raise ValueError(f"axes: {name} = {axis!r:.60}: must be an ADRC, or a Compensator")
+            raise ValueError(
+                f"axes: {name} = {axis!r:.60}: must be an ADRC, which may have one prefilter, or a "
+                "Compensator"
+            )
         check_controller(axis, f"axes: {name}")
         if takes_control(axis) != takes_control(axes[0]):
             raise ValueError(
@@ -439,19 +453,15 @@ def checked_drives(drives: Any, names: Sequence[str], inputs: int, dt: float) ->
     return tuple(copy.copy(drive) for drive in drives)
 
 
-def given_design(compensates: bool, drives: Sequence[Any]) -> Any:
-    """Return the parameters; ``compensates`` says whether the axes are compensators."""
-    if not compensates:
-        return References()
+def given_design(drives: Sequence[Any]) -> GivenControls:
+    """Return the parameters of control signals in the place of references."""
     if not drives:
         return GivenControls(FromOutside())
     return GivenControls(tuple(drive.parameters for drive in drives))
 
 
-def given_memory(design: Any, drives: Sequence[Any], n: int, m: int) -> Any:
+def given_memory(drives: Sequence[Any], n: int, m: int) -> GivenMemory:
     """Return the state before the first sample, for n axes and m actuators."""
-    if isinstance(design, References):
-        return NoGivenMemory(np.zeros(0))
     states = tuple(drive.initial_state() for drive in drives)
     limits = LimitsOfChange(*(np.zeros(m) for _ in range(4)))
     u_0, before, told, held = (np.zeros(m) for _ in range(4))

@@ -145,10 +145,10 @@ def leaves(state: Any, name: str = "", path: tuple[str | int, ...] = ()) -> Iter
         elif hasattr(part, "_fields"):
             yield from leaves(part, f"{name}{field}.", here)
         else:
-            behind = f"{name}{field}."
+            behind, first = f"{name}{field}.", _PAIRS.get(field, ("", "", ""))[1]
             for i, each in enumerate(part):
-                yield from leaves(each, f"{behind}{_PAIRS[field][1]}.", (*here, i))
-                behind += "others."
+                yield from leaves(each, f"{behind}{first or i}.", (*here, i))
+                behind += "others." if first else ""
 
 
 def named_arrays(state: Any) -> dict[str, NDArray[Any]]:
@@ -202,7 +202,11 @@ def _what(design: Any) -> Any:
         inner: Any = end, "NoneType", ()
         for axis in reversed(design.axes):
             inner = kind, "NoneType", (_what(axis), inner)
-        return type(design).__name__, meaning(design.gain), *together, inner
+        shapers = [
+            getattr(each, "prefilter", None) for each in getattr(design.given, "shapers", ())
+        ]
+        shaped = tuple(type(each).__name__ for each in shapers)
+        return type(design).__name__, meaning(design.gain), *together, *shaped, inner
     inner = tuple(_what(each) for each in _inside(design))
     return type(design).__name__, type(getattr(design, "prefilter", None)).__name__, inner
 

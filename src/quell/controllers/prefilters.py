@@ -283,10 +283,10 @@ def restart_if_astray(design: Any, memory: Any, r: float, y: float) -> None:
     """Start again from rest at ``y`` if the shaped reference is no transition from y to r."""
 
 
-@generic
+@generic_with_default
 def stopping_point(design: Any, memory: Any) -> float:
-    """Return where the shaped reference comes to rest soonest, for a prefilter with limits."""
-    raise TypeError
+    """Return where the shaped reference comes to rest soonest; NaN without limits that plan it."""
+    return math.nan
 
 
 class PrefilteredDesign(NamedTuple):
@@ -316,12 +316,19 @@ class PrefilteredState(NamedTuple):
     loop: NDArray[PrefilteredLoop]  # (1,)
 
 
-@control.register(PrefilteredDesign)
-def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: float) -> float:
-    loop = state.loop[0]
+@kernel
+def shaped_reference(
+    design: Any, memory: Any, controller: Any, state: Any, r: float, y: float
+) -> float:
+    """Take one sample of a prefilter: return the reference for the controller behind it.
+
+    ``design`` has the ``prefilter``, ``memory`` the fields of ``PrefilteredState`` but for the
+    controller, which receives the derivatives that it uses.
+    """
+    loop = memory.loop[0]
     loop.status = 0.0
     if loop.started == 0.0 and is_usable(y):
-        settle(design.prefilter, state.prefilter, y)
+        settle(design.prefilter, memory.prefilter, y)
         loop.started = 1.0
     if is_usable(r):
         loop.r = r
@@ -331,15 +338,21 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
     shaped = r
     if loop.started != 0.0 and loop.has_reference != 0.0:
         if is_usable(y):
-            restart_if_astray(design.prefilter, state.prefilter, loop.r, y)
-        shaped = prefilter(design.prefilter, state.prefilter, loop.r)
-        if state.derivatives.size > 0:
-            write_derivatives(design.prefilter, state.prefilter, state.derivatives)
+            restart_if_astray(design.prefilter, memory.prefilter, loop.r, y)
+        shaped = prefilter(design.prefilter, memory.prefilter, loop.r)
+        if memory.derivatives.size > 0:
+            write_derivatives(design.prefilter, memory.prefilter, memory.derivatives)
             # What a prefilter has beyond them would be taken for signals of a schedule.
-            for i in range(state.used.size):
-                state.used[i] = state.derivatives[i]
-            set_reference_derivatives(design.controller, state.controller, state.used)
+            for i in range(memory.used.size):
+                memory.used[i] = memory.derivatives[i]
+            set_reference_derivatives(controller, state, memory.used)
     loop.r_shaped = shaped if is_finite(shaped) else y
+    return shaped
+
+
+@control.register(PrefilteredDesign)
+def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: float) -> float:
+    shaped = shaped_reference(design, state, design.controller, state.controller, r, y)
     return control(design.controller, state.controller, shaped, y)
 
 
@@ -509,12 +522,10 @@ class Prefiltered(Wrapper):
 
     def initial_state(self) -> PrefilteredState:
         """Return a state before the first sample, with nothing learned."""
-        wanted = getattr(self.controller, "derivatives", 0)
-        count = getattr(self.prefilter, "derivatives", 0) if wanted > 0 else 0
         inner = self.controller.initial_state()
-        memory = self.prefilter.memory(self.parameters.prefilter)
-        derivatives, used = np.zeros(count), np.zeros(min(count, wanted))
-        return PrefilteredState(inner, memory, derivatives, used, PrefilteredLoop.zeros())
+        wanted = getattr(self.controller, "derivatives", 0)
+        design = self.parameters.prefilter
+        return PrefilteredState(inner, *prefilter_memory(self.prefilter, design, wanted))
 
     def read(self, state: PrefilteredState) -> Any:
         """Return the estimates of the ADRC in ``state``."""
@@ -534,6 +545,18 @@ class Prefiltered(Wrapper):
     def _restore_external(self, state: PrefilteredState, snapshots: Mapping[str, Any]) -> None:
         inner = {name.removeprefix("controller."): value for name, value in snapshots.items()}
         self.controller._restore_external(state.controller, inner)
+
+
+def prefilter_memory(
+    prefilter: Prefilter, design: Any, wanted: int
+) -> tuple[Any, Vector, Vector, NDArray[PrefilteredLoop]]:
+    """Return the state of a prefilter before the first sample, as ``PrefilteredState`` has it.
+
+    ``wanted`` is the number of derivatives that the controller behind it takes.
+    """
+    count = getattr(prefilter, "derivatives", 0) if wanted > 0 else 0
+    derivatives, used = np.zeros(count), np.zeros(min(count, wanted))
+    return prefilter.memory(design), derivatives, used, PrefilteredLoop.zeros()
 
 
 def without_prefilters(controller: Controller) -> Controller:

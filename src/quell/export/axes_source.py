@@ -156,9 +156,12 @@ def places_of_axes(name: str, members: tuple[str, ...]) -> list[str]:
 
 
 def estimate_structs_of_axes(
-    name: str, members: tuple[str, ...], own: list[Channels], real: str
+    name: str, members: tuple[str, ...], own: list[Channels], real: str, shaped: bool
 ) -> list[str]:
-    """Return the lines of the structs of the estimates; ``own`` are the channels of each axis."""
+    """Return the lines of the structs of the estimates; ``own`` are the channels of each axis.
+
+    ``shaped`` says whether references pass through prefilters.
+    """
     kinds: dict[Channels, str] = {}
     lines: list[str] = []
     for channels in own:
@@ -170,12 +173,14 @@ def estimate_structs_of_axes(
     lines += ["", "/* What the controller knows after a sample. */", "typedef struct {"]
     lines += [f"    {kinds[each]} {member};" for member, each in zip(members, own, strict=True)]
     lines.append(f"    {real} v[{len(own)}]; /* B0 u as it was applied */")
+    if shaped:
+        lines.append(f"    {real} r_shaped[{len(own)}]; /* references that the axes follow */")
     lines.append("    int status; /* flags of the last sample, of all axes and actuators */")
     return [*lines, f"}} {name}_estimate;"]
 
 
 def estimate_lines_of_axes(
-    files: CFiles, members: tuple[str, ...], own: list[Channels]
+    files: CFiles, members: tuple[str, ...], own: list[Channels], shaped: bool
 ) -> tuple[int, list[str]]:
     """Return the numbers of the longest row, and the statements that set all estimates."""
     lines, widest = [], 0
@@ -187,8 +192,13 @@ def estimate_lines_of_axes(
         row = Value(Array((total,), Number.REAL), "row", root="row", mutable=True)
         lines.append(f"    {files.call(write_row, design, state, row)};")
         lines += estimate_lines(files, f"estimate.{member}", channels)
-    v = _known(files.program.structs.field(files.memory, "v"))
-    lines += [f"    estimate.v[{i}] = {v.code}[{i}];" for i in range(len(own))]
+    structs = files.program.structs
+    arrays = {"v": _known(structs.field(files.memory, "v"))}
+    if shaped:
+        given = _known(structs.field(files.memory, "given"))
+        arrays["r_shaped"] = _known(structs.field(given, "r"))
+    for array, value in arrays.items():
+        lines += [f"    estimate.{array}[{i}] = {value.code}[{i}];" for i in range(len(own))]
     return widest, [*lines, f"    estimate.status = {files.name}_status(state);"]
 
 

@@ -30,6 +30,7 @@ from quell.controllers.memory import images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.several import control_all
+from quell.controllers.shaped_references import plan_stops, stop_of_moves
 from quell.controllers.single import SeveralInSingle, SinglePrecision, in_single_precision
 from quell.controllers.state_space import StateFeedback
 from quell.export import axes_source, c_files
@@ -368,6 +369,11 @@ class _Signal(NamedTuple):
         return Value(Array((self.size,), Number.REAL), self.name, root=self.name)
 
 
+def _entries(name: str, count: int) -> tuple[str, int]:
+    """Return the channel of an array in the estimate."""
+    return (name, count) if count > 1 else (f"{name}[0]", 1)
+
+
 class _Writer:
     """Writer of the public functions of one controller."""
 
@@ -397,6 +403,7 @@ class _Writer:
         design = self.described.parameters
         has_own = isinstance(self.described, Prefiltered)  # derivatives, from its prefilter
         self.moves = has_own and type(design.prefilter) in stopping_point.implementations
+        self.moves = self.moves or plan_stops(getattr(design, "given", None))
         self.signals = int(getattr(self.described, "external_signals", 0))
         self.derivatives = max(parts.counts) - self.signals
         # They are arguments of each step: whoever forgets them gets an error of the compiler.
@@ -502,6 +509,11 @@ class _Writer:
         """Return the sentence on the reference of a controller that plans moves."""
         if not self.moves:
             return ""
+        if not self.one:
+            return (
+                "r of an axis with a profile generator is the target of a move within the limits\n"
+                "of its prefilter in parameters->given; it may change in any sample.\n"
+            )
         return (
             "r is the target of a move within the limits of speed, acceleration and jerk in\n"
             "parameters->prefilter; it may change in any sample, also during a move.\n"
@@ -640,6 +652,16 @@ class _Writer:
 
     def _add_stop(self) -> None:
         files = self.files
+        if not self.one:
+            r = replace(self.r.value, mutable=True)
+            files.add(
+                "stopping_point",
+                f"void NAME(const {self.state}, {self.real} r[{self.r.size}])",
+                "Write where the moves can stop soonest: they do if this is r of the next steps.\n"
+                "Of an axis that plans no moves it is the reference that it followed last.",
+                f"    {files.call(stop_of_moves, *files.both, r)};",
+            )
+            return
         files.add(
             "stopping_point",
             f"{self.real} NAME(const {self.state})",
@@ -656,12 +678,14 @@ class _Writer:
         ]
         files.enums += enums(name, tuple(each for channels in own for each in channels))
         if members:
-            channels: Channels = (("v", len(own)) if len(own) > 1 else ("v[0]", 1), ("status", 1))
+            shaped = any(self.described.prefilters)
+            channels: Channels = (_entries("v", len(own)), ("status", 1))
             for member, each in zip(members, own, strict=True):
                 channels += tuple((f"{member}.{channel}", width) for channel, width in each)
+            channels += (_entries("r_shaped", len(own)),) if shaped else ()
             files.enums += places_of_axes(name, members)
-            files.structs += estimate_structs_of_axes(name, members, own, real)
-            total, lines = estimate_lines_of_axes(files, members, own)
+            files.structs += estimate_structs_of_axes(name, members, own, real, shaped)
+            total, lines = estimate_lines_of_axes(files, members, own, shaped)
         else:
             (channels,) = own
             doc = "What a controller knows after a sample."

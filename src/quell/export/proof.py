@@ -366,6 +366,7 @@ _CALLS_OF_SEVERAL = CALLS | {
     "track": "r, y, givenDERIVATIVES",
     "set_held": "any_int, any_int != 0",
     "start": "y, given, r",
+    "stopping_point": "r",
 }
 RETURN_U = {"step": "REAL r, REAL y", "step_counts": "int32_t r, int32_t count",
              "track": "REAL r, REAL y, REAL u"}  # fmt: skip

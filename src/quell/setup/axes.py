@@ -22,6 +22,8 @@ from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
 from quell.controllers.compensator import Compensator
+from quell.controllers.prefilters import Prefiltered
+from quell.controllers.shaped_references import without_prefilter
 from quell.features.all_axes import sees_all_axes
 from quell.plants.base import PlantWrapper
 from quell.plants.linear import LinearPlant
@@ -32,6 +34,7 @@ from quell.records.trajectory import Trajectory
 from quell.setup import registry
 from quell.setup.description import DT, TITLE, Title, is_of_axes, optional
 from quell.setup.loading import (
+    REPLACED,
     Known,
     Setup,
     Variation,
@@ -71,6 +74,7 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Metrics
     from quell.setup.schema import CallTable as Observer
     from quell.setup.schema import CallTable as OnTop
+    from quell.setup.schema import CallTable as Prefilter
     from quell.setup.schema import CallTable as Rig
     from quell.setup.schema import CallTable as ScenarioTable
     from quell.setup.schema import CallTable as Sweep
@@ -139,7 +143,9 @@ def coupled(
         checks.one_of("B0", B0, ("plant",))
         if plant is None:
             raise ValueError('B0 = "plant": there is no plant; give rows, or a table [plant]')
-        gain, inverse = _of_plant(plant, [axis.observer.order for axis in axes.values()], M)
+        gain, inverse = _of_plant(
+            plant, [without_prefilter(axis)[0].observer.order for axis in axes.values()], M
+        )
     limits: dict[str, Any] = {"u_min": u_min, "u_max": u_max, "rate_limit": rate_limit}
     rest: dict[str, Any] = {"saturation": saturation, "weights": weights, "wished": wished}
     rest |= {"learner": learner, "guard": guard, "drives": drives}
@@ -325,6 +331,7 @@ TUNE = call_table("tune", tuning_of_axes, only=True)
 METRICS = call_table("metrics", Trajectory.metrics, only=True, without=("target",))
 if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
+    Prefilter = registry.Prefilter
     Observer, Learner = one_of(OBSERVERS), registry.Learner
     AxisDrive, OnTop = one_of(DRIVES, default="pid"), ON_TOP
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
@@ -341,6 +348,7 @@ class Axis(Table):
     drive: AxisDrive | None = optional("the controller that gives u_0 below a compensator.")
     learner: Learner | None = optional("the learner; none by default.")
     guard: Guard | None = optional("the guard of the learner; none by default.")
+    prefilter: Prefilter | None = optional("the prefilter of the reference; none by default.")
     signal: str = Field("", description="name and unit of its y, `angle [rad]`, for files.")
     reference: registry.Signal = Field(0.0, description="signal that y has to follow [y-unit].")
     noise: registry.Signal = Field(0.0, description="signal added to y before the controller.")
@@ -368,13 +376,8 @@ class AxesDescription(Table):
 
 # ---- From a file to objects ----
 
-# Tables of a setup of one axis, and where they are here; what belongs to one axis only.
-_ELSEWHERE = {
-    **dict.fromkeys(
-        ("observer", "controller", "compensator", "learner", "guard"), "belongs into each [[axis]]"
-    ),
-    "prefilter": "NOT for several axes yet",
-}
+# Tables of a setup of one axis, and where they are here.
+_ELSEWHERE = dict.fromkeys(REPLACED, "belongs into each [[axis]]")
 
 
 def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
@@ -494,7 +497,10 @@ def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]
         outside, learner = (learner, parts.pop("guard")), None
     key = "controller" if axis.compensator is None else "compensator"
     table: Any = getattr(axis, key)
-    made: Compensator = builder.build(table, f"{path}.{key}", learner=learner, **parts)
+    made: Any = builder.build(table, f"{path}.{key}", learner=learner, **parts)
+    if axis.prefilter is not None:
+        prefilter = builder.build(axis.prefilter, f"{path}.prefilter", dt=dt)
+        made = builder.attempt(f"{path}.prefilter", (), Prefiltered, made, prefilter)
     return made, *outside
 
 

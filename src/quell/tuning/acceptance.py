@@ -29,6 +29,7 @@ from quell.tuning.reference import (
     Axis,
     Shaped,
     bounded_rate,
+    few_at_limits,
     largest_step,
     model_of_linear_step,
     profile_for,
@@ -81,11 +82,15 @@ class Seen(NamedTuple):
     move: MoveFigures | None  # along a reference that moves
     overloads: tuple[Overload, ...]
     failures: tuple[str, ...]  # lines that begin with NOT
+    prefilter: Any = None  # of an axis
 
     def __str__(self) -> str:
-        """Return its step or move as a line, with the name behind it."""
+        """Return its step or move as a line, with the name and the prefilter behind it."""
         what = str(self.move if self.step is None else self.step)
-        return f"{what} ({self.name})" if self.name else what
+        what += f" ({self.name})" if self.name else ""
+        if self.prefilter is not None:
+            what += f", behind the prefilter {_described(self.prefilter)}"
+        return what
 
     def to_json(self) -> dict[str, Any]:
         """Return it as a table."""
@@ -95,13 +100,16 @@ class Seen(NamedTuple):
             if each is not None:
                 del each["signals"]
         loads = [each.to_json() for each in self.overloads]
-        return {"name": self.name, "step": step, "move": move, "overloads": loads}
+        found = {"name": self.name, "step": step, "move": move, "overloads": loads}
+        if self.prefilter is not None:
+            found["prefilter"] = prefilter_table(self.prefilter)
+        return found
 
 
 class Judged(NamedTuple):
     """A design in the file that is written."""
 
-    controller: Controller  #: with its prefilter
+    controller: Any  #: with its prefilter
     prefilter: Any  #: None if it has none
     step: StepFigures | None  #: after the largest step of the scenario; None if its r moves
     move: MoveFigures | None  #: along a reference that moves
@@ -249,7 +257,14 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
     return Judged(whole, prefilter, own.step, own.move, *rest)
 
 
-def judge_axes(written: Written, controller: Any, tau: float, held: Matrix, size: Vector) -> Judged:
+def judge_axes(
+    written: Written,
+    controller: Any,
+    tau: float,
+    held: Matrix,
+    size: Vector,
+    with_prefilters: Callable[[Any, Sequence[Written]], Any],
+) -> Judged:
     """Return what a controller of several axes does in the file, each axis and after overloads.
 
     Parameters
@@ -264,6 +279,9 @@ def judge_axes(written: Written, controller: Any, tau: float, held: Matrix, size
         u that holds each disturbance of 1 (m, q).
     size
         step of each reference (n,) for a scenario in which none steps or moves.
+    with_prefilters
+        function of the controller and the file of each axis that returns it behind prefilters, or
+        None; it is called where a step overshoots, or needs the limits of u.
     """
     axes = [replace(written, axis=i) for i in range(len(controller.names))]
     before = _BEFORE
@@ -275,11 +293,11 @@ def judge_axes(written: Written, controller: Any, tau: float, held: Matrix, size
             each.stepping(float(f"{step:.2g}"), _LOOKED * tau, before)
             for each, step in zip(axes, size.tolist(), strict=True)
         ]
-    seen, runs = [], dict[int, Any]()
-    for axis, name in zip(axes, controller.names, strict=True):
-        key = id(axis.scenario)
-        runs[key] = runs[key] if key in runs else axis.run(controller)
-        seen.append(_seen(axis, controller, tau, np.zeros(1), "", name, runs[key]))
+    seen = _axes_seen(axes, controller, tau)
+    if of_file and bounded(controller) and any(_needs_prefilter(each, written.dt) for each in seen):
+        shaped = with_prefilters(controller, axes)
+        if shaped is not None:
+            controller, seen = shaped, _axes_seen(axes, shaped, tau)
     failures = tuple(dict.fromkeys(line for each in seen for line in each.failures))
     over = [
         f"{100.0 * each.step.overshoot:.1f} % of {each.name}"
@@ -288,9 +306,9 @@ def judge_axes(written: Written, controller: Any, tau: float, held: Matrix, size
     ]
     if of_file and over and not failures and bounded(controller):
         failures = (
-            f"NOT below {100.0 * MOST_OVERSHOOT:.0f} %: steps overshoot by {', '.join(over)}; axes "
-            "have no prefilter: give references that the actuators can follow (LimitedMove), "
-            "smaller steps, or bound the loop more (M_ks)",
+            f"NOT below {100.0 * MOST_OVERSHOOT:.0f} %: steps overshoot by {', '.join(over)}; no "
+            "prefilters were found with which they do less: give references that the actuators can "
+            "follow (LimitedMove), smaller steps, or bound the loop more (M_ks)",
         )
     overloads: list[Overload] = []
     if bounded(controller) and not failures:
@@ -299,6 +317,26 @@ def judge_axes(written: Written, controller: Any, tau: float, held: Matrix, size
         failures = tuple(_slow(each) for each in overloads if not each.passes)
     rest = None, None, tuple(overloads), failures, tuple(seen)
     return Judged(controller, None, None, None, *rest)
+
+
+def _axes_seen(axes: Sequence[Written], controller: Any, tau: float) -> list[Seen]:
+    """Return what each axis does in its file; files of one scenario are one run."""
+    seen, runs = [], dict[int, Any]()
+    for axis, name, shaper in zip(axes, controller.names, controller.prefilters, strict=True):
+        key = id(axis.scenario)
+        runs[key] = runs[key] if key in runs else axis.run(controller)
+        found = _seen(axis, controller, tau, np.zeros(1), "", name, runs[key])
+        seen.append(found._replace(prefilter=shaper))
+    return seen
+
+
+def _needs_prefilter(axis: Seen, dt: float) -> bool:
+    """Return whether a step overshoots, does not settle, or needs the limits of u."""
+    step = axis.step
+    if step is None or axis.prefilter is not None:
+        return False
+    over = not step.overshoot <= MOST_OVERSHOOT or math.isnan(step.settling)
+    return over or step.limited > few_at_limits(step.settling, dt)
 
 
 def _seen(

@@ -79,6 +79,7 @@ from quell.tuning.axes_at_limits import (
     slower,
     step_sizes,
     time_constant,
+    with_prefilters,
 )
 from quell.tuning.constraints import Constraints, first_given, given_constraints
 from quell.tuning.optimiser.coupled import (
@@ -264,7 +265,10 @@ def tune_axes(
                 whole = _made(axes, each.values)
                 tau = time_constant(_loop(nominal[0], axes, each.values))
                 sizes = step_sizes(nominal[0], whole, tau, points[0])
-                return judge_axes(file, whole, tau, held, sizes)
+                return judge_axes(
+                    file, whole, tau, held, sizes,
+                    lambda of, files: with_prefilters(plant, of, held, points[0], files),
+                )  # fmt: skip
 
             others = slower(found, loops(plants, limits=limits))
             found, seen, refused = accepted(found, others, at_limits, "the quickest")
@@ -272,7 +276,7 @@ def tune_axes(
                 told.append(refused)
                 worst = _exact(loops(judged, limits=limits), range(len(judged)), axes, found.values)
                 excess = _excess(worst)
-        made = _made(axes, found.values)
+        made: Axes = _made(axes, found.values) if seen is None else seen.controller
         A, B, C, R = nominal[0]
         bandwidth, fastest = (
             float(np.max(np.sqrt(values[:, 0] * values[:, 1]))) for values in (found.values, start)

@@ -1,11 +1,23 @@
 """Coupled axes in the file that is written: their steps and loads at the limits of the actuators.
 
 What ``acceptance.judge_axes`` needs of a plant with several inputs and outputs.
+
+*Prefilters.* Along y of one axis, the others at rest, the linear plant needs u = c_0 y + c_1 y' +
+c_2 y''. With y = t²/2 and x = x_0 + x_1 t + x_2 t²/2, the powers of t in x' = A x + B u, y = C x
+give three systems with one matrix, for e of the axis::
+
+    K = [A, B; C, 0],   K [x_2; c_0] = [0; e],   K [x_1; c_1] = [x_2; 0],   K [x_0; c_2] = [x_1; 0]
+
+So an axis that needs little u at rest gets a ``ProfileGenerator`` of its c_1 and c_2, as a single
+one does (``tuning/reference.py``), with the feedforward of its order; axes that step in one sample
+share the room for u. Another one gets a ``ReferenceModel``. Each try is a run of the file.
 """
 
 from __future__ import annotations
 
+import copy
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,12 +27,15 @@ import numpy as np
 from quell.analysis.matrices import linear_part_of
 from quell.analysis.multivariable import MultivariableLoop
 from quell.controllers.axes import Axes
+from quell.controllers.feedforward import checked_feedforward
+from quell.controllers.prefilters import ReferenceModel
 from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.nonlinear import checked_point
 from quell.tuning.acceptance import WORSE, conditionally_stable, file_without_step
 from quell.tuning.optimiser.coupled import CoupledLoops, Found, Plant
+from quell.tuning.reference import MOST_RESERVED, Axis, few_at_limits
 from quell.tuning.tables import SHARE
-from quell.tuning.written import Written
+from quell.tuning.written import MOST_OVERSHOOT, StepFigures, Written
 from quell.types import Matrix, Vector
 
 # Factors of all bandwidths with which axes take the place of some that fail at the limits of u.
@@ -29,6 +44,14 @@ _SLOWER = (0.85, 0.7, 0.55)
 _HOLD = 1e3
 # A solution of ``A x + B u = −E w``, ``C x = 0`` within this share of its right side is one.
 _SOLVED = 1e-6
+# Shares of the room for u and ramps of the acceleration, in time constants of the axis, that are
+# tried; the best is taken, or the first of slower ones. Chosen by hand; each is simulated.
+_TRIED = tuple((share, ramp) for share in (0.95, 0.8, 0.65) for ramp in (0.3, 1.0, 3.0))
+_SLOWER_MOVES = tuple((0.65 * 0.5**i, 3.0) for i in range(1, 9))
+# A step that needs more than this share of the room for u at rest is that of a process, whose first
+# reference model has this multiple of the bandwidth of its loop.
+_PROCESS, _FASTEST_MODEL = 0.5, 3.0
+_RAMP_SAMPLES = 4.0
 
 
 def file_at(plant: Any, axes: Axes, point: Any) -> Written:
@@ -57,6 +80,92 @@ def held_loads(plant: Any, axes: Axes, point: Any) -> Matrix:
     solved = left <= _SOLVED * np.linalg.norm(right, axis=0)
     held: Matrix = np.where(solved, found[n:], 0.0)
     return held
+
+
+def needs_along(plant: Any, axes: Axes, point: Any) -> tuple[Matrix, Matrix, Matrix]:
+    """Return the u that each axis needs for y, y' and y'' of 1 (m, n) each; see above."""
+    linear = linear_part_of(plant, axes.dt, point)[0]
+    n, p, m = linear.A.shape[0], linear.C.shape[0], linear.B.shape[1]
+    inverse = np.linalg.pinv(np.block([[linear.A, linear.B], [linear.C, np.zeros((p, m))]]))
+    x, found = np.zeros((n, p)), []
+    for y in (np.eye(p), np.zeros((p, p)), np.zeros((p, p))):
+        solved = inverse @ np.vstack([x, y])
+        x = solved[:n]
+        found.append(np.abs(solved[n:]))
+    return found[0], found[1], found[2]
+
+
+def with_prefilters(
+    plant: Any, axes: Axes, held: Matrix, point: Any, files: Sequence[Written]
+) -> Axes | None:
+    """Return the axes behind prefilters with which the steps of the file overshoot by 5 % at most.
+
+    None where no step is left without a prefilter, or no prefilters do.
+
+    Parameters
+    ----------
+    plant, axes, point
+        as for ``tune_axes``.
+    held
+        u that holds each disturbance of 1 (m, q).
+    files
+        plant and scenario, for each axis.
+    """
+    stepping = {
+        i: (each.largest[0], abs(each.largest[2]))
+        for i, (each, given) in enumerate(zip(files, axes.prefilters, strict=True))
+        if each.largest is not None and given is None
+    }
+    if not stepping:
+        return None
+    u = np.zeros(axes.inputs) if point is None else np.atleast_1d(checked_point(point)[1])
+    room = np.minimum(axes.limits.high - u, u - axes.limits.low)
+    t = np.arange(round(files[0].scenario.duration / axes.dt)) * axes.dt
+    loads = np.array([float(np.max(np.abs(load(t)), initial=0.0)) for load in files[0].loads])
+    if held.shape[1] == loads.size:
+        room = room - np.minimum(np.abs(held) @ loads, MOST_RESERVED * room)
+    together = Counter(first for first, _ in stepping.values())
+    needed = needs_along(plant, axes, point)
+
+    def tried(share: float, ramp: float) -> tuple[Axes, list[StepFigures]]:
+        """Return axes behind prefilters, and their steps."""
+        made = copy.copy(axes)
+        shapers = list(axes.prefilters)
+        for i, (first, size) in stepping.items():
+            axis = made.axes[i]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                at_rest, viscous, inertia = (
+                    float(np.nanmax(each[:, i] / room)) * together[first] for each in needed
+                )
+            left = share * (1.0 - at_rest * size)
+            if axis.observer.order < 2 or not left > share * (1.0 - _PROCESS):
+                omega = min(_FASTEST_MODEL * share / ramp * axis.omega_c, 1.0 / axes.dt)
+                shapers[i] = ReferenceModel(omega, axis.observer.order)
+                continue
+            slow = max(ramp / axis.omega_c, _RAMP_SAMPLES * axes.dt)
+            shapers[i] = Axis(viscous, inertia).profile(size, left, slow)
+            if not axis.feedforward and axis.observer.order <= shapers[i].derivatives:
+                axis.feedforward = checked_feedforward(True)
+                axis._initialise()
+        made.prefilters = tuple(shapers)
+        made._initialise()
+        run = files[0].run(made)
+        return made, [
+            figures for i in stepping if (figures := files[i].figures(made, run)) is not None
+        ]
+
+    best: tuple[float, Axes] | None = None
+    for share, ramp in _TRIED + _SLOWER_MOVES:
+        if best is not None and share < _TRIED[-1][0]:
+            break
+        made, steps = tried(share, ramp)
+        if any(math.isnan(s.settling) or not s.overshoot <= MOST_OVERSHOOT for s in steps):
+            continue
+        limited = any(s.limited > few_at_limits(s.settling, axes.dt) for s in steps)
+        rank = math.inf if limited else sum(step.settling for step in steps)
+        if best is None or rank < best[0]:
+            best = rank, made
+    return None if best is None else best[1]
 
 
 def time_constant(loop: MultivariableLoop) -> float:

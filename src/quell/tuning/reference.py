@@ -54,7 +54,7 @@ from quell.types import Vector
 _NO_U = 1e-6
 # Shares of the room for u that a move uses, what a load may take of it at most, and the ramps of
 # the acceleration: in samples and in time constants of the loop. Chosen by hand; each is simulated.
-_SHARES, _MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
+_SHARES, MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
 _SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
 # Beside a resonance: ramps and smoothing in periods of it.
 _PERIODS = (
@@ -160,7 +160,7 @@ def room_of_u(
         values = loads[0](np.arange(round(written.scenario.duration / written.dt)) * written.dt)
         acting = [values[first:end] for first, end, _ in written.steps] or [values]
         largest = max(float(np.max(np.abs(each - values[0]), initial=0.0)) for each in acting)
-        room -= min(abs(held_load(linear)) * largest, _MOST_RESERVED * room)
+        room -= min(abs(held_load(linear)) * largest, MOST_RESERVED * room)
     return room
 
 
@@ -196,7 +196,7 @@ def profile_for(
         own = _duration(generator, size)
         last = min(end, first + math.ceil((_LOOKED * own + _AFTER * tau) / written.dt))
         shown = _with(written, controller, generator, last)
-        most = max(_LIMITED * own, _FEW * written.dt)
+        most = few_at_limits(own, written.dt)
         if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
             continue
         whole = Prefiltered(controller, generator)
@@ -233,6 +233,11 @@ def _profiles(
         for ramp, smoothing in ramps
     ]
     yield from sorted(made, key=lambda each: _duration(each, size))
+
+
+def few_at_limits(duration: float, dt: float) -> float:
+    """Return the time that u may be at a limit in a move [s]."""
+    return max(_LIMITED * duration, _FEW * dt)
 
 
 def _duration(generator: ProfileGenerator, size: float) -> float:
@@ -285,7 +290,7 @@ def reference_model_for(
         shown = _with(written, controller, model, end)
         if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
             return None
-        free = shown.limited <= max(_LIMITED * shown.looked, _FEW * written.dt)
+        free = shown.limited <= few_at_limits(shown.looked, written.dt)
         return model, shown, free
 
     for _ in range(_MOST_LAGS):
@@ -366,7 +371,7 @@ def bounded_rate(
         omega = min(factor * first.omega, 1.0 / written.dt)
         tried = replace(first, omega=omega, rate_limit=float(f"{share * own:.4g}"))
         step = worst_step(written, Prefiltered(controller, tried))
-        limited = step.limited > max(_LIMITED * step.looked, _FEW * written.dt, usual.limited)
+        limited = step.limited > max(few_at_limits(step.looked, written.dt), usual.limited)
         if limited or not (step.overshoot <= MOST_OVERSHOOT and step.settling < latest):
             continue
         shown = larger_with(tried, tried.rate_limit)

@@ -16,7 +16,7 @@ from quell.analysis.coupling import INDEPENDENT, Coupling, about_zeros
 from quell.analysis.multivariable import MultivariableLoop
 from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none, written_atomically
-from quell.tuning.acceptance import Judged
+from quell.tuning.acceptance import Judged, prefilter_table
 from quell.tuning.constraints import Constraints
 from quell.tuning.report import toml_text
 from quell.tuning.tuned import Tuned
@@ -335,13 +335,17 @@ class TunedAxes:
             raise ValueError("toml: there is no setup to complete; give tune_axes its tables")
         tables = dict(self.setup)
         entries = []
-        for table, axis in zip(tables["axis"], self.axes, strict=True):
+        made = self.controller
+        parts = zip(tables["axis"], self.axes, made.axes, made.prefilters, strict=True)
+        for table, axis, own, shaper in parts:
             observer = {**table["observer"], "omega_o": axis.omega_o}
             law = table["controller"]
-            law = {"kind": law} if isinstance(law, str) else law
-            entries.append(
-                {**table, "observer": observer, "controller": {**law, "omega_c": axis.omega_c}}
-            )
+            law = {**({"kind": law} if isinstance(law, str) else law), "omega_c": axis.omega_c}
+            if own.feedforward is True:
+                law["feedforward"] = True
+            entries.append({**table, "observer": observer, "controller": law})
+            if shaper is not None and "prefilter" not in table:
+                entries[-1]["prefilter"] = prefilter_table(shaper)
         tables["axis"] = entries
         found = "\n".join(self.verdicts())
         return toml_text(tables, f"axes tuned by quell\nconstraints: {self.constraints}\n{found}")
