@@ -61,6 +61,7 @@ from quell.controllers.law import (
     AdrcState,
     ControlGiven,
     LinearFeedback,
+    ModelFeedforward,
     has_reference_at_start,
     known_share,
     law_gains,
@@ -495,6 +496,7 @@ class Compensator(StatefulController):
     def _with_law(self, observer: ESO, gains: Vector, **law: Any) -> AdrcDesign:
         """Return the parameters with a law; ``gains`` k (n,) are those of the closed loop."""
         learner = checked_learner_design(self.learner, observer, self._learner_omega_c)
+        schedule = self._schedule_design(observer)
         return AdrcDesign(
             eso=observer.model,
             cancel_f=observer.cancel_f,
@@ -502,7 +504,7 @@ class Compensator(StatefulController):
             limits=self._limits,
             safe_set=self._safe_set_design(observer),
             held=NoHeldPlant() if self.held is None else self.held.design(observer),
-            schedule=self._schedule_design(observer),
+            schedule=schedule,
             learner=learner,
             lag=lag_of(observer) if self._learns else NO_LAG,
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, gains),
@@ -510,6 +512,12 @@ class Compensator(StatefulController):
             # A guard judges the output itself; an output set from outside is kept in any case.
             forgets=self.guard is None and type(learner) in forget.implementations,
             window=window_samples(observer) if self._learns else 0,
+            guarded=self.guard is not None,
+            scheduled=not isinstance(schedule, NoSchedule),
+            has_safe_set=self.safe_set is not None,
+            has_held=self.held is not None,
+            has_model=isinstance(law["feedforward"], ModelFeedforward),
+            nonlinear=not isinstance(law["feedback"], LinearFeedback),
             **law,
         )
 

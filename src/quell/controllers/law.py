@@ -449,6 +449,13 @@ class AdrcDesign(NamedTuple):
     learns: Flag  # whether there is a learner
     forgets: Flag  # whether it forgets what does harm
     window: int  # samples of the windows in which it is watched
+    # Whether there are parts: the calls of one that is absent are left out.
+    guarded: Flag
+    scheduled: Flag
+    has_safe_set: Flag
+    has_held: Flag  # a detection of holds
+    has_model: Flag  # in the feedforward
+    nonlinear: Flag  # feedback
 
 
 class AdrcState(NamedTuple):
@@ -471,10 +478,8 @@ class AdrcState(NamedTuple):
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, estimates = state.loop[0], state.estimates
     status = hold_last_good(loop, r, y)
-    see(
-        design.safe_set, state.safe_set, y,
-        control_at_nominal(design.schedule, state.schedule, loop.u),
-    )  # fmt: skip
+    if design.has_safe_set:
+        see(design.safe_set, state.safe_set, y, nominal_control(design, state, loop.u))
     f_plain, continues = 0.0, loop.started != 0.0
     u_acting = acting_control(design.eso, state.z, loop.u)
     if loop.started == 0.0:
@@ -487,52 +492,63 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         loop.started = 1.0
         if loop.held != 0.0:
             status |= _HELD
-        else:
-            is_released(
-                design.held, state.held, loop.y,
-                control_at_nominal(design.schedule, state.schedule, u_acting), 0.0, 0.0, design.b0,
-            )  # fmt: skip
+        elif design.has_held:
+            u_nominal = nominal_control(design, state, u_acting)
+            is_released(design.held, state.held, loop.y, u_nominal, 0.0, 0.0, design.b0)
     else:
-        _finish_sample(design, state, u_acting)
+        if design.learns or design.guarded:
+            _finish_sample(design, state, u_acting)
         if status & _MEASUREMENT_HELD != 0 and loop.held == 0.0:
             # The last y would look like a disturbance while the plant moves; the expected y does
             # not change the estimates.
-            known = known_now(design, state, u_acting)
-            u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
+            known, u_observed = known_now(design, state, u_acting), loop.u
+            if design.scheduled:
+                u_observed = control_as_observed(design.schedule, state.schedule, u_observed)
             y = expected_measurement(design.eso, state.z, u_observed, known)
             if is_usable(y):
                 loop.y = y
         status |= _estimate(design, state, u_acting, status & _MEASUREMENT_HELD == 0)
-        f_plain = (
-            at_nominal(design.schedule, state.schedule, estimates[design.law.size])
-            + loop.f_learned_filtered
-        )
-        if loop.held == 0.0:
+        f_plain = estimates[design.law.size]
+        if design.scheduled:
+            f_plain = at_nominal(design.schedule, state.schedule, f_plain)
+        f_plain += loop.f_learned_filtered
+        if design.guarded and loop.held == 0.0:
             assess(design.guard, state.guard, f_plain)
-        if status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
-            show_at_nominal(design.schedule, state.schedule, estimates, design.law.size)
+        if design.learns and status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
+            if design.scheduled:
+                show_at_nominal(design.schedule, state.schedule, estimates, design.law.size)
             adapt(design.learner, state.learner, estimates, loop.y, u_acting, f_plain)
-            show_at_present(design.schedule, state.schedule, estimates, design.law.size)
+            if design.scheduled:
+                show_at_present(design.schedule, state.schedule, estimates, design.law.size)
             status |= learner_flags(design.learner, state.learner)
     order = design.law.size
-    status |= follow_signals(
-        design.schedule, state.schedule, loop, state.z, estimates, state.reference, order,
-        u_acting, continues, design.safe_set, state.safe_set, design.held, state.held,
-    )  # fmt: skip
-    loop.f_known = known_of_model(
-        design.schedule, state.schedule, design.feedforward, loop.r, state.reference, design.b0,
-        known_share(design.feedforward, loop.r, state.reference),
-    )  # fmt: skip
-    constant, slope = predict(design.learner, state.learner, estimates, u_acting)
-    output = constant + slope * u_acting
-    constant, slope, was_cut = limit(
-        design.guard, state.guard, f_plain, loop.f_learned_filtered, constant, slope, u_acting
-    )
-    if was_cut:
-        status |= _LEARNER_CUT
-        restart(design.learner, state.learner)
+    if design.scheduled:
+        status |= follow_signals(
+            design.schedule, state.schedule, loop, state.z, estimates, state.reference, order,
+            u_acting, continues, design.safe_set, state.safe_set, design.held, state.held,
+        )  # fmt: skip
+    known = 0.0
+    if design.has_model:
+        known = known_share(design.feedforward, loop.r, state.reference)
+    if design.scheduled:
+        known = known_of_model(
+            design.schedule, state.schedule, design.feedforward, loop.r, state.reference,
+            design.b0, known,
+        )  # fmt: skip
+    loop.f_known = known
+    constant = slope = output = 0.0
+    if design.learns:
+        constant, slope = predict(design.learner, state.learner, estimates, u_acting)
+        output = constant + slope * u_acting
+    if design.guarded:
+        constant, slope, was_cut = limit(
+            design.guard, state.guard, f_plain, loop.f_learned_filtered, constant, slope, u_acting
+        )
+        if was_cut:
+            status |= _LEARNER_CUT
+            restart(design.learner, state.learner)
     unlimited = unlimited_control(design, state, constant, slope)
-    if slope != 0.0:
+    if design.guarded and slope != 0.0:
         # The guard's bound holds for the new u, too: beyond it the output counts as a constant.
         f_learned = constant + slope * acting_control(design.eso, state.z, unlimited)
         permitted = nearest_permitted(design.guard, state.guard, f_learned)
@@ -557,13 +573,14 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             loop.offset = 0.0
         unlimited += loop.offset
         loop.offset = loop.offset * design.fade if abs(loop.offset) > smallest else 0.0
-    safe, changed = nearest_safe(
-        design.safe_set, state.safe_set,
-        control_at_nominal(design.schedule, state.schedule, unlimited),
-    )  # fmt: skip
-    safe = safe_as_applied(
-        design.schedule, state.schedule, safe, unlimited, design.safe_set, state.safe_set
-    )
+    safe, changed = unlimited, 0
+    if design.has_safe_set:
+        wished = nominal_control(design, state, unlimited)
+        safe, changed = nearest_safe(design.safe_set, state.safe_set, wished)
+        if design.scheduled:
+            safe = safe_as_applied(
+                design.schedule, state.schedule, safe, unlimited, design.safe_set, state.safe_set
+            )
     u, cut = apply_limits(design.limits, safe, loop.u)
     cut |= changed
     loop.u_limited = u
@@ -572,24 +589,26 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     else:
         u = loop.u_manual
     loop.u = u
-    status |= flags_of_applied(design.safe_set, state.safe_set, u)
+    if design.has_safe_set:
+        status |= flags_of_applied(design.safe_set, state.safe_set, u)
     loop.constant, loop.slope = constant, slope
-    loop.f_learned = at_present(
-        design.schedule, state.schedule, constant + slope * acting_control(design.eso, state.z, u)
-    )
+    if design.learns or design.guarded:
+        f_learned = constant + slope * acting_control(design.eso, state.z, u)
+        if design.scheduled:
+            f_learned = at_present(design.schedule, state.schedule, f_learned)
+        loop.f_learned = f_learned
     if design.learns and status & _MEASUREMENT_HELD == 0 and loop.held == 0.0:
         excessive = is_excessive(unlimited, u, smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
         lost = has_escaped(watch, output, excessive) or has_lost_range(
             watch, design.window, loop.y, f_plain, output, excessive, limited
         )
-        if design.forgets and does_harm(
-            watch,
-            design.window,
-            at_nominal(design.schedule, state.schedule, estimates[design.law.size]),
-            f_plain,
-        ):
-            lost = True
+        if design.forgets:
+            residual = estimates[design.law.size]
+            if design.scheduled:
+                residual = at_nominal(design.schedule, state.schedule, residual)
+            if does_harm(watch, design.window, residual, f_plain):
+                lost = True
         if lost:
             status |= _OVERFLOWED
             start_learning_again(design, state)
@@ -602,35 +621,43 @@ def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured
     """Update the observer; return the flag of a held plant."""
     loop, z, estimates, order = state.loop[0], state.z, state.estimates, design.law.size
     fed, before = loop.f_learned + loop.f_known, estimates[order]
-    known = known_with_schedule(design.schedule, state.schedule, fed, design.b0, u_acting)
-    u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
+    known, u_observed = fed, loop.u
+    if design.scheduled:
+        known = known_with_schedule(design.schedule, state.schedule, fed, design.b0, u_acting)
+        u_observed = control_as_observed(design.schedule, state.schedule, loop.u)
     observe(design.eso, z, estimates, loop.y, u_observed, known)
-    scheduled_correction(design.schedule, state.schedule, design.eso, z, estimates, loop.y)
+    if design.scheduled:
+        scheduled_correction(design.schedule, state.schedule, design.eso, z, estimates, loop.y)
     if loop.held != 0.0:
         begin_with(design.eso, z, estimates, loop.y, order, before)
         set_motion(design.safe_set, state.safe_set, estimates, before + fed)
         look_anew(design.held, state.held)
         return _HELD
+    if not design.has_held:
+        return 0
     if is_measured:
         # A learner's share that follows u is right for any u.
-        known = fed - loop.slope * control_at_nominal(design.schedule, state.schedule, u_acting)
-        residual = f_before(design.held, state.held) - known
+        u_nominal = nominal_control(design, state, u_acting)
+        own = fed - loop.slope * u_nominal
+        residual = f_before(design.held, state.held) - own
         follow(
-            design.held, state.held, design.eso, z, loop.y,
-            control_as_observed(design.schedule, state.schedule, loop.u),
-            known_with_schedule(design.schedule, state.schedule, fed, design.b0, u_acting),
-            residual,
+            design.held, state.held, design.eso, z, loop.y, u_observed, known, residual
         )  # fmt: skip
-        f = estimates[order] + known
+        f = estimates[order] + own
         if is_released(
-            design.held, state.held, loop.y,
-            control_at_nominal(design.schedule, state.schedule, u_acting), f, loop.slope, design.b0,
+            design.held, state.held, loop.y, u_nominal, f, loop.slope, design.b0
         ):  # fmt: skip
             take_motion(design.held, state.held, z, estimates)
             set_motion(design.safe_set, state.safe_set, estimates, estimates[order] + fed)
     else:
         miss(design.held, state.held)
     return held_flag(design.held, state.held)
+
+
+@kernel
+def nominal_control(design: AdrcDesign, state: AdrcState, u: float) -> float:
+    """Return what a control signal is for the observer's b0."""
+    return control_at_nominal(design.schedule, state.schedule, u) if design.scheduled else u
 
 
 @kernel
@@ -667,12 +694,15 @@ def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> Non
     """
     loop = state.loop[0]
     f_learned = loop.constant + loop.slope * u_acting
-    if loop.slope != 0.0:
+    if design.guarded and loop.slope != 0.0:
         f_learned = nearest_permitted(design.guard, state.guard, f_learned)
-    loop.f_learned = at_present(design.schedule, state.schedule, f_learned)
+    loop.f_learned = f_learned
+    if design.scheduled:
+        loop.f_learned = at_present(design.schedule, state.schedule, f_learned)
     loop.f_learned_filtered = lag_push(design.lag, state.lag_state, 0, f_learned)
     commit(design.learner, state.learner, state.estimates, u_acting, f_learned)
-    record_output(design.guard, state.guard, f_learned)
+    if design.guarded:
+        record_output(design.guard, state.guard, f_learned)
 
 
 @kernel
@@ -691,25 +721,30 @@ def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slo
     unlimited = reference_part(design.feedforward, design.law, r, reference)
     for i in range(order):
         unlimited += (design.cancel[i] - design.law[i]) * estimates[i]
-    unlimited -= design.cancel_f * (
-        estimates[order] + at_present(design.schedule, state.schedule, constant)
-    )
-    unlimited = nonlinear_part(design.feedback, design.law, estimates, r, reference, unlimited)
     schedule, memory = design.schedule, state.schedule
+    if design.scheduled:
+        constant, slope = (
+            at_present(schedule, memory, constant),
+            at_present(schedule, memory, slope),
+        )
+    unlimited -= design.cancel_f * (estimates[order] + constant)
+    if design.nonlinear:
+        unlimited = nonlinear_part(design.feedback, design.law, estimates, r, reference, unlimited)
+    if not design.scheduled:
+        return unlimited / (design.b0 + design.cancel_f * slope)
     unlimited = scheduled_law(
         schedule, memory, design.feedforward, estimates, r, reference, design.b0, unlimited
     )
-    return unlimited / (
-        gain_in_use(schedule, memory, design.b0)
-        + design.cancel_f * at_present(schedule, memory, slope)
-    )
+    return unlimited / (gain_in_use(schedule, memory, design.b0) + design.cancel_f * slope)
 
 
 @kernel
 def known_now(design: AdrcDesign, state: AdrcState, u: float) -> float:
     """Return what is known of f while u acts: from learner, feedforward and schedule."""
     known = state.loop[0].f_learned + state.loop[0].f_known
-    return known_with_schedule(design.schedule, state.schedule, known, design.b0, u)
+    if design.scheduled:
+        known = known_with_schedule(design.schedule, state.schedule, known, design.b0, u)
+    return known
 
 
 @set_reference_derivatives.register(AdrcDesign)

@@ -135,6 +135,10 @@ class Leaf(NamedTuple):
 _PAIRS = {"axes": ("AxisDesigns", "axis", "NoAxis"), "drives": ("Drives", "controller", "NoDrive")}
 
 
+# Flags of an ``AdrcDesign`` that say which parts there are: the parts say it, too.
+_RESTATED = ("guarded", "scheduled", "has_safe_set", "has_held", "has_model", "nonlinear")
+
+
 def leaves(state: Any, name: str = "", path: tuple[str | int, ...] = ()) -> Iterator[Leaf]:
     """Yield the arrays of a nested NamedTuple in the order of an image."""
     work = work_fields(type(state))
@@ -253,11 +257,13 @@ def _text(value: Any, digits: int) -> str:
     if isinstance(value, tuple):
         kind = type(value).__name__ if hasattr(value, "_fields") else ""
         fields = getattr(value, "_fields", range(len(value)))
+        left_out = _RESTATED if isinstance(value, AdrcDesign) else ()
         parts = (
             _text_of_pairs(part, digits, *_PAIRS[field])
             if field in _PAIRS and type(part) is tuple
             else _text(part, digits)
             for field, part in zip(fields, value, strict=True)
+            if field not in left_out
         )
         return f"{kind}({','.join(parts)})"
     if isinstance(value, str) or value is None:
