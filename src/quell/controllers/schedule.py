@@ -553,8 +553,10 @@ def _follow(
             z[i] += change
             estimates[i] += change
             model = 0.0
-        scale_f(safe_set, set_memory, ratio)
-        scale_loads(held, held_memory, ratio)
+        if design.has_safe_set:
+            scale_f(safe_set, set_memory, ratio)
+        if design.has_held:
+            scale_loads(held, held_memory, ratio)
     jump = 0.0  # of the law's numerator
     for i in range(design.law):
         value = _blended(second, table, row, column, weight, other, 1 + i)
