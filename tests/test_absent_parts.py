@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -31,9 +32,8 @@ PARTS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
 }
 
 
-def calls(**options: Any) -> list[tuple[str, str]]:
-    """Return file and function of each call in a sample with the interpreted kernels."""
-    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT)
+def followed(run: Callable[[], Any]) -> list[tuple[str, str]]:
+    """Return file and function of each call while a function runs."""
     found: list[tuple[str, str]] = []
 
     def follow(frame: FrameType, event: str, _: Any) -> None:
@@ -41,17 +41,23 @@ def calls(**options: Any) -> list[tuple[str, str]]:
         if event == "call" and path.is_relative_to(ROOT):
             found.append((path.relative_to(ROOT).as_posix(), frame.f_code.co_qualname))
 
+    sys.setprofile(follow)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def calls(**options: Any) -> list[tuple[str, str]]:
+    """Return file and function of each call in a sample with the interpreted kernels."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dispatch, "interpret_all", True)
         controller = ql.ADRC(observer, omega_c=2.0, **options)
         for _ in range(5):
             controller.step(1.0, 0.0)
-        sys.setprofile(follow)
-        try:
-            controller.step(1.0, 0.01)
-        finally:
-            sys.setprofile(None)
-    return found
+        return followed(lambda: controller.step(1.0, 0.01))
 
 
 def in_files(found: list[tuple[str, str]], of: tuple[str, ...]) -> list[tuple[str, str]]:
@@ -91,3 +97,16 @@ def test_a_sample_is_short_to_follow(options: dict[str, Any], most: int, files: 
 def test_a_plain_sample_has_forty_calls_at_most_with_all_helpers() -> None:
     """Writing numbers of the state and finding the kernel of an observer count, too."""
     assert len(calls()) <= 40
+
+
+def test_axes_without_bands_learners_of_all_and_controls_do_not_call_them() -> None:
+    """Nor prefilters, a moving B0 and drives: a sample of axes runs its axes, allocates, and tells them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dispatch, "interpret_all", True)
+        axes = ql.Axes([ql.ADRC(ql.ESO.model_free(2, 1.0, 20.0, DT), 2.0) for _ in range(2)])
+        axes.step([1.0, 0.0], [0.0, 0.0])
+        found = followed(lambda: axes.step([1.0, 0.0], [0.01, 0.0]))
+    files = ("axes_learning", "safe_axes", "shaped_references", "safe_set", "schedule", "held")
+    assert not in_files(found, tuple(f"controllers/{each}" for each in files))
+    names = {name for _, name in found}
+    assert not names & {"_take_controls", "tell_given", "_tell_given", "_by_function", "_constant"}

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.allocation import (
     ActuatorLimits,
+    FunctionGain,
     Gain,
     GainMemory,
     RangeMemory,
@@ -114,7 +115,7 @@ from quell.controllers.shaped_references import (
     without_prefilter,
 )
 from quell.controllers.stateful import StatefulController
-from quell.kernels.sized import Scalars, Work, clear
+from quell.kernels.sized import Flag, Scalars, Work, clear
 from quell.types import Channels, Matrix, Status, Vector
 
 # ---- A sample of all axes ----
@@ -140,6 +141,11 @@ class AxesDesign(NamedTuple):
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
     safe: Any  # the safe sets of axes together, or none
     given: Any  # references, or control signals in their place
+    # Whether there are parts: the calls of one that is absent are left out.
+    learns_of_all: Flag
+    has_bands: Flag
+    gain_moves: Flag  # B0 is a function of the estimates
+    takes_controls: Flag  # in the place of references
 
 
 class AxesState(NamedTuple):
@@ -167,10 +173,13 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     flags = take_references(
         design.given, state.given, design.axes, state.axes, state.gain, r, y, state.wish
     )
-    look_at_all(design.learning, state.learning, design.axes, state.axes)
+    if design.learns_of_all:
+        look_at_all(design.learning, state.learning, design.axes, state.axes)
     flags = ask_axes(design.axes, state.axes, flags, state.wish, y, state.v, state.x)
-    flags |= learn_of_all(design.learning, state.learning, design.axes, state.axes)
-    flags |= update_gain(design.gain, state.gain, state.x)
+    if design.learns_of_all:
+        flags |= learn_of_all(design.learning, state.learning, design.axes, state.axes)
+    if design.gain_moves:
+        flags |= update_gain(design.gain, state.gain, state.x)
     if loop.manual != 0.0:
         loop.status = flags
         return
@@ -178,15 +187,17 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
         design.given, state.given, design.rule, design.limits, state.gain, state.range, state.v,
         state.u, state.u_limited,
     )  # fmt: skip
-    flags |= keep_in_bands(
-        design.safe, state.safe, design.axes, state.axes, design.limits, state.gain, state.range,
-        state.u_limited,
-    )  # fmt: skip
+    if design.has_bands:
+        flags |= keep_in_bands(
+            design.safe, state.safe, design.axes, state.axes, design.limits, state.gain,
+            state.range, state.u_limited,
+        )  # fmt: skip
     for k in range(u.size):
         state.u[k] = state.u_limited[k]
         u[k] = state.u[k]
     apply_to_axes(state.gain, state.u, state.v)
-    tell_given(design.given, state.given, design.axes, state.axes, state.gain, state.u, flags)
+    if design.takes_controls:
+        tell_given(design.given, state.given, design.axes, state.axes, state.gain, state.u, flags)
     tell_axes(design.axes, state.axes, state.v)
     loop.status, loop.started = flags, 1.0
 
@@ -490,6 +501,10 @@ class Axes(StatefulController):
             np.array(self._own_derivatives, dtype=np.int64),
             safe_axes_design([axis.safe_set for axis in self.axes], self._gain.weights),
             given,
+            learns_of_all=self.learning.learns,
+            has_bands=self._has_bands,
+            gain_moves=isinstance(self._gain.design, FunctionGain),
+            takes_controls=self.compensates,
         )
 
     def initial_state(self) -> AxesState:

@@ -135,8 +135,11 @@ class Leaf(NamedTuple):
 _PAIRS = {"axes": ("AxisDesigns", "axis", "NoAxis"), "drives": ("Drives", "controller", "NoDrive")}
 
 
-# Flags of an ``AdrcDesign`` that say which parts there are: the parts say it, too.
-_RESTATED = ("guarded", "scheduled", "has_safe_set", "has_held", "has_model", "nonlinear")
+# Flags that say which parts there are, by the kind of parameters: the parts say it, too.
+_RESTATED = {
+    "AdrcDesign": ("guarded", "scheduled", "has_safe_set", "has_held", "has_model", "nonlinear"),
+    "AxesDesign": ("learns_of_all", "has_bands", "gain_moves", "takes_controls"),
+}
 
 
 def leaves(state: Any, name: str = "", path: tuple[str | int, ...] = ()) -> Iterator[Leaf]:
@@ -257,7 +260,7 @@ def _text(value: Any, digits: int) -> str:
     if isinstance(value, tuple):
         kind = type(value).__name__ if hasattr(value, "_fields") else ""
         fields = getattr(value, "_fields", range(len(value)))
-        left_out = _RESTATED if isinstance(value, AdrcDesign) else ()
+        left_out = _RESTATED.get(kind, ())
         parts = (
             _text_of_pairs(part, digits, *_PAIRS[field])
             if field in _PAIRS and type(part) is tuple
