@@ -6,7 +6,7 @@ import math
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -146,7 +146,9 @@ def test_axes_are_judged_each_by_its_step_and_after_overloads() -> None:
     file = axes_at_limits.file_at(machine(), axes(), None)
     limited = axes(u_min=[-1.0, -1.0], u_max=[1.0, 1.0])
     held = np.zeros((2, 2))
-    found = acceptance.judge_axes(file, limited, 0.1, held, np.array([0.1234, 0.2]))
+    sizes, no_prefilter = np.array([0.1234, 0.2]), Mock(return_value=None)
+    found = acceptance.judge_axes(file, limited, 0.1, held, sizes, no_prefilter)
+    no_prefilter.assert_not_called()
     assert [each.name for each in found.others] == ["x", "y"]
     assert [each.step.size for each in found.others] == [0.12, 0.2]
     assert found.failures == ()

@@ -298,8 +298,7 @@ def _compare_setups(
     paths: Sequence[Path], seeds: int | None, criterion: str, trust: bool, outputs: Outputs
 ) -> None:
     from quell.experiments import over_seeds as experiment
-    from quell.setup import SetupError, read
-    from quell.setup.axes import made_any
+    from quell.setup import SetupError, made, read
 
     stems = [path.stem for path in paths]
     names = stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
@@ -309,7 +308,7 @@ def _compare_setups(
     setups = {}
     for key, path in zip(names, paths, strict=True):
         name, data = read(path)
-        setups[key] = made_any(name, data, trust)
+        setups[key] = made(name, data, trust)
     outputs = check_outputs(outputs, [figure])
     console = Console()
     first = next(iter(setups.values()))

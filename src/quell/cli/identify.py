@@ -566,9 +566,10 @@ def _of_loop(path: Path, dt: float, trust: bool) -> dict[str, Any]:
     """Return order, b0 and omega_o over omega_c of a setup's controller, if it has them."""
     from quell.controllers.adrc import ADRC
     from quell.controllers.prefilters import without_prefilters
-    from quell.setup import load
+    from quell.setup import read
+    from quell.setup.loading import unchecked
 
-    setup = load(path, trust)
+    setup = unchecked(*read(path), trust)
     controller = without_prefilters(setup.controller)
     if abs(controller.dt - dt) > 1e-3 * dt:
         rule = f"must be the sample time of the record, {dt:g} s"

@@ -247,11 +247,10 @@ def proxy(
     from quell.realtime.devices import counts_text
     from quell.realtime.registry import listen
     from quell.realtime.rig import Rig
-    from quell.setup import read
-    from quell.setup.axes import made_any
+    from quell.setup import made, read
     from quell.setup.schema import SetupError, with_path
 
-    loaded = made_any(*read(setup), trust)
+    loaded = made(*read(setup), trust)
     options = dict(loaded.needed("rig"))
     url = str(options.pop("device")) if device is None else device
     for name, value in options.items():
@@ -387,8 +386,7 @@ def run_rig(
         while it runs: an alarm is printed at once. A new file is a new state; make it with quell
         watch for other windows.
     """
-    from quell.setup import EXAMPLES, read
-    from quell.setup.axes import made_any
+    from quell.setup import EXAMPLES, made, read
     from quell.setup.description import is_of_axes
 
     numbers: dict[str, Any] = {
@@ -433,7 +431,7 @@ def run_rig(
     if seconds is not None and isinstance(windows := tables.get("metrics"), list):
         # A shorter run is not judged after its end.
         tables["metrics"] = [each for each in windows if not _begins_after(each, seconds)]
-    given = made_any(name, tables, trust)
+    given = made(name, tables, trust)
     if code := _run(given, files, (live, live_origin or []), watch, outputs):
         sys.exit(code)
 
@@ -700,14 +698,14 @@ def replay(
     from quell.realtime import replay as replay_record
     from quell.records import metrics
     from quell.records.units import runs_in_common_units
-    from quell.setup import EXAMPLES, read
-    from quell.setup.axes import made_any, signals_in
+    from quell.setup import EXAMPLES, made, read
+    from quell.setup.axes import signals_in
     from quell.setup.description import is_of_axes
     from quell.setup.schema import with_path
 
     file, data = read(setup or EXAMPLES / "torsional_rig.toml")
     several = is_of_axes(data)
-    given = made_any(file, data, trust)
+    given = made(file, data, trust)
     name = f"{record.stem}-replayed"
     outputs = check_outputs(outputs, [name])
     console = Console()

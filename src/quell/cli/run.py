@@ -73,8 +73,8 @@ def run(
     example
         Print such a file, and do no more.
     """
-    from quell.setup import EXAMPLES, SetupError, read
-    from quell.setup.axes import made_any, signals_in
+    from quell.setup import EXAMPLES, SetupError, made, read
+    from quell.setup.axes import signals_in
     from quell.setup.description import is_of_axes
     from quell.simulation import simulate
     from quell.types import Status
@@ -88,7 +88,7 @@ def run(
         raise ValueError("setup: missing; must be a TOML file, and quell run --example prints one")
     name, data = read(setup)
     several = is_of_axes(data)
-    given = made_any(name, data, trust)
+    given = made(name, data, trust)
     plant, scenario = given.needed("plant"), given.needed("scenario")
     outputs = check_outputs(outputs, [setup.stem])
     console = Console()
@@ -164,14 +164,14 @@ def sweep(
     worst
         Number of worst runs to print.
     """
-    from quell.setup import read
-    from quell.setup.axes import made_any, sweep_of_axes
+    from quell.setup import made, read
+    from quell.setup.axes import sweep_of_axes
     from quell.setup.description import is_of_axes
     from quell.setup.loading import sweep_of
 
     name, data = read(setup)
     several = is_of_axes(data)
-    given = made_any(name, data, trust)
+    given = made(name, data, trust)
     plan = (sweep_of_axes if several else sweep_of)(given)
     where = Path(f"{setup.stem}-sweep") if folder is None else folder
     console = Console()
@@ -368,8 +368,7 @@ def export(
         shall be stable, too.
     """
     from quell.export import c
-    from quell.setup import read
-    from quell.setup.axes import made_any
+    from quell.setup import made, read
 
     if to != "c":
         refuse({"resolution": (resolution, None), "prove": (prove, False)}, "only with --to c")
@@ -384,7 +383,7 @@ def export(
         refuse({"what": (what, "controller")}, f"is for --to fmu; {to} is of the controller")
     if what == "plant":
         refuse({"memory": (memory, None)}, "is of a controller; a plant has none")
-    given = made_any(*read(setup), trust)
+    given = made(*read(setup), trust)
     controller = _learned(given.controller, memory, precision)
     if to == "fmu":
         _to_fmu(given, what, out, name or "", overwrite)

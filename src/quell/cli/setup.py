@@ -21,8 +21,7 @@ def setup(files: list[Path] | None = None, *, schema: Switch = False, trust: Tru
     schema
         Print the JSON Schema (draft 7) of setup files, and do no more.
     """
-    from quell.setup import SetupError, read
-    from quell.setup.axes import made_any
+    from quell.setup import SetupError, made, read
 
     if schema:
         unused = {"files": (files, None), "trust": (trust, False)}
@@ -37,7 +36,7 @@ def setup(files: list[Path] | None = None, *, schema: Switch = False, trust: Tru
     for file in files:
         try:
             name, data = read(file)
-            found = made_any(name, data, trust)
+            found = made(name, data, trust)
         except SetupError as error:
             mistakes += error.mistakes
         else:

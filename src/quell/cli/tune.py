@@ -505,7 +505,8 @@ def _tune_compensator(
     from quell.controllers.compensated import Compensated
     from quell.controllers.prefilters import without_prefilters
     from quell.files import written_atomically
-    from quell.setup.loading import load, unchecked, varied
+    from quell.setup import load, varied
+    from quell.setup.loading import unchecked
     from quell.simulation import Scenario
     from quell.tuning import Constraints, tune_compensator
     from quell.tuning.report import toml_text

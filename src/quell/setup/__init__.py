@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 from quell.lazy import imported_on_use
 
 if TYPE_CHECKING:
-    from quell.setup.axes import AxesDescription, load_axes, made_axes
+    from quell.setup.axes import AxesDescription
     from quell.setup.description import Description
-    from quell.setup.loading import EXAMPLES, Setup, controllers_of, load, made, varied
+    from quell.setup.loading import EXAMPLES, Setup, controllers_of, varied
+    from quell.setup.reading import load, made
     from quell.setup.schema import SetupError, plant_given, plant_of, read
 
 _HOMES = {
@@ -24,10 +25,8 @@ _HOMES = {
     "Setup": "loading",
     "SetupError": "schema",
     "controllers_of": "loading",
-    "load": "loading",
-    "load_axes": "axes",
-    "made": "loading",
-    "made_axes": "axes",
+    "load": "reading",
+    "made": "reading",
     "plant_given": "schema",
     "plant_of": "schema",
     "read": "schema",
@@ -42,13 +41,14 @@ __all__ = [
     "SetupError",
     "controllers_of",
     "load",
-    "load_axes",
     "made",
-    "made_axes",
     "plant_given",
     "plant_of",
     "read",
     "varied",
 ]
 
-__getattr__ = imported_on_use(__name__, _HOMES)
+# Names of the last release.
+_RENAMED = {"load_axes": "load", "made_axes": "made"}
+
+__getattr__ = imported_on_use(__name__, _HOMES, (), _RENAMED)

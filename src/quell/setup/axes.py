@@ -32,14 +32,13 @@ from quell.plants.nonlinear import NonlinearPlant
 from quell.quantities import AxesSignals
 from quell.records.trajectory import Trajectory
 from quell.setup import registry
-from quell.setup.description import DT, TITLE, Title, is_of_axes, optional
+from quell.setup.description import DT, TITLE, Title, optional
 from quell.setup.loading import (
     REPLACED,
     Known,
     Setup,
     Variation,
     changed,
-    made,
     made_once,
     sweep_of,
     title_of,
@@ -237,7 +236,7 @@ def axes_task(
 ) -> tuple[Setup, dict[str, Any]]:
     """Read a setup file of several axes; return it and the arguments of ``tune_axes``.
 
-    ``changes`` are values of ``[tune]`` by name. Raises ``SetupError`` as ``load_axes``, and for a
+    ``changes`` are values of ``[tune]`` by name. Raises ``SetupError`` as ``load``, and for a
     file without plant.
     """
     name, data = read(path)
@@ -378,25 +377,6 @@ class AxesDescription(Table):
 
 # Tables of a setup of one axis, and where they are here.
 _ELSEWHERE = dict.fromkeys(REPLACED, "belongs into each [[axis]]")
-
-
-def load_axes(path: str | os.PathLike[str], trust: bool = False) -> Setup:
-    """Read a TOML file of several axes and build the objects that it describes.
-
-    The ``controller`` of the setup is a ``quell.Axes``. ``trust`` and errors are those of ``load``.
-
-    Examples
-    --------
-    >>> from quell.setup import EXAMPLES, load_axes
-    >>> load_axes(EXAMPLES / "arm.toml").controller.names
-    ('shoulder', 'elbow')
-    """
-    return made_axes(*read(path), trust)
-
-
-def made_any(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
-    """Build the objects of a file of one axis, as ``made``, or of several, as ``made_axes``."""
-    return (made_axes if is_of_axes(data) else made)(name, data, trust)
 
 
 def made_axes(

@@ -92,7 +92,7 @@ def describe(name: str, data: Mapping[str, Any]) -> Description:
             [
                 f"{name}: NOT for several axes yet: this works on one axis, and the file has "
                 "[[axis]]; quell run, run-rig, replay, proxy, tune, sweep, compare, studio and "
-                "export take it, in Python quell.setup.load_axes reads it"
+                "export take it, in Python quell.setup.load reads it"
             ]
         )
     values = immutable(data)

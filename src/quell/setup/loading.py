@@ -119,41 +119,6 @@ class Setup:
         return getattr(self, table)
 
 
-def load(path: str | os.PathLike[str], trust: bool = False) -> Setup:
-    r"""Read a TOML file of one axis and build the objects that it describes.
-
-    A plant of the kind ``python`` runs a Python file, which is refused without ``trust``. A
-    ``SetupError`` has a line for each error: file, path of the key, value and rule, or the
-    nearest known name.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> text = "dt = 0.01\ncontroller = {omega_c = 2.0}\n"
-    >>> text += "observer = {kind = 'model-free', order = 2, b0 = 1.0, omega_0 = 9.0}"
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "rig.toml"
-    ...     _ = path.write_text(text)
-    ...     load(path)
-    Traceback (most recent call last):
-        ...
-    quell.setup.schema.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
-    """
-    return made(*read(path), trust)
-
-
-def made(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
-    """Build the objects that ``data`` describes: the content of a TOML file called ``name``.
-
-    Raises
-    ------
-    SetupError
-        as ``load``.
-    """
-    return usable(unchecked(name, data, trust))
-
-
 def assembled(
     name: str, tables: Description, known: Known | None = None, trust: bool = False
 ) -> Setup:

@@ -24,10 +24,9 @@ from quell.plants.nonlinear import NonlinearPlant
 from quell.records.metrics import worsened
 from quell.records.record import describe
 from quell.records.trajectory import Trajectory
-from quell.setup.axes import made_axes
-from quell.setup.description import describe as tables_of
+from quell.setup import made
 from quell.setup.description import is_of_axes, parsed
-from quell.setup.loading import Known, Setup, assembled, usable
+from quell.setup.loading import Known, Setup
 from quell.simulation import simulate
 from quell.studio.messages import (
     MOST_BYTES,
@@ -98,11 +97,7 @@ class Maker:
     def __call__(self, tables: Mapping[str, Any]) -> Setup:
         """Return the setup; raise a ``SetupError`` for tables that do not fit."""
         with caught_warnings() as self.warnings:
-            if is_of_axes(tables):
-                setup = made_axes(self.name, tables, self.trust, self._known)
-            else:
-                described = tables_of(self.name, tables)
-                setup = usable(assembled(self.name, described, self._known, self.trust))
+            setup = made(self.name, tables, self.trust, self._known)
         if self.warnings:
             self._known = {}  # what is not built again would not warn again
         for table in ("plant", "scenario"):
@@ -384,7 +379,7 @@ import matplotlib.pyplot as plt
 
 import quell as ql
 
-setup = ql.setup.made_axes("{name}", {tables})
+setup = ql.setup.made("{name}", {tables})
 run = ql.simulate(setup.plant, setup.controller, setup.scenario)
 for axis, metrics in run.metrics().items():
     print(axis, metrics)

@@ -1,0 +1,60 @@
+"""Setup files of any number of axes: reading one builds the objects that it describes.
+
+A file with tables ``[[axis]]`` has several coupled axes (``setup/axes.py``), another one a single
+axis (``setup/loading.py``).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from quell.setup.axes import made_axes
+from quell.setup.description import describe, is_of_axes
+from quell.setup.loading import Known, Setup, assembled, usable
+from quell.setup.schema import read
+
+
+def load(path: str | os.PathLike[str], trust: bool = False) -> Setup:
+    r"""Read a TOML file and build the objects that it describes.
+
+    A plant of the kind ``python`` runs a Python file, which is refused without ``trust``. A
+    ``SetupError`` has a line for each error: file, path of the key, value and rule, or the
+    nearest known name. The ``controller`` of a file with several axes is a ``quell.Axes``.
+
+    Examples
+    --------
+    >>> from quell.setup import EXAMPLES
+    >>> load(EXAMPLES / "arm.toml").controller.names
+    ('shoulder', 'elbow')
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> text = "dt = 0.01\ncontroller = {omega_c = 2.0}\n"
+    >>> text += "observer = {kind = 'model-free', order = 2, b0 = 1.0, omega_0 = 9.0}"
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "rig.toml"
+    ...     _ = path.write_text(text)
+    ...     load(path)
+    Traceback (most recent call last):
+        ...
+    quell.setup.schema.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
+    """
+    return made(*read(path), trust)
+
+
+def made(
+    name: str, data: Mapping[str, Any], trust: bool = False, known: Known | None = None
+) -> Setup:
+    """Build the objects that ``data`` describes: the content of a TOML file called ``name``.
+
+    ``known`` has parts of an earlier call, which are not built again if their tables are the same.
+
+    Raises
+    ------
+    SetupError
+        as ``load``.
+    """
+    if is_of_axes(data):
+        return made_axes(name, data, trust, known)
+    return usable(assembled(name, describe(name, data), known, trust))
