@@ -4,8 +4,8 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 """
 
 from quell.analysis.advice import advise
-from quell.analysis.certificate import Certificate, certify, observer_error
-from quell.analysis.coupled import CoupledCertificate, certify_axes, certify_coupled
+from quell.analysis.certificate import Certificate, observer_error
+from quell.analysis.coupled import CoupledCertificate, certify_coupled
 from quell.analysis.coupling import Coupling, coupling, relative_gains
 from quell.analysis.disk import DiskMargin
 from quell.analysis.feedback import (
@@ -15,10 +15,11 @@ from quell.analysis.feedback import (
     observer_within,
 )
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
-from quell.analysis.loop import LoopAnalysis, analyse
+from quell.analysis.loop import LoopAnalysis
+from quell.analysis.machine import analyse, certify
 from quell.analysis.margins import Margins
 from quell.analysis.matrices import MatrixLaw, axes_law
-from quell.analysis.multivariable import MultivariableLoop, Peak, Pole, analyse_axes
+from quell.analysis.multivariable import MultivariableLoop, Peak, Pole
 from quell.analysis.online import OnlineCertificate, certify_online
 from quell.analysis.plots import (
     loops_over_omega_o,
@@ -32,6 +33,7 @@ from quell.analysis.plots import (
 )
 from quell.analysis.points import LoopsAtPoints, analyse_points
 from quell.controllers.adrc import Finding
+from quell.lazy import imported_on_use
 from quell.lti.zeros import (
     Existence,
     InvariantZeros,
@@ -62,12 +64,10 @@ __all__ = [
     "adapting",
     "advise",
     "analyse",
-    "analyse_axes",
     "analyse_feedback",
     "analyse_points",
     "axes_law",
     "certify",
-    "certify_axes",
     "certify_coupled",
     "certify_online",
     "coupling",
@@ -89,3 +89,8 @@ __all__ = [
     "relative_gains",
     "unobservable_modes",
 ]
+
+# Names of the last release.
+__getattr__ = imported_on_use(
+    __name__, {}, (), {"analyse_axes": "analyse", "certify_axes": "certify"}
+)

@@ -9,7 +9,7 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.linearise import Adapting, Frozen, adapting
-from quell.analysis.loop import LoopAnalysis, analyse, durations
+from quell.analysis.loop import LoopAnalysis, analyse_axis, durations
 from quell.analysis.margins import eigenvalues
 from quell.controllers.adrc import ADRC, Finding, known_samples, sampling_findings
 from quell.controllers.base import Controller
@@ -93,7 +93,7 @@ def advise(
         found = sampling_findings(controller.observer, controller.omega_c)
         found += _judge_bandwidths(controller)
     options = {"at": at, "operating_point": operating_point}
-    loop = analyse(plant, controller, delay=known_delay, **options)
+    loop = analyse_axis(plant, controller, delay=known_delay, **options)
     if not loop.stable:
         lost = _lost_by_delay(loop, plant, controller, known_delay, options)
         if lost is None:
@@ -103,7 +103,7 @@ def advise(
     found += _judge_learner(plant, controller, known_delay, options)
     if actuator_lag > 0.0 or delay > 0.0:
         lags: dict[str, Any] = {"delay": known_delay + delay, "actuator_lag": actuator_lag}
-        late = analyse(plant, controller, **lags, **options)
+        late = analyse_axis(plant, controller, **lags, **options)
         found += _judge_lag(loop, late, actuator_lag, delay, observer)
         loop = late
     if delay == 0.0 and loop.stable:
@@ -165,7 +165,7 @@ def _lost_by_delay(
     stated = loop.dt * known_samples(controller.observer)
     if own + delay <= stated + 0.5 * loop.dt:
         return None
-    prompt = analyse(linear, controller, delay=stated, at=options["at"])
+    prompt = analyse_axis(linear, controller, delay=stated, at=options["at"])
     if not prompt.stable:
         return None
     late, margin, known = durations(own + delay, stated + prompt.margins.delay, stated)
@@ -235,7 +235,7 @@ def _judge_learner(
     rates = learner.rates
 
     def m_s(part: Any) -> float:
-        loop = analyse(plant, controller, delay=delay, **{**options, "at": part})
+        loop = analyse_axis(plant, controller, delay=delay, **{**options, "at": part})
         return 1.0 / loop.margins.modulus if loop.stable else math.inf
 
     none = m_s(learner.known._replace(gain=0.0 * learner.known.gain, before=0.0, slope=0.0))

@@ -134,7 +134,7 @@ class Certificate:
         return dict(nonfinite_to_none(found))
 
 
-def certify(
+def certify_axis(
     plants: Any,
     controller: Controller,
     *,
@@ -142,38 +142,7 @@ def certify(
     actuator_lag: float = 0.0,
     operating_point: Any = None,
 ) -> Certificate:
-    """Compute what a guard guarantees for the loops of linear plants, whatever the learner does.
-
-    The loop is the sampled one, with the form of its observer, delays and lag. Raises
-    ``ValueError`` for a loop that is unstable without learner, another controller than an ADRC, a
-    nonlinear law or observer, a nonlinear plant without operating point.
-
-    Parameters
-    ----------
-    plants
-        a plant as for ``analyse``, or a list of plants, or ``{name: plant}``. The bounds hold for
-        these plants, not for those between them.
-    controller
-        an ``ADRC``; κ is that of its guard. Without guard or learner κ is that of ``Guard()``, and
-        ``condition``, the first line of the text, says that the bounds are not those of this loop.
-    delay
-        additional dead time of the loops [s].
-    actuator_lag
-        time constant of a first-order lag between u and the plants [s].
-    operating_point
-        state and control signal ``(x, u)`` about which nonlinear plants are linearised.
-
-    Examples
-    --------
-    >>> import quell as ql
-    >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=0.005)
-    >>> plants = {f"b = {b}": ([b], [1.0, 0.0, 0.0]) for b in (0.7, 1.0, 1.3)}
-    >>> learner, guard = ql.learners.Kalman(), ql.Guard(certified_for=plants)
-    >>> controller = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard)
-    >>> found = certify(plants, controller)
-    >>> found.certified, found.worst, round(found.gain, 2)
-    (True, 'b = 0.7', 0.52)
-    """
+    """Return the certificate of one axis; see ``analysis.certify``."""
     adrc = linear_adrc(controller)
     gains: dict[str, CorrectionGains] = {}
     excluded: list[str] = []

@@ -44,7 +44,7 @@ from quell.types import Matrix, Vector
 
 @dataclass(frozen=True)
 class CoupledCertificate:
-    """Bounds for axes that act on each other; made by ``certify_coupled`` and ``certify_axes``."""
+    """Bounds for axes that act on each other; made by ``certify_coupled`` and ``certify``."""
 
     gains: Matrix
     """Peak-to-peak gains Γ (axes, axes) from e_j to q_i."""
@@ -245,38 +245,10 @@ def _peak_gains(name: str, systems: Any) -> Matrix:
 
 
 def certify_axes(plant: Any, axes: Axes, operating_point: Any = None) -> CoupledCertificate:
-    """Compute what the guards of several axes guarantee together, whatever the learners do.
+    """Return the certificate of several axes; see ``analysis.certify``.
 
-    The loop is linear, without limits; the plant may have other couplings than B0.
-
-    Parameters
-    ----------
-    plant
-        a plant with an output for each axis, as for ``analyse_axes``.
-    axes
-        the controller; κ of each axis is that of its guard, or of ``Guard()`` if it has none;
-        ``condition`` names the axes that learn without guard, for which the bounds do not hold.
-    operating_point
-        (x, u) at which a nonlinear plant is linearised, and y of which B0 is evaluated at.
-
-    Raises
-    ------
-    ValueError
-        for a plant that does not fit, a loop that is unstable without learners, or an axis that
-        ``certify`` refuses.
-
-    Examples
-    --------
-    Two axes whose inertia couples them by a third, and whose law does not know it:
-
-    >>> import numpy as np
-    >>> import quell as ql
-    >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron([[1.2, 0.4], [0.4, 1.2]], [[0], [1]])
-    >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=0.005)
-    >>> axis = ql.ADRC(observer, omega_c=1.0, learner=ql.learners.Kalman(), guard=ql.Guard())
-    >>> found = certify_axes((A, B, np.eye(4)[[0, 2]]), ql.Axes({"x": axis, "y": axis}))
-    >>> found.certified, found.gains.round(2).tolist()
-    (False, [[0.25, 0.46], [0.46, 0.25]])
+    κ of each axis is that of its guard, or of ``Guard()`` if it has none; ``condition`` names the
+    axes that learn without guard, for which the bounds do not hold.
     """
     adrcs = [linear_adrc(each) for each in axes.axes]
     matrices = sampled_matrices(plant, axes.dt, operating_point)

@@ -247,7 +247,7 @@ def coupling(
     Parameters
     ----------
     plant
-        a plant with several inputs and outputs, as for ``analyse_axes``; output i and input i are
+        a plant with several inputs and outputs, as for ``analyse``; output i and input i are
         axis i.
     dt
         sample time of the loops [s].
@@ -261,7 +261,7 @@ def coupling(
     Raises
     ------
     ValueError
-        for a plant that ``analyse_axes`` refuses, other numbers of inputs than of outputs, a
+        for a plant that ``analyse`` refuses, other numbers of inputs than of outputs, a
         bandwidth of more than half the sampling rate, or an output that no input moves.
 
     Examples

@@ -72,7 +72,7 @@ def analyse_feedback(
     controller
         the law with its observer; gains that follow the covariance are those of the steady state.
     plant
-        as for ``analyse_axes``; by default the one that the observer is made for.
+        as for ``analyse``; by default the one that the observer is made for.
     u_size, y_size
         size of each control signal and of each output, as for ``MultivariableLoop``.
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.certificate import Certificate, certify
+from quell.analysis.certificate import Certificate, certify_axis
 from quell.analysis.linearise import Frozen, is_known, knows_other_axes, linear_law
 from quell.analysis.margins import (
     Complex,
@@ -157,7 +157,7 @@ def _control() -> Any:
 # ---- The loop of a linear plant and a controller ----
 
 
-def analyse(
+def analyse_axis(
     plant: Any,
     controller: Controller,
     *,
@@ -166,36 +166,7 @@ def analyse(
     actuator_lag: float = 0.0,
     operating_point: Any = None,
 ) -> LoopAnalysis:
-    """Analyse the loop of a linear plant and a controller, unlimited, with a learner at rest.
-
-    What a learner knows of the plant is a feedback, and its bias and oscillators go on adapting:
-    the loop contains both, linearised about rest (``analysis/linearise.py``).
-
-    Raises ``ValueError`` for a nonlinear plant without operating point, a plant with direct
-    feedthrough, a controller without a linear law, a delay of more than 200 samples.
-
-    Parameters
-    ----------
-    plant
-        ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction`` or ``(num, den)``; one
-        of them delayed or encoded (an encoder is left out); or a ``NonlinearPlant``, with its
-        operating point.
-    controller
-        an ``ADRC``, a linear controller, either with a compensator, or a ``Compensator`` alone,
-        whose loop is closed around the plant that it sees; a prefilter in front is left out.
-    at
-        instant at which its learner is looked at: a run or state of the controller (its end), or
-        an ``Adapting`` from ``adapting(controller, run, t)``; by default the present state, which
-        for a new controller has learned nothing. A ``Frozen`` from ``frozen`` in its place is a
-        learner that no longer learns.
-    delay
-        additional dead time of the loop [s].
-    actuator_lag
-        time constant of a first-order lag between u and the plant [s].
-    operating_point
-        state and control signal ``(x, u)`` about which a nonlinear plant is linearised; see
-        ``quell.plants.linearised``.
-    """
+    """Return the loop of one axis; see ``analysis.analyse``."""
     controller = without_prefilters(controller)
     if not (hasattr(controller, "law") or hasattr(controller, "observer")):
         raise ValueError(
@@ -211,7 +182,9 @@ def analyse(
     certificate = None
     if _is_guarded(controller):
         how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
-        certificate = partial(certify, plant, controller, operating_point=operating_point, **how)
+        certificate = partial(
+            certify_axis, plant, controller, operating_point=operating_point, **how
+        )
     law, note = linear_law(controller, at), ""
     part = compensating_part(controller)
     if part is not None and not isinstance(at, Frozen):

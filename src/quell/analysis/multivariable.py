@@ -484,46 +484,7 @@ class MultivariableLoop:
 
 
 def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> MultivariableLoop:
-    """Analyse the loop of a plant and several axes, unlimited, with learners at rest.
-
-    Learners are taken as ``analyse`` takes them; what those of all axes have learned from states
-    of other axes is not in the loop, and the summary says so. Compensators are taken with their
-    drives; without drives the loop that u_0 closes is not in it, which the summary says, too. A B0
-    that is a function of the estimates is a constant here, the one at the operating point: what its
-    changes do is not in these margins, and the summary says so (``analyse_points`` judges several
-    points).
-
-    Parameters
-    ----------
-    plant
-        a plant with an output for each axis: a ``LinearPlant`` or what it is made
-        ``of``, such as (A, B, C) in continuous time; one behind delays or encoders, which are left
-        out; a ``NonlinearPlant``, with its operating point; or a sampled one, a
-        ``control.StateSpace`` with the same dt, or what a ``LinearPlant`` is ``sampled`` to.
-    axes
-        the controller.
-    operating_point
-        (x, u) at which a nonlinear plant is linearised, at rest.
-
-    Raises
-    ------
-    ValueError
-        for another plant or controller, sizes that do not fit, a nonlinear plant without operating
-        point, a drive without a linear law.
-
-    Examples
-    --------
-    >>> import quell as ql
-    >>> robot = ql.plants.arm(gravity=0.0)
-    >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3)
-    >>> joint = ql.ADRC(observer, omega_c=8.0)
-    >>> pose = ([0.3, 1.2, 0.0, 0.0], [0.0, 0.0])
-    >>> loop = analyse_axes(robot, ql.Axes([joint, joint], M=robot.inertia), pose)
-    >>> round(loop.disk_margin("inputs").alpha, 2)
-    0.84
-    """
-    if not isinstance(axes, Axes):
-        raise ValueError(f"axes = {axes!r}: must be quell.Axes; of one signal, use analyse")
+    """Return the loop of several axes; see ``analysis.analyse``."""
     matrices = sampled_matrices(plant, axes.dt, operating_point)
     m, p = matrices[1].shape[1], matrices[2].shape[0]
     if (p, m) != (axes.outputs, axes.inputs):

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.analysis.loop import analyse
+from quell.analysis.loop import analyse_axis
 from quell.controllers.adrc import ADRC
 from quell.controllers.online_gain import OnlineGain
 from quell.lti.canonical import canonical
@@ -98,7 +98,7 @@ def certify_online(plant: Any, controller: ADRC, *, delay: float = 0.0) -> Onlin
             f"plant has b = {b:.6g}, outside of low = {online.low!r} … high = {online.high!r}: "
             "the estimate can not find it; give limits that contain it"
         )
-    loop = analyse(plant, controller.at(b), delay=delay)
+    loop = analyse_axis(plant, controller.at(b), delay=delay)
     if not loop.stable:
         raise ValueError(
             "the loop is unstable with b0 = b: lower omega_c or omega_o, no estimate can help"

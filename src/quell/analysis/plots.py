@@ -15,7 +15,7 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.linearise import adapting
-from quell.analysis.loop import LoopAnalysis, analyse
+from quell.analysis.loop import LoopAnalysis, analyse_axis
 from quell.controllers.base import Controller
 from quell.records.plotting import given_axes
 from quell.records.trajectory import Trajectory
@@ -54,7 +54,8 @@ def loops_over_time(
     instants = checks.vector("times", times).tolist()
     if isinstance(run, Trajectory):
         return [
-            analyse(plant, controller, at=adapting(controller, run, t), **options) for t in instants
+            analyse_axis(plant, controller, at=adapting(controller, run, t), **options)
+            for t in instants
         ]
     if not isinstance(run, Scenario):
         raise ValueError(f"run = {run!r}: must be a Trajectory or a Scenario")
@@ -67,7 +68,7 @@ def loops_over_time(
         record = simulate(plant, controller, until, record_every=10**9)
         if record.diverged:
             raise ValueError(f"times has {t!r}: the loop diverged at {record.ended:.6g} s")
-        loops.append(analyse(plant, controller, at=record, **options))
+        loops.append(analyse_axis(plant, controller, at=record, **options))
     return loops
 
 
@@ -95,7 +96,9 @@ def loops_over_omega_o(
     bandwidths = checks.positive_vector("omegas", omegas)
     if bandwidths.size == 0:
         raise ValueError(f"omegas = {omegas!r}: must hold at least one bandwidth")
-    return [analyse(plant, make_controller(omega_o), **options) for omega_o in bandwidths.tolist()]
+    return [
+        analyse_axis(plant, make_controller(omega_o), **options) for omega_o in bandwidths.tolist()
+    ]
 
 
 # ---- Plots of loops ----

@@ -1,6 +1,6 @@
 """Loops of several axes at a set of operating points, and the worst of them.
 
-An arm has another plant and another B0 in each pose. ``analyse_axes`` judges one, in which B0 is a
+An arm has another plant and another B0 in each pose. ``analyse`` judges one, in which B0 is a
 constant; here the loop is judged at each point of a set, and the worst of every measure is told. As
 with a schedule, these are loops at rest: between the points and in fast motion nothing is proved.
 
@@ -175,7 +175,7 @@ def analyse_points(plant: Any, axes: Axes, points: Sequence[Any]) -> LoopsAtPoin
     Raises
     ------
     ValueError
-        as ``analyse_axes``; for a state that no u holds at rest, and without any point.
+        as ``analyse``; for a state that no u holds at rest, and without any point.
 
     Examples
     --------

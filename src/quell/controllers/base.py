@@ -60,7 +60,7 @@ def check_controller(value: Any, name: str = "controller", *, several: bool = Fa
         raise ValueError(
             f"{name} = {type(value).__name__}(…) has {value.inputs} control signals and "
             f"{value.outputs} outputs: NOT possible here yet, one of each is; quell.simulate, "
-            "quell.analysis.analyse_axes and quell.export.c take several"
+            "quell.analysis.analyse and quell.export.c take several"
         )
     check_runs_alone(name, value)
 

@@ -30,7 +30,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import analyse
+from quell.analysis.loop import analyse_axis
 from quell.controllers import ADRC
 from quell.experiments.common import (
     ESTIMATES,
@@ -219,7 +219,7 @@ def margins(law: ADRC, run: Trajectory) -> Scores:
 
     None for a run that diverged, and for a loop that is not stable at rest.
     """
-    loop = None if run.diverged else analyse(two_mass_spring(), law, at=run)
+    loop = None if run.diverged else analyse_axis(two_mass_spring(), law, at=run)
     if loop is None or not loop.stable:
         return {"m_s": None, "m_ks": None}
     return {"m_s": 1.0 / loop.margins.modulus, "m_ks": loop.noise_to_control_peak}

@@ -107,7 +107,7 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
     if getattr(plant, "inputs", 1) > 1 or getattr(plant, "outputs", 1) > 1:
         raise ValueError(
             f"plant = {named} has {plant.inputs} control signals and {plant.outputs} outputs, here "
-            "there is one of each; several: quell.Axes and quell.analysis.analyse_axes"
+            "there is one of each; several: quell.Axes and quell.analysis.analyse"
         )
     raise ValueError(
         f"plant = {named}: must be a linear plant or control.StateSpace (with A, B, C), matrices "
@@ -180,7 +180,7 @@ def check_matrices(A: Any, B: Any, C: Any, several: bool = False) -> tuple[Matri
         raise ValueError(
             f"B has shape {np.shape(B)}, C {np.shape(C)}: {inputs} inputs and {outputs} outputs, "
             "here there is one of each; several are controlled by quell.Axes and judged by "
-            "quell.analysis.analyse_axes"
+            "quell.analysis.analyse"
         )
     B = checks.matrix("B", np.reshape(B, (-1, 1)) if np.ndim(B) == 1 else B)
     C = checks.matrix("C", np.reshape(C, (1, -1)) if np.ndim(C) == 1 else C)

@@ -315,7 +315,7 @@ def sampled_plant(
         model = to_state_space(model) if isinstance(model, TransferFunction) else model
         N, B = model.A - np.eye(model.C.size), model.B[:, None]
         return _delayed(N, B, np.zeros_like(B), model.C, B, round(delay / dt), {})
-    check_one_input(plant, "quell.analysis.analyse_axes")
+    check_one_input(plant, "quell.analysis.analyse")
     linear: Any = LinearPlant.of(plant)
     first = leading_gain(linear.A, linear.B, linear.C)
     gains = {} if first is None else {first[1]: first[0]}

@@ -277,7 +277,7 @@ def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any
     ``ValueError`` for a delay that was made for another sample time, and for a nonlinear plant
     without operating point.
     """
-    check_one_input(plant, "quell.Axes and quell.analysis.analyse_axes")
+    check_one_input(plant, "quell.Axes and quell.analysis.analyse")
     delay = 0.0
     while isinstance(plant, DelayedPlant | EncodedPlant):
         if isinstance(plant, DelayedPlant):

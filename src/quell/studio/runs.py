@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis import LoopAnalysis, analyse, analyse_axes
+from quell.analysis import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
 from quell.controllers.axes import Axes
 from quell.kernels.cache import compile_time
@@ -255,7 +255,7 @@ def _analysis_of_axis(setup: Setup, axis: int) -> tuple[dict[str, Any], dict[str
     if isinstance(inner, NonlinearPlant):
         start = np.zeros(plant.order) if scenario.x0 is None else np.asarray(scenario.x0)
         point = held_at(plant, start[: inner.order])
-    loop = analyse_axes(plant, controller, point)
+    loop = analyse(plant, controller, point)
     name = controller.names[axis]
     omega = _shown(loop.omega[1:], loop.dt)
     S = loop.response("S_o", omega)[:, axis, axis]

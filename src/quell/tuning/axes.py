@@ -157,7 +157,7 @@ def tune_axes(
     Parameters
     ----------
     plant
-        a plant with an output for each axis, as for ``analysis.analyse_axes``, in continuous time:
+        a plant with an output for each axis, as for ``analysis.analyse``, in continuous time:
         a ``LinearPlant`` or matrices (A, B, C), one behind delays or encoders (which
         are left out), or a nonlinear one with its operating points.
     axes

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import LoopAnalysis, analyse
+from quell.analysis.loop import LoopAnalysis, analyse_axis
 from quell.controllers.adrc import ADRC
 from quell.controllers.schedule import Schedule
 from quell.files import nonfinite_to_none, written_atomically
@@ -498,7 +498,7 @@ def tune_schedule(
     waiting = {at: float(each.delays[0]) for at, each in zip(grid, given, strict=True)}
 
     def frozen(of: _Made, at: tuple[float, ...]) -> LoopAnalysis:
-        return analyse(plant_at(at), of.controller.at(*at), **late)
+        return analyse_axis(plant_at(at), of.controller.at(*at), **late)
 
     def gentler() -> Iterator[_Made]:
         """Yield controllers with tighter bounds of noise in u that are not much worse."""
@@ -622,7 +622,7 @@ def _result(
 ) -> PointResult:
     frozen = controller.at(*at)
     with one_blas_thread():
-        loop, own = (analyse(plant, each, **late) for each in (frozen, alone))
+        loop, own = (analyse_axis(plant, each, **late) for each in (frozen, alone))
         m_t = loop.response("T", loop.omega) if loop.stable else np.array([math.inf])
         return PointResult(
             signals=at,

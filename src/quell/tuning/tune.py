@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import LoopAnalysis, analyse
+from quell.analysis.loop import LoopAnalysis, analyse_axis
 from quell.controllers.feedforward import Feedforward, checked_feedforward
 from quell.lti.canonical import canonical
 from quell.parallel import one_blas_thread
@@ -525,7 +525,7 @@ def _check_u_max(u_max: float | None, inputs: Inputs, plants: PlantSet) -> None:
 def _analysis(given: Given, plants: PlantSet, design: Design) -> LoopAnalysis:
     assert design.controller is not None
     delay, lag = float(given.delays[0]), given.actuator_lag
-    return analyse(given.linear[0], design.controller, delay=delay, actuator_lag=lag)
+    return analyse_axis(given.linear[0], design.controller, delay=delay, actuator_lag=lag)
 
 
 def _check(
