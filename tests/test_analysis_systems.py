@@ -36,7 +36,7 @@ def test_exported_systems_answer_as_the_simulated_loop_does(
         chain(order),
         controller,
         ql.Scenario(
-            reference=1.0, duration=6.0, disturbances=(ql.signals.Step(height=0.5, at=3.0),)
+            reference=1.0, duration=3.0, disturbances=(ql.signals.Step(height=0.5, at=1.5),)
         ),
     )
     loop = analysis.analyse(chain(order), controller)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import re
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -33,16 +35,23 @@ PIDS: dict[str, tuple[float, float, float, Any, float]] = {
 }
 
 
+@cache
 def made(name: str, **options: Any) -> PidEqual:
     """Return the equal ADRC of an example."""
     kp, ki, kd, tf, dt = PIDS[name]
     return equal_to_pid(kp, ki, kd, tf=tf, dt=dt, **options)
 
 
-def adrc(name: str, **options: Any) -> ql.ADRC:
-    """Return the controller of an example; some sample slowly, as the PID does."""
+@cache
+def _adrc(name: str, **options: Any) -> ql.ADRC:
+    """Make the controller of an example, whose search takes its time."""
     kp, ki, kd, tf, dt = PIDS[name]
     return ql.ADRC.from_pid(kp, ki, kd, tf=tf, dt=dt, **options)
+
+
+def adrc(name: str, **options: Any) -> ql.ADRC:
+    """Return the controller of an example, at rest; some sample slowly, as the PID does."""
+    return copy.deepcopy(_adrc(name, **options))
 
 
 def backward(kp: float, ki: float, kd: float, tf: Any, dt: float, y: Any) -> Any:

@@ -289,6 +289,7 @@ def test_the_deviation_of_a_root_is_its_derivative() -> None:
         )
 
 
+@pytest.mark.trial
 def test_the_result_is_a_plant_for_an_observer() -> None:
     """A loop designed on the identified twin, friction and all, moves it to π as one with the true model does."""
     found = found_twin((0.2, 20.0), 2.0)

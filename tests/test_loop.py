@@ -137,7 +137,7 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
 def test_a_delay_of_the_device_costs_no_measurement(hiccup: int, k: int) -> None:
     """Its late ticks come at once; the loop takes a step for each, with its own measurement."""
     late = {k + i: max(hiccup - i * SAMPLE, 0) for i in range(4)}
-    found, loop = ticks(TickingDevice(SAMPLE, late), 5.0)
+    found, loop = ticks(TickingDevice(SAMPLE, late), 3.5)
     ahead = found[:, LOOP_WIDTH - 2] - found[:, 0]
     np.testing.assert_array_equal(np.diff(found[:, 0]), 1.0)
     np.testing.assert_array_equal(ahead, ahead[0])
@@ -152,7 +152,7 @@ def test_a_delay_of_the_loop_costs_no_measurement(hiccup: int, k: int) -> None:
     """The loop wakes late: it makes up for the ticks meanwhile, and sends u for the newest."""
     late = np.zeros(20_000, dtype=np.int64)
     late[k] = hiccup
-    found, loop = ticks(TickingDevice(SAMPLE), 5.0, late)
+    found, loop = ticks(TickingDevice(SAMPLE), 3.5, late)
     ahead = found[:, LOOP_WIDTH - 2] - found[:, 0]
     np.testing.assert_array_equal(np.diff(found[:, 0]), 1.0)
     np.testing.assert_array_equal(ahead, ahead[0])

@@ -36,6 +36,12 @@ def exported(folder: Path, controller: Any = ADRC, name: str = "servo") -> Path:
     return ql.export.c(controller, folder / name, name=name).folder
 
 
+@pytest.fixture(scope="module")
+def servo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of one controller, for tests that only read it."""
+    return exported(tmp_path_factory.mktemp("packages"))
+
+
 # ---- Arduino ----
 
 # The regular expressions are those of arduino-lint's schemas and rules.
@@ -134,9 +140,11 @@ def test_the_folder_keeps_the_rules_of_the_library_manager(tmp_path: Path, contr
         ("includes=servo.h", "includes=drive.h", "LP052"),
     ],
 )
-def test_a_rule_that_is_broken_is_found(tmp_path: Path, old: str, new: str, rule: str) -> None:
+def test_a_rule_that_is_broken_is_found(
+    servo: Path, tmp_path: Path, old: str, new: str, rule: str
+) -> None:
     """Each change breaks one rule, so the test above can fail."""
-    folder = exported(tmp_path)
+    folder = shutil.copytree(servo, tmp_path / "servo")
     file = folder / "library.properties"
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
@@ -163,16 +171,15 @@ def test_a_name_that_the_library_manager_refuses_is_said_in_the_readme(
     assert list(arduino_findings(folder)) == [rule]
 
 
-def test_the_usual_name_has_no_line_with_not(tmp_path: Path) -> None:
+def test_the_usual_name_has_no_line_with_not(servo: Path) -> None:
     """Nothing stands in the way of ``servo``."""
-    assert "NOT for" not in (exported(tmp_path) / "README.md").read_text()
+    assert "NOT for" not in (servo / "README.md").read_text()
 
 
-def test_the_keywords_are_the_names_of_the_header(tmp_path: Path) -> None:
+def test_the_keywords_are_the_names_of_the_header(servo: Path) -> None:
     """A word, a tab and its kind; types, functions and constants that the header declares."""
-    folder = exported(tmp_path)
-    rows = [line.split("\t") for line in (folder / "keywords.txt").read_text().splitlines()]
-    header = (folder / "src/servo.h").read_text()
+    rows = [line.split("\t") for line in (servo / "keywords.txt").read_text().splitlines()]
+    header = (servo / "src/servo.h").read_text()
     assert len({word for word, _ in rows}) == len(rows)
     assert all(re.search(rf"\b{word}\b", header) for word, _ in rows)
     kinds = dict(rows)
@@ -183,23 +190,22 @@ def test_the_keywords_are_the_names_of_the_header(tmp_path: Path) -> None:
     assert functions == {word for word, kind in rows if kind == "KEYWORD2"}
 
 
-def test_the_licence_is_that_of_quell(tmp_path: Path) -> None:
+def test_the_licence_is_that_of_quell(servo: Path) -> None:
     """The code is made from quell's kernels."""
-    assert (exported(tmp_path) / "LICENSE").read_text() == (ROOT / "LICENSE").read_text()
+    assert (servo / "LICENSE").read_text() == (ROOT / "LICENSE").read_text()
 
 
 # ---- PlatformIO and ESP-IDF ----
 
 
-def test_the_manifests_have_one_version_and_the_needed_fields(tmp_path: Path) -> None:
+def test_the_manifests_have_one_version_and_the_needed_fields(servo: Path) -> None:
     """Version and description of all are the same; the header and the folders of library.json exist."""
-    folder = exported(tmp_path)
-    library = json.loads((folder / "library.json").read_text())
-    component = (folder / "idf_component.yml").read_text()
-    assert library["version"] == properties_of(folder)["version"] == "1.0.0"
+    library = json.loads((servo / "library.json").read_text())
+    component = (servo / "idf_component.yml").read_text()
+    assert library["version"] == properties_of(servo)["version"] == "1.0.0"
     assert 'version: "1.0.0"\n' in component
     assert f'description: "{library["description"]}"\n' in component
-    assert (folder / library["build"]["srcDir"] / library["headers"]).is_file()
+    assert (servo / library["build"]["srcDir"] / library["headers"]).is_file()
     assert all(re.fullmatch(r"[a-z\d\-_+. ]{1,50}", word) for word in library["keywords"])
 
 

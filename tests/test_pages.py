@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import re
 import tomllib
@@ -101,6 +102,19 @@ def test_every_setup_on_a_page_is_accepted(page: Path) -> None:
                 plant_of(plant, float(tables["dt"]))
 
 
+@functools.cache
+def options_of(*names: str) -> set[str]:
+    """Return the options of a command of the program; none where it only has commands."""
+    command: Any = app
+    for name in names:
+        command = command[name]
+    if not names or command.default_command is None:
+        return set()
+    return {"--help", "--version", "-h"}.union(
+        *([*each.names, *each.negatives] for each in command.assemble_argument_collection())
+    )
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_command_on_a_page_has_these_options(page: Path) -> None:
     """In the text, in blocks and in cells; what a page leaves out is not looked at."""
@@ -108,17 +122,13 @@ def test_every_command_on_a_page_has_these_options(page: Path) -> None:
     wrong = []
     for line in re.findall(r"(?:^!|^    |`)(quell [a-z][^`\n]*)", text, re.M):
         words = line.partition("#")[0].partition("|")[0].partition(">")[0].split()[1:]
-        command: Any = app
+        command, names = app, []
         while words and words[0] in command:
-            command = command[words.pop(0)]
-        if command is app or command.default_command is None:
+            names.append(words.pop(0))
+            command = command[names[-1]]
+        known = options_of(*names)
+        if not known:
             continue
-        known = {
-            name
-            for argument in command.assemble_argument_collection()
-            for name in (*argument.names, *argument.negatives)
-        }
-        known |= {"--help", "--version", "-h"}
         flags = [word.partition("=")[0].rstrip(",.;:)…'\"") for word in words]
         wrong += [
             f"{line}: {flag}"

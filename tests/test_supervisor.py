@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,12 @@ from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
 HOLD, RAMP, SETTLE = 5, 10, 10
 SAMPLE = round(1e9 * DT)
 MISS = math.nan
+
+
+@cache
+def undisturbed() -> Outcome:
+    """Return the loop of ``PLANT`` in which nothing happens."""
+    return run(ScriptedDevice(PLANT))
 
 
 def modes(outcome: Outcome) -> list[tuple[int, Mode, Cause]]:
@@ -86,9 +93,7 @@ def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
         (60 + missed, Mode.RUN, Cause.RECOVERED),
     ]
     assert np.all(outcome["EVENTS"].astype(int)[60 : 60 + missed] & Event.MISSED)
-    assert outcome["Y"][SETTLE + 300] == pytest.approx(
-        run(ScriptedDevice(PLANT))["Y"][SETTLE + 300], abs=0.05
-    )
+    assert outcome["Y"][SETTLE + 300] == pytest.approx(undisturbed()["Y"][SETTLE + 300], abs=0.05)
 
 
 @pytest.mark.parametrize("value", [MISS, math.inf])
@@ -177,7 +182,7 @@ def test_a_tracking_error_beyond_its_limit_trips() -> None:
 def test_an_f_hat_beyond_its_limit_trips() -> None:
     """The limit is on the whole estimate, with the learned part."""
     outcome = run(ScriptedDevice(PLANT), most_f=1.0)
-    plain = run(ScriptedDevice(PLANT))
+    plain = undisturbed()
     f_hat = plain.rows[:, 11] + plain.rows[:, 12]
     check_ended_by(outcome, int(np.flatnonzero(np.abs(f_hat) > 1.0)[0]), Cause.F_HAT)
 

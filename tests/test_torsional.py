@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 import quell as ql
 from quell.experiments import torsional as study
 from quell.experiments.common import Claim
-from quell.kernels.dispatch import compiled
+from quell.kernels import dispatch
+from quell.kernels.dispatch import compiled, interpreted
 from quell.plants.base import advance, measure
 
 from .cases import cases
@@ -46,7 +47,9 @@ def record(
     u, w = np.array(u, dtype=float), np.array(w)[: plant.disturbances]
     states, outputs = np.empty((u.size, plant.order)), np.empty(u.size)
     x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=float)
-    sample_by_sample(plant.sampled(dt), x, np.zeros(6 * plant.order), u, w, states, outputs)
+    scratch = np.zeros(6 * plant.order)
+    entry = interpreted(sample_by_sample) if dispatch.interpret_all else sample_by_sample
+    entry(plant.sampled(dt), x, scratch, u, w, states, outputs)
     return states, outputs
 
 
@@ -91,6 +94,7 @@ def test_its_defaults_are_the_identified_plant() -> None:
     assert response[0] == pytest.approx(response[1], rel=2e-4)
 
 
+@pytest.mark.compiled
 def test_friction_only_takes_energy() -> None:
     """A twisted shaft let go: the energy never grows, and both disks stand in the end."""
     twin = ql.plants.torsional()
@@ -102,6 +106,7 @@ def test_friction_only_takes_energy() -> None:
     assert np.max(np.abs(states[-1, 2:])) < 1e-12
 
 
+@pytest.mark.compiled
 def test_a_free_disk_stops_when_and_where_coulomb_says() -> None:
     """Both disks together, without viscous friction: stop after ``ω0² J / 2C`` and ``ω0 J / C``."""
     inertia, coulomb, speed = np.array([0.0192, 0.0019]), 0.02, 3.0
@@ -120,6 +125,7 @@ def test_a_free_disk_stops_when_and_where_coulomb_says() -> None:
     assert states[-1, 1] == pytest.approx(0.5 * speed * time, rel=1e-4)
 
 
+@pytest.mark.compiled
 def test_it_sticks_below_its_breakaway_torque_and_moves_above() -> None:
     """A minute just below: not a trace of creep. Just above: off, and away."""
     volts = 0.01 / (3.0 * 0.09617 * 2.0)
@@ -129,6 +135,7 @@ def test_it_sticks_below_its_breakaway_torque_and_moves_above() -> None:
     assert moved[-1, 0] > 1e-3
 
 
+@pytest.mark.compiled
 def test_it_sticks_under_a_torque_on_the_disk_too() -> None:
     """The disturbance inputs are torques [N m] on the lower and the upper disk."""
     for w, sticks in (
@@ -141,6 +148,7 @@ def test_it_sticks_under_a_torque_on_the_disk_too() -> None:
         assert (np.max(np.abs(states[-1])) < 1e-9) == sticks, w
 
 
+@pytest.mark.compiled
 def test_a_steady_speed_costs_coulomb_and_viscous_friction() -> None:
     """Torque at constant speed: ``C1 + C2 + (c1 + c2) ω``."""
     u = 0.1
@@ -178,6 +186,7 @@ def test_its_friction_agrees_with_an_independent_solution() -> None:
     )
 
 
+@pytest.mark.compiled
 def test_halving_the_sample_time_changes_little() -> None:
     """Sub-steps are of one length, whatever dt: stops are found within one of them."""
     rough, _ = record(
@@ -189,6 +198,7 @@ def test_halving_the_sample_time_changes_little() -> None:
     np.testing.assert_allclose(rough, fine[::5], atol=1e-9)
 
 
+@pytest.mark.compiled
 def test_the_encoder_counts() -> None:
     """Y is the nearest whole count, of either sign: at most half a count from the angle."""
     states, y = record(ql.plants.torsional(counts=1000), 0.3 * np.sin(np.arange(3000) * DT * 4.0))

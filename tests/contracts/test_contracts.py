@@ -235,7 +235,7 @@ def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state
     truth[observer.order + 1 :] = (0.3, -0.05)[: observer.disturbance_order - 1]
     z, seen = np.zeros(observer.states), np.zeros(size)
     begin(model, z, seen, 0.0)
-    for _ in range(1500):
+    for _ in range(600):
         truth = extended.transition @ truth + extended.input * u
         observe(model, z, seen, truth[0], u, 0.0)
     scale = 12.0 ** -np.arange(size)
@@ -309,7 +309,7 @@ def test_an_observer_runs_the_same_again(name: str) -> None:
     companion[-1] = -observer.a
     ends = np.eye(observer.order)
     plant = ql.plants.LinearPlant(companion, 1.5 * ends[-1], ends[0])
-    first, again = (ql.simulate(plant, ql.ADRC(observer, omega_c=1.0), SCENARIO) for _ in range(2))
+    first, again = (ql.simulate(plant, ql.ADRC(observer, omega_c=1.0), SHORT) for _ in range(2))
     np.testing.assert_array_equal(first.log, again.log)
     assert np.all(np.isfinite(first.log))
 
@@ -370,7 +370,7 @@ def test_a_learner_does_not_see_the_derivatives_of_f(name: str, rng: np.random.G
     design = learner.design(OBSERVERS["model-free, order 2, current"], 1.0)
     memories = [learner.memory(design) for _ in range(2)]
     said: list[list[Any]] = [[], []]
-    for _ in range(200):
+    for _ in range(100):
         seen = rng.normal(size=3)
         for memory, shown, out in zip(
             memories, (seen, np.append(seen, (1e3, -1e4))), said, strict=True
@@ -579,12 +579,12 @@ def test_a_learner_that_forgets_is_a_new_one(name: str, rng: np.random.Generator
         commit(design, memory, seen, 0.3, 0.1)
         return said
 
-    for size in np.repeat([1e8, 1e3], 100):
+    for size in np.repeat([1e8, 1e3], 50):
         seen = size * rng.normal(size=3)
         show(one, seen, seen[0] + 1e-6)
     forget(design, one)
     again = []
-    for _ in range(200):
+    for _ in range(100):
         seen = rng.normal(size=3)
         again.append(show(one, seen, seen[0] + 1e-6))
         assert show(other, seen, seen[0] + 1e-6) == again[-1]
@@ -627,17 +627,17 @@ def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
     one, other = (
         law_for(CHAIN, learner=LEARNERS[name], guard=ql.Guard(time=0.5)) for _ in range(2)
     )
-    ys = (np.sin(0.02 * np.arange(280)) + 0.1 * np.sin(0.31 * np.arange(280))).tolist()
-    for y in ys[:250]:
+    ys = (np.sin(0.02 * np.arange(140)) + 0.1 * np.sin(0.31 * np.arange(140))).tolist()
+    for y in ys[:120]:
         step(one, y)
     other.state = one.state
     others = (other, copy.deepcopy(one), pickle.loads(pickle.dumps(one)))
-    expected = [step(one, y) for y in ys[250:]]
+    expected = [step(one, y) for y in ys[120:]]
     state = _named_arrays(one._state)
     if name in PYTHON_LEARNERS:
         del state["learner.model"]  # the number of the Python object, which is a copy, too
     for copied in others:
-        assert [step(copied, y) for y in ys[250:]] == expected
+        assert [step(copied, y) for y in ys[120:]] == expected
         # The guard may not have let the learner act on u yet: what it holds is compared, too.
         arrays = _named_arrays(copied._state)
         for label, array in state.items():
@@ -653,7 +653,7 @@ def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
     run = ql.simulate(
         CHAIN,
         ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]),
-        ql.Scenario(reference=1.0, duration=10.0),
+        ql.Scenario(reference=1.0, duration=6.0),
     )
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
 

@@ -16,7 +16,7 @@ from .examples import CHAIN, LEARNERS, OBSERVERS, PYTHON_LEARNERS
 from .test_contracts import SCENARIO
 from .test_controllers import CONTROLLERS, PLANTS
 
-SHORT = dataclasses.replace(SCENARIO, duration=2.0, rest_at=(1.5,))
+SHORT = dataclasses.replace(SCENARIO, duration=1.5, rest_at=(1.2,))
 
 
 def check_single(plant: Any, controller: Any, tolerance: float) -> None:
