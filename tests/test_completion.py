@@ -16,16 +16,21 @@ from .commands import in_this_process
 SHELLS = ("bash", "zsh", "fish")
 
 
+_MADE: dict[str, str] = {}
+
+
 @pytest.fixture
 def program(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[[str], str]:
-    """Return a function that returns the program for a shell."""
+    """Return a function that returns the program for a shell, which is made once."""
 
     def of(shell: str) -> str:
-        shown = in_this_process(("completion", shell), monkeypatch, capsys)
-        assert (shown.code, shown.err) == (0, "")
-        return shown.out
+        if shell not in _MADE:
+            shown = in_this_process(("completion", shell), monkeypatch, capsys)
+            assert (shown.code, shown.err) == (0, "")
+            _MADE[shell] = shown.out
+        return _MADE[shell]
 
     return of
 

@@ -6,6 +6,7 @@ import json
 import math
 import pickle
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from quell.types import Matrix
 
 from .cases import cases
 
-pytest.importorskip("optuna")
+pytestmark = pytest.mark.skipif(find_spec("optuna") is None, reason="optuna is missing")
 
 SPACE = {"a": SearchRange(0.1, 10.0), "b": SearchRange(-3.0, 3.0)}
 SAMPLES = np.linspace(-0.5, 0.5, 16).tolist()

@@ -29,8 +29,10 @@ CASES = {
         for name in ("cascade", "nonlinear", "delay", "model-based, order 3, with a zero")
     },
     **{
-        f"learner: {name}": ql.ADRC(_CHAIN, 1.5, learner=learner, guard=ql.Guard(), **_LIMITS)
-        for name, learner in LEARNERS.items()
+        f"learner: {name}": ql.ADRC(
+            _CHAIN, 1.5, learner=LEARNERS[name], guard=ql.Guard(), **_LIMITS
+        )
+        for name in LEARNERS
         if name not in {*PYTHON_LEARNERS, "NoLearner"}
     },
 }
