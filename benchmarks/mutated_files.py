@@ -65,7 +65,6 @@ def read(kind: str, path: Path) -> None:
     from quell.realtime import load
     from quell.records.trajectory import Trajectory
     from quell.setup import load as load_setup
-    from quell.setup import load_axes
 
     if kind in ("recording in CSV", "header", "recording in MCAP", "NetCDF"):
         loader: Callable[..., Any] = load
@@ -83,7 +82,7 @@ def read(kind: str, path: Path) -> None:
             for cubic in (False, True):
                 loops.plant(row, cubic)
     else:
-        (load_axes if kind == "setup of axes" else load_setup)(path).as_json()
+        load_setup(path).as_json()
 
 
 def command(reader: str, path: Path, valid: Path) -> str:

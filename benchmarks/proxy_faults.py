@@ -43,8 +43,7 @@ from quell.realtime.registry import listen
 from quell.realtime.rig import Rig
 from quell.realtime.supervisor import initial_state, is_opposed
 from quell.realtime.wire import COMMAND
-from quell.setup import read
-from quell.setup.axes import made_any
+from quell.setup import made, read
 
 DT, LIMIT, OMEGA_O, GAIN = 0.01, 2.0, 30.0, 50.0
 RAMP = 10 * DT  # the default of ``Safety`` at this sample time [s]
@@ -271,7 +270,7 @@ def warm_up(axes: int, folder: Path) -> None:
         stack.callback(over.set)
         device = open_device(drive.listener.url, DT, signals=signals)
         stack.callback(device.close)
-        proxy = CompensatedDrive(device, made_any(*read(file)).controller)
+        proxy = CompensatedDrive(device, made(*read(file)).controller)
         with Rig(proxy, DT, listen("udp://127.0.0.1:0"), log=folder / f"log{axes}.csv") as rig:
             rig.prepare()
         device.read()

@@ -28,8 +28,7 @@ from typing import Any
 import jsonschema
 from measured import options_of, parser_of, write
 
-from quell.setup import EXAMPLES, SetupError, made, made_axes, registry
-from quell.setup.description import is_of_axes
+from quell.setup import EXAMPLES, SetupError, made, registry
 from quell.setup.json_schema import json_schema
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,7 +74,7 @@ def refusal(name: str, data: Mapping[str, Any]) -> str | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            (made_axes if is_of_axes(data) else made)(name, data)
+            made(name, data)
     except (SetupError, MemoryError) as error:
         return str(error)
     return None

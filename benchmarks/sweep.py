@@ -30,7 +30,8 @@ from pathlib import Path
 import numpy as np
 from measured import options_of, parser_of, write
 
-from quell.setup.loading import made, sweep_of
+from quell.setup import made
+from quell.setup.loading import sweep_of
 from quell.sweeping import Sweep, sweep
 
 SETUP = {

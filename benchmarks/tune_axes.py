@@ -22,7 +22,7 @@ import numpy as np
 from measured import options_of, parser_of, write
 
 import quell as ql
-from quell.analysis import MultivariableLoop, analyse_axes
+from quell.analysis import MultivariableLoop, analyse
 from quell.tuning import TunedAxes, tune_axes
 from quell.tuning.axes import _nominal
 from quell.tuning.optimiser.coupled import CoupledLoops, Limits
@@ -99,7 +99,7 @@ def judge(seeds: range) -> dict[str, Any]:
     for seed in seeds:
         machine = drawn(seed)
         found = tuned(machine)
-        worst = ratios(analyse_axes(machine.plant, found.controller), found)
+        worst = ratios(analyse(machine.plant, found.controller), found)
         rng = np.random.default_rng([seed, 5])
         name, largest = max(worst.items(), key=lambda each: each[1])
         if machine.off:  # other errors of B0 than those of the tuning
@@ -112,7 +112,7 @@ def judge(seeds: range) -> dict[str, Any]:
                 late = ql.plants.delayed_inputs(
                     moved, machine.plant.samples[0] * machine.dt, machine.dt
                 )
-                again = ratios(analyse_axes(late, found.controller), found)
+                again = ratios(analyse(late, found.controller), found)
                 name, largest = max([(name, largest), *again.items()], key=lambda each: each[1])
         wrong = found.met != (largest <= 1.002)
         mean = float(np.exp(np.mean(np.log([each.ratio for each in found.axes]))))

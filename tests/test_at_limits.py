@@ -16,7 +16,6 @@ from scipy import stats
 import quell as ql
 from quell.analysis import analyse
 from quell.analysis.loop import LoopAnalysis
-from quell.analysis.multivariable import analyse_axes
 from quell.controllers.prefilters import Prefiltered, ReferenceModel
 from quell.plants.linear import LinearPlant
 from quell.tuning import Constraints, acceptance, axes_at_limits
@@ -79,7 +78,7 @@ def test_steps_of_axes_use_two_fifths_of_the_room_of_an_actuator() -> None:
 
 def test_the_slowest_axis_has_the_time_constant_of_them_all() -> None:
     """Where its |S| first reaches 1/√2."""
-    loop = analyse_axes(machine(), axes())
+    loop = analyse(machine(), axes())
     tau = axes_at_limits.time_constant(loop)
     omega = loop.omega[1:]
     S = np.abs(np.einsum("kii->ki", loop.response("S_o", omega)))
@@ -115,12 +114,12 @@ def test_axes_become_slower_as_long_as_they_are_not_much_worse() -> None:
     most = acceptance.WORSE
     expected = [[f, g] for f in (0.85, 0.7, 0.55) for g in (f, 1.0) if 1.0 / (f * g) <= most]
     np.testing.assert_allclose(factors, [each for each in expected if each != [0.7, 0.7]])
-    assert axes_at_limits.least_gains([analyse_axes(machine(), axes())]) == []
+    assert axes_at_limits.least_gains([analyse(machine(), axes())]) == []
 
 
 def test_the_sensitivities_of_axes_are_drawn_with_their_bound() -> None:
     """Those of the nominal plant by name, of others in grey; the largest singular value below."""
-    loop = analyse_axes(machine(), axes())
+    loop = analyse(machine(), axes())
     result = SimpleNamespace(
         loops=[loop, loop], controller=axes(), constraints=Constraints(m_s=1.7)
     )

@@ -15,7 +15,7 @@ import quell as ql
 from quell.realtime import CsvSink, Safety, TwinDevice, load, replay, run_rig
 from quell.realtime.channels import checked_channels
 from quell.realtime.recordings import Event
-from quell.setup import made_axes
+from quell.setup import made
 
 from .cases import cases
 from .commands import Shown
@@ -247,7 +247,7 @@ def test_a_setup_of_axes_names_its_channels(quell: Callable[..., Shown]) -> None
     """In ``[rig]``; what the device does not give is one plain line."""
     text = slow_gantry(channels=["x.held"])
     Path("gantry.toml").write_text(text, encoding="utf-8")
-    assert made_axes("gantry.toml", tomllib.loads(text)).needed("rig")["channels"] == ("x.held",)
+    assert made("gantry.toml", tomllib.loads(text)).needed("rig")["channels"] == ("x.held",)
     shown = quell("run-rig", "gantry.toml", "--no-figures")
     assert shown.code == 2
     assert "the channel 'x.held' (number 0) has not come" in shown.err

@@ -18,7 +18,7 @@ from quell.controllers.baselines import ZV
 from quell.controllers.prefilters import ReferenceModel
 from quell.controllers.shaping import ProfileGenerator
 from quell.export import c_source
-from quell.setup import made_axes
+from quell.setup import made
 from quell.setup.schema import SetupError
 from quell.tuning import tune_axes
 from quell.tuning.axes_at_limits import needs_along, with_prefilters
@@ -212,13 +212,13 @@ TABLES: dict[str, Any] = {
 
 def test_a_setup_has_the_prefilter_of_each_axis() -> None:
     """In its table; one for all at the top of the file is refused with the place where it belongs."""
-    axes = made_axes("a", TABLES).controller
+    axes = made("a", TABLES).controller
     assert axes.prefilters == (ProfileGenerator(2.0, 1.0, 9.0), None)
     with pytest.raises(SetupError, match=r"prefilter: belongs into each \[\[axis\]\]"):
-        made_axes("a", TABLES | {"prefilter": {"kind": "zv", "omega": 3.0}})
+        made("a", TABLES | {"prefilter": {"kind": "zv", "omega": 3.0}})
     first = TABLES["axis"][0] | {"prefilter": {"kind": "zv", "omega": 3.0}}
     with pytest.raises(SetupError, match=r"axis\[0\].prefilter: .*no derivatives"):
-        made_axes("a", TABLES | {"axis": [first, TABLES["axis"][1]]})
+        made("a", TABLES | {"axis": [first, TABLES["axis"][1]]})
 
 
 # ---- Tuning ----
@@ -268,8 +268,8 @@ def test_steps_at_the_limits_get_moves_that_are_near_the_quickest() -> None:
         quickest = 2.0 * np.sqrt(height * np.max(row) / 0.15)
         assert each.step.overshoot < 0.05
         assert each.step.settling < 1.5 * quickest
-    made = made_axes("a", tomllib.loads(found.toml())).controller
-    run = ql.simulate(machine(), made, scenario)
+    written = made("a", tomllib.loads(found.toml())).controller
+    run = ql.simulate(machine(), written, scenario)
     for i, each in enumerate(found.judged.others):
         assert run.axis(i).metrics(start=0.1)["settling_time"] == pytest.approx(
             each.step.settling, abs=2 * DT

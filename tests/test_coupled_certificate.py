@@ -10,7 +10,7 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis import certify_axes, certify_coupled
+from quell.analysis import certify, certify_coupled
 from quell.analysis.coupled import coupled_loop
 from quell.guard.guard import state_path
 from quell.lti.models import MatrixSystem, System, zero_order_hold
@@ -52,7 +52,7 @@ def test_one_axis_has_the_bounds_of_certify(order: int, b: float, b0: float, del
         np.diag(np.ones(order - 1), 1), b * np.eye(order)[:, -1:], np.eye(order)[:1]
     )
     late = ql.plants.delayed_inputs(plant, delay * DT, DT)
-    found = certify_axes(late, ql.Axes([axis(order)], [[b0]]))
+    found = certify(late, ql.Axes([axis(order)], [[b0]]))
     assert found.gains[0, 0] == pytest.approx(single.gain, rel=1e-5)
     assert found.output_gains is not None
     assert found.output_gains[0, 0] == pytest.approx(single.output_gain, rel=1e-5)
@@ -66,11 +66,11 @@ def test_axes_that_b0_decouples_are_certified_one_by_one() -> None:
     """With the true B0 each axis is the chain of its observer, and Γ is that of the chain."""
     true = np.array([[2.0, -0.9], [-0.9, 1.5]])
     both = {"x": axis(), "y": axis(omega_o=20.0)}
-    found = certify_axes(inertias(true), ql.Axes(both, true))
+    found = certify(inertias(true), ql.Axes(both, true))
     np.testing.assert_allclose(found.gains, 0.0, atol=1e-8)
     assert found.certified
     assert found.spectral_radius < 1e-7
-    off = certify_axes(inertias(1.3 * true), ql.Axes(both, true))
+    off = certify(inertias(1.3 * true), ql.Axes(both, true))
     for i, omega_o in enumerate((10.0, 20.0)):
         single = analysis.certify(([1.3], [1.0, 0.0, 0.0]), axis(omega_o=omega_o))
         assert off.gains[i, i] == pytest.approx(single.gain, rel=1e-5)
@@ -186,12 +186,12 @@ def test_what_the_bounds_do_not_cover_is_said() -> None:
     robot = ql.plants.arm(gravity=0.0)
     axes = ql.Axes([axis(), axis()], M=robot.inertia, u_max=5.0)
     pose = ([0.3, 1.0, 0.0, 0.0], [0.0, 0.0])
-    found = certify_axes(ql.plants.encoded_outputs(robot, 1e-5), axes, pose)
+    found = certify(ql.plants.encoded_outputs(robot, 1e-5), axes, pose)
     assert found.certified
     assert found.spectral_radius < 1e-2
     assert len(found.excluded) == 4
     assert str(found).splitlines()[-1].startswith("not covered: times when an actuator is limited;")
-    plain = certify_axes(inertias(np.eye(2)), ql.Axes([axis(), axis()]))
+    plain = certify(inertias(np.eye(2)), ql.Axes([axis(), axis()]))
     assert plain.excluded == ()
     assert "not covered" not in str(plain)
 
@@ -200,7 +200,7 @@ def test_the_verdict_of_axes_names_those_that_learn_without_guard() -> None:
     """Axes without learner need no guard; without any learner there is nothing to certify."""
 
     def line(**axes: ql.ADRC) -> str:
-        return str(certify_axes(inertias(np.eye(2)), ql.Axes(axes))).splitlines()[0]
+        return str(certify(inertias(np.eye(2)), ql.Axes(axes))).splitlines()[0]
 
     guarded = axis()
     free = ql.ADRC(guarded.observer, omega_c=1.0, learner=ql.learners.Kalman())
@@ -227,6 +227,6 @@ def test_what_cannot_be_certified_is_refused() -> None:
     with pytest.raises(ValueError, match="q_0 = .*must not be negative"):
         certify_coupled([[row]], [0.1]).error_bound([-1.0])
     with pytest.raises(ValueError, match="plant has 2 inputs and 2 outputs: must have an output"):
-        certify_axes(inertias(np.eye(2)), ql.Axes([axis()]))
+        certify(inertias(np.eye(2)), ql.Axes([axis()]))
     with pytest.raises(ValueError, match=r"to_error.* is unstable"):
-        certify_axes(inertias(-np.eye(2)), ql.Axes([axis(), axis()]))
+        certify(inertias(-np.eye(2)), ql.Axes([axis(), axis()]))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.analysis import analyse_axes, coupling, invariant_zeros, relative_gains
+from quell.analysis import analyse, coupling, invariant_zeros, relative_gains
 from quell.analysis.coupling import is_turned
 from quell.analysis.matrices import sampled_matrices
 from quell.lti.models import zero_order_hold
@@ -214,7 +214,7 @@ def test_where_gains_at_rest_are_turned_no_bandwidths_are_stable(
             ql.ADRC(ql.ESO.model_free(1, 1.0, omega_o=float(o), dt=1.0), float(c))
             for c, o in 10.0 ** rng.uniform([-4.0, -4.0], [-1.0, -0.5], (2, 2))
         ]
-        return analyse_axes(plant, ql.Axes(own, B0=B0)).stable
+        return analyse(plant, ql.Axes(own, B0=B0)).stable
 
     assert turned == (sum(shares) < 1.0)
     assert any(is_stable() for _ in range(30)) != turned

@@ -135,8 +135,8 @@ def test_a_setup_of_axes_names_an_fmu_if_it_is_trusted(files: dict[int, Path]) -
         "scenario": {"duration": 0.05, "disturbances": [0.1]},
     }
     with pytest.raises(setup.SetupError, match=r"plant: path = .*would run this program.*--trust"):
-        setup.made_axes("arm.toml", tables)
-    loaded = setup.made_axes("arm.toml", tables, trust=True)
+        setup.made("arm.toml", tables)
+    loaded = setup.made("arm.toml", tables, trust=True)
     run = ql.simulate(loaded.needed("plant"), loaded.controller, loaded.needed("scenario"))
     wanted = ql.simulate(ARM, loaded.controller, loaded.needed("scenario"))
     np.testing.assert_allclose(run["y"], wanted["y"], rtol=0, atol=1e-11)
@@ -146,7 +146,7 @@ def test_a_setup_of_axes_names_an_fmu_if_it_is_trusted(files: dict[int, Path]) -
     tables["axes"] = {"M": np.eye(3).tolist()}
     words = r"plant = 'arm' has 2 control signals \(tau\[1\], tau\[2\]\) and 2 outputs"
     with pytest.raises(setup.SetupError, match=words):
-        setup.made_axes("arm.toml", tables, trust=True)
+        setup.made("arm.toml", tables, trust=True)
 
 
 def test_a_copy_and_a_pickle_unpack_the_file_again(files: dict[int, Path]) -> None:

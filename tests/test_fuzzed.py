@@ -18,7 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from quell.setup import EXAMPLES, SetupError, made_axes
+from quell.setup import EXAMPLES, SetupError, made
 from quell.setup.description import describe, parsed
 from quell.studio import messages
 from quell.studio.records import MOST_FILE, PageRecord
@@ -155,7 +155,7 @@ def test_a_changed_setup_of_several_axes_is_made_or_refused(
         return
     mistakes: tuple[str, ...] = ()
     try:
-        made_axes("setup.toml", tables)
+        made("setup.toml", tables)
     except SetupError as error:
         mistakes = tuple(error.mistakes)
     assert all(line.startswith("setup.toml: ") for line in mistakes)

@@ -27,7 +27,6 @@ from quell.identification import read_record
 from quell.realtime.recordings import LOOP_CHANNELS, MARK, SCHEMA, TOPIC, Header, load, row_channels
 from quell.records import netcdf, netcdf_reader
 from quell.setup import load as load_setup
-from quell.setup import load_axes
 from tests.mutations import mutated, write_seeds
 
 from .cases import cases
@@ -352,7 +351,7 @@ def test_random_changes_of_files_are_read_or_refused_in_a_line(tmp_path: Path) -
         "record": read_record,
         "samples": read_samples,
         "setup": load_setup,
-        "setup of axes": load_axes,
+        "setup of axes": load_setup,
     }
     results = Counter[bool]()
     for _ in range(240):

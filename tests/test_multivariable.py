@@ -343,7 +343,7 @@ def joint(omega_o: float = 60.0) -> ql.ADRC:
 
 
 def test_axes_around_a_plant_are_the_loop_that_a_run_shows() -> None:
-    """Poles and the closed loop of ``analyse_axes`` are those of ``ql.simulate``, delays included."""
+    """Poles and the closed loop of ``analyse`` are those of ``ql.simulate``, delays included."""
     true = np.array([[2.0, -0.9], [-0.9, 1.5]])
     plant = ql.plants.LinearPlant(
         np.kron(np.eye(2), [[0.0, 1.0], [0.0, -0.3]]),
@@ -352,7 +352,7 @@ def test_axes_around_a_plant_are_the_loop_that_a_run_shows() -> None:
     )
     late = ql.plants.encoded_outputs(ql.plants.delayed_inputs(plant, [0.002, 0.004], DT), 0.0)
     axes = ql.Axes({"x": joint(), "y": joint(40.0)}, B0=1.2 * true)
-    loop = analysis.analyse_axes(late, axes)
+    loop = analysis.analyse(late, axes)
     assert loop.stable
     assert loop.outputs == ("x", "y")
     run = ql.simulate(late, axes, ql.Scenario([0.3, -0.1], duration=0.2), interpret=True)
@@ -368,7 +368,7 @@ def test_the_margins_of_axes_with_the_true_b0_are_those_of_one_axis() -> None:
     """Whatever the inertia: one loop with b0 = 1, at every channel and for all at once."""
     true = np.array([[2.0, -0.9], [-0.9, 1.5]])
     A, B = np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]]), np.kron(true, [[0.0], [1.0]])
-    loop = analysis.analyse_axes((A, B, np.eye(4)[[0, 2]]), ql.Axes([joint(), joint()], true))
+    loop = analysis.analyse((A, B, np.eye(4)[[0, 2]]), ql.Axes([joint(), joint()], true))
     single = analysis.analyse(([1.0], [1.0, 0.0, 0.0]), joint()).margins
     assert loop.disk_margin("inputs").alpha == pytest.approx(single.disk, rel=1e-6)
     assert loop.m_s("outputs").value == pytest.approx(1.0 / single.modulus, rel=1e-6)
@@ -385,9 +385,9 @@ def test_an_arm_is_linearised_at_its_pose_and_b0_taken_there() -> None:
     fixed = ql.Axes([joint(), joint()], M=robot.mass_matrix([0.0, 0.2]))
     for elbow in (0.2, 1.5, 2.8):
         pose = ([0.4, elbow, 0.0, 0.0], [0.0, 0.0])
-        exact = analysis.analyse_axes(robot, follows, pose)
+        exact = analysis.analyse(robot, follows, pose)
         assert exact.disk_margin("inputs").alpha == pytest.approx(single.disk, rel=1e-4)
-        off = analysis.analyse_axes(robot, fixed, pose).disk_margin("inputs").alpha
+        off = analysis.analyse(robot, fixed, pose).disk_margin("inputs").alpha
         assert (off == pytest.approx(single.disk, rel=1e-4)) == (elbow == 0.2)
         found = analysis.coupling(robot, DT, operating_point=pose)
         M = robot.mass_matrix([0.4, elbow])
@@ -395,19 +395,24 @@ def test_an_arm_is_linearised_at_its_pose_and_b0_taken_there() -> None:
     with pytest.raises(
         ValueError, match=r"is nonlinear: give the point .* operating_point=\(x, u\)"
     ):
-        analysis.analyse_axes(robot, follows)
+        analysis.analyse(robot, follows)
 
 
 def test_what_is_no_loop_of_axes_is_refused() -> None:
-    """Another controller, sizes that do not fit, a plant of another sample time."""
+    """Options of one axis, sizes that do not fit, a plant of another sample time."""
     plant = (np.diag([-1.0, -2.0]), np.eye(2), np.eye(2))
-    with pytest.raises(ValueError, match="must be quell.Axes; of one signal, use analyse"):
-        analysis.analyse_axes(plant, joint())
+    axes = ql.Axes([joint(), joint()])
+    with pytest.raises(ValueError, match="delay = 0.01: of one axis only; give Axes a plant with"):
+        analysis.analyse(plant, axes, delay=0.01)
+    with pytest.raises(ValueError, match="actuator_lag = 0.1: of one axis only"):
+        analysis.certify(plant, axes, actuator_lag=0.1)
+    with pytest.raises(ValueError, match="at: of one axis only"):
+        analysis.analyse(plant, axes, at=1.0)
     with pytest.raises(ValueError, match="plant has 2 inputs and 2 outputs: the controller has 1"):
-        analysis.analyse_axes(plant, ql.Axes([joint()]))
+        analysis.analyse(plant, ql.Axes([joint()]))
     sampled = control.ss(0.5 * np.eye(2), np.eye(2), np.eye(2), 0.0 * np.eye(2), 0.01)
     with pytest.raises(ValueError, match=r"plant is sampled with dt = 0.01 s, the controller with"):
-        analysis.analyse_axes(sampled, ql.Axes([joint(), joint()]))
+        analysis.analyse(sampled, ql.Axes([joint(), joint()]))
 
 
 DOUBLE = (np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]]), np.kron(np.eye(2), [[0.0], [1.0]]))
@@ -429,9 +434,9 @@ def test_the_bias_of_a_learner_of_all_axes_is_in_the_margins(each: bool) -> None
     """As that of a learner of the own axis: M_s is 2.07, and 1.53 without a bias."""
     observer = joint().observer
     own = ql.ADRC(observer, 8.0, learner=ql.learners.RLS(State() + Bias()))
-    known = analysis.analyse_axes(two_masses(), ql.Axes([own, own])).m_s("outputs").value
+    known = analysis.analyse(two_masses(), ql.Axes([own, own])).m_s("outputs").value
     learner = [of_all(), of_all()] if each else of_all()
-    loop = analysis.analyse_axes(two_masses(), ql.Axes([joint(), joint()], learner=learner))
+    loop = analysis.analyse(two_masses(), ql.Axes([joint(), joint()], learner=learner))
     assert known == pytest.approx(2.067, abs=1e-3)
     assert loop.m_s("outputs").value == pytest.approx(known, rel=1e-9)
     assert not loop.remark
@@ -446,7 +451,7 @@ def test_a_learner_of_all_axes_at_rest_is_the_loop_that_a_run_shows(each: bool) 
     axes = ql.Axes([joint(), joint()], 1.2 * true, learner=learner)
     scenario = ql.Scenario([ql.signals.Step(0.3, 0.5), ql.signals.Step(-0.1, 0.5)], duration=1.2)
     run = ql.simulate(two_masses(true), axes, scenario, interpret=True)
-    system = analysis.analyse_axes(two_masses(true), axes).closed_loop("r", "y")
+    system = analysis.analyse(two_masses(true), axes).closed_loop("r", "y")
     x, y = np.zeros(system.N.shape[0]), []
     for k in range(1200):
         y.append(system.C @ x)
@@ -460,14 +465,14 @@ def test_what_was_learned_of_other_axes_is_named_as_not_in_the_margins(each: boo
     """A learner that has learned nothing is all in them; after motion the summary says what lacks."""
     learner = [of_all(), None] if each else of_all()
     axes = ql.Axes({"x": joint(), "y": joint()}, 1.2 * np.eye(2), learner=learner)
-    assert not analysis.analyse_axes(two_masses(), axes).remark
+    assert not analysis.analyse(two_masses(), axes).remark
     x = np.zeros(4)
     with as_python():
         for k in range(800):
             u = axes.step([0.3 * np.sin(0.01 * k), 0.2 * np.sin(0.013 * k)], x[[0, 2]])
             x[[0, 2]] += DT * x[[1, 3]]
             x[[1, 3]] += DT * (u - 20.0 * x[[2, 0]])
-    loop = analysis.analyse_axes(two_masses(), axes)
+    loop = analysis.analyse(two_masses(), axes)
     named = "in x;" if each else "in x, y;"
     assert "NOT in these margins: what learners have learned from states of all axes" in loop.remark
     assert named in loop.summary()
@@ -493,10 +498,10 @@ def test_drives_are_in_the_margins_of_axes() -> None:
         ([1.0], [1.0, 20.0, 100.0]), ql.Compensated(drive(), model_based())
     ).margins
     parts = [model_based(), model_based()]
-    loop = analysis.analyse_axes(lag, ql.Axes(parts, drives=[drive(), drive()]))
+    loop = analysis.analyse(lag, ql.Axes(parts, drives=[drive(), drive()]))
     assert loop.m_s("inputs").value == pytest.approx(1.0 / single.modulus, rel=1e-6)
     assert not loop.remark
-    alone = analysis.analyse_axes(lag, ql.Axes(parts))
+    alone = analysis.analyse(lag, ql.Axes(parts))
     assert abs(alone.m_s("inputs").value - loop.m_s("inputs").value) > 0.05
     assert "NOT in these margins: the loop that u_0 closes" in alone.summary()
 
@@ -514,7 +519,7 @@ def test_axes_with_drives_are_the_loop_that_a_run_shows(given: bool) -> None:
     r = np.array([0.3, -0.1] if given else [0.3, -0.1, 0.2])
     plant = two_masses(true)
     run = ql.simulate(plant, axes, ql.Scenario(r.tolist(), duration=0.2), interpret=True)
-    system = analysis.analyse_axes(plant, axes).closed_loop("r", "y")
+    system = analysis.analyse(plant, axes).closed_loop("r", "y")
     x, y = np.zeros(system.N.shape[0]), []
     for _ in range(200):
         y.append(system.C @ x)
@@ -528,4 +533,4 @@ def test_a_drive_without_a_linear_law_is_not_judged() -> None:
     changing = ql.ADRC(joint().observer, 8.0, schedule=ql.OnlineGain(0.5, 2.0))
     axes.drives = (axes.drives[0], changing)
     with pytest.raises(ValueError, match="drives: axis2: NOT judged, it has no linear law"):
-        analysis.analyse_axes(two_masses(), axes)
+        analysis.analyse(two_masses(), axes)

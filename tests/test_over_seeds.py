@@ -19,7 +19,7 @@ import quell as ql
 from quell.experiments import over_seeds
 from quell.experiments.over_seeds import ALL_AXES, _verdicts
 from quell.records.metrics import MEASURES
-from quell.setup import made, made_axes
+from quell.setup import made
 from quell.setup.loading import Setup
 from quell.tuning.report import toml_text
 
@@ -43,7 +43,7 @@ def gantry(omega_c: float = 8.0, noise: Any = NOISY, **scenario: Any) -> dict[st
 
 def setups(*omega_c: float, **options: Any) -> dict[str, Setup]:
     """Return setups by name."""
-    return {f"c{omega:g}": made_axes(f"c{omega:g}", gantry(omega, **options)) for omega in omega_c}
+    return {f"c{omega:g}": made(f"c{omega:g}", gantry(omega, **options)) for omega in omega_c}
 
 
 @pytest.mark.trial
@@ -86,9 +86,7 @@ def test_what_the_seeds_do_not_decide_begins_with_not() -> None:
     assert lines[0].startswith("x, 0.1 to 0.3 s: best is c12: RMS error ")
     assert lines[1].startswith("NOT decided: y, 0.1 to 0.3 s: ")
     assert "seeds" in lines[1]
-    same = over_seeds.of_setups(
-        {"a": (one := made_axes("a", gantry())), "b": replace(one)}, seeds=3
-    )
+    same = over_seeds.of_setups({"a": (one := made("a", gantry())), "b": replace(one)}, seeds=3)
     assert all(verdict.best is None for verdict in same.verdicts)
     assert same.describe().count("alike, as far as 3 seeds show") == 3
 
@@ -107,7 +105,7 @@ def test_an_axis_at_rest_is_alike_and_left_out_of_all_axes(
         data["axis"][0]["noise"], data["axis"][1]["noise"] = noise, 0.0
         if not coupled:
             data["plant"]["B"] = [[0, 0], [5, 0], [0, 0], [0, 6]]
-        given[f"c{omega:g}"] = made_axes("gantry", data)
+        given[f"c{omega:g}"] = made("gantry", data)
     found = over_seeds.of_setups(given, seeds=seeds)
     still = found.values["rms"][:, 0, 1]
     assert np.all(still < 1e-17)
@@ -148,7 +146,7 @@ def test_small_real_errors_are_no_rounding() -> None:
 @pytest.mark.trial
 def test_differences_of_rounding_are_alike_in_all_seeds() -> None:
     """An omega_c of 8 and one of 8.0000000001 differ by 1e-9 % in each seed, which no model has."""
-    given = {"a": made_axes("a", gantry(8.0)), "b": made_axes("b", gantry(8.0000000001))}
+    given = {"a": made("a", gantry(8.0)), "b": made("b", gantry(8.0000000001))}
     found = over_seeds.of_setups(given, seeds=3)
     pair = found.verdicts[0].pairs[0]
     assert 0.0 < pair.least < pair.most < 1e-9
@@ -192,7 +190,7 @@ def test_a_setup_that_diverges_is_named_and_has_no_verdict() -> None:
     wrong = gantry(8.0)
     wrong["axes"] |= {"B0": [[-5.0, 0.0], [0.0, -6.0]], "u_max": 1e9, "u_min": -1e9}
     wrong["axis"][0]["observer"]["omega_o"] = wrong["axis"][1]["observer"]["omega_o"] = 400.0
-    given = setups(8.0) | {"wrong": made_axes("wrong", wrong)}
+    given = setups(8.0) | {"wrong": made("wrong", wrong)}
     found = over_seeds.of_setups(given, seeds=2)
     assert found.diverged.tolist() == [[False, False], [True, True]]
     assert np.all(np.isnan(found.values["rms"][1]))
@@ -221,7 +219,7 @@ def test_the_variation_of_u_is_that_of_the_actuators_whatever_b0_is() -> None:
     """Half of B0 halves v of the same motors, so all have the B of the first; the rest of the measures stays."""
     half = gantry(8.0)
     half["axes"]["B0"] = [[2.5, 0.25], [0.2, 3.0]]
-    given = {"one": made_axes("one", gantry(8.0)), "half": made_axes("half", half)}
+    given = {"one": made("one", gantry(8.0)), "half": made("half", half)}
     found = over_seeds.of_setups(given, seeds=2)
     first = given["one"]
     B = np.array([[5.0, 0.5], [0.4, 6.0]])
@@ -250,7 +248,7 @@ def test_a_variation_of_u_that_cannot_be_compared_is_no_number(
     monkeypatch.setattr(over_seeds, "one_gain", refuse)
     half = gantry(8.0)
     half["axes"]["B0"] = [[2.5, 0.25], [0.2, 3.0]]
-    given = {"one": made_axes("one", gantry(8.0)), "half": made_axes("half", half)}
+    given = {"one": made("one", gantry(8.0)), "half": made("half", half)}
     found = over_seeds.of_setups(given, seeds=2)
     assert np.all(np.isnan(found.values["control_variation"]))
     assert np.all(np.isnan(found.values["total_variation"]))
@@ -275,7 +273,7 @@ def in_windows(*windows: Any) -> Any:
         ),
         (
             lambda: over_seeds.of_setups(
-                setups(8.0) | {"other": made_axes("o", gantry() | {"axis": [a | {"name": n} for a, n in zip(gantry()["axis"], "xz", strict=True)]})}
+                setups(8.0) | {"other": made("o", gantry() | {"axis": [a | {"name": n} for a, n in zip(gantry()["axis"], "xz", strict=True)]})}
             ),
             "other has x, z, c8 x, y: must have the same axes",
         ),
@@ -294,7 +292,7 @@ def in_windows(*windows: Any) -> Any:
             r"windows\[0\].start = 50: must be less than the scenario's duration",
         ),
         (
-            lambda: over_seeds.of_setups(setups(8.0) | {"longer": made_axes("l", gantry() | {"dt": 2e-3})}),
+            lambda: over_seeds.of_setups(setups(8.0) | {"longer": made("l", gantry() | {"dt": 2e-3})}),
             r"c8 has dt = 0.001 s, longer 0.002 s: must have one dt, as the errors between samples",
         ),
         (
@@ -339,7 +337,7 @@ def test_the_command_shows_which_is_best_per_axis(
     )
     told = json.loads((tmp_path / "out.json").read_text())
     found = over_seeds.of_setups(
-        {"slow": made_axes("slow", gantry()), "quick": made_axes("quick", other)}, seeds=3
+        {"slow": made("slow", gantry()), "quick": made("quick", other)}, seeds=3
     )
     assert told["values"]["rms"] == found.values["rms"].tolist()
     assert told["verdicts"][0]["best"] == "quick"

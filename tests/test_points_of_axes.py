@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.analysis import LoopsAtPoints, analyse_axes, analyse_points
+from quell.analysis import LoopsAtPoints, analyse, analyse_points
 from quell.plants.linearise import held_at
 
 from .cases import cases
@@ -34,7 +34,7 @@ def test_the_worst_point_is_that_of_single_analyses() -> None:
     robot = ql.plants.arm(gravity=0.0, viscous=0.1)
     found = analysed(True, POSES)
     singles = [
-        analyse_axes(robot, axes(robot, True), (pose, [0.0, 0.0])).disk_margin("outputs").alpha
+        analyse(robot, axes(robot, True), (pose, [0.0, 0.0])).disk_margin("outputs").alpha
         for pose in POSES
     ]
     assert found.disk_margin("outputs") == pytest.approx((min(singles), int(np.argmin(singles))))
@@ -61,9 +61,9 @@ def test_what_was_not_looked_at_is_told() -> None:
     assert line not in analysed(False, POSES).verdicts()
     assert "NOT proved between the points and in fast motion" in analysed(False, POSES).summary()
     assert not any(each.startswith("NOT") for each in analysed(True, POSES[1:2]).verdicts())
-    one = analyse_axes(robot, axes(robot), (POSES[0], [0.0, 0.0]))
+    one = analyse(robot, axes(robot), (POSES[0], [0.0, 0.0]))
     assert one.summary().splitlines()[-1].startswith("NOT judged at other operating points")
-    constant = analyse_axes(robot, axes(robot, True), (POSES[0], [0.0, 0.0]))
+    constant = analyse(robot, axes(robot, True), (POSES[0], [0.0, 0.0]))
     assert "NOT" not in constant.summary()
 
 

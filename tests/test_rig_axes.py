@@ -31,7 +31,7 @@ from quell.realtime.registry import open_device
 from quell.realtime.run import mode_changes, silence_of
 from quell.realtime.supervisor import Cause, Mode
 from quell.records.trajectory import Trajectory
-from quell.setup import made_axes
+from quell.setup import made
 
 from .cases import cases
 from .commands import Shown
@@ -722,7 +722,7 @@ def test_a_setup_of_axes_runs_at_its_device(quell: Callable[..., Shown]) -> None
     shown = quell("run-rig", "gantry.toml", "--omega-c", "3.0")
     assert (shown.code, "--omega-c" in shown.err) == (2, True)
     assert (
-        made_axes(
+        made(
             "a.toml",
             {
                 "dt": 0.01,

@@ -20,9 +20,9 @@ import quell as ql
 from quell import checks
 from quell.realtime.memory_file import MemoryFile, memory_file
 from quell.realtime.viewers import Viewers, is_local
-from quell.setup import SetupError, registry
+from quell.setup import SetupError, made, registry
 from quell.setup import json_schema as rules
-from quell.setup.axes import _markov, axes_task, made_axes
+from quell.setup.axes import _markov, axes_task
 from quell.setup.loading import _type, tuning_task
 from quell.setup.points import _merged, schedule_task
 
@@ -318,7 +318,7 @@ def test_the_b0_of_a_plant_is_the_gain_of_the_highest_derivative() -> None:
 
 def load_text_of_axes(text: str) -> Any:
     """Return a setup of axes."""
-    return made_axes("setup.toml", tomllib.loads(text))
+    return made("setup.toml", tomllib.loads(text))
 
 
 # ---- schedules

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.analysis import analyse, analyse_axes
+from quell.analysis import analyse
 from quell.kernels.cache import compile_time
-from quell.setup import load, made, made_axes
+from quell.setup import load, made
 from quell.setup.loading import changed
 from quell.studio import messages, separate
 from quell.studio.messages import Columns, frame, parsed_frame
@@ -493,9 +493,9 @@ def test_an_identified_model_is_opened_with_its_file(client: Client, tmp_path: P
 @pytest.mark.trial
 def test_of_several_axes_one_is_shown_with_all_actuators(client: Client) -> None:
     """Its curves are those of ``simulate``, its margins those of its channel; tuning says NOT."""
-    setup = made_axes("two", AXES)
+    setup = made("two", AXES)
     run = ql.simulate(setup.plant, setup.controller, setup.scenario)
-    loop = analyse_axes(setup.plant, setup.controller)
+    loop = analyse(setup.plant, setup.controller)
     for i, name in enumerate(setup.controller.names):
         found = client.ask("loop", do="run", setup=AXES, axis=i)
         header, arrays, _ = found["run"]

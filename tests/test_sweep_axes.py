@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.setup import SetupError, made_axes
+from quell.setup import SetupError, made
 from quell.setup.axes import sweep_of_axes
 from quell.sweeping.measures import Measure, as_measures
 from quell.sweeping.runs import Plan
@@ -41,7 +41,7 @@ def gantry(**changes: Any) -> dict[str, Any]:
 @pytest.mark.trial
 def test_each_run_is_that_of_simulate(tmp_path: Path) -> None:
     """Measures of both axes, bit for bit; a run that cannot be built is recorded, and the others are done."""
-    setup = made_axes("gantry.toml", gantry())
+    setup = made("gantry.toml", gantry())
     with pytest.warns(
         RuntimeWarning, match=r"1 of 3 runs failed: run 2: axis\[1\]\.controller\.omega_c"
     ):
@@ -55,7 +55,7 @@ def test_each_run_is_that_of_simulate(tmp_path: Path) -> None:
     for i, omega_c in enumerate((4.0, 8.0)):
         data = gantry()
         data["axis"][1]["controller"]["omega_c"] = omega_c
-        one = made_axes("gantry.toml", data)
+        one = made("gantry.toml", data)
         # The run has the seed of its draw.
         plan = Plan(setup.sweep["parameters"], 1, "latin-hypercube", 0)  # type: ignore[index]
         scenario = replace(one.needed("scenario"), seed=plan.part(i, i + 1).seed(i))
@@ -73,13 +73,13 @@ def test_a_measure_names_its_axis() -> None:
     with pytest.raises(ValueError, match="'rsm' is unknown"):
         as_measures(["elbow.rsm"])
     with pytest.raises(SetupError, match="sweep.limits.iae: is none of the metrics"):
-        sweep_of_axes(made_axes("a.toml", gantry(sweep=SWEEP | {"limits": {"iae": 1.0}})))
+        sweep_of_axes(made("a.toml", gantry(sweep=SWEEP | {"limits": {"iae": 1.0}})))
     with pytest.raises(SetupError, match="sweep.parameters: axis.9..controller.omega_c"):
         sweep_of_axes(
-            made_axes("a.toml", gantry(sweep={"parameters": {"axis[9].controller.omega_c": [1.0]}}))
+            made("a.toml", gantry(sweep={"parameters": {"axis[9].controller.omega_c": [1.0]}}))
         )
     with pytest.raises(SetupError, match="sweep: missing"):
-        sweep_of_axes(made_axes("a.toml", {k: v for k, v in gantry().items() if k != "sweep"}))
+        sweep_of_axes(made("a.toml", {k: v for k, v in gantry().items() if k != "sweep"}))
 
 
 @cases(
@@ -107,7 +107,7 @@ def test_an_unknown_axis_is_refused_before_anything_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The line has the name that was meant; nothing is written."""
-    setup = made_axes("gantry.toml", gantry())
+    setup = made("gantry.toml", gantry())
     given = sweep_of_axes(setup)
     monkeypatch.setattr("quell.sweeping.runs.simulate", lambda *parts: pytest.fail("a run"))
     given |= {"limits": {}, "workers": 1, "folder": tmp_path / "sweep"}

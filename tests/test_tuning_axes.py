@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.analysis import MultivariableLoop, analyse_axes
+from quell.analysis import MultivariableLoop, analyse
 from quell.lti.models import System, zero_order_hold
-from quell.setup import SetupError, load_axes, made_axes
+from quell.setup import SetupError, load, made
 from quell.tuning import Constraints, TunedAxes, tune_axes
 from quell.tuning.axes import _exact, _given_gain, _made, _nominal, diagonal_entry
 from quell.tuning.optimiser.coupled import (
@@ -74,9 +74,9 @@ def channels(loop: MultivariableLoop) -> tuple[float, float]:
 @pytest.mark.trial
 @pytest.mark.parametrize("own", [False, True])
 def test_the_bounds_hold_for_the_coupled_loop(own: bool) -> None:
-    """M_s and M_t of each channel with the others closed, and the disk margins of all at once, by ``analyse_axes``."""
+    """M_s and M_t of each channel with the others closed, and the disk margins of all at once, by ``analyse``."""
     found = tuned(own)
-    loop = analyse_axes(machine(), found.controller)
+    loop = analyse(machine(), found.controller)
     m_s, m_t = channels(loop)
     least = min(loop.disk_margin(at).alpha for at in ("inputs", "outputs"))
     assert found.met
@@ -121,7 +121,7 @@ def test_the_bandwidths_are_no_worse_than_those_of_a_grid() -> None:
             T, CS = (np.max(np.abs(loop.response(name, omega))) for name in ("T", "CS"))
             if T > 1.6 or limit < CS:
                 continue
-            poles = analyse_axes(machine(), trial).poles
+            poles = analyse(machine(), trial).poles
             s = np.array([np.log(p.z) / DT for p in poles if abs(p.z) > 1e-3])
             s = s[(s.imag > 1e-6 * np.abs(s)) & (s.imag < math.pi / (4 * DT))]
             if np.min(-s.real / np.abs(s), initial=1.0) < 0.4:
@@ -372,7 +372,7 @@ def test_the_command_tunes_all_axes_of_a_setup(quell: Callable[..., Shown], tmp_
     assert results["constraints"]["m_s"] == 1.5
     assert results["met"]
     out = tmp_path / "tuned.toml"
-    again = load_axes(out)
+    again = load(out)
     for axis, result in zip(again.controller.axes, results["axes"], strict=True):
         assert (axis.omega_c, axis.observer.omega_o) == (result["omega_c"], result["omega_o"])
     assert max(each["m_s"] for each in results["axes"]) <= 1.503
@@ -395,7 +395,7 @@ def test_the_command_refuses_what_is_for_one_axis(
     assert shown.code == 2
     assert "is for one axis, not for several" in shown.err
     with pytest.raises(SetupError, match="a.toml: tune.structure: unknown"):
-        made_axes("a.toml", gantry(tune={"structure": "pid"}))
+        made("a.toml", gantry(tune={"structure": "pid"}))
 
 
 @pytest.mark.trial
@@ -404,7 +404,7 @@ def test_a_drawn_machine_keeps_its_bounds() -> None:
     trial = benchmark("tune_axes")
     drawn = trial.drawn(1)
     found = trial.tuned(drawn)
-    worst = trial.ratios(analyse_axes(drawn.plant, found.controller), found)
+    worst = trial.ratios(analyse(drawn.plant, found.controller), found)
     assert found.met
     assert max(worst.values()) <= 1.002
 
@@ -436,7 +436,7 @@ def test_distances_that_double_change_no_sum_of_an_oscillation() -> None:
 
 @pytest.mark.trial
 def test_a_bound_of_damping_is_judged_as_the_others_are() -> None:
-    """Its value is that of the poles of ``analyse_axes``, its ratio decides, and the line with NOT names it alone."""
+    """Its value is that of the poles of ``analyse``, its ratio decides, and the line with NOT names it alone."""
     values = np.array([[30.0, 60.0], [60.0, 40.0]])
     observers = [ql.ESO.model_free(order=2, b0=1.0, omega_o=each, dt=DT) for each in values[:, 1]]
     given = ql.Axes(
@@ -447,7 +447,7 @@ def test_a_bound_of_damping_is_judged_as_the_others_are() -> None:
     loops = CoupledLoops(plants, given.axes, limits, DT, 2, np.ones(2), "load-iae")
     found = {each.name.split()[0]: each for each in _exact(loops, [0], given, values)}
     s = np.array(
-        [np.log(complex(p.z)) / DT for p in analyse_axes(machine(), given).poles if abs(p.z) > 1e-3]
+        [np.log(complex(p.z)) / DT for p in analyse(machine(), given).poles if abs(p.z) > 1e-3]
     )
     s = s[(s.imag > 1e-6 * np.abs(s)) & (s.imag < math.pi / (4 * DT))]
     assert found["damping"].value == pytest.approx(np.min(-s.real / np.abs(s)), rel=1e-6)

@@ -39,7 +39,7 @@ def test_the_response_and_the_integral_gain_are_those_of_the_controller(plant: o
 
 def test_its_table_describes_the_same_controller() -> None:
     """Read from a setup it has the same gains."""
-    from quell.setup.loading import made
+    from quell.setup import made
 
     lqg, row = structure(LAGS), np.array([1.7, 1.0, 6.0])
     tables = {"dt": 0.01, "plant": {"kind": "linear", "A": [[-1.0]], "B": [1.0], "C": [1.0]}}

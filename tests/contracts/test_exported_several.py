@@ -15,7 +15,7 @@ import pytest
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.export import TranslationError, c_source, ros2, st
-from quell.setup import EXAMPLES, load_axes, read
+from quell.setup import EXAMPLES, load, read
 from quell.setup.description import is_of_axes
 from tests.test_axes_export import ROWS
 
@@ -30,7 +30,7 @@ FILES = [
 EVERY: dict[str, Any] = {
     **{name: lambda given=given: given for name, given in SEVERAL.items()},
     **{f"axes, {name}": make for name, make in ROWS.items()},
-    **{file.name: lambda file=file: load_axes(file).controller for file in FILES},
+    **{file.name: lambda file=file: load(file).controller for file in FILES},
 }
 # What a form does not have, and what its message says to do instead.
 REFUSED = {

@@ -6,7 +6,6 @@ A later version loads them, and goes on as the stored run.
 from __future__ import annotations
 
 import base64
-import tomllib
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import quell as ql
-from quell.setup import load, load_axes
+from quell.setup import load
 
 from .corpus import outcome_of, with_rounded_design, with_rounded_signals
 from .loops import channels_of, controller_of, drive, inputs
@@ -64,10 +63,9 @@ def setup_case(case: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return the run of a setup file, or that of a controller in one without a plant."""
     path = folder / "setup.toml"
     path.write_text(case["text"], encoding="utf-8")
-    several = "axis" in tomllib.loads(case["text"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        setup = (load_axes if several else load)(path)
+        setup = load(path)
         controller = with_rounded_design(setup.controller)
         tables = [name for name in ("rig", "sweep", "tune") if getattr(setup, name, None)]
         if setup.plant is None or setup.scenario is None:
