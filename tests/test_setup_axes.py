@@ -204,7 +204,7 @@ def test_load_and_made_take_any_number_of_axes() -> None:
     with pytest.raises(SetupError, match=r"plant.kind = 'arm'.* a setup with a table \[\[axis\]\]"):
         made("a.toml", tomllib.loads(single))
     with pytest.raises(SetupError, match="axis: missing"):
-        made("a.toml", {"dt": 0.01})
+        made("a.toml", {"dt": 0.01, "axes": {}})
 
 
 def test_a_command_of_one_axis_says_so(quell: Callable[..., Shown], tmp_path: Path) -> None:
