@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import pkgutil
+import re
 from typing import Any
 
 import numpy as np
@@ -107,3 +109,34 @@ def test_a_name_of_an_earlier_release_is_the_present_one(of: Any, old: str, new:
         found = getattr(of, old)
     known = [getattr(each, new) for each in (ql, ql.plants, of) if hasattr(each, new)]
     assert found is known[0]
+
+
+# Public names that say how many axes there are: the machine, what spans its axes, and what still has
+# a twin for one axis. No other one is added: a capability has one name for any number of axes.
+SEVERAL = {
+    "Axes",
+    "AllAxes",  # features of the states of all axes
+    "CoupledCertificate",  # of systems that act on each other
+    "certify_coupled",
+    "MultivariableLoop",
+    "MultivariableESO",
+    "MultivariableFMU",
+    "axes_law",
+    "AxesDescription",
+    "AxesBound",
+    "AxesCheck",
+    "TunedAxes",
+    "tune_axes",
+}
+
+
+def test_no_other_public_name_is_for_several_axes_only() -> None:
+    """In any package; the list of those that there are has no name that is gone."""
+    packages = [
+        importlib.import_module(f"quell.{each.name}")
+        for each in pkgutil.iter_modules(ql.__path__)
+        if each.ispkg and each.name not in ("cli", "studio")
+    ]
+    public = {name for each in (ql, *packages) for name in getattr(each, "__all__", ())}
+    words = re.compile("axes|several|multivariable|coupled", re.IGNORECASE)
+    assert {name for name in public if words.search(name)} == SEVERAL
