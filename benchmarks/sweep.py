@@ -31,7 +31,7 @@ import numpy as np
 from measured import options_of, parser_of, write
 
 from quell.setup import made
-from quell.setup.loading import sweep_of
+from quell.setup.sweeps import sweep_of
 from quell.sweeping import Sweep, sweep
 
 SETUP = {

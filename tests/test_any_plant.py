@@ -19,7 +19,8 @@ from quell.plants.nonlinear import CompiledParametric
 from quell.plants.registry import IDENTIFIED_NUMBERS
 from quell.realtime import open_device
 from quell.setup import SetupError, made, plant_given, plant_of, varied
-from quell.setup.loading import sweep_of, tuning_task
+from quell.setup.loading import tuning_task
+from quell.setup.sweeps import sweep_of
 from tests.commands import Shown
 
 DT = 0.01

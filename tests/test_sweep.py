@@ -21,7 +21,7 @@ import quell as ql
 from quell.plants import two_mass_spring
 from quell.setup import SetupError, made, varied
 from quell.setup.description import read
-from quell.setup.loading import sweep_of
+from quell.setup.sweeps import sweep_of
 from quell.sweeping import Measure, Normal, Plan, Range, Sweep, sweep
 
 from .cases import cases

@@ -15,7 +15,7 @@ import pytest
 
 import quell as ql
 from quell.setup import SetupError, made
-from quell.setup.axes import sweep_of_axes
+from quell.setup.sweeps import sweep_of
 from quell.sweeping.measures import Measure, as_measures
 from quell.sweeping.runs import Plan
 from quell.tuning.report import toml_text
@@ -45,8 +45,8 @@ def test_each_run_is_that_of_simulate(tmp_path: Path) -> None:
     with pytest.warns(
         RuntimeWarning, match=r"1 of 3 runs failed: run 2: axis\[1\]\.controller\.omega_c"
     ):
-        found = ql.sweep(**sweep_of_axes(setup), folder=tmp_path / "sweep", workers=1)
-    assert sorted(sweep_of_axes(setup)["metrics"]) == [
+        found = ql.sweep(**sweep_of(setup), folder=tmp_path / "sweep", workers=1)
+    assert sorted(sweep_of(setup)["metrics"]) == [
         "x.peak_error",
         "x.rms",
         "y.peak_error",
@@ -73,13 +73,13 @@ def test_a_measure_names_its_axis() -> None:
     with pytest.raises(ValueError, match="'rsm' is unknown"):
         as_measures(["elbow.rsm"])
     with pytest.raises(SetupError, match="sweep.limits.iae: is none of the metrics"):
-        sweep_of_axes(made("a.toml", gantry(sweep=SWEEP | {"limits": {"iae": 1.0}})))
+        sweep_of(made("a.toml", gantry(sweep=SWEEP | {"limits": {"iae": 1.0}})))
     with pytest.raises(SetupError, match="sweep.parameters: axis.9..controller.omega_c"):
-        sweep_of_axes(
+        sweep_of(
             made("a.toml", gantry(sweep={"parameters": {"axis[9].controller.omega_c": [1.0]}}))
         )
     with pytest.raises(SetupError, match="sweep: missing"):
-        sweep_of_axes(made("a.toml", {k: v for k, v in gantry().items() if k != "sweep"}))
+        sweep_of(made("a.toml", {k: v for k, v in gantry().items() if k != "sweep"}))
 
 
 @cases(
@@ -108,7 +108,7 @@ def test_an_unknown_axis_is_refused_before_anything_is_simulated(
 ) -> None:
     """The line has the name that was meant; nothing is written."""
     setup = made("gantry.toml", gantry())
-    given = sweep_of_axes(setup)
+    given = sweep_of(setup)
     monkeypatch.setattr("quell.sweeping.runs.simulate", lambda *parts: pytest.fail("a run"))
     given |= {"limits": {}, "workers": 1, "folder": tmp_path / "sweep"}
     for metrics, message in (

@@ -165,14 +165,10 @@ def sweep(
         Number of worst runs to print.
     """
     from quell.setup import made, read
-    from quell.setup.axes import sweep_of_axes
-    from quell.setup.description import is_of_axes
-    from quell.setup.loading import sweep_of
+    from quell.setup.sweeps import sweep_of
 
-    name, data = read(setup)
-    several = is_of_axes(data)
-    given = made(name, data, trust)
-    plan = (sweep_of_axes if several else sweep_of)(given)
+    given = made(*read(setup), trust)
+    plan = sweep_of(given)
     where = Path(f"{setup.stem}-sweep") if folder is None else folder
     console = Console()
     if repeat is not None:

@@ -37,15 +37,11 @@ from quell.setup.loading import (
     REPLACED,
     Known,
     Setup,
-    Variation,
-    changed,
+    check_windows,
     made_once,
-    sweep_of,
     title_of,
-    usable,
     windows_of,
 )
-from quell.setup.registry import CASE
 from quell.setup.schema import (
     Builder,
     Plant,
@@ -243,7 +239,8 @@ def axes_task(
     tables = dict(data)
     if changes:
         tables["tune"] = {**data.get("tune", {}), **changes}
-    setup = made_axes(name, tables, trust)
+    setup = assembled_axes(name, tables, trust)
+    check_windows(setup)
     plant = setup.needed("plant")
     options = dict(setup.tune or tuning_of_axes())
     if options["operating_points"] is None and _is_nonlinear(plant):
@@ -379,7 +376,7 @@ class AxesDescription(Table):
 _ELSEWHERE = dict.fromkeys(REPLACED, "belongs into each [[axis]]")
 
 
-def made_axes(
+def assembled_axes(
     name: str, data: Mapping[str, Any], trust: bool = False, known: Known | None = None
 ) -> Setup:
     """Build the objects that ``data`` describes: the content of a file of several axes.
@@ -440,7 +437,7 @@ def made_axes(
     if rig is not None and signals.known:
         rig = {"signals": signals, **rig}
     parts = (controller, plant, scenario, rig, sweep, windows)
-    return usable(Setup(name, title, *parts, tables, tune, trust), AxesVariation)
+    return Setup(name, title, *parts, tables, tune, trust)
 
 
 def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:
@@ -526,25 +523,3 @@ def _explained(error: SetupError) -> SetupError:
                 break
         lines.append(line)
     return SetupError(lines)
-
-
-# ---- Sweeps ----
-
-
-class AxesVariation(Variation):
-    """A function of values by path that returns a setup of several axes with these values."""
-
-    def __call__(self, **values: Any) -> Setup:
-        """Return the setup; values are by path, and ``case`` is the name of a case."""
-        case = values.pop(CASE, None)
-        changes = {**({} if case is None else self.cases[case]), **values}
-        return made_axes(self.name, changed(self.name, self.data, changes), self.trust)
-
-
-def sweep_of_axes(setup: Setup) -> dict[str, Any]:
-    """Return the arguments of ``quell.sweep`` for a setup of several axes, except the folder.
-
-    Each measure is taken of each axis, as ``elbow.rms``; a limit of ``rms`` holds for all. Errors
-    are those of ``sweep_of``.
-    """
-    return sweep_of(setup, AxesVariation)

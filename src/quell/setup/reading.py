@@ -10,10 +10,13 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from quell.setup.axes import made_axes
+from quell.setup.axes import AxesDescription, assembled_axes
 from quell.setup.description import describe, is_of_axes
-from quell.setup.loading import Known, Setup, assembled, usable
-from quell.setup.schema import read
+from quell.setup.loading import Known, Setup, assembled, check_windows
+from quell.setup.schema import Builder, read
+from quell.setup.sweeps import sweep_of
+from quell.signals import as_signal
+from quell.simulation.scenario import check_schedule
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Setup:
@@ -56,5 +59,30 @@ def made(
         as ``load``.
     """
     if is_of_axes(data):
-        return made_axes(name, data, trust, known)
-    return usable(assembled(name, describe(name, data), known, trust))
+        setup = assembled_axes(name, data, trust, known)
+    else:
+        setup = assembled(name, describe(name, data), known, trust)
+    _check_together(setup)
+    return setup
+
+
+def _check_together(setup: Setup) -> None:
+    """Check windows, signals and sweep of a setup; raise a ``SetupError`` if they can't be used.
+
+    A part alone cannot know these rules. ``assembled`` does not check them: tuning and sweeps build
+    setups with another controller, in which only the parts matter.
+    """
+    check_windows(setup)
+    scenario, tables = setup.scenario, setup.description
+    is_of_one = not isinstance(tables, AxesDescription)
+    if scenario is not None and setup.plant is not None and is_of_one:
+        builder = Builder(setup.file, setup.trust)
+        derivative: Any = scenario.reference
+        for _ in range(int(getattr(setup.controller, "derivatives", 0))):
+            next_one = as_signal(derivative).derivative
+            derivative = builder.attempt("scenario", ("reference",), next_one)
+        # A device gives the signals that a schedule follows, too; a tuning has yet to make it.
+        if "schedule" not in (setup.tune or {}) and not (setup.rig or {}).get("channels"):
+            builder.attempt("", (), check_schedule, scenario, setup.controller)
+    if tables.sweep is not None:
+        sweep_of(setup)
