@@ -640,13 +640,9 @@ def _estimate(design: AdrcDesign, state: AdrcState, u_acting: float, is_measured
         u_nominal = nominal_control(design, state, u_acting)
         own = fed - loop.slope * u_nominal
         residual = f_before(design.held, state.held) - own
-        follow(
-            design.held, state.held, design.eso, z, loop.y, u_observed, known, residual
-        )  # fmt: skip
+        follow(design.held, state.held, design.eso, z, loop.y, u_observed, known, residual)
         f = estimates[order] + own
-        if is_released(
-            design.held, state.held, loop.y, u_nominal, f, loop.slope, design.b0
-        ):  # fmt: skip
+        if is_released(design.held, state.held, loop.y, u_nominal, f, loop.slope, design.b0):
             take_motion(design.held, state.held, z, estimates)
             set_motion(design.safe_set, state.safe_set, estimates, estimates[order] + fed)
     else:
