@@ -196,12 +196,16 @@ def parts(files: list[str], count: int) -> list[set[str]]:
     return [files for _, files in made]
 
 
+def is_whole(config: pytest.Config) -> bool:
+    """Return whether a run is of all files."""
+    return all(Path(each).resolve() in (HERE, HERE.parent) for each in config.args)
+
+
 def announcement(config: pytest.Config) -> str | None:
     """Return how long the run will take on a quiet machine, for a run of many files."""
     marks = config.option.markexpr
     columns = {"": (0, 1), "not trial": (0,), "trial": (1,)}.get(marks)
-    whole = all(Path(each).resolve() in (HERE, HERE.parent) for each in config.args)
-    if columns is None or not whole or config.option.keyword or not table():
+    if columns is None or not is_whole(config) or config.option.keyword or not table():
         return None
     known, part = table(), config.option.part
     files = known if part is None else files_of_part(part, sorted(known))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import math
 import os
 import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,23 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if any(collection_path.name in each for each in config.args):
         return None  # a file that is named is shown with all its tests deselected
     return True if _ONLY_TRIALS.search(collection_path.read_text(encoding="utf-8")) else None
+
+
+def pytest_collectstart(collector: pytest.Collector) -> None:
+    """Let every second worker import the test files from the last one on, before it collects them.
+
+    pytest rewrites the assertions of a file at the first import, and keeps the result in __pycache__:
+    two workers that begin at both ends have half of this to do each, which is all of it otherwise.
+    """
+    config = collector.config
+    number = getattr(config, "workerinput", {}).get("workerid", "gw0").removeprefix("gw")
+    if collector.path != budget.HERE or int(number) % 2 == 0 or not budget.is_whole(config):
+        return
+    for path in sorted(budget.HERE.rglob("test_*.py"), reverse=True):
+        if not pytest_ignore_collect(path, config):
+            name = ".".join(path.relative_to(budget.HERE.parent).with_suffix("").parts)
+            with suppress(Exception, pytest.skip.Exception):  # the collection will say so
+                importlib.import_module(name)
 
 
 def pytest_collection_finish() -> None:
