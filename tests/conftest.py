@@ -237,13 +237,3 @@ def compiled_functions(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     monkeypatch.setattr(user_functions, "compile_cfunc", counted)
     return compiled
-
-
-@pytest.fixture
-def interpreted_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the loops of identification as plain Python: they are called without ``specialised``."""
-    from quell.identification import model, running_loop
-
-    for name in ("_states", "_chains", "_gradient", "_mean_sign", "_states_with_friction"):
-        monkeypatch.setattr(model, name, getattr(model, name).plain)
-    monkeypatch.setattr(running_loop, "_simulate", running_loop._simulate.plain)

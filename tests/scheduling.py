@@ -17,6 +17,16 @@ GROUPS = {
         "test_harmonic",
         "test_sized",
     ),
+    "fits": (
+        "test_identification",
+        "test_identification_parts",
+        "test_running_loop_parts",
+        "test_short_records",
+        "test_small_identifications",
+        "test_spectral_parts",
+        "test_step_records",
+        "test_tests_of_errors",
+    ),
     "Python models": ("contracts/test_contracts", "test_adapters"),
 }
 _GROUP_OF = {f"tests/{file}.py": name for name, files in GROUPS.items() for file in files}

@@ -40,7 +40,7 @@ from quell.identification.search import Known, Wanted
 
 from .cases import cases
 
-pytestmark = pytest.mark.usefixtures("interpreted_fits")
+pytestmark = pytest.mark.compiled
 
 
 @cache

@@ -62,7 +62,7 @@ from quell.identification.running_loop import _predictor as predictor
 
 from .cases import cases
 
-pytestmark = pytest.mark.usefixtures("interpreted_fits")
+pytestmark = pytest.mark.compiled
 
 PLAIN = Form(2, lag=False, delay=False, drift=False)
 BOTH = PLAIN._replace(lag=True, delay=True)

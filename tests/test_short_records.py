@@ -42,7 +42,7 @@ from quell.identification.starts import (
 
 from .cases import cases
 
-pytestmark = pytest.mark.usefixtures("interpreted_fits")
+pytestmark = pytest.mark.compiled
 
 DT = 0.1
 LAG = ([3.0], [1.0, 2.0])

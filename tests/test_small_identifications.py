@@ -23,7 +23,7 @@ from quell.tuning.plants import RecordModel, doubts, identified_plants
 
 from .cases import cases
 
-pytestmark = pytest.mark.usefixtures("interpreted_fits")
+pytestmark = pytest.mark.compiled
 
 DT = 0.1
 

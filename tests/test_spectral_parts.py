@@ -19,7 +19,7 @@ from quell.identification.swings import FreeSwing, Mode, _pencil, free_decay, fr
 
 from .cases import cases
 
-pytestmark = pytest.mark.usefixtures("interpreted_fits")
+pytestmark = pytest.mark.compiled
 
 DT = 0.1
 A_1 = 0.9

@@ -20,7 +20,7 @@ from quell.identification.validation import Linearised
 
 from .cases import cases
 
-pytestmark = pytest.mark.usefixtures("interpreted_fits")
+pytestmark = pytest.mark.compiled
 
 N = 140
 
