@@ -600,7 +600,7 @@ def _learn(model: ExplodesDesign, memory: Memory, features: Any, target: float) 
 
 SCENARIO = ql.Scenario(
     ql.signals.Sinusoid(omega=1.5),
-    duration=5.0,
+    duration=4.0,
     disturbances=(),
     noise=ql.signals.BandLimitedNoise(1e-12, 0.01),
 )
