@@ -584,7 +584,7 @@ def test_a_learner_that_forgets_is_a_new_one(name: str, rng: np.random.Generator
         show(one, seen, seen[0] + 1e-6)
     forget(design, one)
     again = []
-    for _ in range(100):
+    for _ in range(200):
         seen = rng.normal(size=3)
         again.append(show(one, seen, seen[0] + 1e-6))
         assert show(other, seen, seen[0] + 1e-6) == again[-1]
@@ -653,7 +653,7 @@ def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
     run = ql.simulate(
         CHAIN,
         ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]),
-        ql.Scenario(reference=1.0, duration=6.0),
+        ql.Scenario(reference=1.0, duration=10.0),
     )
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
 
