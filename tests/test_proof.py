@@ -31,6 +31,8 @@ needs_frama_c = pytest.mark.skipif(
 LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
 ADRC = ql.ADRC(OBSERVER, 1.5, **LIMITS)
+FIRST = ql.ESO.model_free(order=1, b0=1.5, omega_o=12.0, dt=0.01)
+NETWORK = ql.learners.MLP(features=ql.features.Bias(), hidden=1)
 JOINT = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=0.01), 1.5)
 AXES = ql.Axes([JOINT, JOINT], [[1, 0.3], [0.2, 1]], u_min=-2.0, u_max=3.0, saturation="direction")
 PID = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=0.01, **LIMITS)
@@ -51,6 +53,7 @@ def exported(folder: Path, controller: Any = ADRC, **options: Any) -> Exported:
         pytest.param(ADRC, {"resolution": 1e-4}, id="ADRC, counts"),
         pytest.param(ql.ADRC(OBSERVER, 1.5), {}, id="without limits"),
         pytest.param(PID, {}, id="PID"),
+        pytest.param(ql.ADRC(FIRST, 1.5, learner=NETWORK, **LIMITS), {}, id="a model in a union"),
         pytest.param(ql.controllers.Prefiltered(PID, ql.baselines.ZV(3.0)), {}, id="shaper, with a ring"),
         pytest.param(AXES, {}, id="axes"),
         pytest.param(AXES, {"precision": "single"}, id="axes, single"),
@@ -164,27 +167,40 @@ typedef struct {
     double row[5];
 } a_sample;
 typedef struct {
+    double weights[2];
+} a_model;
+typedef struct {
+    double scale[2];
+    union {
+        a_model model;
+        double flat[2]; /* the same memory */
+    } shared;
+} a_learner;
+typedef struct {
     const a_parameters *parameters;
     double z[3];
     a_memory memory[2];
     a_limits limits;
     a_sample sample;
+    a_learner learner;
 } a_state;
 """
 
 
 def test_arrays_of_the_state_become_objects_of_their_own() -> None:
-    """With their lengths, also within arrays of structs; not what the parameters or a variable have, too."""
+    """With their lengths, also within arrays of structs; not what the parameters, a variable or a union have, too."""
     code = "static void f(void)\n{\n    a_sample sample = {0};\n}\n"
     found = separated(CSource("a", HEADER, code, "double", (), ()))
-    assert found.left == ("a_limits.low", "a_sample.row")
+    left = ("a_learner.shared.flat", "a_limits.low", "a_model.weights", "a_sample.row")
+    assert found.left == left
     lines = [line.strip() for line in found.header.splitlines()]
     for line in ("double (*z);", "a_memory (*memory);", "int (*place); /* of double old[3]; */", "double (*P)[3];",
                  "double low[2];", "double row[5];", "static double separate_0[3];",
                  "static a_memory separate_1[2];", "separate_1[1].P = separate_5;",
-                 "(void)(memset)(place->P, 0, 6 * sizeof(double));"):  # fmt: skip
+                 "(void)(memset)(place->P, 0, 6 * sizeof(double));", "double weights[2];", "double flat[2]; /* the same memory */",
+                 "(void)(memset)(&place->shared, 0, sizeof place->shared);"):  # fmt: skip
         assert line in lines, line
-    assert found.number == 6
+    assert found.number == 7
 
 
 @pytest.mark.trial

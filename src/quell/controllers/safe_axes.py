@@ -361,7 +361,7 @@ def nearest(
             whole = side * distance / left
             if whole <= share:
                 share, end = whole, row
-        if not is_finite(share):
+        if end < 0 or not is_finite(share):  # share is infinite then; a proof does not see it
             return False
         for j in range(rows):
             if held[j] != 0.0:

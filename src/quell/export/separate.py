@@ -6,7 +6,8 @@ the exported controller is written with pointers in place of these arrays, and w
 gives each of them an array of its own, of the same length; the file with the code stays as it is
 delivered. An index that leaves an array then leaves an object, which the analysis knows.
 
-``memset`` of a struct would clear the pointers, so a macro clears what they point to.
+``memset`` of a struct would clear the pointers, so a macro clears what they point to. What is in a
+union stays in it, as its members have the same memory.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ HEADER = "separate.h"
 """What the name of the file ends in; it stands for the header of the controller."""
 
 _STRUCT = re.compile(r"typedef struct \{\n(.*?)\n\} (\w+);", re.S)
+_UNION = re.compile(r"^    union \{\n(.*?)\n    \} (\w+);", re.M | re.S)
 _MEMBER = re.compile(r"^\s*(?:const )?(\w+) (\**)(\w+)((?:\[\d+\])*);", re.M)
 
 
@@ -45,18 +47,20 @@ def separated(source: CSource) -> Separated:
     """Return the header with the arrays of the state as objects of their own.
 
     Arrays of structs that the code has as variables, too, or that are in the parameters, are left:
-    there an array has to be one. The indices of these are known from the text alone.
+    there an array has to be one. So are those in a union, whose members have the same memory. The
+    indices of these are known from the text alone.
     """
     name = source.name
-    structs = {
-        found[2]: [
-            _Member(kind, member, tuple(map(int, re.findall(r"\d+", sizes))), bool(star))
-            for kind, star, member, sizes in _MEMBER.findall(_without_comments(found[1]))
-        ]
-        for found in _STRUCT.finditer(source.header)
-    }
+    structs: dict[str, list[_Member]] = {}
+    unions: dict[str, list[_Member]] = {}
+    for body, kind in _STRUCT.findall(source.header):
+        code = _without_comments(body)
+        structs[kind] = _members(_UNION.sub(r"    union \2;", code))
+        unions |= {f"{kind}.{union}": _members(inside) for inside, union in _UNION.findall(code)}
     state = f"{name}_state"
-    kept = _reached(structs, f"{name}_parameters") | {
+    shared = {kind for inside in unions.values() for each in inside
+              for kind in _reached(structs, each.kind)}  # fmt: skip
+    kept = shared | _reached(structs, f"{name}_parameters") | {
         kind for kind in structs if kind != state
         and re.search(rf"^\s+(?:const )?{kind} \w+(?: =|;|\[)", source.source, re.M)
     }  # fmt: skip
@@ -67,8 +71,10 @@ def separated(source: CSource) -> Separated:
     arrays: list[str] = []
     places: list[str] = []
     _give(structs, changed, state, "state->", arrays, places)
-    left = [f"{kind}.{each.name}" for kind in sorted(_reached(structs, state) & kept)
-            for each in structs[kind] if each.lengths]  # fmt: skip
+    reached = (_reached(structs, state) | shared) & kept
+    known = {kind: structs[kind] for kind in reached & structs.keys()} | unions
+    left = [f"{kind}.{each.name}" for kind in sorted(known)
+            for each in known[kind] if each.lengths]  # fmt: skip
     with_arrays = [kind for kind in structs
                    if kind in changed and _has_arrays(structs, changed, kind)]  # fmt: skip
     text = [
@@ -91,6 +97,13 @@ def separated(source: CSource) -> Separated:
         "",
     ]  # fmt: skip
     return Separated("\n".join(text), len(arrays), tuple(left))
+
+
+def _members(body: str) -> list[_Member]:
+    return [
+        _Member(kind, member, tuple(map(int, re.findall(r"\d+", sizes))), bool(star))
+        for kind, star, member, sizes in _MEMBER.findall(body)
+    ]
 
 
 def _without_comments(text: str) -> str:
