@@ -677,7 +677,7 @@ def start_learning_again(design: AdrcDesign, state: AdrcState) -> None:
 @kernel
 def _forget_learning(design: AdrcDesign, state: AdrcState) -> None:
     """Return learner, guard and the lag filter of f_L to their states before the first sample."""
-    reset_lag_filters(design, state)
+    _reset_lag_filter(state)
     start_again(design.guard, state.guard)
     forget(design.learner, state.learner)
 
@@ -705,6 +705,11 @@ def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> Non
 def reset_lag_filters(design: AdrcDesign, state: AdrcState) -> None:
     """Set the lag filters of f_L and of the guard to zero."""
     reset_filters(design.guard, state.guard)
+    _reset_lag_filter(state)
+
+
+@kernel
+def _reset_lag_filter(state: AdrcState) -> None:
     state.loop[0].f_learned_filtered = 0.0
     reset_lag(state.lag_state)
 

@@ -17,6 +17,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from enum import IntEnum
 from importlib import resources
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -624,9 +625,11 @@ def test_program(source: CSource, vectors: Vectors) -> str:
         "samples": f"count + {blocks * (BLOCK - 1)}" if blocks else "count",
         "tolerance": repr(tolerance_of(vectors.loops is not None)),
         "image_sample": SAVED,
+        "counts": int("step_counts" in source.operations),
         "running": _words_of(vectors.images[0]),
         "at_rest": _words_of(vectors.images[1]),
         "parts": "\n".join(f"    {{{count}, {size!r}}}," for count, size in vectors.parts),
+        "constant": "\n".join(_constant_numbers(source.source)),
         "number": _NUMBER[source.precision],
         "tolerance_reason": TOLERANCE_REASON.replace("\n", "\n * "),
     })  # fmt: skip
@@ -644,6 +647,19 @@ _NUMBER = {
         bits = bits << 8 | first[i];
     memcpy(&x, &bits, sizeof x);""",
 }
+
+
+def _constant_numbers(code: str) -> Iterator[str]:
+    """Yield the runs of numbers in an image for which the code has a constant, and takes any."""
+    checked = re.search(r" memory_ranges\[\d+\] = \{(.*?)\n\};", code, re.S)
+    refused = re.findall(r"\{(\d+), ", checked[1]) if checked else []
+    found = re.findall(r"memory_put\(image, (\d+), -?[\d.e+-]+f?\);", code)
+    places = [*(int(place) for place in found if place not in refused), -1]
+    first = places[0]
+    for place, following in pairwise(places):
+        if following != place + 1:
+            yield f"    {{{first}, {place + 1}}},"
+            first = following
 
 
 def _words_of(image: bytes) -> str:

@@ -90,6 +90,7 @@ static int power_cycle(@name@_state *state)
 
 /* ---- Memory images that quell has written ---- */
 
+#define COUNTS @counts@
 #define NUMBERS ((int)((@NAME@_MEMORY_SIZE - 40) / sizeof(real)))
 /* Each byte of a small image is damaged once, and of a larger one about 4096 of them. */
 #define STRIDE (@NAME@_MEMORY_SIZE / 4096 + 1)
@@ -114,6 +115,17 @@ static const image_word at_rest[] = { /* the same, loaded without resume */
 };
 static const image_part parts[] = {
 @parts@
+};
+
+/* From and until which numbers are the same in all images, and any others are as good. */
+static const int constant[][2] = {
+    {-1, -1},
+@constant@
+};
+
+static const unsigned long others[4][2] = { /* 0.5, 2, -2 and 1e9 in single and in double precision */
+    {0x3f000000UL, 0x3fe00000UL}, {0x40000000UL, 0x40000000UL},
+    {0xc0000000UL, 0xc0000000UL}, {0x4e6e6b28UL, 0x41cdcd65UL},
 };
 
 static void put(unsigned char *image, unsigned long at, unsigned long word)
@@ -160,6 +172,13 @@ static int wrong_if(bool condition, const char *what)
     return condition;
 }
 
+/* Save over other bytes, so that those that are not written show. */
+static void save(const @name@_state *state, unsigned char *image)
+{
+    memset(image, 0xa5, @NAME@_MEMORY_SIZE);
+    @name@_save(state, image);
+}
+
 /* An image must be refused, and nothing may have changed. */
 static int must_refuse(@name@_state *state, const unsigned char *image, size_t length, const char *what)
 {
@@ -170,6 +189,38 @@ static int must_refuse(@name@_state *state, const unsigned char *image, size_t l
         || wrong_if(memcmp(&before, state, sizeof before) != 0, "a refused image changes the state");
 }
 
+/* Make an image with another number k, whose upper 32 bits are given, and the others 0. */
+static void with_number(unsigned char *image, const unsigned char *golden, int k, unsigned long bits)
+{
+    const size_t at = 32 + (size_t)k * sizeof(real);
+
+    memcpy(image, golden, @NAME@_MEMORY_SIZE);
+    memset(image + at, 0, sizeof(real));
+    put(image, (unsigned long)(at + sizeof(real) - 4), bits);
+    sign(image);
+}
+
+/* Whether number k is the same in all images: the controller has no use for it. */
+static bool is_constant(int k)
+{
+    for (int i = 0; i < (int)(sizeof constant / sizeof constant[0]); i++)
+        if (k >= constant[i][0] && k < constant[i][1])
+            return true;
+    return false;
+}
+
+/* An image with another number k must be refused, as k is a whole number, or saved as it was. */
+static int must_keep(@name@_state *state, const unsigned char *image, const unsigned char *golden, int k)
+{
+    static unsigned char saved[@NAME@_MEMORY_SIZE];
+
+    if (!@name@_load(state, image, @NAME@_MEMORY_SIZE, true))
+        return must_refuse(state, image, @NAME@_MEMORY_SIZE, "an image is refused once");
+    save(state, saved);
+    return wrong_if(memcmp(saved, is_constant(k) ? golden : image, sizeof saved) != 0,
+        "a number of an image becomes another one");
+}
+
 /* Save as quell, take what quell has saved, and refuse what is damaged; continue from quell's. */
 static int images(@name@_state *state, double tolerance)
 {
@@ -178,7 +229,7 @@ static int images(@name@_state *state, double tolerance)
     int wrong = 0, k = 0;
 
     unpack(running, sizeof running / sizeof running[0], golden);
-    @name@_save(state, image);
+    save(state, image);
     wrong += wrong_if(memcmp(image, golden, 32) != 0, "the head of the image is not quell's");
     for (int i = 0; i < (int)(sizeof parts / sizeof parts[0]); i++) {
         for (int end = k + parts[i].count; k < end; k++) {
@@ -193,7 +244,7 @@ static int images(@name@_state *state, double tolerance)
     @name@_init(state);
     wrong += wrong_if(!@name@_load(state, golden, sizeof golden, false), "quell's image is refused");
     unpack(at_rest, sizeof at_rest / sizeof at_rest[0], golden);
-    @name@_save(state, image);
+    save(state, image);
     wrong += wrong_if(memcmp(image, golden, sizeof image) != 0, "a loaded image is not at rest");
     unpack(running, sizeof running / sizeof running[0], golden);
     for (size_t at = 0; at < sizeof golden && wrong == 0; at += STRIDE) {
@@ -202,23 +253,28 @@ static int images(@name@_state *state, double tolerance)
         golden[at] ^= 1;
     }
     wrong += must_refuse(state, golden, sizeof golden - 1, "an image that is cut is taken");
-    for (k = 0; k < NUMBERS && wrong == 0; k += STRIDE) {
-        const unsigned long last = 32 + (unsigned long)((size_t)(k + 1) * sizeof(real)) - 4;
-
+    /* The head says what an image is for, but for the count from which positions are counted. */
+    for (size_t at = 0; at < 32 && wrong == 0; at += 4) {
         memcpy(image, golden, sizeof image);
-        put(image, last, sizeof(real) == 8 ? 0x7ff80000UL : 0x7fc00000UL);
+        image[at] ^= 1;
         sign(image);
-        wrong += must_refuse(state, image, sizeof image, "an image with NaN is taken");
-        put(image, last, sizeof(real) == 8 ? 0xfff00000UL : 0xff800000UL);
-        sign(image);
-        wrong += must_refuse(state, image, sizeof image, "an image with an infinite number is taken");
+        if (at != 12 || !COUNTS)
+            wrong += must_refuse(state, image, sizeof image, "an image with another head is taken");
     }
-    memcpy(image, golden, sizeof image);
-    image[24] ^= 1;
-    sign(image);
-    wrong += must_refuse(state, image, sizeof image, "a loop of other parameters is continued");
+    wrong += wrong_if(wrong == 0 && !@name@_load(state, image, sizeof image, false),
+        "what was learned with other parameters is refused");
+    for (k = 0; k < NUMBERS && wrong == 0; k += STRIDE) {
+        with_number(image, golden, k, sizeof(real) == 8 ? 0x7ff80000UL : 0x7fc00000UL);
+        wrong += must_refuse(state, image, sizeof image, "an image with NaN is taken");
+        with_number(image, golden, k, sizeof(real) == 8 ? 0xfff00000UL : 0xff800000UL);
+        wrong += must_refuse(state, image, sizeof image, "an image with an infinite number is taken");
+        for (int i = 0; i < 4; i++) {
+            with_number(image, golden, k, others[i][sizeof(real) == 8]);
+            wrong += must_keep(state, image, golden, k);
+        }
+    }
     wrong += wrong_if(!@name@_load(state, golden, sizeof golden, true), "quell's image is refused");
-    @name@_save(state, image);
+    save(state, image);
     wrong += wrong_if(memcmp(image, golden, sizeof image) != 0, "a loaded image is saved otherwise");
     return wrong;
 }
