@@ -321,11 +321,10 @@ def ready_row(
 
 
 def chosen_rows(
-    text: str, part: slice, precision: str | None = None, more: Iterable[tuple[str, Any]] = ()
+    known: Iterable[tuple[str, Any]], text: str, part: slice, precision: str | None = None
 ) -> list[tuple[str, Any, str]]:
-    """Return controllers whose name has a text, in one precision or both."""
+    """Return those of the controllers whose name has a text, in one precision or both."""
     precisions = [precision] if precision else ["double", "single"]
-    known = [*cases(), *more]
     rows = [(name, each, kind) for name, each in known for kind in precisions if text in name]
     return rows[part]
 

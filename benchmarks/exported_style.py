@@ -89,7 +89,7 @@ def unexplained(found: Counter[str]) -> list[str]:
 
 def main() -> None:
     """Read the rows and print a table of rules."""
-    from exported import chosen_rows
+    from exported import cases, chosen_rows
 
     parser = parser_of(__doc__)
     parser.add_argument("--rows", default="", help="controllers whose name has this text")
@@ -100,7 +100,7 @@ def main() -> None:
     places: Counter[str] = Counter()
     having: Counter[str] = Counter()
     count, bad = 0, False
-    for name, controller, precision in chosen_rows(options.rows, options.part):
+    for name, controller, precision in chosen_rows(cases(), options.rows, options.part):
         try:
             _, source = exported_source(controller, precision == "single")
         except ValueError:  # a model in Python

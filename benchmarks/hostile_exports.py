@@ -11,8 +11,8 @@ conversions to integers, and the first report ends the row; ``--sanitizer memory
 for what is read before it is set. After each call u is looked at: that of
 the call if it returns one, else that of a step of a copy of the state. It must be a number within
 the limits in use. Memory images are saved and loaded between them: whole, cut, damaged, and with
-any numbers behind a right check; one that is refused must change nothing. Bits are compared to find
-NaN, which no option of a compiler can change.
+any numbers behind a right check, also the largest in a row; one that is refused must change
+nothing. Bits are compared to find NaN, which no option of a compiler can change.
 
 10^7 calls of all rows take some hours of a core: ``--results`` names a file to which each row is
 added when it is ready, and whose rows are not run again; ``--part I/N`` takes each N-th row.
@@ -175,6 +175,7 @@ static void check_copy(const NAME_state *state)
 {
     NAME_state copy = *state;
     const REAL r = reference(), y = measurement();
+    note((uint64_t)NAME_status(state));
     check(&copy, NAME_step(&copy, r, yHOSTILE_DERIVATIVES));
 }
 """
@@ -207,9 +208,13 @@ static void load(NAME_state *state)
     } else if (kind == 2) { /* cut */
         length = bits() % sizeof image;
     } else if (kind == 3) { /* other numbers, with a check that is right */
-        for (int i = (int)(bits() % 8); i >= 0; i--) {
-            const REAL x = bits() & 1 ? hostile() : (REAL)((int)(bits() % 2048) - 1024);
-            memcpy(image + 32 + sizeof x * (bits() % (uint64_t)numbers), &x, sizeof x);
+        const bool in_row = bits() & 1; /* the largest, whose sums are no number */
+        const uint64_t count = (uint64_t)numbers, first = bits() % count;
+        for (uint64_t i = bits() % 8 + 1; i > 0; i--) {
+            const REAL x = in_row ? (bits() & 1 ? REAL_MAX : -REAL_MAX)
+                : bits() & 1 ? hostile() : (REAL)((int)(bits() % 2048) - 1024);
+            const uint64_t at = (in_row ? first + i : bits()) % count;
+            memcpy(image + 32 + sizeof x * at, &x, sizeof x);
         }
         put_check();
     }
@@ -433,7 +438,7 @@ def is_good(cells: list[str]) -> bool:
 
 def main() -> None:
     """Run the rows and print a table."""
-    from exported import chosen_rows, counted, shown_rows
+    from exported import cases, chosen_rows, counted, shown_rows
 
     parser = parser_of(__doc__)
     parser.add_argument("--calls", type=float, default=1e7, help="calls of each row")
@@ -446,7 +451,7 @@ def main() -> None:
     options = options_of(parser, calls=2000, rows="PPI", precision="double")
     check_present(options, tools=[SANITIZERS[options.sanitizer][0]])
     warnings.simplefilter("ignore")
-    rows = chosen_rows(options.rows, options.part, options.precision)
+    rows = chosen_rows(cases(), options.rows, options.part, options.precision)
     done = shown_rows(rows, HEADS, partial(row_of, options=options), options.results)
     bad = sum(not is_good(cells) for cells in done)
     print(f"{bad} rows have a report or a bad u" if bad else "no report, no bad u")

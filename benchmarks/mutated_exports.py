@@ -1,20 +1,25 @@
 """Wrong versions of exported C, drawn by chance: does a test find them, or the proof.
 
-    python benchmarks/mutated_exports.py [--count 30] [--seed 1] [--without-proof]
+    python benchmarks/mutated_exports.py [--count 60] [--seed 1] [--without-proof]
 
 Changes of one place are drawn from the C code of several controllers, as many of each kind:
 
 * *limit*: a comparison with a limit of u is turned round or dropped, a limit is taken for the
   other, the smaller of two numbers for the larger;
+* *rate*: the same of a limit of the change of u;
 * *NaN*: a test whether a number is finite or usable is always true, always false, or loses a part;
-* *index*: a loop has a pass more or less, a place in an array is the next one.
+* *index*: a loop has a pass more or less, a place in an array is the next one;
+* *copy*: a number too many or too few is written into an image or read from it, or one place off;
+* *image*: a part of the check of an image is left out, or always refuses;
+* *fields*: two numbers that follow one another are exchanged in an image, an assignment, or a call;
+* *reset*: what a reset, a start or a handover sets stays as it was.
 
-Each is given to four judges, until one finds it: the golden vectors of ``test_NAME.c`` with the
-sanitizers of gcc; the hostile program (``hostile_exports.py``), which finds reports and a bad u;
-the bits of all u and flags in that program, which must be those of the unchanged code (which
-repeats the kernels: ``exported.py``); and Frama-C (``quell export --prove``). A change that the
-compiler refuses is drawn again. What nobody finds ends the script with 1, unless ``SAME`` says why
-it changes nothing.
+Each is given to judges in order of their cost, until one finds it: the golden vectors of
+``test_NAME.c`` with the sanitizers of gcc; the hostile program (``hostile_exports.py``), which
+finds reports and a bad u; the bits of all u and flags in that program, which must be those of the
+unchanged code (which repeats the kernels: ``exported.py``); and Frama-C (``quell export --prove``).
+A change that the compiler refuses is drawn again. What nobody finds ends the script with 1, unless
+``SAME`` says why it changes nothing.
 """
 
 from __future__ import annotations
@@ -34,6 +39,7 @@ from typing import Any, NamedTuple
 
 from hostile_exports import SANITIZERS, built, traced
 from measured import check_present, options_of, parser_of, write
+from proofs import write_proof
 from rich.console import Console
 from rich.table import Table
 
@@ -48,12 +54,14 @@ SAME = {
     "every finite u is usable, and no usable y or r makes one that is not finite",
     "if (is_usable(unlimited)) { -> if (false && (is_usable(unlimited))) {": "the line behind it "
     "accepts every finite u, as the limits are finite",
+    "state->loop.has_reference = false; -> ;": "the loop is cleared two lines above; only the "
+    "compensator of a u that is given has true there",
     "return fabs(a) <= DBL_MAX; -> return true || (fabs(a) <= DBL_MAX);": "limits of u are finite",
 }
 
 
 class Mutant(NamedTuple):
-    """A changed line of exported code."""
+    """A change of a line of exported code, or of two that follow one another."""
 
     controller: str
     kind: str
@@ -68,9 +76,14 @@ class Mutant(NamedTuple):
         return self.block.partition("\n")[0]
 
     @property
+    def change(self) -> str:
+        """What becomes what, in one line."""
+        return " ".join(f"{self.before} -> {self.after}".split())
+
+    @property
     def name(self) -> str:
-        """The change in one line."""
-        return f"{self.controller}, line {self.line}: {self.before} -> {self.after}"
+        """The change in one line, with its place."""
+        return f"{self.controller}, line {self.line}: {self.change}"
 
 
 def controllers() -> dict[str, Any]:
@@ -92,22 +105,31 @@ def controllers() -> dict[str, Any]:
 
 _NEXT = {"<": ">", ">": "<", "<=": ">=", ">=": "<="}
 _NAN = re.compile(r"is_usable|is_finite|is_usable_control|(\w+(?:->\w+)?) == \1\b|_MAX")
+_OTHERS = (("low", "high"), ("high", "low"), ("minimum(", "maximum("), ("maximum(", "minimum("),
+           ("least_change", "most_change"), ("most_change", "least_change"))  # fmt: skip
+_CHECKING = re.compile(r"memory_fits|\w+_load")
+_RESETTING = re.compile(r"\w*(?:reset|restart|start|start_\w+|init|set_rest|at_rest|hand_over)\w*")
+_STATEMENT = re.compile(r"\s+(?!return\b|const\b|break\b)[\w(][\w\[\]>.\-]*(?: [-+*/]?= |\()[^;]*;")
+_HEAD = re.compile(r"\S.*?\b(\w+)\([^;]*$")
+_ASSIGNMENT = re.compile(r"(\s+)([\w\[\]>.\-]+)( = )([^;]+)(;)")
+_WRITTEN = re.compile(r"(\s+memory_put(?:_all)?\(image, \d+, )(.+?)((?:, \d+)?\);)")
 
 
-def changes(line: str) -> Iterator[tuple[str, str]]:
-    """Yield kind and text of all changes of a line of C code."""
+def changes(line: str, function: str = "") -> Iterator[tuple[str, str]]:
+    """Yield kind and text of all changes of a line of C code in a function."""
     code = line.partition("/*")[0]
     if re.search(r"\blimits(?:->|\.)|\bminimum\(|\bmaximum\(", code):
+        kind = "rate" if "_change" in code else "limit"
         for found in re.finditer(r" (<=?|>=?) ", code):
-            yield "limit", f"{line[: found.start(1)]}{_NEXT[found[1]]}{line[found.end(1) :]}"
-        for one, other in (("low", "high"), ("high", "low"), ("minimum(", "maximum("),
-                           ("maximum(", "minimum("), ("least_change", "most_change"),
-                           ("most_change", "least_change")):  # fmt: skip
+            yield kind, f"{line[: found.start(1)]}{_NEXT[found[1]]}{line[found.end(1) :]}"
+        for one, other in _OTHERS:
             if re.search(rf"\b{re.escape(one)}", code):
-                yield "limit", line.replace(one, other, 1)
+                yield kind, line.replace(one, other, 1)
         if re.fullmatch(r"\s+\w+ = [^;]*;\s*", code):
-            yield "limit", re.sub(r"\S.*", ";", line, count=1)
-    if _NAN.search(code):
+            yield kind, re.sub(r"\S.*", ";", line, count=1)
+        if kind == "rate":
+            yield kind, re.sub(r"\blimits->\w+_change", r"10.0 * \g<0>", line, count=1)
+    if _NAN.search(code) and not _CHECKING.fullmatch(function):
         test = re.fullmatch(r"(\s*(?:\} else )?if )\((.*)\)( \{.*)", line)
         if test:
             yield "NaN", f"{test[1]}(true || ({test[2]})){test[3]}"
@@ -117,6 +139,33 @@ def changes(line: str) -> Iterator[tuple[str, str]]:
             yield "NaN", f"{value[1]}true || ({value[2]}){value[3]}"
         for found in re.finditer(r"(?<=\()[^()&|?]+ && |(\w+) == \1 && ", code):
             yield "NaN", f"{line[: found.start()]}{line[found.end() :]}"
+        for found in re.finditer(r"(?:= |return )([^;?]+) \? ", code):
+            yield "NaN", f"{line[: found.start(1)]}(true || ({found[1]})){line[found.end(1) :]}"
+    if _CHECKING.fullmatch(function):
+        test = re.fullmatch(r"(\s*if )\((.*)\)( \{.*)", line)
+        if test:
+            yield "image", f"{test[1]}(false && ({test[2]})){test[3]}"
+        for found in re.finditer(
+            r"(?:length|memory_get_\w+\([^()]*\)) != (?:\w+\(\w+\)|\w+)|x [<>]= \w+", code
+        ):
+            known = "true" if found[0].startswith("x ") else "false"
+            yield "image", f"{line[: found.start()]}{known}{line[found.end() :]}"
+        if "return" in code:
+            for one, other in (("false", "true"), ("true", "false")):
+                if one in code:
+                    yield "image", line.replace(one, other)
+    if "image" in code and "memory_" in code:
+        for found in re.finditer(r"(?<=image, )\d+(?=[,)])|(?<=, )\d+(?=\);)", code):
+            for number in (int(found[0]) + 1, int(found[0]) - 1):
+                if number >= 0:
+                    yield "copy", f"{line[: found.start()]}{number}{line[found.end() :]}"
+    if _RESETTING.fullmatch(function) and _STATEMENT.fullmatch(code.rstrip()):
+        yield "reset", re.sub(r"\S.*", ";", line, count=1)
+    if "memory_" not in code:
+        for found in re.finditer(r"(?<=[(,] |.\()(r|y|u)(, )(r|y|u)(?=[,)])", code):
+            if function and _STATEMENT.match(line):
+                exchanged = f"{found[3]}{found[2]}{found[1]}"
+                yield "fields", f"{line[: found.start()]}{exchanged}{line[found.end() :]}"
     loop = re.match(r"\s*for \(int (\w+) = .*; \1 (<|>) ([^;]+); ", code)
     if loop:
         for more in (" + 1", " - 1"):
@@ -127,32 +176,71 @@ def changes(line: str) -> Iterator[tuple[str, str]]:
             yield "index", f"{line[: found.end(1)]} + 1{line[found.end(1) :]}"
 
 
+def exchanges(line: str, following: str) -> Iterator[str]:
+    """Yield the texts of two lines in which what they write, or where to, is exchanged."""
+    one, other = _WRITTEN.fullmatch(line), _WRITTEN.fullmatch(following)
+    if one and other and one[3] == other[3] and one[2] != other[2]:
+        yield f"{one[1]}{other[2]}{one[3]}\n{other[1]}{one[2]}{other[3]}"
+    one, other = _ASSIGNMENT.fullmatch(line), _ASSIGNMENT.fullmatch(following)
+    if one and other and one[1] == other[1] and one[4] != other[4]:
+        yield "\n".join("".join((here[1], there[2], *here.groups()[2:])) for here, there in
+                        ((one, other), (other, one)))  # fmt: skip
+
+
+def all_mutants(name: str, text: str) -> Iterator[Mutant]:
+    """Yield all changes of the code of a controller."""
+    function, lines = "", text.splitlines()
+    for number, line in enumerate(lines, 1):
+        head = _HEAD.fullmatch(line)
+        function = head[1] if head else "" if line == "}" else function
+        if not line.startswith("    ") or line.endswith((",", ")")):  # the head of a function
+            continue
+        for kind, after in changes(line, function):
+            block = "\n".join(lines[number:]).partition("\n}\n")[0]
+            yield Mutant(name, kind, number, line.strip(), after.strip(), block)
+        for after in exchanges(line, lines[number]):
+            before = f"{line}\n{lines[number]}"
+            block = "\n".join(lines[number + 1 :]).partition("\n}\n")[0]
+            yield Mutant(name, "fields", number, before.strip(), after.strip(), block)
+
+
 def drawn(code: dict[str, str], count: int, chance: random.Random) -> list[Mutant]:
     """Return mutants of the sources, equally many of each kind, from all controllers."""
     found: dict[str, dict[str, list[Mutant]]] = {}
     for name, text in code.items():
-        for number, line in enumerate(text.splitlines(), 1):
-            if line.startswith("    ") and not line.endswith((",", ")")):  # no head of a function
-                for kind, after in changes(line):
-                    block = "\n".join(text.splitlines()[number:]).partition("\n}\n")[0]
-                    mutant = Mutant(name, kind, number, line.strip(), after.strip(), block)
-                    found.setdefault(kind, {}).setdefault(name, []).append(mutant)
+        for mutant in all_mutants(name, text):
+            found.setdefault(mutant.kind, {}).setdefault(name, []).append(mutant)
     chosen: list[Mutant] = []
     kinds = sorted(found)
-    while len(chosen) < count:
+    while len(chosen) < count and found:
         kind = kinds[len(chosen) % len(kinds)]
-        pool = found[kind][chance.choice(sorted(found[kind]))]
-        chosen.append(pool.pop(chance.randrange(len(pool))))
+        pools = found[kind]
+        name = chance.choice(sorted(pools))
+        chosen.append(pools[name].pop(chance.randrange(len(pools[name]))))
+        if not pools[name]:
+            del pools[name]
+        if not pools:
+            del found[kind]
+            kinds.remove(kind)
     return chosen
 
 
 def changed(text: str, mutant: Mutant) -> str:
-    """Return the text of a source with one line changed."""
+    """Return the text of a source with one place changed."""
     lines = text.splitlines(keepends=True)
-    old = lines[mutant.line - 1]
+    at, count = mutant.line - 1, mutant.before.count("\n") + 1
+    old = "".join(lines[at : at + count])
     assert old.strip() == mutant.before
-    lines[mutant.line - 1] = old.replace(mutant.before, mutant.after)
+    lines[at : at + count] = [old.replace(mutant.before, mutant.after)]
     return "".join(lines)
+
+
+def ends_well(command: list[str]) -> bool:
+    """Return whether a program ends with 0 within two minutes."""
+    try:
+        return not subprocess.run(command, capture_output=True, check=False, timeout=120).returncode
+    except subprocess.TimeoutExpired:
+        return False
 
 
 def judge(
@@ -165,20 +253,19 @@ def judge(
     with tempfile.TemporaryDirectory() as place:
         folder, source = Path(place), done.source
         wrong = dataclasses.replace(source, source=changed(source.source, mutant))
-        try:
-            program = built(folder, controller, wrong)
-        except RuntimeError:
-            return "compiler"
         name = source.name
-        test = folder / "golden"
+        for end, text in ((".c", wrong.source), (".h", source.header)):
+            (folder / f"{name}{end}").write_text(text, encoding="utf-8")
         vectors = done.folder / f"test_{name}.c"
         command = [*SANITIZERS["address"], "-std=c99", "-O1", "-ffp-contract=off", f"-I{folder}"]
-        command += [str(vectors), f"{name}.c", "-o", str(test), "-lm"]
-        subprocess.run(command, cwd=folder, capture_output=True, check=True)
-        if subprocess.run([test], capture_output=True, check=False, timeout=120).returncode:
+        command += [str(vectors), f"{name}.c", "-o", "golden", "-lm"]
+        if subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode:
+            return "compiler"
+        if not ends_well([str(folder / "golden")]):
             return "golden vectors"
+        program = built(folder, controller, wrong)
         try:
-            *found, trace = traced(program, calls, 120.0)
+            *found, trace = traced(program, calls, 600.0)
         except subprocess.TimeoutExpired:
             return "hostile calls"
         if found != ["0", "0", "0"]:
@@ -204,7 +291,7 @@ def why_same(mutant: Mutant) -> str:
     without = re.sub(r"(\w+(?:->\w+)?) == \1 && (?=\1 >)", "", mutant.before)
     if mutant.after == without:
         return "a comparison with a number is false for NaN, too; the test is there for Eva"
-    return SAME.get(f"{mutant.before} -> {mutant.after}", "")
+    return SAME.get(mutant.change, "")
 
 
 def right_trace(controller: Any, done: Exported, calls: float) -> str:
@@ -216,7 +303,7 @@ def right_trace(controller: Any, done: Exported, calls: float) -> str:
 def main() -> None:
     """Draw mutants, judge them and print a table."""
     parser = parser_of(__doc__)
-    parser.add_argument("--count", type=int, default=30)
+    parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--without-proof", action="store_true", help="the tests alone")
     parser.add_argument("--calls", type=float, default=1e6, help="of the hostile program")
@@ -236,10 +323,7 @@ def main() -> None:
             if options.only in name
         }
         for controller, done in made.values():  # the files of the proof, without a proof
-            for path, text in ql.export.proof.proof_files(controller, done.source).items():
-                target = done.folder / path
-                target.parent.mkdir(exist_ok=True)
-                target.write_text(text, encoding="utf-8")
+            write_proof(done.folder, controller, done.source)
         right = {name: right_trace(*each, options.calls) for name, each in made.items()}
         code = {name: done.source.source for name, (_, done) in made.items()}
         judged = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import random
 import shutil
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,57 @@ def test_the_program_calls_every_function(hostile: Any) -> None:
     more = dataclasses.replace(source, operations=(*source.operations, "explode"))
     with pytest.raises(ValueError, match="explode"):
         hostile.hostile_program(ADRC, more)
+
+
+KINDS = ("NaN", "copy", "fields", "image", "index", "limit", "rate", "reset")
+
+
+def test_wrong_versions_of_all_kinds_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many of each; each is another text that differs in the line, or the two lines, that it names."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    mutants = benchmark("mutated_exports")
+    text = ql.export.c_source(ADRC, "servo").source
+    found = mutants.drawn({"ADRC": text}, 3 * len(KINDS), random.Random(7))
+    assert [each.kind for each in found] == [*KINDS] * 3
+    for mutant in found:
+        lines = mutants.changed(text, mutant).splitlines()
+        count, at = mutant.before.count("\n") + 1, mutant.line - 1
+        assert lines[:at] == text.splitlines()[:at]
+        assert lines[at + count :] == text.splitlines()[at + count :]
+        assert lines[at : at + count] != text.splitlines()[at : at + count]
+
+
+def test_two_lines_are_exchanged_where_both_are_of_one_form(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is written into an image, or what is assigned; not a line and another kind of line."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    exchanges = benchmark("mutated_exports").exchanges
+    first, second = "    memory_put(image, 6, state->r);", "    memory_put(image, 7, state->y);"
+    assert [*exchanges(first, second)] == [
+        "    memory_put(image, 6, state->y);\n    memory_put(image, 7, state->r);"
+    ]
+    first, second = "    state->r = memory_get(image, 6);", "    state->y = memory_get(image, 7);"
+    assert [*exchanges(first, second)] == [
+        "    state->y = memory_get(image, 6);\n    state->r = memory_get(image, 7);"
+    ]
+    assert [*exchanges(first, "    memory_put(image, 7, state->y);")] == []
+
+
+@pytest.mark.trial
+def test_drawn_controllers_are_those_of_their_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has a name of its own, and is exported in both precisions."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    proofs = benchmark("proofs")
+    found = dict(proofs.drawn(4, 7))
+    assert len(found) == 4
+    assert [*found] == [name for name, _ in proofs.drawn(4, 7)]
+    assert not {*found} & {name for name, _ in proofs.drawn(4, 8)}
+    for controller in found.values():
+        for precision in ("double", "single"):
+            assert (
+                "servo_step" in ql.export.c_source(controller, "servo", precision=precision).source
+            )
 
 
 @pytest.mark.trial
