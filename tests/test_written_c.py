@@ -297,10 +297,10 @@ def test_further_arguments_of_a_step_are_said(
     )
     assert _Writer._about_derivatives(stands) == text  # type: ignore[arg-type]
     assert _Writer._about_target(stands) == ""  # type: ignore[arg-type]
-    moving = _Writer._about_target(SimpleNamespace(moves=True))  # type: ignore[arg-type]
-    assert moving.startswith(
-        "r is the target of a move within the limits of speed, acceleration and jerk in\n"
-    )
+    moving = _Writer._about_target(SimpleNamespace(moves=True, one=one))  # type: ignore[arg-type]
+    begin = "r is the target of a move within the limits of speed, acceleration and jerk in\n"
+    of_axes = "r of an axis with a profile generator is the target of a move within the limits\n"
+    assert moving.startswith(begin if one else of_axes)
 
 
 # ---- other programs
