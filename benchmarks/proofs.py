@@ -21,6 +21,7 @@ import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import exported
@@ -114,7 +115,10 @@ def main() -> None:
     figures: dict[str, Any] = {"rows": len(done)}
     for verdict in ("yes", "refused", "NOT"):
         figures[verdict] = sum(cells[2].startswith(verdict) for cells in done)
+    figures["controllers"] = len({cells[0] for cells in done})
     figures["alarms"] = sum(int(cells[3] or 0) for cells in done)
+    times = [float(cells[4]) for cells in done if cells[4]]
+    figures |= {"median": median(times), "longest": max(times)} if times else {}
     figures["each"] = {
         f"{cells[0]}, {cells[1]}": dict(zip(HEADS[2:], map(_number, cells[2:]), strict=True))
         for cells in done

@@ -66,6 +66,7 @@ MUTANTS = {
     "one number too few is loaded": (r"(memory_get_all\(image, 3, state->estimates, )3", r"\g<1>2"),
     "one number too few is saved": (r"(memory_put_all\(image, 3, state->estimates, )3", r"\g<1>2"),
     "the image is of big-endian words": (r"\(\(word >> 8\) & 0xffU\)", "((word >> 16) & 0xffU)"),
+    "a controller begins otherwise": (r"(void servo_init\(.*?)\n\}", r"\1\n    state->loop.u = 1.0;\n}"),
     "there is no upper limit": (r"        applied = limits->high;\n", ""),
     "there is no limit of the rate": (r"most_change;", "most_change + 1e9;"),
     "u is not held in an interval": (r"limits->low\)", "limits->low - 1e9)"),
@@ -84,7 +85,7 @@ def changed(code: str, pattern: str, new: str) -> str:
             assert y in code
             code = code.replace(r, call.format(11, "r") + " ").replace(y, call.format(10, "y"))
         return code
-    return re.sub(pattern, new, code)
+    return re.sub(pattern, new, code, flags=re.DOTALL)
 
 
 @pytest.mark.trial

@@ -30,7 +30,14 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.compensator import samples_to_settle
-from quell.controllers.memory import images_of, named_arrays, start_from_rest, written_image
+from quell.controllers.memory import (
+    CHECK,
+    Layout,
+    images_of,
+    named_arrays,
+    start_from_rest,
+    written_image,
+)
 from quell.export.c_files import CSource
 from quell.export.controller_source import Parts, at_path, limits_path, parts_of
 from quell.export.translate.text import Literals
@@ -271,6 +278,8 @@ class Vectors(NamedTuple):
         memory images after ``SAVED`` samples: running, and at rest as a start leaves it.
     parts
         number and largest size of the entries of each array in an image.
+    fresh
+        the last 8 bytes of an image before the first sample, its check.
     """
 
     rows: tuple[Row, ...]
@@ -281,6 +290,7 @@ class Vectors(NamedTuple):
     loops: Loops | None
     images: tuple[bytes, bytes]
     parts: list[tuple[int, float]]
+    fresh: bytes
 
 
 class Player:
@@ -396,6 +406,7 @@ def golden_vectors(controller: Any, source: CSource) -> Vectors:
     """
     player, path = Player(controller, source.precision), limits_path(controller)
     available, (_, p, m) = source.operations, player.sizes
+    fresh = written_image(_layout(player))[-CHECK.size :]
     amplitude = _amplitude(controller, source.precision, path)
     signals = _AllSignals(player, amplitude)
     for _ in range(2):  # before the first measurement
@@ -445,14 +456,18 @@ def golden_vectors(controller: Any, source: CSource) -> Vectors:
     row = np.zeros(sum(widths), dtype=player.dtype)
     write_row(player.design, player.state, row)
     sizes = np.array(scale)
-    return Vectors(*(tuple(player.rows), path, limit, sizes, row, player.loops, images, parts))
+    played = tuple(player.rows), path, limit, sizes, row, player.loops
+    return Vectors(*played, images, parts, fresh)
+
+
+def _layout(player: Player) -> Layout:
+    controller = player.parts.controller
+    return images_of(player.design, player.state, controller.dt, getattr(controller, "names", ()))
 
 
 def _images(player: Player) -> tuple[tuple[bytes, bytes], list[tuple[int, float]]]:
     """Return the images of a player's state, and numbers and sizes of their parts."""
-    controller, state = player.parts.controller, player.state
-    names = getattr(controller, "names", ())
-    known = images_of(player.design, state, controller.dt, names)
+    state, known = player.state, _layout(player)
     running = written_image(known)
     parts = [(each.size, float(np.max(np.abs(each[np.isfinite(each)]), initial=0.0)))
              for each in known.arrays.values() if each.size]  # fmt: skip
@@ -626,6 +641,7 @@ def test_program(source: CSource, vectors: Vectors) -> str:
         "tolerance": repr(tolerance_of(vectors.loops is not None)),
         "image_sample": SAVED,
         "counts": int("step_counts" in source.operations),
+        "fresh": ", ".join(f"{byte:#x}" for byte in vectors.fresh),
         "running": _words_of(vectors.images[0]),
         "at_rest": _words_of(vectors.images[1]),
         "parts": "\n".join(f"    {{{count}, {size!r}}}," for count, size in vectors.parts),

@@ -107,6 +107,8 @@ typedef struct {
     double size;
 } image_part;
 
+/* The check of one before the first sample. */
+static const unsigned char fresh[8] = {@fresh@};
 static const image_word running[] = { /* after @image_sample@ samples */
 @running@
 };
@@ -221,6 +223,16 @@ static int must_keep(@name@_state *state, const unsigned char *image, const unsi
         "a number of an image becomes another one");
 }
 
+/* A controller before its first sample is quell's. */
+static int begins(const @name@_state *state)
+{
+    static unsigned char image[@NAME@_MEMORY_SIZE];
+
+    save(state, image);
+    return wrong_if(memcmp(image + sizeof image - sizeof fresh, fresh, sizeof fresh) != 0,
+        "a controller does not begin as quell's");
+}
+
 /* Save as quell, take what quell has saved, and refuse what is damaged; continue from quell's. */
 static int images(@name@_state *state, double tolerance)
 {
@@ -288,6 +300,7 @@ int main(int argc, char **argv)
     int wrong = 0;
 
     @name@_init(&state);
+    wrong += begins(&state);
     for (int k = 0; k < count; k++) {
         const sample *now = &samples[k];
         real u[ACTUATORS] = {@zero@};
