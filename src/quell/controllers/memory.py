@@ -90,6 +90,9 @@ class Layout(NamedTuple):
         the two hashes.
     zeros
         numbers of the image that are zero in any image: flags that are set during a call alone.
+    before
+        the layout of images that were saved when the guard had no account of outcomes; None if it
+        is the same.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -97,6 +100,7 @@ class Layout(NamedTuple):
     layout: int
     design: int
     zeros: tuple[int, ...]
+    before: Layout | None = None
 
     @property
     def numbers(self) -> int:
@@ -181,12 +185,27 @@ def kept_arrays(state: Any) -> dict[str, NDArray[Any]]:
     return kept
 
 
+_LATER = "guard.trial"
+
+
 def images_of(parameters: Any, state: Any, dt: float, names: Sequence[str] = ()) -> Layout:
     """Return the layout of the images of a controller, given by its kernels' parameters.
 
     ``names`` are those of its axes: an image with the axes in another order is of another one.
     """
     arrays = kept_arrays(state)
+    known = _layout_of(arrays, parameters, state, dt, names)
+    # An account of outcomes begins with zeros.
+    older = {name: each for name, each in arrays.items() if not name.endswith(_LATER)}
+    if len(older) == len(arrays):
+        return known
+    return known._replace(before=_layout_of(older, parameters, state, dt, names))
+
+
+def _layout_of(
+    arrays: dict[str, NDArray[Any]], parameters: Any, state: Any, dt: float, names: Sequence[str]
+) -> Layout:
+    """Return the layout of images with some arrays of a state."""
     single = any(array.dtype == np.float32 for array in arrays.values())
     shapes = [(name, array.shape) for name, array in arrays.items()]
     if names:  # behind the last axis was an empty array, which is in the hash
@@ -357,6 +376,13 @@ def read_image(known: Layout, image: Any, *, running: bool) -> dict[str, NDArray
             f"image is in {names.get(width, 'unknown')} precision: must be in "
             f"{names[known.width]}, as the controller is; restore it into one of its own precision"
         )
+    missing = {}
+    if known.before is not None and (layout, size) == (known.before.layout, known.before.size):
+        kept = known.before.arrays
+        missing = {
+            name: np.zeros_like(each) for name, each in known.arrays.items() if name not in kept
+        }
+        known = known.before
     if layout != known.layout or size != known.size:
         raise ValueError(
             "image is of another controller: kind, orders, features and scales of the learner, dt, "
@@ -380,7 +406,7 @@ def read_image(known: Layout, image: Any, *, running: bool) -> dict[str, NDArray
         raise ValueError("image has numbers that are not finite; let the controller learn anew")
     if any(numbers[place] != 0.0 for place in known.zeros):
         raise ValueError("image was saved in the middle of a sample; let the controller learn anew")
-    found, at = {}, 0
+    found, at = missing, 0
     for name, array in known.arrays.items():
         found[name] = numbers[at : at + array.size].reshape(array.shape)
         at += array.size

@@ -1,6 +1,4 @@
-"""``Guard`` as users make it, and the bound that is certified for a set of plants.
-
-The guard as users make it; ``kernels.py`` has its equations.
+"""``Guard`` as users make it (``kernels.py`` has its equations), and its certified bound.
 
 Effect of a learner's correction on the loop of a linear plant and the plain observer.
 
@@ -33,10 +31,12 @@ import numpy as np
 import quell.guard.kernels  # noqa: F401  (registers the functions for ``GuardDesign``)
 from quell import checks
 from quell.guard.kernels import (
+    SETTLING_LAGS,
     GuardAverages,
     GuardDesign,
     GuardMemory,
     GuardSample,
+    GuardTrial,
     withdraw_authority,
 )
 from quell.learners.base import lag_memory, lag_of
@@ -253,37 +253,21 @@ def _is_part_of_a_plant(value: Any) -> bool:
 
 # ---- The guard as users make it ----
 
-# These values were chosen by hand on tuning seeds of `quell stress`, which judges them as a set on
-# other seeds (studies/notes/guard_parts.md). Times are in lags N/omega_o of the observer.
-# T of the averages:
-_AVERAGING_LAGS = 15.0
-# T_C/T: a learner that explains a part of a sinusoidal load has full authority after 25 lags.
-_CREDIT_TIME = 2.0 / 3.0
-# P follows a growing |q| within this many lags, and decays over this many.
-_RISE_LAGS, _DECAY_LAGS = 0.7, 200.0
-# e grows by a factor of 2.7 in this time while the learner acts.
-_GROWTH_LAGS = 5.0
-# Memory of c_L, the learner's newest largest correction.
-_OWN_LAGS = 10.0
-# β̄ follows β over this time.
-_SMOOTHING_LAGS = 30.0
-# The target returns to f_L over this time, where the bound keeps them apart.
-_LEAK_LAGS = 7.0
-# A target that is far from β̄g approaches it by e in this time, which has almost no effect.
-_HOME_LAGS = 1000.0
-# Memory of the account.
-_ACCOUNT_LAGS = 300.0
-# Time over which ε compares p with q, over T: a learner that turns is noticed within five lags.
-_MATCH_TIME = 0.1
-# κ_0, for learners that leave a good part of the error. With 1 a perfect one is clipped at its
-# peaks, because e is a little less than those of what the plain observer misses.
-_USUAL_BOUND = 1.2
-# After a learner has lost its authority, what it has done to y is taken back in this time.
-_CLOSING_LAGS = 2.0 / 3.0
-# It is taken back for at most so long: from then on a learner without authority moves nothing.
-_TAKING_BACK_LAGS = 10.0
-# After the filters were emptied in mid-run, q is wrong for this time.
-_SETTLING_LAGS = 3.0
+# Chosen by hand on tuning seeds of `quell stress`, which judges them as a set on other seeds
+# (studies/notes/guard_parts.md). Times are in lags N/omega_o of the observer.
+_AVERAGING_LAGS = 15.0  # T of the averages
+_CREDIT_TIME = 2.0 / 3.0  # T_C/T: who explains a part of a sinusoid has full authority in 25 lags
+_RISE_LAGS, _DECAY_LAGS = 0.7, 200.0  # of P
+_GROWTH_LAGS = 5.0  # e grows by a factor of 2.7 in this time while the learner acts
+_OWN_LAGS = 10.0  # memory of c_L, the learner's newest largest correction
+_SMOOTHING_LAGS = 30.0  # β̄ follows β over this time
+_LEAK_LAGS = 7.0  # the target returns to f_L over this time, where the bound keeps them apart
+_HOME_LAGS = 1000.0  # a target that is far from β̄g approaches it by e in this time
+_ACCOUNT_LAGS = 300.0  # memory of the account
+_MATCH_TIME = 0.1  # time over which ε compares p with q, over T
+_USUAL_BOUND = 1.2  # κ_0: with 1 a perfect learner is clipped at its peaks
+_CLOSING_LAGS = 2.0 / 3.0  # what a learner has done to y is taken back in this time
+_TAKING_BACK_LAGS = 10.0  # for at most so long: then one without authority moves nothing
 
 
 @dataclass(frozen=True)
@@ -355,6 +339,7 @@ class Guard:
         degree = observer.degree
         omega_c = 1.0 / lag_time if law is None else float(law[0]) ** (1.0 / degree)
         lag, invertible = lag_of(observer), is_invertible(observer)
+        chain = ESO.model_free(observer.order, observer.b0, observer.omega_o, dt)
         return GuardDesign(
             lag=lag,
             forget=-math.expm1(-dt / time),
@@ -375,9 +360,9 @@ class Guard:
             smooth=share(_SMOOTHING_LAGS),
             leak=share(_LEAK_LAGS),
             home=share(_HOME_LAGS),
-            settling=_SETTLING_LAGS * lag_time / dt,
+            settling=SETTLING_LAGS * lag_time / dt,
             invertible=invertible,
-            fed_lag=lag if invertible else _lag_of_a_chain(observer),
+            fed_lag=lag if invertible else lag_of(chain),
             least_slope=least_slope,
             largest_slope=largest_slope,
         )
@@ -387,11 +372,7 @@ class Guard:
         fed = lag_memory(parameters.fed_lag, 0 if parameters.invertible else 1)
         filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
         effects = np.zeros((3, parameters.stages))
-        memory = GuardMemory(*filters, effects, GuardAverages.zeros(), GuardSample.zeros())
+        records = GuardAverages.zeros(), GuardSample.zeros(), GuardTrial.zeros()
+        memory = GuardMemory(*filters, effects, *records)
         withdraw_authority(memory)
         return memory
-
-
-def _lag_of_a_chain(observer: ESO) -> Any:
-    """Return the lag filter of the model-free observer of the same order and bandwidth."""
-    return lag_of(ESO.model_free(observer.order, observer.b0, observer.omega_o, observer.dt))

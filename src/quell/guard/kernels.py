@@ -1,5 +1,8 @@
 """The guard: bounds what a learner changes in the estimate of f by what its past was worth.
 
+docs/theory_guard has each part with its reasons, docs/certificate and docs/guard_measured theorem,
+proof and measurements. Here are the equations, in the order of the functions.
+
 **Known exactly.** ``f_plain = Δf̂ + f_L^F = f^F`` is the estimate of an ESO without learner from the
 same y and u (``learners/base.py``). All that a learner changes in the total estimate is
 
@@ -10,104 +13,70 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 
     q = F (f − f^F) = f_plain − f_plain^F,        p = F v,        v = g − g^F
 
-**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. ``e ≤ P`` rises to
-|q| as P does; while the learner acts it grows by a factor of 2.7 in five lags at most. So a learner
-that causes what it then explains does not raise e at once.
+**Credit.** M is the mean of q² over T, which bursts raise slowly, ε what the learner left lately:
 
-**Withheld.** Friction lets learner and loop keep each other moving: the learner explains much of a
-motion that would not be there without it. o ≤ P, the error that is certainly not the learner's,
-rises to |q| − 1.5 c_L as P rises to |q|, with the largest recent correction ``c_L ← max(|e_L|,
-λ c_L)``. Authority is withheld where q is large beside o, to see whether the motion goes on: with
-M, the mean of q² (below), and M_left, that of (q − p)²,
+    p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², M), −1, 1 )
+    ε = mean (q − p)² / mean q²  over T/10, 1.5 lags
+    β = min( clip(2 max(C, C_y), 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
+
+What C earns counts 1 + 7 clip(1 − ε/0.35, 0, 1) times: a jump of f is seen in q for two lags only.
+C_y is such a credit of ℓ q and ℓ p̄, without that, because q is mostly noise where y has some; while
+ε > 1 it pays what C pays. S is the mean share of p² in p² + q² over T. C and C_y start at −1.
+
+**Account.** With ``ℓ = (ω_c/(s + ω_c))^r``, as y responds to f (r: relative degree of the plant,
+ω_c^r the first gain of the law), and d, ``ℓ e_L`` through a first-order lag, as late as q:
+
+    J ← J + ((ℓ q)² − J) dt/300 lags,
+    A ← clip( A + (2 ℓq d − 1.5 d² − A) dt/300 lags,  −0.02 J, J ),        R = A/J
+
+J follows a burst no more quickly than M does, and A does not follow it. While R < −0.01 both
+credits are −1. A negative A is compared with M_y, the mean of (ℓ q)² over T, where that is larger.
+
+**Outcomes** (r ≤ 3). F is the mean of q² over 1.5 lags, c_L ← max(|e_L|, λ c_L) the largest recent
+correction, c_B is c_L through two lags and decays over 40 lags at most. Where c_B is too small to
+have caused q, q² is from outside:
+
+    B ← B + min(F − B, 0) dt/200 lags,      B ← max(B, q²) where |q| > 4 c_B
+
+(there B at first forgets within the last third of the time). From F > 3 B, ε > 0.7 on authority
+is withheld for a trial of 20 lags. If F is below half of its largest value of the first five lags
+then, the trial has failed, and D, at first 100 lags, doubles. Doubt lasts D after a failed trial
+and 3 D after one in doubt: no authority until 2 D of it are left, 0.25 at most until D, then 0.5.
+A trial that has not failed raises B to F, four times at most.
+
+**Withheld** (r ≤ 3). o ≤ P, the error that is certainly not the learner's, rises to |q| − 1.5 c_L
+as P rises to |q|; M_left is the mean of (q − p)²:
 
     β = 0  from  M > (2 o)² and M_left > 0.05 (2 o)²  on, until  M < (1.3 o)²
 
-λ is that of ten lags, without authority that of one, so that o soon follows |q| if the error was
-not the learner's; if it was, M decays. Only for r ≤ 3: of higher order, what a gap in e_L does to y
-is worse. How it ends is the verdict, for r ≤ 2: if M is below (1.3 o)² with the o from which
-authority was withheld, the motion went with the learner, and the account (below) is set to its
-largest debt, whatever it says that the learner explained.
+λ is that of ten lags, without authority that of one. If M is then below (1.3 o)² with the o from
+which authority was withheld, A is set to its least value (r ≤ 2).
 
-**Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
-each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
-raise slowly:
+**The bound.** P, the peak of |q|, rises within 0.7 lags and decays over 200; ``e ≤ P`` rises to |q|
+as P does, while the learner acts by a factor of 2.7 in five lags at most. κ_0 = 1.2, or κ:
 
-    p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², M), −1, 1 )
-    β = min( clip(2 max(C, C_y), 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
+    w = clip(R/0.1, 0, 1) clip(2 − 2.5 ε, 0, 1),        b = (κ_0 + w (κ − κ_0)) e
+    b_ε = b clip(2 − ε/1.5, 0.3, 1)  on the side of ℓ e_L, b on the other
 
-q is an n-th derivative of y, and mostly noise where y has some. C_y is such a credit at y, of ℓ q
-and ℓ p̄ in place of q and p̄ (ℓ: account, below), without the eight times: ℓ q changes so slowly
-that a close match over 1.5 lags is no evidence. y shows late what q shows at once, so C_y pays what
-C pays while ε > 1, that is, while the learner adds to q. Both are −1 while R < −0.01.
-
-C and C_y start at −1. For C, a learner that explains q nearly completely earns up to eight times as
-much: 1 + 7 clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below);
-a jump of f is seen in q for two lags only. S, the mean share of p² in p² + q² over T, scales down
-an output that is larger than what it explains.
-
-**Account.** Credit is soon forgotten: a learner can earn it in twenty lags and spend it in ten,
-again and again. And y is q through n integrations: a learner that explains quick changes of f and
-adds to slow ones earns credit and harms y. So an account over 300 lags compares what its
-corrections did to y with what was missed there, with ``ℓ = (ω_c/(s + ω_c))^r``, as y responds to f.
-r is the relative degree of the plant, n where it has no zeros, and ω_c^r the first gain of the law:
-
-    J ← J + ((ℓ q)² − J) dt/300 lags,
-    A ← clip( A + (2 ℓq d − 1.5 d² − A) dt/300 lags,  −0.02 J, J )
-
-q is a lag of the observer late, so d is ``ℓ e_L`` through a first-order lag of that time: with
-``ℓ e_L`` of now, right corrections of disturbances with a period below some nine lags would count
-as harm.
-
-J follows a burst no more quickly than M does, and A does not follow it.
-
-Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
-removed; the factor is for plants on which a correction acts more strongly than on the observer's
-model. While R < −0.01 the credit is −1: whoever has added one percent to the squared error begins
-anew. J follows a load that begins only after some ten lags, so a negative A is compared with M_y,
-the mean of (ℓ q)² over T, where that is larger.
-
-**Width.** The bound b is κ_0 e; κ_0 = 1.2, or κ if that is less. After a jump of f, (1 − F) f is
-twice what q shows of it, and b clips what would be right. So b is wider, up to κe, for a learner
-with R > 0 whose p is close to q:
-
-    ε = mean (q − p)² / mean q²  over T/10, 1.5 lags
-    w = clip(R/0.1, 0, 1) clip(2 − 2.5 ε, 0, 1)
-    b = (κ_0 + w (κ − κ_0)) e
-
-A learner with ε > 1 adds to the error. From ε = 1.5 on it has less of b on the side to which its
-corrections have moved y, the sign of ℓe_L; on the other side it has b, to take them back:
-
-    b_ε = b clip(2 − ε/1.5, 0.3, 1)
-
-**Output.** The target changes by ``β̄ Δg``, so that a change of β over a constant g does nothing,
-and what the bound took is made up for while the target is still near:
+**Output.** β̄ is β over 30 lags (r ≤ 3: as many times as quickly as a sample earns more); at β = 1
+it comes nearer by 0.05/30 lags at least:
 
     target ← target + β̄ (g − g_before),        e_L = clip( target − f_L^F, ±β b )  or b_ε
     f_L = f_L^F + e_L,        target ← target + dt/(7 lags) (f_L − target)
 
-β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
-what is constant in e_L. For r ≤ 3 it follows as many times as quickly as a sample earns more, up to
-eight: a learner that explains nearly all of q is not what moves its β. At β = 1 it comes nearer by
-0.05/30 lags at least, so that it reaches 1.
-The constant part of f_L is free. A target that is more than 1000 e from β̄g approaches it by e in
-1000 lags, so that rounding errors stay small.
+A target more than 1000 e from β̄g approaches it by e in 1000 lags. An output that is not finite or a
+hundred times larger than f, is cut off within the sample.
 
 **Without authority** what earlier corrections have done to y is taken back, for ten lags at most;
 from then on e_L = 0. With the stages x_i of ℓ e_L, x_1 the first,
 
     e_L = clip( −Σ_i C(n, i) (a − 1)^i x_i, ±κ_0 e ),        a ω_c = 1.5/lag
 
-places the n poles of ℓ e_L, which are at −ω_c, at −a ω_c, so that it decays within some lags. Where
-that asks for more than 4 κ_0 e, a is smaller: a chain of four lags that is pushed to and fro with
-all of κ_0 e swings for a hundred lags. A plant with zeros responds to e_L otherwise, in ways that ℓ
-does not have: nothing is taken back there. A learner that never had authority has e_L = 0.
+places the n poles of ℓ e_L at −a ω_c; where that asks for more than 4 κ_0 e, a is smaller. A plant
+with zeros responds otherwise, and nothing is taken back there.
 
 For observers with which that recursion is unstable (``guard.is_invertible``), F is here the
 filter of a chain of integrators with the same omega_o; for them nothing is certified.
-
-An output that is not finite, or a hundred times larger than f, is cut off within the sample.
-
-docs/theory_guard, docs/certificate and docs/guard_measured give theorem, proof and measurements.
 
 Functions of a guard, registered for the type of its parameters; their defaults limit nothing.
 
@@ -198,6 +167,18 @@ class GuardSample(Scalars):
     taking_back: float  # samples in which corrections are still taken back
 
 
+class GuardTrial(Scalars):
+    """The account of outcomes."""
+
+    outside: float  # B [(y-unit/s^n)²]
+    own_lately: float  # c_L, a lag late [y-unit/s^n]
+    own: float  # c_B, c_L two lags late [y-unit/s^n]
+    highest: float  # largest F of the first lags of a trial
+    left: float  # samples that a trial still lasts
+    doubt: float  # samples until failed trials are forgotten
+    wait: float  # D in samples
+
+
 class GuardMemory(NamedTuple):
     """State of the guard."""
 
@@ -208,6 +189,7 @@ class GuardMemory(NamedTuple):
     effects: Matrix  # ℓ q, ℓ e_L and ℓ p̄, stage by stage (3, r) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
+    trial: NDArray[GuardTrial]  # (1,)
 
 
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.filtered.
@@ -328,6 +310,7 @@ class Reason(IntEnum):
     WITHHELD = 4
     EXPLODED = 5
     NOT_FINITE = 6
+    FAILED = 7
 
     @property
     def message(self) -> str:
@@ -346,6 +329,9 @@ _MESSAGES = {
     "it was cut off and starts again without authority.",
     Reason.NOT_FINITE: "The learner's output is not finite; "
     "it was cut off, and the learner was reset and starts again without authority.",
+    Reason.FAILED: "Twice the error fell when authority was withheld: the learner drives what "
+    "it explains. b0 is likely below half of the gain (OnlineGain and quell b0 find it), "
+    "or loops move each other; authority is withheld for a time that doubles.",
 }
 
 
@@ -370,11 +356,24 @@ _LOAN, _LARGEST_DEBT = 0.01, 2.0
 # RMS of q in units of o from which it may be the learner's own doing, and until which authority is
 # withheld; the share of the square of the first that such a learner leaves at least.
 _OWN_DOING, _GONE, _LEFT = 2.0, 1.3, 0.05
+# After the filters were emptied in mid-run, q is wrong for this time [lags].
+SETTLING_LAGS = 3.0
 # Of higher order, authority that is withheld, or comes quickly, moves y too much.
 HIGHEST_ORDER = 3
 
+# F in units of B from which authority is on trial, where ε is above the second; how many lags a
+# trial lasts, and its first lags, in which F may still grow; F below that share of its largest
+# fails.
+_SUSPECT, _LEAVES, _TRIAL, _STILL_GROWS, _FALLEN = 3.0, 0.7, 20.0, 5.0, 0.5
+# |q| in units of c_B that is not the learner's; c_B decays so many times as quickly as P; a trial
+# that has not failed raises B so many times at most.
+_OUTSIDE, _OWN_DECAYS, _RAISES = 4.0, 5.0, 4.0
+# D_1 in lags; most authority in doubt, and after a wait; most samples of D, so that it can be
+# counted in single precision.
+_FIRST_WAIT, _IN_DOUBT, _AFTER_WAIT, _LONGEST = 100.0, 0.5, 0.25, 2.0**22
+
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
-_WITHHELD = int(Reason.WITHHELD)
+_WITHHELD, _FAILED = int(Reason.WITHHELD), int(Reason.FAILED)
 
 
 @kernel
@@ -401,6 +400,8 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
         # The learner adds to q: what y shows late, q shows at once.
         sample.credit_at_y = max(sample.credit_at_y + guard.earn * min(earned, 0.0), -1.0)
     _keep_account(guard, memory, missed, is_new)
+    if guard.stages <= HIGHEST_ORDER:
+        keep_outcomes(guard, memory, qq)
 
 
 @kernel
@@ -430,6 +431,51 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new
     averages.gained = min(max(gain, -_LARGEST_DEBT * allowed), averages.missed)
     if averages.gained < -allowed:
         memory.sample[0].credit = memory.sample[0].credit_at_y = -1.0
+
+
+@kernel
+def keep_outcomes(guard: GuardDesign, memory: GuardMemory, qq: float) -> None:
+    """Update B with q², begin and end trials."""
+    averages, sample, trial = memory.averages[0], memory.sample[0], memory.trial[0]
+    trial.own_lately += guard.within_lag * (sample.own_peak - trial.own_lately)
+    own = trial.own + guard.within_lag * (trial.own_lately - trial.own)
+    trial.own = max(own, (1.0 - _OWN_DECAYS * guard.decay) * trial.own)
+    trial.doubt = max(trial.doubt - 1.0, 0.0)
+    newest = averages.newest_error
+    if trial.left > 0.0:
+        _try(guard, memory, newest)
+        return
+    is_outside = qq > (_OUTSIDE * trial.own) ** 2
+    # Without the learner's doing it at first forgets within the last third of the time.
+    rate = max(3.0 / max(sample.samples, 3.0), guard.decay) if is_outside else guard.decay
+    trial.outside += rate * min(newest - trial.outside, 0.0)
+    if is_outside:
+        trial.outside = max(trial.outside, qq)
+    suspect = newest > _SUSPECT * trial.outside and averages.newest_left > _LEAVES * newest
+    if suspect and sample.authority > 0.0:
+        trial.left, trial.highest = _TRIAL * _lag(guard), newest
+
+
+@kernel
+def _try(guard: GuardDesign, memory: GuardMemory, newest: float) -> None:
+    """Take a sample of a trial, and end it if that was the last."""
+    trial = memory.trial[0]
+    trial.left -= 1.0
+    if trial.left > (_TRIAL - _STILL_GROWS) * _lag(guard):
+        trial.highest = max(trial.highest, newest)
+    if trial.left > 0.0:
+        return
+    if newest < _FALLEN * trial.highest:
+        trial.wait = min(max(2.0 * trial.wait, _FIRST_WAIT * _lag(guard)), _LONGEST)
+        trial.doubt = 3.0 * trial.wait if trial.doubt > 0.0 else trial.wait
+    else:
+        trial.outside = max(trial.outside, min(newest, _RAISES * trial.outside))
+
+
+@kernel
+def _lag(guard: GuardDesign) -> float:
+    """Return the number of samples in a lag of the observer."""
+    return guard.settling / SETTLING_LAGS
 
 
 @kernel
@@ -500,6 +546,12 @@ def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tup
     if earned <= 0.0:
         sample.outside_then = 0.0
         return 0.0, _UNPROVEN
+    trial = memory.trial[0]
+    if trial.left > 0.0 or trial.doubt > 2.0 * trial.wait:
+        sample.outside_then = 0.0
+        return 0.0, _WITHHELD if trial.left > 0.0 else _FAILED
+    if trial.doubt > 0.0:
+        earned = min(earned, _AFTER_WAIT if trial.doubt > trial.wait else _IN_DOUBT)
     if _is_own_doing(guard, memory):
         if sample.outside_then == 0.0:
             sample.outside_then = sample.outside
@@ -750,6 +802,7 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
         memory.filtered[i] = 0.0
     sample.output = sample.target = sample.unsettled = 0.0
     sample.own_peak = sample.late_effect = sample.taking_back = 0.0
+    memory.trial[0].own_lately = memory.trial[0].own = 0.0
     # The next output has none before it: it is a constant.
     sample.share = -abs(sample.share)
 
@@ -759,5 +812,6 @@ def _start_again(guard: GuardDesign, memory: GuardMemory) -> None:
     reset_filters(guard, memory)
     clear(memory.averages)
     clear(memory.sample)
+    clear(memory.trial)
     withdraw_authority(memory)
     memory.sample[0].unsettled = guard.settling

@@ -31,6 +31,7 @@ _MARKED = (
     Reason.WITHHELD,
     Reason.EXPLODED,
     Reason.NOT_FINITE,
+    Reason.FAILED,
 )
 # A longer label [characters] is higher than its panel of a run: its unit stands below.
 _LABEL = 20
