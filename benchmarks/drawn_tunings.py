@@ -206,7 +206,7 @@ def main() -> None:
     figures: dict[str, Any] = {"loops": len(rows), "refused": len(rows) - len(tuned)}
     for name in ("off", "never", "cycles"):
         figures[name] = sum(row[name] and not row["warned"] for row in tuned)
-    figures["warned"] = sum(row["warned"] for row in tuned)
+    figures["warned"] = sum(bool(row["warned"]) for row in tuned)
     for kind in ("motor", "flexible"):
         for name in ("over_fastest", "over_least"):
             of_kind = [row[name] for row in tuned if row["kind"] == kind]
