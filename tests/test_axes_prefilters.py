@@ -21,7 +21,7 @@ from quell.export import c_source
 from quell.setup import made
 from quell.setup.schema import SetupError
 from quell.tuning import tune_axes
-from quell.tuning.axes_at_limits import needs_along, with_prefilters
+from quell.tuning.axes_at_limits import held_loads, needs_along, with_prefilters
 from quell.tuning.written import Written
 
 from .in_c import needs_gcc
@@ -283,3 +283,23 @@ def test_no_prefilter_is_added_where_no_step_is_left() -> None:
     file = Written(machine(), ql.Scenario([0.0, 0.0], duration=0.5), DT)
     files = [replace(file, axis=i) for i in range(2)]
     assert with_prefilters(machine(), axes, np.zeros((2, 2)), None, files) is None
+
+
+@pytest.mark.trial
+def test_an_axis_whose_actuator_has_no_limits_gets_no_prefilter() -> None:
+    """Of two independent axes only the limited one is slowed down; nor is there a load that the other can't hold."""
+    one = ql.plants.LinearPlant(
+        np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]]),
+        np.kron(np.eye(2), [[0.0], [1.0]]),
+        np.eye(4)[::2],
+    )
+    axes = ql.Axes({"a": joint(), "b": joint()}, u_min=[-3.0, -np.inf], u_max=[3.0, np.inf])
+    steps = [ql.signals.Step(0.5, 0.1), ql.signals.Step(0.5, 0.1)]
+    file = Written(one, ql.Scenario(steps, duration=1.5), DT)
+    files = [replace(file, axis=i) for i in range(2)]
+    held = held_loads(one, axes, None)
+    np.testing.assert_array_equal(held, -np.eye(2))
+    found = with_prefilters(one, axes, held, None, files)
+    assert found is not None
+    assert isinstance(found.prefilters[0], ProfileGenerator)
+    assert found.prefilters[1] is None

@@ -79,7 +79,8 @@ def held_loads(plant: Any, axes: Axes, point: Any) -> Matrix:
     left = np.linalg.norm(matrix @ found - right, axis=0)
     solved = left <= _SOLVED * np.linalg.norm(right, axis=0)
     held: Matrix = np.where(solved, found[n:], 0.0)
-    return held
+    # What rounding leaves of an actuator that holds nothing would be a huge load at its limits.
+    return np.where(np.abs(held) > _SOLVED * np.max(np.abs(held), axis=0, initial=0.0), held, 0.0)
 
 
 def needs_along(plant: Any, axes: Axes, point: Any) -> tuple[Matrix, Matrix, Matrix]:
@@ -137,6 +138,8 @@ def with_prefilters(
                 at_rest, viscous, inertia = (
                     float(np.nanmax(each[:, i] / room)) * together[first] for each in needed
                 )
+            if not max(at_rest, viscous, inertia) > 0.0:  # no actuator that moves it has limits
+                continue
             left = share * (1.0 - at_rest * size)
             if axis.observer.order < 2 or not left > share * (1.0 - _PROCESS):
                 omega = min(_FASTEST_MODEL * share / ramp * axis.omega_c, 1.0 / axes.dt)
