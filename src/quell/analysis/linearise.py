@@ -617,10 +617,15 @@ def _linear_part(controller: Compensator | Compensated, learner: Any) -> tuple[A
         inner = _linear_part(controller.compensator, learner)
         parameters, before = controller.parameters, controller.initial_state()
         return parameters._replace(compensator=inner[0]), before._replace(compensator=inner[1])
-    learns = not isinstance(learner, NoLearnerDesign)
-    design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
-    design = design._replace(learns=learns, guarded=False)
-    design = design._replace(limits=NO_LIMITS, feedforward=without_forces(design.feedforward))
+    given = controller.parameters
+    design = given._replace(
+        learner=learner,
+        learns=not isinstance(learner, NoLearnerDesign),
+        guard=UnguardedDesign(),
+        guarded=False,
+        limits=NO_LIMITS,
+        feedforward=without_forces(given.feedforward),
+    )
     learned: Any = NoLearnerMemory(nothing)
     if isinstance(learner, Adapting):
         learned = adaptation_memory(learner)

@@ -78,8 +78,6 @@ from quell.controllers.each_axis import (
 )
 from quell.controllers.given_controls import (
     ANY_CUT,
-    NoGivenMemory,
-    References,
     allocate_given,
     check_axes,
     check_compensates,
@@ -107,6 +105,7 @@ from quell.controllers.several import (
     tell_applied,
 )
 from quell.controllers.shaped_references import (
+    are_shaped,
     plan_stops,
     shaped_design,
     shaped_memory,
@@ -472,7 +471,7 @@ class Axes(StatefulController):
             for name, axis in zip(self.names, self.axes, strict=True)
             for channel, width in axis.channels
         ]
-        shaped = [("r_shaped", self.outputs)] if any(self.prefilters) else []
+        shaped = [("r_shaped", self.outputs)] if are_shaped(self.prefilters) else []
         return (("v", self.outputs), ("status", 1), *own, *shaped)
 
     @property
@@ -510,13 +509,18 @@ class Axes(StatefulController):
     def initial_state(self) -> AxesState:
         """Return a state before the first sample, with nothing learned."""
         n, m = self._gain.shape
+        given: Any = (
+            given_memory(self.drives, n, m)
+            if self.compensates
+            else shaped_memory(self.parameters.given, self.prefilters, self.axes)
+        )
         return AxesState(
             axes=tuple(axis.initial_state() for axis in self.axes),
             learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
             range=range_memory(n, m, self._rule),
             safe=safe_axes_memory(self.parameters.safe, n, m),
-            given=self._given_memory(n, m),
+            given=given,
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
             v=np.zeros(n),
@@ -526,14 +530,6 @@ class Axes(StatefulController):
             r_given=np.zeros(self.references),
             y_given=np.zeros(n),
         )
-
-    def _given_memory(self, n: int, m: int) -> Any:
-        design = self.parameters.given
-        if isinstance(design, References):
-            return NoGivenMemory(np.zeros(0))
-        if self.compensates:
-            return given_memory(self.drives, n, m)
-        return shaped_memory(design, self.prefilters, self.axes)
 
     def _use_state(self, state: AxesState) -> None:
         super()._use_state(state)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from quell.controllers.allocation import GainMemory
 from quell.controllers.base import is_usable
 from quell.controllers.given_controls import (
+    NoGivenMemory,
     References,
     reset_given,
     start_given,
@@ -253,9 +254,14 @@ def with_prefilter(axis: Any, prefilter: Any) -> Any:
     return axis if prefilter is None else Prefiltered(axis, prefilter)
 
 
+def are_shaped(prefilters: Sequence[Any]) -> bool:
+    """Return whether one of the axes has a prefilter."""
+    return any(each is not None for each in prefilters)
+
+
 def shaped_design(prefilters: Sequence[Any], dt: float) -> ShapedReferences | References:
     """Return the parameters of the prefilters of the axes; ``References`` without any."""
-    if all(each is None for each in prefilters):
+    if not are_shaped(prefilters):
         return References()
     return ShapedReferences(
         tuple(NoPrefilter() if p is None else AxisPrefilter(p.design(dt)) for p in prefilters)
@@ -263,9 +269,11 @@ def shaped_design(prefilters: Sequence[Any], dt: float) -> ShapedReferences | Re
 
 
 def shaped_memory(
-    design: ShapedReferences, prefilters: Sequence[Any], axes: Sequence[Any]
-) -> ShapedMemory:
+    design: ShapedReferences | References, prefilters: Sequence[Any], axes: Sequence[Any]
+) -> ShapedMemory | NoGivenMemory:
     """Return the state before the first sample."""
+    if isinstance(design, References):
+        return NoGivenMemory(np.zeros(0))
     parts: list[Any] = []
     for part, prefilter, axis in zip(design.shapers, prefilters, axes, strict=True):
         if prefilter is None:

@@ -30,7 +30,7 @@ from quell.controllers.memory import images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.several import control_all
-from quell.controllers.shaped_references import plan_stops, stop_of_moves
+from quell.controllers.shaped_references import are_shaped, plan_stops, stop_of_moves
 from quell.controllers.single import SeveralInSingle, SinglePrecision, in_single_precision
 from quell.controllers.state_space import StateFeedback
 from quell.export import axes_source, c_files
@@ -678,7 +678,7 @@ class _Writer:
         ]
         files.enums += enums(name, tuple(each for channels in own for each in channels))
         if members:
-            shaped = any(self.described.prefilters)
+            shaped = are_shaped(self.described.prefilters)
             channels: Channels = (_entries("v", len(own)), ("status", 1))
             for member, each in zip(members, own, strict=True):
                 channels += tuple((f"{member}.{channel}", width) for channel, width in each)

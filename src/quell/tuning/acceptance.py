@@ -53,7 +53,7 @@ from quell.types import Matrix, Vector
 # time before it, in samples.
 _LOOKED, _BEFORE = 150.0, 10
 # The first reference model that is tried at limits, in units of the bandwidth of the loop.
-_FASTEST_MODEL = 3.0
+FASTEST_MODEL = 3.0
 # Plants of a set in which a controller is run at most: those of the most and the least gain and
 # phase at the crossover come first.
 _MOST_PLANTS = 8
@@ -220,7 +220,7 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
         if not modes or written.largest is not None:
             found = profile_for(written, controller, heaviest, tau, room, period)
         if modes:
-            fastest = _FASTEST_MODEL * ORDER_OF_AXIS / tau
+            fastest = FASTEST_MODEL * ORDER_OF_AXIS / tau
             model = reference_model_for(written, controller, fastest, ORDER_OF_AXIS)
             if found.step is None or (
                 model.step is not None and model.step.settling < found.step.settling
@@ -232,7 +232,7 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
         step = worst_step(written, controller)
         if step.overshoot > MOST_OVERSHOOT:
             if loop.shaped and limited:
-                prefilter = reference_model_for(written, controller, _FASTEST_MODEL / tau).prefilter
+                prefilter = reference_model_for(written, controller, FASTEST_MODEL / tau).prefilter
             elif not limited and math.isfinite(step.overshoot):
                 offered, offered_step = _offer(written, loop.plants, controller, tau)
     larger = None
@@ -503,7 +503,7 @@ def _offer(
     if not getattr(controller, "derivatives", 0) and not written.others:
         model = model_of_linear_step(plants, controller)
     if model is None:
-        model = reference_model_for(written, controller, _FASTEST_MODEL / tau).prefilter
+        model = reference_model_for(written, controller, FASTEST_MODEL / tau).prefilter
     if model is None:
         return None, None
     shaped = Prefiltered(controller, model)

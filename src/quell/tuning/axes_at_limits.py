@@ -16,6 +16,7 @@ share the room for u. Another one gets a ``ReferenceModel``. Each try is a run o
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -31,9 +32,22 @@ from quell.controllers.feedforward import checked_feedforward
 from quell.controllers.prefilters import ReferenceModel
 from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.nonlinear import checked_point
-from quell.tuning.acceptance import WORSE, conditionally_stable, file_without_step
+from quell.tuning.acceptance import (
+    FASTEST_MODEL,
+    WORSE,
+    conditionally_stable,
+    file_without_step,
+)
 from quell.tuning.optimiser.coupled import CoupledLoops, Found, Plant
-from quell.tuning.reference import MOST_RESERVED, Axis, few_at_limits
+from quell.tuning.reference import (
+    MOST_RESERVED,
+    SAMPLES,
+    SHARES,
+    SLOWER,
+    TRIES,
+    Axis,
+    few_at_limits,
+)
 from quell.tuning.tables import SHARE
 from quell.tuning.written import MOST_OVERSHOOT, StepFigures, Written
 from quell.types import Matrix, Vector
@@ -44,14 +58,13 @@ _SLOWER = (0.85, 0.7, 0.55)
 _HOLD = 1e3
 # A solution of ``A x + B u = −E w``, ``C x = 0`` within this share of its right side is one.
 _SOLVED = 1e-6
-# Shares of the room for u and ramps of the acceleration, in time constants of the axis, that are
-# tried; the best is taken, or the first of slower ones. Chosen by hand; each is simulated.
-_TRIED = tuple((share, ramp) for share in (0.95, 0.8, 0.65) for ramp in (0.3, 1.0, 3.0))
-_SLOWER_MOVES = tuple((0.65 * 0.5**i, 3.0) for i in range(1, 9))
-# A step that needs more than this share of the room for u at rest is that of a process, whose first
-# reference model has this multiple of the bandwidth of its loop.
-_PROCESS, _FASTEST_MODEL = 0.5, 3.0
-_RAMP_SAMPLES = 4.0
+# Ramps of the acceleration, in time constants of the axis. With the shares of a single axis the
+# best is taken, or the first of slower ones. Chosen by hand; each is simulated.
+_RAMPS = (0.3, 1.0, 3.0)
+_QUICK_MOVES = tuple(itertools.product(SHARES, _RAMPS))
+_SLOW_MOVES = tuple((SHARES[-1] * SLOWER**i, _RAMPS[-1]) for i in range(1, TRIES + 1))
+# A step that needs more than this share of the room for u at rest is that of a process.
+_PROCESS = 0.5
 
 
 def file_at(plant: Any, axes: Axes, point: Any) -> Written:
@@ -126,7 +139,11 @@ def with_prefilters(
     if held.shape[1] == loads.size:
         room = room - np.minimum(np.abs(held) @ loads, MOST_RESERVED * room)
     together = Counter(first for first, _ in stepping.values())
-    needed = needs_along(plant, axes, point)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        needed = [
+            np.max(np.where(u > 0.0, u / room[:, None], 0.0), axis=0)
+            for u in needs_along(plant, axes, point)
+        ]
 
     def tried(share: float, ramp: float) -> tuple[Axes, list[StepFigures]]:
         """Return axes behind prefilters, and their steps."""
@@ -134,18 +151,15 @@ def with_prefilters(
         shapers = list(axes.prefilters)
         for i, (first, size) in stepping.items():
             axis = made.axes[i]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                at_rest, viscous, inertia = (
-                    float(np.nanmax(each[:, i] / room)) * together[first] for each in needed
-                )
+            at_rest, viscous, inertia = (float(u[i]) * together[first] for u in needed)
             if not max(at_rest, viscous, inertia) > 0.0:  # no actuator that moves it has limits
                 continue
             left = share * (1.0 - at_rest * size)
             if axis.observer.order < 2 or not left > share * (1.0 - _PROCESS):
-                omega = min(_FASTEST_MODEL * share / ramp * axis.omega_c, 1.0 / axes.dt)
+                omega = min(FASTEST_MODEL * share / ramp * axis.omega_c, 1.0 / axes.dt)
                 shapers[i] = ReferenceModel(omega, axis.observer.order)
                 continue
-            slow = max(ramp / axis.omega_c, _RAMP_SAMPLES * axes.dt)
+            slow = max(ramp / axis.omega_c, SAMPLES[0] * axes.dt)
             shapers[i] = Axis(viscous, inertia).profile(size, left, slow)
             if not axis.feedforward and axis.observer.order <= shapers[i].derivatives:
                 axis.feedforward = checked_feedforward(True)
@@ -158,8 +172,8 @@ def with_prefilters(
         ]
 
     best: tuple[float, Axes] | None = None
-    for share, ramp in _TRIED + _SLOWER_MOVES:
-        if best is not None and share < _TRIED[-1][0]:
+    for share, ramp in _QUICK_MOVES + _SLOW_MOVES:
+        if best is not None and share < SHARES[-1]:
             break
         made, steps = tried(share, ramp)
         if any(math.isnan(s.settling) or not s.overshoot <= MOST_OVERSHOOT for s in steps):

@@ -54,8 +54,8 @@ from quell.types import Vector
 _NO_U = 1e-6
 # Shares of the room for u that a move uses, what a load may take of it at most, and the ramps of
 # the acceleration: in samples and in time constants of the loop. Chosen by hand; each is simulated.
-_SHARES, MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
-_SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
+SHARES, MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
+SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
 # Beside a resonance: ramps and smoothing in periods of it.
 _PERIODS = (
     (0.3, 0.1), (0.15, 0.3), (0.3, 0.3), (0.6, 0.3), (1.0, 0.3), (1.0, 0.0), (1.5, 0.0), (2.0, 0.0)
@@ -68,7 +68,7 @@ _SPEEDS, _FASTER = 40, 10.0
 # A move that settles within this multiple of its own duration is quick, and no other is looked for.
 _QUICK = 1.1
 # A slower move: factors of the acceleration, and how many are tried.
-_SLOWER, _TRIES = 0.5, 8
+SLOWER, TRIES = 0.5, 8
 # Share of the move in which u may be at a limit, and samples that are always allowed.
 _LIMITED, _FEW = 0.02, 2
 # The move is looked at for this multiple of the duration, and so many time constants of the loop.
@@ -179,9 +179,7 @@ def profile_for(
     """
     if written.largest is None:
         size = 1.0 / axis.needs(tau) * room
-        return Shaped(
-            axis.profile(size, _SHARES[0] * room, max(_SAMPLES[0] * written.dt, tau)), None
-        )
+        return Shaped(axis.profile(size, SHARES[0] * room, max(SAMPLES[0] * written.dt, tau)), None)
     first, end, step = written.largest
     size, found = abs(step), list[tuple[float, Shaped]]()
     small = []
@@ -190,7 +188,7 @@ def profile_for(
         small = [written.stepping(share * step, *how) for share in _SMALLER]
         ramps = [(ramp * period, smoothing * period) for ramp, smoothing in _PERIODS]
     else:
-        plain = *(n * written.dt for n in _SAMPLES), *(n * tau for n in _CONSTANTS)
+        plain = *(n * written.dt for n in SAMPLES), *(n * tau for n in _CONSTANTS)
         ramps = [(ramp, 0.0) for ramp in plain]
     for generator in _profiles(axis, size, room, ramps):
         own = _duration(generator, size)
@@ -213,9 +211,9 @@ def profile_for(
         return min(found, key=lambda pair: pair[0])[1]
     if period > 0.0:
         return Shaped(None, None)
-    generator = axis.profile(size, _SHARES[-1] * room, max(_SAMPLES[0] * written.dt, tau))
-    for i in range(_TRIES):
-        share = _SHARES[-1] * _SLOWER ** (i + 1)
+    generator = axis.profile(size, SHARES[-1] * room, max(SAMPLES[0] * written.dt, tau))
+    for i in range(TRIES):
+        share = SHARES[-1] * SLOWER ** (i + 1)
         generator = axis.profile(size, share * room, tau / math.sqrt(share))
         shown = _with(written, controller, generator, end)
         if shown.overshoot <= MOST_OVERSHOOT and not math.isnan(shown.settling):
@@ -229,7 +227,7 @@ def _profiles(
     """Yield the generators to try, quick ones first, with these ramps and this smoothing [s]."""
     made = [
         replace(axis.profile(size, share * room, ramp), smoothing=smoothing)
-        for share in _SHARES
+        for share in SHARES
         for ramp, smoothing in ramps
     ]
     yield from sorted(made, key=lambda each: _duration(each, size))
