@@ -65,73 +65,62 @@ class AxisPrefilterMemory(NamedTuple):
 
 
 @generic_with_default
-def reference_of_axis(shaper: Any, memory: Any, axis: Any, state: Any, r: float, y: float) -> float:
-    """Return the reference that an axis follows."""
-    return r
+def shape_reference(
+    shaper: Any, memory: Any, axis: Any, state: Any, i: int, flags: int, r: Vector, y: Vector,
+    wish: Vector, shown: Vector,
+) -> int:  # fmt: skip
+    """Write the reference that an axis follows, for it and as a channel; return the flags."""
+    wish[i] = shown[i] = r[i]
+    return flags
 
 
-@reference_of_axis.register(AxisPrefilter)
-def _shaped(
-    shaper: AxisPrefilter, memory: AxisPrefilterMemory, axis: Any, state: Any, r: float, y: float
-) -> float:
-    return shaped_reference(shaper, memory, axis, state, r, y)
-
-
-@generic_with_default
-def flags_of_prefilter(shaper: Any, memory: Any) -> int:
-    """Return the status flags of the last sample."""
-    return 0
-
-
-@flags_of_prefilter.register(AxisPrefilter)
-def _flags(shaper: AxisPrefilter, memory: AxisPrefilterMemory) -> int:
-    return int(memory.loop[0].status)
+@shape_reference.register(AxisPrefilter)
+def _shape(
+    shaper: AxisPrefilter, memory: AxisPrefilterMemory, axis: Any, state: Any, i: int, flags: int,
+    r: Vector, y: Vector, wish: Vector, shown: Vector,
+) -> int:  # fmt: skip
+    wish[i] = shaped_reference(shaper, memory, axis, state, r[i], y[i])
+    shown[i] = memory.loop[0].r_shaped
+    return flags | int(memory.loop[0].status)
 
 
 @generic_with_default
-def start_prefilter(shaper: Any, memory: Any, y: float, r: float) -> None:
-    """Start at rest at ``y``, with r as the last reference."""
+def start_shaping(shaper: Any, memory: Any, i: int, y: Vector, r: Vector) -> None:
+    """Start the prefilter of an axis at rest at y, with r as the last reference."""
 
 
-@start_prefilter.register(AxisPrefilter)
-def _start(shaper: AxisPrefilter, memory: AxisPrefilterMemory, y: float, r: float) -> None:
-    settle(shaper.prefilter, memory.prefilter, y)
+@start_shaping.register(AxisPrefilter)
+def _start(
+    shaper: AxisPrefilter, memory: AxisPrefilterMemory, i: int, y: Vector, r: Vector
+) -> None:
+    settle(shaper.prefilter, memory.prefilter, y[i])
     loop = memory.loop[0]
     loop.started = loop.has_reference = 1.0
-    loop.r = r if is_usable(r) else y
+    loop.r = r[i] if is_usable(r[i]) else y[i]
 
 
 @generic_with_default
-def reset_prefilter(shaper: Any, memory: Any) -> None:
-    """Start from rest at the next measurement."""
+def reset_shaping(shaper: Any, memory: Any, i: int) -> None:
+    """Start the prefilter of an axis from rest at the next measurement."""
 
 
-@reset_prefilter.register(AxisPrefilter)
-def _reset(shaper: AxisPrefilter, memory: AxisPrefilterMemory) -> None:
+@reset_shaping.register(AxisPrefilter)
+def _reset(shaper: AxisPrefilter, memory: AxisPrefilterMemory, i: int) -> None:
     clear(memory.loop)
 
 
 @generic_with_default
-def shaped_last(shaper: Any, memory: Any, r: float) -> float:
-    """Return the reference that the axis followed in the last sample."""
-    return r
+def stop_shaping(shaper: Any, memory: Any, i: int, shown: Vector, r: Vector) -> None:
+    """Write where the reference of an axis rests soonest; the last one where none is planned."""
+    r[i] = shown[i]
 
 
-@shaped_last.register(AxisPrefilter)
-def _shaped_last(shaper: AxisPrefilter, memory: AxisPrefilterMemory, r: float) -> float:
-    return memory.loop[0].r_shaped
-
-
-@generic_with_default
-def stop_of_prefilter(shaper: Any, memory: Any, shown: float) -> float:
-    """Return where the reference comes to rest soonest; the last one where no stop is planned."""
-    return shown
-
-
-@stop_of_prefilter.register(AxisPrefilter)
-def _stop(shaper: AxisPrefilter, memory: AxisPrefilterMemory, shown: float) -> float:
+@stop_shaping.register(AxisPrefilter)
+def _stop(
+    shaper: AxisPrefilter, memory: AxisPrefilterMemory, i: int, shown: Vector, r: Vector
+) -> None:
     at = stopping_point(shaper.prefilter, memory.prefilter)
-    return at if is_finite(at) else shown
+    r[i] = at if is_finite(at) else shown[i]
 
 
 # ---- Those of all axes ----
@@ -150,42 +139,9 @@ class ShapedMemory(NamedTuple):
     r: Vector  # references that the axes followed in the last sample (n,)
 
 
-def shape_reference(
-    shaper: Any,
-    memory: Any,
-    axis: Any,
-    state: Any,
-    i: int,
-    flags: int,
-    r: Vector,
-    y: Vector,
-    wish: Vector,
-    shown: Vector,
-) -> int:
-    """Write the reference that an axis follows; return the flags."""
-    wish[i] = reference_of_axis(shaper, memory, axis, state, r[i], y[i])
-    shown[i] = shaped_last(shaper, memory, wish[i])
-    return flags | flags_of_prefilter(shaper, memory)
-
-
-def start_shaping(shaper: Any, memory: Any, i: int, y: Vector, r: Vector) -> None:
-    """Start the prefilter of an axis at rest."""
-    start_prefilter(shaper, memory, y[i], r[i])
-
-
-def reset_shaping(shaper: Any, memory: Any, i: int) -> None:
-    """Start the prefilter of an axis from rest."""
-    reset_prefilter(shaper, memory)
-
-
 _shape_all = for_each("shape_references", shape_reference, tuples=4)
 _start_all = for_each("start_shapings", start_shaping)
 _reset_all = for_each("reset_shapings", reset_shaping)
-
-
-def stop_shaping(shaper: Any, memory: Any, i: int, shown: Vector, r: Vector) -> None:
-    """Write the reference with which an axis stops."""
-    r[i] = stop_of_prefilter(shaper, memory, shown[i])
 
 
 _stop_all = for_each("stop_shapings", stop_shaping)

@@ -259,7 +259,8 @@ def for_each(name: str, function: Callable[..., Any], tuples: int = 2) -> Callab
     name
         of the returned function.
     function
-        takes an entry of each tuple, their index i, and what all entries share. If it returns a
+        a kernel, or a generic function of the first entry: it takes an entry of each tuple, their
+        index i, and what all entries share. If it returns a
         value, that is the first of these for the next entry, and of the last entry the result.
     tuples
         number of the tuples, all of one length.
@@ -267,7 +268,7 @@ def for_each(name: str, function: Callable[..., Any], tuples: int = 2) -> Callab
     parameters = inspect.signature(function).parameters
     heads, shared = [*parameters][:tuples], [*parameters][tuples + 1 :]
     returns = function.__annotations__["return"] != "None"
-    of_one = kernel(function)
+    of_one = function if hasattr(function, "implementations") else kernel(function)
     floats = {each for each in shared if function.__annotations__[each] == "float"}
     typed = [f"{each}: float" if each in floats else each for each in shared]
 
