@@ -28,7 +28,7 @@ ROWS = (
     # Plants from tables, which twins and rigs are made of.
     ("setup.schema",),
     ("realtime",),
-    ("export.translate", "export", "setup"),
+    ("export.reserved", "export.translate", "export", "setup"),
     ("commissioning",),
     ("monitoring",),
     ("experiments.common", "experiments.two_mass_spring", "experiments.torsional"),
