@@ -110,12 +110,13 @@ def load(draw: Draw, kind: str, size: float, omega_c: float, dt: float) -> Any:
 @compiled
 def first_trip(rules: Any, state: Any, y: Any, u: Any, r: Any) -> int:
     """Return the sample in which the check would end the run, −1 for none."""
-    memory = state.memory[0]
-    memory.y_began, memory.watching = y[0], ARMED
+    signals = state.signals
+    watch = signals.watched[0]
+    watch.y_began, watch.watching = y[0], ARMED
     for k in range(y.size):
-        memory.y = y[k]
-        memory.u = u[k - 1] if k > 0 else 0.0
-        if runs_away(rules, memory, r[k]):
+        watch.y, signals.r[0] = y[k], r[k]
+        signals.v[0] = rules.b0[0] * u[k - 1] if k > 0 else 0.0
+        if runs_away(rules, signals, 0):
             return k
     return -1
 
@@ -162,14 +163,15 @@ def trial(draw: Draw, wrong: bool) -> Loop:
     loading = "none" if kind == "torsional" else loading
     run = ql.simulate(model, controller, scenario, limit=1e15)
     y, u, r = (np.ascontiguousarray(run[name]) for name in ("y_measured", "u", "r"))
-    rules, state = Safety().rules(controller, scenario), initial_state()
+    rules, state = Safety().rules(controller, scenario).limits, initial_state()
     rest = y[0] + noise * draw.random.standard_normal(20)  # y in START
-    state.memory[0].y_rest_low, state.memory[0].y_rest_high = np.min(rest), np.max(rest)
+    watch = state.signals.watched[0]
+    watch.y_rest_low, watch.y_rest_high = np.min(rest), np.max(rest)
     k = call_specialised(first_trip, rules, state, y, u, r)
     low, high = min(0.0, float(np.min(r))), max(0.0, float(np.max(r)))
-    beyond = max(low - np.min(y), np.max(y) - high, 0.0) / (high - low + rules.reach)
+    beyond = max(low - np.min(y), np.max(y) - high, 0.0) / (high - low + rules.reach[0])
     last = np.abs(r - y)[-y.size // 4 :]
-    stable = not run.diverged and float(np.max(last)) < 0.5 * max(high - low, rules.reach)
+    stable = not run.diverged and float(np.max(last)) < 0.5 * max(high - low, rules.reach[0])
     ended = k * dt * omega_c if k >= 0 else math.nan
     return Loop(kind, loading, moving, wrong, stable, ended, float(beyond))
 

@@ -357,16 +357,16 @@ def loop(draw: np.random.Generator, wrong: bool) -> tuple[float, float]:
         noise=reach * between(1e-6, 1e-3),
     )
     run = ql.simulate(([b], den), ql.Compensated(host, compensator), scenario)
-    most = Safety().rules(compensator).most_opposed
-    memory, largest = initial_state().memory[0], 0.0
+    rules, signals, largest = Safety().rules(compensator).limits, initial_state().signals, 0.0
     u, f = run["u"].tolist(), run["f_hat"].tolist()
     with as_python():
         for k in range(1, len(u)):
             at_limit = abs(u[k - 1]) >= limit
-            is_opposed(memory, most, b0 * u[k - 1], f[k], b0 * limit, at_limit)
-            largest = max(largest, memory.opposed)
+            signals.v[0], signals.f_hat[0] = b0 * u[k - 1], f[k]
+            is_opposed(rules, signals, 0, at_limit)
+            largest = max(largest, signals.watched[0].opposed)
     scale = max(reach, height if chosen < 2 else 0.0)
-    return largest / most, float(np.max(np.abs(run["y"]))) / scale
+    return largest / rules.most_opposed[0], float(np.max(np.abs(run["y"]))) / scale
 
 
 def signs(count: int, seed: int) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from quell.realtime import RigRun, Safety, TwinDevice, open_device, run_rig
 from quell.realtime.cycle import ControlLoop
 from quell.realtime.recordings import row_channels
 from quell.realtime.run import mode_changes
-from quell.realtime.safety import axes_reference
+from quell.realtime.safety import reference_samples
 from quell.realtime.supervisor import Cause, Mode
 from quell.realtime.system import virtual_clock
 from quell.realtime.telemetry import ring
@@ -147,7 +147,7 @@ def first_motion(seed: int) -> tuple[bool, bool, bool]:
         width = sum(size for _, size in channels)
         twin = TwinDevice(plant, dt)
         twin._handle.w[:] = load
-        reference = axes_reference(scenario, axes, 0.3)
+        reference = reference_samples(scenario, axes, 0.3)
         loop = ControlLoop.of(twin, axes, reference, rules, virtual_clock([0]), ring(4096, width))
         loop.run()
         causes = [change.cause for change in mode_changes(loop.controller.supervisor, dt)]

@@ -154,7 +154,7 @@ def run(
     controller = adrc() if controller is None else controller
     width = sum(width for _, width in row_channels(controller.channels, channels))
     scenario = as_scenario(reference, duration)
-    points = reference_samples(scenario, DT, getattr(controller, "derivatives", 0), approach)
+    points = reference_samples(scenario, controller, approach)
     rules = Safety(**{"settle": 10} | safety).rules(controller, scenario)
     loop = ControlLoop.of(
         device,

@@ -14,7 +14,7 @@ from quell.realtime import Safety, TwinDevice, wire
 from quell.realtime.cycle import ControlLoop
 from quell.realtime.recordings import Header, row_channels, trajectory_of
 from quell.realtime.run import mode_changes
-from quell.realtime.safety import axes_reference
+from quell.realtime.safety import reference_samples
 from quell.realtime.supervisor import Cause, Mode
 from quell.realtime.system import virtual_clock
 from quell.realtime.telemetry import drain, ring
@@ -96,7 +96,7 @@ class Outcome:
         self.loop = ControlLoop.of(
             self.device,
             self.controller,
-            axes_reference(scenario, self.controller, approach),
+            reference_samples(scenario, self.controller, approach),
             self.rules,
             virtual_clock(late),
             ring(4096, sum(width for _, width in channels)),

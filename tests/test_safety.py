@@ -18,8 +18,6 @@ from quell.realtime.supervisor import (
     OFF,
     SUSPECT,
     Cause,
-    Mode,
-    Rules,
     initial_state,
     runs_away,
 )
@@ -44,26 +42,29 @@ def controller(dt: float) -> ql.ADRC:
     )
 
 
+def range_of_y(limits: Any) -> tuple[float, float]:
+    """Return the bounds of y of one axis."""
+    return float(limits.y_low[0]), float(limits.y_high[0])
+
+
 def test_bounds_of_y_follow_from_reference_and_reach_of_u() -> None:
     """Zero and the reference, and ten times that range plus b0 max|u| / omega_c²."""
     reach = 1.5 * 3.0 / 1.5**2
     for design in (adrc(), ql.controllers.Prefiltered(adrc(), ql.baselines.ZV(3.0))):
-        rules = Safety().rules(design, CONSTANT)
-        assert rules.reach == pytest.approx(reach)
-        assert (rules.y_low, rules.y_high) == pytest.approx(
-            (-10 * (1 + reach), 1 + 10 * (1 + reach))
-        )
-    swing = Safety().rules(adrc(), ql.Scenario(ql.signals.Sinusoid(2.0), 10.0))
-    assert (swing.y_low, swing.y_high) == pytest.approx((-62.0, 62.0), abs=1e-3)
+        limits = Safety().rules(design, CONSTANT).limits
+        assert limits.reach == pytest.approx(reach)
+        assert range_of_y(limits) == pytest.approx((-10 * (1 + reach), 1 + 10 * (1 + reach)))
+    swing = Safety().rules(adrc(), ql.Scenario(ql.signals.Sinusoid(2.0), 10.0)).limits
+    assert range_of_y(swing) == pytest.approx((-62.0, 62.0), abs=1e-3)
     # Without b0 there is no scale of y but the reference.
     pid = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT, u_min=-3, u_max=3)
-    assert Safety().rules(pid, CONSTANT)[9:11] == (-1e6, 1e6 + 1.0)
-    assert Safety(u_min=-1.0).rules(adrc(), CONSTANT).reach == pytest.approx(reach)
+    assert range_of_y(Safety().rules(pid, CONSTANT).limits) == (-1e6, 1e6 + 1.0)
+    assert Safety(u_min=-1.0).rules(adrc(), CONSTANT).limits.reach == pytest.approx(reach)
     assert plausible_range([-7.0, 5.0], math.nan) == (-7e6 - 7.0, 7e6 + 5.0)
     assert plausible_range([-3.0, 5.0], math.nan) == (-5e6 - 3.0, 5e6 + 5.0)
-    assert Safety().rules(adrc())[9:11] == (-math.inf, math.inf)
+    assert range_of_y(Safety().rules(adrc()).limits) == (-math.inf, math.inf)
     given = Safety(y_min=-1.0, y_max=math.inf).rules(adrc(), CONSTANT)
-    assert (given.y_low, given.y_high) == (-1.0, math.inf)
+    assert range_of_y(given.limits) == (-1.0, math.inf)
 
 
 @pytest.mark.parametrize("value", [1e300, -1e300])
@@ -98,7 +99,7 @@ def test_y_may_lie_at_its_bound_but_not_beyond(sign: float) -> None:
 )
 def test_default_times_hold_at_every_rate(dt: float, counts: tuple[int, ...]) -> None:
     """Seconds at quick rates, a least number of samples at slow ones: 10 s of ramp at 1 Hz."""
-    rules = Safety().rules(controller(dt))
+    rules = Safety().rules(controller(dt)).limits
     assert (rules.hold, rules.most_overruns, rules.ramp, rules.settle) == counts
     assert rules.longest_start == 10 * counts[-1] + max(round(1.0 / dt), 10)
     assert rules.most_saturated > 1e15
@@ -111,13 +112,13 @@ def test_times_are_given_in_seconds_or_in_samples() -> None:
     for samples, seconds in times.items():
         name = f"{seconds}_time"
         for value, count in ((0.07, 7), (0.076, 8), (1e-9, 1)):
-            assert getattr(Safety(**{name: value}).rules(controller(0.01)), samples) == count
-        assert getattr(Safety(**{samples: 3}).rules(controller(0.01)), samples) == 3
+            assert getattr(Safety(**{name: value}).rules(controller(0.01)).limits, samples) == count
+        assert getattr(Safety(**{samples: 3}).rules(controller(0.01)).limits, samples) == 3
         with pytest.raises(ValueError, match=f"{samples} = 3, {name} = 0.1: give one of them"):
             Safety(**{samples: 3, name: 0.1})
         with pytest.raises(ValueError, match=f"{name} = 0.0: must be finite and greater than zero"):
             Safety(**{name: 0.0})
-    assert Safety(hold=0).rules(controller(0.01)).hold == 0
+    assert Safety(hold=0).rules(controller(0.01)).limits.hold == 0
     assert Safety(most_overruns=0, ramp=1, settle=1, most_saturated=1).ramp == 1
 
 
@@ -130,7 +131,7 @@ rig = {device = "twin:two-mass", safety = {hold_time = 0.08, ramp = 7, y_max = 3
     (tmp_path / "rig.toml").write_text(text)
     setup = load(tmp_path / "rig.toml")
     assert setup.rig is not None
-    rules = setup.rig["safety"].rules(setup.controller, CONSTANT)
+    rules = setup.rig["safety"].rules(setup.controller, CONSTANT).limits
     assert (rules.hold, rules.ramp, rules.y_high) == (8, 7, 3.0)
 
 
@@ -195,74 +196,74 @@ def test_a_load_that_is_released_with_the_take_over_does_not_trip() -> None:
     assert np.min(outcome["Y"][10:100]) < -0.05
 
 
-RULES = Rules(-2.0, 4.0, math.inf, math.inf, 5, 5, 5, 5, 5, direction=1.0, reach=1.25)
+LIMITS = Safety(u_min=-2.0, u_max=4.0).rules(
+    ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=DT), math.sqrt(3.2))
+)
+LIMITS = LIMITS.limits
 
 
-def memory(**fields: float) -> Any:
-    """Return a memory in RUN with y at rest at 10 ± 0.001 before it."""
-    record = initial_state().memory[0]
-    values = {"mode": Mode.RUN, "y_began": 10.0, "y_rest_low": 9.999, "y_rest_high": 10.001}
-    for name, value in (values | {"watching": ARMED} | fields).items():
-        setattr(record, name, value)
-    return record
+def signals(r: float, **fields: float) -> Any:
+    """Return signals of RUN with y at rest at 10 ± 0.001 before it."""
+    made = initial_state().signals
+    made.r[0], made.v[0] = r, fields.pop("v")
+    values = {"y_began": 10.0, "y_rest_low": 9.999, "y_rest_high": 10.001, "watching": ARMED}
+    for name, value in (values | fields).items():
+        setattr(made.watched[0], name, value)
+    return made
 
 
-@cases("direction", [1.0, -1.0])
 @cases(
     ("fields", "r", "watching"),
     [
-        ({"y": 9.976, "u": 1.0}, 10.5, ARMED),  # less than 2 % of the reach of u
-        ({"y": 9.974, "u": 1.0}, 10.5, SUSPECT),
-        ({"y": 9.974, "u": 1.0, "y_rest_low": 9.998}, 10.5, ARMED),  # ten times the noise
-        ({"y": 9.974, "u": 1.0}, 10.026, SUSPECT),
-        ({"y": 9.974, "u": 1.0}, 9.5, OFF),  # the reference goes the same way
-        ({"y": 9.974, "u": 1.0}, 10.025, OFF),  # y moved before the reference: a load
-        ({"y": 9.974, "u": -1.0}, 10.5, OFF),  # u pushes that way
-        ({"y": 9.974, "u": -1.0, "pushed": 5.0}, 10.5, SUSPECT),  # it pushed the other way so far
-        ({"y": 10.026, "u": 1.0}, 10.5, OFF),  # the right way
-        ({"y": 9.0, "u": 1.0, "watching": OFF}, 10.5, OFF),
-        ({"y": 9.99, "u": 0.0}, 10.5, ARMED),
-        ({"y": 10.063, "u": 0.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
-        ({"y": 10.063, "u": 1.0, "watching": SUSPECT}, 10.5, OFF),  # the right way after all
-        ({"y": 10.062, "u": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),
-        ({"y": 10.0625, "u": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),  # at the very limit
+        ({"y": 9.976, "v": 1.0}, 10.5, ARMED),  # less than 2 % of the reach of u
+        ({"y": 9.974, "v": 1.0}, 10.5, SUSPECT),
+        ({"y": 9.974, "v": 1.0, "y_rest_low": 9.998}, 10.5, ARMED),  # ten times the noise
+        ({"y": 9.974, "v": 1.0}, 10.026, SUSPECT),
+        ({"y": 9.974, "v": 1.0}, 9.5, OFF),  # the reference goes the same way
+        ({"y": 9.974, "v": 1.0}, 10.025, OFF),  # y moved before the reference: a load
+        ({"y": 9.974, "v": -1.0}, 10.5, OFF),  # u pushes that way
+        ({"y": 9.974, "v": -1.0, "pushed": 5.0}, 10.5, SUSPECT),  # it pushed the other way so far
+        ({"y": 10.026, "v": 1.0}, 10.5, OFF),  # the right way
+        ({"y": 9.0, "v": 1.0, "watching": OFF}, 10.5, OFF),
+        ({"y": 9.99, "v": 0.0}, 10.5, ARMED),
+        ({"y": 10.063, "v": 0.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
+        ({"y": 10.063, "v": 1.0, "watching": SUSPECT}, 10.5, OFF),  # the right way after all
+        ({"y": 10.062, "v": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),
+        ({"y": 10.0625, "v": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),  # at the very limit
         (
-            {"y": -0.025, "y_began": 0.0, "y_rest_low": 0.0, "y_rest_high": 0.0, "u": 1.0},
+            {"y": -0.025, "y_began": 0.0, "y_rest_low": 0.0, "y_rest_high": 0.0, "v": 1.0},
             0.5,
             ARMED,
         ),
-        ({"y": 10.063, "u": -1.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
+        ({"y": 10.063, "v": -1.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
     ],
 )
-def test_the_first_motion_is_judged(
-    fields: dict[str, float], r: float, watching: int, direction: float
-) -> None:
-    """By its direction against that of u and of the reference; b0 < 0 turns u round."""
-    turned = {key: direction * fields[key] for key in fields.keys() & {"u"}}
-    record = memory(**fields | turned)
-    assert not runs_away(RULES._replace(direction=direction), record, r)
-    assert record.watching == watching
+def test_the_first_motion_is_judged(fields: dict[str, float], r: float, watching: int) -> None:
+    """By its direction against that of u and of the reference."""
+    made = signals(r, **fields)
+    assert not runs_away(LIMITS, made, 0)
+    assert made.watched[0].watching == watching
 
 
 @cases(
     ("fields", "r", "trips"),
     [
-        ({"y": 7.49, "u": 2.0}, 10.5, True),  # twice the reach of u
-        ({"y": 7.51, "u": 2.0}, 10.5, False),
-        ({"y": 7.49, "u": 1.99}, 10.5, False),  # less than half of the limit
-        ({"y": 7.49, "u": 2.0}, 11.26, False),  # the reference is further away
-        ({"y": 7.49, "u": 2.0, "y_rest_low": 9.875}, 10.5, False),  # noisy
-        ({"y": 7.49, "u": 2.0, "pushed": -9.0}, 10.5, False),  # u has only just turned
-        ({"y": 12.51, "u": -1.0, "pushed": -9.0}, 9.5, True),  # the lower limit is −2
-        ({"y": 12.51, "u": -0.99, "pushed": -9.0}, 9.5, False),
-        ({"y": 12.51, "u": 2.0}, 10.5, False),  # with u
+        ({"y": 7.49, "v": 2.0}, 10.5, True),  # twice the reach of u
+        ({"y": 7.51, "v": 2.0}, 10.5, False),
+        ({"y": 7.49, "v": 1.99}, 10.5, False),  # less than half of the limit
+        ({"y": 7.49, "v": 2.0}, 11.26, False),  # the reference is further away
+        ({"y": 7.49, "v": 2.0, "y_rest_low": 9.875}, 10.5, False),  # noisy
+        ({"y": 7.49, "v": 2.0, "pushed": -9.0}, 10.5, False),  # u has only just turned
+        ({"y": 12.51, "v": -1.0, "pushed": -9.0}, 9.5, True),  # the lower limit is −2
+        ({"y": 12.51, "v": -0.99, "pushed": -9.0}, 9.5, False),
+        ({"y": 12.51, "v": 2.0}, 10.5, False),  # with u
     ],
 )
 def test_a_motion_against_u_trips_when_it_is_large(
     fields: dict[str, float], r: float, trips: bool
 ) -> None:
     """Beyond twice the scales of an honest loop, with u pushing against it."""
-    assert runs_away(RULES, memory(watching=SUSPECT, **fields), r) == trips
+    assert runs_away(LIMITS, signals(r, watching=SUSPECT, **fields), 0) == trips
     # Each direction has its own limit.
-    one_way = RULES._replace(low=-1.0)
-    assert not runs_away(one_way, memory(watching=SUSPECT, y=7.49, u=0.9), 10.5)
+    one_way = LIMITS._replace(v_low=np.array([-1.0]))
+    assert not runs_away(one_way, signals(10.5, watching=SUSPECT, y=7.49, v=0.9), 0)

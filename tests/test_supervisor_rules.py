@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+import quell as ql
 from quell.realtime.run import ModeChange, RigRun, lost_changes, mode_changes, scenario_part, tally
+from quell.realtime.safety import Safety
 from quell.realtime.supervisor import (
     FLUSH,
     Cause,
     Mode,
     Request,
-    Rules,
     SupervisorState,
     change_mode,
     finished,
     initial_state,
-    supervised_output,
+    supervise_controls,
     update_mode,
 )
 from quell.records.trajectory import Trajectory
@@ -27,18 +28,21 @@ from quell.types import Status
 
 from .cases import cases
 
-RULES = Rules(
-    *(-2.0, 4.0),
-    most_error=3.0,
-    most_f=7.0,
-    hold=5,
-    ramp=4,
-    settle=3,
-    most_saturated=2,
-    most_overruns=5,
-    y_low=-9.0,
-    y_high=9.0,
-    longest_start=50,
+RULES = (
+    Safety(
+        *(-2.0, 4.0),
+        most_error=3.0,
+        most_f=7.0,
+        hold=5,
+        ramp=4,
+        settle=3,
+        most_saturated=2,
+        most_overruns=5,
+        y_min=-9.0,
+        y_max=9.0,
+    )
+    .rules(ql.baselines.PID(1.0, dt=1.0))
+    .limits._replace(longest_start=50)
 )
 SAMPLES = 100
 REST: Any = {"plant": "", "features": (), "final_state": None}
@@ -47,12 +51,30 @@ REST: Any = {"plant": "", "features": (), "final_state": None}
 def state(mode: Mode = Mode.RUN, **fields: Any) -> SupervisorState:
     """Return a state in a mode, with y = 0 and the scenario begun at cycle 3."""
     made = initial_state()
-    memory = made.memory[0]
-    values: dict[str, Any] = {"mode": int(mode), "y": 0.0, "began": -1 if mode == Mode.START else 3}
+    signals, memory = made.signals, made.memory[0]
+    signals.watched[0].y = fields.pop("y", 0.0)
+    signals.u[0], signals.at_limit[0] = fields.pop("u", 0.0), fields.pop("at_limit", 0)
+    values: dict[str, Any] = {"mode": int(mode), "began": -1 if mode == Mode.START else 3}
     for name, value in (values | fields).items():
         assert hasattr(memory, name)
         setattr(memory, name, value)
     return made
+
+
+def measure(made: SupervisorState, k: int, y: float, samples: int = SAMPLES) -> None:
+    """Let a sample choose the mode."""
+    made.signals.y[0] = y
+    update_mode(RULES, made, k, samples)
+
+
+def supervised(
+    made: SupervisorState, k: int, wished: float, r: float = 0.0, f_hat: float = 0.0
+) -> float:
+    """Return the u of a sample in which the controller wishes another one."""
+    signals = made.signals
+    signals.wished[0], signals.r[0], signals.f_hat[0] = wished, r, f_hat
+    supervise_controls(RULES, made, k)
+    return float(signals.u[0])
 
 
 def last_change(made: SupervisorState) -> tuple[Mode, Cause] | None:
@@ -64,7 +86,7 @@ def last_change(made: SupervisorState) -> tuple[Mode, Cause] | None:
 def updated(k: int = 10, y: float = 0.0, **fields: Any) -> tuple[Mode, Cause] | None:
     """Return the change that a sample in RUN makes before the controller's step."""
     made = state(**fields)
-    update_mode(RULES, made, k, y, SAMPLES)
+    measure(made, k, y)
     return last_change(made)
 
 
@@ -103,28 +125,29 @@ def test_a_run_ends_beyond_its_limits_and_not_at_them(
 def test_a_good_sample_forgets_missed_and_skipped_ones() -> None:
     """A sample that is not good counts, and forgets nothing."""
     made = state(missed_in_row=3, skipped_in_row=2)
-    update_mode(RULES, made, 10, math.nan, SAMPLES)
+    measure(made, 10, math.nan)
     memory = made.memory[0]
     assert (memory.missed_in_row, memory.skipped_in_row, memory.mode) == (4, 2, Mode.HOLD)
-    assert (made.counters[0].missed, memory.y) == (1, 0.0)
-    update_mode(RULES, made, 11, 0.5, SAMPLES)
+    watch = made.signals.watched[0]
+    assert (made.counters[0].missed, watch.y) == (1, 0.0)
+    measure(made, 11, 0.5)
     assert (memory.missed_in_row, memory.skipped_in_row, memory.mode) == (0, 0, Mode.RUN)
-    assert (made.counters[0].missed, memory.y) == (1, 0.5)
+    assert (made.counters[0].missed, watch.y) == (1, 0.5)
 
 
 def test_settling_takes_good_samples_in_a_row_and_has_an_end() -> None:
     """Three here; y at rest is remembered, and START ends after ``longest_start`` samples."""
     made = state(Mode.START, y=math.nan)
     for k, y in enumerate([0.5, math.nan, 0.1, -0.2, 0.3]):
-        update_mode(RULES, made, k, y, SAMPLES)
+        measure(made, k, y)
         assert (made.memory[0].mode, made.memory[0].began) == (Mode.START, -1)
-    update_mode(RULES, made, 5, 0.7, SAMPLES)
-    memory = made.memory[0]
-    assert (memory.mode, memory.began, memory.y_began, memory.samples) == (Mode.RUN, 5, 0.7, 0)
-    assert (memory.y_rest_low, memory.y_rest_high, memory.watching) == (-0.2, 0.5, 0)
+    measure(made, 5, 0.7)
+    memory, watch = made.memory[0], made.signals.watched[0]
+    assert (memory.mode, memory.began, watch.y_began, memory.samples) == (Mode.RUN, 5, 0.7, 0)
+    assert (watch.y_rest_low, watch.y_rest_high, watch.watching) == (-0.2, 0.5, 0)
     assert last_change(made) == (Mode.RUN, Cause.SETTLED)
     made = state(Mode.START)  # a scenario that is shorter than the settling has not begun
-    update_mode(RULES, made, 40, 0.0, 5)
+    measure(made, 40, 0.0, 5)
     assert last_change(made) is None
     assert updated(k=99, began=0) is None
     assert updated(k=100, began=0) == (Mode.RAMP, Cause.COMPLETED)
@@ -138,13 +161,13 @@ def test_requests_come_first(mode: Mode) -> None:
     """A ramp before any fault, but not twice; zero at once in every mode but the last."""
     made = state(mode, missed_in_row=9, tripped=1)
     made.requests[0] = Request.RAMP
-    update_mode(RULES, made, 10, 0.0, SAMPLES)
+    measure(made, 10, 0.0)
     assert last_change(made) == (None if mode == Mode.RAMP else (Mode.RAMP, Cause.STOP_REQUESTED))
     made.requests[0] = Request.ZERO
-    update_mode(RULES, made, 11, 0.0, SAMPLES)
+    measure(made, 11, 0.0)
     assert last_change(made) == (Mode.STOPPED, Cause.ZERO_REQUESTED)
     before = int(made.changed[0])
-    update_mode(RULES, made, 12, 0.0, SAMPLES)
+    measure(made, 12, 0.0)
     assert made.changed[0] == before
 
 
@@ -153,7 +176,7 @@ def output(
 ) -> tuple[float, Cause | None]:
     """Return u of a sample in RUN, and the cause if the run ends."""
     made = state(**fields)
-    u = supervised_output(RULES, made, 10, wished, r, f_hat)
+    u = supervised(made, 10, wished, r, f_hat)
     change = last_change(made)
     return u, None if change is None else change[1]
 
@@ -171,12 +194,12 @@ def output(
         ({"f_hat": math.inf}, Cause.F_HAT),
         ({"wished": math.nan}, Cause.NOT_A_NUMBER),
         ({"wished": math.inf}, Cause.NOT_A_NUMBER),
-        ({"wished": 4.0, "at_limit_in_row": 1}, None),
-        ({"wished": 4.0, "at_limit_in_row": 2}, Cause.SATURATED),
-        ({"wished": -2.0, "at_limit_in_row": 2}, Cause.SATURATED),  # the lower limit
-        ({"wished": -9.0, "at_limit_in_row": 2}, Cause.SATURATED),
-        ({"wished": 3.999, "at_limit_in_row": 2}, None),
-        ({"wished": 2.0, "at_limit_in_row": 2}, None),
+        ({"wished": 4.0, "at_limit": 1}, None),
+        ({"wished": 4.0, "at_limit": 2}, Cause.SATURATED),
+        ({"wished": -2.0, "at_limit": 2}, Cause.SATURATED),  # the lower limit
+        ({"wished": -9.0, "at_limit": 2}, Cause.SATURATED),
+        ({"wished": 3.999, "at_limit": 2}, None),
+        ({"wished": 2.0, "at_limit": 2}, None),
     ],
 )
 def test_what_the_controller_gives_is_checked(options: dict[str, Any], cause: Cause | None) -> None:
@@ -189,13 +212,16 @@ def test_what_the_controller_gives_is_checked(options: dict[str, Any], cause: Ca
         assert u == pytest.approx(0.6)  # the first of four steps from the last u
 
 
-def test_without_limits_an_estimate_that_is_not_a_number_trips_all_the_same() -> None:
+def test_without_limits_an_estimate_that_is_not_a_number_trips_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Infinite limits allow any number, and NaN is none."""
-    rules = RULES._replace(most_f=math.inf, most_error=math.inf)
+    without = np.array([math.inf])
+    monkeypatch.setattr(f"{__name__}.RULES", RULES._replace(most_f=without, most_error=without))
     made = state()
-    supervised_output(rules, made, 10, 1.0, 0.0, math.inf)
+    supervised(made, 10, 1.0, f_hat=math.inf)
     assert last_change(made) is None
-    supervised_output(rules, made, 11, 1.0, 0.0, math.nan)
+    supervised(made, 11, 1.0, f_hat=math.nan)
     assert last_change(made) == (Mode.RAMP, Cause.F_HAT)
 
 
@@ -204,29 +230,29 @@ def test_samples_at_a_limit_count_in_a_row() -> None:
     made = state()
     counted = []
     for wished in (4.0, -2.0, 1.0, 9.0):
-        supervised_output(RULES, made, 10, wished, 0.0, 0.0)
-        counted.append(int(made.memory[0].at_limit_in_row))
+        supervised(made, 10, wished)
+        counted.append(int(made.signals.at_limit[0]))
     assert counted == [1, 2, 0, 1]
 
 
 def test_u_is_held_ramped_and_then_zero() -> None:
     """HOLD keeps it, RAMP takes four equal steps, STOPPED is written four more times."""
     made = state(Mode.HOLD, u=0.8)
-    assert supervised_output(RULES, made, 10, 3.0, 0.0, 0.0) == 0.8
+    assert supervised(made, 10, 3.0) == 0.8
     change_mode(made, 11, Mode.RAMP, Cause.LOST)
-    steps = [supervised_output(RULES, made, k, 3.0, 0.0, 0.0) for k in range(11, 15)]
+    steps = [supervised(made, k, 3.0) for k in range(11, 15)]
     assert steps == pytest.approx([0.6, 0.4, 0.2, 0.0], abs=1e-15)
     assert last_change(made) == (Mode.STOPPED, Cause.RAMPED)
     more = 0
     while not finished(made):
-        assert supervised_output(RULES, made, 15, 3.0, 0.0, 0.0) == 0.0
+        assert supervised(made, 15, 3.0) == 0.0
         more += 1
     assert more == FLUSH + 1
     assert not any(finished(state(mode, samples=99)) for mode in Mode if mode != Mode.STOPPED)
     still = state(Mode.RAMP)  # u was zero: there is nothing to ramp
-    assert supervised_output(RULES, still, 10, 3.0, 0.0, 0.0) == 0.0
+    assert supervised(still, 10, 3.0) == 0.0
     assert last_change(still) == (Mode.STOPPED, Cause.RAMPED)
-    assert supervised_output(RULES, state(Mode.START), 10, 3.0, 0.0, 0.0) == 0.0
+    assert supervised(state(Mode.START), 10, 3.0) == 0.0
 
 
 @pytest.mark.trial
@@ -234,7 +260,7 @@ def test_the_first_changes_and_the_end_are_kept_of_more_than_4092() -> None:
     """A device that misses every other sample: the list ends, the loop goes on, the end is told."""
     made = state(Mode.RUN)
     for k in range(10, 6010):
-        update_mode(RULES, made, k, math.nan if k % 2 == 0 else 0.0, 1 << 60)
+        measure(made, k, math.nan if k % 2 == 0 else 0.0, 1 << 60)
     changes = mode_changes(made, 1.0)
     assert len(changes) == 4092
     assert changes[-1].t == 10 + 4091
@@ -293,7 +319,7 @@ def test_a_run_that_was_ended_has_no_measures_of_a_step_and_says_why() -> None:
 
     def run(*causes: Cause) -> RigRun:
         changes = tuple(ModeChange(9.5, Mode.RAMP, cause) for cause in causes)
-        parts: Any = (part, part, None, changes, None, {}, (), RULES)
+        parts: Any = (part, part, None, changes, None, {}, (), None)
         return RigRun(*parts)
 
     ended, done = run(Cause.SETTLED, Cause.LOST, Cause.RAMPED), run(Cause.COMPLETED)

@@ -229,17 +229,17 @@ def test_axes_are_told_of_a_u_that_acts_in_place_of_theirs() -> None:
         own = SimpleNamespace(y=np.zeros(2), u=np.zeros(2), acting=np.zeros(2))
         memory = np.rec.fromrecords([(int(mode),)], names="mode")
         controller: Any = SimpleNamespace(
-            axes=own, log=SimpleNamespace(row=row), design="design", state="state",
-            supervisor=SimpleNamespace(memory=memory),
+            log=SimpleNamespace(row=row, controller=at + 2), design="design", state="state",
+            supervisor=SimpleNamespace(memory=memory, signals=own),
         )  # fmt: skip
         with (
             patch.object(
                 cycle, "read_acting", lambda handle, into: into.__setitem__(slice(None), acting)
             ),
             patch.object(cycle, "set_applied_controls", lambda *given: told.append(given[:2])),
-            patch.object(cycle, "_fill_v", lambda controller, given: told.append(given.tolist())),
+            patch.object(cycle, "write_applied", lambda *given: told.append(given[2].tolist())),
         ):
-            cycle._finish_all(controller, None, u)
+            cycle._finish_signals(controller, None, u)
         return row[at : at + 2]
 
     assert run([1.0, 2.0]).tolist() == [1.0, 2.0]

@@ -14,7 +14,7 @@ from quell.realtime.devices import (
     TwinDevice,
     handle_of,
     read_measurement,
-    write_command,
+    write_signals,
 )
 from quell.realtime.system import system_clock
 
@@ -85,6 +85,6 @@ def test_a_device_that_raises_gives_no_number_and_says_so() -> None:
 
     handle = handle_of(Broken())
     assert np.isnan(read_measurement(handle, system_clock(), 0)[0])
-    assert write_command(handle, 1.0) != 0
+    assert write_signals(handle, np.ones(1)) != 0
     assert handle.faults[0] == 2
     assert str(handle.errors[0]) == "cable"

@@ -52,6 +52,7 @@ from quell.controllers.axes_learning import (
 from quell.controllers.base import (
     Controller,
     RateLimit,
+    bumpless_transfer,
     reset_loop,
     set_axis_held,
     set_reference_derivatives,
@@ -74,6 +75,7 @@ from quell.controllers.each_axis import (
     set_axes_manual,
     start_axes,
     tell_axes,
+    transfer_axes,
     write_axes,
 )
 from quell.controllers.given_controls import (
@@ -99,10 +101,13 @@ from quell.controllers.safe_axes import (
 )
 from quell.controllers.several import (
     control_all,
+    motion_by,
     prepared_step,
+    set_applied_controls,
     start_all,
     take_signals,
     tell_applied,
+    write_applied,
 )
 from quell.controllers.shaped_references import (
     are_shaped,
@@ -201,6 +206,23 @@ def _control_all(design: AxesDesign, state: AxesState, r: Vector, y: Vector, u: 
     loop.status, loop.started = flags, 1.0
 
 
+@set_applied_controls.register(AxesDesign)
+def _set_applied_controls(design: AxesDesign, state: AxesState, u: Vector) -> None:
+    for k in range(u.size):
+        state.u[k] = u[k]
+    tell_applied(design, state)
+
+
+@motion_by.register(AxesDesign)
+def _motion_by(design: AxesDesign, state: AxesState, b0: Vector, u: Vector, v: Vector) -> None:
+    apply_to_axes(state.gain, u, v)
+
+
+@write_applied.register(AxesDesign)
+def _write_applied(design: AxesDesign, state: AxesState, u: Vector, row: Vector) -> None:
+    apply_to_axes(state.gain, u, row[: state.v.size])  # the first channel
+
+
 @tell_applied.register(AxesDesign)
 def _tell_applied(design: AxesDesign, state: AxesState) -> None:
     apply_to_axes(state.gain, state.u, state.v)
@@ -246,6 +268,11 @@ def hand_over_all(design: AxesDesign, state: AxesState) -> bool:
         return False
     continue_axes(design.axes, state.axes)
     return True
+
+
+@bumpless_transfer.register(AxesDesign)
+def _bumpless_transfer(design: AxesDesign, state: AxesState) -> None:
+    transfer_axes(design.axes, state.axes)
 
 
 @status_flags.register(AxesDesign)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from quell.controllers.base import (
+    bumpless_transfer,
     control,
     is_usable,
     reset_loop,
@@ -80,6 +81,11 @@ def continue_axis(axis: Any, state: Any, i: int) -> None:
     state.loop[0].bumpless = 1.0
 
 
+def transfer_axis(axis: Any, state: Any, i: int) -> None:
+    """Continue an axis from what was applied, as if it had been at rest until now."""
+    bumpless_transfer(axis, state)
+
+
 def set_axis_manual(axis: Any, state: Any, i: int, manual: float, v: Vector) -> None:
     """Begin or end manual operation of an axis under v."""
     state.loop[0].manual, state.loop[0].u_manual = manual, v[i]
@@ -99,5 +105,6 @@ set_axes_derivatives = for_each("set_axes_derivatives", set_axis_derivatives)
 start_axes = for_each("start_axes", start_axis)
 axes_started = for_each("axes_started", count_started)
 continue_axes = for_each("continue_axes", continue_axis)
+transfer_axes = for_each("transfer_axes", transfer_axis)
 set_axes_manual = for_each("set_axes_manual", set_axis_manual)
 hold_axes = for_each("hold_axes", hold_axis)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.controllers.base import control
+from quell.controllers.base import control, set_applied_control
 from quell.controllers.stateful import PackedController, unpacked
 from quell.kernels import dispatch
 from quell.kernels.dispatch import (
@@ -26,6 +26,31 @@ def control_all(controller: Any, state: Any, r: Vector, y: Vector, u: Vector) ->
     A controller of one of each has ``control`` instead.
     """
     u[0] = control(controller, state, r[0], y[0])
+
+
+@generic_with_default
+def set_applied_controls(controller: Any, state: Any, u: Vector) -> None:
+    """Replace the control signals of the last sample by the applied ``u`` (m,)."""
+    set_applied_control(controller, state, u[0])
+
+
+@generic_with_default
+def motion_by(controller: Any, state: Any, b0: Vector, u: Vector, v: Vector) -> None:
+    """Write v (n,), what control signals ``u`` (m,) do to each axis: by default ``b0 u``."""
+    v[0] = b0[0] * u[0]
+
+
+@generic_with_default
+def write_applied(controller: Any, state: Any, u: Vector, row: Vector) -> None:
+    """Correct what ``write_row`` has written for the control signals ``u`` (m,) that are applied.
+
+    By default no channel has them.
+    """
+
+
+def inputs_of(controller: Any) -> int:
+    """Return the number of control signals of a controller."""
+    return int(getattr(controller, "inputs", 1))
 
 
 def outputs_of(controller: Any) -> int:

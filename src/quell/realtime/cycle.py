@@ -38,21 +38,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.allocation import apply_to_axes
 from quell.controllers.axes import Axes
 from quell.controllers.base import (
     bumpless_transfer,
-    control,
-    set_applied_control,
     set_reference_derivatives,
     write_row,
 )
-from quell.controllers.several import control_all
+from quell.controllers.several import (
+    control_all,
+    inputs_of,
+    motion_by,
+    outputs_of,
+    set_applied_controls,
+    write_applied,
+)
 from quell.kernels.dispatch import (
     compiled,
     explain_compile_errors,
     generic,
-    generic_with_default,
     interpreted,
     is_finite,
     kernel,
@@ -60,14 +63,6 @@ from quell.kernels.dispatch import (
 )
 from quell.kernels.sized import Size
 from quell.realtime import recordings
-from quell.realtime.axes_supervisor import (
-    AxesMemory,
-    all_measured,
-    axes_memory,
-    set_applied_controls,
-    supervise_outputs,
-    update_axes_mode,
-)
 from quell.realtime.channels import (
     ChannelInputs,
     channel_inputs,
@@ -86,24 +81,25 @@ from quell.realtime.devices import (
     read_measurement,
     read_signals,
     read_tick,
-    write_command,
     write_signals,
 )
 from quell.realtime.recordings import Event, loop_channels, row_channels
-from quell.realtime.safety import AxesReference, ReferenceSamples
+from quell.realtime.safety import ReferenceSamples
 from quell.realtime.supervisor import (
     FLUSH,
-    AxesLimits,
     Cause,
+    LoopSignals,
     Memory,
     Mode,
     Request,
     Rules,
+    RunLimits,
     SupervisorState,
+    all_measured,
     change_mode,
     finished,
     initial_state,
-    supervised_output,
+    supervise_controls,
     update_mode,
 )
 from quell.realtime.system import (
@@ -131,8 +127,6 @@ class CycleLog(NamedTuple):
 
     ring: Ring
     row: Vector  #: work array: one row
-    f_learned: int  #: index of the learned part of f̂ in a row; −1 if the controller reports none
-    f_residual: int  #: index of the observer's part of f̂
     channels: int  #: index of the device's channels, behind the controller's
     controller: Size  #: index of the controller's channels
     lateness: NDArray[np.int64]  #: histogram, see ``count_duration``
@@ -144,11 +138,13 @@ class SupervisedController(NamedTuple):
 
     design: Any  #: parameters of the controller
     state: Any  #: state of the controller
-    rules: Rules
+    rules: RunLimits
     supervisor: SupervisorState
-    reference: Any  #: ``ReferenceSamples``, or another one with ``set_reference``
+    reference: Any  #: ``ReferenceSamples``, or another one with ``set_references``
     log: CycleLog
     inputs: ChannelInputs  #: what the device gives beside y
+    f_hat: NDArray[np.int64]
+    """Places in a row of the learned and of the observer's part of f̂ of each axis; −1 (n, 2)."""
 
 
 @compiled
@@ -158,7 +154,7 @@ def run_cycles(handle: Any, clock: Any, period: float, controller: Any) -> None:
     ``controller`` is a ``SupervisedController``, or a ``CompiledController`` around one.
     """
     supervisor, log = controller.supervisor, controller.log
-    memory, counters = supervisor.memory[0], supervisor.counters[0]
+    counters = supervisor.counters[0]
     origin = now(clock) + int(period)
     k = left_out = 0
     while not finished(supervisor):
@@ -170,89 +166,60 @@ def run_cycles(handle: Any, clock: Any, period: float, controller: Any) -> None:
         k += overslept
         _count_skipped(supervisor, overslept)
         y, waited = read_measurement(handle, clock, woke)
-        take_inputs(controller, handle)
+        take_inputs(controller, handle, y)
         changed, clipped = supervisor.changed[0], counters.clipped
-        u = control_step(controller, k, left_out, y)
-        fault = send_control(controller, handle, u)
+        control_step(controller, k, left_out)
+        fault = write_signals(handle, supervisor.signals.u)
         count_fault(supervisor, fault)
         written = now(clock)
         due = origin + int((k + 1) * period)
         missed_next = 1 + int((written - due) / period) if written >= due else 0
         overran = overslept + missed_next > 0
         count_cycle(supervisor, overran)
-        events = cycle_events(supervisor, y, overran, fault, changed, clipped)
-        events += _channel_event(controller.inputs)
-        fill_row(log, memory, k, lateness, written - woke - waited, events)
-        fill_signals(controller, y)
+        events = cycle_events(controller, overran, fault, changed, clipped)
+        fill_row(controller, k, lateness, written - woke - waited, events)
         push(log.ring, log.row)
         _count_skipped(supervisor, missed_next)
         left_out = missed_next
         k += 1 + missed_next
 
 
-@generic
-def take_inputs(controller: Any, handle: Any) -> None:
-    """Take what the device gave beside the number that the loop has: channels, or all signals."""
-    raise TypeError
+@kernel
+def take_inputs(controller: Any, handle: Any, y: float) -> None:
+    """Take all measurements and channels of the device; ``y`` is the measurement of one axis."""
+    measured = controller.supervisor.signals.y
+    measured[0] = y
+    read_signals(handle, measured)
+    read_inputs(controller.inputs, handle)
 
 
-@generic_with_default
-def skip_inputs(controller: Any) -> None:
+@kernel
+def _skip_inputs(controller: SupervisedController) -> None:
     """Take a sample without measurements."""
+    measured = controller.supervisor.signals.y
+    for i in range(measured.size):
+        measured[i] = np.nan
 
 
-@generic
-def send_control(controller: Any, handle: Any, u: float) -> int:
-    """Let the device apply u, or all control signals; return what ``write_command`` does."""
-    raise TypeError
-
-
-@generic
-def fill_signals(controller: Any, y: float) -> None:
-    """Write y and u of this cycle into the row; ``y`` is as the device gave it."""
-    raise TypeError
-
-
-@generic
-def finish_signals(controller: Any, handle: Any, u: float) -> None:
+@kernel
+def _finish_signals(controller: SupervisedController, handle: Any, u: float) -> None:
     """Correct u of the row before by what acts since then, ``u``; NaN if it is not known.
 
     If it is not the u of that step, tell the controller, before it takes the next one.
     """
-    raise TypeError
-
-
-@take_inputs.register(SupervisedController)
-def _take_channels(controller: SupervisedController, handle: Any) -> None:
-    read_inputs(controller.inputs, handle)
-
-
-@send_control.register(SupervisedController)
-def _send_control(controller: SupervisedController, handle: Any, u: float) -> int:
-    return write_command(handle, u)
-
-
-@fill_signals.register(SupervisedController)
-def _fill_signals(controller: SupervisedController, y: float) -> None:
-    row, memory = controller.log.row, controller.supervisor.memory[0]
-    row[recordings.Y] = memory.y
-    row[recordings.Y_MEASURED] = y
-    row[recordings.U] = memory.u
-
-
-@finish_signals.register(SupervisedController)
-def _finish_signals(controller: SupervisedController, handle: Any, u: float) -> None:
-    row = controller.log.row
-    if is_finite(u) and u != row[recordings.U]:
-        row[recordings.U] = u
-        if controller.supervisor.memory[0].mode != Mode.STOPPED:
-            set_applied_control(controller.design, controller.state, u)
-
-
-@kernel
-def _channel_event(inputs: ChannelInputs) -> int:
-    """Return the ``Event`` flag of a missing channel."""
-    return _CHANNEL if inputs.missing[0] != 0 else 0
+    if not is_finite(u):
+        return
+    acting, row, different = controller.supervisor.signals.acting, controller.log.row, False
+    at = recordings.R + 3 * controller.supervisor.signals.y.size
+    acting[0] = u
+    read_acting(handle, acting)
+    for c in range(acting.size):
+        different |= acting[c] != row[at + c]
+        row[at + c] = acting[c]
+    if different and controller.supervisor.memory[0].mode != Mode.STOPPED:
+        design, state = controller.design, controller.state
+        set_applied_controls(design, state, acting)
+        write_applied(design, state, acting, row[controller.log.controller :])
 
 
 @kernel
@@ -274,30 +241,37 @@ def count_cycle(supervisor: SupervisorState, overran: bool) -> None:
 
 
 @kernel
-def cycle_events(
-    supervisor: SupervisorState, y: float, overran: bool, fault: int, changed: int, clipped: int
-) -> int:
+def cycle_events(controller: Any, overran: bool, fault: int, changed: int, clipped: int) -> int:
     """Return the ``Event`` flags; ``changed`` and ``clipped`` are counters before the step."""
+    supervisor, missed = controller.supervisor, False
+    for i in range(supervisor.signals.y.size):
+        missed |= not is_finite(supervisor.signals.y[i])
     return (
-        (0 if is_finite(y) else _MISSED)
+        (_MISSED if missed else 0)
         + (_OVERRAN if overran else 0)
         + (_CLIPPED if supervisor.counters[0].clipped > clipped else 0)
         + (_UNSENT if fault == 1 else 0)
         + (_CHANGED if supervisor.changed[0] > changed else 0)
+        + (_CHANNEL if controller.inputs.missing[0] != 0 else 0)
     )
 
 
 @kernel
-def fill_row(
-    log: CycleLog, memory: Memory, k: int, lateness: int, step_time: int, events: int
-) -> None:
-    """Write time, mode and events into the row."""
-    row = log.row
+def fill_row(controller: Any, k: int, lateness: int, step_time: int, events: int) -> None:
+    """Write time, mode, events and signals into the row."""
+    log, signals = controller.log, controller.supervisor.signals
+    row, at, n = log.row, recordings.R, signals.y.size
     row[recordings.K] = k
     row[recordings.LATENESS] = 1e-9 * lateness
     row[recordings.STEP_TIME] = 1e-9 * step_time
-    row[recordings.MODE] = memory.mode
+    row[recordings.MODE] = controller.supervisor.memory[0].mode
     row[recordings.EVENTS] = events
+    for i in range(n):
+        row[at + i] = signals.r[i]
+        row[at + n + i] = signals.watched[i].y
+        row[at + 2 * n + i] = signals.y[i]
+    for c in range(signals.u.size):
+        row[at + 3 * n + c] = signals.u[c]
     count_duration(log.lateness, lateness)
     count_duration(log.step_time, step_time)
 
@@ -312,47 +286,56 @@ def _count_skipped(supervisor: SupervisorState, deadlines: int) -> None:
 
 
 @generic
-def control_step(controller: Any, k: int, left_out: int, y: float) -> float:
-    """Take a sample of supervisor and controller; return the u to apply.
+def control_step(controller: Any, k: int, left_out: int) -> None:
+    """Take a sample of supervisor and controller: find the u to apply.
 
     First the controller takes the ``left_out`` deadlines before k as samples without measurement.
-    Reference and channels of the controller are written into the row.
+    Channels of the controller are written into the row.
     """
     raise TypeError
 
 
 @control_step.register(SupervisedController)
-def _control_step(controller: SupervisedController, k: int, left_out: int, y: float) -> float:
+def _control_step(controller: SupervisedController, k: int, left_out: int) -> None:
     design, state, rules = controller.design, controller.state, controller.rules
     supervisor, reference, row = controller.supervisor, controller.reference, controller.log.row
-    memory = supervisor.memory[0]
+    memory, signals = supervisor.memory[0], supervisor.signals
     store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
-    update_mode(rules, supervisor, k, y, samples_of(reference))
+    update_mode(rules, supervisor, k, samples_of(reference))
     first = k - min(left_out, rules.hold)
     if memory.mode == Mode.RUN and memory.began == k:
         bumpless_transfer(design, state)
-        memory.offset = y - first_of(reference, 0)
+        for i in range(signals.y.size):
+            signals.offset[i] = signals.y[i] - first_of(reference, i)
         first = k
-    awake = memory.mode != Mode.STOPPED and is_finite(memory.y)
+    awake = memory.mode != Mode.STOPPED and all_measured(supervisor)
     pass_channels(controller.inputs, design, state, rules.hold)
     record_channels(controller.inputs, row[controller.log.channels :])
-    r, wished, f_hat = 0.0, 0.0, 0.0
+    for c in range(signals.u.size):
+        signals.wished[c] = 0.0
     for i in range(first, k + 1):
-        r = set_reference(reference, design, state, memory, i)
+        set_references(reference, design, state, memory, signals, i)
+        for j in range(signals.y.size):
+            signals.measured[j] = signals.y[j] if i == k else np.nan
         if awake:
-            wished = control(design, state, r, y if i == k else np.nan)
+            control_all(design, state, reference.given, signals.measured, signals.wished)
             if i < k:
-                set_applied_control(design, state, memory.u)
-    write_row(design, state, row[controller.log.controller : controller.log.channels])
-    if controller.log.f_learned >= 0:
-        f_hat = row[controller.log.f_learned] + row[controller.log.f_residual]
-    u = supervised_output(rules, supervisor, k, wished, r, f_hat)
-    if awake and u != wished:
-        set_applied_control(design, state, u)
+                set_applied_controls(design, state, signals.u)
+    own = row[controller.log.controller : controller.log.channels]
+    write_row(design, state, own)
+    for i in range(signals.f_hat.size):
+        learned, residual = controller.f_hat[i, 0], controller.f_hat[i, 1]
+        signals.f_hat[i] = row[learned] + row[residual] if learned >= 0 else 0.0
+    supervise_controls(rules, supervisor, k)
+    different = False
+    for c in range(signals.u.size):
+        different |= signals.u[c] != signals.wished[c]
+    if awake and different:
+        set_applied_controls(design, state, signals.u)
         supervisor.counters[0].clipped += 1 if memory.mode == Mode.RUN else 0
-    row[recordings.R] = r
+    write_applied(design, state, signals.u, own)
+    motion_by(design, state, rules.b0, signals.u, signals.v)
     store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
-    return u
 
 
 @generic
@@ -368,191 +351,44 @@ def first_of(reference: Any, i: int) -> float:
 
 
 @generic
-def set_reference(reference: Any, design: Any, state: Any, memory: Memory, k: int) -> float:
-    """Return the reference of sample k (y before the scenario begins); pass its derivatives on."""
-    raise TypeError
-
-
-@samples_of.register(ReferenceSamples)
-def _samples(reference: ReferenceSamples) -> int:
-    return reference.r.size
-
-
-@first_of.register(ReferenceSamples)
-def _first(reference: ReferenceSamples, i: int) -> float:
-    return reference.r[0]
-
-
-@set_reference.register(ReferenceSamples)
-def _set_reference(
-    reference: ReferenceSamples, design: Any, state: Any, memory: Memory, k: int
-) -> float:
-    if memory.began < 0:
-        return memory.y
-    i = min(k - memory.began, reference.r.size - 1)
-    offset = memory.offset if i < reference.approach.shape[0] else 0.0
-    r = reference.r[i]
-    if offset != 0.0:
-        r += offset * reference.approach[i, 0]
-    if reference.current.size > 0:
-        for j in range(reference.current.size):
-            reference.current[j] = reference.derivatives[i, j]
-            if offset != 0.0:
-                reference.current[j] += offset * reference.approach[i, 1 + j]
-        set_reference_derivatives(design, state, reference.current)
-    return r
-
-
-# ---- The control step of several axes ----
-
-
-class SupervisedAxes(NamedTuple):
-    """Several axes with their supervisor; the numbers y and u of the loop stand for all of them.
-
-    y is the first measurement if all came, else NaN, and u the first control signal.
-    """
-
-    design: Any  #: parameters of the controller
-    state: Any  #: state of the controller
-    rules: AxesLimits
-    supervisor: SupervisorState
-    reference: Any  #: ``AxesReference``, or another one with ``set_references``
-    log: CycleLog
-    inputs: ChannelInputs
-    axes: AxesMemory
-    f_hat: NDArray[np.int64]
-    """Places in a row of the learned and of the observer's part of f̂ of each axis; −1 (n, 2)."""
-
-
-@take_inputs.register(SupervisedAxes)
-def _take_signals(controller: SupervisedAxes, handle: Any) -> None:
-    read_signals(handle, controller.axes.y)
-    read_inputs(controller.inputs, handle)
-
-
-@skip_inputs.register(SupervisedAxes)
-def _skip_signals(controller: SupervisedAxes) -> None:
-    for i in range(controller.axes.y.size):
-        controller.axes.y[i] = np.nan
-
-
-@send_control.register(SupervisedAxes)
-def _send_all(controller: SupervisedAxes, handle: Any, u: float) -> int:
-    return write_signals(handle, controller.axes.u)
-
-
-@fill_signals.register(SupervisedAxes)
-def _fill_all(controller: SupervisedAxes, y: float) -> None:
-    row, axes = controller.log.row, controller.axes
-    count, at = axes.y.size, recordings.R
-    for i in range(count):
-        row[at + i] = axes.r[i]
-        row[at + count + i] = axes.good[i]
-        row[at + 2 * count + i] = axes.y[i]
-    for c in range(axes.u.size):
-        row[at + 3 * count + c] = axes.u[c]
-
-
-@finish_signals.register(SupervisedAxes)
-def _finish_all(controller: SupervisedAxes, handle: Any, u: float) -> None:
-    if not is_finite(u):
-        return
-    axes, row, different = controller.axes, controller.log.row, False
-    at = recordings.R + 3 * axes.y.size
-    read_acting(handle, axes.acting)
-    for c in range(axes.u.size):
-        different |= axes.acting[c] != row[at + c]
-        row[at + c] = axes.acting[c]
-    if different and controller.supervisor.memory[0].mode != Mode.STOPPED:
-        set_applied_controls(controller.design, controller.state, axes.acting)
-        _fill_v(controller, axes.acting)
-
-
-@kernel
-def _fill_v(controller: SupervisedAxes, u: Vector) -> None:
-    """Write ``v = B0 u`` of what is applied into the row: the controller's first channel."""
-    at = controller.log.controller
-    apply_to_axes(controller.state.gain, u, controller.log.row[at : at + controller.axes.y.size])
-
-
-@control_step.register(SupervisedAxes)
-def _control_axes(controller: SupervisedAxes, k: int, left_out: int, y: float) -> float:
-    design, state, rules = controller.design, controller.state, controller.rules
-    supervisor, reference, row = controller.supervisor, controller.reference, controller.log.row
-    memory, axes = supervisor.memory[0], controller.axes
-    store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
-    update_axes_mode(rules, supervisor, axes, k, samples_of(reference))
-    first = k - min(left_out, rules.hold)
-    if memory.mode == Mode.RUN and memory.began == k:
-        bumpless_transfer(design, state)
-        for i in range(axes.y.size):
-            axes.offset[i] = axes.y[i] - first_of(reference, i)
-        first = k
-    awake = memory.mode != Mode.STOPPED and all_measured(axes)
-    pass_channels(controller.inputs, design, state, rules.hold)
-    record_channels(controller.inputs, row[controller.log.channels :])
-    for c in range(axes.u.size):
-        axes.wished[c] = 0.0
-    for i in range(first, k + 1):
-        set_references(reference, design, state, memory, axes, i)
-        for j in range(axes.y.size):
-            axes.measured[j] = axes.y[j] if i == k else np.nan
-        if awake:
-            control_all(design, state, reference.given, axes.measured, axes.wished)
-            if i < k:
-                set_applied_controls(design, state, axes.u)
-    write_row(design, state, row[controller.log.controller : controller.log.channels])
-    for i in range(axes.f_hat.size):
-        learned, residual = controller.f_hat[i, 0], controller.f_hat[i, 1]
-        axes.f_hat[i] = row[learned] + row[residual] if learned >= 0 else 0.0
-    supervise_outputs(rules, supervisor, axes, k)
-    different = False
-    for c in range(axes.u.size):
-        different |= axes.u[c] != axes.wished[c]
-    if awake and different:
-        set_applied_controls(design, state, axes.u)
-        supervisor.counters[0].clipped += 1 if memory.mode == Mode.RUN else 0
-    _fill_v(controller, axes.u)
-    for i in range(axes.watched.size):
-        axes.watched[i].u = row[controller.log.controller + i]
-    store_release(supervisor.steps, 0, supervisor.steps[0] + 1)
-    return axes.u[0]
-
-
-@generic
 def set_references(
-    reference: Any, design: Any, state: Any, memory: Memory, axes: AxesMemory, k: int
+    reference: Any, design: Any, state: Any, memory: Memory, signals: LoopSignals, k: int
 ) -> None:
     """Set ``reference.given``, what controllers get in sample k: y before the scenario begins."""
     raise TypeError
 
 
-@samples_of.register(AxesReference)
-def _axes_samples(reference: AxesReference) -> int:
+@samples_of.register(ReferenceSamples)
+def _samples(reference: ReferenceSamples) -> int:
     return reference.r.shape[0]
 
 
-@first_of.register(AxesReference)
-def _first_of_axis(reference: AxesReference, i: int) -> float:
+@first_of.register(ReferenceSamples)
+def _first(reference: ReferenceSamples, i: int) -> float:
     return reference.r[0, i]
 
 
-@set_references.register(AxesReference)
+@set_references.register(ReferenceSamples)
 def _set_references(
-    reference: AxesReference, design: Any, state: Any, memory: Memory, axes: AxesMemory, k: int
+    reference: ReferenceSamples,
+    design: Any,
+    state: Any,
+    memory: Memory,
+    signals: LoopSignals,
+    k: int,
 ) -> None:
     if memory.began < 0:
-        for i in range(axes.r.size):
-            axes.r[i] = reference.given[i] = axes.good[i]
+        for i in range(signals.r.size):
+            signals.r[i] = reference.given[i] = signals.watched[i].y
         return
     at = min(k - memory.began, reference.r.shape[0] - 1)
     approaches, place = at < reference.approach.shape[0], 0
-    for i in range(axes.r.size):
-        offset = axes.offset[i] if approaches else 0.0
-        axes.r[i] = reference.r[at, i]
+    for i in range(signals.r.size):
+        offset = signals.offset[i] if approaches else 0.0
+        signals.r[i] = reference.r[at, i]
         if offset != 0.0:
-            axes.r[i] += offset * reference.approach[at, 0]
-        reference.given[i] = axes.r[i]
+            signals.r[i] += offset * reference.approach[at, 0]
+        reference.given[i] = signals.r[i]
         for j in range(reference.counts[i]):
             reference.current[place] = reference.derivatives[at, place]
             if offset != 0.0:
@@ -610,34 +446,31 @@ def follow_ticks(handle: Any, clock: Any, period: float, controller: SupervisedC
                 ahead = 1 + max(int((taken - expected) / period), 0)
                 invented += ahead
         ahead -= 1
-        y = tick.y if ahead == 0 else np.nan
         if ahead == 0:
-            take_inputs(controller, handle)
+            take_inputs(controller, handle, tick.y)
         else:
-            skip_inputs(controller)
+            _skip_inputs(controller)
         superseded = ahead > 0 or tick.left > 0
         taken = now(clock)
         if k > 0:
-            finish_signals(controller, handle, tick.u)
+            _finish_signals(controller, handle, tick.u)
             push(log.ring, log.row)
         if overslept > 0:
             memory.skipped_in_row = overslept
             memory.missed_in_row += overslept
         changed, clipped = supervisor.changed[0], counters.clipped
-        u = control_step(controller, k, 0, y)
+        control_step(controller, k, 0)
         fault = 0
         if superseded:
             counters.skipped += 1
         else:
-            fault = send_control(controller, handle, u)
+            fault = write_signals(handle, supervisor.signals.u)
             count_fault(supervisor, fault)
         written = now(clock)
         overran = overslept > 0 or written - taken >= period
         count_cycle(supervisor, overran)
-        events = cycle_events(supervisor, y, overran, fault, changed, clipped)
-        events += _channel_event(controller.inputs)
-        fill_row(log, memory, k, late, written - taken, events)
-        fill_signals(controller, y)
+        events = cycle_events(controller, overran, fault, changed, clipped)
+        fill_row(controller, k, late, written - taken, events)
         k += 1
     if k > 0:
         push(log.ring, log.row)
@@ -710,7 +543,7 @@ def _next_tick(
         asked = load_acquire(supervisor.requests, 0)
         if time >= until or (asked != Request.NONE and memory.mode <= Mode.HOLD):
             break
-        fault = send_control(controller, handle, memory.u)
+        fault = write_signals(handle, supervisor.signals.u)
         count_fault(supervisor, fault)
         if fault > 1 or memory.unsent_in_row > controller.rules.hold:
             break
@@ -728,38 +561,23 @@ class CompiledController(NamedTuple):
     supervisor: SupervisorState
     log: CycleLog
     inputs: ChannelInputs
-    controller: Any  #: a ``SupervisedController``, or ``SupervisedAxes``
-    step: Callable[[Any, int, int, float], float]
+    controller: SupervisedController
+    step: Callable[[Any, int, int], None]
 
 
 @compiled
-def _step(controller: Any, k: int, left_out: int, y: float) -> float:
-    return control_step(controller, k, left_out, y)
-
-
-@take_inputs.register(CompiledController)
-def _take_inputs_of(controller: CompiledController, handle: Any) -> None:
-    take_inputs(controller.controller, handle)
-
-
-@send_control.register(CompiledController)
-def _send_control_of(controller: CompiledController, handle: Any, u: float) -> int:
-    return send_control(controller.controller, handle, u)
-
-
-@fill_signals.register(CompiledController)
-def _fill_signals_of(controller: CompiledController, y: float) -> None:
-    fill_signals(controller.controller, y)
+def _step(controller: Any, k: int, left_out: int) -> None:
+    control_step(controller, k, left_out)
 
 
 @control_step.register(CompiledController)
-def _call_step(controller: CompiledController, k: int, left_out: int, y: float) -> float:
-    return float(controller.step(controller.controller, k, left_out, y))
+def _call_step(controller: CompiledController, k: int, left_out: int) -> None:
+    controller.step(controller.controller, k, left_out)
 
 
-def compiled_controller(controller: Any) -> CompiledController:
+def compiled_controller(controller: SupervisedController) -> CompiledController:
     """Return the controller with its compiled control step."""
-    step = specialised(_step, controller, 0, 0, 0.0)
+    step = specialised(_step, controller, 0, 0)
     inputs = controller.inputs
     return CompiledController(controller.supervisor, controller.log, inputs, controller, step)
 
@@ -770,43 +588,33 @@ def compiled_controller(controller: Any) -> CompiledController:
 def supervise(
     controller: Any,
     reference: Any,
-    rules: Any,
+    rules: Rules,
     ring: Ring,
     channels: Sequence[str] = (),
     state: Any = None,
-) -> Any:
+) -> SupervisedController:
     """Return a supervised controller for ``control_step``; arguments are those of ``of`` below."""
-    axes = isinstance(controller, Axes)
-    counts = (controller.outputs, controller.inputs) if axes else (1, 1)
+    counts = outputs_of(controller), inputs_of(controller)
     columns = row_channels(controller.channels, channels, *counts)
     row = np.zeros(sum(width for _, width in columns))
-    f_learned, f_residual = _places_of_f(columns)
-    log = CycleLog(
-        ring=ring,
-        row=row,
-        f_learned=f_learned,
-        f_residual=f_residual,
-        channels=row.size - len(channels),
-        controller=sum(width for _, width in loop_channels(*counts)),
-        lateness=empty_counts(),
-        step_time=empty_counts(),
+    before = [f"{name}." for name in controller.names] if isinstance(controller, Axes) else [""]
+    return SupervisedController(
+        design=controller.parameters,
+        state=controller.initial_state() if state is None else state,
+        rules=rules.limits,
+        supervisor=initial_state(*counts),
+        reference=reference,
+        log=CycleLog(
+            ring=ring,
+            row=row,
+            channels=row.size - len(channels),
+            controller=sum(width for _, width in loop_channels(*counts)),
+            lateness=empty_counts(),
+            step_time=empty_counts(),
+        ),
+        inputs=channel_inputs(controller, channels),
+        f_hat=np.array([_places_of_f(columns, each) for each in before]),
     )
-    common: dict[str, Any] = {
-        "design": controller.parameters,
-        "state": controller.initial_state() if state is None else state,
-        "supervisor": initial_state(),
-        "reference": reference,
-        "log": log,
-        "inputs": channel_inputs(controller, channels),
-    }
-    supervised: Any
-    if axes:
-        places = np.array([_places_of_f(columns, f"{name}.") for name in controller.names])
-        memory = axes_memory(*counts)
-        supervised = SupervisedAxes(rules=rules.limits, axes=memory, f_hat=places, **common)
-    else:
-        supervised = SupervisedController(rules=rules, **common)
-    return supervised
 
 
 @dataclass(frozen=True, eq=False)
@@ -820,7 +628,7 @@ class ControlLoop:
     handle: Any
     clock: Any
     period: float  # sample time [ns]
-    controller: Any  # a ``SupervisedController``, or ``SupervisedAxes``
+    controller: SupervisedController
     paced: bool  # whether the device's ticks pace the loop, and not the loop's own deadlines
     interpret: bool = False
 
@@ -830,7 +638,7 @@ class ControlLoop:
         device: Device,
         controller: Any,
         reference: Any,
-        rules: Any,
+        rules: Rules,
         clock: Any,
         ring: Ring,
         *,
@@ -841,8 +649,7 @@ class ControlLoop:
         """Return the compiled loop of a device and a controller.
 
         It runs on ``state``; by default on a new one with nothing learned. ``channels`` are those
-        of the device, as ``checked_channels`` returns them. Reference and rules of several axes are
-        an ``AxesReference`` and ``AxesRules``.
+        of the device, as ``checked_channels`` returns them.
         """
         supervised = supervise(controller, reference, rules, ring, channels, state)
         handle = handle_of(device)
@@ -883,11 +690,14 @@ class ControlLoop:
         with explain_compile_errors(self.handle, self.controller.design):
             replace(self, controller=over).run()
             if self.interpreted and not self.interpret:
-                control_step(compiled_controller(over), 0, 0, 0.0)
+                control_step(compiled_controller(over), 0, 0)
 
 
-def _places_of_f(columns: Channels, prefix: str = "") -> tuple[int, int]:
-    """Return the places in a row of the learned and of the observer's part of f̂; −1 without."""
+def _places_of_f(columns: Channels, prefix: str) -> tuple[int, int]:
+    """Return the places in a row of the learned and of the observer's part of f̂; −1 without.
+
+    Names of channels of an axis begin with ``prefix``.
+    """
     names, known = ("f_learned", "f_residual"), {name for name, width in columns if width}
     if not {f"{prefix}{name}" for name in names} <= known:
         return -1, -1

@@ -141,22 +141,29 @@ def read_channels(handle: Any, values: Vector) -> None:
         values[i] = math.nan
 
 
-@generic
+@generic_with_default
 def read_signals(handle: Any, y: Vector) -> None:
-    """Write all measurements of the last read or tick into ``y`` (p,); NaN for one without."""
-    raise TypeError
+    """Write all measurements of the last read or tick into ``y`` (p,); NaN for one without.
+
+    ``y`` has the first: a device of one y needs no implementation.
+    """
 
 
-@generic
+@generic_with_default
 def write_signals(handle: Any, u: Vector) -> int:
-    """Apply ``u`` (m,) [u-unit]; return what ``write_command`` does."""
-    raise TypeError
+    """Apply ``u`` (m,) [u-unit]; return what ``write_command`` does.
+
+    A device of one y and one u has ``write_command`` instead.
+    """
+    return write_command(handle, u[0])
 
 
-@generic
+@generic_with_default
 def read_acting(handle: Any, u: Vector) -> None:
-    """Write the control signals from the last tick of a paced device on into ``u`` (m,)."""
-    raise TypeError
+    """Write the control signals from the last tick of a paced device on into ``u`` (m,).
+
+    ``u`` has the first: a device of one u needs no implementation.
+    """
 
 
 @generic_with_default
@@ -284,26 +291,17 @@ def _read_channels(handle: PythonHandle, values: Vector) -> None:
         _count_error(handle, error)
 
 
-@write_command.register(PythonHandle)
-def _write_command(handle: PythonHandle, u: float) -> int:
-    try:
-        handle.device.write(float(u))
-    except Exception as error:
-        _count_error(handle, error)
-        return 1
-    return 0
-
-
 @read_signals.register(PythonHandle)
 def _read_signals(handle: PythonHandle, y: Vector) -> None:
-    y[:] = handle.y
+    if handle.y.size:
+        y[:] = handle.y
 
 
 @write_signals.register(PythonHandle)
 def _write_signals(handle: PythonHandle, u: Vector) -> int:
     try:
         given: Any = handle.device
-        given.write(u.copy())
+        given.write(u.copy() if handle.y.size else float(u[0]))
     except Exception as error:
         _count_error(handle, error)
         return 1

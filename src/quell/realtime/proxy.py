@@ -50,17 +50,15 @@ from quell.controllers.base import check_controller, limits_of
 from quell.controllers.compensated import takes_control
 from quell.controllers.compensator import Compensator
 from quell.kernels.dispatch import is_finite, kernel
-from quell.plants.base import advance, all_signals, as_input, measure, measure_all
-from quell.realtime.axes_supervisor import AxesMemory
+from quell.plants.base import advance, all_signals, as_input, measure_all
 from quell.realtime.channels import await_channels, checked_channels
 from quell.realtime.cycle import (
+    SupervisedController,
     control_step,
     count_cycle,
     count_fault,
     first_of,
     samples_of,
-    send_control,
-    set_reference,
     set_references,
     supervise,
     take_inputs,
@@ -72,6 +70,7 @@ from quell.realtime.devices import (
     counts_of,
     handle_of,
     read_measurement,
+    write_signals,
 )
 from quell.realtime.rig import (
     BEHIND,
@@ -90,6 +89,7 @@ from quell.realtime.supervisor import (
     Cause,
     Ending,
     Host,
+    LoopSignals,
     Memory,
     Mode,
     Request,
@@ -130,14 +130,9 @@ def _first(reference: HostCommand, i: int) -> float:
     return 0.0
 
 
-@set_reference.register(HostCommand)
-def _set_command(reference: HostCommand, design: Any, state: Any, memory: Memory, k: int) -> float:
-    return 0.0 if memory.began < 0 else reference.given[0]
-
-
 @set_references.register(HostCommand)
 def _set_commands(
-    reference: HostCommand, design: Any, state: Any, memory: Memory, axes: AxesMemory, k: int
+    reference: HostCommand, design: Any, state: Any, memory: Memory, signals: LoopSignals, k: int
 ) -> None:
     if memory.began < 0:
         for c in range(reference.given.size):
@@ -159,17 +154,11 @@ class ProxyDesign(NamedTuple):
 
     handle: Any  # of the device
     clock: Any
-    controller: Any  # ``SupervisedController``, or ``SupervisedAxes``
+    controller: SupervisedController
     drive: Drive
 
 
-class AxesProxyDesign(NamedTuple):
-    """Drives of several axes and the compensators in front of them."""
-
-    one: ProxyDesign
-
-
-as_input.register(AxesProxyDesign)(all_signals)
+as_input.register(ProxyDesign)(all_signals)
 
 
 # ---- The host's side ----
@@ -199,34 +188,19 @@ def _hide_channels(proxy: ProxyDesign) -> None:
             values[i] = np.nan
 
 
-@measure.register(ProxyDesign)
-def _measure(proxy: ProxyDesign, x: Vector) -> float:
-    y, _ = read_measurement(proxy.handle, proxy.clock, now(proxy.clock))
-    take_inputs(proxy.controller, proxy.handle)
-    shown = _shown(proxy.drive, 0, y)
-    _hide_channels(proxy)
-    return shown
-
-
-@measure_all.register(AxesProxyDesign)
-def _measure_all(proxy: AxesProxyDesign, x: Vector, y: Vector) -> None:
-    one = proxy.one
-    read_measurement(one.handle, one.clock, now(one.clock))
-    take_inputs(one.controller, one.handle)
+@measure_all.register(ProxyDesign)
+def _measure_all(proxy: ProxyDesign, x: Vector, y: Vector) -> None:
+    first, _ = read_measurement(proxy.handle, proxy.clock, now(proxy.clock))
+    take_inputs(proxy.controller, proxy.handle, first)
     for i in range(y.size):
-        y[i] = _shown(one.drive, i, one.controller.axes.y[i])
-    _hide_channels(one)
+        y[i] = _shown(proxy.drive, i, proxy.controller.supervisor.signals.y[i])
+    _hide_channels(proxy)
 
 
 @measure_channels.register(ProxyDesign)
 def _measure_channels(proxy: ProxyDesign, x: Vector, values: Vector) -> None:
     for i in range(values.size):
         values[i] = proxy.controller.inputs.values[i]
-
-
-@measure_channels.register(AxesProxyDesign)
-def _measure_channels_of_axes(proxy: AxesProxyDesign, x: Vector, values: Vector) -> None:
-    measure_channels(proxy.one, x, values)
 
 
 @tell_host.register(ProxyDesign)
@@ -242,18 +216,17 @@ def _tell(proxy: ProxyDesign, counts: NDArray[np.int64], session: int) -> None:
     own[_LATE] = counts[BEHIND]
 
 
-@tell_host.register(AxesProxyDesign)
-def _tell_axes(proxy: AxesProxyDesign, counts: NDArray[np.int64], session: int) -> None:
-    tell_host(proxy.one, counts, session)
-
-
 # ---- The drive's side ----
 
 
-@kernel
-def _step(proxy: ProxyDesign) -> None:
+@advance.register(ProxyDesign)
+def _advance(
+    proxy: ProxyDesign, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
+) -> None:
     """Take the sample of a tick and send its u to the drive."""
     controller, drive = proxy.controller, proxy.drive
+    for c in range(u.size):
+        controller.reference.given[c] = u[c]
     supervisor, k = controller.supervisor, drive.counts[_TICK]
     memory, seen = supervisor.memory[0], True
     for i in range(drive.last.size):
@@ -266,36 +239,16 @@ def _step(proxy: ProxyDesign) -> None:
         memory.skipped_in_row += 1
     if finished(supervisor) and memory.ended_by == Cause.HOST_LEFT:
         wait_for_host(supervisor, k)
-    u = control_step(controller, k, 0, drive.y[0])
-    count_fault(supervisor, send_control(controller, proxy.handle, u))
+    control_step(controller, k, 0)
+    count_fault(supervisor, write_signals(proxy.handle, supervisor.signals.u))
     count_cycle(supervisor, drive.counts[_LATE] > 1)
     drive.counts[_TICK] = k + 1
-
-
-@advance.register(ProxyDesign)
-def _advance(proxy: ProxyDesign, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
-    proxy.controller.reference.given[0] = u
-    _step(proxy)
-
-
-@advance.register(AxesProxyDesign)
-def _advance_all(
-    proxy: AxesProxyDesign, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
-) -> None:
-    for c in range(u.size):
-        proxy.one.controller.reference.given[c] = u[c]
-    _step(proxy.one)
 
 
 @has_ended.register(ProxyDesign)
 def _has_ended(proxy: ProxyDesign) -> bool:
     supervisor = proxy.controller.supervisor
     return finished(supervisor) and supervisor.memory[0].ended_by != Cause.HOST_LEFT
-
-
-@has_ended.register(AxesProxyDesign)
-def _axes_have_ended(proxy: AxesProxyDesign) -> bool:
-    return has_ended(proxy.one)
 
 
 @may_end.register(ProxyDesign)
@@ -307,23 +260,12 @@ def _may_end(proxy: ProxyDesign, stop: int) -> bool:
     return finished(supervisor)
 
 
-@may_end.register(AxesProxyDesign)
-def _axes_may_end(proxy: AxesProxyDesign, stop: int) -> bool:
-    return may_end(proxy.one, stop)
-
-
 @fill_log.register(ProxyDesign)
 def _fill_log(proxy: ProxyDesign, row: Vector) -> None:
-    memory = proxy.controller.supervisor.memory[0]
-    row[0], row[1] = memory.mode, memory.u
-
-
-@fill_log.register(AxesProxyDesign)
-def _fill_log_of_axes(proxy: AxesProxyDesign, row: Vector) -> None:
-    controller = proxy.one.controller
-    row[0] = controller.supervisor.memory[0].mode
-    for c in range(controller.axes.u.size):
-        row[1 + c] = controller.axes.u[c]
+    supervisor = proxy.controller.supervisor
+    row[0] = supervisor.memory[0].mode
+    for c in range(supervisor.signals.u.size):
+        row[1 + c] = supervisor.signals.u[c]
 
 
 class CompensatedDrive:
@@ -436,12 +378,11 @@ class CompensatedDrive:
         """Whether it can run compiled: always."""
         return True
 
-    def sampled(self, dt: float, interpret: bool = False) -> ProxyDesign | AxesProxyDesign:
+    def sampled(self, dt: float, interpret: bool = False) -> ProxyDesign:
         """Return the parameters, for the compensator's sample time."""
         if abs(checks.positive("dt", dt, "s") - self.compensator.dt) > 1e-9 * dt:
             raise ValueError(f"dt = {dt!r} s: must be the compensator's, {self.compensator.dt!r} s")
-        one = ProxyDesign(self._handle, system_clock(), self._controller, self._drive)
-        return AxesProxyDesign(one) if isinstance(self.compensator, Axes) else one
+        return ProxyDesign(self._handle, system_clock(), self._controller, self._drive)
 
     @property
     def watchdog(self) -> int:
@@ -468,9 +409,8 @@ class CompensatedDrive:
     @property
     def u(self) -> Any:
         """The u of the last tick, as sent to the drive; of several axes an array (m,)."""
-        if isinstance(self.compensator, Axes):
-            return self._controller.axes.u.copy()
-        return float(self._supervisor.memory[0].u)
+        u = self._supervisor.signals.u
+        return u.copy() if isinstance(self.compensator, Axes) else float(u[0])
 
     def changes(self, first: int = 0) -> tuple[ModeChange, ...]:
         """Return the changes of the supervisor's mode, from number ``first`` on."""

@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.allocation import apply_to_axes
 from quell.controllers.axes import Axes
 from quell.controllers.base import (
     bumpless_transfer,
     check_controller,
-    control,
-    set_applied_control,
-    set_reference_derivatives,
     status_flags,
     write_row,
 )
-from quell.controllers.several import control_all
+from quell.controllers.several import (
+    control_all,
+    inputs_of,
+    set_applied_controls,
+    write_applied,
+)
 from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors, kernel
-from quell.realtime.axes_supervisor import set_applied_controls
 from quell.realtime.channels import ChannelInputs, channel_inputs, checked_channels, pass_channels
 from quell.realtime.devices import SignalCounts, counts_text
 from quell.realtime.recordings import check_one, in_column
@@ -137,15 +137,10 @@ def replay(
     log[:, : recorded.shape[1]] = recorded
     began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
     with np.errstate(over="ignore", invalid="ignore"), explain_compile_errors(design):
-        if axes is None:
-            status = call_specialised(
-                _follow, design, state, _NO_DERIVATIVES, began, log, inputs, given, hold
-            )
-        else:
-            wished = np.zeros(axes.inputs)
-            status = call_specialised(
-                _follow_axes, design, state, places, began, log, wished, inputs, given, hold
-            )
+        wished = np.zeros(inputs_of(controller))
+        status = call_specialised(
+            _follow, design, state, places, began, log, wished, inputs, given, hold
+        )
     common: dict[str, Any] = {
         "log": log,
         "channels": columns,
@@ -224,36 +219,6 @@ def _give_channels(
 def _follow(
     design: Any,
     state: Any,
-    derivatives: Vector,
-    began: int,
-    log: Matrix,
-    inputs: ChannelInputs,
-    given: Matrix,
-    hold: int,
-) -> int:
-    """Run the controller on the first columns of ``log``, write the others; return status flags.
-
-    From sample ``began`` on the controller was in control. ``given`` are the device's channels.
-    """
-    status = 0
-    for k in range(log.shape[0]):
-        if k == began and k > 0:
-            bumpless_transfer(design, state)
-        set_reference_derivatives(design, state, derivatives)
-        _give_channels(inputs, given, k, design, state, hold)
-        wished = control(design, state, log[k, 0], log[k, 2])
-        status |= status_flags(design, state)
-        log[k, 4] = wished
-        write_row(design, state, log[k, 5:])
-        if log[k, 3] != wished:
-            set_applied_control(design, state, log[k, 3])
-    return status
-
-
-@compiled
-def _follow_axes(
-    design: Any,
-    state: Any,
     places: NDArray[np.int64],
     began: int,
     log: Matrix,
@@ -262,9 +227,10 @@ def _follow_axes(
     given: Matrix,
     hold: int,
 ) -> int:
-    """Do what ``_follow`` does for several axes.
+    """Run the controller on the first columns of ``log``, write the others; return status flags.
 
-    ``places`` are the first columns of r, y, y_measured, u and u_wished.
+    From sample ``began`` on the controller was in control. ``places`` are the first columns of r,
+    y, y_measured, u and u_wished, and ``given`` are the device's channels.
     """
     status, count = 0, wished.size
     for k in range(log.shape[0]):
@@ -279,9 +245,9 @@ def _follow_axes(
         for c in range(count):
             log[k, places[4] + c] = wished[c]
             different |= u[c] != wished[c]
-        at = places[4] + count
-        write_row(design, state, log[k, at:])
-        apply_to_axes(state.gain, u, log[k, at : at + r.size])  # v as applied
+        own = log[k, places[4] + count :]
+        write_row(design, state, own)
+        write_applied(design, state, u, own)
         if different:
             set_applied_controls(design, state, u)
     return status

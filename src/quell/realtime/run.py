@@ -45,13 +45,11 @@ from quell.realtime.recordings import (
 from quell.realtime.safety import (
     Safety,
     as_scenario,
-    axes_reference,
     check_takes_reference,
     reference_samples,
 )
 from quell.realtime.supervisor import (
     RESERVED,
-    AxesRules,
     Cause,
     Ending,
     Mode,
@@ -116,7 +114,7 @@ class RigRun:
     counters: dict[str, int]  #: the device's counters, of frames for instance
     notes: tuple[str, ...]  #: remarks, for example on permitted real-time scheduling
     #: safety rules of the run, with those that were derived; ``rules.text(dt)``
-    rules: Rules | AxesRules
+    rules: Rules
 
     @property
     def overruns(self) -> int:
@@ -378,8 +376,7 @@ def run_rig(
     """
     handle = handle_of(device)
     with closing(device):
-        axes = controller if isinstance(controller, Axes) else None
-        check_controller(controller, several=axes is not None)
+        check_controller(controller, several=isinstance(controller, Axes))
         check_takes_reference(controller)
         dt = controller.dt
         own = getattr(device, "dt", dt)
@@ -391,12 +388,7 @@ def run_rig(
         scenario = as_scenario(scenario, duration)
         rules = (Safety() if safety is None else safety).rules(controller, scenario)
         names = checked_channels(controller, channels)
-        reference: Any
-        if axes is not None:
-            reference = axes_reference(scenario, axes, approach)
-        else:
-            derivatives = getattr(controller, "derivatives", 0)
-            reference = reference_samples(scenario, dt, derivatives, approach)
+        reference = reference_samples(scenario, controller, approach)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
         kept, state, learned = memory_file(memory), None, ""
         if kept is not None:
@@ -443,8 +435,8 @@ def run_rig(
         notes.append(f"the device raised {count} errors, the last of them: {last!r}")
     notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
     record = rows.trajectory()
-    if axes is None:
-        record = replace(record, u_limits=(rules.low, rules.high))
+    if not rules.names:
+        record = replace(record, u_limits=(rules.limits.low[0], rules.limits.high[0]))
     counters = dict(getattr(device, "counters", {}))
     changes = mode_changes(supervisor, dt, axis_names=getattr(controller, "names", ()))
     notes += [*silence_of(record, changes, before, counters), *missing_channels(record, names)]

@@ -20,11 +20,11 @@ from quell.controllers import ADRC, Axes
 from quell.controllers.base import Controller
 from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
+from quell.controllers.several import inputs_of, outputs_of, references_of
 from quell.kernels.sized import Buffer
-from quell.realtime.supervisor import AxesLimits, AxesRules, Rules
+from quell.realtime.supervisor import Rules, RunLimits
 from quell.records.record import in_steps
 from quell.signals import as_signal
-from quell.signals.shapes import check_derivative
 from quell.simulation.scenario import Scenario, derivatives_in
 from quell.types import Matrix, Vector
 
@@ -38,18 +38,17 @@ _MARGIN = 10.0
 _MARGIN_WITHOUT_MODEL = 1e6
 
 
-def reach(controller: Controller, low: float, high: float) -> float:
-    """Return the error at which the law ``k1 e / b0`` alone puts u to its limit [y-unit].
+def reach(controller: Controller, v_low: float, v_high: float) -> float:
+    """Return the error at which the law ``k1 e`` alone puts v = b0 u to its limit [y-unit].
 
-    With all poles at −omega_c it is ``b0 max|u| / omega_c^m``. It is the scale of motions of y that
+    With all poles at −omega_c it is ``max|v| / omega_c^m``. It is the scale of motions of y that
     are within the power of u: a load that u can hold moves y by a part of it. NaN for a controller
     that is not an ADRC, possibly behind prefilters.
     """
     adrc = inner_adrc(controller)
     if adrc is None:
         return float("nan")
-    design = adrc.parameters
-    return float(abs(design.b0) * max(abs(low), abs(high)) / design.law[0])
+    return float(max(abs(v_low), abs(v_high)) / adrc.parameters.law[0])
 
 
 def inner_adrc(controller: Any) -> ADRC | None:
@@ -64,6 +63,15 @@ def inner_adrc(controller: Any) -> ADRC | None:
 # Score at which the check of a compensator's b0 ends the run, in lag times of its observer
 # (``quell.realtime.supervisor``): honest loops came to 5.8.
 _OPPOSED = 8.0
+
+
+def _gain_of(controller: Any) -> float:
+    """Return b0 of an ADRC or a compensator, also behind prefilters; 1 of another controller."""
+    found: Any = inner_adrc(controller)
+    inner = getattr(controller, "controller", controller)
+    if found is None and takes_control(inner):
+        found = inner
+    return 1.0 if found is None else float(found.observer.b0)
 
 
 def most_opposed(controller: Any) -> float:
@@ -116,46 +124,40 @@ def check_takes_reference(controller: Any) -> None:
 
 
 class ReferenceSamples(NamedTuple):
-    """The reference for all samples of a run: code is not compiled for each duration."""
-
-    r: Buffer  # (samples,) [y-unit]
-    derivatives: Buffer  # (samples, d): r', r'', …, as many as the controller uses
-    approach: Buffer  # (·, 1 + d): ``approach_curve`` and its derivatives for a distance of 1
-    current: Vector  # work array: derivatives of one sample (d,)
-
-
-class AxesReference(NamedTuple):
-    """The references of several axes for all samples of a run."""
+    """The references for all samples of a run: code is not compiled for each duration."""
 
     r: Buffer  # (samples, n) [y-unit]
-    derivatives: Buffer  # (samples, d): those of the first axis, then of the second …
-    approach: Buffer  # (·, 1 + most of an axis)
+    derivatives: Buffer  # (samples, d): those of the first axis, r', r'', …, then of the second …
+    approach: Buffer  # (·, 1 + most of an axis): ``approach_curve`` for a distance of 1
     current: Vector  # work array: derivatives of one sample (d,)
-    given: Vector  # what the controllers get in one sample (n,)
+    given: Vector  # what the controller gets in one sample (n,)
     counts: NDArray[np.int64]  # derivatives of each axis (n,)
 
 
-def axes_reference(scenario: Scenario, axes: Axes, approach: float) -> AxesReference:
-    """Return the references of several axes for every sample, and their approach [s]."""
-    r, derivatives = axes_reference_columns(scenario, axes)
-    counts = np.array(axes.derivatives, dtype=np.int64)
+def reference_samples(scenario: Scenario, controller: Any, approach: float) -> ReferenceSamples:
+    """Return a controller's references for every sample, and their approach [s]."""
+    r, derivatives = reference_columns(scenario, controller)
+    own: Any = getattr(controller, "derivatives", 0)
+    counts = np.array(own if isinstance(own, tuple) else (own,), dtype=np.int64)
     time = checks.non_negative("approach", approach, "s")
-    curve = approach_curve(axes.dt, time, int(np.max(counts)))
+    curve = approach_curve(controller.dt, time, int(np.max(counts)))
     current, given = np.zeros(derivatives.shape[1]), np.zeros(r.shape[1])
-    return AxesReference(r, derivatives, curve, current, given, counts)
+    return ReferenceSamples(r, derivatives, curve, current, given, counts)
 
 
-def axes_reference_columns(scenario: Scenario, axes: Axes) -> tuple[Matrix, Matrix]:
-    """Return the references of several axes (samples, n), and their derivatives (samples, d)."""
-    t = _sample_times(scenario, axes.dt)
-    signals, _, _ = scenario.seeded(axes.references, len(scenario.disturbances), axes.outputs)
-    derivatives = derivatives_in(signals, axes)
+def reference_columns(scenario: Scenario, controller: Any) -> tuple[Matrix, Matrix]:
+    """Return a controller's references (samples, n), and their derivatives (samples, d)."""
+    t = _sample_times(scenario, controller.dt)
+    counts = references_of(controller), len(scenario.disturbances), outputs_of(controller)
+    signals, _, _ = scenario.seeded(*counts)
+    derivatives = derivatives_in(signals, controller)
     columns = [
         np.column_stack([each(t) for each in part]) if part else np.zeros((t.size, 0))
         for part in (signals, derivatives)
     ]
-    for i, name in enumerate(axes.names):
-        _check_finite(f"reference of {name}", columns[0][:, i : i + 1], t)
+    names = getattr(controller, "names", None)
+    for i in range(len(signals)):
+        _check_finite(f"reference of {names[i]}" if names else "reference", columns[0][:, [i]], t)
     _check_finite("reference", columns[1], t)
     return columns[0], columns[1]
 
@@ -189,23 +191,6 @@ def as_scenario(value: Any, duration: float | None) -> Scenario:
             f"rest_at = {value.rest_at!r}: a real plant can't be put back to rest; leave it out"
         )
     return value if duration is None else Scenario(value.reference, duration, seed=value.seed)
-
-
-def reference_samples(
-    scenario: Scenario, dt: float, derivatives: int, approach: float
-) -> ReferenceSamples:
-    """Return the reference for every sample, and its approach within ``approach`` [s]."""
-    t = _sample_times(scenario, dt)
-    signals = [scenario.seeded_signals(len(scenario.disturbances))[0]]
-    for _ in range(derivatives):
-        check_derivative(signals[-1])
-        signals.append(signals[-1].derivative())
-    columns = np.column_stack([signal(t) for signal in signals])
-    _check_finite("reference", columns, t)
-    curve = approach_curve(dt, checks.non_negative("approach", approach, "s"), derivatives)
-    return ReferenceSamples(
-        columns[:, 0].copy(), columns[:, 1:].copy(), curve, np.zeros(derivatives)
-    )
 
 
 def approach_curve(dt: float, time: float, derivatives: int) -> Matrix:
@@ -370,15 +355,10 @@ class Safety:
             return value
         return value[min(i, len(value) - 1)]
 
-    def rules(self, controller: Any, scenario: Scenario | None = None) -> Any:
+    def rules(self, controller: Any, scenario: Scenario | None = None) -> Rules:
         """Return the supervisor's rules for a controller, with the narrower limits of both.
 
         The default bounds of y come from the reference of ``scenario``; without one there are none.
-
-        Returns
-        -------
-        Rules
-            ``AxesRules`` for several axes.
 
         Raises
         ------
@@ -386,43 +366,57 @@ class Safety:
             if u has no finite limits, zero is not between them, or a list is not as long as there
             are signals.
         """
-        if isinstance(controller, Axes):
-            return self._rules_of_axes(controller, scenario)
-        for name in _FOR_EACH:
-            if isinstance(value := getattr(self, name), tuple):
-                raise ValueError(
-                    f"{name} = {list(value)!r}: must be one number; lists are for several axes"
-                )
-        own = getattr(controller, "limits", None)
-        limits: Any = self
-        low = max(float(limits.u_min), -math.inf if own is None else own.low)
-        high = min(float(limits.u_max), math.inf if own is None else own.high)
-        if not (math.isfinite(low) and math.isfinite(high)):
+        axes = controller if isinstance(controller, Axes) else None
+        own: Any = getattr(controller, "limits", None)
+        n, m = outputs_of(controller), inputs_of(controller)
+        low, high = self._each("u_min", m, axes), self._each("u_max", m, axes)
+        if own is not None:
+            low, high = np.maximum(low, own.low), np.minimum(high, own.high)
+        if not np.all(np.isfinite([low, high])):
+            u_min, u_max = (each.tolist() if axes else float(each[0]) for each in (low, high))
             raise ValueError(
-                f"u_min = {low!r}, u_max = {high!r}: must be finite for a real device; "
+                f"u_min = {u_min!r}, u_max = {u_max!r}: must be finite for a real device; "
                 "give u_min and u_max to the controller or to quell.realtime.Safety"
             )
-        _check_around_zero(low, high)
-        scale = reach(controller, low, high)
-        y_low, y_high = -math.inf, math.inf
+        for pair in zip(low.tolist(), high.tolist(), strict=True):
+            _check_around_zero(*pair)
+        parts = axes.axes if axes else (controller,)
+        adrcs = [inner_adrc(part) for part in parts]
+        opposed = np.full(n, math.inf)
+        if self.check_direction and getattr(controller, "takes_u_0", True):
+            opposed = np.array([most_opposed(part) for part in parts])
+        b0 = np.array([_gain_of(part) for part in parts])
+        ends = np.diag(b0) if axes is None else axes.first_gain
+        ends = np.sort([ends * low, ends * high], axis=0)  # what each u does at its limits
+        v_low, v_high = ends[0].sum(axis=1), ends[1].sum(axis=1)
+        scale = np.array([reach(*each) for each in zip(parts, v_low, v_high, strict=True)])
+        bounds = np.tile([[-math.inf], [math.inf]], n)
         if scenario is not None:
-            r = reference_samples(scenario, controller.dt, 0, 0.0).r
-            y_low, y_high = plausible_range(r, scale)
-        adrc = inner_adrc(controller) if self.check_direction else None
-        inner: Any = getattr(controller, "controller", controller)
-        opposed = most_opposed(controller) if self.check_direction else math.inf
+            columns = reference_columns(scenario, controller)[0].T
+            ranges = [plausible_range(*pair) for pair in zip(columns, scale, strict=True)]
+            bounds = np.array(ranges).T
+        y_low, y_high = (
+            bounds[i] if getattr(self, name) is None else self._each(name, n, axes)
+            for i, name in enumerate(("y_min", "y_max"))
+        )
+        watched = [self.check_direction and adrc is not None for adrc in adrcs]
         return Rules(
-            low=low,
-            high=high,
-            most_error=float(limits.most_error),
-            most_f=float(limits.most_f),
-            y_low=y_low if limits.y_min is None else float(limits.y_min),
-            y_high=y_high if limits.y_max is None else float(limits.y_max),
-            direction=0.0 if adrc is None else math.copysign(1.0, adrc.parameters.b0),
-            reach=scale,
-            b0=math.nan if math.isinf(opposed) else float(inner.observer.b0),
-            most_opposed=opposed,
-            **self._counts(controller.dt),
+            axes.names if axes else (),
+            RunLimits(
+                low=low,
+                high=high,
+                most_error=self._each("most_error", n, axes),
+                most_f=self._each("most_f", n, axes),
+                y_low=y_low,
+                y_high=y_high,
+                direction=np.array(watched, dtype=float),
+                reach=scale,
+                b0=b0,
+                v_low=v_low,
+                v_high=v_high,
+                most_opposed=opposed,
+                **self._counts(controller.dt),
+            ),
         )
 
     def _counts(self, dt: float) -> dict[str, int]:
@@ -431,57 +425,17 @@ class Safety:
         more = max(round(_START_MORE / dt), _START_SAMPLES)
         return counts | {"longest_start": _START_FACTOR * counts["settle"] + more}
 
-    def _rules_of_axes(self, axes: Axes, scenario: Scenario | None) -> AxesRules:
-        outputs, inputs = axes.outputs, axes.inputs
-        low = np.maximum(self._each("u_min", inputs, "actuators"), axes.limits.low)
-        high = np.minimum(self._each("u_max", inputs, "actuators"), axes.limits.high)
-        if not np.all(np.isfinite([low, high])):
-            raise ValueError(
-                f"u_min = {low.tolist()!r}, u_max = {high.tolist()!r}: must be finite for a real "
-                "device; give u_min and u_max to Axes or to quell.realtime.Safety"
-            )
-        for pair in zip(low.tolist(), high.tolist(), strict=True):
-            _check_around_zero(*pair)
-        push = np.abs(axes.first_gain) @ np.maximum(np.abs(low), np.abs(high))
-        pairs = zip(axes.axes, push, strict=True)
-        scale = np.array([reach(axis, 0.0, most) for axis, most in pairs])
-        bounds = np.tile([[-math.inf], [math.inf]], outputs)
-        if scenario is not None:
-            columns = axes_reference_columns(scenario, axes)[0].T
-            ranges = [plausible_range(*pair) for pair in zip(columns, scale, strict=True)]
-            bounds = np.array(ranges).T
-        y_low, y_high = (
-            bounds[i] if getattr(self, name) is None else self._each(name, outputs, "axes")
-            for i, name in enumerate(("y_min", "y_max"))
-        )
-        return AxesRules(
-            axes.names,
-            AxesLimits(
-                low=low,
-                high=high,
-                most_error=self._each("most_error", outputs, "axes"),
-                most_f=self._each("most_f", outputs, "axes"),
-                y_low=y_low,
-                y_high=y_high,
-                direction=np.where(np.isfinite(scale) & self.check_direction, 1.0, 0.0),
-                reach=scale,
-                push=push,
-                most_opposed=np.array(
-                    [
-                        most_opposed(axis) if axes.takes_u_0 and self.check_direction else math.inf
-                        for axis in axes.axes
-                    ]
-                ),
-                **self._counts(axes.dt),
-            ),
-        )
-
-    def _each(self, name: str, count: int, what: str) -> Vector:
-        """Return a limit of each signal."""
+    def _each(self, name: str, count: int, axes: Axes | None) -> Vector:
+        """Return a limit of each signal, of several ``axes`` or of one."""
         value = getattr(self, name)
         if not isinstance(value, tuple):
             return np.full(count, float(value))
+        if axes is None:
+            raise ValueError(
+                f"{name} = {list(value)!r}: must be one number; lists are for several axes"
+            )
         if len(value) != count:
+            what = "actuators" if name in ("u_min", "u_max") else "axes"
             raise ValueError(
                 f"{name} = {list(value)!r}: there are {count} {what}; must be one number for all, "
                 "or one for each"

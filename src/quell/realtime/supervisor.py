@@ -16,6 +16,13 @@ The supervisor: after a fault it holds u, then ramps it to zero, then stops.
   there is no way back to RUN.
 * STOPPED: u is zero; it is written some more times, in case a frame is lost.
 
+One axis is the case of one y and one u. Of several a sample is good if all measurements came: if
+one did not, all u are held, and the observers of the other axes go on with their own. After a fault
+all u go to zero together, each in a straight line, because a machine of which one axis is still
+driven is no safer than one that is not. The cause names the signal to which it is due:
+``Memory.culprit``. Each axis is judged by v, the share of all u that moves it: ``b0 u`` of one
+axis, ``(B0 u)_i`` of several.
+
 All of it is arithmetic on arrays, so that tests can run it without a clock or a device.
 
 A check of the signs of y, u and b0 by the first motion after the controller takes over.
@@ -24,23 +31,23 @@ With one of the signs wrong the loop has positive feedback: y leaves its place o
 push of u, and ``|r − y|`` grows by a factor e in about 1/omega_c. A load, a zero in the right half
 plane and noise move y against u as well, but not so far. So the run ends only if
 
-1. y first moves (beyond its noise before the run, and 2 % of the reach of u) against the sum of
-   ``sign(b0) u`` so far, while the reference already goes the other way and is further away from
+1. y first moves (beyond its noise before the run, and 2 % of the reach of u) against the sum of v
+   so far, while the reference already goes the other way and is further away from
    the place of rest than y. A load that moves y before the reference moves ends the check. So
    does a first motion in the right direction: signs do not change during a run;
 2. y then goes on to twice the largest of three distances: the reference's distance from the
    place of rest, the reach of u (``quell.realtime.supervisor.reach``), and ten times the noise;
-   while u pushes the other way with at least half of its limit.
+   while v pushes the other way with at least half of its limit.
 
 The numbers come from random honest loops with loads, friction, delays, zeros in the right half
 plane and learners, and the same loops with a wrong sign: ``benchmarks/direction.py``.
 
 A check of the sign of b0 of a compensator, whose reference is known to its host only.
 
-While u is not at a limit, ``f̂ + b0 u = b0 u_0`` by definition, with each sign of b0. At a limit
+While u is not at a limit, ``f̂ + v = b0 u_0`` by definition, with each sign of b0. At a limit
 that sum is what really moves y, ``y^(n)`` without a model. With the wrong sign it goes against
-``b0 u``, and the compensator, which takes this for a load, holds u at the limit. So in each sample
-at a limit ``−(f̂ + b0 u) b0 u``, in units of the largest ``(b0 u)²``, is added to a score, and in
+v, and the compensator, which takes this for a load, holds u at the limit. So in each sample
+at a limit ``−(f̂ + v) v``, in units of the largest ``v²``, is added to a score, and in
 the others a quarter is taken from it. The run ends where the score is above eight lag times of the
 observer. A load within the limits of u keeps it at zero; a spring that swings at a limit brought it
 to 5.8 lag times, in the worst of 300 honest loops (``benchmarks/proxy_faults.py``).
@@ -62,7 +69,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.kernels.dispatch import is_finite, kernel
-from quell.kernels.sized import Scalars
+from quell.kernels.sized import Scalars, Work
 from quell.realtime.system import load_acquire, store_release
 from quell.types import Vector
 
@@ -159,111 +166,67 @@ class Cause(IntEnum):
 _KEPT, RESERVED = 4096, 4
 
 
-class Rules(NamedTuple):
-    """The supervisor's rules; ``Safety.rules`` makes them."""
+class RunLimits(NamedTuple):
+    """The supervisor's rules for n axes and m control signals, as kernels take them."""
 
-    low: float  #: lower limit of u [u-unit], ≤ 0
-    high: float  #: upper limit, ≥ 0
-    most_error: float  #: largest ``|r − y|`` [y-unit]
-    most_f: float  #: largest ``|f̂|`` [y-unit/s^n]
-    hold: int
-    ramp: int
-    settle: int
-    most_saturated: int
-    most_overruns: int
-    y_low: float = -np.inf  #: plausible range of y [y-unit]
-    y_high: float = np.inf
-    longest_start: int = 1 << 60  #: samples after which START is given up
-    direction: float = 0.0  #: sign of b0; 0 for no check of the first motion
-    reach: float = np.nan  #: error at which the law puts u to its limit [y-unit]
-    b0: float = np.nan  #: of a compensator [y-unit/s^n per u-unit]
-    most_opposed: float = np.inf  #: largest score of the check of its sign [samples]
-
-    def text(self, dt: float) -> str:
-        """Return the rules as a line of text, for a sample time ``dt`` [s]."""
-        parts = [f"u from {self.low:.6g} to {self.high:.6g}", *self.bounds_text()]
-        parts.append(checked_text(bool(self.direction), self.most_opposed))
-        return ", ".join([*parts, *counts_of_samples(self, dt)])
-
-    def bounds_text(self) -> list[str]:
-        """Return the bounds of y, of the error and of f̂ as text, where there are some."""
-        parts = []
-        if np.isfinite([self.y_low, self.y_high]).any():
-            parts.append(f"y from {self.y_low:.6g} to {self.y_high:.6g}")
-        if np.isfinite(self.most_error):
-            parts.append(f"|r − y| up to {self.most_error:.6g}")
-        if np.isfinite(self.most_f):
-            parts.append(f"|f̂| up to {self.most_f:.6g}")
-        return parts
-
-
-class AxesLimits(NamedTuple):
-    """The supervisor's rules for several axes, for kernels; names are those of ``Rules``."""
-
-    low: Vector  #: (m,)
-    high: Vector
-    most_error: Vector  #: (n,)
-    most_f: Vector
-    y_low: Vector
+    low: Vector  #: lower limits of u [u-unit], ≤ 0 (m,)
+    high: Vector  #: upper limits, ≥ 0
+    most_error: Vector  #: largest ``|r − y|`` [y-unit] (n,)
+    most_f: Vector  #: largest ``|f̂|`` [y-unit/s^n]
+    y_low: Vector  #: plausible range of y [y-unit]
     y_high: Vector
     direction: Vector  #: 1, or 0 for no check of the first motion
-    reach: Vector
-    push: Vector  #: largest ``|v|`` within the limits of u, with the first B0 [y-unit/s^n]
-    most_opposed: Vector
+    reach: Vector  #: error at which the law puts u to its limit [y-unit]
+    b0: Vector  #: v = b0 u of one axis; several axes know their v themselves
+    v_low: Vector  #: least v within the limits of u, with the first B0 [y-unit/s^n]
+    v_high: Vector  #: and largest
+    most_opposed: Vector  #: largest score of the check of the sign of b0 [samples]
     hold: int
     ramp: int
     settle: int
     most_saturated: int
     most_overruns: int
-    longest_start: int
+    longest_start: int = 1 << 60  #: samples after which START is given up
 
 
 @dataclass(frozen=True, eq=False)
-class AxesRules:
-    """The supervisor's rules for several axes; ``Safety.rules`` makes them."""
+class Rules:
+    """The supervisor's rules; ``Safety.rules`` makes them."""
 
-    names: tuple[str, ...]  #: of the axes
-    limits: AxesLimits  #: numbers for all, and arrays with one for each axis or actuator
+    names: tuple[str, ...]  #: of several axes; none of one
+    limits: RunLimits
 
     def text(self, dt: float) -> str:
         """Return the rules as a line of text, for a sample time ``dt`` [s]."""
-        limits, parts = self.limits, []
-        for k, (low, high) in enumerate(zip(limits.low, limits.high, strict=True)):
-            parts.append(f"u[{k}] from {low:.6g} to {high:.6g}")
-        for i, name in enumerate(self.names):
-            own = Rules(
-                *(0.0, 0.0, limits.most_error[i], limits.most_f[i]),
-                *(limits.hold, limits.ramp, limits.settle),
-                *(limits.most_saturated, limits.most_overruns),
-                *(limits.y_low[i], limits.y_high[i]),
-            )
-            parts += [f"{name}: {part}" for part in own.bounds_text()]
-        checked = checked_text(bool(np.any(limits.direction)), float(np.min(limits.most_opposed)))
-        return ", ".join([*parts, checked, *counts_of_samples(limits, dt)])
+        rules, parts = self.limits, []
+        for k, (low, high) in enumerate(zip(rules.low, rules.high, strict=True)):
+            name = f"u[{k}]" if self.names else "u"
+            parts.append(f"{name} from {low:.6g} to {high:.6g}")
+        for i, name in enumerate(self.names or ("",)):
+            before = f"{name}: " if name else ""
+            if np.isfinite([rules.y_low[i], rules.y_high[i]]).any():
+                parts.append(f"{before}y from {rules.y_low[i]:.6g} to {rules.y_high[i]:.6g}")
+            if np.isfinite(rules.most_error[i]):
+                parts.append(f"{before}|r − y| up to {rules.most_error[i]:.6g}")
+            if np.isfinite(rules.most_f[i]):
+                parts.append(f"{before}|f̂| up to {rules.most_f[i]:.6g}")
+        if np.isfinite(rules.most_opposed).any():
+            parts.append("sign of b0 checked")
+        else:
+            parts.append(f"first motion {'checked' if np.any(rules.direction) else 'not checked'}")
+        for name in ("settle", "hold", "ramp", "most_overruns", "most_saturated"):
+            samples = getattr(rules, name)
+            if samples * dt < 1e9:
+                parts.append(f"{name} {samples} samples ({samples * dt:.6g} s)")
+        return ", ".join(parts)
 
     def _asdict(self) -> dict[str, Any]:
-        """Return the rules by name, as ``Rules`` does; lists have one for each signal."""
-        found = {"axes": list(self.names)}
+        """Return the rules by name: numbers of one axis, lists with one for each of several."""
+        found: dict[str, Any] = {"axes": list(self.names)} if self.names else {}
         for name, value in self.limits._asdict().items():
-            found[name] = value.tolist() if isinstance(value, np.ndarray) else value
+            each = value.tolist() if isinstance(value, np.ndarray) else value
+            found[name] = each[0] if isinstance(each, list) and not self.names else each
         return found
-
-
-def checked_text(first_motion: bool, most_opposed: float) -> str:
-    """Return which check of signs there is as text."""
-    if np.isfinite(most_opposed):
-        return "sign of b0 checked"
-    return "first motion checked" if first_motion else "first motion not checked"
-
-
-def counts_of_samples(rules: Any, dt: float) -> list[str]:
-    """Return the rules that are numbers of samples as text, with their times."""
-    parts = []
-    for name in ("settle", "hold", "ramp", "most_overruns", "most_saturated"):
-        samples = getattr(rules, name)
-        if samples * dt < 1e9:
-            parts.append(f"{name} {samples} samples ({samples * dt:.6g} s)")
-    return parts
 
 
 class Memory(Scalars):
@@ -274,26 +237,27 @@ class Memory(Scalars):
     began: int  #: index k of the scenario's first sample; −1 before it
     missed_in_row: int  #: deadlines without a good sample, those that were skipped included
     skipped_in_row: int
-    at_limit_in_row: int  #: samples with u at a limit
     overruns_in_row: int
     unsent_in_row: int
     tripped: int  #: not zero if the device has set u to zero for good
-    u: float  #: as applied [u-unit]
-    ramp_start: float  #: u at the beginning of the ramp [u-unit]
-    y: float  #: last good measurement [y-unit]; NaN before the first
-    offset: float  #: distance from the reference to y at the scenario's first sample [y-unit]
-    y_rest_low: float  #: least y since the first cycle, before the scenario [y-unit]
-    y_rest_high: float  #: largest
-    y_began: float  #: y at the scenario's first sample [y-unit]
-    pushed: float  #: sum of u since then, with the sign of b0 [u-unit]
-    watching: int  #: how the first motion is judged, see ``quell.realtime.supervisor``
     culprit: int  #: number of the signal, from 1, to which the next change is due; 0 if to none
-    opposed: float  #: score of the check of the sign of b0 [samples]
     forgiven: int  #: missed samples in a row after which START goes on to count good ones
     host: int  #: a ``Host``
     waited: int  #: index k of the last cycle without a host
     ended_by: int  #: cause of the last RAMP, or of STOPPED without one
     ended_signal: int  #: its signal, as ``culprit``
+
+
+class Watch(Scalars):
+    """What an axis is judged by: its first motion, and the sign of its b0."""
+
+    y: float  #: last good measurement [y-unit]; NaN before the first
+    y_rest_low: float  #: least y since the first cycle, before the scenario [y-unit]
+    y_rest_high: float  #: largest
+    y_began: float  #: y at the scenario's first sample [y-unit]
+    pushed: float  #: sum of v since then
+    watching: int  #: how the first motion is judged, see ``quell.realtime.supervisor``
+    opposed: float  #: score of the check of the sign of b0 [samples]
 
 
 class Counters(Scalars):
@@ -307,11 +271,30 @@ class Counters(Scalars):
     unsent: int
 
 
+class LoopSignals(NamedTuple):
+    """The signals of a loop from one cycle to the next, for n axes and m control signals."""
+
+    y: Vector  #: as measured in this sample; NaN for what has not come (n,)
+    measured: Vector  #: what the controller gets: NaN in a sample that was skipped (n,)
+    r: Vector  #: references of this sample (n,)
+    f_hat: Vector  #: estimates after it; zero without (n,)
+    offset: Vector  #: distances from the references to y at the scenario's first sample (n,)
+    v: Vector  #: share of the applied u that moves each axis [y-unit/s^n] (n,)
+    wished: Vector  #: the controller's u (m,)
+    u: Vector  #: as applied (m,)
+    acting: Vector  #: what acts at a device with a clock of its own (m,)
+    next: Work  #: u of this sample, before it is applied (m,)
+    ramp_start: Vector  #: u at the beginning of the ramp (m,)
+    at_limit: NDArray[np.int64]  #: samples in a row with u at a limit (m,)
+    watched: NDArray[Watch]  #: (n,)
+
+
 class SupervisorState(NamedTuple):
     """State of the supervisor, which the loop writes and another thread may read."""
 
     memory: NDArray[Memory]
     counters: NDArray[Counters]
+    signals: LoopSignals
     #: k, mode, cause and number of the signal from 1, or 0, of each change of mode (·, 4)
     changes: NDArray[np.int64]
     changed: NDArray[np.int64]  #: number of changes of mode that are kept (1,), an atomic word
@@ -320,13 +303,30 @@ class SupervisorState(NamedTuple):
     steps: NDArray[np.int64]
 
 
-def initial_state() -> SupervisorState:
-    """Return the state before the first cycle."""
+def initial_state(outputs: int = 1, inputs: int = 1) -> SupervisorState:
+    """Return the state before the first cycle, for n axes and m control signals."""
     memory, (changed, requests, steps) = Memory.zeros(), np.zeros((3, 1), np.int64)
-    memory[0].began, memory[0].y = -1, np.nan
-    memory[0].y_rest_low, memory[0].y_rest_high = np.inf, -np.inf
+    memory[0].began = -1
+    watched = np.zeros(outputs, Watch.zeros().dtype)
+    for each in watched:
+        each.y, each.y_rest_low, each.y_rest_high = np.nan, np.inf, -np.inf
+    signals = LoopSignals(
+        y=np.full(outputs, np.nan),
+        measured=np.full(outputs, np.nan),
+        r=np.zeros(outputs),
+        f_hat=np.zeros(outputs),
+        offset=np.zeros(outputs),
+        v=np.zeros(outputs),
+        wished=np.zeros(inputs),
+        u=np.zeros(inputs),
+        acting=np.zeros(inputs),
+        next=np.zeros(inputs),
+        ramp_start=np.zeros(inputs),
+        at_limit=np.zeros(inputs, dtype=np.int64),
+        watched=watched,
+    )
     changes = np.zeros((_KEPT, 4), np.int64)
-    return SupervisorState(memory, Counters.zeros(), changes, changed, requests, steps)
+    return SupervisorState(memory, Counters.zeros(), signals, changes, changed, requests, steps)
 
 
 # ---- A check of the signs of y, u and b0 by the first motion after the controller takes over ----
@@ -344,32 +344,30 @@ _STRONG = 0.5  # share of a limit of u
 
 
 @kernel
-def runs_away(rules: Any, memory: Memory, r: float) -> bool:
-    """Return whether y runs away against u, in a sample of RUN with the reference ``r``.
+def runs_away(rules: RunLimits, signals: LoopSignals, i: int) -> bool:
+    """Return whether axis i runs away against u, in a sample of RUN.
 
-    ``rules`` are ``Rules``, or have their ``low``, ``high``, ``direction`` and ``reach``.
-
-    ``memory.u`` is the u that acted until this sample.
+    ``signals.v`` is that of the u which acted until this sample, ``signals.r`` the references.
     """
-    if memory.watching == OFF:
+    watch, v = signals.watched[i], signals.v[i]
+    if watch.watching == OFF:
         return False
-    push = rules.direction * memory.u
-    memory.pushed += push
-    moved, wanted = memory.y - memory.y_began, r - memory.y_began
-    against = moved * memory.pushed < 0.0
-    noise = _NOISE * (memory.y_rest_high - memory.y_rest_low)
-    if memory.watching == ARMED and abs(moved) > max(noise, _MOTION * rules.reach):
-        first = against and wanted * memory.pushed > 0.0 and abs(wanted) >= abs(moved)
-        memory.watching = SUSPECT if first else OFF
-    if memory.watching != SUSPECT or push * memory.pushed <= 0.0:
+    watch.pushed += v
+    moved, wanted, reach = watch.y - watch.y_began, signals.r[i] - watch.y_began, rules.reach[i]
+    against = moved * watch.pushed < 0.0
+    noise = _NOISE * (watch.y_rest_high - watch.y_rest_low)
+    if watch.watching == ARMED and abs(moved) > max(noise, _MOTION * reach):
+        first = against and wanted * watch.pushed > 0.0 and abs(wanted) >= abs(moved)
+        watch.watching = SUSPECT if first else OFF
+    if watch.watching != SUSPECT or v * watch.pushed <= 0.0:
         return False
     if not against:
-        if abs(moved) > max(noise, _RIGHT * rules.reach):
-            memory.watching = OFF
+        if abs(moved) > max(noise, _RIGHT * reach):
+            watch.watching = OFF
         return False
-    limit = rules.high if memory.u > 0.0 else -rules.low
-    far = _FAR * max(abs(wanted), rules.reach, noise)
-    return abs(memory.u) >= _STRONG * limit and abs(moved) > far
+    limit = rules.v_high[i] if v > 0.0 else -rules.v_low[i]
+    far = _FAR * max(abs(wanted), reach, noise)
+    return abs(v) >= _STRONG * limit and abs(moved) > far
 
 
 # Taken from the score of the check of b0 in a sample in which u is not at a limit. Chosen with the
@@ -378,20 +376,23 @@ _FORGIVEN = 0.25
 
 
 @kernel
-def is_opposed(memory: Memory, most: float, v: float, f_hat: float, push: float, at: bool) -> bool:
-    """Update the score of the check of the sign of b0; return whether it is above ``most``.
+def is_opposed(rules: RunLimits, signals: LoopSignals, i: int, at_limit: bool) -> bool:
+    """Update the score of the check of the sign of b0; return whether it is above its largest.
 
-    ``v`` is b0 times the u that acted until this sample, ``push`` the largest, and ``at`` says
-    whether u was at a limit.
+    ``signals.v`` is that of the u which acted until this sample, ``signals.f_hat`` the estimate
+    after it, and ``at_limit`` says whether that u was at a limit.
     """
-    if not is_finite(most):
+    watch, v = signals.watched[i], signals.v[i]
+    if not is_finite(rules.most_opposed[i]):
         return False
-    if at:
-        memory.opposed -= min(max((f_hat + v) * v / (push * push), -1.0), 1.0)
+    if at_limit:
+        push = max(rules.v_high[i], -rules.v_low[i])
+        change = (signals.f_hat[i] + v) * v / (push * push)
+        watch.opposed -= min(max(change, -1.0), 1.0)
     else:
-        memory.opposed -= _FORGIVEN
-    memory.opposed = max(memory.opposed, 0.0)
-    return memory.opposed > most
+        watch.opposed -= _FORGIVEN
+    watch.opposed = max(watch.opposed, 0.0)
+    return watch.opposed > rules.most_opposed[i]
 
 
 # ---- The supervisor ----
@@ -407,7 +408,8 @@ def change_mode(state: SupervisorState, k: int, mode: int, cause: int) -> None:
     memory.mode = mode
     memory.samples = 0
     if mode == Mode.RAMP:
-        memory.ramp_start = memory.u
+        for c in range(state.signals.u.size):
+            state.signals.ramp_start[c] = state.signals.u[c]
     if mode >= Mode.RAMP and cause != Cause.RAMPED:
         memory.ended_by, memory.ended_signal = cause, memory.culprit
     number = state.changed[0]
@@ -422,43 +424,44 @@ def change_mode(state: SupervisorState, k: int, mode: int, cause: int) -> None:
 
 
 @kernel
-def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples: int) -> None:
-    """Choose the mode of cycle ``k`` before the controller's step.
+def update_mode(rules: RunLimits, state: SupervisorState, k: int, samples: int) -> None:
+    """Choose the mode of cycle ``k`` before the controller's step, by its measurements.
 
-    ``y`` is the measurement, ``samples`` the number of samples of the scenario.
+    ``samples`` is the number of samples of the scenario.
     """
-    memory = state.memory[0]
-    good, settling = is_finite(y), memory.mode == Mode.START
-    if good:
-        memory.y = y
-    outside = memory.y < rules.y_low or memory.y > rules.y_high
-    choose_mode(rules, state, k, good, 1 if outside else 0, samples)
+    memory, signals = state.memory[0], state.signals
+    count, missing, last, outside = signals.y.size, 0, 0, 0
+    for i in range(count):
+        watch = signals.watched[i]
+        if is_finite(signals.y[i]):
+            watch.y = signals.y[i]
+        else:
+            missing, last = missing + 1, i + 1
+        if outside == 0 and (watch.y < rules.y_low[i] or watch.y > rules.y_high[i]):
+            outside = i + 1
+    good, settling = missing == 0, memory.mode == Mode.START
+    memory.culprit = 0 if missing == count else last
+    _choose_mode(rules, state, k, good, outside, samples)
+    memory.culprit = 0
     if settling and memory.mode == Mode.RUN:
-        memory.at_limit_in_row = 0
-        begin_watch(memory, y, rules.direction)
+        for c in range(signals.at_limit.size):
+            signals.at_limit[c] = 0
+        for i in range(count):
+            watch = signals.watched[i]
+            watch.y_began, watch.opposed = signals.y[i], 0.0
+            watch.watching = ARMED if rules.direction[i] != 0.0 else OFF
     elif settling and good and memory.mode == Mode.START:
-        widen_rest(memory, y)
+        for i in range(count):
+            watch = signals.watched[i]
+            watch.y_rest_low = min(watch.y_rest_low, signals.y[i])
+            watch.y_rest_high = max(watch.y_rest_high, signals.y[i])
 
 
 @kernel
-def begin_watch(memory: Memory, y: float, direction: float) -> None:
-    """Begin to judge the first motion, from y on, unless ``direction`` is 0."""
-    memory.y_began, memory.opposed = y, 0.0
-    memory.watching = ARMED if direction != 0.0 else OFF
-
-
-@kernel
-def widen_rest(memory: Memory, y: float) -> None:
-    """Take y into the range before the scenario."""
-    memory.y_rest_low = min(memory.y_rest_low, y)
-    memory.y_rest_high = max(memory.y_rest_high, y)
-
-
-@kernel
-def choose_mode(
-    rules: Any, state: SupervisorState, k: int, good: bool, outside: int, samples: int
+def _choose_mode(
+    rules: RunLimits, state: SupervisorState, k: int, good: bool, outside: int, samples: int
 ) -> None:
-    """Choose the mode of cycle ``k``; ``rules`` are those of one axis or of several.
+    """Choose the mode of cycle ``k``.
 
     ``good`` says whether all measurements came, ``outside`` is the number, from 1, of one beyond
     its plausible range, 0 if there is none.
@@ -496,7 +499,7 @@ def choose_mode(
 
 @kernel
 def _cause_to_end(
-    rules: Any, memory: Memory, k: int, request: int, outside: int, samples: int
+    rules: RunLimits, memory: Memory, k: int, request: int, outside: int, samples: int
 ) -> int:
     """Return the cause to end the run, as far as it is known before the controller's step."""
     cause = Cause.NONE
@@ -524,46 +527,64 @@ def _cause_to_end(
 
 
 @kernel
-def supervised_output(
-    rules: Rules, state: SupervisorState, k: int, wished: float, r: float, f_hat: float
-) -> float:
-    """Return the u to apply in cycle ``k``; in RUN, end the run if a limit is exceeded.
+def supervise_controls(rules: RunLimits, state: SupervisorState, k: int) -> None:
+    """Write the u to apply in cycle ``k``; in RUN, end the run if a limit is exceeded.
 
-    ``wished`` is the controller's u, ``r`` the reference of this sample, ``f_hat`` the estimate
-    after it, zero if the controller has none.
+    ``state.signals`` have the controller's u, and references and f̂ of this sample.
     """
-    memory = state.memory[0]
-    u = 0.0
+    memory, signals = state.memory[0], state.signals
+    count = signals.u.size
+    for c in range(count):
+        signals.next[c] = signals.u[c] if memory.mode == Mode.HOLD else 0.0
     if memory.mode == Mode.RUN:
-        at_limit = memory.at_limit_in_row > 0
-        push = rules.b0 * max(rules.high, -rules.low)
-        opposed = is_opposed(memory, rules.most_opposed, rules.b0 * memory.u, f_hat, push, at_limit)
-        u = min(max(wished, rules.low), rules.high)
-        at_limit = u == rules.low or u == rules.high
-        memory.at_limit_in_row = memory.at_limit_in_row + 1 if at_limit else 0
-        if not is_finite(wished):
-            change_mode(state, k, Mode.RAMP, Cause.NOT_A_NUMBER)
-        elif not abs(r - memory.y) <= rules.most_error:
-            change_mode(state, k, Mode.RAMP, Cause.TRACKING_ERROR)
-        elif not abs(f_hat) <= rules.most_f:
-            change_mode(state, k, Mode.RAMP, Cause.F_HAT)
-        elif memory.at_limit_in_row > rules.most_saturated:
-            change_mode(state, k, Mode.RAMP, Cause.SATURATED)
-        elif opposed or runs_away(rules, memory, r):
-            change_mode(state, k, Mode.RAMP, Cause.WRONG_WAY)
-    elif memory.mode == Mode.HOLD:
-        u = memory.u
+        _limit_and_end(rules, state, k)
     if memory.mode == Mode.RAMP:
         memory.samples += 1
-        left = rules.ramp - memory.samples
-        u = memory.ramp_start * left / rules.ramp
-        if left <= 0 or memory.ramp_start == 0.0:
-            u = 0.0
+        left, most = rules.ramp - memory.samples, 0.0
+        for c in range(count):
+            signals.next[c] = signals.ramp_start[c] * left / rules.ramp
+            most = max(most, abs(signals.ramp_start[c]))
+        if left <= 0 or most == 0.0:
+            for c in range(count):
+                signals.next[c] = 0.0
             change_mode(state, k, Mode.STOPPED, Cause.RAMPED)
     elif memory.mode == Mode.STOPPED:
         memory.samples += 1
-    memory.u = u
-    return u
+    for c in range(count):
+        signals.u[c] = signals.next[c]
+
+
+@kernel
+def _limit_and_end(rules: RunLimits, state: SupervisorState, k: int) -> None:
+    """Put the controller's u within its limits; change the mode to RAMP if a rule is broken."""
+    memory, signals = state.memory[0], state.signals
+    was_at_limit, cause, culprit = False, Cause.NONE, 0
+    for c in range(signals.u.size):
+        was_at_limit |= signals.at_limit[c] > 0
+    for c in range(signals.u.size):
+        u = min(max(signals.wished[c], rules.low[c]), rules.high[c])
+        signals.next[c] = u
+        at_limit = u == rules.low[c] or u == rules.high[c]
+        signals.at_limit[c] = signals.at_limit[c] + 1 if at_limit else 0
+    for i in range(signals.watched.size):  # the later ones of these rules go first
+        opposed = is_opposed(rules, signals, i, was_at_limit)
+        if runs_away(rules, signals, i) or opposed:
+            cause, culprit = Cause.WRONG_WAY, i + 1
+    for c in range(signals.u.size):
+        if signals.at_limit[c] > rules.most_saturated:
+            cause, culprit = Cause.SATURATED, c + 1
+    for i in range(signals.watched.size):
+        if not abs(signals.f_hat[i]) <= rules.most_f[i]:
+            cause, culprit = Cause.F_HAT, i + 1
+    for i in range(signals.watched.size):
+        if not abs(signals.r[i] - signals.watched[i].y) <= rules.most_error[i]:
+            cause, culprit = Cause.TRACKING_ERROR, i + 1
+    for c in range(signals.u.size):
+        if not is_finite(signals.wished[c]):
+            cause, culprit = Cause.NOT_A_NUMBER, c + 1
+    if cause != Cause.NONE:
+        memory.culprit = culprit
+        change_mode(state, k, Mode.RAMP, cause)
 
 
 @kernel
@@ -578,3 +599,12 @@ def wait_for_host(state: SupervisorState, k: int) -> None:
 def finished(state: SupervisorState) -> bool:
     """Return whether u is zero and was written often enough."""
     return state.memory[0].mode == Mode.STOPPED and state.memory[0].samples > FLUSH
+
+
+@kernel
+def all_measured(state: SupervisorState) -> bool:
+    """Return whether each measurement has come once."""
+    for i in range(state.signals.watched.size):  # noqa: SIM110  kernels keep to loops
+        if not is_finite(state.signals.watched[i].y):
+            return False
+    return True
