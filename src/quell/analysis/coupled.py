@@ -250,7 +250,7 @@ def certify_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Coupled
     κ of each axis is that of its guard, or of ``Guard()`` if it has none; ``condition`` names the
     axes that learn without guard, for which the bounds do not hold.
     """
-    adrcs = [linear_adrc(each) for each in axes.axes]
+    adrcs = [linear_adrc(each) for each in axes.unit_axes]
     matrices = sampled_matrices(plant, axes.dt, operating_point)
     inverse = gain_at(axes, estimates_at(axes, plant, operating_point))[1]
     to_error, to_output = coupled_loop(matrices, adrcs, inverse)

@@ -174,7 +174,8 @@ def gain_at(axes: Axes, x: Any = None) -> tuple[Matrix, Matrix]:
     point = state.x if x is None else np.asarray(x, dtype=np.float64)
     if update_gain(axes.parameters.gain, state.gain, point):
         raise ValueError(f"B0 at x = {point.tolist()!r}: is not finite, or has no inverse")
-    return state.gain.B.copy(), state.gain.inverse.copy()
+    b0 = np.array([axis.observer.b0 for axis in axes.axes])
+    return b0[:, None] * state.gain.B, state.gain.inverse / b0
 
 
 def estimates_at(axes: Axes, plant: Any, operating_point: Any) -> Matrix | None:
@@ -201,7 +202,7 @@ def law_of_axes(axes: Axes, x: Any = None) -> MatrixLaw:
     for a drive without a linear law.
     """
     B0, inverse = gain_at(axes, x)
-    law = joined([linear_law(axis) for axis in axes.axes], inverse)
+    law = joined([linear_law(axis) for axis in axes.unit_axes], inverse)
     if not axes.compensates:
         return law
     # Each compensator is asked for (B0 u_0)_i; what B0 does not see of u_0 passes (more actuators

@@ -355,6 +355,10 @@ class ADRC(Compensator):
         if isinstance(self.feedforward, Feedforward):
             self.feedforward = self.feedforward.with_inertia(ratio, self.observer.degree)
 
+    def _take_gain(self, ratio: float) -> None:
+        if isinstance(self.feedforward, Feedforward):
+            self.feedforward = self.feedforward.with_gain(ratio)
+
     def _check_law_of_schedule(self) -> None:
         """Raise a ``ValueError`` for parts of the law that a schedule does not reach."""
         flat = isinstance(self.feedforward, Feedforward) and len(self.feedforward.numerator) > 1

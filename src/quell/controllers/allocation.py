@@ -1,7 +1,9 @@
 """From what the axes ask for to what the actuators do: B0, its inverse, and limits.
 
-The axes are ``y_i^(n_i) = f_i + v_i`` with ``v = B0 u``, B0 (n, m). Each axis asks for v_i. With
-the weights W of the actuators (diagonal) and a wished u_r, the u that comes nearest to u_r is
+The axes are ``y_i^(n_i) = f_i + (B0 u)_i``, B0 (n, m). Each asks for its own input v_i, with a gain
+b0_i of its own, ``y_i^(n_i) = f_i + b0_i v_i``, so that ``v = diag(1/b0) B0 u``; in what follows B0
+stands for that product, which is 1 for one axis with the b0 of its actuator. With the weights W of
+the actuators (diagonal) and a wished u_r, the u that comes nearest to u_r is
 
     u = u_r + B0⁺ (v − B0 u_r),        B0⁺ = W⁻¹ B0ᵀ (B0 W⁻¹ B0ᵀ)⁻¹
 
@@ -689,7 +691,7 @@ class Gain(NamedTuple):
     design: Any
     code: Any  # the compiled function, kept as long as its address
     shape: tuple[int, int]  # (n, m)
-    first: Matrix  # B0 before the first sample
+    first: Matrix  # diag(1/b0) B0 before the first sample
     weights: Vector
 
     def memory(self) -> GainMemory:
@@ -713,13 +715,15 @@ def checked_gain(
     names: Sequence[str],
     most: int,
     weighs_change: bool = False,
+    b0: Vector | None = None,
 ) -> Gain:
-    """Return B0 of axes with these names, given as B0 or as its inverse M.
+    """Return ``diag(1/b0) B0`` of axes with these names; B0 is given, or its inverse M.
 
     Parameters
     ----------
     B0, M
-        a matrix or a function of the estimates (n, most), one of them; neither is the unit matrix.
+        a matrix or a function of the estimates (n, most), one of them; neither is ``diag(b0)``: an
+        actuator for each axis.
     weights
         of the actuators, or None for ones.
     names
@@ -728,6 +732,8 @@ def checked_gain(
         largest order of an axis.
     weighs_change
         whether weights have a use with as many actuators as axes, too.
+    b0
+        of the n axes, the gains of their own inputs; ones by default, and where B0 is a function.
 
     Raises
     ------
@@ -738,10 +744,17 @@ def checked_gain(
         raise ValueError("B0 and M are both given: M is the inverse of B0; give one of them")
     name, given = ("M", M) if M is not None else ("B0", B0)
     n = len(names)
+    b0 = np.ones(n) if b0 is None else b0
     if given is None:
-        given = np.eye(n)
+        given = np.diag(b0)
     x = np.zeros((n, most))
     if callable(given):
+        for axis, own in zip(names, b0, strict=True):
+            if own != 1.0:
+                raise ValueError(
+                    f"axes: {axis} has an observer with b0 = {float(own)!r}: must be 1 where "
+                    f"{name} is a function, which knows the gains of the actuators"
+                )
         rule = f"it takes x, an array ({n}, {most}) of estimates x[axis, derivative]"
         plain, values = user_functions.separated(name, given, 1)
         frozen(plain)  # compiles helpers again whose globals have changed
@@ -769,6 +782,7 @@ def checked_gain(
     _check_condition(name, first, names)
     start: Matrix = np.asarray(np.linalg.inv(first) if name == "M" else first, dtype=np.float64)
     if not callable(given):
+        start = start / b0[:, None]
         return Gain(ConstantGain(start), None, (n, count), start, of_actuators)
     shapes = user_functions.shapes_of(values)
     try:

@@ -4,12 +4,12 @@ The machine is
 
     y_i^(n_i) = f_i + (B0 u)_i,        i = 1 … n
 
-with u (m,) of the actuators, m ≥ n. Each axis is an ``ADRC`` of its own with b0 = 1 and the input
-``v_i = (B0 u)_i``: whatever couples the axes beyond B0 (centrifugal and Coriolis forces, gravity, a
-B0 that is not right) is in f_i, which its observer estimates and its learner learns. The axes ask
-for v, ``controllers/allocation.py`` finds u within the limits of the actuators, and every observer
-receives ``(B0 u)_i`` with the u that was applied. So the limits of one actuator, which take
-something from all axes, are no disturbance to any of them.
+with u (m,) of the actuators, m ≥ n. Each axis is an ``ADRC`` of its own with the input v_i and the
+gain b0_i, ``b0_i v_i = (B0 u)_i``, usually 1: whatever couples the axes beyond B0 (centrifugal and
+Coriolis forces, gravity, a B0 that is not right) is in f_i, which its observer estimates and its
+learner learns. The axes ask for v, ``controllers/allocation.py`` finds u within the limits of the
+actuators, and every observer receives its v_i with the u that was applied. So the limits of one
+actuator, which take something from all axes, are no disturbance to any of them.
 
 B0 is a constant matrix or a function of the estimates, of a robot for instance the inverse of its
 mass matrix M(q). With an exact B0 the axes are independent loops; with another one their stability
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.allocation import (
     ActuatorLimits,
+    ConstantGain,
     FunctionGain,
     Gain,
     GainMemory,
@@ -77,6 +78,7 @@ from quell.controllers.each_axis import (
     tell_axes,
     transfer_axes,
     write_axes,
+    write_motions,
 )
 from quell.controllers.given_controls import (
     ANY_CUT,
@@ -120,6 +122,7 @@ from quell.controllers.shaped_references import (
 )
 from quell.controllers.stateful import StatefulController
 from quell.kernels.sized import Flag, Scalars, Work, clear
+from quell.observers.eso import ESO, with_gains
 from quell.types import Channels, Matrix, Status, Vector
 
 # ---- A sample of all axes ----
@@ -216,11 +219,12 @@ def _set_applied_controls(design: AxesDesign, state: AxesState, u: Vector) -> No
 @motion_by.register(AxesDesign)
 def _motion_by(design: AxesDesign, state: AxesState, b0: Vector, u: Vector, v: Vector) -> None:
     apply_to_axes(state.gain, u, v)
+    write_motions(design.axes, state.axes, v, v)
 
 
 @write_applied.register(AxesDesign)
 def _write_applied(design: AxesDesign, state: AxesState, u: Vector, row: Vector) -> None:
-    apply_to_axes(state.gain, u, row[: state.v.size])  # the first channel
+    motion_by(design, state, state.v, u, row[: state.v.size])  # the first channel
 
 
 @tell_applied.register(AxesDesign)
@@ -293,8 +297,7 @@ def _reset_loop(design: AxesDesign, state: AxesState) -> None:
 @write_row.register(AxesDesign)
 def _write_row(design: AxesDesign, state: AxesState, row: Vector) -> None:
     n = state.v.size
-    for i in range(n):
-        row[i] = state.v[i]
+    write_motions(design.axes, state.axes, state.v, row)
     row[n] = state.loop[0].status
     end = write_axes(design.axes, state.axes, n + 1, design.widths, row)
     write_given(design.given, state.given, end, row)
@@ -319,8 +322,8 @@ class Axes(StatefulController):
     Parameters
     ----------
     axes
-        an ``ADRC`` for each axis, all with one ``dt``, with an observer of ``b0 = 1`` and without
-        limits of u: what it calls u is v_i, the acceleration (for order 2) that it asks for. In a
+        an ``ADRC`` for each axis, all with one ``dt``, and without limits of u: what it calls u is
+        v_i, for ``b0 = 1`` the acceleration (for order 2) that it asks for. In a
         dictionary each has a name. They are copied. One that is ``Prefiltered`` follows its shaped
         reference; ``prefilters`` has them, None for an axis without. Or a ``Compensator`` for each:
         then control signals u_0 of the actuators (m,) take the place of the references r, and
@@ -330,8 +333,8 @@ class Axes(StatefulController):
         of the estimates that returns it. The function takes ``x[axis, derivative]``, so ``x[0, 0]``
         is the position of the first axis and ``x[1, 1]`` the rate of the second; it is compiled.
         Parameters that ``functools.partial`` binds by name, numbers, vectors or matrices, are data:
-        other values of them compile nothing. By default the unit matrix: each actuator moves one
-        axis.
+        other values of them compile nothing; each axis has b0 = 1 then. By default each actuator
+        moves one axis, with its b0.
     M
         the inverse of B0 instead, of a robot its mass matrix: a matrix or a function.
     u_min, u_max
@@ -386,6 +389,7 @@ class Axes(StatefulController):
 
     parameters: AxesDesign
     _state: AxesState
+    _moved = 1.0  # what was taken from the gain of one actuator into the b0 of its axis
 
     def __init__(
         self,
@@ -414,6 +418,11 @@ class Axes(StatefulController):
         self.axes: tuple[Any, ...] = tuple(copy.copy(axis) for axis in parts)
         self.B0, self.M, self.weights = B0, M, weights
         self._gain = self._checked_gain()
+        if self._gain.first.shape == (1, 1) and isinstance(self._gain.design, ConstantGain):
+            # The gain of one actuator is the b0 of its axis, which has the bits of that ADRC then.
+            self._moved = float(self._gain.first[0, 0])
+            self.axes = (self.axes[0].with_b0(float(self.first_gain[0, 0])),)
+            self._gain = self._checked_gain()
         check_compensates(self.compensates, drives, wished)
         self._rule = checked_rule(saturation, wished, self._gain, self.names)
         self.drives = checked_drives(drives, self.names, self.inputs, self.dt)
@@ -458,7 +467,16 @@ class Axes(StatefulController):
     @property
     def first_gain(self) -> Matrix:
         """B0 before the first sample (n, m)."""
-        return self._gain.first.copy()
+        return self._b0[:, None] * self._gain.first
+
+    @property
+    def unit_axes(self) -> tuple[Any, ...]:
+        """The axes as controllers of ``y^(n)``, with b0 = 1: what they ask for is (B0 u)_i."""
+        return tuple(axis if axis.observer.b0 == 1.0 else axis.with_b0(1.0) for axis in self.axes)
+
+    @property
+    def _b0(self) -> Vector:
+        return np.array([axis.observer.b0 for axis in self.axes])
 
     @property
     def _most(self) -> int:
@@ -469,8 +487,8 @@ class Axes(StatefulController):
         return any(axis.safe_set is not None for axis in self.axes)
 
     def _checked_gain(self) -> Gain:
-        given = (self.B0, self.M, self.weights)
-        return checked_gain(*given, self.names, self._most, weighs_change=self._has_bands)
+        given = (self.B0, self.M, self.weights, self.names, self._most)
+        return checked_gain(*given, weighs_change=self._has_bands, b0=self._b0)
 
     @property
     def derivatives(self) -> tuple[int, ...]:
@@ -695,7 +713,9 @@ class Axes(StatefulController):
             omega_c = changes["omega_c"]
             raise ValueError(f"omega_c = {omega_c!r}: a compensator has no law; give an observer")
         self.learning.check_retuning(changes)
-        place = self.index(axis)
+        place, new = self.index(axis), changes.get("observer")
+        if self._moved != 1.0 and isinstance(new, ESO):
+            changes["observer"] = with_gains(new, new.b0 * self._moved, new.omega_o)
         self.axes[place]._axis = ""
         try:
             self.axes[place].retune(**changes)

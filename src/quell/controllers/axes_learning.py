@@ -112,7 +112,7 @@ def gather_axis(
     loop, estimates = state.loop[0], state.estimates
     order, dt = axis.law.size, learning.dt
     # y^(n) as the observer has it, for f that enters where v does.
-    rate = axis.cancel_f * (loop.u + estimates[order] + loop.f_learned + loop.f_known)
+    rate = axis.cancel_f * (axis.b0 * loop.u + estimates[order] + loop.f_learned + loop.f_known)
     for j in range(order):
         rate -= axis.cancel_f * axis.cancel[j] * estimates[j]
         before[at + j] = estimates[j]

@@ -631,6 +631,33 @@ class Compensator(StatefulController):
         made._initialise()
         return made
 
+    def with_b0(self, b0: float) -> Any:
+        """Return the controller for an actuator of another gain, ``b0`` in place of the observer's.
+
+        What it knows in units of u is converted: limits, a feedforward, ``largest_u`` of a safe
+        set. It is new, and shares no state. Raises ``ValueError`` for a b0 of zero, and for a
+        controller with a schedule.
+        """
+        checks.nonzero("b0", b0, "or u does not reach y")
+        if self.schedule is not None:
+            raise ValueError("with_b0: the controller has a schedule; make one for this b0")
+        ratio = b0 / self.observer.b0
+        made = type(self).__new__(type(self))
+        vars(made).update(vars(self))
+        made.observer = with_gains(self.observer, b0, self.observer.omega_o)
+        if self.safe_set is not None:
+            largest = self.safe_set.largest_u / abs(ratio)
+            made.safe_set = replace(self.safe_set, largest_u=largest)
+        low, high = sorted((self._limits.low / ratio, self._limits.high / ratio))
+        least, most = sorted((self._limits.least_change / ratio, self._limits.most_change / ratio))
+        made._limits = Limits(low, high, most, least)
+        made._take_gain(ratio)
+        made._initialise()
+        return made
+
+    def _take_gain(self, ratio: float) -> None:
+        """Convert what depends on the actuator to a gain ``ratio`` times as large: nothing here."""
+
     def _take_inertia(self, ratio: float) -> None:
         """Convert what depends on the inertia to ``ratio`` times as much: nothing here."""
 

@@ -48,6 +48,11 @@ def write_axis(axis: Any, state: Any, i: int, at: int, widths: Any, row: Vector)
     return at + widths[i]
 
 
+def write_motion(axis: Any, state: Any, i: int, v: Vector, row: Vector) -> None:
+    """Write what the input v of an axis does to it, ``b0 v``, into ``row``."""
+    row[i] = axis.b0 * v[i]
+
+
 def set_axis_derivatives(
     axis: Any, state: Any, i: int, at: int, counts: Any, values: Vector
 ) -> int:
@@ -101,6 +106,7 @@ ask_axes = for_each("ask_axes", ask_axis)
 tell_axes = for_each("tell_axes", tell_axis)
 reset_axes = for_each("reset_axes", reset_axis)
 write_axes = for_each("write_axes", write_axis)
+write_motions = for_each("write_motions", write_motion)
 set_axes_derivatives = for_each("set_axes_derivatives", set_axis_derivatives)
 start_axes = for_each("start_axes", start_axis)
 axes_started = for_each("axes_started", count_started)

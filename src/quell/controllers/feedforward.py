@@ -270,6 +270,12 @@ class Feedforward:
         heavier = tuple(ratio * c if i >= degree else c for i, c in enumerate(own))
         return replace(self, coefficients=heavier)
 
+    def with_gain(self, ratio: float) -> Feedforward:
+        """Return it for an actuator that moves the plant ``ratio`` times as much for the same u."""
+        own = tuple(c / ratio for c in self.coefficients)
+        coulomb, constant = self.coulomb / ratio, self.constant / ratio
+        return replace(self, coefficients=own, coulomb=coulomb, constant=constant)
+
     def linear_part(self, reference: Signal, t: Vector, dt: float) -> tuple[Vector, Vector]:
         """Return y, and u_ff without friction and constant, at times (k,) [s].
 

@@ -380,11 +380,6 @@ def check_axes(axes: Sequence[Any], names: Sequence[str]) -> None:
             raise ValueError(
                 f"axes: {name} has dt = {axis.dt!r} s, {names[0]} {axes[0].dt!r} s: must be one dt"
             )
-        if axis.observer.b0 != 1.0:
-            raise ValueError(
-                f"axes: {name} has an observer with b0 = {axis.observer.b0!r}: must be 1, its "
-                "input is v = B0 u; the gain of the actuator belongs in B0"
-            )
         limits = axis.limits
         if any(map(np.isfinite, limits)):
             raise ValueError(

@@ -578,7 +578,8 @@ def _made(axes: Axes, values: Matrix) -> Axes:
     made = copy.copy(axes)
     for axis, (omega_c, omega_o) in zip(made.axes, values.tolist(), strict=True):
         axis._axis = ""  # until ``made`` is made anew with all of them
-        axis.retune(omega_c=omega_c, observer=with_gains(axis.observer, 1.0, omega_o))
+        observer = with_gains(axis.observer, axis.observer.b0, omega_o)
+        axis.retune(omega_c=omega_c, observer=observer)
         # A learner keeps its scales when a running axis is retuned.
         axis._learner_omega_c = omega_c
         axis._initialise()
