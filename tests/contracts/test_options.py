@@ -86,6 +86,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "sweep": (*_SETUP, *_FIGURES),
     "export": (*_SETUP, "--out", "c"),
     "studio": (*_SETUP, "--no-browser"),
+    "docs": ("zeros",),
     "doctor": (),
     "completion": ("bash",),
 }
@@ -178,7 +179,7 @@ CASES: dict[str, dict[str, Case]] = {
         "--prove": ("--prove",), "--spread": ((*_EXPORT, "--prove"), (*_EXPORT, "--prove", "--spread", "0.2")),
     },
     "studio": {"SETUP": (("--no-browser",), ("setup.toml", "--no-browser")), "--port": ("--port", "0"), "--browser": (_SETUP, (*_SETUP, "--no-browser"))},
-    "doctor": {}, "completion": {"SHELL": (("bash",), ("fish",))},
+    "docs": {"WORDS": ("notch",), "--browser": ("--browser",)}, "doctor": {}, "completion": {"SHELL": (("bash",), ("fish",))},
 }  # fmt: skip
 
 
@@ -342,7 +343,11 @@ def test_no_output_replaces_a_file(
 ) -> None:
     """Named files are looked at before the work; so the option has an effect."""
     base = [each for each in BASES[command] if each != "--no-figures"]
-    more = () if option == "--figures" or command in ("b0", "rank", "watch", "doctor") else _FIGURES
+    more = (
+        ()
+        if option == "--figures" or command in ("b0", "rank", "watch", "docs", "doctor")
+        else _FIGURES
+    )
     taken = "taken.nc" if option == "--save" else "taken.json"
     code, told = outcome(command, *base, *more, option, taken)
     assert code != 0

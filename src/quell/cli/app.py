@@ -14,6 +14,7 @@ from quell.cli.doctor import doctor
 from quell.cli.exit_codes import HELP, ExitCode
 from quell.cli.identify import b0, excite, identify
 from quell.cli.monitor import rank, watch
+from quell.cli.pages import docs
 from quell.cli.reproduce import acc, torsional, two_mass
 from quell.cli.rig import proxy, replay, rig, run_rig
 from quell.cli.run import export, run, studio, sweep
@@ -78,6 +79,7 @@ for _each in (
     sweep,
     export,
     studio,
+    docs,
     doctor,
     completion,
 ):
