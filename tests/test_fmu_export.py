@@ -8,9 +8,11 @@ import math
 import re
 import shutil
 import subprocess
+import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -67,6 +69,20 @@ def _compile_quickly() -> Iterator[None]:
         quick = tuple(option for option in module._OPTIONS if option != "-O2")
         patch.setattr(module, "_OPTIONS", quick)
         yield
+
+
+def test_the_headers_of_fmi_come_from_fmpy_and_nothing_else_of_it_is_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Without it, or without its headers, an export says what to install and writes nothing."""
+    module = importlib.import_module("quell.export.fmi.fmu")
+    assert "fmi3Instance" in module.headers()["fmi3FunctionTypes.h"]
+    for stand_in in (None, SimpleNamespace(__file__=str(tmp_path / "x.py"), __version__="0")):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, "fmpy", stand_in)
+            with pytest.raises(ImportError, match=r"install 'quell-control\[fmi\]'"):
+                fmu(plain(), tmp_path / "servo.fmu")
+    assert not (tmp_path / "servo.fmu").exists()
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
+from quell.checks import import_extra
 from quell.controllers.base import check_controller
 from quell.export import reserved
 from quell.export.c_files import plant_source
@@ -53,6 +54,7 @@ from quell.export.fmi.parts import (
 from quell.export.library.exported import FLAGS, NoCompilerError
 from quell.export.translate.text import TranslationError, checked_name
 from quell.files import check_regular, check_writable, whole_text, written_atomically
+from quell.lazy import install
 from quell.lti.models import is_linear_model
 from quell.plants.base import check_plant, is_several
 from quell.plants.linear import LinearPlant
@@ -563,6 +565,8 @@ def fmu(
     ValueError
         for a name that is no C name, parts that can't be translated to C (``TranslationError``
         names them), no compiler, and a file that exists.
+    ImportError
+        without FMPy, which brings the headers of FMI (extra ``fmi``).
 
     Notes
     -----
@@ -579,6 +583,7 @@ def fmu(
         raise ValueError(f"path = {str(target)!r}: must end in .fmu")
     name = checked_name(name or target.stem, "FMI")
     check_writable(target, checks.flag("overwrite", overwrite))
+    fixed = headers()
     plant, controller = _parts(part)
     own = _own_sources(sources)
     model, files = _model(plant, controller, name, dt, x0)
@@ -586,7 +591,7 @@ def fmu(
         raise _two_files(each)
     if checks.flag("binary", binary):
         place(name)
-    content = _content(model, files | own, name, binary)
+    content = _content(model, fixed | files | own, name, binary)
     with (
         written_atomically(target, overwrite) as file,
         zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -683,6 +688,28 @@ def _model(
                 "axis another name"
             )
     return model, files
+
+
+# The headers of the standard, which come from FMPy.
+_HEADERS = ("fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h")
+
+
+def headers() -> dict[str, str]:
+    """Return the headers of FMI 3.0 of the Modelica Association, as the installed FMPy has them.
+
+    Raises
+    ------
+    ImportError
+        without FMPy, naming the extra that installs it, and for an FMPy without these headers.
+    """
+    fmpy = import_extra("fmpy", "fmi", "an FMU, whose headers come from it,")
+    folder = Path(fmpy.__file__).parent / "c-code"
+    try:
+        return {name: (folder / name).read_text(encoding="utf-8") for name in _HEADERS}
+    except OSError as error:
+        raise ImportError(
+            f"FMPy {fmpy.__version__} has no {Path(str(error.filename)).name}: {install('fmi')}"
+        ) from None
 
 
 def _content(
