@@ -15,7 +15,7 @@ import pytest
 # the file that gathers the public names of folder x and its subfolders. A new folder needs an entry
 # here.
 ROWS = (
-    ("lazy", "types", "checks", "files", "parallel", "quantities"),
+    ("hints", "lazy", "types", "checks", "files", "parallel", "quantities"),
     ("kernels",),
     ("lti", "signals", "observers", "plants", "features"),
     ("learners", "guard"),

@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from quell.hints import OF_MODULES, MissingAttributeError
+
 
 def imported_on_use(
     package: str,
@@ -42,7 +44,8 @@ def imported_on_use(
         elif name in known:
             value = importlib.import_module(f"{package}.{known[name]}")
         else:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            public = vars(sys.modules[package]).get("__all__", [*homes, *known])
+            raise MissingAttributeError(f"module {package!r}", name, public, lambda: OF_MODULES)
         setattr(sys.modules[package], name, value)
         return value
 

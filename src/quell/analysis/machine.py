@@ -10,6 +10,7 @@ from quell.analysis.loop import LoopAnalysis, analyse_axis
 from quell.analysis.multivariable import MultivariableLoop, analyse_axes
 from quell.controllers.axes import Axes
 from quell.controllers.base import Controller
+from quell.hints import explained
 
 
 @overload
@@ -28,6 +29,7 @@ def analyse(
 ) -> LoopAnalysis: ...
 
 
+@explained("quell.analysis.analyse(plant, controller)")
 def analyse(
     plant: Any,
     controller: Controller | Axes,

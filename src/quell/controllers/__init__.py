@@ -39,6 +39,7 @@ from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
 from quell.controllers.state_space import StateFeedback
+from quell.lazy import imported_on_use
 
 __all__ = [
     "ADRC",
@@ -76,3 +77,5 @@ __all__ = [
     "state_feedback",
     "warn_if_unwise",
 ]
+
+__getattr__ = imported_on_use(__name__, {})

@@ -76,6 +76,7 @@ from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import NoSchedule, Schedule, ScheduleDesign
 from quell.controllers.stateful import Retuning
 from quell.guard import Guard
+from quell.hints import explained
 from quell.learners.base import Learner
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
@@ -177,6 +178,7 @@ def check_zeros(observer: ESO) -> None:
 # ---- The ADRC controller ----
 
 
+@explained("quell.ADRC(observer, omega_c=2.0), with observer = quell.ESO.model_free(…)")
 class ADRC(Compensator):
     """Active disturbance rejection control around an ESO, with or without a learner.
 

@@ -40,6 +40,7 @@ from quell.controllers.memory import (
     start_from_rest,
     written_image,
 )
+from quell.hints import OF_CONTROLLERS, Hinted
 from quell.kernels import dispatch
 from quell.kernels.dispatch import compiled_call, dispatcher_for, explain_compile_errors
 from quell.kernels.sized import Constant, ConstantFlag, SizedArray, layout_of, type_of
@@ -205,7 +206,7 @@ class Retuning(NamedTuple):
     take: Callable[[], None]
 
 
-class StatefulController(Described):
+class StatefulController(Described, Hinted):
     """A controller with its own running state, which ``simulate`` does not touch.
 
     A subclass sets its attributes, then calls ``_initialise``. It defines ``_update_parameters``,
@@ -220,6 +221,9 @@ class StatefulController(Described):
     _packed: Any
     _step: Callable[..., Any]
     _axis = ""  # its name, if it is one of ``quell.Axes``; a copy is none
+
+    def _meant(self) -> Mapping[str, str]:
+        return OF_CONTROLLERS
 
     def described(self) -> dict[str, Any]:
         """Return what ``repr`` prints: arguments by name, and finite limits of u and its rate."""

@@ -7,6 +7,7 @@ and its name here; users can also write one, see ``base.py``.
 from quell.features.all_axes import AllAxes
 from quell.features.base import Bias, Custom, Features, Input, Joined, Polynomial, State
 from quell.features.basis import RBF, Friction, Periodic, RandomFourier
+from quell.lazy import imported_on_use
 
 __all__ = [
     "RBF",
@@ -22,3 +23,5 @@ __all__ = [
     "RandomFourier",
     "State",
 ]
+
+__getattr__ = imported_on_use(__name__, {})

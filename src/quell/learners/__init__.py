@@ -4,6 +4,7 @@ Files of this folder itself are the base of its subfolders. May import ``feature
 imports.
 """
 
+from quell.lazy import imported_on_use
 from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner
 from quell.learners.batch_gradient import BatchGradient
@@ -35,3 +36,5 @@ __all__ = [
     "infer",
     "learn",
 ]
+
+__getattr__ = imported_on_use(__name__, {})

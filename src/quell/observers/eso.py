@@ -12,6 +12,7 @@ import numpy as np
 
 from quell import checks
 from quell.checks import text
+from quell.hints import explained
 from quell.lti.canonical import Canonical, canonical, format_roots, without_far_zeros
 from quell.observers.design import (
     checked_disturbance_order,
@@ -34,6 +35,7 @@ from quell.observers.multivariable import MultivariableESO
 from quell.types import Vector, warn
 
 
+@explained("quell.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=1e-3)")
 @dataclass(frozen=True, eq=False)
 class ESO:
     """An extended state observer of a plant of order 1 to 8.
@@ -81,6 +83,7 @@ class ESO:
     disturbance_order: int = 1
 
     @classmethod
+    @explained("quell.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=1e-3)")
     def model_free(
         cls,
         order: int,
@@ -136,6 +139,7 @@ class ESO:
         return cls._design(chain, b0, omega_o, dt, form, half_gain, False, delay, poles, m)
 
     @classmethod
+    @explained("quell.ESO.model_based(plant, omega_o=20.0, dt=1e-3)")
     def model_based(
         cls,
         plant: Any,

@@ -35,6 +35,7 @@ import numpy as np
 
 from quell import checks
 from quell.checks import Described
+from quell.hints import explained
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Size
 from quell.lti.models import (
@@ -139,6 +140,7 @@ def _advance_many(
         x[i] = scratch[i]
 
 
+@explained("quell.plants.LinearPlant(A, B, C), or LinearPlant.of((num, den))")
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearPlant(Described):
     """A linear plant ``x' = A x + B u + E w``, ``y = C x`` with any number of inputs and outputs.

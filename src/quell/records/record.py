@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.files import check_writable, written_atomically
+from quell.hints import Hinted
 from quell.quantities import UNKNOWN, AxesSignals, Signals
+from quell.records.metrics import MEASURES
 from quell.types import Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
@@ -210,7 +212,7 @@ def in_steps(time: float, step: float) -> float:
 # ---- Common part of the records of one run and of a batch ----
 
 
-class Record:
+class Record(Hinted):
     """A log: channels side by side along its last axis, samples along the last but one."""
 
     log: Matrix
@@ -221,6 +223,12 @@ class Record:
     signals: Any  # ``Signals``, of several axes ``AxesSignals`` if they are known
     axis_names: tuple[str, ...]
     axis_features: tuple[tuple[str, ...], ...]
+
+    def _meant(self) -> Mapping[str, str]:
+        names = readable_names(vars(self).get("channels", ()))
+        channels = {name.replace("_", ""): f"run[{name!r}]" for name in names}
+        measures = {name.replace("_", ""): f"run.metrics()[{name!r}]" for name in MEASURES}
+        return measures | channels | dict.fromkeys(("time", "times"), "run.t")
 
     @property
     def several(self) -> bool:

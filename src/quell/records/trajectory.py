@@ -193,6 +193,11 @@ class Trajectory(Record):
 
     def _part(self, start: float, stop: float | None) -> slice:
         """Return the samples in ``[start, stop)``; raise a ``ValueError`` if there are none."""
+        given: Any = start
+        if isinstance(given, str):
+            raise ValueError(
+                f"start = {given!r}: must be a time [s]; a measure is run.metrics()[name]"
+            )
         part = self.window(start, np.inf if stop is None else stop)
         window = f"start = {start!r}, stop = {stop!r}"
         if stop is not None and not start < stop:

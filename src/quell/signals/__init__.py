@@ -12,6 +12,7 @@ May import ``types``, ``checks`` and ``kernels``.
 
 from __future__ import annotations
 
+from quell.lazy import imported_on_use
 from quell.signals.excitation import PRBS, BandLimitedNoise, Multisine
 from quell.signals.moves import LimitedMove
 from quell.signals.registry import KINDS, make
@@ -38,3 +39,5 @@ __all__ = [
     "Repeated", "Samples", "Scaled", "Signal", "Sinusoid", "SmoothMove", "Step", "Sum", "Switched",
     "Trapezoid", "as_signal", "make", "seeded_apart",
 ]  # fmt: skip
+
+__getattr__ = imported_on_use(__name__, {})

@@ -184,7 +184,15 @@ class Switched(Signal):
 
 def as_signal(value: Signal | float, name: str = "signal") -> Signal:
     """Return a signal as it is and a number as a constant; errors call the value ``name``."""
-    return value if isinstance(value, Signal) else Constant(checks.finite(name, value))
+    if isinstance(value, Signal):
+        return value
+    if callable(value) or np.ndim(value) > 0:
+        what = "a function" if callable(value) else f"{np.size(value)} numbers"
+        raise ValueError(
+            f"{name}: is {what}, must be a number or a signal; samples become one by "
+            "quell.signals.Samples(times, values)"
+        )
+    return Constant(checks.finite(name, value))
 
 
 def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:

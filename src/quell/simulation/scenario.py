@@ -19,6 +19,7 @@ from quell.controllers.base import (
     Controller,
 )
 from quell.controllers.several import outputs_of, references_of
+from quell.hints import explained
 from quell.plants.base import (
     Plant,
     inputs_of,
@@ -33,6 +34,7 @@ from quell.types import Matrix, Vector, warn
 # ---- A scenario ----
 
 
+@explained("quell.Scenario(reference=1.0, duration=10.0, disturbances=(load,))")
 @dataclass(frozen=True)
 class Scenario:
     """Signals, duration and initial state of a run.

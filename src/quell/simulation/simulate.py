@@ -27,6 +27,7 @@ from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, check_controller, limits_of
 from quell.controllers.single import SeveralInSingle, check_compilable, in_single_precision
 from quell.controllers.state_space import StateFeedback
+from quell.hints import explained
 from quell.kernels import dispatch
 from quell.kernels.cache import cache_path
 from quell.kernels.sized import layout_of
@@ -309,6 +310,7 @@ def simulate(
     record: Sequence[str] | None = None,
     workers: int | None = None,
 ) -> BatchTrajectory: ...
+@explained("quell.simulate(plant, controller, quell.Scenario(reference=1.0, duration=10.0))")
 def simulate(
     plant: Any,
     controller: Any,

@@ -14,6 +14,7 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse_axis
 from quell.controllers.feedforward import Feedforward, checked_feedforward
+from quell.hints import explained
 from quell.lti.canonical import canonical
 from quell.parallel import one_blas_thread
 from quell.plants.base import signals_of
@@ -75,6 +76,7 @@ COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "poles", "model-b
 _LIMITS = ("u_min", "u_max", "rate_limit")
 
 
+@explained("quell.tune(([1.0], [1.0, 2.0, 1.0]), dt=0.01)")
 def tune(
     plant: Any,
     dt: float,

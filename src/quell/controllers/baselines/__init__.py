@@ -6,6 +6,7 @@ May import ``controllers`` with ``adrc``, ``linear`` and ``prefilters``, and wha
 from quell.controllers.baselines.pid import PID, PPI, Notch, NotchPID, equivalent_pid
 from quell.controllers.baselines.state_feedback import LQG, ResonanceRatio
 from quell.controllers.shaping import ZV, ZVD, Shaper
+from quell.lazy import imported_on_use
 
 __all__ = [
     "LQG",
@@ -19,3 +20,5 @@ __all__ = [
     "Shaper",
     "equivalent_pid",
 ]
+
+__getattr__ = imported_on_use(__name__, {})

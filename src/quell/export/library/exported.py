@@ -40,6 +40,7 @@ from quell.export.loop_stability import Stability, stability
 from quell.export.proof import Proof, proof_files, prove
 from quell.export.translate.text import checked_name
 from quell.files import check_folder, write_folder
+from quell.hints import explained
 from quell.simulation.scenario import Scenario
 
 # ---- The files around an exported controller ----
@@ -520,6 +521,7 @@ class Exported:
         return measured_sizes(source.name, source.header, source.source, source.precision)
 
 
+@explained('quell.export.c(controller, "folder")')
 def c(
     controller: Any,
     folder: str | os.PathLike[str],
