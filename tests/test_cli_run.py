@@ -199,15 +199,16 @@ def test_a_window_after_the_end_of_a_rig_run_has_the_cause_of_the_end() -> None:
         assert ("ended early" in str(raised.value)) == bool(told)
 
 
-def test_all_exit_codes_are_in_one_table_that_help_shows(quell: Callable[..., Shown]) -> None:
+def test_all_exit_codes_are_in_one_table_that_a_command_shows(quell: Callable[..., Shown]) -> None:
     """Each with its meaning; commands that use one name it."""
     codes = {code.name: code.value for code in ExitCode}
     assert codes == {
         "DONE": 0, "INTERNAL": 1, "ERROR": 2, "ENDED_BY_SAFETY": 3, "DIVERGED": 4, "NOT_PROVED": 5,
         "ALARM": 6, "BROKEN": 7, "RUNS_FAILED": 8, "NOT_VALID": 9, "INTERRUPTED": 130, "TERMINATED": 143,
     }  # fmt: skip
-    told = " ".join(quell("--help").out.split())
-    assert all(f"{code.value} {code.about}" in told for code in ExitCode)
+    told = quell("help", "exit-codes").out
+    assert all(f"{code.value:>3}  {code.about}\n" in told for code in ExitCode)
+    assert "quell help exit-codes" in quell("--help").out
     for command in ("run", "compare", "run-rig", "watch", "doctor"):
         assert "exit code" in quell(command, "--help").out
 

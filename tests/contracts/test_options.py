@@ -89,6 +89,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "docs": ("zeros",),
     "doctor": (),
     "completion": ("bash",),
+    "help": ("exit-codes",),
 }
 _RECORD = ("record.csv", *_FIGURES)
 _TWIN = (
@@ -179,7 +180,7 @@ CASES: dict[str, dict[str, Case]] = {
         "--prove": ("--prove",), "--spread": ((*_EXPORT, "--prove"), (*_EXPORT, "--prove", "--spread", "0.2")),
     },
     "studio": {"SETUP": (("--no-browser",), ("setup.toml", "--no-browser")), "--port": ("--port", "0"), "--browser": (_SETUP, (*_SETUP, "--no-browser"))},
-    "docs": {"WORDS": ("notch",), "--browser": ("--browser",)}, "doctor": {}, "completion": {"SHELL": (("bash",), ("fish",))},
+    "docs": {"WORDS": ("notch",), "--browser": ("--browser",)}, "doctor": {}, "completion": {"SHELL": (("bash",), ("fish",))}, "help": {"TOPIC": (("exit-codes",), ("run",))},
 }  # fmt: skip
 
 
@@ -345,7 +346,7 @@ def test_no_output_replaces_a_file(
     base = [each for each in BASES[command] if each != "--no-figures"]
     more = (
         ()
-        if option == "--figures" or command in ("b0", "rank", "watch", "docs", "doctor")
+        if option == "--figures" or command in ("b0", "rank", "watch", "docs", "doctor", "help")
         else _FIGURES
     )
     taken = "taken.nc" if option == "--save" else "taken.json"

@@ -11,7 +11,8 @@ from cyclopts import App, CycloptsError
 from quell import __version__
 from quell.cli.compare import compare
 from quell.cli.doctor import doctor
-from quell.cli.exit_codes import HELP, ExitCode
+from quell.cli.examples import USAGES
+from quell.cli.exit_codes import ExitCode
 from quell.cli.identify import b0, excite, identify
 from quell.cli.monitor import rank, watch
 from quell.cli.pages import docs
@@ -28,7 +29,7 @@ _LONG = 1.0
 app = App(
     name="quell",
     help="Disturbance-rejection control that learns.",
-    help_epilogue=HELP,
+    help_epilogue="Pages: quell docs WORDS. Exit codes: quell help exit-codes.",
     version=__version__,
     help_format="plaintext",  # to import what renders Markdown takes a fifth of the time
     print_error=False,
@@ -40,11 +41,9 @@ reproduce = App(
     help_format="markdown",
 )
 app.command(reproduce)
-for _command in (two_mass, torsional, acc):
-    reproduce.command(_command)
 
 
-_completion_of = app.generate_completion
+_completion_of, _print_help = app.generate_completion, app.help_print
 
 
 def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
@@ -61,7 +60,37 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
     print(_completion_of(prog_name="quell", shell=shell), end="")
 
 
-for _each in (
+def help_of(topic: str) -> None:
+    """Explain the exit codes, or a command, as `quell COMMAND --help` does.
+
+    Parameters
+    ----------
+    topic
+        `exit-codes`, or the name of a command.
+    """
+    if topic == "exit-codes":
+        for code in ExitCode:
+            print(f"{code.value:>3}  {code.about}")
+        return
+    known = ["exit-codes", *dict.fromkeys(name.split()[0] for name in USAGES)]
+    if topic not in known:
+        from quell.checks import nearest
+
+        raise ValueError(f"topic = {topic!r}: unknown; {nearest(topic, known)}")
+    _print_help([topic])
+
+
+def _add(where: App, function: Any, path: str) -> None:
+    """Add a command whose name is the last word of ``path``, with its examples and page."""
+    usage = USAGES[path]
+    how: dict[str, Any] = {"usage": usage.text(path), "help_epilogue": usage.end}
+    where.command(function, name=path.split()[-1], help_format="markdown", **how)
+
+
+_studies: tuple[Any, ...] = (two_mass, torsional, acc)
+for _each in _studies:
+    _add(reproduce, _each, f"reproduce {_each.__name__.replace('_', '-')}")
+_commands: tuple[Any, ...] = (
     stress,
     compare,
     identify,
@@ -82,8 +111,10 @@ for _each in (
     docs,
     doctor,
     completion,
-):
-    app.command(_each, help_format="markdown")
+)
+for _each in _commands:
+    _add(app, _each, _each.__name__.replace("_", "-"))
+_add(app, help_of, "help")
 
 
 def main() -> None:

@@ -77,8 +77,6 @@ _MEANINGS = {
     ),
     ExitCode.TERMINATED: "stopped by SIGTERM, quell run-rig before its loop",
 }
-HELP = "Exit codes: " + "; ".join(f"{code.value} {code.about}" for code in ExitCode) + "."
-"""The table, for the help text of the command."""
 
 
 def exit_if_diverged(runs: Iterable[Trajectory]) -> None:
