@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 if TYPE_CHECKING:
     from quell import (
@@ -114,6 +114,4 @@ _RENAMED = {"AxesBatch": "BatchTrajectory", "AxesTrajectory": "Trajectory"}
 
 __getattr__ = imported_on_use(__name__, _HOMES, _MODULES, _RENAMED)
 
-
-def __dir__() -> list[str]:
-    return sorted([*__all__, *(name for name in globals() if name.startswith("__"))])
+__dir__ = public_names(__name__)

@@ -52,6 +52,16 @@ def imported_on_use(
     return get
 
 
+def public_names(package: str) -> Callable[[], list[str]]:
+    """Return the function ``__dir__`` of a package: its public names, and those of Python."""
+
+    def names() -> list[str]:
+        own = vars(sys.modules[package])
+        return sorted([*own["__all__"], *(name for name in own if name.startswith("__"))])
+
+    return names
+
+
 DISTRIBUTION = "quell-control"
 """Name of the distribution on the package index."""
 

@@ -33,7 +33,7 @@ from quell.analysis.plots import (
 )
 from quell.analysis.points import LoopsAtPoints, analyse_points
 from quell.controllers.adrc import Finding
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 from quell.lti.zeros import (
     Existence,
     InvariantZeros,
@@ -94,3 +94,5 @@ __all__ = [
 __getattr__ = imported_on_use(
     __name__, {}, (), {"analyse_axes": "analyse", "certify_axes": "certify"}
 )
+
+__dir__ = public_names(__name__)

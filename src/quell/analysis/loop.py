@@ -41,6 +41,7 @@ from quell.learners.base import NoLearner
 from quell.lti.models import System, h2_squared
 from quell.plants.linear import SampledPlant, sampled_plant
 from quell.plants.linearise import linear_part
+from quell.records.notebook import InNotebook
 from quell.types import Matrix, Vector
 
 # ---- Parts of a loop, open and closed, as sampled systems of one input and one output ----
@@ -197,7 +198,7 @@ def analyse_axis(
     return LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note)
 
 
-class LoopAnalysis:
+class LoopAnalysis(InNotebook):
     """The loop of a sampled plant and a linear law; made by ``analyse``.
 
     Attributes
@@ -228,6 +229,13 @@ class LoopAnalysis:
         self._N = law_matrix(law)
         names = ("P", "C_r", "C_y")
         self._open = {name: Response(subsystem(plant, law, name)) for name in names}
+
+    def _draw_small(self, figure: Any) -> None:
+        for ax, name in zip(figure.subplots(1, 2), ("S", "T"), strict=True):
+            ax.loglog(self.omega, np.abs(self.response(name, self.omega)))
+            ax.axhline(1.0, color="0.6", linewidth=0.8)
+            ax.set(xlabel="frequency [rad/s]", ylabel=f"|{name}|")
+            ax.grid(alpha=0.3)
 
     def __repr__(self) -> str:
         states = f"{self.plant.N.shape[0]} + {self.law.A.shape[0]} states"

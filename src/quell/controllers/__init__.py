@@ -39,7 +39,7 @@ from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
 from quell.controllers.state_space import StateFeedback
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 __all__ = [
     "ADRC",
@@ -79,3 +79,5 @@ __all__ = [
 ]
 
 __getattr__ = imported_on_use(__name__, {})
+
+__dir__ = public_names(__name__)

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from quell.checks import import_extra
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 if TYPE_CHECKING:
     from quell.envs.actions import Policy
@@ -61,3 +61,5 @@ def register() -> None:
 
 if find_spec("gymnasium") is not None:
     register()
+
+__dir__ = public_names(__name__)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 if TYPE_CHECKING:
     from quell.experiments import acc, compare, over_seeds, stress, torsional, two_mass_spring
@@ -19,3 +19,5 @@ if TYPE_CHECKING:
 __all__ = ["acc", "compare", "over_seeds", "stress", "torsional", "two_mass_spring"]
 
 __getattr__ = imported_on_use(__name__, {}, __all__)
+
+__dir__ = public_names(__name__)

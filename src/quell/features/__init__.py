@@ -7,7 +7,7 @@ and its name here; users can also write one, see ``base.py``.
 from quell.features.all_axes import AllAxes
 from quell.features.base import Bias, Custom, Features, Input, Joined, Polynomial, State
 from quell.features.basis import RBF, Friction, Periodic, RandomFourier
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 __all__ = [
     "RBF",
@@ -25,3 +25,5 @@ __all__ = [
 ]
 
 __getattr__ = imported_on_use(__name__, {})
+
+__dir__ = public_names(__name__)

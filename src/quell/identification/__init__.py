@@ -33,6 +33,7 @@ from quell.identification.structures import (
 )
 from quell.identification.swings import FreeDecay, FreeSwing, Mode, free_decay, free_swing
 from quell.identification.validation import Residuals
+from quell.lazy import public_names
 
 __all__ = [
     "Alternative",
@@ -74,3 +75,5 @@ __all__ = [
     "save_excitations",
     "simulated_plant",
 ]
+
+__dir__ = public_names(__name__)

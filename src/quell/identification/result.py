@@ -24,6 +24,7 @@ from quell.plants.base import labelled
 from quell.plants.friction import with_friction_and_delay
 from quell.plants.linear import LinearPlant
 from quell.quantities import UNKNOWN, Quantity, Signals
+from quell.records.notebook import InNotebook
 from quell.records.plotting import draw_line, given_axes
 from quell.types import Matrix, Vector
 
@@ -165,7 +166,7 @@ _CONTRADICTED = 0.003
 
 
 @dataclass(frozen=True, eq=False)
-class Identified:
+class Identified(InNotebook):
     """A transfer function found in a record, with measures of its quality.
 
     ``str()`` gives the whole report; ``plant`` is the model for ``ESO.model_based``.
@@ -524,6 +525,10 @@ class Identified:
         return "\n".join(lines)
 
     __str__ = describe
+
+    def _draw_small(self, figure: Any) -> None:
+        axes, y = figure.subplots(2, 1, sharex=True), self.signals.y
+        draw_output(axes, self.t, self.y, self.simulated, self.held_from, self.fits, y)
 
     def __repr__(self) -> str:
         fit = self.fits.get("held out", self.fits["estimation"])

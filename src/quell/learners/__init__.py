@@ -4,7 +4,7 @@ Files of this folder itself are the base of its subfolders. May import ``feature
 imports.
 """
 
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner
 from quell.learners.batch_gradient import BatchGradient
@@ -38,3 +38,5 @@ __all__ = [
 ]
 
 __getattr__ = imported_on_use(__name__, {})
+
+__dir__ = public_names(__name__)

@@ -3,6 +3,7 @@
 May import ``commissioning``, ``identification``, ``records``, ``realtime`` and what these import.
 """
 
+from quell.lazy import public_names
 from quell.monitoring.rank import Comparison, Ranking, Scores, rank
 from quell.monitoring.watch import Alarm, Machine, Watch, WatchSink
 from quell.monitoring.windows import Signals, features_of, windows_of
@@ -20,3 +21,5 @@ __all__ = [
     "rank",
     "windows_of",
 ]
+
+__dir__ = public_names(__name__)

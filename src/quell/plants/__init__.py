@@ -4,7 +4,7 @@ May import ``lti``, ``kernels`` and what stands before them. A new machine needs
 ``machines``, a line in ``registry.py`` and, if it is public, its name here.
 """
 
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 from quell.plants.base import Plant, PlantBatch, batch, labelled, signals_of
 from quell.plants.channels import delayed_inputs, encoded_outputs
 from quell.plants.flexible import (
@@ -37,3 +37,5 @@ _RENAMED = {
 }
 
 __getattr__ = imported_on_use(__name__, {}, (), _RENAMED)
+
+__dir__ = public_names(__name__)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 if TYPE_CHECKING:
     from quell.realtime.devices import Device, TwinDevice
@@ -55,3 +55,5 @@ __all__ = [
 ]  # fmt: skip
 
 __getattr__ = imported_on_use(__name__, _HOMES)
+
+__dir__ = public_names(__name__)

@@ -195,6 +195,21 @@ def _draw_estimates(run: Any, ax: Axes) -> None:
     ax.set_ylabel(Quantity(run.signals.f.name, unit).label("total disturbance"))
 
 
+def draw_loop(run: Any, axes: Any) -> None:
+    """Draw outputs with their references, and all control signals, into two matplotlib axes."""
+    rows = (("y", "output", "C0"), ("u", "control signal", "C1"))
+    for ax, (name, label, color) in zip(axes, rows, strict=True):
+        for wanted in run["r"].reshape(len(run), -1).T if name == "y" and "r" in run.names else ():
+            draw_line(ax, run.t, wanted, color="0.2", linestyle=(0, (4, 3)), linewidth=1.2)
+        values = run[name].reshape(len(run), -1)
+        for k, column in enumerate(values.T):
+            draw_line(ax, run.t, column, color=color if values.shape[1] == 1 else f"C{k % 10}")
+        known = getattr(run.signals, name)
+        ax.set_ylabel(label if isinstance(known, tuple) else (known or Quantity()).label(label))
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]")
+
+
 def plot_axes(run: Any, axes: Any = None) -> Any:
     """Draw output, error and estimates of each axis of a machine, and all control signals.
 

@@ -16,6 +16,7 @@ from quell.files import MAX_SIZE
 from quell.quantities import UNKNOWN
 from quell.records.metrics import MEASURES, SETTLING_BAND, BatchMetrics, Metrics, Window, measured
 from quell.records.netcdf import Stored, load_record
+from quell.records.notebook import InNotebook
 from quell.records.record import Record
 from quell.types import LOST, Channels, Matrix, Status, Vector
 
@@ -36,8 +37,8 @@ def check_no_target(target: float | None) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory(Record):
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Record, InNotebook):
     """The record of one run.
 
     ``run["y"]`` is a channel: (samples,), or (samples, width) for ``w``, ``x``, ``x_hat`` and
@@ -68,6 +69,15 @@ class Trajectory(Record):
     u_limits: tuple[float, float] = _NO_LIMITS  #: limits of the controller [u-unit]
     axis_names: tuple[str, ...] = ()  #: names of several axes
     axis_features: tuple[tuple[str, ...], ...] = ()  #: names of each axis' features
+
+    def __repr__(self) -> str:
+        size = f"{len(self)} samples, {self.every * self.dt:g} s apart, to {self.ended:g} s"
+        return f"Trajectory({self.plant!r}: {size}; {', '.join(self.names)}; {self.status.name})"
+
+    def _draw_small(self, figure: Any) -> None:
+        from quell.records.plotting import draw_loop
+
+        draw_loop(self, figure.subplots(2, 1, sharex=True))
 
     @property
     def diverged(self) -> bool:
@@ -320,8 +330,8 @@ _PER_RUN = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class BatchTrajectory(Record):
+@dataclass(frozen=True, eq=False, repr=False)
+class BatchTrajectory(Record, InNotebook):
     """The record of a batch of runs.
 
     ``runs["y"]`` is a channel: (runs, samples), or (runs, samples, width) for ``w``, ``x``,
@@ -352,6 +362,16 @@ class BatchTrajectory(Record):
     signals: Any = UNKNOWN  #: names and units, as those of a ``Trajectory``
     axis_names: tuple[str, ...] = ()  #: names of several axes
     axis_features: tuple[tuple[str, ...], ...] = ()  #: names of each axis' features
+
+    def __repr__(self) -> str:
+        step = self.every * self.dt
+        size = f"{len(self.ended)} runs of {self.log.shape[1]} samples, {step:g} s apart"
+        lost = f"{int(np.sum(self.lost))} diverged or ran away"
+        return f"BatchTrajectory({self.plant!r}: {size}; {', '.join(self.names)}; {lost})"
+
+    def _draw_small(self, figure: Any) -> None:
+        rows = 2 * max(len(self.axis_names), 1)
+        self.plot(figure.subplots(2, rows // 2, sharex=True).ravel())
 
     @property
     def diverged(self) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 if TYPE_CHECKING:
     from quell.setup.axes import AxesDescription
@@ -52,3 +52,5 @@ __all__ = [
 _RENAMED = {"load_axes": "load", "made_axes": "made"}
 
 __getattr__ = imported_on_use(__name__, _HOMES, (), _RENAMED)
+
+__dir__ = public_names(__name__)

@@ -12,7 +12,7 @@ May import ``types``, ``checks`` and ``kernels``.
 
 from __future__ import annotations
 
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 from quell.signals.excitation import PRBS, BandLimitedNoise, Multisine
 from quell.signals.moves import LimitedMove
 from quell.signals.registry import KINDS, make
@@ -41,3 +41,5 @@ __all__ = [
 ]  # fmt: skip
 
 __getattr__ = imported_on_use(__name__, {})
+
+__dir__ = public_names(__name__)

@@ -6,6 +6,7 @@ the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` p
 and returns a ``Tuned``.
 """
 
+from quell.lazy import public_names
 from quell.tuning.axes import tune_axes
 from quell.tuning.compensator import TunedCompensator, tune_compensator
 from quell.tuning.constraints import Constraints
@@ -32,3 +33,5 @@ __all__ = [
     "tune_compensator",
     "tune_schedule",
 ]
+
+__dir__ = public_names(__name__)

@@ -20,6 +20,7 @@ from quell.controllers.feedforward import Feedforward
 from quell.files import nonfinite_to_none, written_atomically
 from quell.parallel import one_blas_thread
 from quell.quantities import UNKNOWN, Signals
+from quell.records.notebook import InNotebook
 from quell.records.plotting import given_axes
 from quell.sweeping.runs import latin_hypercube
 from quell.sweeping.sweep import share_interval
@@ -186,7 +187,7 @@ def checked(
 
 
 @dataclass(frozen=True, eq=False)
-class Tuned:
+class Tuned(InNotebook):
     """The controller of a structure with the best objective under constraints; from ``tune``.
 
     Attributes
@@ -351,6 +352,11 @@ class Tuned:
         single = len(self.designs) == 1  # compares nothing
         resonant = not single and bool(resonances(self.task.model))
         return lines + report.not_tried(self.designs, resonant)
+
+    _size = (8.0, 5.5)
+
+    def _draw_small(self, figure: Any) -> None:
+        self.plot(figure.subplots(2, 2).ravel())
 
     def __repr__(self) -> str:
         return f"Tuned {self.design.name}:\n{self.summary()}"

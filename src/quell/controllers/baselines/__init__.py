@@ -6,7 +6,7 @@ May import ``controllers`` with ``adrc``, ``linear`` and ``prefilters``, and wha
 from quell.controllers.baselines.pid import PID, PPI, Notch, NotchPID, equivalent_pid
 from quell.controllers.baselines.state_feedback import LQG, ResonanceRatio
 from quell.controllers.shaping import ZV, ZVD, Shaper
-from quell.lazy import imported_on_use
+from quell.lazy import imported_on_use, public_names
 
 __all__ = [
     "LQG",
@@ -22,3 +22,5 @@ __all__ = [
 ]
 
 __getattr__ = imported_on_use(__name__, {})
+
+__dir__ = public_names(__name__)
