@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.realtime.devices import TwinDevice, handle_of, read_measurement, write_command
+from quell.realtime.devices import TwinDevice, handle_of, read_measurement, write_signals
 from quell.realtime.ni import NiDevice, Tasks, Voltage, ni_device
 from quell.realtime.registry import open_device
 from quell.realtime.system import virtual_clock
@@ -290,7 +290,7 @@ def test_a_card_that_is_lost_is_an_error_that_the_loop_counts(rack, device):
     rack.cards["Dev1"].present = rack.cards["Dev2"].present = False
     value, _ = read_measurement(handle, virtual_clock(), 0)
     assert math.isnan(value)
-    assert write_command(handle, 1.0) != 0
+    assert write_signals(handle, np.ones(1)) != 0
     assert handle.faults[0] == 2
     assert "-200324: the card is gone" in str(handle.errors[0])
     with pytest.warns(RuntimeWarning, match="switch the amplifier off"):

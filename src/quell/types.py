@@ -6,7 +6,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from enum import IntFlag
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,7 +171,10 @@ def called_by_quell(depth: int) -> bool:
     1 is the function that asks. What is inside judges the results of its runs itself, and needs no
     warning.
     """
-    return _package(sys._getframe(depth + 1).f_globals) in (*_BETWEEN, "concurrent")
+    frame: Any = sys._getframe(depth + 1)
+    while frame.f_globals.get("__name__") == "quell.hints":  # the frame of a decorator
+        frame = frame.f_back
+    return _package(frame.f_globals) in (*_BETWEEN, "concurrent")
 
 
 def _package(names: dict[str, object]) -> str:

@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import quell as ql
@@ -21,7 +22,7 @@ from quell.realtime.devices import (
     TwinDevice,
     handle_of,
     read_measurement,
-    write_command,
+    write_signals,
 )
 from quell.realtime.registry import SCHEMES, listen, open_device
 from quell.realtime.rig import Rig
@@ -206,7 +207,7 @@ def test_the_loop_uses_it_through_its_handle(example: Any) -> None:
     example.sample(device, 0.5)
     handle, clock = handle_of(device), system_clock()
     assert isinstance(handle, PythonHandle) == (getattr(device, "handle", None) is None)
-    assert write_command(handle, 1.0) == 0
+    assert write_signals(handle, np.ones(1)) == 0
     assert not math.isfinite(example.limit) or abs(example.applied() - 1.0) < 1e-3
     y, waited = read_measurement(handle, clock, time.monotonic_ns() + 10**9)
     assert math.isfinite(y)
@@ -283,7 +284,7 @@ def test_a_device_that_is_lost_is_an_error_and_never_a_number(example: Any) -> N
     for _ in range(3):
         y, _ = read_measurement(handle, clock, time.monotonic_ns() + 1_000_000)
     assert math.isnan(y)
-    assert write_command(handle, 1.0) != 0
+    assert write_signals(handle, np.ones(1)) != 0
     with pytest.raises(OSError, match="."):
         device.write(1.0)
     assert time.monotonic() - start < 5.0
