@@ -9,7 +9,8 @@ clipped at the top; u is late by 0 to 10 samples, and y has an offset. Each reco
 as ``quell tune RECORD`` takes it, without options (``record_model``).
 
 It is *usable* if its gain and each pole are within 3 half widths or 5 % of the truth; otherwise
-*wrong without NOT*, *said* (a line with NOT), or *refused*. Beside it a least-squares fit of the
+*named* if those of another model are, from which the report says that the record does not tell it
+(``quell tune`` tunes for both), *wrong without NOT*, *said* (a line with NOT), or *refused*. Beside it a least-squares fit of the
 true form is made, from parameters that are off by up to a third, with the delay and the clipped
 samples known: where that has gain and poles within 5 %, the record has an answer.
 
@@ -257,6 +258,8 @@ def main() -> None:
                 outcome = "refused"
             elif judged(one, found.model):
                 outcome = "usable"
+            elif any(judged(one, other) for other in found.others):
+                outcome = "named"
             else:
                 outcome = "said" if said or not found.model.converged else "wrong"
         results.append((one, outcome, answer, said))
@@ -279,7 +282,7 @@ def main() -> None:
         "records": total,
         **{
             name: sum(outcome == name for _, outcome, _, _ in results)
-            for name in ("usable", "wrong", "said", "refused")
+            for name in ("usable", "named", "wrong", "said", "refused")
         },
         "usable [%]": 100.0 * sum(outcome == "usable" for _, outcome, _, _ in results) / total,
         "own fit succeeds": len(answers),

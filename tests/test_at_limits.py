@@ -312,6 +312,7 @@ def model(order: int, fit: float = 90.0, fault: str = "", friction: Any = None, 
         "undecided": (),
         "fails": False,
         "converged": True,
+        "rubs": friction is not None,
     }
     return SimpleNamespace(den=np.ones(order + 1), friction=friction, fit=fit, **{**parts, **more})
 
@@ -388,7 +389,7 @@ def test_a_model_holds_if_it_has_no_fault_and_is_decided(reason: str) -> None:
 
 
 def test_friction_on_a_speed_must_be_better_than_a_model_without() -> None:
-    """Alone it may hide an offset; on a position it may be taken alone."""
+    """Alone it may hide an offset; on a position it may be taken alone, unless it may be none."""
     bad, rubbing = model(4, fault="a"), model(1, 95.0, friction=0.1)
     found, _ = taken({(4, False): bad, (1, True): rubbing})
     assert found.model is bad
@@ -398,6 +399,10 @@ def test_friction_on_a_speed_must_be_better_than_a_model_without() -> None:
     assert found.model.friction is None
     found, _ = taken({(4, False): bad, (2, True): model(2, 95.0, friction=0.1)})
     assert found.model.friction == 0.1
+    none = model(2, 95.0, friction=0.1, rubs=False)
+    plain = model(2, 95.0)
+    found, _ = taken({(4, False): bad, (2, True): none, (2, False): plain})
+    assert found.model is plain
 
 
 @cache

@@ -165,6 +165,27 @@ def test_u_before_the_record_does_not_matter() -> None:
     assert found.delay == pytest.approx(0.04375, rel=2e-3)
 
 
+@pytest.mark.trial
+def test_a_delay_beyond_those_that_the_search_starts_at_is_found() -> None:
+    """A lag of 2 s behind 25 and 40 samples of delay: no other form, and a PI stands beside."""
+    rng, dt, held = np.random.default_rng(0), 0.05, math.exp(-0.025)
+    for late in (25, 40):
+        u, y, before, x = np.zeros(2500), np.zeros(2500), [0.0] * late, 0.0
+        r = np.repeat(rng.uniform(-1.0, 1.0, 25), 100)
+        for k in range(u.size):
+            y[k] = x + 1e-3 * rng.standard_normal()
+            u[k] = 0.2 * (r[k] - y[k]) + 0.3 * r[k] + 0.05 * rng.standard_normal()
+            before.append(u[k])
+            x = held * x + 2.0 * (1.0 - held) * before.pop(0)
+        found = identify_b0(u, y, dt, order=1)
+        assert found.b0 == pytest.approx(1.0, rel=0.01)
+        assert found.delay == pytest.approx(late * dt, rel=0.01)
+        assert found.shortcomings == ()
+        beside = found.beside(found.omega_c())
+        assert beside is not None
+        assert beside.name == "PI"
+
+
 def test_what_a_record_does_not_determine_is_said() -> None:
     """One sine and no noise: two numbers, which any b0 of a plant of order 2 can explain."""
     found = identify_b0(np.sin(5.0 * T), np.sin(5.0 * T + 1.0), DT, order=2)
@@ -538,6 +559,15 @@ def test_a_pi_or_pid_of_the_same_margin_stands_beside_omega_c(order: int, late: 
     adrc = loops.loop(2.0, 10.0)
     k_adrc = abs(adrc.response("C_y", np.array([1e-4]))[0]) * 1e-4
     assert found.over_adrc == pytest.approx(abs(found.ki) / k_adrc, rel=1e-3)
+
+
+def test_a_pi_stands_beside_an_order_of_two_where_samples_leave_no_place_for_a_pid() -> None:
+    """The filter of the PID would be faster than half a sample."""
+    loops = Candidate(2.0, np.array([1.0, 3.0, 1.0]), 0.0, 0.2, b0=2.0, dt=0.2)
+    found = pid_of_margin(loops, 60.0, Reach(0.8, 3.0, 60.0, True))
+    assert found is not None
+    assert found.name == "PI"
+    assert found.phase == pytest.approx(60.0, abs=0.6)
 
 
 def test_no_simple_controller_stands_beside_a_third_order() -> None:

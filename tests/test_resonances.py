@@ -12,7 +12,7 @@ import quell as ql
 from quell.identification.frequency_starts import continuous, poles_of_record, resonant_poles
 from quell.identification.identify import Records, first_held_out
 from quell.identification.saturation import standing
-from quell.identification.vector_fitting import fit_of_record, vector_fit
+from quell.identification.vector_fitting import Spectra, fit_of_record, pair_beside, vector_fit
 
 DT = 1e-3
 # A motor with its encoder before a flexible coupling: 32 Hz, 22 Hz, a pole of 5 rad/s.
@@ -77,6 +77,36 @@ def test_a_resonance_is_shown_and_a_lag_shows_none() -> None:
     assert np.min(np.abs(np.abs(poles) - OMEGA)) < 0.01 * OMEGA
     lag = answer([50.0], [1.0, 50.0], u) + 1e-2 * rng.standard_normal(u.size)
     assert resonant_poles(u, lag, 4, 2) is None
+
+
+def test_a_resonance_hardly_above_the_noise_is_found_beside_the_poles_that_are_known() -> None:
+    """Steps move it by as much as the noise: vector fitting of all poles at once misses it."""
+    u = binary(1500, 200)
+    noise = 0.02 * np.random.default_rng(3).standard_normal(u.size)
+    y = answer(NUM, DEN, u) + noise
+    at_once = continuous(fit_of_record(u, y, 4).poles) / DT
+    assert np.min(np.abs(np.abs(at_once) - OMEGA)) > 0.2 * OMEGA
+    rigid = np.exp(np.array([-1e-6, -5.0 * DT]))
+    upper, weight = pair_beside(Spectra.of(u, y), rigid)
+    assert abs(continuous(np.array([upper]))[0]) / DT == pytest.approx(OMEGA, rel=0.03)
+    assert np.std(np.log(weight)) < 0.3  # the noise is white
+    a = resonant_poles(u, y, 4, 2)
+    assert a is not None
+    poles = np.roots(np.append(1.0, a[::-1])) / DT
+    assert np.min(np.abs(np.abs(poles) - OMEGA)) < 0.03 * OMEGA
+    assert resonant_poles(u, answer([300.0], [1.0, 5.0, 0.0], u) + noise, 4, 2) is None
+
+
+def test_a_pair_is_found_where_slow_noise_is_much_larger() -> None:
+    """The error is weighted by its own level in each band."""
+    u = binary(2000, 50)
+    rng = np.random.default_rng(4)
+    drift = lfilter([1.0], [1.0, -0.999], rng.standard_normal(u.size))
+    swing = answer([100.0], [1.0 / OMEGA**2, 0.02 / OMEGA, 1.0], u)
+    y = 0.02 * swing + drift + 0.05 * rng.standard_normal(u.size)
+    upper, weight = pair_beside(Spectra.of(u, y), np.zeros(0, dtype=complex))
+    assert abs(continuous(np.array([upper]))[0]) / DT == pytest.approx(OMEGA, rel=0.03)
+    assert weight[500] > 10.0 * weight[3]
 
 
 def test_the_end_of_a_chirp_and_a_standing_end_are_not_held_out_by_default() -> None:

@@ -7,14 +7,14 @@ import math
 from dataclasses import replace
 from functools import cache
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
 from scipy import optimize, signal, stats
 
 import quell as ql
-from quell.identification import Identified, alternatives, free_swing, friction_search
+from quell.identification import Identified, alternatives, free_swing, friction_search, structures
 from quell.identification.identify import delay_range, resolution_of
 from quell.identification.model import Root, gain_interval, poles_of, zeros_of
 from quell.identification.structures import _EQUAL, Alternative, not_told_apart
@@ -588,6 +588,23 @@ def test_a_verdict_needs_both_significance_and_size() -> None:
 def test_a_model_that_explains_all_stays() -> None:
     """One pole has no smaller model, and the test finds no further one."""
     assert not_told_apart(noisy()) == (noisy(),)
+
+
+def test_a_smaller_model_with_faults_is_a_step_and_not_the_result() -> None:
+    """The last model without faults stays, and a smaller one behind the faulty one is reached."""
+    good, faulty, small = noisy(), Mock(faults=("b",), converged=True), Mock(faults=())
+
+    def fewer(model: Any) -> Any:
+        one = alternative(model=model, smaller=True, z=-1.0, by_likelihood=True)
+        return (one,)
+
+    for steps, result in (
+        ({id(good): fewer(faulty)}, (good,)),
+        ({id(good): fewer(faulty), id(faulty): fewer(small)}, (small, good)),
+    ):
+        of = Mock(side_effect=lambda one, *_, steps=steps, **__: steps.get(id(one), ()))
+        with patch.object(structures, "alternatives", of):
+            assert not_told_apart(good) == result
 
 
 def test_the_plants_of_a_model_are_the_ends_of_its_joint_intervals() -> None:

@@ -9,7 +9,7 @@ omega_o.
 An unstable plant needs an omega_c above a least one, so the range that keeps the margin is searched
 from its upper end.
 
-Beside it stands the PI (n = 1) or PID controller (n = 2) of the same margin. With the crossover ω
+Beside it stands the PI or, for n = 2, PID controller of the same margin. With the crossover ω
 the phase that the plant leaves to ``K (1 + 1/(s T_i))``, or to ``K (1 + 2 s T_d)²/(4 s T_d F(s))``
 with ``T_i = 4 T_d`` and a filter of T_d/10, gives its time, and ``|L| = 1`` its gain. Of all ω the
 one with the largest ``k_i = K/T_i`` is taken, as 1/k_i is ``∫ y dt`` after a step of the load
@@ -47,9 +47,9 @@ RATIOS = tuple(np.geomspace(3.0, 100.0, 9).tolist())
 _ENOUGH = 0.9
 # Loss of phase at an edge that is more than rounding [degrees].
 _JUMP = 1e-3
-# Orders with a simple controller; crossovers that are tried, and the margin that sampling may take
-# [degrees]. Chosen by hand.
-_LEAD, _CROSSOVERS, _NEARLY_KEPT = ("PI", "PID"), 120, 0.5
+# Most order with a simple controller; crossovers that are tried, and the margin that sampling may
+# take [degrees]. Chosen by hand.
+_MOST_SIMPLE, _CROSSOVERS, _NEARLY_KEPT = 2, 120, 0.5
 # Phase margin that stands for an unstable loop [degrees].
 _UNSTABLE_BANDWIDTH = -180.0
 
@@ -158,7 +158,7 @@ def pid_of_margin(loops: Candidate, margin: float, reach: Reach) -> SimpleContro
     """
     from quell.controllers.baselines.pid import PID
 
-    if loops.order > len(_LEAD):
+    if loops.order > _MOST_SIMPLE:
         return None
     adrc = loops.loop(reach.omega_c, reach.ratio)
     low = np.array([1e-4 * reach.omega_c])
@@ -169,31 +169,28 @@ def pid_of_margin(loops: Candidate, margin: float, reach: Reach) -> SimpleContro
     left = np.remainder(left + np.pi, 2.0 * np.pi) - np.pi  # phase that the controller needs
     x = np.geomspace(1e-2, 1e2, _CROSSOVERS)  # ω T_i, or ω T_d
     # PID filters on P, I and D alike: 1 + T_f s + (T_f s)²/2 with T_f = T_d/10.
-    if loops.order == 1:
-        shape = 1.0 + 1.0 / (1j * x)
-    else:
-        shape = (1.0 + 2j * x) ** 2 / (4j * x)
-        shape = shape / (1.0 + 0.1j * x - 0.005 * x**2)
-    # The phase rises with x up to where the filter takes over.
-    top = int(np.argmax(np.angle(shape))) + 1
-    phase, size = np.angle(shape)[:top], np.abs(shape)[:top]
-    inside = (left > phase[0]) & (left < phase[-1])
-    omega, plant, left = omega[inside], plant[inside], left[inside]
-    at = np.interp(left, phase, np.log(x[:top]))
-    times = np.exp(at) / omega
-    gains = 1.0 / np.abs(plant) / np.exp(np.interp(at, np.log(x[:top]), np.log(size)))
-    ki = gains / times / (1.0 if loops.order == 1 else 4.0)
-    for i in np.argsort(-ki).tolist():
-        kp, time = float(np.sign(loops.b0) * gains[i]), float(times[i])
-        kd, tf = (0.0, 0.0) if loops.order == 1 else (kp * time, 0.1 * time)
-        signed = float(np.sign(loops.b0) * ki[i])
+    of_pid = (1.0 + 2j * x) ** 2 / (4j * x) / (1.0 + 0.1j * x - 0.005 * x**2)
+    tried: list[tuple[float, float, float, bool]] = []
+    for shape, is_pid in ((1.0 + 1.0 / (1j * x), False), (of_pid, True))[: loops.order]:
+        # The phase rises with x up to where the filter takes over.
+        top = int(np.argmax(np.angle(shape))) + 1
+        phase, size = np.angle(shape)[:top], np.abs(shape)[:top]
+        inside = (left > phase[0]) & (left < phase[-1])
+        at = np.interp(left[inside], phase, np.log(x[:top]))
+        times = np.exp(at) / omega[inside]
+        gains = 1.0 / np.abs(plant[inside]) / np.exp(np.interp(at, np.log(x[:top]), np.log(size)))
+        ki = gains / times / (4.0 if is_pid else 1.0)
+        rows = zip(ki.tolist(), gains.tolist(), times.tolist(), strict=True)
+        tried += [(*row, is_pid) for row in rows]
+    sign = float(np.sign(loops.b0))
+    for ki, gain, time, is_pid in sorted(tried, reverse=True):
+        kd, tf = (sign * gain * time, 0.1 * time) if is_pid else (0.0, 0.0)
         if 0.0 < tf < 0.5 * loops.dt:  # faster than samples show
             continue
-        loop = LoopAnalysis(
-            loops.plant, linear_law(PID(kp, signed, kd, tf=tf, dt=loops.dt)), loops.dt
-        )
+        law = linear_law(PID(sign * gain, sign * ki, kd, tf=tf, dt=loops.dt))
+        loop = LoopAnalysis(loops.plant, law, loops.dt)
         if loop.stable and loop.margins.phase >= margin - _NEARLY_KEPT:
-            return SimpleController(kp, signed, kd, tf, loop.margins.phase, abs(signed) / k_adrc)
+            return SimpleController(sign * gain, sign * ki, kd, tf, loop.margins.phase, ki / k_adrc)
     return None
 
 

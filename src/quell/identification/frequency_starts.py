@@ -15,7 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.identification.vector_fitting import Rational, fit_of_record
+from quell.identification.vector_fitting import (
+    Rational,
+    Spectra,
+    fit_of_record,
+    pair_beside,
+)
 from quell.types import Vector
 
 Complex = NDArray[Any]
@@ -48,28 +53,43 @@ def resonant_poles(u: Vector, y: Vector, order: int, longest: int) -> Vector | N
     """
     if not _is_long(u, order + _EXTRA):
         return None
-    if u.size > _SAMPLES:  # a part is a record as well
-        moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(u)))])
-        first = int(np.argmax(moved[_SAMPLES - 1 :] - moved[: u.size - _SAMPLES + 1]))
-        u, y = u[first : first + _SAMPLES], y[first : first + _SAMPLES]
+    part = moving_part(u)
+    u, y = u[part], y[part]
 
-    def best(order: int) -> Rational:
+    def best(order: int) -> tuple[Vector, Rational]:
         fits = []
         for late in (late for late in _DELAYS if late <= longest):
             delayed = np.concatenate([np.full(late, u[0]), u[: u.size - late]])
-            fits += [fit_of_record(delayed, y, order, extra, _ROUNDS) for extra in (0, _EXTRA)]
-        return min(fits, key=lambda one: one.error)
+            for extra in (0, _EXTRA):
+                fits.append((delayed, fit_of_record(delayed, y, order, extra, _ROUNDS)))
+        return min(fits, key=lambda one: one[1].error)
 
-    found = best(order)
+    later, without = best(order - 2)
+    of = Spectra.of(later, y)
+    upper, weight = pair_beside(of, without.poles)
+    beside = of.fitted(np.append([upper, upper.conjugate()], without.poles), weight)
+    least = of.fitted(without.poles, weight).error
+    later, all_at_once = best(order)
+    fits = [beside, Spectra.of(later, y).fitted(all_at_once.poles, weight)]
+    found = min(fits, key=lambda one: one.error)
     poles = continuous(found.poles)
     pairs = poles[(poles.imag > 0.0) & (-poles.real < DAMPED * np.abs(poles))]
     if not pairs.size:
         return None
-    # Each pole comes with a zero and a part of the transient.
-    ratio = u.size * math.log(best(order - 2).error / max(found.error, 1e-300))
-    if ratio < 6.0 * math.log(u.size):
+    # Frequency, damping and two numbers of the numerator: a start, which the fit then has to prove.
+    ratio = u.size * math.log(least / max(found.error, 1e-300))
+    if ratio < 4.0 * math.log(u.size):
         return None
     return np.asarray(np.poly(poles).real[:0:-1], dtype=np.float64)
+
+
+def moving_part(u: Vector) -> slice:
+    """Return the part of a long record in which u moves most: it is a record as well."""
+    if u.size <= _SAMPLES:
+        return slice(0, u.size)
+    moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(u)))])
+    first = int(np.argmax(moved[_SAMPLES - 1 :] - moved[: u.size - _SAMPLES + 1]))
+    return slice(first, first + _SAMPLES)
 
 
 def _is_long(u: Vector, order: int) -> bool:

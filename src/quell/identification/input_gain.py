@@ -298,6 +298,8 @@ def _white(found: LoopFit, y: Vector) -> bool:
 _SAMPLES_PER_PARAMETER = 10
 # Longest delay and lag at the start by default [samples], and as a share of the record.
 _MOST_DELAY, _MOST_SHARE = 20, 0.05
+# Factor of the delays in a second search, where the first one ends nowhere: by hand.
+_LONGER = 5.0
 # A relative deviation from here on says nothing for a design: its 95 % interval is ±30 %, as far as
 # b0 may be off with little loss (Herbst, *Electronics* 2, 2013, sec. 3).
 _POOR = 0.15
@@ -516,10 +518,10 @@ class InputGain:
         return np.concatenate([self.den[1:], [self.b0, self.lag, self.delay]]), loops
 
     def beside(self, found: Bandwidth, phase_margin: float = 60.0) -> SimpleController | None:
-        """Return the PI (order 1) or PID controller (order 2) that keeps the same phase margin.
+        """Return the PI or PID controller (this for order 2) that keeps the same phase margin.
 
-        Of those with ``T_i = 4 T_d`` it is the one with the largest k_i. None for a larger order,
-        and where none keeps the margin.
+        Of PI controllers, and PID with ``T_i = 4 T_d``, it is the one with the largest k_i. None
+        for a larger order, and where none keeps the margin.
 
         Parameters
         ----------
@@ -604,8 +606,8 @@ def identify_b0(
         n, the order of the plant for ADRC, 1 to 4: u acts on the n-th derivative of y. With a lag,
         order 1 is not distinguished from order 2 by the record: give that of the controller.
     max_delay
-        longest delay or lag to start the search at [s]; 20 samples by default, at most a twentieth
-        of the record.
+        longest delay or lag to start the search at [s]; by default 20 samples, and 100 where no
+        model of this form holds with these; at most a twentieth of the record.
 
     Raises
     ------
@@ -637,6 +639,17 @@ def identify_b0(
     for name, value in (("u", u), ("y", y)):
         check_motion(name, value)
     most = longest_delay(max_delay, u.size, dt)
+    found = _found(u, y, dt, order, most)
+    longer = min(_LONGER * most, _MOST_SHARE * u.size)
+    if max_delay is None and found.rejected and longer > most:
+        # A delay beyond those that the search starts at looks like another form.
+        other = _found(u, y, dt, order, longer)
+        found = found if other.rejected else other
+    return found
+
+
+def _found(u: Vector, y: Vector, dt: float, order: int, most: float) -> InputGain:
+    """Return the result of searches that start at delays up to ``most`` samples."""
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
     before = samples_before(most, u.size)
     with one_blas_thread():

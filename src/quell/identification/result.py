@@ -263,6 +263,14 @@ class Identified(InNotebook):
         return self.one_more_pole <= self.one_more_pole_limit
 
     @property
+    def rubs(self) -> bool:
+        """Whether there is Coulomb friction that acts against motion, beyond chance.
+
+        One that would drive the plant, or may be none, hides what else a record shows.
+        """
+        return self.friction is not None and self.friction > WITHIN_95 * self.friction_std
+
+    @property
     def bends(self) -> bool:
         """Whether a gain that depends on u or its sign explains most of the error."""
         return self.curvature > _BENT

@@ -160,11 +160,11 @@ def alternatives(
 
     They are: one pole less, and one zero less; if the error is not white, also the opposite of the
     given assumption on Coulomb friction, and for a larger model without friction that of a mass
-    with friction, unless friction would drive the plant; and one pole more, if the model does not
-    explain the response to u or leaves something ``undecided``, and has no ``faults``; and two
-    zeros from order 4 on, if the model has fewer and does not explain the response to u or has
-    ``faults``: a motor with its encoder before a flexible coupling has them. A structure that
-    cannot be fitted is left out.
+    with friction, unless friction would drive the plant or may be none; and one pole more, if the
+    model does not explain the response to u or leaves something ``undecided``, and has no
+    ``faults``; and two zeros from order 4 on, if the model has fewer and does not explain the
+    response to u or has ``faults``: a motor with its encoder before a flexible coupling has them.
+    A structure that cannot be fitted is left out.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def alternatives(
         except ValueError:  # too short a record for it, or no such model
             continue
         model = replace(model, rest_given=found.rest_given)
-        if model.friction is not None and model.friction <= 0.0:  # it would drive the plant
+        if model.friction is not None and not model.rubs:
             continue
         flags = _options(change)
         nested = name != _RIGID
@@ -265,7 +265,8 @@ def not_told_apart(
     """Return the model that ``decided`` returns, and those that the record does not tell from it.
 
     These are the larger models from which a smaller one was taken because it may be as good, if
-    they have no ``faults``. ``progress`` gets the share of the work that is done, about.
+    they have no ``faults``. A smaller one with faults is a step to the next smaller one that is
+    as good, and not the result. ``progress`` gets the share of the work that is done, about.
     """
     kept: list[Identified] = []
     for step in range(_MOST_ORDER):
@@ -278,13 +279,15 @@ def not_told_apart(
         smaller = [
             one
             for one in others
-            if one.smaller and (one.may_be_as_good or (doubtful and one.gain > -_EQUAL))
+            if one.smaller
+            and (one.may_be_as_good or (doubtful and not kept and one.gain > -_EQUAL))
         ]
         if not better and not smaller:
             break
-        kept = [] if better or doubtful else [*kept, found]
+        kept = [] if better else kept if doubtful else [*kept, found]
         found = max(better or smaller, key=lambda one: one.z).model
-    return (found, *(one for one in kept if not one.faults))
+    kept = [one for one in kept if not one.faults]
+    return (kept.pop(), *kept) if found.faults and kept else (found, *kept)
 
 
 def _options(change: dict[str, Any]) -> str:

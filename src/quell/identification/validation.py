@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.frequency_starts import DAMPED, continuous
+from quell.identification.frequency_starts import continuous, moving_part
 from quell.identification.model import (
     chains,
     correlation,
@@ -42,15 +42,15 @@ from quell.identification.model import (
 )
 from quell.identification.output_error import noise_model
 from quell.identification.search import Fit
-from quell.identification.vector_fitting import fit_of_record
+from quell.identification.vector_fitting import Spectra, pair_beside
 from quell.types import Matrix, Vector
 
 # Rounds that adapt the start and the signs of friction to each other: chosen by hand, not tuned.
 _ROUNDS = 6
 # Poles of the test for one more pole, and the probability that it fails by chance: by hand.
 _EXTRA_POLES, _SELDOM = 4, 1e-3
-# Fewest samples in which a pair of poles is looked for, and its largest frequency [rad/sample].
-_LEAST_OF_PAIR, _FAST_PAIR = 200, 2.0
+# Fewest samples in which a pair of poles is looked for.
+_LEAST_OF_PAIR = 200
 # Where that is looked at: up to this phase, and at most to this frequency [rad/sample].
 _LAST_PHASE, _FASTEST_CROSSOVER, _POINTS = -math.radians(200.0), 0.6, 80
 # Share of the error's power that the u of the same sample explains where y is early: by hand.
@@ -162,9 +162,9 @@ def _pair_in(near: Linearised, u: Vector) -> Vector | None:
     structure = near.fit.structure
     if structure.samples or structure.friction or u.size < _LEAST_OF_PAIR:
         return None
-    poles = continuous(fit_of_record(u, near.error, 2).poles)
-    if not (poles[0].imag > 0.0 and -poles[0].real < DAMPED * abs(poles[0]) < DAMPED * _FAST_PAIR):
-        return None
+    part = moving_part(u)
+    upper, _ = pair_beside(Spectra.of(u[part], near.error[part]), np.zeros(0, dtype=complex))
+    poles = continuous(np.array([upper, upper.conjugate()]))
     return np.asarray(np.poly(poles).real[:0:-1], dtype=np.float64)
 
 

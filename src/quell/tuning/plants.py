@@ -394,6 +394,8 @@ def record_model(
             models.append(fitted(fewer, rubs, ends))
     held: Identified | None = None
     for one in [*models, first]:
+        if friction is None and one.friction is not None and not one.rubs:
+            continue
         # Friction on a speed hides an offset: it must be better than a model without, not alone.
         alone = held is None and not (
             one.den.size == 2 and one.friction is not None and not friction
