@@ -10,9 +10,10 @@ as ``quell tune RECORD`` takes it, without options (``record_model``).
 
 It is *usable* if its gain and each pole are within 3 half widths or 5 % of the truth; otherwise
 *named* if those of another model are, from which the report says that the record does not tell it
-(``quell tune`` tunes for both), *wrong without NOT*, *said* (a line with NOT), or *refused*. Beside it a least-squares fit of the
-true form is made, from parameters that are off by up to a third, with the delay and the clipped
-samples known: where that has gain and poles within 5 %, the record has an answer.
+(``quell tune`` tunes for both), *wrong without NOT*, *said* (a line with NOT), or *refused*. Beside
+it a least-squares fit of the true form is made, from parameters that are off by up to a third, with
+the delay and the clipped samples known: where that has gain and poles within 5 %, the record has an
+answer.
 
 With ``--tune`` a controller is tuned for each, with the limits of u alone, and its M_s on the true
 plant is found. With ``--axes`` only flexible axes with the encoder at the motor are drawn, and
