@@ -15,7 +15,7 @@ from quell.identification.frequencies import FrequencyResponse
 from quell.identification.frequency_model import FrequencyModel
 from quell.identification.result import draw_bode, draw_output, draw_tests, seven_axes
 from quell.identification.spectra import SpectralModes
-from quell.identification.swings import FreeDecay, FreeSwing
+from quell.identification.swings import Decay, FreeSwing
 from quell.identification.validation import Residuals
 from quell.quantities import UNKNOWN, Quantity, Signals
 from quell.tuning import Constraints
@@ -58,8 +58,8 @@ def test_a_spectrum_is_drawn_over_hertz_with_its_model() -> None:
 def test_a_swing_and_a_decay_are_drawn_with_their_errors() -> None:
     """Measured, simulated, and the difference below."""
     y, simulated = np.cos(0.3 * T), np.cos(0.31 * T)
-    swing = FreeSwing((), 0.0, 99.0, 0.1, y, simulated)
-    decay = FreeDecay(4.0, (3.0, 5.0), 0.0, (-1.0, 1.0), 1.0, 99.0, 0.1, y, simulated)
+    swing = FreeSwing((), None, 1.0, 0.0, (-1.0, 1.0), 99.0, 0.1, y, simulated)
+    decay = swing._replace(decay=Decay(4.0, (3.0, 5.0)))
     for found in (swing, decay):
         shown, error = found.plot(axes_of(2))
         np.testing.assert_allclose(data(shown, 0), [0.1 * T, y])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.identification import free_decay, free_swing
+from quell.identification import free_swing
 
 from .commands import Shown
 
@@ -64,11 +64,12 @@ def test_a_number_of_modes_that_is_given_is_taken() -> None:
 @pytest.mark.parametrize(
     ("y", "options", "message"),
     [
-        (np.exp(-T), {}, "y does not ring"),
-        (np.random.default_rng(0).standard_normal(500), {}, "y does not ring"),
-        (np.full(400, 3.0), {}, "y is 3 all through: must ring"),
-        (swing(MODES[0])[:15], {}, "y has 15 samples: must have at least 20 for each mode"),
-        (swing(MODES[0]), {"modes": 6}, "modes = 6: must be a whole number from 1 to 5"),
+        (np.exp(-T), {"modes": 1}, "y does not ring"),
+        (np.random.default_rng(0).standard_normal(500), {}, "does not ring, nor does it decay: no"),
+        (np.full(400, 3.0), {}, "y is 3 all through: must ring or decay"),
+        (swing(MODES[0])[:11], {}, "y has 11 samples: must have at least 20 for each mode"),
+        (swing(MODES[0])[:15], {"modes": 1}, "has 15 samples: must have at least 20 for each mode"),
+        (swing(MODES[0]), {"modes": 6}, "modes = 6: must be a whole number from 0 to 5"),
         (np.append(swing(MODES[0]), np.nan), {}, r"y: entry \(1200,\) is nan"),
     ],
 )
@@ -109,29 +110,32 @@ def test_a_decay_of_twenty_samples_has_its_time_constant_and_its_end(
     """A heat-up and a coast-down; it is no swing, however much a damped mode could fit."""
     t = 5.0 * np.arange(20)
     y = end + (begin - end) * np.exp(-t / 40.0) + np.random.default_rng(1).standard_normal(20)
-    found = free_decay(y, 5.0)
+    found = free_swing(y, 5.0)
+    assert found.modes == ()
+    assert found.decay is not None
     for value, (low, high), truth in (
-        (found.time_constant, found.interval, 40.0),
+        (found.decay.time_constant, found.decay.interval, 40.0),
         (found.at_rest, found.at_rest_interval, end),
     ):
         assert low < value < high
         assert abs(value - truth) < 1.5 * (high - low)
-    assert found.interval[1] - found.interval[0] < 10.0
+    assert found.decay.interval[1] - found.decay.interval[0] < 10.0
+    assert free_swing(y, 5.0, 0).decay == found.decay
     with pytest.raises(ValueError, match="does not ring"):
-        free_swing(y, 5.0)
+        free_swing(y, 5.0, 1)
 
 
 def test_a_straight_line_has_no_time_constant_and_noise_does_not_decay() -> None:
     """Both are refused; a decay that the record hardly shows is said with NOT."""
     noise = 0.5 * np.random.default_rng(0).standard_normal(40)
     with pytest.raises(ValueError, match="as a straight line or faster"):
-        free_decay(np.arange(40.0) ** 1.2 + noise, 1.0)
-    hardly = free_decay(100.0 * (1.0 - np.exp(-np.arange(40.0) / 150.0)) + 2.0 * noise, 1.0)
+        free_swing(np.arange(40.0) ** 1.2 + noise, 1.0, 0)
+    hardly = free_swing(100.0 * (1.0 - np.exp(-np.arange(40.0) / 150.0)) + 2.0 * noise, 1.0, 0)
     assert "NOT: the record does not decide the time constant" in str(hardly)
     with pytest.raises(ValueError, match="y does not decay"):
-        free_decay(np.random.default_rng(0).standard_normal(40), 1.0)
+        free_swing(np.random.default_rng(0).standard_normal(40), 1.0, 0)
     with pytest.raises(ValueError, match="y has 5 samples: must have at least 12"):
-        free_decay(np.arange(5.0), 1.0)
+        free_swing(np.arange(5.0), 1.0, 0)
 
 
 def test_the_command_finds_the_time_constant_of_a_heat_up(

@@ -15,7 +15,7 @@ from quell.identification import frequency_response
 from quell.identification.frequencies import FrequencyResponse, _period
 from quell.identification.model import WITHIN_95
 from quell.identification.spectra import SpectralMode, SpectralModes, _model, modes_of_spectrum
-from quell.identification.swings import FreeSwing, Mode, _pencil, free_decay, free_swing
+from quell.identification.swings import Decay, FreeSwing, Mode, _pencil, free_swing
 
 from .cases import cases
 
@@ -481,13 +481,26 @@ def test_a_swing_is_told_in_hertz() -> None:
     assert str(mode) == (
         "mode at 4 Hz (25.133 rad/s), 95 %: 3 to 5 Hz; damping 0.1, 95 %: 0.05 to 0.15; amplitude 0.7"
     )
-    found = swing()._replace(at_rest=1.0, fit=99.0)
+    found = swing()._replace(begin=3.0, at_rest=1.0, at_rest_interval=(0.5, 1.5), fit=99.0)
     *modes, last = str(found).splitlines()
     assert modes == [str(found.modes[0])]
-    assert last == "at rest y is 1; fit 99.000 %"
+    assert last == "from 3 to 1 at rest, 95 %: 0.5 to 1.5; fit 99.000 %"
     value = found.to_json()
-    assert value["modes"] == [found.modes[0]._asdict()]
-    assert (value["at_rest"], value["fit"]) == (found.at_rest, found.fit)
+    known = found.modes[0]
+    assert value["modes"] == [
+        known._asdict()
+        | {
+            "omega_interval": list(known.omega_interval),
+            "damping_interval": list(known.damping_interval),
+        }
+    ]
+    assert (value["at_rest"], value["fit"], value["decay"]) == (found.at_rest, found.fit, None)
+    decay = found._replace(modes=(), decay=Decay(8.0, (7.0, math.inf)))
+    first, said, rest = str(decay).splitlines()
+    assert first == "y decays with a time constant of 8 s, 95 %: 7 to inf s"
+    assert said.startswith("NOT: the record does not decide the time constant")
+    assert rest == last
+    assert decay.to_json()["decay"] == {"time_constant": 8.0, "interval": [7.0, None]}
 
 
 def test_the_pencil_has_the_poles_of_the_swing_strong_ones_first() -> None:
@@ -505,7 +518,7 @@ def test_the_pencil_has_the_poles_of_the_swing_strong_ones_first() -> None:
 def test_twenty_samples_are_needed_for_each_mode() -> None:
     """And of two that are given each."""
     y = np.cos(0.9 * np.arange(40.0))
-    for count, modes, fails in ((19, None, True), (20, None, False), (39, 2, True)):
+    for count, modes, fails in ((19, 1, True), (20, None, False), (39, 2, True)):
         if fails:
             with pytest.raises(
                 ValueError, match=f"y has {count} samples: must have at least 20 for"
@@ -520,31 +533,38 @@ def test_a_decay_has_the_values_and_intervals_of_least_squares() -> None:
     """Time constant, end, begin and fit; twelve samples at least, and no straight line."""
     t = 0.5 * np.arange(30.0)
     y = 20.0 - 15.0 * np.exp(-t / 8.0) + noise(30, 0.05)
-    found = free_decay(y, 0.5)
+    found = free_swing(y, 0.5)
+    decay = found.decay
+    assert decay is not None
     best, covariance = optimize.curve_fit(
         lambda t, a, end, begin: end + (begin - end) * np.exp(-a * t), t, y, [0.1, 20.0, 5.0]
     )
-    assert found.time_constant == pytest.approx(1.0 / best[0], rel=1e-5)
+    assert decay.time_constant == pytest.approx(1.0 / best[0], rel=1e-5)
     assert (found.at_rest, found.begin) == pytest.approx(best[1:].tolist(), rel=1e-5)
     half = 1.96 * math.sqrt(covariance[0, 0])
-    low, high = found.interval
-    assert 1.0 / low - 1.0 / found.time_constant == pytest.approx(half, rel=0.35)
-    assert 1.0 / low + 1.0 / high == pytest.approx(2.0 / found.time_constant, rel=1e-9)
+    low, high = decay.interval
+    assert 1.0 / low - 1.0 / decay.time_constant == pytest.approx(half, rel=0.35)
+    assert 1.0 / low + 1.0 / high == pytest.approx(2.0 / decay.time_constant, rel=1e-9)
     low, high = found.at_rest_interval
     assert low < found.at_rest < high
     assert high - low == pytest.approx(2.0 * 1.96 * math.sqrt(covariance[1, 1]), rel=0.4)
     left = np.linalg.norm(y - found.simulated) / np.linalg.norm(y - np.mean(y))
     assert found.fit == pytest.approx(100.0 * (1.0 - left), rel=1e-9)
     value = found.to_json()
-    assert (value["time_constant"], value["begin"]) == (found.time_constant, found.begin)
+    assert (value["decay"]["time_constant"], value["begin"]) == (decay.time_constant, found.begin)
     assert tuple(value["at_rest_interval"]) == found.at_rest_interval
     exact_y = 20.0 - 15.0 * np.exp(-t / 8.0)
-    assert free_decay(exact_y[:12], 0.5).time_constant == pytest.approx(8.0, rel=1e-5)
+    short = free_swing(exact_y[:12], 0.5).decay
+    assert short is not None
+    assert short.time_constant == pytest.approx(8.0, rel=1e-5)
     for record, message in (
-        (exact_y[:11], "y has 11 samples: must have at least 12; record more"),
+        (exact_y[:11], "y has 11 samples: must have at least 12; record longer"),
         (t, "y does not decay: it moves on as a straight line or faster; record longer"),
         (np.exp(0.05 * t), "y does not decay: it moves on as a straight line or faster"),
-        (noise(30, 1.0), "y does not decay: no time constant explains more of it than chance;"),
+        (
+            noise(30, 1.0),
+            "y does not decay: no frequency and no time constant explains more of it than chance;",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
-            free_decay(record, 0.5)
+            free_swing(record, 0.5, 0)

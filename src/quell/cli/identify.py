@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from quell.cli.exit_codes import ExitCode
 from quell.cli.options import (
@@ -276,32 +276,25 @@ def _frequencies(record: Measured, name: str, with_reference: bool, outputs: Out
 def _modes(record: Measured, name: str, outputs: Outputs) -> None:
     """Print, draw and write the modes of a free swing, or the time constant of a decay."""
     from quell.experiments.common import save_figure
-    from quell.identification import free_decay, free_swing
+    from quell.identification import free_swing
 
     outputs = check_outputs(outputs, ["identified"])
     console = Console()
-    u, decay, shown = float(record.u[0]), None, cast(Any, None)
-    try:
-        shown = free_swing(record.y, record.dt)
-    except ValueError as no_swing:
-        try:
-            shown = decay = free_decay(record.y, record.dt)
-        except ValueError:
-            raise no_swing from None
-    kind = "a free swing, as u rests" if decay is None else f"a decay, as u is {u:g} all through"
+    u, found = float(record.u[0]), free_swing(record.y, record.dt)
+    kind = f"a decay, as u is {u:g} all through" if found.decay else "a free swing, as u rests"
     print_line(console, f"{name}: {kind}: {record.y.size} samples")
-    for line in str(shown).splitlines():
+    for line in str(found).splitlines():
         print_line(console, line)
-    results = shown.to_json()
-    if decay is not None and u != 0.0:
-        results["gain_from_rest"] = (decay.at_rest - decay.begin) / u
+    results = found.to_json()
+    if found.decay and u != 0.0:
+        results["gain_from_rest"] = (found.at_rest - found.begin) / u
         print_line(
             console,
             f"if u was 0 and y at rest before, the gain is {results['gain_from_rest']:.5g}",
         )
     paths: list[Path] = []
     if outputs.figures:
-        figure = shown.plot()[0].figure
+        figure = found.plot()[0].figure
         paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
     write_results(console, results, outputs, paths)
 

@@ -31,15 +31,15 @@ from quell.identification.structures import (
     decided,
     not_told_apart,
 )
-from quell.identification.swings import FreeDecay, FreeSwing, Mode, free_decay, free_swing
+from quell.identification.swings import Decay, FreeSwing, Mode, free_swing
 from quell.identification.validation import Residuals
 from quell.lazy import public_names
 
 __all__ = [
     "Alternative",
     "Bandwidth",
+    "Decay",
     "Excitation",
-    "FreeDecay",
     "FreeSwing",
     "FrequencyModel",
     "FrequencyResponse",
@@ -59,7 +59,6 @@ __all__ = [
     "decided",
     "excitation",
     "excited",
-    "free_decay",
     "free_swing",
     "frequency_response",
     "frequency_table",

@@ -1,4 +1,4 @@
-"""A free swing: frequency and damping of the modes of a y that rings while u rests.
+"""A free swing: the modes of a y that rings while u rests, or the time constant of its decay.
 
 The motion of a linear plant with m modes after a knock, about a constant y_0, is::
 
@@ -13,10 +13,11 @@ coloured. With the slope ∂p/∂a of a pole by the coefficients of A the deviat
     δω = Re(p̄ δp)/ω,        δζ = −(Re δp + ζ δω)/ω
 
 Each mode must pass the ratio of likelihoods of ``alternatives``, the first one against a y that is
-constant or decays as ``y_∞ + (y_0 − y_∞) exp(−t/T)``: a coast-down, or a heat-up under a steady u,
-which ``free_decay`` fits in the same way. With 1/T = a the interval of T is that of 1/a, and y_∞ is
-a ratio of two parameters, with Fieller's interval (``model.gain_interval``). What rings is taken as
-linear: friction makes the damping of a small swing larger than that of a large one.
+constant or decays as ``y_∞ + (y_0 − y_∞) exp(−t/T)``. Where none does, that is the model: of a
+coast-down, or a heat-up under a steady u. With 1/T = a the interval of T is that of 1/a, and y_∞,
+where y rests, is a ratio of two parameters, with Fieller's interval (``model.gain_interval``). What
+rings is taken as linear: friction makes the damping of a small swing larger than that of a large
+one.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from quell.identification.output_error import ParameterEstimate, likelihood_rati
 from quell.identification.starts import with_poles
 from quell.parallel import one_blas_thread
 from quell.records.plotting import draw_line, given_axes, grid_of_axes, new_figure
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 # Most modes, samples of the pencil, and samples per period of the fastest frequency that matters.
 _MOST_MODES, _PENCIL, _PER_PERIOD = 5, 600, 8.0
@@ -53,6 +54,7 @@ _LEAST_DECAY, _RATES = 12, 7
 # Relative mean square that counts as zero, and samples over time constant of a straight line: an
 # exact one has a time constant of rounding.
 _ROUNDING, _STRAIGHT = 1e-24, 1e-9
+_FIRST_ORDER = Structure(1, 0, (0,))
 
 
 class Mode(NamedTuple):
@@ -80,11 +82,35 @@ class Mode(NamedTuple):
         )
 
 
-class FreeSwing(NamedTuple):
-    """The modes of a free swing, large amplitudes first, and how well they describe it."""
+class Decay(NamedTuple):
+    """The time constant of a y that decays."""
 
-    modes: tuple[Mode, ...]
-    at_rest: float  #: y_0 [y-unit]
+    time_constant: float  #: T [s]
+    interval: tuple[float, float]  #: 95 % interval of it [s]; infinite if the record is too short
+
+    def __str__(self) -> str:
+        """Return it as a line, and one with NOT where the record does not decide it."""
+        low, high = self.interval
+        line = (
+            f"y decays with a time constant of {self.time_constant:.5g} s, 95 %: {low:.5g} to "
+            f"{high:.5g} s"
+        )
+        if high < math.inf:
+            return line
+        return (
+            f"{line}\nNOT: the record does not decide the time constant: y may be a straight line; "
+            "record longer"
+        )
+
+
+class FreeSwing(NamedTuple):
+    """The modes of a free swing, large amplitudes first, or its decay, and how well they fit."""
+
+    modes: tuple[Mode, ...]  #: none for a y that decays without ringing
+    decay: Decay | None  #: None for a y that rings
+    begin: float  #: y_0, of the first sample [y-unit]
+    at_rest: float  #: y_∞ [y-unit]
+    at_rest_interval: tuple[float, float]  #: 95 % interval of it [y-unit]
     fit: float  #: NRMSE [%]
     dt: float  #: sample time [s]
     y: Vector  #: as measured (N,) [y-unit]
@@ -92,8 +118,13 @@ class FreeSwing(NamedTuple):
 
     def __str__(self) -> str:
         """Return the report."""
-        lines = [str(mode) for mode in self.modes]
-        return "\n".join([*lines, f"at rest y is {self.at_rest:.5g}; fit {self.fit:.3f} %"])
+        found = self.modes if self.decay is None else (self.decay,)
+        low, high = self.at_rest_interval
+        last = (
+            f"from {self.begin:.5g} to {self.at_rest:.5g} at rest, 95 %: {low:.5g} to {high:.5g}; "
+            f"fit {self.fit:.3f} %"
+        )
+        return "\n".join([*(str(each) for each in found), last])
 
     def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw y as measured and simulated, and the error; return the two axes.
@@ -115,140 +146,31 @@ class FreeSwing(NamedTuple):
         return axes
 
     def to_json(self) -> dict[str, Any]:
-        """Return the modes for JSON."""
-        return {
-            "modes": [mode._asdict() for mode in self.modes],
-            "at_rest": self.at_rest,
-            "fit": self.fit,
-        }
-
-
-class FreeDecay(NamedTuple):
-    """A y that decays to where it rests, with one time constant."""
-
-    time_constant: float  #: T [s]
-    interval: tuple[float, float]  #: 95 % interval of it [s]; infinite if the record is too short
-    at_rest: float  #: y_∞ [y-unit]
-    at_rest_interval: tuple[float, float]  #: 95 % interval of it [y-unit]
-    begin: float  #: y_0 [y-unit]
-    fit: float  #: NRMSE [%]
-    dt: float  #: sample time [s]
-    y: Vector  #: as measured (N,) [y-unit]
-    simulated: Vector  #: (N,) [y-unit]
-
-    def __str__(self) -> str:
-        """Return the report."""
-        (low, high), (least, most) = self.interval, self.at_rest_interval
-        lines = [
-            f"y decays with a time constant of {self.time_constant:.5g} s, 95 %: {low:.5g} to "
-            f"{high:.5g} s",
-            f"from {self.begin:.5g} to {self.at_rest:.5g}, 95 %: {least:.5g} to {most:.5g}; "
-            f"fit {self.fit:.3f} %",
-        ]
-        if not high < math.inf:
-            lines.append(
-                "NOT: the record does not decide the time constant: y may be a straight line; "
-                "record longer"
-            )
-        return "\n".join(lines)
-
-    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
-        """Draw y as measured and simulated, and the error, as ``FreeSwing.plot``."""
-        drawn = FreeSwing((), self.at_rest, self.fit, self.dt, self.y, self.simulated)
-        return drawn.plot(axes, ax=ax)
-
-    def to_json(self) -> dict[str, Any]:
         """Return the results for JSON; None for numbers that are not finite."""
-        names = ("time_constant", "interval", "at_rest", "at_rest_interval", "begin", "fit")
-        return dict(nonfinite_to_none({name: getattr(self, name) for name in names}))
-
-
-def free_decay(y: Any, dt: float) -> FreeDecay:
-    """Return time constant and end of a y that decays while u is steady.
-
-    Parameters
-    ----------
-    y
-        record (N,) of a coast-down, or of a heat-up under a steady u [y-unit]; 12 samples at least.
-    dt
-        sample time [s].
-
-    Raises
-    ------
-    ValueError
-        for a y that does not decay, and for a record that is too short.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import quell as ql
-    >>> t = np.arange(20) * 5.0
-    >>> found = ql.identification.free_decay(150.0 - 130.0 * np.exp(-t / 40.0), dt=5.0)
-    >>> round(found.time_constant, 3), round(found.at_rest, 3)
-    (40.0, 150.0)
-    """
-    y, dt = checks.vector("y", y), checks.positive("dt", dt, "s")
-    if y.size < _LEAST_DECAY:
-        raise ValueError(f"y has {y.size} samples: must have at least {_LEAST_DECAY}; record more")
-    structure = Structure(1, 0, (0,))
-    with one_blas_thread(), np.errstate(all="ignore"):
-        estimate = _decay(y)
-        centred = y - np.mean(y)
-        simulated = output(structure, estimate.theta, np.ones((y.size, 1)))
-        ratio = likelihood_ratio((centred, y - simulated), _ROUNDING * float(centred @ centred))
-    a = float(estimate.theta[0])
-    if not math.isfinite(estimate.cost) or a >= math.pi or ratio < 4.0 * math.log(y.size):
-        raise ValueError(
-            "y does not decay: no time constant explains more of it than chance; begin the record "
-            "where u was switched, and keep u steady"
-        )
-    if a * y.size <= _STRAIGHT:
-        raise ValueError(
-            "y does not decay: it moves on as a straight line or faster; record longer, until it "
-            "comes to rest"
-        )
-    half = WITHIN_95 * math.sqrt(max(float(estimate.covariance[0, 0]), 0.0))
-    spread = float(np.linalg.norm(centred))
-    low, high = gain_interval(
-        estimate.theta[:1], float(estimate.theta[1]), estimate.covariance[:2, :2]
-    )
-    return FreeDecay(
-        dt / a,
-        (dt / (a + half), dt / (a - half) if half < a else math.inf),
-        float(estimate.theta[1]) / a,
-        (low, high),
-        float(simulated[0]),
-        100.0 * (1.0 - float(np.linalg.norm(y - simulated)) / spread),
-        dt,
-        y,
-        simulated,
-    )
-
-
-def _decay(y: Vector) -> ParameterEstimate:
-    """Return the best exponential from several time constants."""
-    structure, v = Structure(1, 0, (0,)), np.ones((y.size, 1))
-    rates = np.geomspace(0.3 / y.size, 1.0, _RATES)
-    tried = [refine(structure, with_poles(structure, np.array([a])), v, y, _STEPS) for a in rates]
-    return min(tried, key=lambda one: one.cost)
+        value = {name: getattr(self, name) for name in ("begin", "at_rest", "at_rest_interval")}
+        decay = None if self.decay is None else self.decay._asdict()
+        value |= {"fit": self.fit, "modes": [mode._asdict() for mode in self.modes]}
+        return dict(nonfinite_to_none(value | {"decay": decay}))
 
 
 def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
-    """Return frequency and damping of the modes of a y that rings while u rests.
+    """Return frequency and damping of the modes of a y that rings while u rests, or its decay.
 
     Parameters
     ----------
     y
-        record (N,) from soon after the knock on [y-unit].
+        record (N,) from soon after the knock on, of a coast-down, or of a heat-up under a steady u
+        [y-unit]; 12 samples at least, and 20 for each mode.
     dt
         sample time [s].
     modes
-        number of modes, 1 to 5; by default as many as the record tells apart.
+        number of modes, 0 to 5; 0 for a decay. By default as many as the record tells apart, and a
+        decay where y does not ring.
 
     Raises
     ------
     ValueError
-        for a y that does not ring, and for a record that is too short.
+        for a y that neither rings nor decays, and for a record that is too short.
 
     Examples
     --------
@@ -259,46 +181,90 @@ def free_swing(y: Any, dt: float, modes: int | None = None) -> FreeSwing:
     >>> (mode,) = ql.identification.free_swing(y, dt=0.002).modes
     >>> round(mode.omega, 3), round(mode.damping, 4)
     (50.01, 0.02)
+    >>> t = np.arange(20) * 5.0
+    >>> found = ql.identification.free_swing(150.0 - 130.0 * np.exp(-t / 40.0), dt=5.0)
+    >>> round(found.decay.time_constant, 3), round(found.at_rest, 3)
+    (40.0, 150.0)
     """
     y, dt = checks.vector("y", y), checks.positive("dt", dt, "s")
-    most = _MOST_MODES if modes is None else checks.whole("modes", modes, 1, _MOST_MODES)
-    if y.size < _PER_MODE * (modes or 1):
+    if modes is not None:
+        modes = checks.whole("modes", modes, 0, _MOST_MODES)
+    least = _LEAST_DECAY if modes == 0 else _PER_MODE * (modes or 1)
+    short = y.size < least
+    if short and (modes is not None or y.size < _LEAST_DECAY):
+        each = " for each mode" * (modes != 0)
         raise ValueError(
-            f"y has {y.size} samples: must have at least {_PER_MODE} for each mode; record longer"
+            f"y has {y.size} samples: must have at least {_PER_MODE if modes != 0 else least}"
+            f"{each}; record longer"
         )
     if np.ptp(y) == 0.0:
-        raise ValueError(f"y is {y[0]:g} all through: must ring; record it from the knock on")
-    v, found, error = np.ones((y.size, 1)), None, y - np.mean(y)
+        raise ValueError(f"y is {y[0]:g} all through: must ring or decay; record it from the begin")
     with one_blas_thread(), np.errstate(all="ignore"):
-        least = _ROUNDING * float(np.sum(error**2))
-        poles = _pencil(y)
         decay = _decay(y)
-        left = y - output(Structure(1, 0, (0,)), decay.theta, v)
-        # What decays is no mode that is damped so much that it hardly swings.
-        if math.isfinite(decay.cost) and likelihood_ratio((error, left), least) > 3.0 * math.log(
-            y.size
-        ):
-            error = left
-        for count in range(modes or 1, most + 1):
-            if poles.size < count or y.size < _PER_MODE * count:
-                break
-            structure = Structure(2 * count, 0, (0,))
-            pairs = np.concatenate([poles[:count], poles[:count].conjugate()])
-            start = with_poles(structure, np.asarray(np.poly(pairs).real[:0:-1], np.float64))
-            model = structure, refine(structure, start, v, y, _STEPS)
-            if not _rings(*model):
-                continue
-            left = y - output(structure, model[1].theta, v)
-            more = 2 * (structure.order - (0 if found is None else found[0].order))
-            if likelihood_ratio((error, left), least) >= (more + 2) * math.log(y.size):
-                found, error = model, left
-        if found is None:
+        found = None if modes == 0 or short else _ringing(y, decay, modes)
+        if found is None and modes:
             raise ValueError(
                 "y does not ring: no pole with a frequency that its samples show was found; is it "
-                "a free swing, after a knock, while u rests? A heat-up or coast-down is for "
-                "free_decay"
+                "a free swing, after a knock, while u rests?"
             )
-        return _result(*found, y, dt)
+        return _result(*(found or (_FIRST_ORDER, _checked(y, decay, modes))), y, dt)
+
+
+def _ringing(
+    y: Vector, decay: ParameterEstimate, modes: int | None
+) -> tuple[Structure, ParameterEstimate] | None:
+    """Return the model of modes; None if y does not ring."""
+    v, found, error = np.ones((y.size, 1)), None, y - np.mean(y)
+    least = _ROUNDING * float(np.sum(error**2))
+    poles = _pencil(y)
+    left = y - output(_FIRST_ORDER, decay.theta, v)
+    # What decays is no mode that is damped so much that it hardly swings.
+    if math.isfinite(decay.cost) and likelihood_ratio((error, left), least) > 3.0 * math.log(
+        y.size
+    ):
+        error = left
+    for count in range(modes or 1, (modes or _MOST_MODES) + 1):
+        if poles.size < count or y.size < _PER_MODE * count:
+            break
+        structure = Structure(2 * count, 0, (0,))
+        pairs = np.concatenate([poles[:count], poles[:count].conjugate()])
+        start = with_poles(structure, np.asarray(np.poly(pairs).real[:0:-1], np.float64))
+        model = structure, refine(structure, start, v, y, _STEPS)
+        if not _rings(*model):
+            continue
+        left = y - output(structure, model[1].theta, v)
+        more = 2 * (structure.order - (0 if found is None else found[0].order))
+        if likelihood_ratio((error, left), least) >= (more + 2) * math.log(y.size):
+            found, error = model, left
+    return found
+
+
+def _checked(y: Vector, decay: ParameterEstimate, modes: int | None) -> ParameterEstimate:
+    """Return the model of a decay; a ``ValueError`` refuses a y that does not decay."""
+    centred = y - np.mean(y)
+    left = y - output(_FIRST_ORDER, decay.theta, np.ones((y.size, 1)))
+    ratio = likelihood_ratio((centred, left), _ROUNDING * float(centred @ centred))
+    a = float(decay.theta[0])
+    which = "y does not decay" if modes == 0 else "y does not ring, nor does it decay"
+    if not math.isfinite(decay.cost) or a >= math.pi or ratio < 4.0 * math.log(y.size):
+        raise ValueError(
+            f"{which}: no frequency and no time constant explains more of it than chance; begin "
+            "the record at the knock, or where u was switched, and keep u steady"
+        )
+    if a * y.size <= _STRAIGHT:
+        raise ValueError(
+            f"{which}: it moves on as a straight line or faster; record longer, until it comes to "
+            "rest"
+        )
+    return decay
+
+
+def _decay(y: Vector) -> ParameterEstimate:
+    """Return the best exponential from several time constants."""
+    v, rates = np.ones((y.size, 1)), np.geomspace(0.3 / y.size, 1.0, _RATES)
+    starts = [with_poles(_FIRST_ORDER, np.array([a])) for a in rates]
+    tried = [refine(_FIRST_ORDER, start, v, y, _STEPS) for start in starts]
+    return min(tried, key=lambda one: one.cost)
 
 
 def _pencil(y: Vector) -> Any:
@@ -336,15 +302,39 @@ def _rings(structure: Structure, estimate: ParameterEstimate) -> bool:
 
 def _result(structure: Structure, estimate: ParameterEstimate, y: Vector, dt: float) -> FreeSwing:
     a, n = structure.denominator(estimate.theta), structure.order
-    covariance = estimate.covariance[:n, :n]
+    simulated = output(structure, estimate.theta, np.ones((y.size, 1)))
+    at_rest, decay = float(estimate.theta[n] / a[0]), None
+    modes: tuple[Mode, ...] = ()
+    if n == 1:
+        half = WITHIN_95 * math.sqrt(max(float(estimate.covariance[0, 0]), 0.0))
+        rate = float(a[0])
+        ends = dt / (rate + half), dt / (rate - half) if half < rate else math.inf
+        decay = Decay(dt / rate, ends)
+    else:
+        modes = _modes(a, estimate.covariance[:n, :n], simulated - at_rest, dt)
+    spread = float(np.linalg.norm(y - np.mean(y)))
+    return FreeSwing(
+        modes=modes,
+        decay=decay,
+        begin=float(simulated[0]),
+        at_rest=at_rest,
+        at_rest_interval=gain_interval(
+            estimate.theta[:n], float(estimate.theta[n]), estimate.covariance[: n + 1, : n + 1]
+        ),
+        fit=100.0 * (1.0 - float(np.linalg.norm(y - simulated)) / spread),
+        dt=dt,
+        y=y,
+        simulated=simulated,
+    )
+
+
+def _modes(a: Vector, covariance: Matrix, swing: Vector, dt: float) -> tuple[Mode, ...]:
+    """Return the modes, large amplitudes first, of the coefficients a of A and the swing itself."""
     roots = np.roots(np.append(1.0, a[::-1]))
     upper = roots[roots.imag > 0.0]
-    simulated = output(structure, estimate.theta, np.ones((y.size, 1)))
-    at_rest = float(estimate.theta[n] / a[0])
-    t = np.arange(float(y.size))
-    shapes = np.exp(np.outer(t, upper))
+    shapes = np.exp(np.outer(np.arange(float(swing.size)), upper))
     columns = np.column_stack([shapes.real, shapes.imag])
-    sizes = np.linalg.lstsq(columns, simulated - at_rest, rcond=None)[0]
+    sizes = np.linalg.lstsq(columns, swing, rcond=None)[0]
     modes = []
     for i, p in enumerate(upper):
         slope, omega = pole_slope(a, p), abs(p)
@@ -364,7 +354,4 @@ def _result(structure: Structure, estimate: ParameterEstimate, y: Vector, dt: fl
                 float(np.hypot(sizes[i], sizes[upper.size + i])),
             )
         )
-    modes.sort(key=lambda mode: -mode.amplitude)
-    spread = float(np.linalg.norm(y - np.mean(y)))
-    fit = 100.0 * (1.0 - float(np.linalg.norm(y - simulated)) / spread)
-    return FreeSwing(tuple(modes), at_rest, fit, dt, y, simulated)
+    return tuple(sorted(modes, key=lambda mode: -mode.amplitude))
