@@ -632,6 +632,17 @@ def test_the_plants_of_a_model_are_the_ends_of_its_joint_intervals() -> None:
     assert more[1][-1] == 0.2
 
 
+def test_a_y_that_is_early_in_a_larger_model_is_the_refusal_of_a_smaller_one() -> None:
+    """Only where the larger model explains more."""
+    found = noisy()
+    nearer = replace(found, simulated=found.y + 0.5 * (found.simulated - found.y), early=1)
+    refusal = RecordModel(found, (), 0.3, nearer).refusal
+    assert refusal.startswith("y follows the u of the same sample")
+    assert "leave out the first 1 sample of u and the last of y" in refusal
+    assert RecordModel(found, (), 0.3, replace(nearer, early=0)).refusal == ""
+    assert RecordModel(found, (), 0.3, replace(found, early=1)).refusal == ""
+
+
 def test_a_record_model_says_why_nothing_can_be_tuned_for_it() -> None:
     """Faults and what is undecided; a good one has the plants of its set."""
     good = RecordModel(noisy(), (), 0.3)

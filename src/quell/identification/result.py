@@ -362,14 +362,7 @@ class Identified(InNotebook):
                 "the record does not decide the size of the gain, as the slowest pole may be at "
                 f"s = 0: {self._gain_text}; if the plant integrates, set integrators"
             )
-        if self.early:
-            count = f"{self.early} sample{'s' * (self.early > 1)}"
-            found.append(
-                f"y follows the u of {'the same' if self.early == 1 else 'the next'} sample, on "
-                f"which it can't depend: it is early by {count}, as where u is stored beside the y "
-                f"that came after it; leave out the first {count} of u and the last of y, or, if u "
-                "acts on y at once, as on an acceleration, give as many zeros as poles"
-            )
+        found += [self.early_text] * bool(self.early)
         if self.before:
             found.append(
                 "u was another one before the record, which acts in its first samples "
@@ -395,6 +388,17 @@ class Identified(InNotebook):
                 f"(probability {self.rest_probability:.2g}); leave rest=True (--rest) out"
             )
         return tuple(found)
+
+    @property
+    def early_text(self) -> str:
+        """That y is ``early`` against u, and what to do; only where it is."""
+        count = f"{self.early} sample{'s' * (self.early > 1)}"
+        return (
+            f"y follows the u of {'the same' if self.early == 1 else 'the next'} sample, on "
+            f"which it can't depend: it is early by {count}, as where u is stored beside the y "
+            f"that came after it; leave out the first {count} of u and the last of y, or, if u "
+            "acts on y at once, as on an acceleration, give as many zeros as poles"
+        )
 
     @property
     def fails(self) -> bool:

@@ -301,9 +301,13 @@ class RecordModel:
     def refusal(self) -> str:
         """Why no controller should be tuned for the model, and what to do; empty if there is none.
 
-        The reasons are faults of the model, and what the record does not decide.
+        The reasons are faults of the model, what the record does not decide, and a y that is early
+        against u, which a larger model shows that is not taken.
         """
-        return "; ".join([*self.model.faults, *self.model.undecided])
+        found, larger = [*self.model.faults, *self.model.undecided], self.larger
+        if larger is not None and larger.early and fits_better(self.model, larger):
+            found.append(larger.early_text)
+        return "; ".join(found)
 
     @cached_property
     def plants(self) -> tuple[list[Any], list[float]]:
