@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import quell as ql
 from quell.identification.identify import resolution_of
@@ -63,3 +65,20 @@ def test_a_u_at_the_limits_of_its_actuator_is_named_without_not() -> None:
     assert "u stands at a limit in" in str(found)
     assert found.shortcomings == ()
     assert found.gain == pytest.approx(1.0, rel=0.02)
+
+
+def test_a_record_that_begins_at_a_limit_is_taken_from_its_first_free_sample() -> None:
+    """What y was before follows from a start that is not shown; u acts with a delay after it."""
+    rng, dt = np.random.default_rng(3), 0.01
+    u = np.repeat(np.sign(rng.standard_normal(150)), 4)
+    late = np.append(np.full(3, u[0]), u)[: u.size]
+    y = lfilter([0.0, 0.04], [1.0, -0.98], late) + 6.0 * 0.98 ** np.arange(u.size)
+    y = np.minimum(y + 1e-3 * rng.standard_normal(u.size), 3.0)
+    found = ql.identify(u, y, dt, 1, delay=None, held_out=0.0)
+    begins = int(np.argmax(y < 3.0))
+    assert begins > 20
+    assert begins <= found.left_out <= begins + 8
+    assert f"the first {found.left_out} samples are left out" in str(found)
+    assert found.delay == pytest.approx(0.03, abs=1e-3)
+    assert found.den[1] == pytest.approx(-math.log(0.98) / dt, rel=5e-3)
+    assert found.shortcomings == ()

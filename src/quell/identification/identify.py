@@ -216,6 +216,9 @@ _CUTS = 3
 # Most rounds in which samples at a limit are bounded, and the change of y, as a share of its range,
 # that ends them; rounds that tell where they lead: chosen by hand.
 _ROUNDS, _SETTLED, _MEMORY = 20, 5e-5, 5
+# Weight of a sample at a limit where what is beyond it begins: by hand, so that it moves what other
+# samples show by less than their noise.
+_AT_LIMIT = 1e-5
 # Parts of a search after which half of the work counts as done: those of a search for the delay.
 _HALF = 30.0
 # Least number of samples for each parameter: chosen by hand; real records have many more.
@@ -369,10 +372,12 @@ def identify(
 
 def _explains_more(found: Identified, late: Identified) -> bool:
     """Return whether a model with a delay leaves less, beyond chance, and has no more faults."""
-    first, count = found.y.size - late.y.size, late.held_from
-    errors = (found.y - found.simulated)[first : first + count], (late.y - late.simulated)[:count]
+    both = found, late
+    first = max(one.left_out for one in both)
+    last = min(one.left_out + one.held_from for one in both)
+    errors = [(one.y - one.simulated)[first - one.left_out : last - one.left_out] for one in both]
     least = _ROUNDED * float(np.sum((late.y - np.mean(late.y)) ** 2)) * _ROUNDED
-    more = likelihood_ratio(errors, least) > 3.0 * math.log(count)
+    more = likelihood_ratio((errors[0], errors[1]), least) > 3.0 * math.log(last - first)
     return more and len(late.faults) <= len(found.faults)
 
 
@@ -410,7 +415,7 @@ def identified(
     if not records.samples and reference is None:
         at_limits = standing(records.y, resolution_of(records.y), records.u)
     if at_limits is not None and at_limits.is_usable:
-        return _bounded(records, at_limits, given)
+        return _from_first_free(records, at_limits, given)
     found = whole = _identified(records, *given)
     known_before = bool(options.rest) or bool(records.samples) or reference is not None
     if known_before or found.faults or not found.converged:
@@ -426,6 +431,24 @@ def identified(
         except ValueError:  # too short, or u does not move there
             return whole
     return whole if found.before else replace(found, left_out=first)
+
+
+def _from_first_free(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> Identified:
+    """Return the result from the first sample on that is at no limit.
+
+    Those before it say nothing: what they would be follows from a start that they do not show. What
+    u was before that sample acts after it for the time of the delay, which is left out, too.
+    """
+    first = int(np.argmax(at_limits.free))
+    for _ in range(_CUTS):
+        rest = Standing(at_limits.upper[first:], at_limits.lower[first:])
+        part = Records(records.u[first:], records.y[first:], ())
+        found = _bounded(part, rest, given) if rest.samples else _identified(part, *given)
+        found = replace(found, left_out=first)
+        if not (first and found.before) or found.faults:
+            break
+        first += math.ceil(found.delay_interval[1] / found.dt - _ROUNDED)
+    return found
 
 
 def _bounded(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> Identified:
@@ -485,14 +508,22 @@ def _over_limits(records: Records, at_limits: Standing, given: tuple[Any, ...]) 
         model = _identified(Records(u[part], y[part], ()), given[0], options, *given[2:])
     except ValueError:  # too short
         return y
-    late = delayed(u, model.delay / model.dt)
-    bank = chains(known_of(model).a, np.column_stack([late, np.ones(u.size)]))
-    columns = np.column_stack([bank[:, : model.num.size, 0], bank[:, 0, 1], bank[:, :, 2]])
+    late, known = delayed(u, model.delay / model.dt), known_of(model).a
+    n = known.size
+    b = model.num[::-1] * model.dt ** (n - np.arange(float(model.num.size)))
+    direct = float(b[n]) if b.size > n else 0.0
+    b = b[:n] - direct * known[: b[:n].size]
+    bank = chains(known, np.column_stack([late, np.ones(u.size)]))
+    # The force, and the start of the free motion, are what another part has of its own. A motion
+    # that has died out before the first sample that is fitted is not known: it ends near the limit.
+    of_u = bank[:, : b.size, 0] @ b + direct * late
+    columns = np.column_stack([bank[:, 0, 1], bank[:, :, 2]])
     columns /= nonzero_lengths(columns)
-    if not np.all(np.isfinite(columns)):
+    if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(of_u))):
         return y
-    theta = np.linalg.lstsq(columns[at_limits.free], y[at_limits.free], rcond=1e-12)[0]
-    return at_limits.bounded(y, columns @ theta)
+    weight = np.where(at_limits.free, 1.0, _AT_LIMIT)
+    theta = np.linalg.lstsq(columns * weight[:, None], (y - of_u) * weight, rcond=1e-12)[0]
+    return at_limits.bounded(y, of_u + columns @ theta)
 
 
 def known_of(found: Identified) -> Known:

@@ -216,7 +216,8 @@ class Identified(InNotebook):
     converged: bool  #: whether the search ended at a minimum that a second start or tests confirm
     method: str
     signals: Signals = UNKNOWN  #: names and units of u and y
-    #: number of first samples that were left out, as u before the record was another one
+    #: number of first samples that were left out, as u before the record was another one, or y
+    #: stands at a limit in them
     left_out: int = 0
     #: number of samples in which y stands at a limit; they are bounded by it, and ``y`` has there
     #: what the model says, where that is beyond the limit
@@ -499,7 +500,10 @@ class Identified(InNotebook):
             how = "given" if self.rest_given else "assumed"
             lines += [f"start at rest: {how} (probability {self.rest_probability:.3g})"]
         if self.left_out:
-            lines += [f"the first {self.left_out} samples are left out: u was another one before"]
+            lines += [
+                f"the first {self.left_out} samples are left out: u was another one before, or y "
+                "stands at a limit there"
+            ]
         if self.at_limits:
             share = 100.0 * self.at_limits / self.y.size
             lines += [
