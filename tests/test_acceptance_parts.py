@@ -185,15 +185,12 @@ class _File:
         self.name, self._step, self._move = "", step, move
         self._cycling, self._loads, self.asked = cycling, list(loads), 0
 
-    def run(self, controller: Any) -> str:
-        return "run"
+    def runs(self, controller: Any) -> list[str]:
+        return ["run"]
 
-    def figures(self, controller: Any, run: Any) -> Any:
-        assert run == "run"
-        return self._step
-
-    def along(self, run: Any) -> Any:
-        return self._move
+    def of_draws(self, controller: Any, runs: Any) -> Any:
+        assert runs == ["run"]
+        return self._step, self._move
 
     def cycles(self, controller: Any, run: Any) -> bool:
         return self._cycling

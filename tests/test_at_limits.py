@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -157,6 +158,12 @@ def test_axes_are_judged_each_by_its_step_and_after_overloads() -> None:
         assert each.step.settling < 10.0
         assert each.step.overshoot < 0.05
         assert each.overloads == ()
+        assert each.step.settlings is None
+    noise = ql.signals.BandLimitedNoise(1e-8 * DT, DT)
+    noisy = replace(file, scenario=replace(file.scenario, noise=noise))
+    found = acceptance.judge_axes(noisy, limited, 0.1, held, sizes, no_prefilter)
+    for each in found.others:
+        assert each.step.settlings[0] <= each.step.settling <= each.step.settlings[1]
 
 
 def test_axes_with_other_bandwidths_are_as_if_they_were_made_with_them() -> None:

@@ -11,13 +11,20 @@ import pytest
 
 import quell as ql
 from quell.plants.linear import LinearPlant
-from quell.quantities import Quantity, Signals
+from quell.quantities import UNKNOWN, Quantity, Signals
 from quell.records.metrics import SETTLING_BAND
 from quell.tuning import reference, tables
 from quell.tuning.acceptance import Judged, _described, _slow, prefilter_table
 from quell.tuning.reference import Axis
 from quell.tuning.tables import Rest
-from quell.tuning.written import MoveFigures, Overload, StepFigures, Written
+from quell.tuning.written import (
+    DRAWS,
+    MoveFigures,
+    Overload,
+    StepFigures,
+    Written,
+    figures_table,
+)
 
 from .cases import cases
 
@@ -248,6 +255,58 @@ def test_a_run_along_a_moving_reference_has_the_largest_error() -> None:
     assert str(MoveFigures(INF, INF)) == "NOT stable: y diverges in the scenario"
 
 
+NOISE = ql.signals.BandLimitedNoise(0.02**2 * DT, DT)
+
+
+def test_figures_have_their_range_over_draws_of_the_noise() -> None:
+    """Of each draw, and of the mean response in a band that is wider and narrower by 3 σ."""
+    shown = loop(reference=ql.signals.Step(1.0, 0.5), duration=12.0, noise=NOISE)
+    controller = pi(1.5, 3.0)
+    runs = shown.runs(controller)
+    assert len(runs) == DRAWS
+    np.testing.assert_array_equal(runs[0]["y"], shown.run(controller)["y"])
+    step, move = shown.of_draws(controller, runs)
+    assert (step is None, move) == (False, None)
+    each = [shown.figures(controller, run) for run in runs]
+    assert step[:7] == each[0][:7]
+    overshoots = [one.overshoot for one in each]
+    assert step.overshoots == (min(overshoots), max(overshoots))
+    assert step.overshoots[1] - step.overshoots[0] > 0.005
+    y = np.array([run["y"][10:] for run in runs])
+    mean, sigma = np.mean(y, axis=0), math.sqrt(float(np.mean(np.var(y, axis=0, ddof=1))))
+
+    def settled(band: float) -> float:
+        return float((np.flatnonzero(np.abs(mean - 1.0) > band)[-1] + 1) * DT)
+
+    times = [one.settling for one in each]
+    times += [settled(step.band - 3.0 * sigma), settled(step.band + 3.0 * sigma)]
+    assert step.settlings == pytest.approx((min(times), max(times)))
+    assert step.settlings[1] > 1.03 * step.settlings[0]
+    quiet = loop(reference=ql.signals.Step(1.0, 0.5))
+    (alone,) = quiet.runs(controller)
+    assert quiet.of_draws(controller, [alone])[0] == quiet.figures(controller, alone)
+    assert "settlings" not in figures_table(quiet.figures(controller, alone))
+    assert figures_table(step)["settlings"] == step.settlings
+
+
+def test_the_error_along_a_move_and_the_time_after_an_overload_have_ranges() -> None:
+    """The largest |r − y| of each draw; the time back from each draw; none without noise."""
+    moving = loop(reference=ql.signals.Sinusoid(omega=2.0), noise=NOISE)
+    runs = moving.runs(pi())
+    step, move = moving.of_draws(pi(), runs)
+    errors = [float(np.max(np.abs(run["r"] - run["y"]))) for run in runs]
+    assert step is None
+    assert move == moving.along(runs[0])._replace(largests=(min(errors), max(errors)))
+    controller = pi(4.0, 4.0, u_min=-1.0, u_max=1.0)
+    calm = loop(disturbances=(0.0,), duration=2.0, noise=NOISE)
+    for load in calm.overloads(controller, None, 0.1, -1.0):
+        assert load.backs[0] <= load.back <= load.backs[1]
+        assert load.backs[0] < load.backs[1]
+        assert load.to_json()["backs"] == load.backs
+    quiet = loop(disturbances=(0.0,), duration=2.0).overloads(controller, None, 0.1, -1.0)
+    assert all(load.backs is None and "backs" not in load.to_json() for load in quiet)
+
+
 MM = Signals(Quantity("position", "mm"), Quantity("force", "N"))
 
 
@@ -271,6 +330,35 @@ MM = Signals(Quantity("position", "mm"), Quantity("force", "N"))
             StepFigures(2.0, 0.5, 0.0, 1.5, 0.05, 4.0, 0.0),
             "step of the reference by 2 at 0.5 s: overshoots by 0.0 %, settles within 5 % (with "
             "three deviations of the noise) in 1.5 s",
+        ),
+        (
+            StepFigures(2.0, 0.5, 0.02, 1.5, 0.02, 4.0, 0.0, overshoots=(0.01, 0.03)),
+            "step of the reference by 2 at 0.5 s: overshoots by 2.0 % (1 to 3 % over 5 draws of the "
+            "noise), settles within 2 % in 1.5 s",
+        ),
+        (
+            StepFigures(2.0, 0.5, 0.0, 1.5, 0.02, 4.0, 0.0, UNKNOWN, (0.0, 0.009), (1.4, 2.25)),
+            "step of the reference by 2 at 0.5 s: overshoots by 0.0 %, settles within 2 % in 1.5 s "
+            "(1.4 to 2.25 s over 5 draws of the noise)",
+        ),
+        (
+            StepFigures(2.0, 0.5, 0.0, 1.5, 0.02, 4.0, 0.0, UNKNOWN, None, (1.49, 1.53)),
+            "step of the reference by 2 at 0.5 s: overshoots by 0.0 %, settles within 2 % in 1.5 s",
+        ),
+        (
+            StepFigures(2.0, 0.5, 0.0, 1.5, 0.02, 4.0, 0.0, UNKNOWN, None, (1.4, math.nan)),
+            "NOT settled with each draw of the noise: step of the reference by 2 at 0.5 s: "
+            "overshoots by 0.0 %, settles within 2 % in 1.5 s (1.4 s to never over 5 draws of the "
+            "noise)",
+        ),
+        (
+            MoveFigures(0.4, 0.1, MM, (0.38, 0.5)),
+            "scenario: the largest |r − y| is 0.4 mm (0.38 to 0.5 mm over 5 draws of the noise), "
+            "0.1 mm in its last tenth",
+        ),
+        (
+            Overload(1.4, 2.0, 0.1, 3.0, 1.0, backs=(2.5, math.nan)),
+            "1.4 for 2 s: back in 3 s (2.5 s to never over 5 draws of the noise)",
         ),
         (Overload(1.4, 2.0, 0.1, 3.0, 1.0), "1.4 for 2 s: back in 3 s"),
         (Overload(1.4, 2.0, 0.1, math.nan, 1.0), "1.4 for 2 s: back never"),

@@ -46,6 +46,7 @@ from quell.tuning.written import (
     StepFigures,
     Written,
     bounded,
+    figures_table,
 )
 from quell.types import Matrix, Vector
 
@@ -94,11 +95,7 @@ class Seen(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return it as a table."""
-        step = None if self.step is None else self.step._asdict()
-        move = None if self.move is None else self.move._asdict()
-        for each in (step, move):
-            if each is not None:
-                del each["signals"]
+        step, move = (None if each is None else figures_table(each) for each in self[1:3])
         loads = [each.to_json() for each in self.overloads]
         found = {"name": self.name, "step": step, "move": move, "overloads": loads}
         if self.prefilter is not None:
@@ -150,9 +147,8 @@ class Judged(NamedTuple):
     def to_json(self) -> dict[str, Any]:
         """Return step, overloads and failures for ``quell.files.write_json``."""
         step = self.step
-        found = None if step is None else {**step._asdict(), "prefilter": None}
+        found = None if step is None else {**figures_table(step), "prefilter": None}
         if found is not None:
-            del found["signals"]
             if self.prefilter is not None:
                 found["prefilter"] = prefilter_table(self.prefilter)
             found["prefilter_omega"] = getattr(self.offered, "omega", None)
@@ -250,7 +246,9 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
     own = _seen(written, whole, tau, held, remedy)
     others, failures, several = tuple[Seen, ...](), own.failures, ""
     if both and not failures and written.others:
-        others = tuple(_seen(each, whole, tau, held, remedy) for each in written.others)
+        others = tuple(
+            _seen(each, whole, tau, held, remedy, runs=[each.run(whole)]) for each in written.others
+        )
         failures = _of_others(others)
         several = f"with {len(others)} {written.of_others}"
     rest = offered, offered_step, own.overloads, failures, others, several, larger
@@ -324,7 +322,7 @@ def _axes_seen(axes: Sequence[Written], controller: Any, tau: float) -> list[See
     seen, runs = [], dict[int, Any]()
     for axis, name, shaper in zip(axes, controller.names, controller.prefilters, strict=True):
         key = id(axis.scenario)
-        runs[key] = runs[key] if key in runs else axis.run(controller)
+        runs[key] = runs[key] if key in runs else axis.runs(controller)
         found = _seen(axis, controller, tau, np.zeros(1), "", name, runs[key])
         seen.append(found._replace(prefilter=shaper))
     return seen
@@ -346,15 +344,15 @@ def _seen(
     held: Matrix,
     remedy: str,
     name: str = "",
-    run: Any = None,
+    runs: Sequence[Any] | None = None,
 ) -> Seen:
     """Return what a controller does in a scenario, and where u has limits after overloads.
 
-    ``remedy`` is what to do where the step overshoots; empty where that is no failure.
+    ``remedy`` is what to do where the step overshoots; empty where that is no failure. ``runs``
+    are the run through the scenario and those with other draws of its noise, if there are any.
     """
-    name, run = name or written.name, written.run(controller) if run is None else run
-    step = written.figures(controller, run)
-    move = written.along(run) if step is None else None
+    name, runs = name or written.name, written.runs(controller) if runs is None else runs
+    step, move = written.of_draws(controller, runs)
     first, limited = str(move if step is None else step), bounded(controller)
     failures = [first] if first.startswith("NOT") else []
     over = 0.0 if step is None else step.overshoot
@@ -363,7 +361,7 @@ def _seen(
             f"NOT below {100.0 * MOST_OVERSHOOT:.0f} %: the step overshoots by {100.0 * over:.1f} "
             f"%: {remedy}"
         )
-    if limited and written.cycles(controller, run):
+    if limited and written.cycles(controller, runs[0]):
         failures.append(
             "NOT at rest: at the end of the scenario u still goes from limit to limit; bound the "
             "loop more (M_ks, M_s), or give a smaller step"

@@ -3,11 +3,17 @@
 Margins come from linearising the controller. Whatever is said about a step, a load or an overload
 comes from here: the controller as it is written runs on the plant as it is written, with delay, lag
 of the actuator, friction, play, encoder and limits of u.
+
+A figure that depends on the draw of the noise is that of the file's own seed, beside its range over
+several draws. With the mean m of the responses and the standard deviation σ around it, the time at
+which m stays within the band wider and narrower by 3 σ belong to that of the settling time: where
+an overshoot just touches the band y settles before or behind it, and few draws may show one only.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -20,6 +26,7 @@ from quell.quantities import UNKNOWN, Signals
 from quell.records.metrics import SETTLING_BAND, settling_time
 from quell.signals import Signal, Step, as_signal
 from quell.simulation import Scenario, simulate
+from quell.simulation.scenario import is_random
 from quell.types import Vector
 
 # Samples up to which a run is plain Python: that takes as long as code that is loaded from the disk
@@ -31,6 +38,10 @@ _MOST_STEPS = 50
 _NOISE_BAND = 3.0
 # Share of the samples at a limit in the last fifth of a run from which on the loop cycles there.
 _AT_LIMIT, _LAST = 0.2, 5
+DRAWS = 5
+"""Draws of the noise over which the range of a figure is taken."""
+# Ranges are told from this width on, as a share: of the step for an overshoot, else of the figure.
+_POINTS, _SHARE = 0.01, 0.03
 MOST_OVERSHOOT = 0.05
 """Largest overshoot of a step of the reference that is taken without a prefilter, as a share."""
 # Loads in units of what u can hold, for so many closed-loop time constants.
@@ -41,6 +52,25 @@ _HELD = 0.3
 # that overload and recovery without limits take it counts as slow. Chosen by hand: a double
 # integrator with the quickest switching needs 1.5 of the first.
 _BACK, _SLOW = 0.02, 3.0
+
+
+Range = tuple[float, float]
+
+
+def _range(values: Sequence[float]) -> Range | None:
+    """Return the least and the largest value over draws, NaN where one is; None for one draw."""
+    if len(values) == 1:
+        return None
+    return float(np.nanmin([*values, math.inf])), float(np.max(values))
+
+
+def _over_draws(ends: Range | None, least: float, unit: str) -> str:
+    """Return a range that is wider than ``least`` in brackets, else nothing."""
+    if ends is None or ends[1] - ends[0] <= least:
+        return ""
+    low, high = (f"{end:.3g}" for end in ends)
+    high = f"{unit} to never" if math.isnan(ends[1]) else f" to {high}{unit}"
+    return f" ({low}{high} over {DRAWS} draws of the noise)"
 
 
 class StepFigures(NamedTuple):
@@ -54,6 +84,8 @@ class StepFigures(NamedTuple):
     looked: float  #: time that was looked at [s]
     limited: float  #: time that u is at a limit in it [s]
     signals: Signals = UNKNOWN  #: names and units of y and u
+    overshoots: Range | None = None  #: least and largest over draws of the noise, if there is any
+    settlings: Range | None = None  #: the same; NaN at its end where y does not settle with each
 
     def __str__(self) -> str:
         """Return the figures as a sentence."""
@@ -62,13 +94,19 @@ class StepFigures(NamedTuple):
         if not math.isfinite(self.overshoot):
             return f"NOT stable: {begin}: y diverges"
         text = f"{begin}: overshoots by {100.0 * self.overshoot:.1f} %"
+        if self.overshoots is not None:
+            ends = 100.0 * self.overshoots[0], 100.0 * self.overshoots[1]
+            text += _over_draws(ends, 100.0 * _POINTS, " %")
         wide = self.band > 1.1 * SETTLING_BAND
         band = f"{100.0 * (self.band if wide else SETTLING_BAND):.2g} %"
         if math.isnan(self.settling):
             return f"NOT settled: {text}; not within {band} at the end of its {self.looked:.3g} s"
         if wide:
             band += " (with three deviations of the noise)"
-        return f"{text}, settles within {band} in {self.settling:.3g} s"
+        text = f"{text}, settles within {band} in {self.settling:.3g} s"
+        text += _over_draws(self.settlings, _SHARE * self.settling, " s")
+        with_each = self.settlings is None or not math.isnan(self.settlings[1])
+        return text if with_each else f"NOT settled with each draw of the noise: {text}"
 
 
 class MoveFigures(NamedTuple):
@@ -77,16 +115,27 @@ class MoveFigures(NamedTuple):
     largest: float  #: largest ``|r − y|`` in the scenario [y-unit]; infinite if y diverges
     last: float  #: the same in its last tenth [y-unit]
     signals: Signals = UNKNOWN
+    largests: Range | None = None  #: least and largest over draws of the noise, if there is any
 
     def __str__(self) -> str:
         """Return the figures as a sentence."""
         if not math.isfinite(self.largest):
             return "NOT stable: y diverges in the scenario"
         unit = f" {self.signals.y.unit}" if self.signals.y.unit else ""
+        spread = _over_draws(self.largests, _SHARE * self.largest, unit)
         return (
-            f"scenario: the largest |r − y| is {self.largest:.3g}{unit}, {self.last:.3g}{unit} in "
-            "its last tenth"
+            f"scenario: the largest |r − y| is {self.largest:.3g}{unit}{spread}, "
+            f"{self.last:.3g}{unit} in its last tenth"
         )
+
+
+def figures_table(figures: StepFigures | MoveFigures) -> dict[str, Any]:
+    """Return figures as a table, without signals and ranges that they do not have."""
+    return {
+        key: value
+        for key, value in figures._asdict().items()
+        if key != "signals" and value is not None
+    }
 
 
 class Overload(NamedTuple):
@@ -99,6 +148,7 @@ class Overload(NamedTuple):
     usual: float  # the same after a load that u can hold [s]
     name: str = ""  # of several axes: which load
     last: str = ""  # the axis that comes back last
+    backs: Range | None = None  # least and largest over draws of the noise, if there is any
 
     @property
     def passes(self) -> bool:
@@ -110,12 +160,13 @@ class Overload(NamedTuple):
         how = "never" if math.isnan(self.back) else f"in {self.back:.3g} s"
         which = f"{self.name} by " if self.name else ""
         last = f" ({self.last})" if self.last else ""
+        if not math.isnan(self.back):
+            how += _over_draws(self.backs, _SHARE * self.back, " s")
         return f"{which}{self.load:.3g} for {self.duration:.3g} s: back {how}{last}"
 
     def to_json(self) -> dict[str, Any]:
         """Return it as a table."""
-        found = self._asdict()
-        return {key: value for key, value in found.items() if value != ""}
+        return {key: value for key, value in self._asdict().items() if value not in ("", None)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +195,12 @@ class Written:
         short = scenario.duration <= _AS_PYTHON * self.dt and not self.name
         controller = controller.at(*self.at) if self.at else controller
         return simulate(self.plant, controller, scenario, interpret=short)
+
+    def runs(self, controller: Any) -> list[Any]:
+        """Return the run through the scenario, and those with other draws of its noise."""
+        seed, draws = self.scenario.seed, DRAWS if is_random(self.scenario) else 1
+        scenarios = [replace(self.scenario, seed=seed + k) for k in range(draws)]
+        return [self.run(controller, scenario) for scenario in scenarios]
 
     @cached_property
     def _signals(self) -> tuple[tuple[Signal, ...], tuple[Signal, ...], tuple[Signal, ...]]:
@@ -237,14 +294,42 @@ class Written:
         if run.diverged or end <= first:
             return StepFigures(size, at, math.inf, math.nan, band, looked, 0.0, signals)
         y, r = (self._of_axis(run, name)[first:end] for name in ("y", "r"))
-        goal, t = float(r[0]), self._t[first:end]
+        goal = float(r[0])
         # As far as it was looked at: of a step that does not settle the text says so.
         move = (goal - float(y[0])) or size  # as in the metrics of a run
         over = max(float(np.max((y - goal) / move)), 0.0)
-        settling = settling_time(t, y, goal, band, goal - move)
+        settling = settling_time(self._t[first:end], y, goal, band, goal - move)
         at_limit = np.any(_at_limits(run["u"][first:end], controller), axis=(0, 2))
         limited = float(np.sum(at_limit)) * self.dt
         return StepFigures(size, at, over, settling, band, looked, limited, signals)
+
+    def of_draws(
+        self, controller: Any, runs: Sequence[Any]
+    ) -> tuple[StepFigures | None, MoveFigures | None]:
+        """Return ``figures`` of the first of some runs, or what it does ``along`` r that moves.
+
+        With the ranges over all, which differ in the draw of the noise.
+        """
+        every = [self.figures(controller, run) for run in runs]
+        steps = [each for each in every if each is not None]
+        if not steps:
+            moves = [self.along(run) for run in runs]
+            return None, moves[0]._replace(largests=_range([each.largest for each in moves]))
+        step, times = steps[0], [each.settling for each in steps]
+        if len(steps) > 1 and not any(run.diverged for run in runs):
+            assert self.largest is not None
+            first, end, size = self.largest
+            end = min(end, len(runs[0]))
+            y = np.array([self._of_axis(run, "y")[first:end] for run in runs])
+            mean, goal = np.mean(y, axis=0), float(self._of_axis(runs[0], "r")[first])
+            move = (goal - float(mean[0])) or size
+            wide = _NOISE_BAND * math.sqrt(float(np.mean(np.var(y, axis=0, ddof=1)))) / abs(move)
+            for band in (step.band + wide, step.band - wide):
+                if band > 0.0:
+                    time = settling_time(self._t[first:end], mean, goal, band, goal - move)
+                    times += [] if math.isnan(time) else [time]
+        overshoots = _range([each.overshoot for each in steps])
+        return step._replace(overshoots=overshoots, settlings=_range(times)), None
 
     def _names(self, run: Any) -> Signals:
         found: Signals = run.signals if self.axis is None else run.axis(self.axis).signals
@@ -326,13 +411,14 @@ class Written:
             return []
         several, names = self.axis is not None, getattr(controller, "names", ("",))
 
-        def trial(k: int, size: float, duration: float, last: float) -> Any:
+        def trial(k: int, size: float, duration: float, last: float, draw: int) -> Any:
             """Return the errors (samples, n) from the beginning of the load; None if y diverges."""
             end = begin + round(duration / self.dt) * self.dt
             at_rest = float(loads[k](begin))
             load = loads[k].until(begin, at_rest + size).until(end, at_rest)
             scenario = replace(
                 before,
+                seed=before.seed + draw,
                 reference=calm,
                 duration=round((end + last) / self.dt) * self.dt,
                 disturbances=[*loads[:k], load, *loads[k + 1 :]],
@@ -355,23 +441,29 @@ class Written:
         found, usual = [], dict[int, float]()
         for times in _CONSTANTS:
             duration, last = max(times * tau, self.dt), 40.0 * tau
-            for share in (_HELD, _OVERLOAD):
-                tried = {}
-                for k, most in enumerate(room):
-                    if most:
-                        if share == _OVERLOAD:
-                            last = 1.5 * _SLOW * (duration + usual[k])
-                        tried[k] = trial(k, share * most, duration, last)
-                # Of several axes each is back where it is little beside its largest error.
-                of_each = [np.max(each, axis=0) for each in tried.values() if each is not None]
-                peaks = np.max(of_each, axis=0) if of_each else np.array([math.inf])
-                times_back = {k: back(each, peaks, duration) for k, each in tried.items()}
+            for share, draws in ((_HELD, 1), (_OVERLOAD, DRAWS if is_random(self.scenario) else 1)):
+                of_draws = []
+                for draw in range(draws):
+                    tried = {}
+                    for k, most in enumerate(room):
+                        if most:
+                            if share == _OVERLOAD:
+                                last = 1.5 * _SLOW * (duration + usual[k])
+                            tried[k] = trial(k, share * most, duration, last, draw)
+                    # Of several axes each is back where it is little beside its largest error.
+                    of_each = [np.max(each, axis=0) for each in tried.values() if each is not None]
+                    peaks = np.max(of_each, axis=0) if of_each else np.array([math.inf])
+                    times_back = {k: back(each, peaks, duration) for k, each in tried.items()}
+                    of_draws.append((tried, times_back))
+                tried, times_back = of_draws[0]
                 if share == _HELD:
                     usual = {k: last if math.isnan(t) else t for k, (_, t) in times_back.items()}
             for k, (axis, t) in times_back.items():
                 peak = math.inf if tried[k] is None else float(np.max(tried[k][:, axis]))
-                which = (f"disturbance {k + 1}", str(names[axis])) if several else ()
-                found.append(Overload(_OVERLOAD * room[k], duration, peak, t, usual[k], *which))
+                which = (f"disturbance {k + 1}", str(names[axis])) if several else ("", "")
+                backs = _range([each[k][1] for _, each in of_draws])
+                size = _OVERLOAD * room[k]
+                found.append(Overload(size, duration, peak, t, usual[k], *which, backs))
         return found
 
 
