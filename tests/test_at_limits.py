@@ -19,13 +19,13 @@ from quell.analysis import analyse
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.prefilters import Prefiltered, ReferenceModel
 from quell.plants.linear import LinearPlant
-from quell.tuning import Constraints, acceptance, axes_at_limits
+from quell.tuning import Constraints, acceptance, axes_at_limits, reference
 from quell.tuning import plants as tuning_plants
 from quell.tuning.acceptance import Loop, judge
 from quell.tuning.axes import _made
 from quell.tuning.optimiser.coupled import Found, Measured, Plant
 from quell.tuning.plants import RecordModel, given_plants, model_of, plant_set, record_model
-from quell.tuning.reference import Shaped
+from quell.tuning.reference import Shaped, needs_none
 from quell.tuning.written import Written
 
 from .cases import cases
@@ -251,6 +251,37 @@ def test_a_step_that_overshoots_gets_a_reference_model_with_limits_and_an_offer_
     with patch.object(Written, "overloads", lambda *_: []):
         plain = judge(loop_of(shaped=False, duration=3.0), quick, of(quick))
     assert (plain.prefilter, plain.offered) == (None, None)
+
+
+def test_a_process_that_overshoots_little_needs_no_prefilter() -> None:
+    """Neither for its step nor for nearly the largest one; else u may stand at its limits."""
+    calm, quick = (pi(1.0, ki, u_min=-1.0, u_max=1.0) for ki in (1.0, 20.0))
+    loop = loop_of(duration=3.0)
+    assert acceptance.quick_without(loop, calm, of(calm))
+    assert not acceptance.quick_without(loop, quick, of(quick))
+    assert not acceptance.quick_without(loop._replace(limits=(-1.0, math.inf)), calm, of(calm))
+    assert not acceptance.quick_without(loop_of(reference=0.0), calm, of(calm))
+    over = SimpleNamespace(overshoot=0.06, settling=1.0)
+    well = SimpleNamespace(overshoot=0.05, settling=1.0)
+    for steps, most, found in (
+        ([over], 0.1, False),
+        ([well], 0.1, True),
+        ([well, over], 1.8, False),
+        ([well, well], 1.8, True),
+        ([SimpleNamespace(overshoot=0.0, settling=math.nan)], 0.1, False),
+    ):
+        with patch.object(reference, "worst_step", Mock(side_effect=steps)) as looked:
+            assert needs_none(loop.written, calm, most, 0.1) == found
+            assert looked.call_count == len(steps)
+    for limits, within in (((-1.0, 1.0), False), ((-1.0, math.inf), True)):
+        model = Mock(return_value=Shaped(None, None))
+        with (
+            patch.object(acceptance, "reference_model_for", model),
+            patch.object(acceptance, "bounded_rate", lambda *_: (None, None)),
+            patch.object(Written, "overloads", lambda *_: []),
+        ):
+            judge(loop._replace(limits=limits), quick, of(quick))
+        assert model.call_args.kwargs == {"within": within}
 
 
 def test_a_file_without_a_step_gets_one_that_uses_two_fifths_of_the_room() -> None:

@@ -8,6 +8,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from quell.controllers.shaping import ProfileGenerator
 from quell.export import c_source
 from quell.setup import made
 from quell.setup.schema import SetupError
-from quell.tuning import tune_axes
+from quell.tuning import axes_at_limits, tune_axes
 from quell.tuning.axes_at_limits import held_loads, needs_along, with_prefilters
 from quell.tuning.written import Written
 
@@ -275,6 +276,37 @@ def test_steps_at_the_limits_get_moves_that_are_near_the_quickest() -> None:
             each.step.settling, abs=2 * DT
         )
     assert 'behind the prefilter kind = "profile-generator"' in found.summary()
+
+
+@pytest.mark.trial
+def test_axes_that_friction_brakes_speed_up_at_their_limits() -> None:
+    """Quicker than moves within them, with 15 % less of u as well; another axis stays within."""
+    A = np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]])
+    A[1, 1] = -10.0
+    plant = ql.plants.LinearPlant(A, np.kron(np.eye(2), [[0.0], [1.0]]), np.eye(4)[::2])
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=200.0, dt=DT)
+    parts = {name: ql.ADRC(observer, 40.0) for name in "ab"}
+    axes = ql.Axes(parts, u_min=[-3.0, -3.0], u_max=[3.0, 3.0])
+    file = Written(plant, ql.Scenario([ql.signals.Step(0.05, 0.1)] * 2, duration=1.5), DT)
+    files = [replace(file, axis=i) for i in range(2)]
+
+    def found() -> tuple[ql.Axes, list[float]]:
+        made = with_prefilters(plant, axes, held_loads(plant, axes, None), None, files)
+        assert made is not None
+        run = file.run(made)
+        steps = [each.figures(made, run) for each in files]
+        assert all(step is not None and step.overshoot <= 0.05 for step in steps)
+        return made, [step.settling for step in steps if step is not None]
+
+    quick, times = found()
+    with patch.object(axes_at_limits, "_BEYOND_MOVES", ()):
+        within, slower = found()
+    assert times[0] < 0.9 * slower[0]
+    (a, b), (before, _) = quick.prefilters, within.prefilters
+    # Both step at once, so each has half of the room.
+    assert 10.0 * a.v_max + a.a_max > 1.5
+    assert max(10.0 * a.v_max, a.a_max, b.a_max) <= 1.5
+    assert 10.0 * before.v_max + before.a_max <= 1.5
 
 
 def test_no_prefilter_is_added_where_no_step_is_left() -> None:

@@ -229,7 +229,7 @@ def test_an_overload_lasts_as_long_as_it_says() -> None:
 def test_profiles_ramp_the_acceleration_in_given_times() -> None:
     """Each with each share of the room; quick ones come first, with the time of their smoothing."""
     tried = [(0.004, 0.0), (0.03, 0.01), (0.09, 0.0)]
-    found = list(_profiles(Axis(0.0, 0.02), 0.5, 8.0, tried))
+    found = list(_profiles(Axis(0.0, 0.02), 0.5, 8.0, tried, [(0.95, 1.0), (0.65, 1.0)]))
     ramps = {(round(each.a_max / each.j_max, 9), each.smoothing) for each in found}
     assert ramps == set(tried)
     moves = [ql.signals.LimitedMove(0.5, each.v_max, each.a_max, each.j_max) for each in found]

@@ -121,6 +121,10 @@ def test_noise_of_y_and_limits_of_u_bound_the_deviation_of_u() -> None:
 def test_a_bound_of_noise_that_is_not_known_is_ten_times_that_of_a_pi_controller() -> None:
     """And says that it is a guess."""
     found, how = with_noise_bound(task(LAG, Constraints()))
+    more, told = with_noise_bound(task(LAG, Constraints()), 1e6)
+    assert more.constraints.m_ks == 1e6
+    assert "so a guess: M_ks: that of the controller in use, 1e+06; give the limits" in told
+    assert with_noise_bound(task(LAG, Constraints(m_ks=3.0)), 1e6)[1] == ""
     pi = ql.tune(LAG, DT, structure="pi-unfiltered", compare=(), written=False, objective="load",
                  constraints=Constraints(noise_over_pi=None))  # fmt: skip
     size = pi.design.measures["M_ks"]

@@ -525,8 +525,22 @@ def test_a_reference_model_is_the_one_with_which_a_step_settles_soonest() -> Non
     assert none.prefilter is None
 
 
+def test_a_process_at_its_limits_is_quicker_than_one_within_them() -> None:
+    """Behind a reference model with which u may be at a limit; both overshoot by a twentieth."""
+    shown = loop(reference=ql.signals.Step(1.4, 0.2), duration=5.0)
+    controller = pi(2.0, 8.0, u_min=-1.0, u_max=1.0)
+    within, free = (
+        reference.reference_model_for(shown, controller, 6.0, within=each) for each in (True, False)
+    )
+    assert within.step is not None
+    assert free.step is not None
+    assert free.step.settling < within.step.settling
+    assert free.step.limited > within.step.limited
+    assert max(free.step.overshoot, within.step.overshoot) <= 0.05
+
+
 def test_a_profile_generator_moves_an_axis_within_its_room() -> None:
-    """The quickest one that overshoots little: u stays off its limits but for a few samples."""
+    """The quickest one that overshoots little, with 15 % less of u as well, as friction brakes."""
     axis = Axis.of(AXIS, 10.0)
     assert axis is not None
     shown = loop(reference=ql.signals.Step(1.0, 0.2), duration=6.0, plant=AXIS)
@@ -536,7 +550,17 @@ def test_a_profile_generator_moves_an_axis_within_its_room() -> None:
     assert found.step is not None
     assert found.step.overshoot <= 0.05
     generator = found.prefilter
-    assert 0.125 * generator.v_max + 0.25 * generator.a_max <= 0.951
+    # Friction takes a quarter of u at the top speed, and gives it while the axis brakes.
+    assert axis.beyond(1.0, 1.0) == reference.BEYOND
+    assert max(0.125 * generator.v_max, 0.25 * generator.a_max) <= 0.951
+    assert 0.951 < 0.125 * generator.v_max + 0.25 * generator.a_max <= 1.7 * 0.951
+    weaker = reference.with_less(controller)
+    assert (weaker.limits[:2], controller.limits[:2]) == ((-0.85, 0.85), (-1.0, 1.0))
+    last = shown.steps[0][1]
+    assert reference._with(shown, weaker, generator, last).overshoot <= 0.05
+    within = [(share, 1.0) for share in reference.SHARES]
+    for other in reference._profiles(axis, 1.0, 1.0, [(4 * DT, 0.0), (0.4, 0.0)], within):
+        assert reference._with(shown, controller, other, last).settling >= found.step.settling
     move = reference._duration(generator, 1.0)
     assert move > 2.0 * math.sqrt(1.0 / generator.a_max)
     assert found.step.settling >= 0.5 * move
@@ -546,15 +570,32 @@ def test_a_profile_generator_moves_an_axis_within_its_room() -> None:
     assert 0.125 * plain.prefilter.v_max + 0.25 * plain.prefilter.a_max == pytest.approx(0.95)
 
 
+def test_friction_brakes_where_it_takes_a_tenth_of_u_at_the_top_speed() -> None:
+    """Speed and acceleration each need the room at most, and more of it together."""
+    assert Axis(0.125, 0.25).beyond(1.0, 1.0) == reference.BEYOND
+    assert Axis(0.125, 0.25).beyond(0.15, 1.0) == ()
+    assert Axis(0.0, 0.25).beyond(1.0, 1.0) == ()
+    assert Axis(0.125, 0.0).beyond(1.0, 1.0) == ()
+    assert Axis(0.125, 0.25).beyond(1.0, -0.1) == ()
+    for beyond in reference.BEYOND:
+        found = Axis(2.0, 0.25).profile(2.0, 0.5, 0.1, beyond)
+        v, a = 2.0 * found.v_max, 0.25 * found.a_max
+        assert max(v, a) <= 0.5
+        assert 0.5 < v + a <= 0.5 * beyond
+    plain = Axis(2.0, 0.25).profile(2.0, 0.5, 0.1)
+    assert plain == Axis(2.0, 0.25).profile(2.0, 0.5, 0.1, 1.0)
+
+
 def test_profiles_are_tried_from_the_quickest_on() -> None:
     """Three shares of the room, each with the ramps that are given."""
-    axis = Axis(0.125, 0.25)
-    tried = [*reference._profiles(axis, 2.0, 0.5, [(4 * DT, 0.0), (0.3, 0.1), (0.9, 0.0)])]
+    axis, shares = Axis(0.125, 0.25), [(share, 1.0) for share in reference.SHARES]
+    ramps = [(4 * DT, 0.0), (0.3, 0.1), (0.9, 0.0)]
+    tried = [*reference._profiles(axis, 2.0, 0.5, ramps, shares)]
     times = [reference._duration(each, 2.0) for each in tried]
     assert times == sorted(times)
     assert len(tried) == 9
-    ramps = sorted({round(each.a_max / each.j_max, 9) for each in tried})
-    assert ramps == pytest.approx([4 * DT, 0.3, 0.9])
+    found = sorted({round(each.a_max / each.j_max, 9) for each in tried})
+    assert found == pytest.approx([4 * DT, 0.3, 0.9])
     rooms = sorted({round(0.125 * each.v_max + 0.25 * each.a_max, 9) for each in tried})
     assert rooms == pytest.approx([0.65 * 0.5, 0.8 * 0.5, 0.95 * 0.5])
 

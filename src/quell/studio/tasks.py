@@ -94,7 +94,7 @@ def tuned_frames(
     limits = _limits(setup)
     bounds = record.with_noise(bounds, limits, setup, message)
     first: dict[str, Any] = {"structure": structure, "constraints": bounds, **limits}
-    first["compare"] = None if structure == SIMPLEST else ()
+    first |= {"compare": None if structure == SIMPLEST else (), "in_use": setup.controller}
     given = getattr(without_prefilters(setup.controller), "feedforward", False)
     if structure in (SIMPLEST, *FEEDING_FORWARD):
         first["feedforward"] = given or None

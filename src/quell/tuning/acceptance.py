@@ -32,6 +32,7 @@ from quell.tuning.reference import (
     few_at_limits,
     largest_step,
     model_of_linear_step,
+    needs_none,
     profile_for,
     reference_model_for,
     room_of_u,
@@ -228,7 +229,10 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
         step = worst_step(written, controller)
         if step.overshoot > MOST_OVERSHOOT:
             if loop.shaped and limited:
-                prefilter = reference_model_for(written, controller, FASTEST_MODEL / tau).prefilter
+                model = reference_model_for(
+                    written, controller, FASTEST_MODEL / tau, within=not process
+                )
+                prefilter = model.prefilter
             elif not limited and math.isfinite(step.overshoot):
                 offered, offered_step = _offer(written, loop.plants, controller, tau)
     larger = None
@@ -253,6 +257,17 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
         several = f"with {len(others)} {written.of_others}"
     rest = offered, offered_step, own.overloads, failures, others, several, larger
     return Judged(whole, prefilter, own.step, own.move, *rest)
+
+
+def quick_without(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> bool:
+    """Return whether steps of a process overshoot little at the limits of u, without prefilter."""
+    if loop.written.largest is None or not math.isfinite(loop.limits[1] - loop.limits[0]):
+        return False
+    tau = time_constant(analysis, loop.plants)
+    if axis_of(loop.linear, tau, loop.plants) is not None:
+        return False
+    most = largest_step(loop.written, loop.linear, loop.limits, loop.rest)
+    return needs_none(loop.written, controller, most, tau)
 
 
 def judge_axes(

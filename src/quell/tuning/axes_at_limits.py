@@ -40,6 +40,7 @@ from quell.tuning.acceptance import (
 )
 from quell.tuning.optimiser.coupled import CoupledLoops, Found, Plant
 from quell.tuning.reference import (
+    BEYOND,
     MOST_RESERVED,
     SAMPLES,
     SHARES,
@@ -47,6 +48,7 @@ from quell.tuning.reference import (
     TRIES,
     Axis,
     few_at_limits,
+    with_less,
 )
 from quell.tuning.tables import SHARE
 from quell.tuning.written import MOST_OVERSHOOT, StepFigures, Written
@@ -61,6 +63,7 @@ _SOLVED = 1e-6
 # Ramps of the acceleration, in time constants of the axis. With the shares of a single axis the
 # best is taken, or the first of slower ones. Chosen by hand; each is simulated.
 _RAMPS = (0.3, 1.0, 3.0)
+_BEYOND_MOVES = tuple(itertools.product(BEYOND, _RAMPS))
 _QUICK_MOVES = tuple(itertools.product(SHARES, _RAMPS))
 _SLOW_MOVES = tuple((SHARES[-1] * SLOWER**i, _RAMPS[-1]) for i in range(1, TRIES + 1))
 # A step that needs more than this share of the room for u at rest is that of a process.
@@ -145,8 +148,18 @@ def with_prefilters(
             for u in needs_along(plant, axes, point)
         ]
 
-    def tried(share: float, ramp: float) -> tuple[Axes, list[StepFigures]]:
-        """Return axes behind prefilters, and their steps."""
+    braked = set()  # axes that friction brakes
+    for i, (first, size) in stepping.items():
+        at_rest, viscous, inertia = (float(u[i]) * together[first] for u in needed)
+        if Axis(viscous, inertia).beyond(size, 1.0 - at_rest * size):
+            braked.add(i)
+
+    def steps_of(made: Axes) -> list[StepFigures]:
+        run = files[0].run(made)
+        return [figures for i in stepping if (figures := files[i].figures(made, run)) is not None]
+
+    def tried(share: float, ramp: float) -> Axes:
+        """Return axes behind prefilters; a ``share`` above 1 goes beyond it, of ``braked`` ones."""
         made = copy.copy(axes)
         shapers = list(axes.prefilters)
         for i, (first, size) in stepping.items():
@@ -154,32 +167,37 @@ def with_prefilters(
             at_rest, viscous, inertia = (float(u[i]) * together[first] for u in needed)
             if not max(at_rest, viscous, inertia) > 0.0:  # no actuator that moves it has limits
                 continue
-            left = share * (1.0 - at_rest * size)
-            if axis.observer.order < 2 or not left > share * (1.0 - _PROCESS):
-                omega = min(FASTEST_MODEL * share / ramp * axis.omega_c, 1.0 / axes.dt)
+            own = min(share, SHARES[0])
+            left = own * (1.0 - at_rest * size)
+            if axis.observer.order < 2 or not left > own * (1.0 - _PROCESS):
+                omega = min(FASTEST_MODEL * own / ramp * axis.omega_c, 1.0 / axes.dt)
                 shapers[i] = ReferenceModel(omega, axis.observer.order)
                 continue
             slow = max(ramp / axis.omega_c, SAMPLES[0] * axes.dt)
-            shapers[i] = Axis(viscous, inertia).profile(size, left, slow)
+            beyond = max(share, 1.0) if i in braked else 1.0
+            shapers[i] = Axis(viscous, inertia).profile(size, left, slow, beyond)
             if not axis.feedforward and axis.observer.order <= shapers[i].derivatives:
                 axis.feedforward = checked_feedforward(True)
                 axis._initialise()
         made.prefilters = tuple(shapers)
         made._initialise()
-        run = files[0].run(made)
-        return made, [
-            figures for i in stepping if (figures := files[i].figures(made, run)) is not None
-        ]
+        return made
 
     best: tuple[float, Axes] | None = None
-    for share, ramp in _QUICK_MOVES + _SLOW_MOVES:
+    for share, ramp in (*(_BEYOND_MOVES if braked else ()), *_QUICK_MOVES, *_SLOW_MOVES):
         if best is not None and share < SHARES[-1]:
             break
-        made, steps = tried(share, ramp)
+        made = tried(share, ramp)
+        steps = steps_of(made)
         if any(math.isnan(s.settling) or not s.overshoot <= MOST_OVERSHOOT for s in steps):
             continue
-        limited = any(s.limited > few_at_limits(s.settling, axes.dt) for s in steps)
-        rank = math.inf if limited else sum(step.settling for step in steps)
+        rank = sum(step.settling for step in steps)
+        if any(s.limited > few_at_limits(s.settling, axes.dt) for s in steps):
+            weaker = steps_of(with_less(made)) if braked else []
+            if not weaker or not all(s.overshoot <= MOST_OVERSHOOT for s in weaker):
+                rank = math.inf
+        if math.isinf(rank) and share > 1.0:
+            continue
         if best is None or rank < best[0]:
             best = rank, made
     return None if best is None else best[1]

@@ -124,13 +124,14 @@ def range_of_u(limits: Mapping[str, Any]) -> tuple[float, float]:
     return checks.interval("u_min", ends[0], "u_max", ends[1])
 
 
-def with_noise_bound(task: Task) -> tuple[Task, str]:
+def with_noise_bound(task: Task, in_use: float | None = None) -> tuple[Task, str]:
     """Return the task with a bound for what noise does to u, and how it came.
 
     Where the noise of y and the limits of u are known, the standard deviation of u is bounded by a
     share of half their range. Else M_ks is bounded by a multiple of that of the optimal PI
     controller; where a PI controller is of no use, as for an inertia, by that of a PID controller
-    with the usual filter, ``T_f = T_d/10``, if it is larger.
+    with the usual filter, ``T_f = T_d/10``, if it is larger; or by ``in_use``, the M_ks of a
+    controller that is in use, if that is the largest.
     """
     given = task.constraints
     if given.u_std is not None:
@@ -174,6 +175,8 @@ def with_noise_bound(task: Task) -> tuple[Task, str]:
         if pid is not None and (pi is None or pid.cost <= pi.cost - math.log(_OF_USE)):
             how = f"M_ks: that of the optimal PID controller with T_f = T_d/{ratio:g}"
             found.append((_m_ks(task, pid), how))
+    if in_use is not None:
+        found.append((in_use, f"M_ks: that of the controller in use, {in_use:.4g}"))
     if not found:
         source = f"neither a PI controller nor a PID controller with T_f = T_d/{ratio:g}"
         return task, f"NOT bounded: M_ks: {source} meets the constraints, to guess it from; {give}"

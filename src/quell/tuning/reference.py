@@ -7,7 +7,11 @@ An axis, whose position needs no u at rest, gets a ``ProfileGenerator``. With th
 
 and of the v_max those are taken with which the largest step of the scenario takes the least time.
 ``share`` and the ramp t_j of the acceleration are tried in simulations of the file: the quickest
-move that keeps u within its limits and overshoots by 5 % at most.
+move that keeps u within its limits and overshoots by 5 % at most. Friction takes u while an axis
+speeds up and gives it while it brakes, but a generator has one a_max for both. So where friction
+counts, moves are tried, too, in which speed and acceleration need the share each and more together:
+u is at its limit while the axis speeds up, and y is back on the move before it comes to rest. A
+step has to overshoot little with 15 % less of u, too.
 
 Of an axis with a resonance a controller has the feedforward of the flat output, with which a move
 leaves no mode swinging (``controllers/feedforward.py``). It needs four derivatives, so the move is
@@ -18,18 +22,19 @@ step behind a generator is quicker than the mode: what it needs beyond the inert
 of u, and feedforward of the whole inertia moves the motor alone. So smaller steps have to overshoot
 little, too.
 
-Another plant gets a ``ReferenceModel``, the fastest with which u keeps within its limits and the
-step overshoots by 5 % at most. So does an axis for which no generator is quicker. A reference model
-is as slow for a small step as for a large one.
+An axis for which no generator is quicker gets a ``ReferenceModel``, with which u keeps within its
+limits, too. A reference model is as slow for a small step as for a large one.
 
-Of a plant that needs u at rest, a process, the model has a bounded rate, near the largest one of
-the step of the scenario, so that a larger step takes longer and needs no more u on the way. Nearly
+A plant that needs u at rest, a process, has one only where a step overshoots without: heaters and
+valves may stand at their limits until y is near r. It is the one with which the step settles first.
+Its rate may be bounded, near the largest one of the step of the scenario, for a larger step. Nearly
 the largest step that u can hold is simulated, too: of the faster models with such rates that one is
 taken with which both overshoot by 5 % at most, and the step of the scenario settles first.
 """
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -56,6 +61,9 @@ _NO_U = 1e-6
 # the acceleration: in samples and in time constants of the loop. Chosen by hand; each is simulated.
 SHARES, MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
 SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
+# What speed and acceleration need together where friction brakes, in units of the share: where it
+# takes this share of the room at the top speed. How much less of u has to do.
+BEYOND, _FRICTION, _LESS_OF_U = (1.7, 1.3), 0.1, 0.15
 # Beside a resonance: ramps and smoothing in periods of it.
 _PERIODS = (
     (0.3, 0.1), (0.15, 0.3), (0.3, 0.3), (0.6, 0.3), (1.0, 0.3), (1.0, 0.0), (1.5, 0.0), (2.0, 0.0)
@@ -133,8 +141,13 @@ class Axis:
         half = 10.0 * tau
         return self.inertia / half**2 + self.viscous / half
 
-    def profile(self, size: float, room: float, ramp: float) -> ProfileGenerator:
-        """Return the generator that needs ``room`` of u at most, for a largest step ``size``."""
+    def profile(
+        self, size: float, room: float, ramp: float, beyond: float = 1.0
+    ) -> ProfileGenerator:
+        """Return the generator that needs ``room`` of u at most, for a largest step ``size``.
+
+        Speed and acceleration each need the room at most, and together ``beyond`` times the room.
+        """
         inertia = max(self.inertia, self.viscous * ramp)  # an axis of order 1 follows the ramp
         if inertia == 0.0 or self.viscous * math.sqrt(size * room / inertia) < 1e-6 * room:
             a = room / inertia
@@ -142,12 +155,27 @@ class Axis:
         speeds = room / self.viscous * (np.arange(_SPEEDS) + 0.5) / _SPEEDS
         times = []
         for v in speeds.tolist():
-            a = (room - self.viscous * v) / inertia
+            a = min(beyond * room - self.viscous * v, room) / inertia
             reached = size >= v * v / a
             times.append((size / v + v / a if reached else 2.0 * math.sqrt(size / a)) + ramp)
         v = float(speeds[int(np.argmin(times))])
-        a = (room - self.viscous * v) / inertia
+        a = min(beyond * room - self.viscous * v, room) / inertia
         return ProfileGenerator(v, a, a / ramp)
+
+    def beyond(self, size: float, room: float) -> tuple[float, ...]:
+        """Return the ``beyond`` that are tried for a move by ``size``; none without friction."""
+        if self.inertia == 0.0 or room <= 0.0:
+            return ()
+        top = self.viscous * math.sqrt(size * room / self.inertia)
+        return BEYOND if top > _FRICTION * room else ()
+
+
+def with_less(controller: Any) -> Any:
+    """Return a copy of a controller whose limits of u are nearer."""
+    found, limits = copy.copy(controller), controller.limits
+    share = 1.0 - _LESS_OF_U
+    found.set_limits(u_min=share * limits.low, u_max=share * limits.high)
+    return found
 
 
 def room_of_u(
@@ -190,7 +218,9 @@ def profile_for(
     else:
         plain = *(n * written.dt for n in SAMPLES), *(n * tau for n in _CONSTANTS)
         ramps = [(ramp, 0.0) for ramp in plain]
-    for generator in _profiles(axis, size, room, ramps):
+    beyond = () if period > 0.0 else axis.beyond(size, room)
+    shares = [(SHARES[0], each) for each in beyond] + [(share, 1.0) for share in SHARES]
+    for generator in _profiles(axis, size, room, ramps, shares):
         own = _duration(generator, size)
         last = min(end, first + math.ceil((_LOOKED * own + _AFTER * tau) / written.dt))
         shown = _with(written, controller, generator, last)
@@ -200,10 +230,15 @@ def profile_for(
         whole = Prefiltered(controller, generator)
         if any(not worst_step(each, whole).overshoot <= MOST_OVERSHOOT for each in small):
             continue
-        # One that reaches a limit comes behind all that do not.
-        rank = shown.settling if shown.limited <= most else math.inf
-        if period > 0.0 and math.isinf(rank):
-            continue
+        rank = shown.settling
+        if shown.limited > most and beyond:
+            weaker = _with(written, with_less(controller), generator, last)
+            if not weaker.overshoot <= MOST_OVERSHOOT:
+                continue
+        elif shown.limited > most:  # comes behind all that do not
+            rank = math.inf
+            if period > 0.0:
+                continue
         found.append((rank, Shaped(generator, shown)))
         if rank <= _QUICK * own:
             break
@@ -222,12 +257,19 @@ def profile_for(
 
 
 def _profiles(
-    axis: Axis, size: float, room: float, ramps: Sequence[tuple[float, float]]
+    axis: Axis,
+    size: float,
+    room: float,
+    ramps: Sequence[tuple[float, float]],
+    shares: Sequence[tuple[float, float]],
 ) -> Iterator[ProfileGenerator]:
-    """Yield the generators to try, quick ones first, with these ramps and this smoothing [s]."""
+    """Yield the generators to try, quick ones first.
+
+    ``ramps`` have ramp and smoothing [s], ``shares`` the share of the room and what is beyond it.
+    """
     made = [
-        replace(axis.profile(size, share * room, ramp), smoothing=smoothing)
-        for share in SHARES
+        replace(axis.profile(size, share * room, ramp, beyond), smoothing=smoothing)
+        for share, beyond in shares
         for ramp, smoothing in ramps
     ]
     yield from sorted(made, key=lambda each: _duration(each, size))
@@ -269,11 +311,15 @@ def worst_step(written: Written, controller: Controller, last: int | None = None
 
 
 def reference_model_for(
-    written: Written, controller: Controller, omega: float, order: int = _ORDER
+    written: Written,
+    controller: Controller,
+    omega: float,
+    order: int = _ORDER,
+    within: bool = True,
 ) -> Shaped:
-    """Return the reference model with which the step of the file settles soonest within its limits.
+    """Return the reference model with which the step of the file settles soonest.
 
-    It overshoots by 5 % at most.
+    It overshoots by 5 % at most, and ``within`` says whether u has to keep within its limits.
 
     The first one tried has the bandwidth ``omega`` [rad/s], the next ones are slower.
     """
@@ -288,7 +334,7 @@ def reference_model_for(
         shown = _with(written, controller, model, end)
         if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
             return None
-        free = shown.limited <= few_at_limits(shown.looked, written.dt)
+        free = not within or shown.limited <= few_at_limits(shown.looked, written.dt)
         return model, shown, free
 
     for _ in range(_MOST_LAGS):
@@ -328,6 +374,19 @@ def largest_step(
     return sign * _NEARLY * room / abs(held) if held else 0.0
 
 
+def needs_none(written: Written, controller: Controller, most: float, tau: float) -> bool:
+    """Return whether a process needs no prefilter: its steps overshoot by 5 % at most without.
+
+    Arguments are those of ``bounded_rate``.
+    """
+    assert written.largest is not None
+    steps = [written]
+    if abs(most) >= _LARGER * abs(written.largest[2]):
+        steps.append(written.stepping(most, _CONSTANTS_OF_LARGER * tau, _BEFORE))
+    shown = [worst_step(each, controller) for each in steps]
+    return all(s.overshoot <= MOST_OVERSHOOT and not math.isnan(s.settling) for s in shown)
+
+
 def bounded_rate(
     written: Written, controller: Controller, model: Any, most: float, tau: float
 ) -> tuple[Any, StepFigures | None]:
@@ -364,7 +423,7 @@ def bounded_rate(
     if model is None and well:
         return None, plain
     usual = worst_step(written, controller if model is None else Prefiltered(controller, model))
-    best, latest = (model, plain), _AS_QUICK * usual.settling
+    best, latest = (model, plain), (1.0 if well else _AS_QUICK) * usual.settling
     for share, factor in itertools.product(_RATES, _FASTER_MODELS):
         omega = min(factor * first.omega, 1.0 / written.dt)
         tried = replace(first, omega=omega, rate_limit=float(f"{share * own:.4g}"))

@@ -27,6 +27,7 @@ from quell.tuning.acceptance import (
     accepted,
     axis_of,
     judge,
+    quick_without,
     time_constant,
     with_others,
 )
@@ -72,6 +73,8 @@ from quell.types import Progress, Vector
 
 COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "poles", "model-based")
 """The structures that a result is compared with by default; and the cascade at a resonance."""
+# A design without prefilter leaves less of the error in the scenario by this factor.
+_LESS = 0.95
 # Names of the limits of a controller.
 _LIMITS = ("u_min", "u_max", "rate_limit")
 
@@ -104,6 +107,7 @@ def tune(
     rest: Any = None,
     scenario: Any = None,
     search: Mapping[str, Any] | None = None,
+    in_use: Any = None,
     progress: Progress | None = None,
     **limits: Any,
 ) -> Tuned:
@@ -185,6 +189,9 @@ def tune(
     search
         options of ``quell.tuning.simulated.search``: ``trials``, ``sampler``, ``storage``,
         ``executor``, …; and ``factor``, the width of the ranges around the start.
+    in_use
+        a controller that the result replaces. Where the bound of noise is a guess, M_ks may be as
+        large as with that one: what noise does to u then is known to be borne.
     progress
         called with the structure and the share that is done.
     **limits
@@ -289,7 +296,7 @@ def tune(
         forward = _of_axis(given, written, bool(resonances(model)))
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
     with one_blas_thread():
-        task, noise_bound = with_noise_bound(task)
+        task, noise_bound = with_noise_bound(task, _m_ks_of(in_use, given))
         designs = tuned_designs(list(dict.fromkeys(names)), task, report)
         chosen = _chosen(designs, structure, task)
         tables, loop = _file(given, task, setup, written, known_rest, u_limits, chosen)
@@ -530,6 +537,18 @@ def _analysis(given: Given, plants: PlantSet, design: Design) -> LoopAnalysis:
     return analyse_axis(given.linear[0], design.controller, delay=delay, actuator_lag=lag)
 
 
+def _m_ks_of(controller: Any, given: Given) -> float | None:
+    """Return M_ks of a controller with the first plant; None without one, or if it is unstable."""
+    if controller is None:
+        return None
+    delay, lag = float(given.delays[0]), given.actuator_lag
+    try:
+        loop = analyse_axis(given.linear[0], controller, delay=delay, actuator_lag=lag)
+    except ValueError:  # it has no linear law
+        return None
+    return loop.noise_to_control_peak if loop.stable else None
+
+
 def _check(
     box: Uncertain | None,
     given: Given,
@@ -650,7 +669,9 @@ def _accepted(
 ) -> tuple[Design, Judged, str]:
     """Return the design that is accepted at the limits of u, with what it does, and what is not.
 
-    Of a structure that is named it is the only one.
+    Of a structure that is named it is the only one. A process whose step overshoots at the limits
+    of u is slowed by its prefilter. So one that needs none takes its place where it leaves less of
+    the error in the scenario, the step and all loads together.
     """
     able = STRUCTURES if task.feedforward is None else FEEDING_FORWARD
     others = [
@@ -665,7 +686,25 @@ def _accepted(
     def judged(design: Design) -> Judged:
         return judge(loop, _controller(design), _analysis(given, task.plants, design))
 
-    return accepted(first, others if structure == SIMPLEST else [], judged, first.name)
+    others = others if structure == SIMPLEST else []
+    found, its, refused = accepted(first, others, judged, first.name)
+    if its.prefilter is None:
+        return found, its, refused
+    slowed = least = loop.written.error(its.controller)
+    best = found
+    for each in others:
+        analysis = _analysis(given, task.plants, each)
+        if each is best or not quick_without(loop, _controller(each), analysis):
+            continue
+        other, left = judged(each), loop.written.error(_controller(each))
+        if not other.failures and left < _LESS * least:
+            best, its, least = each, other, left
+    if best is not found:
+        refused = (
+            f"{found.name} is left out: at the limits of u its step needs a prefilter, with which "
+            f"∫|r − y| in the scenario is {slowed:.3g}; {best.name} needs none and has {least:.3g}"
+        )
+    return best, its, refused
 
 
 def _controller(design: Design) -> Any:

@@ -343,6 +343,12 @@ class Written:
         last = float(np.max(error[-max(len(run) // 10, 1) :]))
         return MoveFigures(float(np.max(error)), last, self._names(run))
 
+    def error(self, controller: Any) -> float:
+        """Return ∫|r − y| over the scenario [y-unit s]; infinite where y diverges."""
+        run = self.run(controller)
+        error = np.abs(self._of_axis(run, "r") - self._of_axis(run, "y"))
+        return math.inf if run.diverged else float(np.sum(error)) * self.dt
+
     def until_settled(self, scenario_end: float) -> Scenario:
         """Return the scenario up to a time [s], without starts from rest after that."""
         rests = [time for time in np.ravel(self.scenario.rest_at) if time < scenario_end]
