@@ -372,7 +372,8 @@ def test_axes_that_do_not_notice_each_other_are_judged_as_single_loops() -> None
         ql.Scenario([each.reference for each in scenarios], duration=3.0),
         dt,  # type: ignore[misc]
     )
-    found = judge_axes(file, both, 0.1, held_loads(plant, both, None), np.ones(2))
+    held = held_loads(plant, both, None)
+    found = judge_axes(file, both, 0.1, held, np.ones(2), lambda *_: None)
     assert not found.failures
     for i, (b, own, scenario) in enumerate(zip(gains, single, scenarios, strict=True)):
         alone = Written(ql.plants.LinearPlant.of(([b], [1.0, 0.0])), scenario, dt)

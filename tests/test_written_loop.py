@@ -570,10 +570,11 @@ def test_a_profile_generator_moves_an_axis_within_its_room() -> None:
     assert 0.125 * plain.prefilter.v_max + 0.25 * plain.prefilter.a_max == pytest.approx(0.95)
 
 
-def test_friction_brakes_where_it_takes_a_tenth_of_u_at_the_top_speed() -> None:
+def test_friction_brakes_where_it_takes_a_fifth_of_u_at_the_top_speed() -> None:
     """Speed and acceleration each need the room at most, and more of it together."""
     assert Axis(0.125, 0.25).beyond(1.0, 1.0) == reference.BEYOND
-    assert Axis(0.125, 0.25).beyond(0.15, 1.0) == ()
+    assert Axis(0.125, 0.25).beyond(0.6, 1.0) == ()
+    assert Axis(0.125, 0.25).beyond(0.7, 1.0) == reference.BEYOND
     assert Axis(0.0, 0.25).beyond(1.0, 1.0) == ()
     assert Axis(0.125, 0.0).beyond(1.0, 1.0) == ()
     assert Axis(0.125, 0.25).beyond(1.0, -0.1) == ()

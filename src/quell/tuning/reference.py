@@ -63,7 +63,7 @@ SHARES, MOST_RESERVED = (0.95, 0.8, 0.65), 0.5
 SAMPLES, _CONSTANTS = (4.0,), (1.0, 3.0)
 # What speed and acceleration need together where friction brakes, in units of the share: where it
 # takes this share of the room at the top speed. How much less of u has to do.
-BEYOND, _FRICTION, _LESS_OF_U = (1.7, 1.3), 0.1, 0.15
+BEYOND, _FRICTION, _LESS_OF_U = (1.7, 1.3), 0.2, 0.15
 # Beside a resonance: ramps and smoothing in periods of it.
 _PERIODS = (
     (0.3, 0.1), (0.15, 0.3), (0.3, 0.3), (0.6, 0.3), (1.0, 0.3), (1.0, 0.0), (1.5, 0.0), (2.0, 0.0)
