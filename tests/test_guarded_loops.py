@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.experiments import two_mass_spring
 from quell.experiments.stress.adversaries import (
     CONSTANT,
     DELAYED,
@@ -239,3 +240,19 @@ def test_a_bad_measurement_does_not_open_the_bounds() -> None:
         )
         errors.append(np.max(np.abs(run["y"][run.window(60.0, 120.0)])))
     assert errors[1] < 3.0 * errors[0] + 1.0, errors
+
+
+@pytest.mark.trial
+@pytest.mark.compiled
+def test_a_black_box_comes_to_rest_as_soon_with_guard_as_without() -> None:
+    """The step of the paper's study, where y rests at 1 and its noise crosses the largest value so far."""
+    study = two_mass_spring.Settings(seed=1)
+    scenario = dataclasses.replace(two_mass_spring.scenario(study), duration=150.0)
+    observer = two_mass_spring.controller(study).observer
+    times = []
+    for guard in (None, ql.Guard()):
+        learner = ql.learners.GaussianProcess(budget=20)
+        controller = ql.ADRC(observer, 1.0, learner=learner, guard=guard)
+        run = ql.simulate(PLANT, controller, scenario, record_every=10)
+        times.append(run.metrics(110.0, 150.0, target=1.0, band=0.002)["settling_time"])
+    assert times[1] < 1.05 * times[0], times

@@ -104,7 +104,7 @@ class Regression:
         if self.samples <= STARTUP:
             return
         before, old = self.scale.copy(), self.units
-        update_scale(self.design.inputs.scaling, self.scale, np.append(x, 0.0), u, f)
+        update_scale(self.design.inputs.scaling, self.scale, np.append(x, 0.0), u, f, True)
         if not self.has_scale:
             self.has_scale, self.samples = True, 0
             return
@@ -261,7 +261,7 @@ class Descent:
         if self.samples <= STARTUP:
             return
         before = self.scale.copy()
-        update_scale(self.design.scaling, self.scale, np.append(x, 0.0), u, f_plain)
+        update_scale(self.design.scaling, self.scale, np.append(x, 0.0), u, f_plain, True)
         if np.any(self.scale != before):
             self.batch.clear()
         phi, units = self.features(x, u)
@@ -328,7 +328,7 @@ def test_a_learner_around_a_model_follows_its_equations(
         adapt(design, memory, np.append(x, f), y, u, f)
         moves = gate.update(x, y, u)
         if k > STARTUP:
-            update_scale(design.inputs.scaling, scale, np.append(x, f), u, f)
+            update_scale(design.inputs.scaling, scale, np.append(x, f), u, f, False)
         ready = k > STARTUP + delay + 1
         if ready:
             oldest = pairs[-delay - 1]

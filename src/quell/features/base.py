@@ -12,15 +12,17 @@ of unknown size, for which ``unscaled`` is true, are divided by their largest va
 Sizes of features that are functions of signals in the plant's units.
 
 Nothing is known of their size beforehand. So each is divided by the smallest power of two that is
-at least its largest absolute value so far, as signals are.
+at least its largest absolute value so far, or by that value, as signals are.
 
 Automatic scaling: inputs and targets of O(1) whatever the plant's units.
 
 The scale of x̂_i is the smallest power of two that is at least the largest ``|x̂_i|`` so far, so it
-changes seldom and by a whole factor. It is at least ``ω^(i−1)/8`` of the scale of x̂_1, with a
-frequency ω of the plant: at rest, where the higher derivatives are noise, noise is not scaled up to
-O(1). The control signal and the total disturbance, which a learner has to predict, have their own
-scales.
+changes seldom and by a whole factor, by which a linear model converts its coefficients exactly. For
+models that cannot be converted it is the largest ``|x̂_i|`` itself: what they predict then changes
+little where a signal comes to rest at its largest value. It is at least ``ω^(i−1)/8`` of the scale
+of x̂_1, with a frequency ω of the plant: at rest, where the higher derivatives are noise, noise is
+not scaled up to O(1). The control signal and the total disturbance, which a learner has to predict,
+have their own scales.
 
 The features of a linear model: the state, the control signal, a constant.
 """
@@ -307,17 +309,29 @@ def reset_scale(scaling: Scaling, scale: Vector) -> None:
         scale[i] = least_scale(scale[i])
 
 
+@kernel
+def covering(scale: float, size: float, powers: bool) -> float:
+    """Return ``scale``, or if ``size`` is larger that size, or the next of the powers of two."""
+    if size > scale and is_finite(size):
+        return 2.0 ** math.ceil(log2(size)) if powers else size
+    return scale
+
+
 @generic_with_default
-def update_scale(scaling: Any, scale: Vector, estimate: Vector, u: float, f: float) -> None:
-    """Increase ``scale`` (n + 2,) to cover the state in ``estimate`` (n + 1,), ``u`` and ``f``."""
+def update_scale(
+    scaling: Any, scale: Vector, estimate: Vector, u: float, f: float, powers: bool
+) -> None:
+    """Increase ``scale`` (n + 2,) to cover the state in ``estimate`` (n + 1,), ``u`` and ``f``.
+
+    With ``powers`` the scales are powers of two.
+    """
     if scaling.fixed:
         return
     order = scale.size - 2
     for i in range(scale.size):
         size = abs(estimate[i]) if i < order else (abs(u) if i == order else abs(f))
         size = max(size, scaling.floors[i] * scale[0], least_scale(scale[i]))
-        if size > scale[i] and is_finite(size):
-            scale[i] = 2.0 ** math.ceil(log2(size))
+        scale[i] = covering(scale[i], size, powers)
 
 
 # ---- Sizes of features that are functions of signals in the plant's units ----
@@ -343,14 +357,13 @@ def reset_sizes(sizes: Vector) -> None:
 
 
 @kernel
-def update_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> bool:
+def update_sizes(unscaled: Indices, sizes: Vector, values: Vector, powers: bool) -> bool:
     """Let ``sizes`` (k,) cover features with these unscaled ``values`` (p,); return if one grew."""
     grown = False
     for k in range(sizes.size):
-        size = abs(values[unscaled[k]])
-        if size > sizes[k] and is_finite(size):
-            sizes[k] = 2.0 ** math.ceil(log2(size))
-            grown = True
+        covers = covering(sizes[k], abs(values[unscaled[k]]), powers)
+        grown = grown or covers > sizes[k]
+        sizes[k] = covers
     return grown
 
 

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.features.all_axes import asks_for_inputs, bound, sees_all_axes
-from quell.features.base import least_scale, scaling, update_scale
+from quell.features.base import covering, least_scale, scaling, update_scale
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.functions import log2
 from quell.kernels.sized import Flag, Scalars, Size, Work, clear
@@ -89,7 +89,7 @@ class ScalingOfAxes(NamedTuple):
 
 @update_scale.register(ScalingOfAxes)
 def _update_scale(
-    scaling: ScalingOfAxes, scale: Vector, estimate: Vector, u: float, f: float
+    scaling: ScalingOfAxes, scale: Vector, estimate: Vector, u: float, f: float, powers: bool
 ) -> None:
     if scaling.fixed:
         return
@@ -97,8 +97,7 @@ def _update_scale(
     for i in range(scale.size):
         size = abs(estimate[i]) if i < signals else (abs(u) if i == signals else abs(f))
         size = max(size, scaling.floors[i] * scale[scaling.base[i]], least_scale(scale[i]))
-        if size > scale[i] and is_finite(size):
-            scale[i] = 2.0 ** math.ceil(log2(size))
+        scale[i] = covering(scale[i], size, powers)
 
 
 class NoiseGateOfAxes(NamedTuple):

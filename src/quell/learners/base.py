@@ -795,12 +795,14 @@ def _write_physical(inputs: Inputs, memory: Any, estimates: Vector, u: float, ou
 
 
 @kernel
-def update_feature_sizes(inputs: Inputs, memory: Any, estimates: Vector, u: float) -> bool:
+def update_feature_sizes(
+    inputs: Inputs, memory: Any, estimates: Vector, u: float, powers: bool
+) -> bool:
     """Let ``memory.sizes`` cover the features of a sample; return whether one grew."""
     if inputs.unscaled.size == 0:
         return False
     _write_physical(inputs, memory, estimates, u, memory.features)
-    return update_sizes(inputs.unscaled, memory.sizes, memory.features)
+    return update_sizes(inputs.unscaled, memory.sizes, memory.features, powers)
 
 
 def features_first(features: Any, number: Any, default: Any, name: str) -> tuple[Any, Any]:

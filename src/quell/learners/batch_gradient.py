@@ -211,13 +211,13 @@ def _rescale(
     before = after = 0.0
     for i in range(scale.size):
         before += scale[i]
-    update_scale(learner.scaling, scale, estimates, u, f)
+    update_scale(learner.scaling, scale, estimates, u, f, True)
     for i in range(scale.size):
         after += scale[i]
     grown = after != before
     if learner.unscaled.size > 0:
         write_physical(learner.features, estimates[: memory.scaled.size], u, current)
-        grown = update_sizes(learner.unscaled, memory.sizes, current) or grown
+        grown = update_sizes(learner.unscaled, memory.sizes, current, True) or grown
     if not grown:
         return
     write_units(learner.features, learner.unscaled, scale, memory.sizes, current)

@@ -19,9 +19,11 @@ parameters does not need the approximation: ``learners/regression.py``, where th
 described.) A model at rest would learn the noise it is shown and forget the rest, so it learns
 nothing while nothing moves or noise hides f (``learners/base.py``).
 
-When a scale grows, by a factor of at least two, the same motion gives smaller features, and the
-model has to learn them again. This happens in the first motions, and when a motion is larger than
-all before; it does not happen if ``scale`` is given.
+A scale is the largest absolute value so far. When it grows, the same motion gives smaller features,
+and the model has to learn them again. This happens in the first motions, and when a motion is
+larger than all before; it does not happen if ``scale`` is given. Scales that grow by factors of two
+would change all that is predicted within a sample: with y at rest at 1, noise would double its
+scale.
 
 A small neural network, trained while it runs.
 
@@ -202,8 +204,9 @@ def _adapt(
     moves = update_gate(inputs.gate, memory.gate, estimates, y, u_before)
     if loop.samples <= inputs.startup:
         return
-    update_scale(inputs.scaling, scale, estimates, u_before, f_plain)
-    update_feature_sizes(inputs, memory, estimates, u_before)
+    # A model is not converted: a scale that doubled would change all that it predicts at once.
+    update_scale(inputs.scaling, scale, estimates, u_before, f_plain, False)
+    update_feature_sizes(inputs, memory, estimates, u_before, False)
     if not has_pairs(learner, memory):
         return
     # The next row to be written is the oldest of the D + 1 rows: D samples older than the newest.

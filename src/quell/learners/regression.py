@@ -222,8 +222,8 @@ def rescale(
     loop, inputs, last = memory.loop[0], learner.inputs, scale.size - 1
     for i in range(scale.size):
         old[i] = scale[i]
-    update_scale(inputs.scaling, scale, estimates, u, f)
-    grown = update_feature_sizes(inputs, memory, estimates, u)
+    update_scale(inputs.scaling, scale, estimates, u, f, True)
+    grown = update_feature_sizes(inputs, memory, estimates, u, True)
     if loop.has_scale == 0.0:
         # There were no features before this sample: the filters have to settle once more.
         loop.has_scale = 1.0
