@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.analysis import analyse
+from quell.analysis.loop import about_learning
 from quell.guard.kernels import authority_of, keep_outcomes
 
 from .benchmark_module import benchmark
@@ -87,6 +89,33 @@ def test_a_load_that_jumps_after_a_calm_is_no_reason_for_a_trial() -> None:
         memory.sample[0].own_peak = 1e3  # the learner answers in the same sample
         assert _sample(design, memory, 1e6 if k < LAG else 1e3) == 1.0
     assert memory.trial[0].outside > 0.5e6
+
+
+@pytest.mark.parametrize("axes", [(), ("shoulder", "elbow")])
+def test_a_run_says_where_trials_failed_and_what_to_do(axes: tuple[str, ...]) -> None:
+    """Its message has the share of the samples, for each axis, and names b0; one without has none."""
+    names = [f"{axis}.reason" for axis in axes] or ["reason"]
+    log = np.zeros((40, len(names)))
+    record = ql.Trajectory(log, tuple((name, 1) for name in names), 0.1, axis_names=axes)
+    assert record.message == "No step reported a problem."
+    log[:10, -1] = ql.Reason.FAILED
+    where = f"{axes[-1]}: " if axes else ""
+    assert record.message == f"{where}25 % of the samples: {ql.Reason.FAILED.message}"
+    assert "quell b0" in record.message
+
+
+def test_an_analysis_says_that_b0_is_too_small_to_learn_with() -> None:
+    """Beyond b/b0 = 2 a learner explains what it drives; of joints with an inertia between them an eigenvalue counts."""
+    joint = ql.ADRC(ql.ESO.model_free(2, 1.0, 50.0, 2e-3), 10.0, learner=ql.learners.Harmonic())
+    plain = ql.ADRC(joint.observer, 10.0)
+    assert "NOT for learning: b/b0 is 2.1," in analyse(([2.1], [1.0, 0.0, 0.0]), joint).summary()
+    assert about_learning([joint.learner], [1.9]) == []
+    A, C = np.kron(np.eye(2), [[0.0, 1.0], [0.0, 0.0]]), np.eye(4)[[0, 2]]
+    for axis, b, said in ((joint, 1.2, "B B0⁻¹ is 2.1,"), (joint, 1.0, ""), (plain, 1.2, "")):
+        B = np.kron([[b, 0.9], [0.9, b]], [[0.0], [1.0]])
+        remark = analyse((A, B, C), ql.Axes([axis, axis])).remark
+        assert said in remark
+        assert bool(said) == ("NOT for learning" in remark)
 
 
 @pytest.mark.trial

@@ -12,11 +12,12 @@ so that the responses are ``r → y: P C_r S``, ``d → y: P S``, ``n → u: −
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.analysis.certificate import Certificate, certify_axis
@@ -195,7 +196,28 @@ def analyse_axis(
             note = f"NOT in these margins: how {name} adapts; measure it (docs/analysis_learners)"
         elif knows_other_axes(part):
             note = "NOT in these margins: what the learner has learned from states of all axes"
+    learners = [] if part is None else [part.learner]
+    ratios = [] if b_over_b0 is None else [b_over_b0]
+    note = "\n".join(filter(None, [note, *about_learning(learners, ratios)]))
     return LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note)
+
+
+def about_learning(learners: Sequence[Any], ratios: ArrayLike) -> list[str]:
+    """Return a line where what learners explain is what they drive; ``ratios`` are b/b0.
+
+    f contains ``(B B0⁻¹ − 1) v``. Where a learner feeds all of that forward, the gain of the loop
+    that it closes is ``|λ − 1|`` for each eigenvalue λ of ``B B0⁻¹``: of one axis b/b0.
+    """
+    distance = np.abs(np.asarray(ratios) - 1.0)
+    if all(isinstance(each, NoLearner) for each in learners) or not np.any(distance > 1.0):
+        return []
+    worst, one = np.asarray(ratios)[np.argmax(distance)], distance.size == 1
+    what, way = ("b/b0", ", or OnlineGain") if one else ("an eigenvalue of B B0⁻¹", "")
+    return [
+        f"NOT for learning: {what} is {worst:.3g}, f contains b0 u {np.max(distance):.3g} times, "
+        "and what a learner explains of that may grow when it is fed forward; a guard then "
+        f"withholds authority (Reason.FAILED). Take the gains that quell b0 finds in a record{way}"
+    ]
 
 
 class LoopAnalysis(InNotebook):

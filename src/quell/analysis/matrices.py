@@ -34,6 +34,8 @@ from quell.types import Matrix, Vector
 
 # Numbers in the matrices of the frequencies that are solved together: 16 MB, as for one signal.
 _BLOCK = 1_000_000
+# A gain that is smaller, as a share of the terms whose sum it is, is their rounding.
+_CANCELLED = 1e-6
 
 
 class MatrixResponse:
@@ -165,6 +167,20 @@ def linear_part_of(
     return linear, tuple(np.broadcast_to(waiting, linear.inputs).tolist())
 
 
+def high_gains(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, list[int]]:
+    """Return the gains from u to the first derivative of each y that u reaches, and its order."""
+    found, degrees = np.zeros((C.shape[0], B.shape[1])), []
+    for i, row in enumerate(C):
+        bound, degree = np.abs(row), 1
+        while degree < A.shape[0]:
+            found[i] = row @ B
+            if np.any(np.abs(found[i]) > _CANCELLED * (bound @ np.abs(B))):
+                break
+            row, bound, degree = row @ A, bound @ np.abs(A), degree + 1
+        degrees.append(degree)
+    return found, degrees
+
+
 def gain_at(axes: Axes, x: Any = None) -> tuple[Matrix, Matrix]:
     """Return B0 (n, m) and B0⁺ (m, n) of axes, for the estimates ``x[axis, derivative]``.
 
@@ -192,6 +208,21 @@ def estimates_at(axes: Axes, plant: Any, operating_point: Any) -> Matrix | None:
     estimates = axes.initial_state().x
     estimates[:, 0] = y
     return estimates
+
+
+def gain_ratios(plant: Any, axes: Axes, operating_point: Any = None) -> Any:
+    """Return the eigenvalues of ``B B0⁺`` (n,), with the gains B of a plant.
+
+    There are none for a plant that was given sampled, and where u first reaches other derivatives
+    of y than the axes assume.
+    """
+    if isinstance(plant, LinearModelOfMany) or getattr(plant, "dt", None):
+        return np.zeros(0)
+    linear = linear_part_of(plant, axes.dt, operating_point)[0]
+    B, degrees = high_gains(linear.A, linear.B, linear.C)
+    if degrees != [axis.observer.degree for axis in axes.axes]:
+        return np.zeros(0)
+    return np.linalg.eigvals(B @ gain_at(axes, estimates_at(axes, plant, operating_point))[1])
 
 
 def law_of_axes(axes: Axes, x: Any = None) -> MatrixLaw:

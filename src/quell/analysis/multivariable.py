@@ -46,7 +46,7 @@ from quell.analysis.disk import (
     worst_change,
 )
 from quell.analysis.linearise import is_known, knows_other_axes
-from quell.analysis.loop import duration
+from quell.analysis.loop import about_learning, duration
 from quell.analysis.margins import (
     Complex,
     Margins,
@@ -60,6 +60,7 @@ from quell.analysis.margins import (
 from quell.analysis.matrices import (
     MatrixResponse,
     estimates_at,
+    gain_ratios,
     law_matrices,
     law_of_axes,
     plant_matrices,
@@ -495,6 +496,8 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
     law = law_of_axes(axes, estimates_at(axes, plant, operating_point))
     loop = MultivariableLoop(matrices, law, axes.dt, outputs=axes.names)
     lines = not_in_margins(axes)
+    learners = [axis.learner for axis in axes.axes]
+    lines += about_learning(learners, gain_ratios(plant, axes, operating_point))
     if callable(axes.B0) or callable(axes.M):
         lines.append(
             "NOT judged at other operating points than this one, where B0 is another: "

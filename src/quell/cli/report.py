@@ -148,7 +148,7 @@ def print_axes(
         learned[name] = _learned(axis)
         if learned[name]:
             print_line(console, f"{name} learned: {_listed(learned[name])}")
-    if run.status:
+    if run.status or run.failed_trials:
         console.print(("[red]" if run.lost else "") + escape(run.message), soft_wrap=True)
     return scores, learned
 
@@ -167,7 +167,7 @@ def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:
     learned = _learned(run)
     if learned:
         print_line(console, f"Learned: {_listed(learned)}")
-    if run.status:
+    if run.status or run.failed_trials:
         console.print(("[red]" if run.lost else "") + escape(run.message), soft_wrap=True)
     return learned
 

@@ -257,10 +257,34 @@ class Record(Hinted):
 
     def _explained(self, status: Status) -> str:
         """Return the sentences of the flags, with the share of the samples that have each."""
-        if "status" not in self.names or not self.log.size:
-            return status.message
-        flags = flags_of(self["status"])
-        return status.explained({one: float(np.mean((flags & int(one)) != 0)) for one in status})
+        failed = self.failed_trials
+        if failed and not status:
+            return failed
+        shares = {}
+        if "status" in self.names and self.log.size:
+            flags = flags_of(self["status"])
+            shares = {one: float(np.mean((flags & int(one)) != 0)) for one in status}
+        return " ".join(filter(None, [status.explained(shares), failed]))
+
+    @property
+    def failed_trials(self) -> str:
+        """Where a guard's trials failed twice, and what to do; empty where none did.
+
+        A sentence for each axis, with the share of the samples, from channels that have
+        ``Reason.FAILED`` (docs/theory_guard).
+        """
+        from quell.guard import Reason
+
+        sentences = []
+        for name in self.names:
+            axis, _, channel = name.rpartition(".")
+            is_reason = channel == "reason" and self.log.size > 0
+            share = float(np.mean(self[name] == Reason.FAILED)) if is_reason else 0.0
+            if share > 0.0:
+                where = f"{axis}: " if axis else ""
+                time = f"{100.0 * share:.3g} % of the samples"
+                sentences.append(f"{where}{time}: {Reason.FAILED.message}")
+        return " ".join(sentences)
 
     def window(self, start: float, stop: float) -> slice:
         """Return the samples with ``start <= t < stop`` as a slice."""

@@ -392,6 +392,8 @@ class BatchTrajectory(Record, InNotebook):
         counts = [(np.count_nonzero(own & int(flag)), flag.message) for flag in Status]
         counts.append((np.count_nonzero(causes), integration.message))
         sentences = [f"{count} of {runs} runs: {message}" for count, message in counts if count]
+        if self.failed_trials:
+            sentences.append(self.failed_trials)
         if np.any(self.diverged):
             first = int(np.argmin(np.where(self.diverged, self.ended, np.inf)))
             sentences.append(f"The first to diverge was run {first}, at {self.ended[first]:.6g} s.")

@@ -57,6 +57,7 @@ from quell.analysis.coupling import (
 from quell.analysis.matrices import (
     estimates_at,
     gain_at,
+    high_gains,
     joined,
     linear_part_of,
     sampled_matrices,
@@ -735,7 +736,7 @@ def _given_gain(
     N = A - np.eye(A.shape[0])
     linear = linear_part_of(plant, axes.dt, point)[0]
     B0 = gain_at(axes, estimates_at(axes, plant, point))[0]
-    high, degrees = _high_gains(linear.A, linear.B, linear.C)
+    high, degrees = high_gains(linear.A, linear.B, linear.C)
     is_of_plant = _are_rows_of(high, B0)
     for omega in np.geomspace(min(at, 0.5 / axes.dt), math.pi / axes.dt, _FREQUENCIES):
         if is_of_plant:
@@ -758,20 +759,6 @@ def _given_gain(
             pairs = None
     zeros = unstable_zeros(N, B @ R, C, axes.dt, ABOVE_BANDWIDTH * fastest)
     return GivenB0(is_of_plant, better, is_turned(N, B @ R, C), zeros, pairs)
-
-
-def _high_gains(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, list[int]]:
-    """Return the gains from u to the first derivative of each y that u reaches, and its order."""
-    found, degrees = np.zeros((C.shape[0], B.shape[1])), []
-    for i, row in enumerate(C):
-        bound, degree = np.abs(row), 1
-        while degree < A.shape[0]:
-            found[i] = row @ B
-            if np.any(np.abs(found[i]) > _CANCEL * (bound @ np.abs(B))):
-                break
-            row, bound, degree = row @ A, bound @ np.abs(A), degree + 1
-        degrees.append(degree)
-    return found, degrees
 
 
 def _are_rows_of(G: Any, B0: Matrix) -> bool:
