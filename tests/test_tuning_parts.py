@@ -17,6 +17,7 @@ import pytest
 import quell as ql
 from quell.analysis import analyse
 from quell.analysis.loop import LoopAnalysis
+from quell.analysis.matrices import high_gains
 from quell.analysis.multivariable import sampled_matrices
 from quell.tuning import Constraints, TunedAxes, tune_axes
 from quell.tuning.axes import (
@@ -24,7 +25,6 @@ from quell.tuning.axes import (
     _checked_bounds,
     _disk_of,
     _excess,
-    _high_gains,
     _off_by,
     _tightened,
     _with_errors,
@@ -284,7 +284,7 @@ def test_gains_far_above_all_dynamics_are_those_of_the_first_derivative() -> Non
     """C B, or C A B where that is zero; rows of B0 in proportion are those of the plant."""
     A = np.array([[0.0, 1.0, 0.0], [0.0, -3.0, 0.0], [0.0, 0.0, -1.0]])
     B, C = np.array([[0.0, 0.0], [2.0, 0.5], [0.3, 4.0]]), np.eye(3)[[0, 2]]
-    gains, degrees = _high_gains(A, B, C)
+    gains, degrees = high_gains(A, B, C)
     assert gains.tolist() == [[2.0, 0.5], [0.3, 4.0]]
     assert degrees == [2, 1]
     assert _are_rows_of(np.diag([2.0, 5.0]) @ B0, B0)
