@@ -12,14 +12,15 @@ of unknown size, for which ``unscaled`` is true, are divided by their largest va
 Sizes of features that are functions of signals in the plant's units.
 
 Nothing is known of their size beforehand. So each is divided by the smallest power of two that is
-at least its largest absolute value so far, or by that value, as signals are.
+at least its largest absolute value so far, or by √2 times a power of two, as signals are.
 
 Automatic scaling: inputs and targets of O(1) whatever the plant's units.
 
 The scale of x̂_i is the smallest power of two that is at least the largest ``|x̂_i|`` so far, so it
 changes seldom and by a whole factor, by which a linear model converts its coefficients exactly. For
-models that cannot be converted it is the largest ``|x̂_i|`` itself: what they predict then changes
-little where a signal comes to rest at its largest value. It is at least ``ω^(i−1)/8`` of the scale
+models that cannot be converted, and whose predictions change at once where a scale doubles, it is
+√2 times a power of two: a signal that rests at 1, 2 or 10 is not at an edge, where noise would
+double its scale. It is at least ``ω^(i−1)/8`` of the scale
 of x̂_1, with a frequency ω of the plant: at rest, where the higher derivatives are noise, noise is
 not scaled up to O(1). The control signal and the total disturbance, which a learner has to predict,
 have their own scales.
@@ -311,9 +312,14 @@ def reset_scale(scaling: Scaling, scale: Vector) -> None:
 
 @kernel
 def covering(scale: float, size: float, powers: bool) -> float:
-    """Return ``scale``, or if ``size`` is larger that size, or the next of the powers of two."""
+    """Return ``scale``, or if ``size`` is larger the next that covers it.
+
+    With ``powers`` it is a power of two, else √2 times one.
+    """
     if size > scale and is_finite(size):
-        return 2.0 ** math.ceil(log2(size)) if powers else size
+        return (
+            2.0 ** math.ceil(log2(size)) if powers else 2.0 ** (math.ceil(log2(size) - 0.5) + 0.5)
+        )
     return scale
 
 

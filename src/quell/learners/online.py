@@ -19,11 +19,10 @@ parameters does not need the approximation: ``learners/regression.py``, where th
 described.) A model at rest would learn the noise it is shown and forget the rest, so it learns
 nothing while nothing moves or noise hides f (``learners/base.py``).
 
-A scale is the largest absolute value so far. When it grows, the same motion gives smaller features,
-and the model has to learn them again. This happens in the first motions, and when a motion is
-larger than all before; it does not happen if ``scale`` is given. Scales that grow by factors of two
-would change all that is predicted within a sample: with y at rest at 1, noise would double its
-scale.
+When a scale grows, by a factor of at least two, the same motion gives smaller features, and the
+model has to learn them again. This happens in the first motions, and when a motion is larger than
+all before; it does not happen if ``scale`` is given. Scales are √2 times powers of two: where y
+rests at 1, noise beyond 1 would double a scale of 1.
 
 A small neural network, trained while it runs.
 
