@@ -387,7 +387,8 @@ def form(value: Any, name: str = "") -> Any:
         return value.shape, value.dtype.kind
     if isinstance(value, tuple):
         constant = constant_fields(type(value))
-        fields = zip(value._fields, value, strict=True)  # type: ignore[attr-defined]
+        names = getattr(value, "_fields", [""] * len(value))
+        fields = zip(names, value, strict=True)
         return type(value).__name__, *(
             part if name in constant else form(part, name) for name, part in fields
         )
