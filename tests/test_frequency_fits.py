@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import optimize
+from scipy import optimize, signal
 from scipy.ndimage import median_filter
 
 from quell.identification import identify_frequencies
@@ -483,3 +483,17 @@ def test_tables_that_are_none_are_refused(omega: Any, G: Any, more: Any, message
     """With the rule."""
     with pytest.raises(ValueError, match=message):
         identify_frequencies(omega, G, **more)
+
+
+def test_images_of_the_samples_of_a_held_u_add_no_pole() -> None:
+    """The response of the samples themselves, up to half the sampling rate, with hardly any noise."""
+    dt, num, den = 0.01, [40.0], [1.0, 4.0, 40.0]
+    b, a, _ = signal.cont2discrete((num, den), dt)
+    omega = np.linspace(1.0, 310.0, 70)
+    z = np.exp(1j * omega * dt)
+    G = np.polyval(b.ravel(), z) / np.polyval(a, z) / z
+    found = identify_frequencies(omega, G, deviation=np.full(omega.size, 1e-4), dt=dt)
+    assert found.shortcomings == ()
+    assert found.den[1:] == pytest.approx(den[1:], rel=2e-3)
+    assert found.delay == pytest.approx(dt, rel=0.01)
+    assert found.omega[-1] < 0.7 * omega[-1]

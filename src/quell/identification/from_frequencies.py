@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.identification.frequencies import hold_of
+from quell.identification.frequencies import KNOWN, hold_of
 from quell.identification.frequency_model import (
     DEVIATIONS,
     MOST_ORDER,
@@ -51,6 +51,11 @@ _FEW_ROUNDS, _DELAYS, _KEPT = 4, 12, 2
 _NEARLY = 2.0
 # Least relative error that counts: that of five digits, as tables have. Chosen by hand.
 _DIGITS = 1e-5
+# Relative size of the images of G beside G, for a G behind the hold that falls with the third power
+# of ω/(2π/dt − ω): two of them. By hand.
+_IMAGES, _FALLS = 2.0, 3
+# Points that a fit needs.
+_LEAST_POINTS = 8
 # Points for each parameter below which no interval is given.
 _FEW = 2.0
 # Largest logarithm of a frequency or a gain, on the way of the search.
@@ -129,7 +134,8 @@ def identify_frequencies(
         relative standard deviation of each G (N,), if it is known; else neighbours tell.
     dt
         time for which u was held while it was measured [s], as in a record of samples; by default
-        the table is that of the plant itself, and what hold and computing add is in the delay.
+        the table is that of the plant itself, and what hold and computing add is in the delay. Near
+        half the sampling rate samples have images of G: points count less there, or not at all.
     signals
         names and units of u and y.
 
@@ -151,8 +157,10 @@ def identify_frequencies(
     response = np.asarray(response, dtype=np.complex128)
     if response.shape != omega.shape or not np.all(np.isfinite(response)):
         raise ValueError(f"response: must be {omega.size} finite numbers, one for each omega")
-    if omega.size < 8:
-        raise ValueError(f"omega has {omega.size} frequencies: must have at least 8; measure more")
+    if omega.size < _LEAST_POINTS:
+        raise ValueError(
+            f"omega has {omega.size} frequencies: must have at least {_LEAST_POINTS}; measure more"
+        )
     if not (omega[0] > 0.0 and np.all(np.diff(omega) > 0.0)):
         raise ValueError("omega: must rise from above zero on")
     if np.any(response == 0.0):
@@ -171,6 +179,14 @@ def identify_frequencies(
         std = _scatter(omega, log)
     else:
         std = np.maximum(checks.vector("deviation", deviation, omega.size), _DIGITS)
+    if dt is not None:
+        # Samples of a held u have images of G around the sampling rate, which the model leaves out.
+        image = omega / np.maximum(2.0 * math.pi / dt - omega, omega)
+        images = _IMAGES * image**_FALLS
+        seen = images <= KNOWN
+        if int(np.sum(seen)) >= _LEAST_POINTS:
+            parts = omega, response, s, log, np.hypot(std, images)
+            omega, response, s, log, std = (part[seen] for part in parts)
     data = _Data(s / middle, log, std, None if fixed is None else fixed * middle)
     best = _searched(data, n, m, q)
     return _result(best, data, middle, omega, response, dt, signals)
