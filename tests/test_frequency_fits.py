@@ -492,7 +492,8 @@ def test_images_of_the_samples_of_a_held_u_add_no_pole() -> None:
     omega = np.linspace(1.0, 310.0, 70)
     z = np.exp(1j * omega * dt)
     G = np.polyval(b.ravel(), z) / np.polyval(a, z) / z
-    found = identify_frequencies(omega, G, deviation=np.full(omega.size, 1e-4), dt=dt)
+    known = {"zeros": 0, "integrators": 0, "deviation": np.full(omega.size, 1e-4)}
+    found = identify_frequencies(omega, G, dt=dt, **known)  # type: ignore[arg-type]
     assert found.shortcomings == ()
     assert found.den[1:] == pytest.approx(den[1:], rel=2e-3)
     assert found.delay == pytest.approx(dt, rel=0.01)
