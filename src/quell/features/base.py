@@ -273,6 +273,8 @@ LEAST, LEAST_SINGLE = 1e-100, 1e-30
 # Least scale of a derivative, as a share of the one in a motion of x_1 at the frequency ω. Chosen
 # by hand; not tuned further.
 _FLOOR = 1.0 / 8.0
+# √2: numbers at which people let a machine rest, as 1, 2 and 10, are not near √2 2^k.
+_EDGE = 2.0**0.5
 
 
 class Scaling(NamedTuple):
@@ -317,9 +319,8 @@ def covering(scale: float, size: float, powers: bool) -> float:
     With ``powers`` it is a power of two, else √2 times one.
     """
     if size > scale and is_finite(size):
-        return (
-            2.0 ** math.ceil(log2(size)) if powers else 2.0 ** (math.ceil(log2(size) - 0.5) + 0.5)
-        )
+        edge = 1.0 if powers else _EDGE
+        return edge * 2.0 ** math.ceil(log2(size / edge))
     return scale
 
 
