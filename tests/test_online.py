@@ -92,19 +92,20 @@ def learned(delay: int | None) -> np.ndarray:
     return memory.model.theta * memory.scale[-1] / np.array([memory.scale[0], memory.scale[1], 1.0])
 
 
-def test_a_signal_that_rests_at_its_largest_value_changes_no_prediction() -> None:
-    """Noise takes y a millionth beyond 1: the scale grows by as much, where a power of two would double."""
+@pytest.mark.parametrize("rest", [0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 100.0])
+def test_noise_at_rest_changes_no_scale_and_so_no_prediction(rest: float) -> None:
+    """It takes y, at rest at a round number, 5 % beyond: there a power of two would double."""
     learner = ql.learners.Online(Plain(), State() + Bias(), bias_bandwidth=0.0)
     design = learner.design(OBSERVER, 2.0)
     memory = learner.memory(design)
     memory.loop[0].samples = 1e6
     memory.model.theta[:] = [0.4, -0.3, 0.2]
-    for x in (1.0, 1.0 + 1e-6):
-        seen = np.array([x, 0.5, 0.0])
-        before = predict(design, memory, seen, 0.25)[0]
-        adapt(design, memory, seen, x, 0.25, 0.1)
-    assert memory.scale[:2].tolist() == pytest.approx([1.0 + 1e-6, 0.5])
-    assert abs(predict(design, memory, seen, 0.25)[0] - before) < 1e-6
+    seen = np.array([rest, 0.5 * rest, 0.0])
+    adapt(design, memory, seen, rest, 0.25, 0.1)
+    scale, before = memory.scale.copy(), predict(design, memory, seen, 0.25)[0]
+    adapt(design, memory, 1.05 * seen, 1.05 * rest, 0.25, 0.1)
+    assert memory.scale.tolist() == scale.tolist()
+    assert predict(design, memory, seen, 0.25)[0] == pytest.approx(before, abs=1e-9)
 
 
 @pytest.mark.trial
