@@ -48,6 +48,7 @@ def test_a_run_is_a_line_and_a_figure(made: Any) -> None:
     assert "time [s]" in shown
 
 
+@pytest.mark.trial
 def test_an_analysis_is_its_summary_and_a_figure() -> None:
     """The text is escaped."""
     loop = analyse(PLANT, controller())

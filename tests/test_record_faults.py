@@ -34,7 +34,7 @@ def noise(count: int, size: float, seed: int = 0) -> Any:
     return size * np.random.default_rng([seed, 1]).standard_normal(count)
 
 
-@pytest.mark.parametrize("early", [0, 1, 2])
+@pytest.mark.parametrize("early", [0, 1, pytest.param(2, marks=pytest.mark.trial)])
 def test_a_y_that_is_early_against_u_is_named_and_its_remedy_is_right(early: int) -> None:
     """By one sample and by two; without the first samples of u and the last of y nothing is named."""
     u = random_steps(1500, of=5)
