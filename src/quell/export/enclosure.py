@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.several import outputs_of
+from quell.controllers.several import inputs_of, outputs_of
 from quell.export.exact import ExactLaw
 from quell.plants.linear import DelayedPlant, EncodedPlant, LinearPlant
 
@@ -83,7 +83,7 @@ def plant_of(plant: Any, controller: Any) -> Plant:
             f"plant = {plant!r:.60}: must be linear, perhaps behind quell.plants.delayed; "
             "linearise it (quell.plants.linearised)"
         ) from None
-    wanted = int(getattr(controller, "inputs", 1)), outputs_of(controller)
+    wanted = inputs_of(controller), outputs_of(controller)
     if (linear.inputs, linear.outputs) != wanted:
         raise ValueError(
             f"plant = {linear.name}: has {linear.inputs} inputs and {linear.outputs} outputs, the "

@@ -36,7 +36,7 @@ from quell.controllers.law import AdrcDesign, AdrcState
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.safe_set import NoSafeSet
 from quell.controllers.schedule import is_scheduled
-from quell.controllers.several import control_all, outputs_of, references_of
+from quell.controllers.several import control_all, inputs_of, outputs_of, references_of
 from quell.controllers.single import in_single_precision
 from quell.export.controller_source import is_in_single, parameters_of
 from quell.guard import UnguardedDesign, UnguardedMemory
@@ -297,7 +297,7 @@ def sample_of(controller: Any, precision: str) -> Sample:
             "linear law; take it at fixed signals, controller.at(…)"
         )
     given = in_single_precision(plain) if precision == "single" else plain
-    signals = references_of(plain), outputs_of(plain), int(getattr(plain, "inputs", 1))
+    signals = references_of(plain), outputs_of(plain), inputs_of(plain)
     design, state = map(_without_learning, (parameters_of(given), given.initial_state()))
     if any(not isinstance(each.held, NoHeldPlant) or not isinstance(each.safe_set, NoSafeSet)
            for each in _adrc_designs(design)):  # fmt: skip

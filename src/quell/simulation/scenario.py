@@ -18,12 +18,10 @@ from quell import checks
 from quell.controllers.base import (
     Controller,
 )
-from quell.controllers.several import outputs_of, references_of
+from quell.controllers.several import inputs_of, outputs_of, references_of
 from quell.hints import explained
-from quell.plants.base import (
-    Plant,
-    inputs_of,
-)
+from quell.plants.base import Plant
+from quell.plants.base import inputs_of as inputs_of_plant
 from quell.plants.base import outputs_of as outputs_of_plant
 from quell.plants.channels import named
 from quell.records.record import first_sample_at, in_steps
@@ -280,8 +278,8 @@ def derivatives_in(reference: Sequence[Signal], controller: Controller) -> list[
 
 def check_fit(plant: Any, controller: Any) -> None:
     """Raise a ``ValueError`` unless a plant has as many signals as a controller."""
-    own = int(getattr(controller, "inputs", 1)), outputs_of(controller)
-    of_plant = inputs_of(plant), outputs_of_plant(plant)
+    own = inputs_of(controller), outputs_of(controller)
+    of_plant = inputs_of_plant(plant), outputs_of_plant(plant)
     if own == of_plant:
         return
     u = checks.counted(of_plant[0], "control signal")

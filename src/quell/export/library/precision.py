@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.prefilters import without_prefilters
+from quell.controllers.several import inputs_of
 from quell.export.controller_source import in_double_precision
 from quell.learners.gaussian_process import SINGLE_NOVELTY, GaussianProcess
 from quell.records.metrics import WORSE
@@ -233,7 +234,7 @@ def _increases(double: Any, single: Any) -> tuple[float, float]:
 def _limited(one: Any, two: Any, controller: Any) -> NDArray[np.bool_]:
     """Return where u lies at its limits in one of two runs (samples, actuators)."""
     count = min(len(one), len(two))
-    found = np.zeros((count, getattr(controller, "inputs", 1)), dtype=np.bool_)
+    found = np.zeros((count, inputs_of(controller)), dtype=np.bool_)
     for run in (one, two):
         if "status" not in run.names:  # a controller without limits
             continue
