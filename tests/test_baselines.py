@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import control
 import numpy as np
@@ -11,7 +13,9 @@ import pytest
 import quell as ql
 from quell.controllers import LinearController, Prefiltered
 from quell.controllers.baselines import (
+    EI,
     LQG,
+    MZV,
     PID,
     ZV,
     ZVD,
@@ -265,7 +269,7 @@ def test_either_mass_may_be_measured(measured: str) -> None:
 
 
 @pytest.mark.parametrize(("omega", "zeta"), [(1.4, 0.0), (5.0, 0.05), (2.0, 0.4)])
-@pytest.mark.parametrize("shaper", [ZV, ZVD])
+@pytest.mark.parametrize("shaper", [ZV, ZVD, MZV, partial(EI, humps=2)])
 def test_a_shaper_leaves_no_vibration_of_its_mode(
     shaper: object, omega: float, zeta: float
 ) -> None:
@@ -282,6 +286,36 @@ def test_a_shaper_leaves_no_vibration_of_its_mode(
     )
     assert run["r_shaped"][-1] == pytest.approx(1.0)
     assert np.max(np.abs(run["y"][run.t > made.times[-1] + 4e-3] - 1.0)) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("made", "published"),
+    [
+        (partial(EI, humps=1), 0.40),
+        (partial(EI, humps=2), 0.73),
+        (partial(EI, humps=3), 0.95),
+        (ZVD, 0.29),
+        (ZV, 0.06),
+    ],
+)
+def test_the_band_in_which_five_per_cent_is_left_is_as_published(
+    made: Callable[[float], Shaper], published: float
+) -> None:
+    """Insensitivity of Singhose and others (1997): width of the band over the frequency, two digits."""
+    shaper, omega = made(3.0), 3.0 * np.linspace(0.4, 1.6, 2401)
+    left = np.array([shaper.residual(each) for each in omega])
+    above = omega[left > 0.05 + 1e-9] / 3.0
+    band = np.min(above[above > 1.0]) - np.max(above[above < 1.0])
+    assert band == pytest.approx(published, abs=0.016)
+
+
+@pytest.mark.parametrize("humps", [1, 2, 3])
+@pytest.mark.parametrize("zeta", [0.0, 0.02, 0.2])
+def test_an_extra_insensitive_shaper_leaves_at_most_its_tolerance(humps: int, zeta: float) -> None:
+    """Of the mode that it is made for, at any damping; all amplitudes are positive, so r is not overshot."""
+    made = EI(2.0, zeta, tolerance=0.1, humps=humps)
+    assert made.residual(2.0, zeta) <= 0.1 + 1e-12
+    assert min(made.amplitudes) > 0.0
 
 
 def test_how_much_a_wrong_frequency_leaves_is_as_published() -> None:
@@ -386,6 +420,8 @@ WASHED_OUT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [0.0,
         (lambda: ResonanceRatio(m1=0.0, omega_o=5.0, dt=0.01), "m1 = 0.0"),
         (lambda: ZV(0.0), "omega = 0.0"),
         (lambda: ZVD(1.0, 1.0), "zeta = 1.0: must be below 1"),
+        (lambda: EI(1.0, tolerance=0.6), "tolerance = 0.6: must be at most 0.5"),
+        (lambda: EI(1.0, humps=4), "humps = 4: must be 1, 2 or 3"),
         (lambda: Shaper((0.1,), (1.0,)), "times = .0.1,.: must begin at 0.0"),
         (lambda: Shaper((0.0, 1.0), (1.0, 1.0)), "amplitudes = .1.0, 1.0.: must add up to 1"),
         (lambda: ZV(1e-6).design(1e-3), "must be at most 10000000 samples"),

@@ -40,6 +40,8 @@ OTHERS: dict[str, Any] = {
     "Notch": baseline_room.Notch.at(9.25),
     "ZV": baseline_room.ZV(3.25),
     "ZVD": baseline_room.ZVD(3.25),
+    "MZV": baseline_room.MZV(3.25),
+    "EI": baseline_room.EI(3.25, humps=2),
     "Shaper": baseline_room.Shaper([0.0, 0.25], [0.5, 0.5]),
     "in single precision": in_single_precision(CONTROLLERS["PID"]),
     "guard": ql.Guard(bound=2.25),
@@ -79,7 +81,9 @@ def test_every_public_class_has_an_example() -> None:
     """Of controllers, observers, plants and learners; so a new one is in the next test."""
     things = [PARTS[part][name] for part, name in EXAMPLES]
     shown = {base.__name__ for thing in things for base in type(thing).__mro__}
-    made = {name for name in OTHERS if name in ("ZV", "ZVD")}  # functions that return a Shaper
+    made = {
+        name for name in OTHERS if name in ("ZV", "ZVD", "MZV", "EI")
+    }  # functions that return a Shaper
     assert public_classes() - _WITHOUT - made <= shown
 
 

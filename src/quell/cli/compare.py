@@ -188,8 +188,8 @@ def compare(
     setups
         Setup files in TOML: none, one of one axis, or several.
     controllers
-        Names of controllers, with commas between; by default all. Without a setup zv+ or zvd+
-        before a name that is not tuned shapes its reference, as in zv+lqg.
+        Names of controllers, with commas between; by default all. Without a setup zv+, zvd+,
+        mzv+ or ei+ before a name that is not tuned shapes its reference, as in zv+lqg.
     m1
         Mass that is pushed, as it really is [kg].
     m2

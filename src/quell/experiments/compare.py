@@ -49,7 +49,7 @@ from quell.controllers import (
     ReferenceModel,
 )
 from quell.controllers.base import check_controller
-from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
+from quell.controllers.baselines import EI, LQG, MZV, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
 from quell.controllers.prefilters import without_prefilters
 from quell.experiments.common import Scores, check_sample_times, save_figures, step_scores
 from quell.guard import Guard
@@ -465,14 +465,14 @@ def scenario(settings: Benchmark) -> Scenario:
 def controller(name: str, dt: float, u_max: float = math.inf) -> Controller:
     """Return one of the benchmark's controllers, designed for m1 = m2 = k = 1 and ``|u| <= u_max``.
 
-    ``name`` is one of ``NAMES``, with ``zv+`` or ``zvd+`` before it to shape the reference for the
-    plant's resonance. The message for an unknown name lists the known ones.
+    ``name`` is one of ``NAMES``, with a shaper before it, as ``zv+``, to shape the reference for
+    the plant's resonance. The message for an unknown name lists the known ones.
     """
     *shapers, base = name.split("+")
     if base not in _DESIGNS or len(shapers) > 1 or not set(shapers) <= set(_SHAPERS):
         raise ValueError(
             f"controllers: {name!r} must be one of {', '.join(NAMES)}, "
-            "or zv+ or zvd+ and one of these, as zv+pid"
+            f"or one of {', '.join(each + '+' for each in _SHAPERS)} and one of these, as zv+pid"
         )
     design = _DESIGNS[base](dt, {"u_min": -u_max, "u_max": u_max})
     return Prefiltered(design, _SHAPERS[shapers[0]](RESONANCE)) if shapers else design
@@ -556,7 +556,7 @@ _DESIGNS: Mapping[str, Callable[[float, dict[str, Any]], Controller]] = {
     "l-lqg": lambda dt, limits: _learning(_lqg, dt, limits),
     "resonance-ratio": lambda dt, limits: ResonanceRatio(omega_o=OMEGA_O, dt=dt, **limits),
 }
-_SHAPERS = {"zv": ZV, "zvd": ZVD}
+_SHAPERS = {"zv": ZV, "zvd": ZVD, "mzv": MZV, "ei": EI}
 NAMES = tuple(_DESIGNS)  # the benchmark's controllers
 
 

@@ -28,7 +28,9 @@ from quell.controllers import (
     equal_to_pid,
 )
 from quell.controllers.baselines import (
+    EI,
     LQG,
+    MZV,
     PID,
     PPI,
     ZV,
@@ -358,9 +360,11 @@ _CONTROLLERS = (
     call_table("resonance-ratio", ResonanceRatio, forwards_to=_LINEAR),
 )
 CONTROLLERS = {table.kind_name: table for table in _CONTROLLERS}
+_SHAPERS: dict[str, Callable[..., Any]] = {"zv": ZV, "zvd": ZVD, "mzv": MZV, "ei": EI}
 PREFILTERS = _call_tables(
     {"reference-model": ReferenceModel, "tracking-differentiator": TrackingDifferentiator}
-    | {"profile-generator": ProfileGenerator, "zv": ZV, "zvd": ZVD, "shaper": Shaper}
+    | {"profile-generator": ProfileGenerator, "shaper": Shaper}
+    | _SHAPERS
 )
 Observer, Learner, Prefilter = one_of(OBSERVERS), one_of(LEARNERS), one_of(PREFILTERS)
 Controller = one_of(CONTROLLERS, default="adrc")

@@ -5,11 +5,13 @@ May import ``controllers`` with ``adrc``, ``linear`` and ``prefilters``, and wha
 
 from quell.controllers.baselines.pid import PID, PPI, Notch, NotchPID, equivalent_pid
 from quell.controllers.baselines.state_feedback import LQG, ResonanceRatio
-from quell.controllers.shaping import ZV, ZVD, Shaper
+from quell.controllers.shaping import EI, MZV, ZV, ZVD, Shaper
 from quell.lazy import imported_on_use, public_names
 
 __all__ = [
+    "EI",
     "LQG",
+    "MZV",
     "PID",
     "PPI",
     "ZV",
