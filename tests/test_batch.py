@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import quell as ql
 from quell.parallel import in_parallel, one_blas_thread
 from quell.plants import PlantBatch, batch, two_mass_spring
+from quell.plants.linear import sampled_together
 from quell.simulation import scenario as scenario_module
 
 from .cases import cases
@@ -590,3 +591,29 @@ def test_a_number_as_a_channel_of_a_batch_names_the_run() -> None:
     with pytest.raises(ValueError, match=r"run number 1 is runs\.run\(1\)"):
         runs[1]
     assert runs.run(1)["y"].shape == runs["y"][1].shape
+
+
+def test_plants_that_are_sampled_together_have_the_bits_of_each_alone() -> None:
+    """Of any size, stiffness and number of signals."""
+    rng = np.random.default_rng(5)
+    plants = []
+    for _ in range(60):
+        n, (m, p), scale = rng.integers(1, 6), rng.integers(1, 3, 2), 10.0 ** rng.uniform(-2.0, 3.0)
+        matrices = rng.normal(size=(n, n)) * scale, rng.normal(size=(n, m)), rng.normal(size=(p, n))
+        plants.append(ql.plants.LinearPlant(*matrices, rng.normal(size=(n, 2))))
+    for plant, together in zip(plants, sampled_together(plants, 0.01), strict=True):
+        alone = plant.sampled(0.01)
+        assert type(together) is type(alone)
+        assert [part.tobytes() for part in together] == [part.tobytes() for part in alone]
+
+
+def test_a_plant_that_cannot_be_sampled_with_others_is_named() -> None:
+    """By its own error, as it is alone."""
+    plants = [
+        ql.plants.LinearPlant([[a]], [1.0], [1.0], name=name)
+        for a, name in ((1.0, "slow"), (1e6, "fast"))
+    ]
+    with pytest.raises(ValueError, match="fast can't be sampled"):
+        ql.simulate(
+            plants, ql.ADRC(ql.ESO.model_free(1, 1.0, 5.0, dt=0.01), 1.0), ql.Scenario(duration=0.1)
+        )

@@ -264,7 +264,7 @@ def numbers(name: str, value: Any) -> Vector:
     except (TypeError, ValueError, OverflowError):
         got = type(value).__name__
         raise broken(f"{name}: must be an array of numbers, got {got}", name, **NUMBERS) from None
-    if not np.all(np.isfinite(array)):
+    if not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         entry = float(array[where])
         raise ValueError(f"{name}: entry {where} is {entry!r}; every entry must be finite")

@@ -99,7 +99,11 @@ class MissingAttributeError(AttributeError):
     """
 
     def __init__(
-        self, owner: str, name: str, known: Iterable[str], meant: Callable[[], Mapping[str, str]]
+        self,
+        owner: str,
+        name: str,
+        known: Callable[[], Iterable[str]],
+        meant: Callable[[], Mapping[str, str]],
     ) -> None:
         super().__init__(f"{owner} has no attribute {name!r}")
         self._known, self._meant, self._name = known, meant, name
@@ -111,7 +115,7 @@ class MissingAttributeError(AttributeError):
         plain = _plain(self._name)
         near = self._meant().get(plain)
         if near is None:
-            public = {_plain(each): each for each in self._known if not each.startswith("_")}
+            public = {_plain(each): each for each in self._known() if not each.startswith("_")}
             near = public.get(_nearest(plain, public))
         return text if near is None else f"{text}: did you mean {near}?"
 
@@ -126,7 +130,8 @@ class Hinted:
         kind = type(self)
         if hasattr(kind, name):  # a property, whose own error is the one to see
             return object.__getattribute__(self, name)
-        raise MissingAttributeError(f"{kind.__name__!r} object", name, dir(kind), self._meant)
+        known = functools.partial(dir, kind)
+        raise MissingAttributeError(f"{kind.__name__!r} object", name, known, self._meant)
 
     def _meant(self) -> Mapping[str, str]:
         """Return what stands for names that do not exist."""

@@ -45,7 +45,9 @@ def imported_on_use(
             value = importlib.import_module(f"{package}.{known[name]}")
         else:
             public = vars(sys.modules[package]).get("__all__", [*homes, *known])
-            raise MissingAttributeError(f"module {package!r}", name, public, lambda: OF_MODULES)
+            raise MissingAttributeError(
+                f"module {package!r}", name, lambda: public, lambda: OF_MODULES
+            )
         setattr(sys.modules[package], name, value)
         return value
 

@@ -172,7 +172,8 @@ def check_matrices(A: Any, B: Any, C: Any, several: bool = False) -> tuple[Matri
     """
     A = checks.matrix("A", A)
     n = A.shape[0]
-    checks.matrix("A", A, n, n)
+    if A.shape != (n, n):
+        checks.matrix("A", A, n, n)
     B, C = checks.numbers("B", B), checks.numbers("C", C)
     inputs = np.shape(B)[1] if np.ndim(B) == 2 else 1
     outputs = np.shape(C)[0] if np.ndim(C) == 2 else 1
@@ -182,8 +183,8 @@ def check_matrices(A: Any, B: Any, C: Any, several: bool = False) -> tuple[Matri
             "here there is one of each; several are controlled by quell.Axes and judged by "
             "quell.analysis.analyse"
         )
-    B = checks.matrix("B", np.reshape(B, (-1, 1)) if np.ndim(B) == 1 else B)
-    C = checks.matrix("C", np.reshape(C, (1, -1)) if np.ndim(C) == 1 else C)
+    B = np.reshape(B, (-1, 1)) if np.ndim(B) == 1 else checks.matrix("B", B)
+    C = np.reshape(C, (1, -1)) if np.ndim(C) == 1 else checks.matrix("C", C)
     for name, value, shape, rule in (
         ("B", B, (n, inputs), "a row for each state, a column for each control signal"),
         ("C", C, (outputs, n), "a row for each output, a column for each state"),
@@ -435,25 +436,35 @@ def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Mat
     Trans. Automatic Control* 23, 1978)::
 
         exp([[A, B], [0, 0]] dt) = [[Φ, Γ], [0, I]]
+
+    A (…, n, n) and B_i (…, n, m_i) may be stacks of models; each is sampled as if it were alone.
     """
-    n = A.shape[0]
-    edges = list(accumulate((B.shape[1] for B in inputs), initial=n))
+    n = A.shape[-1]
+    edges = list(accumulate((B.shape[-1] for B in inputs), initial=n))
     parts = [slice(*edge) for edge in pairwise(edges)]
-    block = np.zeros((edges[-1], edges[-1]))
-    block[:n, :n] = A
+    block = np.zeros((*A.shape[:-2], edges[-1], edges[-1]))
+    block[..., :n, :n] = A
     for part, B in zip(parts, inputs, strict=True):
-        block[:n, part] = B
-    sampled = _exponential(edges[-1], (block * dt).tobytes())
-    return sampled[:n, :n].copy(), [sampled[:n, part].copy() for part in parts]
+        block[..., :n, part] = B
+    sampled = _exponential(block * dt)
+    return sampled[..., :n, :n].copy(), [sampled[..., :n, part].copy() for part in parts]
+
+
+def _exponential(block: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return exp of a matrix, or of each of a stack."""
+    from scipy.linalg import expm
+
+    if block.ndim == 2:
+        return _kept_exponential(block.shape[0], block.tobytes())
+    with one_blas_thread():
+        found: NDArray[np.float64] = expm(block)
+    return found
 
 
 @lru_cache(maxsize=64)
-def _exponential(size: int, block: bytes) -> Matrix:
+def _kept_exponential(size: int, block: bytes) -> Matrix:
     """Return exp of a matrix; kept, because a plant is sampled again for each of its runs."""
-    from scipy.linalg import expm
-
-    with one_blas_thread():
-        found: Matrix = expm(np.frombuffer(block).reshape(size, size))
+    found = _exponential(np.frombuffer(block).reshape(1, size, size))[0]
     found.flags.writeable = False
     return found
 
@@ -470,7 +481,7 @@ def gramian(A: Matrix, Q: Matrix, dt: float) -> Matrix:
     """
     n = A.shape[0]
     block = np.block([[-A, Q], [np.zeros((n, n)), A.T]]) * dt
-    sampled = _exponential(2 * n, block.tobytes())
+    sampled = _exponential(block)
     found: Matrix = sampled[n:, n:].T @ sampled[:n, n:]
     return 0.5 * (found + found.T)
 

@@ -82,7 +82,7 @@ def chain_matrices(
     n = len(inertias)
     K, D = np.zeros((n, n)), np.diag(np.array(ground, dtype=np.float64))
     for i, (k, d) in enumerate(zip(stiffnesses, dampings, strict=True)):
-        both = np.ix_((i, i + 1), (i, i + 1))
+        both = (slice(i, i + 2), slice(i, i + 2))
         K[both] += np.array([[k, -k], [-k, k]])
         D[both] += np.array([[d, -d], [-d, d]])
     J = np.array(inertias, dtype=np.float64)

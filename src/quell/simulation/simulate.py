@@ -34,7 +34,7 @@ from quell.kernels.sized import layout_of
 from quell.lti.models import is_linear_model
 from quell.parallel import in_parallel, one_blas_thread, part_of
 from quell.plants.base import Plant, PlantBatch, check_plant, signals_of
-from quell.plants.linear import LinearPlant
+from quell.plants.linear import LinearPlant, sampled_together
 from quell.records.record import columns_of, readable_names, signals_of_loop
 from quell.records.trajectory import BatchTrajectory, Trajectory
 from quell.simulation.driver import (
@@ -261,10 +261,18 @@ def _sampled(
 
 
 def _models(plants: Sequence[Plant], dt: float, interpret: bool) -> list[Any]:
-    """Return the sampled model of each plant; a plant that occurs in many runs is sampled once."""
+    """Return the sampled model of each plant.
+
+    A plant that occurs in many runs is sampled once, and linear plants are sampled together.
+    """
     distinct = {id(plant): plant for plant in plants}
     with one_blas_thread():
-        models = {key: plant.sampled(dt, interpret) for key, plant in distinct.items()}
+        linear = {k: plant for k, plant in distinct.items() if type(plant) is LinearPlant}
+        models: dict[int, Any] = dict(
+            zip(linear, sampled_together([*linear.values()], dt), strict=True)
+        )
+        for key in distinct.keys() - linear.keys():
+            models[key] = distinct[key].sampled(dt, interpret)
     return [models[id(plant)] for plant in plants]
 
 
