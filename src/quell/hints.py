@@ -1,4 +1,4 @@
-"""What is meant by a name that does not exist: of a module, of an object, of an argument.
+"""Errors for names that do not exist, of modules, objects and arguments, which say what is meant.
 
 An error of a user's call names what to write. Names from other packages and textbooks have their
 own line here; for others the nearest name is given.

@@ -54,7 +54,7 @@ class CoupledCertificate:
     """Bounds K (axes, axes) of the uncertain parts, κ of the guards on the diagonal."""
     axes: tuple[str, ...]
     excluded: tuple[str, ...] = ()
-    """What the bounds do not cover."""
+    """The parts of the loop that the bounds do not cover."""
     condition: str = ""
     """Why the bounds do not hold for the axes as they are; empty if they do."""
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Usage(NamedTuple):
-    """What the help of a command begins and ends with."""
+    """The first lines and the last line of the help of a command."""
 
     lines: tuple[str, str]  #: command lines to copy
     page: str  #: of the documentation

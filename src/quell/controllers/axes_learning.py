@@ -1,4 +1,4 @@
-"""What the learners of several axes know of each other.
+"""Learners of several axes: the learner of an axis may use the signals of all axes.
 
 A learner that is given to ``Axes`` sees the states of all axes (``learners/all_axes.py``). At the
 beginning of a sample, before the axes run, all signals are gathered; a learner that all axes share

@@ -1,4 +1,4 @@
-"""What a controller of several axes does with each of them: the axes are a tuple, as their states.
+"""Work that a controller of several axes does for each: the axes are a tuple, as their states.
 
 The name of a function of one axis is in the singular, that of the function of all in the plural.
 """

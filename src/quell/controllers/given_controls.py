@@ -159,7 +159,7 @@ class GivenControls(NamedTuple):
 
 
 class LimitsOfChange(NamedTuple):
-    """What the limits of the actuators leave beside u_0, as ``ActuatorLimits``."""
+    """Limits that the actuators leave beside u_0, as ``ActuatorLimits``."""
 
     low: Work
     high: Work

@@ -89,7 +89,7 @@ from quell.observers.forms import DelayedModel, DeltaModel
 from quell.types import Matrix, Status, Vector
 
 SIGNALS = ("reference", "y", "speed", "external")
-"""What a schedule may follow: r, y, the estimate of y', or a signal that is given."""
+"""The signals that a schedule may follow: r, y, the estimate of y', or a signal that is given."""
 
 _REFERENCE, _Y, _SPEED, _EXTERNAL = range(len(SIGNALS))
 _SCHEDULE_HELD = int(Status.SCHEDULE_HELD)

@@ -1,4 +1,4 @@
-"""What a policy sets: the feedforward f_L of axes with a ``Policy``, or all control signals.
+"""Actions of a policy: the feedforward f_L of axes with a ``Policy``, or all control signals.
 
 A policy gives f_L of an ADRC, or of each axis of ``quell.Axes``, whose learner is a ``Policy``, or
 all control signals u of an open plant. Its numbers are written into the states of the loops

@@ -222,7 +222,7 @@ class Driven:
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """What each number of an action is: u, f, or the axis whose f it is."""
+        """Kind of each number of an action: u, f, or the axis whose f it is."""
         return self.action.names
 
     @property

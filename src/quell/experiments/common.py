@@ -1,4 +1,4 @@
-"""What several experiments use: claims, figures as files, scores.
+"""Parts that several experiments share: claims, figures as files, scores.
 
 A published claim, the measured value, and whether the claim holds.
 

@@ -168,7 +168,7 @@ _OF_SEVERAL = Kernels(
 
 
 class Parts(NamedTuple):
-    """What is exported of a controller.
+    """The parts of a controller that are exported.
 
     Attributes
     ----------

@@ -63,7 +63,7 @@ Interval = tuple[int | None, int | None]
 
 @dataclass
 class Structure:
-    """What was read from the text.
+    """Facts that were read from the text.
 
     Attributes
     ----------

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from quell.export.c_files import CSource
 
 HEADER = "separate.h"
-"""What the name of the file ends in; it stands for the header of the controller."""
+"""End of the file's name, which stands for the header of the controller."""
 
 _STRUCT = re.compile(r"typedef struct \{\n(.*?)\n\} (\w+);", re.S)
 _UNION = re.compile(r"^    union \{\n(.*?)\n    \} (\w+);", re.M | re.S)

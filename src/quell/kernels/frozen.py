@@ -1,4 +1,4 @@
-"""What compiled code has frozen of a user's function, and code that is kept as long as that holds.
+"""Values that compiled code has frozen of a user's function; the code is kept while they hold.
 
 Numba makes constants of the globals of a function and of the variables of enclosing functions. In a
 notebook they change while the function stays the same object, so the function alone does not tell

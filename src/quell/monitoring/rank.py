@@ -513,7 +513,7 @@ def _compared(
 
 
 class Decision(NamedTuple):
-    """What samples say of the logarithm d of a ratio."""
+    """The distribution that samples give the logarithm d of a ratio."""
 
     ends: tuple[float, float, float]  #: d, and the ends of its interval
     decided: bool  #: whether the interval is above zero

@@ -367,7 +367,7 @@ def speed_from_noise(
 
 
 class ByNoise(NamedTuple):
-    """What a design by noise gives."""
+    """A design by noise."""
 
     omega: float
     table: GainModel

@@ -462,7 +462,7 @@ class Estimator:
 
     @property
     def innovations(self) -> Vector:
-        """What each measurement (p,) of the last sample said beyond the prediction; 0 if missing.
+        """Innovations (p,) of the last sample, each measurement less its prediction; 0 if missing.
 
         In a sensor that works they are noise without a mean.
         """

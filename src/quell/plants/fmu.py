@@ -300,7 +300,7 @@ def _check(plant: Any, scratch: Vector) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FMUPlant(Described):
-    """What plants that FMUs compute have in common, with one control signal or several."""
+    """The common part of plants that FMUs compute, with one control signal or several."""
 
     path: str | os.PathLike[str]
     u: Any = None

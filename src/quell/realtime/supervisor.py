@@ -249,7 +249,7 @@ class Memory(Scalars):
 
 
 class Watch(Scalars):
-    """What an axis is judged by: its first motion, and the sign of its b0."""
+    """The judgement of an axis by its first motion and the sign of its b0."""
 
     y: float  #: last good measurement [y-unit]; NaN before the first
     y_rest_low: float  #: least y since the first cycle, before the scenario [y-unit]

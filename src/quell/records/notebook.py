@@ -1,4 +1,4 @@
-"""What a notebook shows of runs, analyses, models and tunings: their text and a small figure."""
+"""Runs, analyses, models and tunings in a notebook: their text and a small figure."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def compare(
 
 
 class Judged:
-    """What the outcomes of all sets of loops have in common; NamedTuples of ratios, both."""
+    """The contract of the outcomes of all sets of loops: NamedTuples of ratios."""
 
     guarded: Any  # with learner (and guard), over no learner
     chance: Any  # no learner with other draws of the noise, over no learner

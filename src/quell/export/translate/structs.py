@@ -1,4 +1,4 @@
-"""What kernels are made of: their source, and C structs for NamedTuples and records.
+"""Source of kernels, and C structs for their NamedTuples and records.
 
 Results of a translation of a program, for the next one.
 
