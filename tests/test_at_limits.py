@@ -351,6 +351,7 @@ def model(order: int, fit: float = 90.0, fault: str = "", friction: Any = None, 
         "fails": False,
         "converged": True,
         "rubs": friction is not None,
+        "poles": (),
     }
     return SimpleNamespace(den=np.ones(order + 1), friction=friction, fit=fit, **{**parts, **more})
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from scipy import signal
 
 import quell as ql
 from quell.analysis import analyse
-from quell.tuning import Constraints
+from quell.tuning import Constraints, designs
 from quell.tuning.optimiser import loops as responses
 from quell.tuning.optimiser import requirements, search
 from quell.tuning.optimiser.coupled import CoupledLoops, Limits, Plant
@@ -37,6 +39,7 @@ from quell.tuning.optimiser.requirements import Bound, Followed, Pole, points_of
 from quell.tuning.optimiser.search import Iterate, Problem, Solution
 from quell.tuning.plants import given_plants, model_of, plant_set
 from quell.tuning.structures.registry import make_structure
+from tests.cases import cases
 
 DT = 0.05
 LAG = ([1.0], [1.0, 1.0])
@@ -650,3 +653,26 @@ def test_starts_and_the_optimum_of_coupled_axes_keep_their_bounds() -> None:
         one = ql.ADRC(ql.ESO.model_free(1, 1.0, omega_o, DT), omega_c)
         y = response(sampled("lag").scaled()[0], law_of(one), load_step(sampled("lag"), 1.0, 60.0))
         assert both.costs[i] == pytest.approx(DT * float(np.sum(np.abs(y))), rel=1e-4)
+
+
+@cases(
+    ("omega", "damping", "refused"),
+    [(62.0, 6e-7, True), (62.0, -1e-5, True), (62.0, 0.01, False), (50.0, 6e-7, False)],
+)
+def test_no_search_begins_for_an_undamped_pair_at_half_the_rate(
+    omega: float, damping: float, refused: bool
+) -> None:
+    """Samples can't damp it: it is refused where it decides stability, before any evaluation."""
+    dt, pair = 0.05, [1.0, 2.0 * damping * omega, omega**2]
+    plant = [omega**2], np.polymul([1.0, 2.05, 1.05], pair)
+    begun: list[str] = []
+
+    def best_solution(problem: Problem, structure: Any, more: Any) -> None:
+        begun.append(structure.name)
+
+    how: dict[str, Any] = {"structure": "pi", "compare": (), "written": False}
+    what = "pair of poles with a damping of .* samples at dt = 0.05 s can't damp it; sample with"
+    with patch.object(designs, "best_solution", best_solution), pytest.raises(ValueError) as error:
+        ql.tune([plant, plant], dt, **how)
+    assert bool(re.search(what, str(error.value))) == refused
+    assert bool(begun) != refused

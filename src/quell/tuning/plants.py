@@ -182,6 +182,37 @@ def model_of(given: Given, plants: PlantSet, constraints: Constraints) -> Model:
     )
 
 
+# A pair of poles above this share of half the sampling rate is hardly controllable by samples.
+_NEAR_HALF = 0.9
+
+
+def beyond_control(plants: PlantSet) -> str:
+    """Return which pair of poles decides stability but can't be damped at dt; empty without one.
+
+    At half the sampling rate a pair is sampled in the same place of each half turn: u moves one of
+    its two states, and y shows one (Kalman, Ho & Narendra, *Contributions to Differential
+    Equations* 1, 1963, pp. 189–213: control is lost where ``Im(s_i − s_j) = 2 π k/dt``). Near it
+    the phase that would damp the pair depends on less of the delay than is known of any plant. The
+    pair decides stability if it is unstable, or if |P| there is that at the crossover or more.
+    """
+    top = math.pi / plants.dt
+    for i, plant in enumerate(plants.plants):
+        poles = plants.s_poles(plant)
+        for s in poles[poles.imag >= _NEAR_HALF * top].tolist():
+            if s.real < 0.0:
+                at = np.array([plants.crossover, min(s.imag, float(plants.omega[-1]))])
+                usual, there = np.abs(plants.responses_of(at, np.array([i, i])))
+                if there < usual:
+                    continue
+            return (
+                f"plant[{i}] has a pair of poles with a damping of {-s.real / abs(s):.2g} at "
+                f"{s.imag:.4g} rad/s, {s.imag / top:.3g} of half the sampling rate: it decides "
+                f"whether loops are stable, but samples at dt = {plants.dt:g} s can't damp it; "
+                f"sample with a dt of {0.5 * math.pi / s.imag:.2g} s at most, or leave the pair out"
+            )
+    return ""
+
+
 # ---- The set of plants that an identified model stands for ----
 
 # Probability of the ellipsoid.
@@ -307,6 +338,8 @@ class RecordModel:
         found, larger = [*self.model.faults, *self.model.undecided], self.larger
         if larger is not None and larger.early and fits_better(self.model, larger):
             found.append(larger.early_text)
+        if not found and (fast := _beyond_control(self.model)):
+            found.append(fast)
         return "; ".join(found)
 
     @cached_property
@@ -325,9 +358,24 @@ class RecordModel:
 
 def _why_not(model: Identified) -> str:
     """Return why a model does not hold; empty if it does."""
+    found = [*model.faults, *model.undecided]
+    if not found and (fast := _beyond_control(model)):
+        found.append(fast)
     worse = ["it is worse than the mean of y on samples that were not fitted"] * model.fails
     search = ["its search did not converge"] * (not model.converged)
-    return next(iter([*model.faults, *model.undecided, *worse, *search]), "")
+    return next(iter([*found, *worse, *search]), "")
+
+
+def _beyond_control(model: Identified) -> str:
+    """Return ``beyond_control`` of a model without faults."""
+    if all(pole.value.imag < _NEAR_HALF * math.pi / model.dt for pole in model.poles):
+        return ""
+    try:
+        given = given_plants((model.num, model.den), model.dt, delay=max(model.delay, 0.0))
+    except ValueError:  # no plant for a loop: ``plants`` says why
+        return ""
+    found = beyond_control(plant_set(given, model.dt))
+    return found.replace("plant[0]", "the model").replace("leave the pair out", "use a lower order")
 
 
 def record_model(

@@ -44,7 +44,15 @@ from quell.tuning.designs import (
 )
 from quell.tuning.optimiser.loops import Inputs, PlantSet, load_step, samples_of
 from quell.tuning.optimiser.requirements import OBJECTIVES
-from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set, with_known_noise
+from quell.tuning.plants import (
+    Given,
+    as_list,
+    beyond_control,
+    given_plants,
+    model_of,
+    plant_set,
+    with_known_noise,
+)
 from quell.tuning.report import Design, relative
 from quell.tuning.structures.base import resonances
 from quell.tuning.structures.registry import (
@@ -271,6 +279,8 @@ def tune(
     if setup is None or "scenario" not in setup:
         known_rest = rest_within(LinearPlant.of(given.linear[0]), known_rest, u_limits)
     plants = plant_set(given, dt)
+    if reason := beyond_control(plants):
+        raise ValueError(reason)
     bounds = given_constraints(constraints)
     model = model_of(given, plants, bounds)
     late = float(np.ravel(delay)[0]) + actuator_lag
