@@ -11,7 +11,7 @@ import quell as ql
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.realtime.cycle import ControlLoop
-from quell.realtime.devices import read_measurement, write_command
+from quell.realtime.devices import read_measurement, write_signals
 from quell.realtime.recordings import row_channels
 from quell.realtime.safety import Safety, as_scenario, reference_samples
 from quell.realtime.system import pass_time, virtual_clock
@@ -36,7 +36,7 @@ class Scripted(NamedTuple):
     moves: Any
     """By how many samples the plant has moved on meanwhile, under the last u."""
     refused: Any
-    """What ``write_command`` returns."""
+    """What ``write_signals`` returns."""
     written: Any
     """What was put (·,)."""
 
@@ -58,14 +58,14 @@ def _read_measurement(handle: Scripted, clock: Any, until: int) -> tuple[float, 
     return measure(handle.plant, handle.x) + _entry(handle.y, k), 0
 
 
-@write_command.register(Scripted)
-def _write_command(handle: Scripted, u: float) -> int:
+@write_signals.register(Scripted)
+def _write_signals(handle: Scripted, u: Any) -> int:
     k = handle.at[1]
     handle.at[1] += 1
-    handle.written[k] = u
+    handle.written[k] = u[0]
     if _entry(handle.refused, k) != 0:
         return _entry(handle.refused, k)
-    advance(handle.plant, handle.x, handle.scratch, 0.0, u, handle.w)
+    advance(handle.plant, handle.x, handle.scratch, 0.0, u[0], handle.w)
     return 0
 
 

@@ -23,7 +23,7 @@ from quell.realtime.wire import (
     counts_by_name,
     crc32,
     endpoint,
-    write_next_frame,
+    write_next_numbers,
 )
 
 from .cases import cases
@@ -39,8 +39,8 @@ def _accept(frame: Any, size: int, own: Any) -> bool:
 
 
 @compiled
-def _write_next_frame(out: Any, own: Any, kind: int, time: int, value: float, state: int) -> None:
-    write_next_frame(out, own, kind, time, value, state)
+def _write_next(out: Any, own: Any, kind: int, time: int, values: Any, state: int) -> None:
+    write_next_numbers(out, own, kind, time, values, state)
 
 
 @compiled
@@ -68,12 +68,12 @@ def test_the_checksum_is_that_of_zlib(data: bytes) -> None:
     assert crc32(room, len(data)) == _crc32(room, len(data)) == zlib.crc32(data)
 
 
-@pytest.mark.parametrize("entry", [_write_next_frame, interpreted(_write_next_frame)])
+@pytest.mark.parametrize("entry", [_write_next, interpreted(_write_next)])
 def test_a_frame_is_what_the_table_says(entry: Any) -> None:
     """Byte by byte the one that ``struct`` and ``zlib`` make."""
     own, out = endpoint(COMMAND, SESSION, 20), buffer()
     own.numbers[wire.SENT], own.numbers[wire.RECEIVED] = 2**32 + 6, 41
-    entry(out, own, MEASUREMENT, TIME, -1.5, 1)
+    entry(out, own, MEASUREMENT, TIME, np.array([-1.5]), 1)
     assert out.bytes[:40].tobytes() == packed(MEASUREMENT, 7, 41, -1.5, state=1)
 
 

@@ -13,7 +13,7 @@ from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compilations
 from quell.kernels.sized import layout_of
 from quell.realtime.cycle import ControlLoop, run_cycles
-from quell.realtime.devices import PythonHandle, Tick, read_measurement, read_tick, write_command
+from quell.realtime.devices import PythonHandle, Tick, read_measurement, read_tick, write_signals
 from quell.realtime.recordings import LOOP_WIDTH, Event, row_channels
 from quell.realtime.run import mode_changes
 from quell.realtime.safety import Safety, approach_curve, as_scenario, reference_samples
@@ -61,8 +61,8 @@ def _comes(handle: Ticking, k: int) -> int:
     return max(int(i * handle.period) + int(late[i - k - 1]) for i in range(max(k - 9, 0), k + 1))
 
 
-@write_command.register(Ticking)
-def _write_command(handle: Ticking, u: float) -> int:
+@write_signals.register(Ticking)
+def _write_signals(handle: Ticking, u: Any) -> int:
     return 0
 
 
@@ -266,7 +266,7 @@ class ThroughPython:
 
     def write(self, u: float) -> None:
         """Write; the driver may fail."""
-        if write_command(self.inner.handle, u):
+        if write_signals(self.inner.handle, np.array([u])):
             raise OSError("the driver is not well")
 
     def close(self) -> None:

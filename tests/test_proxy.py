@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import quell as ql
 from quell.kernels.dispatch import as_python
 from quell.realtime import CompensatedDrive, Safety, TwinDevice, wire
-from quell.realtime.devices import read_channels, read_measurement, write_command
+from quell.realtime.devices import read_channels, read_measurement, write_signals
 from quell.realtime.rig import Rig
 from quell.realtime.supervisor import FLUSH, Cause, Mode
 from quell.types import Vector
@@ -182,8 +182,8 @@ def _read_scripted_channels(handle: ScriptedHandle, values: Vector) -> None:
     values[:] = 0.25
 
 
-@write_command.register(ScriptedHandle)
-def _write_scripted(handle: ScriptedHandle, u: float) -> int:
+@write_signals.register(ScriptedHandle)
+def _write_scripted(handle: ScriptedHandle, u: Vector) -> int:
     return handle.fault
 
 

@@ -80,7 +80,8 @@ OF_ARGUMENTS = {
 }
 
 
-def _plain(name: str) -> str:
+def plain(name: str) -> str:
+    """Return a name in small letters, without underscores: the keys of these tables."""
     return name.casefold().replace("_", "")
 
 
@@ -112,11 +113,11 @@ class MissingAttributeError(AttributeError):
         text = str(self.args[0])
         if self._name.startswith("_"):
             return text
-        plain = _plain(self._name)
-        near = self._meant().get(plain)
+        asked = plain(self._name)
+        near = self._meant().get(asked)
         if near is None:
-            public = {_plain(each): each for each in self._known() if not each.startswith("_")}
-            near = public.get(_nearest(plain, public))
+            public = {plain(each): each for each in self._known() if not each.startswith("_")}
+            near = public.get(_nearest(asked, public))
         return text if near is None else f"{text}: did you mean {near}?"
 
     def __reduce__(self) -> Any:
@@ -174,7 +175,7 @@ def _said(function: Callable[..., Any], arguments: Any, named: Mapping[str, Any]
     title = function.__qualname__.removesuffix(".__init__")
     for name in named:
         if name not in parameters:
-            near = OF_ARGUMENTS.get(_plain(name), "")
+            near = OF_ARGUMENTS.get(plain(name), "")
             if not all(each in parameters for each in near.split(", ")):
                 near = _nearest(name, parameters)
             more = f", did you mean {near}?" if near else f"; it takes {', '.join(parameters)}"

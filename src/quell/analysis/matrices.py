@@ -190,8 +190,7 @@ def gain_at(axes: Axes, x: Any = None) -> tuple[Matrix, Matrix]:
     point = state.x if x is None else np.asarray(x, dtype=np.float64)
     if update_gain(axes.parameters.gain, state.gain, point):
         raise ValueError(f"B0 at x = {point.tolist()!r}: is not finite, or has no inverse")
-    b0 = np.array([axis.observer.b0 for axis in axes.axes])
-    return b0[:, None] * state.gain.B, state.gain.inverse / b0
+    return axes.b0[:, None] * state.gain.B, state.gain.inverse / axes.b0
 
 
 def estimates_at(axes: Axes, plant: Any, operating_point: Any) -> Matrix | None:

@@ -224,7 +224,9 @@ def _motion_by(design: AxesDesign, state: AxesState, b0: Vector, u: Vector, v: V
 
 @write_applied.register(AxesDesign)
 def _write_applied(design: AxesDesign, state: AxesState, u: Vector, row: Vector) -> None:
-    motion_by(design, state, state.v, u, row[: state.v.size])  # the first channel
+    v = row[: state.v.size]  # the first channel
+    apply_to_axes(state.gain, u, v)
+    write_motions(design.axes, state.axes, v, v)
 
 
 @tell_applied.register(AxesDesign)
@@ -467,7 +469,7 @@ class Axes(StatefulController):
     @property
     def first_gain(self) -> Matrix:
         """B0 before the first sample (n, m)."""
-        return self._b0[:, None] * self._gain.first
+        return self.b0[:, None] * self._gain.first
 
     @property
     def unit_axes(self) -> tuple[Any, ...]:
@@ -475,7 +477,8 @@ class Axes(StatefulController):
         return tuple(axis if axis.observer.b0 == 1.0 else axis.with_b0(1.0) for axis in self.axes)
 
     @property
-    def _b0(self) -> Vector:
+    def b0(self) -> Vector:
+        """The nominal gain of each axis (n,), ``b0_i v_i = (B0 u)_i``."""
         return np.array([axis.observer.b0 for axis in self.axes])
 
     @property
@@ -488,7 +491,7 @@ class Axes(StatefulController):
 
     def _checked_gain(self) -> Gain:
         given = (self.B0, self.M, self.weights, self.names, self._most)
-        return checked_gain(*given, weighs_change=self._has_bands, b0=self._b0)
+        return checked_gain(*given, weighs_change=self._has_bands, b0=self.b0)
 
     @property
     def derivatives(self) -> tuple[int, ...]:

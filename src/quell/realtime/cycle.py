@@ -224,7 +224,7 @@ def _finish_signals(controller: SupervisedController, handle: Any, u: float) -> 
 
 @kernel
 def count_fault(supervisor: SupervisorState, fault: int) -> None:
-    """Keep what ``write_command`` has returned."""
+    """Keep what ``write_signals`` has returned."""
     memory = supervisor.memory[0]
     memory.unsent_in_row = memory.unsent_in_row + 1 if fault == 1 else 0
     memory.tripped = 1 if fault > 1 else 0

@@ -4,15 +4,14 @@ The interface between the loop and a device: a plant in hardware, simulated, or 
 
 A device is an object with ``read() -> y``, ``write(u)`` and ``close()``. A device that can be used
 from compiled code also has a ``handle``: a NamedTuple for whose type ``read_measurement`` and
-``write_command`` are registered. Any other device gets a ``PythonHandle``; its loop runs as Python.
+``write_signals`` are registered. Any other device gets a ``PythonHandle``; its loop runs as Python.
 
 A device with its own clock sends a numbered measurement at each of its ticks; its attribute
 ``paced`` is True, and ``read_tick`` waits for the next one. Other devices answer at any time.
 
 A device of several axes has an attribute ``signal_counts``; its ``read`` returns an array (p,), its
 ``write`` takes one (m,). For a handle ``read_measurement`` and ``read_tick`` then return the first
-number if all are finite and NaN if one is not, ``read_signals`` gives them all, and
-``write_signals`` takes the place of ``write_command``.
+number if all are finite and NaN if one is not, and ``read_signals`` gives them all.
 
 A device that measures more than y has ``read_channels() -> numbers``, those of the last ``read``;
 for a handle ``read_channels`` is registered (``realtime/channels.py``).
@@ -121,9 +120,18 @@ def read_tick(handle: Any, clock: Any, until: int) -> Tick:
 
 
 @generic
-def write_command(handle: Any, u: float) -> int:
-    """Apply ``u`` [u-unit]; return 0, 1 if it can't be sent, more if the device keeps u at zero."""
+def write_signals(handle: Any, u: Vector) -> int:
+    """Apply ``u`` (m,) [u-unit].
+
+    Return 0, 1 if it can't be sent, more if the device keeps u at zero.
+    """
     raise TypeError
+
+
+def __getattr__(name: str) -> Any:
+    if name == "write_command":
+        raise ImportError("write_command is write_signals now, with an array u (m,) for one u, too")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 @generic_with_default
@@ -147,15 +155,6 @@ def read_signals(handle: Any, y: Vector) -> None:
 
     ``y`` has the first: a device of one y needs no implementation.
     """
-
-
-@generic_with_default
-def write_signals(handle: Any, u: Vector) -> int:
-    """Apply ``u`` (m,) [u-unit]; return what ``write_command`` does.
-
-    A device of one y and one u has ``write_command`` instead.
-    """
-    return write_command(handle, u[0])
 
 
 @generic_with_default
@@ -354,12 +353,6 @@ def _write_signals_twin(handle: TwinHandle, u: Vector) -> int:
     advance(handle.plant, handle.x, handle.scratch, handle.t[0] * handle.t[1], acting, handle.w)
     handle.t[0] += 1.0
     return 0
-
-
-@write_command.register(TwinHandle)
-def _write_command_twin(handle: TwinHandle, u: float) -> int:
-    handle.u[0] = u
-    return write_signals(handle, handle.u)
 
 
 @compiled

@@ -45,7 +45,7 @@ only ``wait_for_frame`` waits.
 The loop's access to a device at the other end of a wire, the same for every transport.
 
 The device has its own clock and sends a measurement at each tick. ``read_tick`` takes them in order
-and waits for the next if there is none, ``read_measurement`` takes the newest. ``write_command``
+and waits for the next if there is none, ``read_measurement`` takes the newest. ``write_signals``
 sends a command that names the measurement it answers; a measurement names the command that acts
 from its tick on.
 """
@@ -69,7 +69,6 @@ from quell.realtime.devices import (
     read_measurement,
     read_signals,
     read_tick,
-    write_command,
     write_signals,
 )
 from quell.realtime.system import SystemClock, external, now
@@ -200,16 +199,6 @@ def _end_frame(out: Buffer, signals: int, state: int) -> None:
     out.length[0] = size
     out.words[size // 4 - 2] = state
     out.words[size // 4 - 1] = crc32(out.bytes, size - 4)
-
-
-@kernel
-def write_next_frame(
-    out: Buffer, own: Endpoint, kind: int, time: int, value: float, state: int
-) -> None:
-    """Write the next frame of the session, of one number, to ``out``."""
-    numbers = own.numbers
-    numbers[SENT] += 1
-    write_frame(out, kind, numbers[SESSION], numbers[SENT], numbers[RECEIVED], time, value, state)
 
 
 @kernel
@@ -437,7 +426,7 @@ def pause(descriptor: Descriptor, nanoseconds: int) -> None:
 # ---- The loop's access to a device at the other end of a wire, the same for every transport ----
 
 COMMAND_NOT_SENT, TRIPPED, SESSION_GONE = 1, 2, 3
-"""Faults that ``write_command`` returns: the command could not be sent; the device's watchdog has
+"""Faults that ``write_signals`` returns: the command could not be sent; the device's watchdog has
 set u to zero until a new session; the device has ended the session."""
 
 
@@ -652,27 +641,12 @@ def is_own(own: Endpoint, frame: Buffer, kind: int) -> bool:
     return fits and int(frame.words[1]) == own.numbers[SESSION]
 
 
-@write_command.register(WireHandle)
-def _write_command(handle: WireHandle, u: float) -> int:
-    own = handle.endpoint
-    write_next_frame(handle.outbox, own, COMMAND, now(handle.watch), u, 0)
-    handle.queue.sent[own.numbers[SENT] % SENT_KEPT, 0] = u
-    return _send_command(handle)
-
-
 @write_signals.register(WireHandle)
 def _write_signals(handle: WireHandle, u: NDArray[np.float64]) -> int:
     own = handle.endpoint
     write_next_numbers(handle.outbox, own, COMMAND, now(handle.watch), u, 0)
     for i in range(u.size):
         handle.queue.sent[own.numbers[SENT] % SENT_KEPT, i] = u[i]
-    return _send_command(handle)
-
-
-@kernel
-def _send_command(handle: WireHandle) -> int:
-    """Send the command in the outbox; return a fault, 0 if there is none."""
-    own = handle.endpoint
     failed = send(handle.transport, handle.outbox) != 0
     if failed:
         own.counters[NOT_SENT] += 1

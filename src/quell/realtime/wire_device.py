@@ -17,7 +17,6 @@ from quell.realtime.devices import (
     checked_counts,
     other_counts,
     read_measurement,
-    write_command,
     write_signals,
 )
 from quell.realtime.system import SystemClock, system_clock
@@ -75,12 +74,7 @@ def _read(handle: WireHandle, clock: SystemClock, until: int) -> tuple[float, in
 
 
 @compiled
-def _write(handle: WireHandle, u: float) -> int:
-    return write_command(handle, u)
-
-
-@compiled
-def _write_all(handle: WireHandle, u: Vector) -> int:
+def _write(handle: WireHandle, u: Vector) -> int:
     return write_signals(handle, u)
 
 
@@ -185,10 +179,10 @@ class WireDevice:
         """
         self._check_open()
         if self.signal_counts is None:
-            fault = call_specialised(_write, self.handle, float(u))
+            values = np.array([float(u)])
         else:
             values = checks.vector("u", u, self.signal_counts.inputs)
-            fault = call_specialised(_write_all, self.handle, values)
+        fault = call_specialised(_write, self.handle, values)
         if fault:
             raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
 
@@ -304,10 +298,7 @@ class WireDevice:
         if not self._compiled:  # this may take seconds and must not count as waiting
             self._compiled = True
             specialised(_read, handle, clock, 0)
-            if self.signal_counts is None:
-                specialised(_write, handle, 0.0)
-            else:
-                specialised(_write_all, handle, np.zeros(self.signal_counts.inputs))
+            specialised(_write, handle, np.zeros(handle.queue.used_u.size))
         read = specialised(_read, handle, clock, 0)
         numbers, counters = handle.endpoint.numbers, handle.endpoint.counters
         unanswered, self._answered = self._answered == numbers[SENT], numbers[SENT]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.files import check_writable, written_atomically
-from quell.hints import Hinted
+from quell.hints import Hinted, plain
 from quell.quantities import UNKNOWN, AxesSignals, Signals
 from quell.records.metrics import MEASURES
 from quell.types import Channels, Matrix, Status, Vector
@@ -226,8 +226,8 @@ class Record(Hinted):
 
     def _meant(self) -> Mapping[str, str]:
         names = readable_names(vars(self).get("channels", ()))
-        channels = {name.replace("_", ""): f"run[{name!r}]" for name in names}
-        measures = {name.replace("_", ""): f"run.metrics()[{name!r}]" for name in MEASURES}
+        channels = {plain(name): f"run[{name!r}]" for name in names}
+        measures = {plain(name): f"run.metrics()[{name!r}]" for name in MEASURES}
         return measures | channels | dict.fromkeys(("time", "times"), "run.t")
 
     @property
