@@ -117,7 +117,7 @@ def test_state_feedback_in_single_precision_does_what_it_does_in_double() -> Non
     for each in (law, single):
         each.start([0.2, 0.2], [0.0], [0.2])
     assert single.step([0.2], [0.2, 0.2])[0] == pytest.approx(0.0, abs=1e-5)
-    with pytest.raises(ValueError, match="track: is of axes; StateFeedback has none"):
+    with pytest.raises(AttributeError, match="'StateFeedback' object has no attribute 'track'"):
         single.track([0.2], [0.2, 0.2], [0.0])
 
 

@@ -13,7 +13,6 @@ state feedback run so, too, with arrays of r, y and u.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numba
@@ -41,12 +40,11 @@ from quell.controllers.compensator import manual_operation
 from quell.controllers.held import HeldDesign
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law
-from quell.controllers.memory import Layout, images_of, learned_state
+from quell.controllers.memory import Layout, learned_state
 from quell.controllers.prefilters import Prefiltered, PrefilteredDesign, Wrapper
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.several import control_all
 from quell.controllers.state_space import FeedbackDesign, StateFeedback
-from quell.controllers.stateful import StatefulController
 from quell.features.base import CustomDesign
 from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels import dispatch
@@ -56,12 +54,13 @@ from quell.kernels.linking import KERNEL_OPTIONS, in_both_precisions
 from quell.kernels.numba_internals import REMEDY
 from quell.kernels.single import in_single
 from quell.kernels.sized import remade
+from quell.lazy import imported_on_use
 from quell.learners.all_axes import NoiseGateOfAxes
 from quell.learners.base import Lag, NoiseGate, NoiseGateMemory
 from quell.learners.kalman import KalmanDesign, KalmanMemory, needs_carries
 from quell.learners.python_model import PythonDesign
 from quell.observers.forms import delta_form
-from quell.types import Channels, Status, Vector
+from quell.types import Vector
 
 # ---- Parameters and states of controllers in single precision ----
 
@@ -115,6 +114,11 @@ def single_state(design: Any, state: Any) -> Any:
 
 def _check(value: Any, name: str) -> None:
     """Raise a ``ValueError`` for a part that works in double only, or averages for too long."""
+    if isinstance(value, FunctionGain):
+        raise ValueError(
+            "precision = 'single': B0 or M is a function, which is compiled in double precision; "
+            "stay in double, or take a constant matrix"
+        )
     if isinstance(value, PythonDesign | CustomDesign):
         what = "a model in Python" if isinstance(value, PythonDesign) else "features.Custom"
         raise ValueError(f"{name} is {what}: it works in double precision only; {_OTHERS}")
@@ -274,7 +278,7 @@ def check_compilable() -> None:
         )
 
 
-def in_single_precision(controller: Controller) -> SinglePrecision | SeveralInSingle:
+def in_single_precision(controller: Controller | Axes | StateFeedback) -> SinglePrecision:
     """Return a controller that calculates what ``controller`` does, in single precision.
 
     Of ``Axes`` and ``StateFeedback`` it takes and returns arrays, as they do.
@@ -294,11 +298,11 @@ def in_single_precision(controller: Controller) -> SinglePrecision | SeveralInSi
     >>> single.step(r=1.0, y=0.0)
     0.10000000149011612
     """
-    if isinstance(controller, SinglePrecision | SeveralInSingle):
-        return controller
-    if isinstance(controller, Axes | StateFeedback):
-        return SeveralInSingle(controller)
-    return SinglePrecision(controller)
+    return controller if isinstance(controller, SinglePrecision) else SinglePrecision(controller)
+
+
+# What a controller of several signals has beside the attributes of one.
+_OF_SEVERAL = ("axes", "estimates", "inputs", "names", "outputs", "references")
 
 
 class SinglePrecision(Wrapper):
@@ -306,20 +310,43 @@ class SinglePrecision(Wrapper):
 
     The given controller is copied and not changed; what it has learned is kept.
     ``parameters.controller`` and the state are single. If it is an ADRC, or one behind a prefilter,
-    the methods for start, manual operation and retuning are available here, too.
+    the methods for start, manual operation and retuning are available here, too. Those of ``Axes``
+    and ``StateFeedback`` are, but for ``retune``: make it again from retuned axes.
     """
 
-    def __init__(self, controller: Controller) -> None:
-        check_controller(controller)
+    _acts: Any = None
+
+    def __init__(self, controller: Any) -> None:
+        check_controller(controller, several=True)
         self.controller: Any = copy.deepcopy(controller)  # in double: it designs the parameters
         self._initialise()
         self._use_state(single_state(self.parameters.controller, learned_state(controller)))
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what a controller of several signals has; other names are those of ``Wrapper``."""
+        return getattr(self._acting, name) if name in _OF_SEVERAL else super().__getattr__(name)
+
+    @property
+    def _several(self) -> bool:
+        """Whether r, y and u are arrays."""
+        return hasattr(self.controller, "inputs")
+
+    @property
+    def _acting(self) -> Any:
+        """The controller, acting on this state with parameters in single precision."""
+        design, acts = self.parameters.controller, self._acts
+        if acts is None or acts.parameters is not design or acts._state is not self._state:
+            acts = self._acts = _acting_on(self.controller, design, self._state)
+        return acts
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
         if not dispatch.interpret_all:
             check_compilable()
-        super().prepare()
+        if self._several:
+            self._acting.prepare()
+        else:
+            super().prepare()
 
     def _update_parameters(self) -> None:
         self.parameters = SingleDesign(single_design(self.controller.parameters))
@@ -329,26 +356,56 @@ class SinglePrecision(Wrapper):
         return single_state(self.parameters.controller, self.controller.initial_state())
 
     @property
-    def derivatives(self) -> int:
-        """Number of derivatives of the reference that are fed forward."""
-        return int(getattr(self.controller, "derivatives", 0))
+    def derivatives(self) -> Any:
+        """Number of derivatives of the reference, or of each one, that are fed forward."""
+        return getattr(self.controller, "derivatives", 0)
 
-    def step(self, r: float, y: float, *derivatives: float) -> float:
-        """Take one sample: return the control signal [u-unit], see ``ADRC.step``."""
+    def step(self, r: Any, y: Any, *derivatives: Any) -> Any:
+        """Take one sample: return the control signal [u-unit], see ``ADRC.step``.
+
+        Of several signals return u (m,) in double precision, see ``Axes.step``.
+        """
+        if self._several:
+            if self._acting._packed is None:
+                self.prepare()
+            with np.errstate(over="ignore"):  # a number out of the range of single becomes infinite
+                return self._acting.step(r, y, *derivatives).astype(np.float64)
         if derivatives or self.derivatives:
             values = np.array(derivatives, dtype=np.float64)
             set_reference_derivatives(self.parameters, self._state, values)
         return super().step(r, y)
 
+    def applied(self, u: Any) -> None:
+        """Set what was really applied since the last ``step``, see ``ADRC.applied``."""
+        if self._several:
+            self._acting.applied(u)
+        else:
+            super().applied(u)
+
+    def start(self, y: Any, u: Any = None, r: Any = None) -> None:
+        """Start at a plant that rests at ``y`` under ``u``, zero by default, see ``ADRC.start``."""
+        rest = np.zeros(self.inputs) if self._several else 0.0
+        self._inner.start(y, rest if u is None else u, r)
+
     def _images(self) -> Layout:
-        return images_of(self.parameters.controller, self._state, self.dt)
+        images: Layout = self._acting._images()
+        return images
 
     @property
     def _inner(self) -> Any:
-        return _acting_on(super()._inner, self.parameters.controller, self._state)
+        if not self._several:
+            _ = super()._inner
+        return self._acting
 
-    def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
-        """Take one sample in manual operation, see ``ADRC.track``."""
+    def _check_inner(self) -> None:
+        if self._several:
+            raise ValueError("retune: NOT possible of axes in single precision: make it again")
+        super()._check_inner()
+
+    def track(self, r: Any, y: Any, u: Any, *derivatives: float) -> Any:
+        """Take one sample in manual operation, see ``ADRC.track`` and ``Axes.track``."""
+        if self._several:
+            return self._acting.track(r, y, u)
         state = self._adrc._state
         with manual_operation(state, checks.signal("u", u)):
             self.step(r, y, *derivatives)
@@ -379,167 +436,5 @@ def _acting_on(controller: Any, design: Any, state: Any) -> Any:
     return acting
 
 
-# ---- Several axes, and state feedback ----
-
-
-def _check_axes(controller: Any) -> None:
-    """Raise a ``ValueError`` for axes that can not be in single precision."""
-    design = controller.parameters
-    if isinstance(controller, Axes) and isinstance(design.gain, FunctionGain):
-        raise ValueError(
-            "precision = 'single': B0 or M is a function, which is compiled in double precision; "
-            "stay in double, or take a constant matrix"
-        )
-
-
-class SeveralInSingle(StatefulController):
-    """Several axes, or state feedback, in single precision; see ``in_single_precision``.
-
-    The given controller is copied and not changed; what it has learned is kept.
-    ``parameters.controller`` and the state are single. The methods are those of ``Axes`` and
-    ``StateFeedback`` of the same names, but for ``retune``: make it again from retuned axes.
-    """
-
-    def __init__(self, controller: Axes | StateFeedback) -> None:
-        _check_axes(controller)
-        self.controller: Any = copy.deepcopy(controller)  # in double: it designs the parameters
-        self._initialise()
-        self._use_state(single_state(self.parameters.controller, learned_state(controller)))
-
-    def _update_parameters(self) -> None:
-        self.parameters = SingleDesign(single_design(self.controller.parameters))
-
-    def initial_state(self) -> Any:
-        """Return a state before the first sample."""
-        return single_state(self.parameters.controller, self.controller.initial_state())
-
-    def _use_state(self, state: Any) -> None:
-        super()._use_state(state)
-        self._acting = _acting_on(self.controller, self.parameters.controller, state)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy is made from."""
-        return {name: value for name, value in super().__getstate__().items() if name != "_acting"}
-
-    def _images(self) -> Layout:
-        images: Layout = self._acting._images()
-        return images
-
-    # ---- Sample by sample ----
-
-    def prepare(self) -> None:
-        """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
-        if not dispatch.interpret_all:
-            check_compilable()
-        self._acting.prepare()
-
-    def step(  # type: ignore[override]
-        self, r: Sequence[float] | Vector, y: Sequence[float] | Vector, *derivatives: Any
-    ) -> Vector:
-        """Take one sample: return the control signals (m,) [u-unit], in double precision."""
-        if self._acting._packed is None:
-            self.prepare()
-        with np.errstate(over="ignore"):  # a number out of the range of single becomes infinite
-            found: Vector = self._acting.step(r, y, *derivatives).astype(np.float64)
-        return found
-
-    def applied(self, u: Sequence[float] | Vector) -> None:  # type: ignore[override]
-        """Set the control signals that were really applied since the last ``step`` (m,)."""
-        self._acting.applied(u)
-
-    def start(self, y: Any, u: Any = None, r: Any = None) -> None:
-        """Start at a machine that rests at ``y`` under ``u``: ``step`` continues from there."""
-        given = np.zeros(self.inputs) if u is None else u
-        self._acting.start(y, given, r)
-
-    def track(self, r: Any, y: Any, u: Any) -> None:
-        """Take one sample in manual operation, see ``Axes.track``; of axes only."""
-        self._axes("track").track(r, y, u)
-
-    def hand_over(self) -> None:
-        """End manual operation, see ``Axes.hand_over``; of axes only."""
-        self._axes("hand_over").hand_over()
-
-    def set_limits(self, *, u_min: Any = None, u_max: Any = None, rate_limit: Any = None) -> None:
-        """Change limits of the actuators while running; what is not given stays."""
-        self.controller.set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
-        self._update_parameters()
-        acting = self._acting
-        acting.parameters = self.parameters.controller
-        acting._pack_again()
-
-    def _axes(self, what: str) -> Any:
-        if not isinstance(self.controller, Axes):
-            raise ValueError(f"{what}: is of axes; StateFeedback has none")
-        return self._acting
-
-    # ---- What it is, and what it knows ----
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return float(self.controller.dt)
-
-    @property
-    def limits(self) -> Any:
-        """Limits of the actuators (m,)."""
-        return self.controller.limits
-
-    @property
-    def inputs(self) -> int:
-        """Number of control signals m."""
-        return int(self.controller.inputs)
-
-    @property
-    def outputs(self) -> int:
-        """Number of measurements."""
-        return int(self.controller.outputs)
-
-    @property
-    def references(self) -> int:
-        """Number of references, or of u_0 of compensators."""
-        return int(self.controller.references)
-
-    @property
-    def derivatives(self) -> tuple[int, ...]:
-        """Number of derivatives of each reference that are fed forward."""
-        found: tuple[int, ...] = self.controller.derivatives
-        return found
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the axes; none of state feedback."""
-        return tuple(self.controller.names)
-
-    @property
-    def axes(self) -> tuple[Any, ...]:
-        """The controllers of the axes, acting on this state; none of state feedback."""
-        return tuple(self._acting.axes)
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """No names: each axis has its own."""
-        return ()
-
-    @property
-    def channels(self) -> Channels:
-        """Name and width of each recorded channel, in order."""
-        channels: Channels = self.controller.channels
-        return channels
-
-    @property
-    def estimates(self) -> Any:
-        """Estimates and status of each axis by its name, see ``Axes.estimates``; of axes only."""
-        return self._axes("estimates").estimates
-
-    @property
-    def status(self) -> Status:
-        """Flags of the last step."""
-        return Status(int(status_flags(self.parameters, self._state)))
-
-    def described(self) -> dict[str, Any]:
-        """Return what ``repr`` prints."""
-        return {"controller": self.controller}
-
-
-__all__ = ["SeveralInSingle", "SinglePrecision", "check_compilable", "in_single_precision"]
+__all__ = ["SinglePrecision", "check_compilable", "in_single_precision"]
+__getattr__ = imported_on_use(__name__, {}, (), {"SeveralInSingle": "SinglePrecision"})

@@ -180,7 +180,7 @@ def _step_as_python(packed: Any, r: float, y: float) -> float:
 
 
 # A copy makes these again: compiled functions and shared arrays belong to one process.
-_NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step", "_axis")
+_NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step", "_axis", "_acts")
 
 
 @compiled_call

@@ -31,7 +31,7 @@ from quell.controllers.prefilters import Prefiltered, stopping_point, without_pr
 from quell.controllers.safe_set import SafeSetDesign
 from quell.controllers.several import control_all
 from quell.controllers.shaped_references import are_shaped, plan_stops, stop_of_moves
-from quell.controllers.single import SeveralInSingle, SinglePrecision, in_single_precision
+from quell.controllers.single import SinglePrecision, in_single_precision
 from quell.controllers.state_space import StateFeedback
 from quell.export import axes_source, c_files
 from quell.export.axes_source import (
@@ -56,7 +56,7 @@ def in_double_precision(controller: Any) -> Any:
 
 def is_in_single(controller: Any) -> bool:
     """Return whether a controller is one of ``in_single_precision``."""
-    return isinstance(controller, SinglePrecision | SeveralInSingle)
+    return isinstance(controller, SinglePrecision)
 
 
 def parameters_of(controller: Any) -> Any:

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from quell import checks
 from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, check_controller, limits_of
-from quell.controllers.single import SeveralInSingle, check_compilable, in_single_precision
+from quell.controllers.single import SinglePrecision, check_compilable, in_single_precision
 from quell.controllers.state_space import StateFeedback
 from quell.hints import explained
 from quell.kernels import dispatch
@@ -144,7 +144,7 @@ def _names_of(plant: Any, controller: Any) -> dict[str, Any]:
 
 def is_of_several(controller: Any) -> bool:
     """Return whether a controller has several signals, as ``Axes`` and ``StateFeedback``."""
-    return isinstance(controller, Axes | StateFeedback | SeveralInSingle)
+    return hasattr(controller, "inputs")
 
 
 def _run_loops(
@@ -295,7 +295,7 @@ def _selected(record: Sequence[str], logged: Channels) -> Channels:
 @overload
 def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
     plant: Plant | tuple[ArrayLike, ...],
-    controller: Controller | Axes | StateFeedback | SeveralInSingle,
+    controller: Controller | Axes | StateFeedback | SinglePrecision,
     scenario: Scenario,
     *,
     record_every: int = 1,
