@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.analysis.margins import Complex
-from quell.analysis.matrices import MatrixResponse, sampled_matrices
+from quell.analysis.margins import Complex, Response
+from quell.analysis.matrices import sampled_matrices
 from quell.analysis.multivariable import grouped_poles
 from quell.lti.canonical import format_roots
 from quell.lti.models import ZERO_TOLERANCE, MatrixSystem
@@ -299,7 +299,7 @@ def coupling(
                 f"bandwidth = {bandwidth!r} rad/s: must be at most half the sampling rate, "
                 f"{math.pi / dt:.6g} rad/s"
             )
-        response = MatrixResponse(MatrixSystem(N, B, C, np.zeros((p, m))))
+        response = Response(MatrixSystem(N, B, C, np.zeros((p, m))))
         found.append(_gains_at(f"at {bandwidth:.4g} rad/s", response([bandwidth], dt)[0]))
     limit = _OF_SAMPLES / dt if bandwidth is None else ABOVE_BANDWIDTH * bandwidth
     return Coupling(tuple(found), names, unstable_zeros(N, B, C, dt, limit))

@@ -1,8 +1,4 @@
-"""Sampled systems of several inputs and outputs: frequency responses, and matrices as given.
-
-The counterpart of ``analysis/margins`` for one signal: the same powers of z⁻¹ for dead times, the
-same scaling, a linear solve per frequency.
-"""
+"""Sampled plants and laws of several inputs and outputs, as matrices."""
 
 from __future__ import annotations
 
@@ -14,78 +10,17 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.linearise import linear_law
-from quell.analysis.margins import (
-    Complex,
-    balancing_scales,
-    delayed_parts,
-    without_delays,
-)
 from quell.controllers.allocation import update_gain
 from quell.controllers.axes import Axes
 from quell.controllers.linear import LinearLaw
-from quell.lti.models import MatrixSystem
 from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.linear import LinearModelOfMany, LinearPlant
 from quell.plants.linearise import linearised
 from quell.plants.nonlinear import NonlinearPlant, checked_point
-from quell.types import Matrix, Vector
+from quell.types import Matrix
 
-# ---- Frequency responses of several inputs and outputs ----
-
-# Numbers in the matrices of the frequencies that are solved together: 16 MB, as for one signal.
-_BLOCK = 1_000_000
 # A gain that is smaller, as a share of the terms whose sum it is, is their rounding.
 _CANCELLED = 1e-6
-
-
-class MatrixResponse:
-    """The frequency response of a system of several inputs and outputs."""
-
-    def __init__(self, system: MatrixSystem) -> None:
-        delays = without_delays(system.N, *system.B.T)
-        steps, N, B, C = np.zeros(0), system.N, system.B, system.C
-        M = np.zeros((0, *N.shape))
-        self._C_late = np.zeros((0, *C.shape))
-        if delays is not None:
-            kept, r = delays.kept, delays.kept.size
-            steps, parts = delayed_parts(delays, np.vstack([N[kept], C]))
-            M, self._C_late = parts[:, :r], parts[:, r:]
-            N, B, C = delays.N, B[kept], C[:, kept]
-        scale = balancing_scales(N, M) if N.size else np.ones(0)
-        self._steps, self._D = steps, system.D
-        self._M = (M * scale / scale[:, None]).reshape(steps.size, N.size)
-        self._C_late = self._C_late * scale
-        self._N, self._B, self._C = N * scale / scale[:, None], B / scale[:, None], C * scale
-
-    def __call__(self, omega: Any, dt: float) -> Complex:
-        """Return the responses (k, p, m) at the frequencies ``omega`` (k,) [rad/s]."""
-        omega = np.atleast_1d(np.asarray(omega, dtype=np.float64))
-        count = math.ceil(omega.size * (self._N.size + self._steps.size) / _BLOCK)
-        parts = np.array_split(omega, max(count, 1))
-        return np.concatenate([self._block(part, dt) for part in parts])
-
-    def _block(self, omega: Vector, dt: float) -> Complex:
-        size = self._N.shape[0]
-        resolvent = np.expm1(1j * omega * dt)[:, None, None] * np.eye(size) - self._N
-        output: Any = self._C
-        if self._steps.size:
-            late = np.exp(-1j * dt * omega[:, None] * self._steps)
-            resolvent -= (late @ self._M).reshape(resolvent.shape)
-            output = self._C + np.tensordot(late, self._C_late, 1)
-        try:
-            solved = np.linalg.solve(
-                resolvent, np.broadcast_to(self._B, (omega.size, *self._B.shape))
-            )
-        except np.linalg.LinAlgError:
-            raise ValueError(
-                f"omega = {omega.tolist()!r} rad/s: the response is infinite at one of "
-                "them, a pole; leave it out"
-            ) from None
-        found: Complex = output @ solved + self._D
-        return found
-
-
-# ---- Plants and laws as users give them ----
 
 
 class MatrixLaw(NamedTuple):

@@ -50,6 +50,7 @@ from quell.analysis.loop import about_learning, duration
 from quell.analysis.margins import (
     Complex,
     Margins,
+    Response,
     eigenvalues,
     frequencies,
     in_s_plane,
@@ -58,7 +59,6 @@ from quell.analysis.margins import (
     without_idle_chains,
 )
 from quell.analysis.matrices import (
-    MatrixResponse,
     estimates_at,
     gain_ratios,
     law_matrices,
@@ -170,7 +170,7 @@ class MultivariableLoop:
             if size.size != count:
                 raise ValueError(f"{name} has {size.size} entries: must have {count}")
         self._size = np.concatenate(sizes)
-        self._response = MatrixResponse(self._broken())
+        self._response = Response(self._broken())
         self.remark = ""
         """Lines on what the loop stands for, at the end of the summary."""
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from quell.analysis.disk import balanced, singular
 from quell.analysis.margins import Complex, Response, eigenvalues, frequencies, in_s_plane
-from quell.analysis.matrices import MatrixResponse, joined
+from quell.analysis.matrices import joined
 from quell.controllers.adrc import ADRC
 from quell.controllers.linear import LinearLaw
 from quell.lti.models import MatrixSystem, System
@@ -174,9 +174,7 @@ class CoupledLoops:
     def _responses(self, plant: Plant) -> Complex:
         m, p = plant.B.shape[1], plant.C.shape[0]
         N = plant.A - np.eye(plant.A.shape[0])
-        return MatrixResponse(MatrixSystem(N, plant.B, plant.C, np.zeros((p, m))))(
-            self.omega, self.dt
-        )
+        return Response(MatrixSystem(N, plant.B, plant.C, np.zeros((p, m))))(self.omega, self.dt)
 
     # ---- measures
 
