@@ -118,10 +118,7 @@ def test_every_plant_has_an_example() -> None:
     made = {make for name, make in registered if name not in FROM_FILES}
     assert public - classes == made - {registry.linear}
     examples = [*PLANTS.values(), *PLANTS_OF_AXES.values()]
-    assert classes <= {type(plant) for plant in examples} | {
-        plant_room.FMU,
-        plant_room.MultivariableFMU,
-    }
+    assert classes <= {type(plant) for plant in examples} | {plant_room.FMU}
 
 
 # Plants with several control signals.

@@ -65,9 +65,7 @@ EXAMPLES = [(part, name) for part, things in PARTS.items() for name in things]
 ROOMS = (controller_room, baseline_room, observer_room, plant_room, learner_room)
 # Interfaces; an estimate and a regulator's matrices belong to a running loop, and an FMU and models of other libraries to
 # files and packages that are not here.
-_WITHOUT = {
-    *("Estimate", "FMU", "GainEstimate", "JaxModel", "MultivariableFMU", "Regulator", "TorchModel")
-}
+_WITHOUT = {*("Estimate", "FMU", "GainEstimate", "JaxModel", "Regulator", "TorchModel")}
 
 
 def public_classes() -> set[str]:

@@ -42,7 +42,7 @@ from quell.export.translate.text import (
 )
 from quell.kernels.dispatch import generic, generic_with_default
 from quell.plants.base import Plant, advance, check_one_input, check_plant, measure
-from quell.plants.fmu import FMUPlant
+from quell.plants.fmu import FMU
 from quell.types import Status, Vector
 
 # ---- A pair of C files around translated kernels ----
@@ -417,8 +417,8 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
     inner: Any = plant
     while hasattr(inner, "plant"):
         inner = inner.plant
-    if isinstance(inner, FMUPlant) or not plant.compiled:
-        called = "an FMU" if isinstance(inner, FMUPlant) else "Python"
+    if isinstance(inner, FMU) or not plant.compiled:
+        called = "an FMU" if isinstance(inner, FMU) else "Python"
         raise TranslationError(f"{plant.name}: it calls {called} at each sample, which C can not")
     parameters = plant.sampled(dt)
     x = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)

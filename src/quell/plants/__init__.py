@@ -14,7 +14,7 @@ from quell.plants.flexible import (
     n_mass,
     two_mass_spring,
 )
-from quell.plants.fmu import FMU, MultivariableFMU
+from quell.plants.fmu import FMU
 from quell.plants.linear import LinearPlant, delayed, encoded, lagged
 from quell.plants.linearise import linearised
 from quell.plants.multibody import Arm, Craft, arm, quadrotor_attitude, rotor_levers
@@ -22,16 +22,16 @@ from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.testbeds import DcMotor, TorsionalPlant, dc_motor, torsional, torsional_identified
 
 __all__ = [
-    "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "LinearPlant", "MultivariableFMU",
-    "NMassPlant", "NonlinearPlant",
-    "Plant", "PlantBatch", "TorsionalPlant", "arm", "batch", "dc_motor", "delayed",
-    "delayed_inputs", "encoded", "encoded_outputs", "labelled", "lagged",
+    "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "LinearPlant", "NMassPlant",
+    "NonlinearPlant", "Plant", "PlantBatch", "TorsionalPlant", "arm", "batch", "dc_motor",
+    "delayed", "delayed_inputs", "encoded", "encoded_outputs", "labelled", "lagged",
     "lagged_two_mass_spring", "linearised", "n_mass", "quadrotor_attitude", "rotor_levers",
     "signals_of", "torsional", "torsional_identified", "two_mass_spring",
 ]  # fmt: skip
 
 # Names of earlier releases.
 _RENAMED = {
+    "MultivariableFMU": "FMU",
     "MultivariableLinearPlant": "LinearPlant",
     "MultivariableNonlinearPlant": "NonlinearPlant",
 }

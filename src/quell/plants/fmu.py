@@ -6,7 +6,7 @@ The memory of a loop contains only numbers, so it contains the number of its ins
 belongs to the array that holds its number: they are deleted together. No exception may leave the
 function that compiled code calls: the error is kept, and y becomes NaN, which ends the run.
 
-``FMU`` and ``MultivariableFMU``: the plants.
+``FMU``: the plant.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from quell.plants.base import (
     as_input,
     begin_run,
     check_run,
+    is_several,
     measure,
     measure_all,
 )
@@ -277,15 +278,9 @@ def callback_address(several: bool = False) -> int:
     return int(ctypes.cast(callback, ctypes.c_void_p).value or 0)
 
 
-# ---- What plants from FMUs have in common ----
+# ---- A sampled FMU ----
 
-_PLANTS: weakref.WeakValueDictionary[int, FMUPlant] = weakref.WeakValueDictionary()
-
-
-def check_names(argument: str, names: Any) -> None:
-    """Raise a ``ValueError`` for what is no sequence of names."""
-    if not checks.is_sequence(names):
-        raise ValueError(f"{argument} = {names!r}: must be a sequence of names")
+_PLANTS: weakref.WeakValueDictionary[int, FMU] = weakref.WeakValueDictionary()
 
 
 def _begin(plant: Any, x: Vector, scratch: Vector) -> None:
@@ -296,85 +291,6 @@ def _begin(plant: Any, x: Vector, scratch: Vector) -> None:
 def _check(plant: Any, scratch: Vector) -> None:
     """Raise the error that ended a run."""
     INSTANCES[int(scratch[0])].raise_problem()
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class FMUPlant(Described):
-    """The common part of plants that FMUs compute, with one control signal or several."""
-
-    path: str | os.PathLike[str]
-    u: Any = None
-    y: Any = None
-    w: Sequence[str] = field(default=())
-    states: Sequence[str] = field(default=())
-    start: Mapping[str, float | int | bool | str] | None = None
-    substeps: int = 1
-    name: str = ""
-    max_size: float = MAX_SIZE
-    _library: Library = field(init=False, repr=False)
-    _ports: Ports = field(init=False, repr=False)
-    _starts: tuple[Start, ...] = field(init=False, repr=False)
-    _number: int = field(init=False, repr=False)
-    compiled = True
-
-    def __post_init__(self) -> None:
-        checks.whole("substeps", self.substeps, 1)
-        for argument in ("w", "states"):
-            check_names(argument, getattr(self, argument))
-        if not isinstance(self.start, Mapping | None):
-            raise ValueError(f"start = {self.start!r}: must be a mapping of names to values")
-        library = Library(Path(self.path), bytes_of(self.max_size))
-        variables = Variables(library.description, library.name, library.old)
-        own: dict[str, Any] = {
-            "_library": library,
-            "_ports": self._ports_of(variables),
-            "_starts": variables.starts(self.start or {}),
-            "_number": next(_NUMBERS),
-            "name": self.name or library.description.modelName or library.name,
-        }
-        for key, value in own.items():
-            object.__setattr__(self, key, value)
-        _PLANTS[self._number] = self
-
-    def _ports_of(self, variables: Variables) -> Ports:
-        """Return the variables of u, w, y and the further states."""
-        raise NotImplementedError
-
-    def __reduce__(self) -> Any:
-        """Return what pickle and copy need: another process unpacks the file itself."""
-        return type(self), tuple(getattr(self, each.name) for each in fields(self) if each.init)
-
-    @property
-    def order(self) -> int:
-        """Number of recorded values: y and ``states``."""
-        return len(self._ports.outputs)
-
-    @property
-    def disturbances(self) -> int:
-        """Number of disturbance inputs."""
-        return len(self._ports.inputs) - self._ports.controls
-
-    @property
-    def one_at_a_time(self) -> bool:
-        """Whether the FMU permits only one instance, so one run at a time, in a process."""
-        return self._library.only_one
-
-    def _check_step(self, dt: float) -> None:
-        """Refuse a sample time that is none, and warn of one that does not fit the FMU."""
-        checks.positive("dt", dt, "s")
-        warn_of_step(self._library.description, dt, self.substeps, self._library.name)
-
-    def instance(self, dt: float, x0: Vector) -> Instance:
-        """Return an instance at its start; raise a ``ValueError`` unless x0 is zero."""
-        if np.any(x0 != 0.0):
-            raise ValueError(
-                f"x0 = {x0.tolist()}: must be zero for an FMU, whose state is its own; give start "
-                "values by name (start)"
-            )
-        return Instance(self._library, self._ports, self._starts, dt, self.substeps)
-
-
-# ---- An FMU of one control signal and one output ----
 
 
 class FMUModel(NamedTuple):
@@ -401,8 +317,37 @@ begin_run.register(FMUModel)(_begin)
 check_run.register(FMUModel)(_check)
 
 
+class FMUModelOfMany(NamedTuple):
+    """A plant of several signals from an FMU, sampled."""
+
+    number: int  # of the plant, in ``_PLANTS``
+    dt: float  # [s]
+    address: int  # of the function that advances an instance
+
+
+@measure_all.register(FMUModelOfMany)
+def _measure_all(plant: FMUModelOfMany, x: Vector, y: Vector) -> None:
+    for i in range(y.size):
+        y[i] = x[i]
+
+
+@advance.register(FMUModelOfMany)
+def _advance_all(
+    plant: FMUModelOfMany, x: Vector, scratch: Vector, t: float, u: Any, w: Vector
+) -> None:
+    call(plant.address, scratch, x, x.size, u, u.size, w, w.size)
+
+
+as_input.register(FMUModelOfMany)(all_signals)
+begin_run.register(FMUModelOfMany)(_begin)
+check_run.register(FMUModelOfMany)(_check)
+
+
+# ---- A plant that an FMU computes ----
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class FMU(FMUPlant):
+class FMU(Described):
     """A plant that a co-simulation FMU, of FMI 2.0 or 3.0, computes through FMPy.
 
     **An FMU is a program.** From the first run on, its binary runs in this process with all rights
@@ -419,11 +364,13 @@ class FMU(FMUPlant):
     path
         the FMU file.
     u
-        name of the input that the controller sets. By default the only input that is a real number
-        and not in ``w``, or the one called ``u``.
+        name of the input that the controller sets; of several names in the order of its control
+        signals (m,). By default the one called ``u``, else all inputs that are real numbers and not
+        in ``w``, in the order of the FMU.
     y
-        name of the variable that the controller sees. By default the only output that is a number,
-        or the one called ``y``. If it follows u at once, the controller sees that a sample later.
+        name of the variable that the controller sees; of several names in the order of its axes
+        (p,). By default the one called ``y``, else all outputs that are numbers, in the order of
+        the FMU. If it follows u at once, the controller sees that a sample later.
     w
         names of the inputs that the disturbances of a scenario set, in their order. Other inputs
         keep their start values.
@@ -443,8 +390,10 @@ class FMU(FMUPlant):
     ValueError
         for a file that is no FMU, is damaged, unpacks to more than ``max_size`` or would write
         outside of its folder; an FMU without co-simulation, or without a binary for this machine;
-        names and values that do not fit its variables. ``simulate`` raises it if ``x0`` is not
-        zero (give ``start``), and where the FMU reports an error or asks to end the simulation.
+        names and values that do not fit its variables; a variable that ``u`` and ``w``, or ``y``,
+        name twice. ``simulate`` raises it if ``x0`` is not zero (give ``start``), where the FMU
+        reports an error or asks to end the simulation, and naming the variables if they are more
+        or fewer than the signals of the controller.
     ImportError
         without FMPy; the message names the extra that installs it.
 
@@ -456,98 +405,58 @@ class FMU(FMUPlant):
     Examples
     --------
     >>> motor = FMU("motor.fmu", u="voltage", y="angle", w=["load"])  # doctest: +SKIP
+    >>> robot = FMU("robot.fmu", u=["tau1", "tau2"], y=["q1", "q2"])  # doctest: +SKIP
     """
 
-    u: str | None = None
-    y: str | None = None
+    path: str | os.PathLike[str]
+    u: str | Sequence[str] | None = None
+    y: str | Sequence[str] | None = None
+    w: Sequence[str] = field(default=())
+    states: Sequence[str] = field(default=())
+    start: Mapping[str, float | int | bool | str] | None = None
+    substeps: int = 1
+    name: str = ""
+    max_size: float = MAX_SIZE
+    _library: Library = field(init=False, repr=False)
+    _ports: Ports = field(init=False, repr=False)
+    _starts: tuple[Start, ...] = field(init=False, repr=False)
+    _number: int = field(init=False, repr=False)
+    compiled = True
 
-    def _ports_of(self, variables: Variables) -> Ports:
-        return variables.ports(self.u, self.y, self.w, self.states)
+    def __post_init__(self) -> None:
+        checks.whole("substeps", self.substeps, 1)
+        for argument in ("w", "states"):
+            names = getattr(self, argument)
+            if not checks.is_sequence(names):
+                raise ValueError(f"{argument} = {names!r}: must be a sequence of names")
+        if not isinstance(self.start, Mapping | None):
+            raise ValueError(f"start = {self.start!r}: must be a mapping of names to values")
+        library = Library(Path(self.path), bytes_of(self.max_size))
+        variables = Variables(library.description, library.name, library.old)
+        own: dict[str, Any] = {
+            "_library": library,
+            "_ports": variables.ports(self.u, self.y, self.w, self.states),
+            "_starts": variables.starts(self.start or {}),
+            "_number": next(_NUMBERS),
+            "name": self.name or library.description.modelName or library.name,
+        }
+        for key, value in own.items():
+            object.__setattr__(self, key, value)
+        _PLANTS[self._number] = self
 
-    def sampled(self, dt: float, interpret: bool = False) -> FMUModel:
-        """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
-        self._check_step(dt)
-        return FMUModel(self._number, dt, callback_address())
+    def __reduce__(self) -> Any:
+        """Return what pickle and copy need: another process unpacks the file itself."""
+        return type(self), tuple(getattr(self, each.name) for each in fields(self) if each.init)
 
+    @property
+    def order(self) -> int:
+        """Number of recorded values: y and ``states``."""
+        return len(self._ports.outputs)
 
-# ---- An FMU of several ----
-
-
-class MultivariableFMUModel(NamedTuple):
-    """A plant of several signals from an FMU, sampled."""
-
-    number: int  # of the plant, in ``_PLANTS``
-    dt: float  # [s]
-    address: int  # of the function that advances an instance
-
-
-@measure_all.register(MultivariableFMUModel)
-def _measure_all(plant: MultivariableFMUModel, x: Vector, y: Vector) -> None:
-    for i in range(y.size):
-        y[i] = x[i]
-
-
-@advance.register(MultivariableFMUModel)
-def _advance_all(
-    plant: MultivariableFMUModel, x: Vector, scratch: Vector, t: float, u: Any, w: Vector
-) -> None:
-    call(plant.address, scratch, x, x.size, u, u.size, w, w.size)
-
-
-as_input.register(MultivariableFMUModel)(all_signals)
-begin_run.register(MultivariableFMUModel)(_begin)
-check_run.register(MultivariableFMUModel)(_check)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MultivariableFMU(FMUPlant):
-    """A plant with several control signals and outputs that a co-simulation FMU computes.
-
-    It is an ``FMU`` in all but its signals: for ``Axes`` and ``StateFeedback``.
-
-    Parameters
-    ----------
-    path
-        the FMU file.
-    u
-        names of the inputs that the controller sets, in the order of its control signals (m,). By
-        default all inputs that are real numbers and not in ``w``, in the order of the FMU.
-    y
-        names of the variables that the controller sees, in the order of its axes (p,). By default
-        all outputs that are numbers, in the order of the FMU.
-    w
-        names of the inputs that the disturbances of a scenario set, in their order. Other inputs
-        keep their start values.
-    states
-        names of further variables to record: the plant's state x is (y, these).
-    start, substeps, name, max_size
-        as for ``FMU``.
-
-    Raises
-    ------
-    ValueError, ImportError
-        as ``FMU``, and for a variable that ``u`` and ``w``, or ``y``, name twice. ``simulate``
-        names the variables if they are more or fewer than the signals of the controller.
-
-    Warns
-    -----
-    DesignWarning
-        as ``FMU``.
-
-    Examples
-    --------
-    >>> robot = MultivariableFMU(
-    ...     "robot.fmu", u=["tau1", "tau2"], y=["q1", "q2"], w=["push1", "push2"]
-    ... )  # doctest: +SKIP
-    """
-
-    u: Sequence[str] | None = None
-    y: Sequence[str] | None = None
-
-    def _ports_of(self, variables: Variables) -> Ports:
-        for argument, names in (("u", self.u), ("y", self.y)):
-            checks.optional(check_names, argument, names)
-        return variables.ports_of_several(self.u, self.y, self.w, self.states)
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbance inputs."""
+        return len(self._ports.inputs) - self._ports.controls
 
     @property
     def inputs(self) -> int:
@@ -568,7 +477,24 @@ class MultivariableFMU(FMUPlant):
             tuple(inputs[: self.inputs]), tuple(measured), tuple(inputs[self.inputs :])
         )
 
-    def sampled(self, dt: float, interpret: bool = False) -> MultivariableFMUModel:
+    @property
+    def one_at_a_time(self) -> bool:
+        """Whether the FMU permits only one instance, so one run at a time, in a process."""
+        return self._library.only_one
+
+    def sampled(self, dt: float, interpret: bool = False) -> FMUModel | FMUModelOfMany:
         """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
-        self._check_step(dt)
-        return MultivariableFMUModel(self._number, dt, callback_address(several=True))
+        checks.positive("dt", dt, "s")
+        warn_of_step(self._library.description, dt, self.substeps, self._library.name)
+        several = is_several(self)
+        of = FMUModelOfMany if several else FMUModel
+        return of(self._number, dt, callback_address(several))
+
+    def instance(self, dt: float, x0: Vector) -> Instance:
+        """Return an instance at its start; raise a ``ValueError`` unless x0 is zero."""
+        if np.any(x0 != 0.0):
+            raise ValueError(
+                f"x0 = {x0.tolist()}: must be zero for an FMU, whose state is its own; give start "
+                "values by name (start)"
+            )
+        return Instance(self._library, self._ports, self._starts, dt, self.substeps)

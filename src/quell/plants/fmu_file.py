@@ -327,49 +327,25 @@ class Variables:
         self._old = old
         self._by_name = {variable.name: variable for variable in description.modelVariables}
 
-    def ports(self, u: str | None, y: str | None, w: Sequence[str], states: Sequence[str]) -> Ports:
+    def ports(self, u: Any, y: Any, w: Sequence[str], states: Sequence[str]) -> Ports:
         """Return the variables of a loop; see ``FMU`` for the defaults.
 
         Raises
         ------
         ValueError
-            for names that the FMU has not, or not with this purpose.
+            for names that the FMU has not, or not with this purpose, or none; and for a variable
+            that u and w, or y, have twice.
         """
         others = [name for name in self._named("input") if name not in w]
-        first = self._input("u", self._only("u", u, others))
-        output = self._output("y", self._only("y", y, self._named("output")))
-        return self._with_others((first,), (output,), w, states)
-
-    def ports_of_several(
-        self, u: Sequence[str] | None, y: Sequence[str] | None, w: Sequence[str],
-        states: Sequence[str],
-    ) -> Ports:  # fmt: skip
-        """Return the variables of a loop of several signals; see ``MultivariableFMU``.
-
-        Raises
-        ------
-        ValueError
-            as ``ports``, for an FMU without inputs or outputs, and a variable that y has twice.
-        """
-        others = [name for name in self._named("input") if name not in w]
-        names_u = self._every("u", u, others)
-        names_y = self._every("y", y, self._named("output"))
-        first = tuple(self._input(f"u[{i}]", name) for i, name in enumerate(names_u))
-        outputs = tuple(self._output(f"y[{i}]", name) for i, name in enumerate(names_y))
-        self._check_once("y names", outputs)
-        return self._with_others(first, outputs, w, states)
-
-    def _with_others(
-        self, u: tuple[Port, ...], y: tuple[Port, ...], w: Sequence[str], states: Sequence[str]
-    ) -> Ports:
-        """Return the variables of u and y with those of the disturbances and the further states."""
-        disturbances = [self._input(f"w[{i}]", name) for i, name in enumerate(w)]
-        inputs = (*u, *disturbances)
+        controls = [self._input(*each) for each in self._names("u", u, others)]
+        measured = [self._output(*each) for each in self._names("y", y, self._named("output"))]
+        self._check_once("y names", measured)
+        inputs = [*controls, *(self._input(f"w[{i}]", name) for i, name in enumerate(w))]
         self._check_once("u and w name", inputs)
         more = [self._output(f"states[{i}]", name) for i, name in enumerate(states)]
-        return Ports(inputs, (*y, *more), len(u), len(y))
+        return Ports(tuple(inputs), (*measured, *more), len(controls), len(measured))
 
-    def _check_once(self, who: str, ports: tuple[Port, ...]) -> None:
+    def _check_once(self, who: str, ports: Sequence[Port]) -> None:
         """Raise a ``ValueError`` if two ports are one variable."""
         # In FMI 2.0 each type has references of its own (section 2.2.7, valueReference).
         seen: dict[tuple[str, int], str] = {}
@@ -380,17 +356,21 @@ class Variables:
                 raise ValueError(f"{self._where}: {who} one variable twice: {both}")
             seen[key] = port.name
 
-    def _every(
-        self, argument: str, names: Sequence[str] | None, candidates: list[str]
-    ) -> Sequence[str]:
-        """Return the names that were given, or all candidates."""
-        found = candidates if names is None else names
+    def _names(
+        self, argument: str, given: str | Sequence[str] | None, candidates: list[str]
+    ) -> list[tuple[str, str]]:
+        """Return names with what messages call them: those given, the one called so, or all."""
+        if isinstance(given, str) or (given is None and argument in candidates):
+            return [(argument, argument if given is None else given)]
+        found = candidates if given is None else given
+        if not checks.is_sequence(found):
+            raise ValueError(f"{argument} = {given!r}: must be a name, or a sequence of names")
         if not found:
             what = "input that is a real number" if argument == "u" else "output that is a number"
             lacks = f"has no {what}{' beside w' if argument == 'u' else ''}"
-            lacks = lacks if names is None else f"{argument} is empty"
+            lacks = lacks if given is None else f"{argument} is empty"
             raise ValueError(f"{self._where}: {lacks}: {argument} must have at least one variable")
-        return found
+        return [(f"{argument}[{i}]", name) for i, name in enumerate(found)]
 
     def starts(self, values: Mapping[str, Any]) -> tuple[Start, ...]:
         """Return start values, of the types of their variables.
@@ -410,20 +390,6 @@ class Variables:
             for name, variable in self._by_name.items()
             if variable.causality == causality and variable.type in kinds and not variable.shape
         ]
-
-    def _only(self, argument: str, name: str | None, candidates: list[str]) -> str:
-        """Return the name that was given, the only candidate, or the one called as the argument."""
-        if name is not None:
-            return name
-        if len(candidates) == 1:
-            return candidates[0]
-        if argument in candidates:
-            return argument
-        what = "input" if argument == "u" else "output"
-        known = f"has {', '.join(candidates)}" if candidates else f"has no {what} that is a number"
-        several = "; all: a plant of several signals (MultivariableFMU, in a table lists u and y)"
-        remedy = f"name one{several if len(candidates) > 1 else ''}"
-        raise ValueError(f"{self._where}: {argument} is not given, and the FMU {known}: {remedy}")
 
     def _variable(self, argument: str, name: Any) -> Any:
         if not isinstance(name, str) or name not in self._by_name:

@@ -17,7 +17,7 @@ from quell.files import whole_text
 from quell.plants.base import Plant, check_plant
 from quell.plants.channels import delayed_inputs, encoded_outputs
 from quell.plants.flexible import lagged_two_mass_spring, n_mass, two_mass_spring
-from quell.plants.fmu import FMU, MultivariableFMU
+from quell.plants.fmu import FMU
 from quell.plants.friction import with_friction_and_delay
 from quell.plants.linear import LinearPlant, delayed, encoded, lagged
 from quell.plants.multibody import arm, quadrotor_attitude
@@ -338,10 +338,10 @@ AXES_PLANTS: Mapping[str, Callable[..., Any]] = {
     "quadrotor-attitude": quadrotor_attitude,
     "encoded-outputs": encoded_outputs,
     "delayed-inputs": delayed_inputs,
-    "fmu": MultivariableFMU,
+    "fmu": FMU,
     "python": python_plant,
 }
 """Plants with several signals that a setup of several axes can have, by their ``kind``."""
 
-RUN_CODE: tuple[Callable[..., Plant], ...] = (FMU, MultivariableFMU)
+RUN_CODE: tuple[Callable[..., Plant], ...] = (FMU,)
 """Plants that are programs: a setup file can only have them if the user trusts it."""

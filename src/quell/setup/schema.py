@@ -665,11 +665,9 @@ def plant_of(
 
 
 def _is_of_axes(table: Any) -> bool:
-    """Return whether a plant is of a kind that has several signals only, or an FMU with lists."""
+    """Return whether a plant is of a kind that has several signals only."""
     kind = table.get("kind") if isinstance(table, Mapping) else None
-    if not isinstance(kind, str) or kind not in AXES_PLANTS:
-        return False
-    return kind not in PLANTS or any(isinstance(table.get(key), list) for key in ("u", "y"))
+    return isinstance(kind, str) and kind in AXES_PLANTS and kind not in PLANTS
 
 
 def check_single(name: str, plant: Any) -> None:
