@@ -25,18 +25,16 @@ from typing import Any
 import numpy as np
 from measured import options_of, parser_of, write
 from rich.console import Console
-from rich.table import Table
+from rich.table import Table as Rows
 
 import quell as ql
 from quell.analysis import analyse
-from quell.controllers.base import control, set_reference_derivatives
 from quell.experiments.stress.adversaries import log_uniform
 from quell.experiments.stress.axes import Arm
+from quell.experiments.stress.loops import Table
 from quell.kernels import dispatch
-from quell.kernels.dispatch import call_specialised, compiled_loop
 from quell.parallel import in_parallel
-from quell.plants.base import advance
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 DT, OMEGA_C, OMEGA_O, NOISE, LIMIT = 2e-3, 10.0, 50.0, 2e-5, 20.0
 JUDGED_AT = 2.0  # start of what is judged [s]
@@ -74,74 +72,41 @@ def draw(seed: int) -> tuple[Arm, Vector]:
     return arm, shares
 
 
-@compiled_loop("plant", "design1", "design2", "r", "noise")
-def run_joints(
-    plant: Any, x: Vector, scratch: Vector, design1: Any, state1: Any, design2: Any, state2: Any,
-    r: Matrix, noise: Matrix, derivatives: Vector, seen: Matrix,
-) -> int:  # fmt: skip
-    """Run both controllers; write the angles and torques; return the number of samples."""
-    torque = scratch[24:]
-    for k in range(r.shape[0]):
-        for j in range(2):
-            seen[k, j] = x[j]
-            if not abs(x[j]) <= LIMIT:
-                return k
-        derivatives[0], derivatives[1] = r[k, 2], r[k, 4]
-        set_reference_derivatives(design1, state1, derivatives)
-        u = control(design1, state1, r[k, 0], x[0] + noise[k, 0])
-        derivatives[0], derivatives[1] = r[k, 3], r[k, 5]
-        set_reference_derivatives(design2, state2, derivatives)
-        torque[0] = control(design2, state2, r[k, 1], x[1] + noise[k, 1])
-        seen[k, 2], seen[k, 3] = u, torque[0]
-        advance(plant, x, scratch, 0.0, u, torque)
-    return int(r.shape[0])
-
-
-def controllers(arm: Arm, shares: Vector, learner: Any, guard: ql.Guard | None) -> list[ql.ADRC]:
+def controller(arm: Arm, shares: Vector, learner: Any, guard: ql.Guard | None) -> ql.Axes:
     """Return the controllers of the joints."""
     most = 3.0 * (float(np.diag(arm.inertia(arm.elbow)).max()) * 16.0 + 2.0 * 9.81 * 1.2)
     gains = shares * np.diag(np.linalg.inv(arm.inertia(arm.elbow)))
-    return [
+    joints = [
         ql.ADRC(
             ql.ESO.model_free(2, float(b0), OMEGA_O, DT), OMEGA_C, learner=learner, guard=guard,
-            feedforward=True, u_min=-most, u_max=most,
+            feedforward=True,
         )
         for b0 in gains
     ]  # fmt: skip
-
-
-def run(
-    arm: Arm, loops: list[ql.ADRC], seconds: float, interpret: bool = False
-) -> tuple[Matrix, Matrix]:
-    """Return the references of the joints and what was seen, angles and torques."""
-    t = DT * np.arange(round(seconds / DT))
-    w, amplitudes = np.array(arm.frequencies), np.array(arm.amplitudes)
-    angle = np.outer(t, w)
-    middle = np.array([0.0, arm.elbow])
-    r = np.hstack(
-        [
-            middle + amplitudes * np.sin(angle),
-            amplitudes * w * np.cos(angle),
-            -amplitudes * w**2 * np.sin(angle),
-        ]
-    )
-    x = np.array([0.0, arm.elbow, *(amplitudes * w)])
-    noise = NOISE * np.random.default_rng([arm.seed, 1]).standard_normal((t.size, 2))
-    seen = np.full((t.size, 4), np.nan)
-    plant = arm.plant.sampled(DT, interpret)
-    states = [part for each in loops for part in (each.parameters, each.initial_state())]
-    call_specialised(run_joints, plant, x, np.zeros(25), *states, r, noise, np.zeros(2), seen)
-    return r[:, :2], seen
+    return ql.Axes(joints, u_min=-most, u_max=most)
 
 
 def errors(
     arm: Arm, shares: Vector, learner: Any, guard: ql.Guard | None, seconds: float, interpret: bool
 ) -> Vector:
     """Return the RMS errors of the joints [rad]; infinite if the arm is lost."""
-    r, seen = run(arm, controllers(arm, shares, learner, guard), seconds, interpret)
-    error = (seen[:, :2] - r)[round(min(JUDGED_AT, 0.5 * seconds) / DT) :]
+    middle, motion = (0.0, arm.elbow), zip(arm.amplitudes, arm.frequencies, strict=True)
+    moves = [ql.signals.Sinusoid(size, omega) for size, omega in motion]
+    reference = [ql.signals.Step(at) + move for at, move in zip(middle, moves, strict=True)]
+    rates = np.array(arm.amplitudes) * np.array(arm.frequencies)
+    count = round(seconds / DT)
+    noise = NOISE * np.random.default_rng([arm.seed, 1]).standard_normal((count, 2))
+    scenario = ql.Scenario(
+        reference, (count - 1) * DT, noise=[Table(each, DT) for each in noise.T],
+        x0=[*middle, *rates],
+    )  # fmt: skip
+    loops = controller(arm, shares, learner, guard)
+    run = ql.simulate(arm.plant, loops, scenario, limit=LIMIT, interpret=interpret)
+    if run.diverged:
+        return np.full(2, np.inf)
+    error = (run["y"] - run["r"])[round(min(JUDGED_AT, 0.5 * seconds) / DT) :]
     found: Vector = np.sqrt(np.mean(error**2, axis=0))
-    return np.where(np.isfinite(found), found, np.inf)
+    return found
 
 
 def margin(arm: Arm, shares: Vector) -> float:
@@ -214,7 +179,7 @@ def main() -> None:
             continue
         figures[title] = {name: row_of(group, name) for name in LEARNERS}
         heads = ("learner", "arms", "median", "worst", f"above {MOST}", "mean log")
-        table = Table(*heads, title=f"{title}: over no learner")
+        table = Rows(*heads, title=f"{title}: over no learner")
         for name, row in figures[title].items():
             table.add_row(name, str(len(group)), *(f"{each:.4g}" for each in row.values()))
         console.print(table)

@@ -108,7 +108,7 @@ def test_arms_are_drawn_within_their_ranges(too_small: float, rng: np.random.Gen
     drawn = axes.draw_arm(rng, too_small)
     assert drawn.margin >= axes.LEAST_MARGIN[too_small]
     gains = drawn.gains()
-    one, _ = drawn.controllers(None, None)
+    one = drawn.controller(None, None).axes[0]
     for gain in (gains.min(), float(np.median(gains)), gains.max()):
         plant = ql.plants.LinearPlant.of(([gain * one.observer.b0], [1.0, 0.0, 0.0]))
         assert analyse(plant, one).margins.modulus >= drawn.margin - 1e-3
@@ -137,11 +137,11 @@ def test_the_arm_moves_as_two_rods_do() -> None:
             corner, velocity = corner + along, velocity + across
         return total
 
-    x, scratch, torque = np.array([0.4, 1.1, 0.5, -2.0]), np.zeros(24), np.zeros(1)
+    x, scratch, torque = np.array([0.4, 1.1, 0.5, -2.0]), np.zeros(24), np.zeros(2)
     plant, first = drawn.plant.sampled(axes.ARM_DT, True), energy(x)
     start = x.copy()
     for _ in range(500):
-        advance(plant, x, scratch, 0.0, 0.0, torque)
+        advance(plant, x, scratch, 0.0, torque, torque)
     assert np.abs(x - start).max() > 0.5
     assert energy(x) == pytest.approx(first, abs=1e-6 * drawn.gravity)
 

@@ -32,21 +32,8 @@ of an arm are those of the joint that loses more.
 
 Two coupled axes: a rigid two-link arm, each joint with a controller of its own.
 
-With the joint angles q (the second relative to the first link) and the torques u,
-
-    M(q) q'' + c(q, q') + g(q) = u
-
-    M = [[a_1 + 2 a_2 cos q_2, a_3 + a_2 cos q_2], [a_3 + a_2 cos q_2, a_3]]
-    c = a_2 sin q_2 [−2 q_1' q_2' − q_2'², q_1'²]
-    g = [b_1 cos q_1 + b_2 cos(q_1 + q_2), b_2 cos(q_1 + q_2)]
-
-(Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, the planar elbow manipulator). For
-uniform rods of lengths l and masses m, with moments of inertia ``m l²/3`` about their ends,
-
-    a_1 = m_1 l_1²/3 + m_2 (l_1² + l_2²/3),   a_2 = m_2 l_1 l_2/2,   a_3 = m_2 l_2²/3
-    b_1 = (m_1/2 + m_2) l_1 γ,                b_2 = m_2 l_2 γ/2
-
-γ is 9.81 m/s² in half of the arms, which move in a vertical plane, else 0.
+The links are uniform rods (``plants.arm``). γ is 9.81 m/s² in half of the arms, which move in a
+vertical plane, else 0.
 
 Each joint has an ADRC of order 2 for the chain of integrators, omega_c = 8 and omega_o = 60 rad/s,
 that takes all of the coupling for a disturbance. Its b0 is the gain from its torque to its
@@ -81,8 +68,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.analysis import analyse
-from quell.controllers import ADRC
-from quell.controllers.base import control
+from quell.controllers import ADRC, Axes
 from quell.experiments import two_mass_spring as setup
 from quell.experiments.common import step_scores
 from quell.experiments.stress.adversaries import log_uniform
@@ -103,13 +89,10 @@ from quell.experiments.stress.study import (
 from quell.features import RandomFourier
 from quell.files import nonfinite_to_none
 from quell.guard import Guard
-from quell.kernels import dispatch
-from quell.kernels.dispatch import call_specialised, compiled_loop
 from quell.learners import RLS, Harmonic, Learner
 from quell.observers import ESO
 from quell.parallel import in_parallel
-from quell.plants import LinearPlant, NonlinearPlant, delayed, n_mass, two_mass_spring
-from quell.plants.base import advance
+from quell.plants import LinearPlant, arm, delayed, n_mass, two_mass_spring
 from quell.plants.linear import DelayedPlant
 from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
@@ -299,28 +282,15 @@ class Arm:
     margin: float  #: least modulus margin over the motion
     seed: int
 
-    @property
-    def parameters(self) -> dict[str, float]:
-        """The numbers a_1, a_2, a_3 [kg m²], b_1, b_2 [N m]."""
-        (l1, l2), (m1, m2), g = self.lengths, self.masses, self.gravity
-        return {
-            "a1": m1 * l1**2 / 3.0 + m2 * (l1**2 + l2**2 / 3.0),
-            "a2": m2 * l1 * l2 / 2.0,
-            "a3": m2 * l2**2 / 3.0,
-            "b1": (m1 / 2.0 + m2) * l1 * g,
-            "b2": m2 * l2 * g / 2.0,
-        }
-
-    @property
-    def plant(self) -> NonlinearPlant:
-        """The arm: its u is the torque of the first joint, its disturbance that of the second."""
-        return _PLANT.with_parameters(**self.parameters)
+    @cached_property
+    def plant(self) -> Any:
+        """The arm, with a torque at each joint."""
+        return arm(self.lengths, self.masses, gravity=self.gravity, substeps=1)
 
     def inertia(self, elbow: float) -> Matrix:
         """Return M at q_2 = ``elbow`` [kg m²]."""
-        a1, a2, a3 = (self.parameters[name] for name in ("a1", "a2", "a3"))
-        c = a2 * math.cos(elbow)
-        return np.array([[a1 + 2.0 * c, a3 + c], [a3 + c, a3]])
+        found: Matrix = self.plant.mass_matrix([0.0, elbow])
+        return found
 
     @property
     def b0(self) -> Vector:
@@ -333,10 +303,10 @@ class Arm:
         found = [np.linalg.solve(self.inertia(q), np.diag(1.0 / self.b0)) for q in angles]
         return np.real(np.linalg.eigvals(np.array(found))).ravel()
 
-    def controllers(self, learner: Learner | None, guard: Guard | None) -> list[ADRC]:
+    def controller(self, learner: Learner | None, guard: Guard | None) -> Axes:
         """Return the controllers of the joints."""
         observers = [ESO.model_free(2, float(b0), OMEGA_O, ARM_DT) for b0 in self.b0]
-        return [ADRC(each, OMEGA_C, learner=learner, guard=guard) for each in observers]
+        return Axes([ADRC(each, OMEGA_C, learner=learner, guard=guard) for each in observers])
 
     def reference(self) -> tuple[Matrix, Matrix]:
         """Return the references of the joints, and the response that the design asks for."""
@@ -370,11 +340,11 @@ class JointErrors(NamedTuple):
 def draw_arm(rng: np.random.Generator, too_small: float = 1.0) -> Arm:
     """Return a random arm of at least ``LEAST_MARGIN``."""
     for _ in range(_MOST_TRIES):
-        arm = _draw_arm(rng, too_small)
-        gains = arm.gains()
+        drawn = _draw_arm(rng, too_small)
+        gains = drawn.gains()
         margin = min(_margin(round(float(each), 3)) for each in (gains.min(), gains.max()))
         if margin >= LEAST_MARGIN[too_small]:
-            return replace(arm, margin=margin)
+            return replace(drawn, margin=margin)
     raise ValueError(f"too_small = {too_small!r}: no arm with such a margin was found")
 
 
@@ -405,84 +375,27 @@ def _margin(gain: float) -> float:
     return float(found.margins.modulus) if found.stable else 0.0
 
 
-def arm_errors(arm: Arm, learner: Learner | None, guard: Guard | None, draws: range) -> JointErrors:
+def arm_errors(
+    drawn: Arm, learner: Learner | None, guard: Guard | None, draws: range
+) -> JointErrors:
     """Return the errors of the joints, over these draws of the noise."""
-    r, asked = arm.reference()
-    plant = arm.plant.sampled(ARM_DT, dispatch.interpret_all)
-    one, other = arm.controllers(learner, guard)
+    r, asked = drawn.reference()
+    controller = drawn.controller(learner, guard)
 
     def once(draw: int) -> JointErrors:
-        rng, q = np.random.default_rng([arm.seed, draw]), np.empty_like(r)
-        noise = _NOISE * rng.standard_normal(r.shape)
-        loops = (one.parameters, one.initial_state(), other.parameters, other.initial_state())
-        x, scratch = np.array([0.0, arm.elbow, 0.0, 0.0]), np.zeros(6 * 4 + 1)
-        done = call_specialised(run_joints, plant, x, scratch, *loops, r, noise, q)
-        if done < r.shape[0]:
+        noise = _NOISE * np.random.default_rng([drawn.seed, draw]).standard_normal(r.shape)
+        follow, seen = ([Table(each, ARM_DT) for each in table.T] for table in (r, noise))
+        x0 = [0.0, drawn.elbow, 0.0, 0.0]
+        run = simulate(
+            drawn.plant, controller, Scenario(follow, _DURATION, noise=seen, x0=x0), limit=_LIMIT
+        )
+        if run.diverged:
             return JointErrors(np.full(2, np.inf), np.full(2, np.inf))
-        square = ((q - asked) ** 2)[round(_JUDGED_AT / ARM_DT) :]
+        square = ((run["y"] - asked) ** 2)[round(_JUDGED_AT / ARM_DT) :]
         late = square[square.shape[0] // 2 :]
         return JointErrors(np.sqrt(square.mean(axis=0)), np.sqrt(late.mean(axis=0)))
 
     return mean_errors(once, draws)
-
-
-@compiled_loop("plant", "design1", "design2", "r", "noise")
-def run_joints(
-    plant: Any,
-    x: Vector,
-    scratch: Vector,
-    design1: Any,
-    state1: Any,
-    design2: Any,
-    state2: Any,
-    r: Matrix,
-    noise: Matrix,
-    q: Matrix,
-) -> int:
-    """Run two controllers on the joints, and write the angles q; return the number of samples.
-
-    The second torque is the plant's disturbance input.
-    """
-    torque = scratch[24:]
-    for k in range(r.shape[0]):
-        for j in range(2):
-            q[k, j] = x[j]
-            if not abs(x[j]) <= _LIMIT:
-                return k
-        u = control(design1, state1, r[k, 0], x[0] + noise[k, 0])
-        torque[0] = control(design2, state2, r[k, 1], x[1] + noise[k, 1])
-        advance(plant, x, scratch, 0.0, u, torque)
-    return r.shape[0]
-
-
-def _motion(
-    t: float,
-    x: Vector,
-    u: float,
-    w: Vector,
-    a1: float,
-    a2: float,
-    a3: float,
-    b1: float,
-    b2: float,
-) -> tuple[float, float, float, float]:
-    """Return (q', q'') of the equations of the module, for the torques u and w."""
-    c, s = a2 * math.cos(x[1]), a2 * math.sin(x[1])
-    m11, m12, m22 = a1 + 2.0 * c, a3 + c, a3
-    weight = b2 * math.cos(x[0] + x[1])
-    free1 = u + s * (2.0 * x[2] + x[3]) * x[3] - b1 * math.cos(x[0]) - weight
-    free2 = w[0] - s * x[2] * x[2] - weight
-    det = m11 * m22 - m12 * m12
-    return x[2], x[3], (m22 * free1 - m12 * free2) / det, (m11 * free2 - m12 * free1) / det
-
-
-_PLANT = NonlinearPlant(
-    _motion,
-    order=4,
-    substeps=1,
-    name="two-link arm",
-    parameters={"a1": 2.0, "a2": 0.5, "a3": 1.0, "b1": 0.0, "b2": 0.0},
-)
 
 
 # ---- Settling near rest ----
