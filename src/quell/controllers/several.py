@@ -63,6 +63,13 @@ def references_of(controller: Any) -> int:
     return int(getattr(controller, "references", outputs_of(controller)))
 
 
+def axes_of(controller: Any) -> dict[str, Any]:
+    """Return the controllers of the axes by their names; of one axis the controller, as ``""``."""
+    if not hasattr(controller, "inputs"):
+        return {"": controller}
+    return dict(zip(controller.names, controller.axes, strict=True))
+
+
 @generic
 def start_all(controller: Any, state: Any, samples: Any, y: Vector, u: Vector, r: Vector) -> None:
     """Start at a machine that rests at y under u: the next sample continues from there.

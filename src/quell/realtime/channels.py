@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.axes import Axes
 from quell.controllers.base import is_usable, set_axis_held, set_schedule_signals
 from quell.controllers.compensated import can_be_held
+from quell.controllers.several import axes_of
 from quell.kernels.dispatch import kernel
 from quell.realtime.devices import read_channels
 from quell.realtime.recordings import LOOP_CHANNELS
@@ -70,24 +70,14 @@ def channel_inputs(controller: Any, names: Sequence[str]) -> ChannelInputs:
         missing=np.zeros(1, dtype=np.int64),
         external=external,
         held=np.array(held, dtype=np.int64).reshape(-1, 4),
-        axes=len(_axes_of(controller)),
+        axes=len(axes_of(controller)),
     )
 
 
 def _places_of_held(controller: Any, names: Sequence[str]) -> list[tuple[int, int]]:
     """Return the place of each channel that says what is held, and its axis; −1 for all."""
-    of = {HELD: -1} | {f"{name}.{HELD}": i for i, name in enumerate(_names_of(controller))}
+    of = {HELD: -1} | {f"{name}.{HELD}": i for i, name in enumerate(axes_of(controller))}
     return [(place, of[name]) for place, name in enumerate(names) if name in of]
-
-
-def _names_of(controller: Any) -> tuple[str, ...]:
-    """Return the names of several axes; none of another controller."""
-    return controller.names if isinstance(controller, Axes) else ()
-
-
-def _axes_of(controller: Any) -> tuple[Any, ...]:
-    """Return the controllers of several axes; the controller itself of one."""
-    return controller.axes if isinstance(controller, Axes) else (controller,)
 
 
 @kernel
@@ -150,7 +140,7 @@ def checked_channels(controller: Any, names: Any) -> tuple[str, ...]:
         rule = "must be a list of names, in the order in which the device gives them"
         raise ValueError(f"channels = {names!r}: {rule}")
     found = tuple(names)
-    axes = _names_of(controller)
+    axes = [name for name in axes_of(controller) if name]
     taken = {name for name, _ in (*LOOP_CHANNELS, *controller.channels)} | {"time"}
     for name in found:
         axis, dot, own = str(name).rpartition(".")
@@ -169,7 +159,7 @@ def checked_channels(controller: Any, names: Any) -> tuple[str, ...]:
             "'y' or 'speed', or take the controller at one point, controller.at(…)"
         )
     for place, of in _places_of_held(controller, found):
-        for i, part in enumerate(_axes_of(controller)):
+        for i, part in enumerate(axes_of(controller).values()):
             if of in (i, -1) and not can_be_held(part):
                 axis = f"axis {axes[i]}, a " if axes else ""
                 raise ValueError(

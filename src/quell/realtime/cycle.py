@@ -38,13 +38,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.axes import Axes
 from quell.controllers.base import (
     bumpless_transfer,
     set_reference_derivatives,
     write_row,
 )
 from quell.controllers.several import (
+    axes_of,
     control_all,
     inputs_of,
     motion_by,
@@ -597,7 +597,7 @@ def supervise(
     counts = outputs_of(controller), inputs_of(controller)
     columns = row_channels(controller.channels, channels, *counts)
     row = np.zeros(sum(width for _, width in columns))
-    before = [f"{name}." for name in controller.names] if isinstance(controller, Axes) else [""]
+    before = [f"{name}." if name else "" for name in axes_of(controller)]
     return SupervisedController(
         design=controller.parameters,
         state=controller.initial_state() if state is None else state,

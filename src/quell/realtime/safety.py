@@ -20,7 +20,7 @@ from quell.controllers import ADRC, Axes
 from quell.controllers.base import Controller
 from quell.controllers.compensated import takes_control
 from quell.controllers.prefilters import without_prefilters
-from quell.controllers.several import inputs_of, outputs_of, references_of
+from quell.controllers.several import axes_of, inputs_of, outputs_of, references_of
 from quell.kernels.sized import Buffer
 from quell.realtime.supervisor import Rules, RunLimits
 from quell.records.record import in_steps
@@ -380,7 +380,7 @@ class Safety:
             )
         for pair in zip(low.tolist(), high.tolist(), strict=True):
             _check_around_zero(*pair)
-        parts = axes.axes if axes else (controller,)
+        parts = list(axes_of(controller).values())
         adrcs = [inner_adrc(part) for part in parts]
         opposed = np.full(n, math.inf)
         if self.check_direction and getattr(controller, "takes_u_0", True):
