@@ -32,6 +32,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
+    "moving_loop",
 ]
 html_theme = "pydata_sphinx_theme"
 html_title = "quell"

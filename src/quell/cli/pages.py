@@ -190,6 +190,8 @@ def readable(text: str) -> str:
     """Return a page as plain Markdown, without what only the build of the pages reads."""
     text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)
     text = re.sub(r"^```\{(toctree|raw|container)\}.*?^```\n", "", text, flags=re.M | re.S)
+    moves = "*A loop that moves: in the built pages, in a browser.*\n"
+    text = re.sub(r"^```\{moving\}.*?^```\n", moves, text, flags=re.M | re.S)
     text = re.sub(
         r"^```\{figure\}[^\n]*\n(?::[^\n]*\n)*(.*?)^```\n", r"*Figure.* \1", text, flags=re.M | re.S
     )
