@@ -107,7 +107,7 @@ def two_mass() -> Machine:
     """Return two masses and a spring; y is the position of the second one."""
     plant = ql.plants.two_mass_spring(m1=1.0, m2=1.0, k=1.0)
     shown = {
-        "pace": 2.5, "window": 30.0, "pull": 0.6, "most": 1.0, "hand": 4.0,
+        "pace": 2.5, "window": 30.0, "pull": 0.5, "most": 0.8, "hand": 5.0,
         "load": {"input": 1, "omega": 0.8, "largest": 1.5},
         "step": {"height": 1.0, "every": 20.0}, "y": [-0.4, 1.4], "unit": "m",
     }  # fmt: skip

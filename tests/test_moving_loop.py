@@ -210,6 +210,19 @@ def test_the_margin_of_a_page_is_that_of_analyse(page: Any, pictures: ModuleType
 
 
 @pytest.mark.trial
+def test_a_loop_that_is_not_stable_says_so_and_what_helps(browser: Any, site: Path) -> None:
+    """A b0 of 0.4 is too low for two masses; the first way out that is named works."""
+    opened = browser.new_page()
+    opened.goto((site / "two-mass.html").as_uri())
+    opened.wait_for_function("window.movingLoops?.length > 0")
+    opened.evaluate("movingLoops[0].set('b0', 0)")
+    assert opened.inner_text("[data-n=margin]") == "NOT stable: raise b0"
+    opened.evaluate("movingLoops[0].set('b0', 12)")
+    assert opened.inner_text("[data-n=margin]").startswith("2.63")
+    opened.close()
+
+
+@pytest.mark.trial
 def test_switches_and_sliders_keep_what_the_observer_knows(page: Any) -> None:
     """f̂ goes on without a jump where a learner comes or goes, and where a bandwidth changes."""
     run_of_page(page, True, True, [12, 12, 12])

@@ -119,16 +119,18 @@
     return [re, im];
   }
 
-  /* Return M_s, the largest |S|, of the loop without learner; Infinity if it is not stable.
-   *
-   * With x^ the estimate, x^+ = M x^ + L y, M = (I - L C)(Phi - Gamma K), and u = -K x^. */
-  function largestSensitivity(machine, design) {
-    const { N, B, C } = machine.sampled;
-    const { transition, input, gain, feedback } = design;
+  /* Return M of x^+ = M x^ + L y, with the estimate x^ and u = -K x^: (I - L C)(Phi - Gamma K). */
+  function estimateMatrix({ transition, input, gain, feedback }) {
     const closed = transition.map((row, i) => row.map((a, j) => a - input[i] * feedback[j]));
-    const M = closed.map((row, i) => row.map((a, j) => a - gain[i] * closed[0][j]));
-    const less = M.map((row, i) => row.map((a, j) => a - (i === j ? 1 : 0)));
-    if (!(radius(machine, M, design) < 1)) return Infinity;
+    return closed.map((row, i) => row.map((a, j) => a - gain[i] * closed[0][j]));
+  }
+
+  /* Return M_s, the largest |S|, of the loop without learner; Infinity if it is not stable. */
+  function largestSensitivity(machine, design) {
+    if (!isStable(machine, design)) return Infinity;
+    const { N, B, C } = machine.sampled;
+    const { gain, feedback } = design;
+    const less = estimateMatrix(design).map((row, i) => row.map((a, j) => a - (i === j ? 1 : 0)));
     const S = (omega) => {
       const half = 0.5 * omega * machine.dt;
       const s = [-2 * Math.sin(half) ** 2, Math.sin(2 * half)]; // exp(i omega dt) - 1
@@ -153,9 +155,10 @@
     return Math.max(largest, S(at((low + high) / 2)));
   }
 
-  /* Return the spectral radius of the closed loop, by squaring its matrix. */
-  function radius(machine, M, { gain, feedback }) {
+  /* Return whether the spectral radius of the closed loop is below 1, by squaring its matrix. */
+  function isStable(machine, design) {
     const { N, B, C } = machine.sampled;
+    const { gain, feedback } = design, M = estimateMatrix(design);
     const KM = M[0].map((_, j) => feedback.reduce((sum, k, i) => sum + k * M[i][j], 0));
     const KL = feedback.reduce((sum, k, i) => sum + k * gain[i], 0);
     let A = [
@@ -171,7 +174,7 @@
       A = A.map((row) => row.map((a) => a / size));
       A = product(A, A);
     }
-    return Math.exp(log);
+    return log < 0;
   }
 
   // ---- The picture on a page ----
@@ -196,7 +199,7 @@
       <div class="ml-legend"><span><i data-c="y"></i>y</span><span><i data-c="r"></i>reference r</span></div>
       <canvas class="ml-chart" data-chart="y" role="img" aria-label="y and r over time"></canvas>
       <div class="ml-legend"><span><i data-c="f"></i>true f</span><span><i data-c="estimate"></i>estimate f̂</span>
-        <span class="ml-learned"><i data-c="learned"></i>its learned share</span></div>
+        <span class="ml-learned"><i data-c="learned"></i>learned share</span></div>
       <canvas class="ml-chart" data-chart="f" role="img" aria-label="f and its estimate over time"></canvas>
     </div>
     <div class="ml-panel">
@@ -321,13 +324,29 @@
     showMargins() {
       this.margin = largestSensitivity(this.machine, this.loop.design());
       const found = this.margin;
-      const words = !Number.isFinite(found) ? "NOT stable: lower ωo or raise b0"
+      const words = !Number.isFinite(found) ? `NOT stable: ${this.remedy()}`
         : found < 1.7 ? "a robust loop"
         : found < 2.2 ? "usual reserve"
         : found < 3.5 ? "little reserve" : "close to instability";
       const place = this.element.querySelector("[data-n=margin]");
       place.textContent = Number.isFinite(found) ? `${found.toFixed(2)}: ${words}` : words;
       place.classList.toggle("ml-alarm", !(found < 3.5));
+    }
+
+    /* Return the first change of one slider that makes the loop stable. */
+    remedy() {
+      const positions = this.settings.positions;
+      const ways = [[0, 1, "raise b0"], [2, 1, "raise omega_o"], [1, -1, "lower omega_c"], [0, -1, "lower b0"], [2, -1, "lower omega_o"]];
+      const found = ways.find(([slider, direction]) => {
+        const tried = [...positions];
+        for (tried[slider] += direction; tried[slider] in this.machine.positions[slider]; tried[slider] += direction) {
+          this.loop.write(tried);
+          if (isStable(this.machine, this.loop.design())) return true;
+        }
+        return false;
+      });
+      this.loop.write(positions);
+      return found ? found[2] : "reset";
     }
 
     // ---- time ----
@@ -346,8 +365,8 @@
       this.turn = Math.round(0.05 * this.machine.step.every / this.machine.dt);
       this.ranAway = false;
       const inputs = this.machine.loads;
-      this.force = { value: 0, rate: 0 };
-      this.swell = { value: 0, rate: 0 };
+      this.force = { goal: 0, value: 0, rate: 0 };
+      this.swell = { goal: 0, value: 0, rate: 0 };
       this.load = new Array(inputs).fill(0);
       this.record = { r: [], w: [], y: [], u: [], x: [], fHat: [], f: [], fLearned: [], authority: [] };
       this.range = 0;
@@ -371,7 +390,8 @@
           }
           loop.r[k] = this.reference;
           // f has the second derivative of a load, so hand and sinusoid begin and end smoothly.
-          const [a, s] = [follow(this.force, this.hand.target, hand, dt), follow(this.swell, amplitude, hand, dt)];
+          const a = follow(this.force, this.hand.target, hand, dt);
+          const s = follow(this.swell, amplitude, hand / 4, dt);
           const [sine, cosine] = [Math.sin(load.omega * index * dt), load.omega * Math.cos(load.omega * index * dt)];
           const rows = [[], [], []];
           for (let j = 0; j < loads; j++) {
@@ -616,7 +636,7 @@
         };
       }
       const size = clamp(width / 11, 34, 62), gap = clamp(0.22 * width, 70, 190);
-      const [low, high] = [-0.6, 1.7];
+      const [low, high] = [-1, 1.5];
       const scale = (width - gap - 2 * size - 16) / (high - low);
       const first = 8 + size / 2 - low * scale;
       const centres = [first + scale * x[0], first + gap + size + scale * x[1]];
@@ -821,8 +841,9 @@
 
   /* Return a force, its rate and its bend now, and take it a sample towards its target. */
   const follow = (force, target, omega, dt) => {
-    const bend = omega * omega * (target - force.value) - 2 * omega * force.rate;
+    const bend = omega * omega * (force.goal - force.value) - 2 * omega * force.rate;
     const now = [force.value, force.rate, bend];
+    force.goal += dt * omega * (target - force.goal);
     force.rate += dt * bend;
     force.value += dt * force.rate;
     return now;
