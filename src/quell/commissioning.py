@@ -42,7 +42,7 @@ from quell.identification.record_file import in_common_units
 from quell.identification.result import Identified, simulated_plant
 from quell.identification.validation import nrmse
 from quell.realtime.devices import Device, TwinDevice
-from quell.realtime.recordings import Event, check_one, is_recording, load, load_one
+from quell.realtime.recordings import Event, check_one, is_recording, load
 from quell.realtime.run import RigRun, run_rig
 from quell.realtime.safety import Safety
 from quell.realtime.supervisor import Cause
@@ -260,17 +260,6 @@ def _of_run(path: Path, axes: Sequence[str] | None, given: Any, max_size: float)
     )
 
 
-def recorded_run(
-    path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
-) -> Trajectory | None:
-    """Return the run in a file that quell wrote; None for a table in text."""
-    if columns or dt is not None or time_unit is not None:
-        return None
-    if path.suffix.lower() == ".nc":
-        return check_one(Trajectory.load(path, max_size), f"path = {os.fspath(path)!r}")
-    return load_one(path, max_size) if is_recording(path) else None
-
-
 def run_in(
     path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
 ) -> Trajectory | None:
@@ -280,6 +269,14 @@ def run_in(
     if path.suffix.lower() == ".nc":
         return Trajectory.load(path, max_size)
     return load(path, max_size) if is_recording(path) else None
+
+
+def recorded_run(
+    path: Path, columns: str, dt: float | None, time_unit: str | None, max_size: float
+) -> Trajectory | None:
+    """Return a run as ``run_in`` does; a ``ValueError`` refuses one of several axes."""
+    run = run_in(path, columns, dt, time_unit, max_size)
+    return None if run is None else check_one(run, f"path = {os.fspath(path)!r}")
 
 
 def by_axis(run: Trajectory) -> dict[str, Trajectory]:

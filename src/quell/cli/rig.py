@@ -609,6 +609,8 @@ def exit_code(run: RigRun) -> int:
 
 
 def _print_timing(console: Console, run: RigRun) -> None:
+    from quell.realtime.run import counters_text
+
     histograms = {"lateness": run.timing.lateness, "step time": run.timing.step}
     rows = table("Punctuality", "[µs]", "p50", "p99", "p99.9", "max")
     for label, histogram in histograms.items():
@@ -619,16 +621,12 @@ def _print_timing(console: Console, run: RigRun) -> None:
         bars = "\n".join(histogram.text().splitlines()[1:])
         heading = f"{label.capitalize()}, cycles (bars are logarithmic):"
         console.print(f"{heading}\n{bars}\n", highlight=False)
-    print_line(console, f"Loop: {_counted(run.tally._asdict())}")
+    print_line(console, f"Loop: {counters_text(run.tally._asdict())}")
     if run.counters:
-        print_line(console, f"Device: {_counted(run.counters)}")
+        print_line(console, f"Device: {counters_text(run.counters)}")
     for note in run.notes:
         if not note.startswith("telemetry: "):  # these were logged at once
             print_line(console, f"Note: {note}")
-
-
-def _counted(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
 
 
 def _save_timing_figure(run: RigRun, setup: Setup, folder: Path, overwrite: bool) -> list[Path]:

@@ -689,11 +689,6 @@ def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Any:
         raise ValueError(f"{where}: must be a recording by quell, CSV or MCAP: {error}") from None
 
 
-def load_one(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory:
-    """Read a recorded run of one y and one u; a ``ValueError`` refuses one of several axes."""
-    return check_one(load(path, max_size), f"path = {os.fspath(path)!r}")
-
-
 def check_one(run: Any, where: str) -> Trajectory:
     """Return a record of one y and one u; a ``ValueError`` says what to do with several axes."""
     if run.several:
