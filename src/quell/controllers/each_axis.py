@@ -37,11 +37,6 @@ def tell_axis(axis: Any, state: Any, i: int, v: Vector) -> None:
     set_applied_control(axis, state, v[i])
 
 
-def reset_axis(axis: Any, state: Any, i: int) -> None:
-    """Start an axis from rest at the next sample."""
-    reset_loop(axis, state)
-
-
 def write_axis(axis: Any, state: Any, i: int, at: int, widths: Any, row: Vector) -> int:
     """Write the ``widths[i]`` channels of an axis into ``row`` from ``at`` on; return their end."""
     write_row(axis, state, row[at : at + widths[i]])
@@ -86,11 +81,6 @@ def continue_axis(axis: Any, state: Any, i: int) -> None:
     state.loop[0].bumpless = 1.0
 
 
-def transfer_axis(axis: Any, state: Any, i: int) -> None:
-    """Continue an axis from what was applied, as if it had been at rest until now."""
-    bumpless_transfer(axis, state)
-
-
 def set_axis_manual(axis: Any, state: Any, i: int, manual: float, v: Vector) -> None:
     """Begin or end manual operation of an axis under v."""
     state.loop[0].manual, state.loop[0].u_manual = manual, v[i]
@@ -104,13 +94,13 @@ def hold_axis(axis: Any, state: Any, i: int, which: int, held: bool) -> None:
 
 ask_axes = for_each("ask_axes", ask_axis)
 tell_axes = for_each("tell_axes", tell_axis)
-reset_axes = for_each("reset_axes", reset_axis)
+reset_axes = for_each("reset_axes", reset_loop)
 write_axes = for_each("write_axes", write_axis)
 write_motions = for_each("write_motions", write_motion)
 set_axes_derivatives = for_each("set_axes_derivatives", set_axis_derivatives)
 start_axes = for_each("start_axes", start_axis)
 axes_started = for_each("axes_started", count_started)
 continue_axes = for_each("continue_axes", continue_axis)
-transfer_axes = for_each("transfer_axes", transfer_axis)
+transfer_axes = for_each("transfer_axes", bumpless_transfer)
 set_axes_manual = for_each("set_axes_manual", set_axis_manual)
 hold_axes = for_each("hold_axes", hold_axis)

@@ -69,32 +69,27 @@ class FromOutside(NamedTuple):
     """U_0 takes the place of the references."""
 
 
-def ask_drive(drive: Any, state: Any, k: int, flags: int, r: Vector, y: Vector, u_0: Vector) -> int:
+def ask_drive(drive: Any, state: Any, i: int, flags: int, r: Vector, y: Vector, u_0: Vector) -> int:
     """Write the u_0 of a drive; return the flags."""
-    u_0[k] = control(drive, state, r[k], y[k])
+    u_0[i] = control(drive, state, r[i], y[i])
     return flags | int(status_flags(drive, state))
 
 
-def tell_drive(drive: Any, state: Any, k: int, u: Vector, held: Vector, undoes: bool) -> None:
+def tell_drive(drive: Any, state: Any, i: int, u: Vector, held: Vector, undoes: bool) -> None:
     """Tell a drive what was applied.
 
     The integrator of one whose axis is held stays as it is: what the last sample has added to it is
     undone if ``undoes``.
     """
-    if held[k] == 0.0:
-        set_applied_control(drive, state, u[k])
+    if held[i] == 0.0:
+        set_applied_control(drive, state, u[i])
     elif undoes:
-        hold_integrators(drive, state, u[k])
-
-
-def reset_drive(drive: Any, state: Any, k: int) -> None:
-    """Start a drive from rest."""
-    reset_loop(drive, state)
+        hold_integrators(drive, state, u[i])
 
 
 _ask_each = for_each("ask_each_drive", ask_drive)
 _tell_each = for_each("tell_each_drive", tell_drive)
-_reset_each = for_each("reset_each_drive", reset_drive)
+_reset_each = for_each("reset_each_drive", reset_loop)
 
 
 @generic

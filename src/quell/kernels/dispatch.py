@@ -260,13 +260,14 @@ def for_each(name: str, function: Callable[..., Any], tuples: int = 2) -> Callab
         of the returned function.
     function
         a kernel, or a generic function of the first entry: it takes an entry of each tuple, their
-        index i, and what all entries share. If it returns a
+        index if its next parameter is ``i``, and what all entries share. If it returns a
         value, that is the first of these for the next entry, and of the last entry the result.
     tuples
         number of the tuples, all of one length.
     """
-    parameters = inspect.signature(function).parameters
-    heads, shared = [*parameters][:tuples], [*parameters][tuples + 1 :]
+    parameters = [*inspect.signature(function).parameters]
+    indexed = parameters[tuples : tuples + 1] == ["i"]
+    heads, shared = parameters[:tuples], parameters[tuples + indexed :]
     returns = function.__annotations__["return"] != "None"
     of_one = function if hasattr(function, "implementations") else kernel(function)
     floats = {each for each in shared if function.__annotations__[each] == "float"}
@@ -277,7 +278,8 @@ def for_each(name: str, function: Callable[..., Any], tuples: int = 2) -> Callab
         lines = [f"def {name}({', '.join([*heads, *typed])}):"]
         for i in range(count):
             entries = [f"{head}[{i}]" for head in heads]
-            call = f"{function.__name__}({', '.join([*entries, str(i), *shared])})"
+            entries += [str(i)] if indexed else []
+            call = f"{function.__name__}({', '.join([*entries, *shared])})"
             lines.append(f"    {f'{shared[0]} = ' if returns else ''}{call}")
         lines.append(f"    return {shared[0]}" if returns else "    return")
         names = {function.__name__: of_one, "__name__": function.__module__}
