@@ -243,7 +243,7 @@ def test_switches_and_sliders_keep_what_the_observer_knows(page: Any) -> None:
 def test_the_controls_of_a_page_do_what_they_say(page: Any) -> None:
     """Sliders by keys, switches, a button that pushes, a change of the theme, a narrow screen."""
     state = "(() => { const p = movingLoops[0]; return [p.settings, p.structure, p.margin]; })()"
-    page.evaluate("movingLoops[0].set('learner', false)")
+    page.evaluate("movingLoops[0].set('learner', false); movingLoops[0].set('load', 0)")
     before = page.evaluate(state)
     page.locator("input[data-key=omega_o]").press("ArrowRight")
     page.locator("input[data-key=learner]").check()
@@ -254,7 +254,7 @@ def test_the_controls_of_a_page_do_what_they_say(page: Any) -> None:
     assert after[2] != before[2]
     page.locator("[data-do=right]").hover()
     page.mouse.down()
-    page.wait_for_function("movingLoops[0].force.value > 0")
+    page.wait_for_function("movingLoops[0].load.some((w) => w > 0)")
     page.mouse.up()
     page.wait_for_function("movingLoops[0].hand.target === 0")
     page.evaluate("document.documentElement.dataset.theme = 'dark'")

@@ -10,7 +10,7 @@
     window.movingLoops.showAll();
     return;
   }
-  const MIDDLE = (list) => (list.length - 1) / 2;
+  const middle = (list) => (list.length - 1) / 2;
   const decoded = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
@@ -229,6 +229,7 @@
 
   class Picture {
     constructor(element, loop, name) {
+      this.shown = Infinity;
       this.element = element;
       this.loop = loop;
       this.name = name;
@@ -260,7 +261,7 @@
       const given = this.element.dataset;
       const nearest = (slider, factor) => {
         const list = this.machine.positions[slider];
-        const wanted = list[MIDDLE(list)] * Number(factor ?? 1);
+        const wanted = list[middle(list)] * Number(factor ?? 1);
         const far = list.map((value) => Math.abs(Math.log(value / wanted)));
         return far.indexOf(Math.min(...far));
       };
@@ -303,8 +304,9 @@
         const list = this.machine.positions[i];
         input.value = positions[i];
         const value = list[positions[i]];
-        const factor = value / list[MIDDLE(list)];
-        const own = i > 0 ? "" : factor === 1 ? " (the plant's own)" : ` (${digits(factor, 2)} of the plant's)`;
+        const factor = value / list[middle(list)];
+        const own = i > 0 ? "" : factor === 1 ? " (the plant's own)"
+          : ` (${digits(factor, 2)} of the plant's)`;
         input.previousElementSibling.textContent = `${value}${units[i]}${own}`;
         input.setAttribute("aria-valuetext", input.previousElementSibling.textContent);
       });
@@ -312,7 +314,8 @@
       input.value = load;
       const unit = this.name === "servo" ? "N m" : "N";
       const size = (load / 24) * this.machine.load.largest;
-      input.previousElementSibling.textContent = load ? `sinusoid of ${digits(size, 2)} ${unit}` : "none";
+      const text = load ? `sinusoid of ${digits(size, 2)} ${unit}` : "none";
+      input.previousElementSibling.textContent = text;
       this.element.querySelector("input[data-key=learner]").checked = learner;
       const box = this.element.querySelector("input[data-key=guard]");
       box.checked = guard;
@@ -336,11 +339,12 @@
     /* Return the first change of one slider that makes the loop stable. */
     remedy() {
       const positions = this.settings.positions;
-      const ways = [[0, 1, "raise b0"], [2, 1, "raise omega_o"], [1, -1, "lower omega_c"], [0, -1, "lower b0"], [2, -1, "lower omega_o"]];
+      const last = this.machine.positions[0].length - 1;
+      const ways = [[0, 1, "raise b0"], [2, 1, "raise omega_o"], [1, -1, "lower omega_c"],
+        [0, -1, "lower b0"], [2, -1, "lower omega_o"]];
       const found = ways.find(([slider, direction]) => {
-        const tried = [...positions];
-        for (tried[slider] += direction; tried[slider] in this.machine.positions[slider]; tried[slider] += direction) {
-          this.loop.write(tried);
+        for (let at = positions[slider] + direction; at >= 0 && at <= last; at += direction) {
+          this.loop.write(positions.map((position, i) => (i === slider ? at : position)));
           if (isStable(this.machine, this.loop.design())) return true;
         }
         return false;
@@ -364,11 +368,13 @@
       this.reference = 0;
       this.turn = Math.round(0.05 * this.machine.step.every / this.machine.dt);
       this.ranAway = false;
-      const inputs = this.machine.loads;
-      this.force = { goal: 0, value: 0, rate: 0 };
-      this.swell = { goal: 0, value: 0, rate: 0 };
-      this.load = new Array(inputs).fill(0);
-      this.record = { r: [], w: [], y: [], u: [], x: [], fHat: [], f: [], fLearned: [], authority: [] };
+      const rest = () => ({ goal: 0, value: 0, rate: 0 });
+      this.forces = Array.from({ length: this.machine.loads }, rest);
+      this.swell = rest();
+      this.load = new Array(this.machine.loads).fill(0);
+      this.record = {};
+      for (const key of ["r", "w", "y", "u", "x", "fHat", "f", "fLearned", "authority"])
+        this.record[key] = [];
       this.range = 0;
       this.showSettings();
     }
@@ -390,15 +396,20 @@
           }
           loop.r[k] = this.reference;
           // f has the second derivative of a load, so hand and sinusoid begin and end smoothly.
-          const a = follow(this.force, this.hand.target, hand, dt);
+          const phase = load.omega * index * dt;
+          const sine = Math.sin(phase), cosine = load.omega * Math.cos(phase);
           const s = follow(this.swell, amplitude, hand / 4, dt);
-          const [sine, cosine] = [Math.sin(load.omega * index * dt), load.omega * Math.cos(load.omega * index * dt)];
-          const rows = [[], [], []];
+          const sinusoid = [
+            s[0] * sine,
+            s[1] * sine + s[0] * cosine,
+            (s[2] - load.omega ** 2 * s[0]) * sine + 2 * s[1] * cosine,
+          ];
+          const rows = [[], [], []]; // w, w', w'' of each input
           for (let j = 0; j < loads; j++) {
-            const mine = j === this.hand.input ? 1 : 0, its = j === load.input ? 1 : 0;
-            rows[0].push(mine * a[0] + its * s[0] * sine);
-            rows[1].push(mine * a[1] + its * (s[1] * sine + s[0] * cosine));
-            rows[2].push(mine * a[2] + its * ((s[2] - load.omega ** 2 * s[0]) * sine + 2 * s[1] * cosine));
+            const target = j === this.hand.input ? this.hand.target : 0;
+            const force = follow(this.forces[j], target, hand, dt);
+            for (let i = 0; i < 3; i++)
+              rows[i].push(force[i] + (j === load.input ? sinusoid[i] : 0));
             loop.w[k * loads + j] = rows[0][j];
           }
           derivatives[k] = rows;
@@ -408,8 +419,10 @@
         for (let k = 0; k < n; k++) {
           const at = (this.count + k) % this.capacity;
           const f = this.trueF(k, derivatives[k], b);
-          const values = { r: loop.r[k], y: loop.y[k], f, estimate: loop.fHat[k], learned: loop.fLearned[k] };
-          for (const key in values) this.history[key][at] = values[key];
+          const { r, y, fHat: estimate, fLearned: learned } = loop;
+          const lists = { r, y, estimate, learned };
+          for (const key in lists) this.history[key][at] = lists[key][k];
+          this.history.f[at] = f;
           if (this.recording) this.keep(k, f);
         }
         this.count += n;
@@ -535,7 +548,8 @@
     readColours() {
       const style = getComputedStyle(this.element);
       this.colours = {};
-      for (const key of ["ink", "soft", "grid", "y", "r", "f", "estimate", "learned", "hand", "body", "ground"])
+      const keys = "ink soft grid y r f estimate learned hand body ground".split(" ");
+      for (const key of keys)
         this.colours[key] = style.getPropertyValue(`--ml-${key}`).trim();
     }
 
@@ -577,7 +591,7 @@
       const { colours, capacity, count } = this;
       const [left, right, top, bottom] = [46, width - 6, 6, height - 18];
       const X = (index) => left + ((index - (count - capacity)) / capacity) * (right - left);
-      const Y = (value) => bottom - ((clamp(value, low - 9 * (high - low), high + 9 * (high - low)) - low) / (high - low)) * (bottom - top);
+      const Y = (value) => bottom - clamp((value - low) / (high - low), -9, 9) * (bottom - top);
       context.font = "11px system-ui, sans-serif";
       context.lineWidth = 1;
       context.textAlign = "right";
@@ -712,10 +726,13 @@
         context.font = "13px system-ui, sans-serif";
         context.fillText(i === 1 ? "m₂" : "m₁", centre, floor - size / 2);
       });
-      this.arrow(context, centres[0], floor - size - 12, clamp(this.now.u, -2, 2) * 0.3 * scale, colours.estimate, "u");
+      const top = floor - size - 12;
+      const length = (force, share) => clamp(force, -2, 2) * share * scale;
+      this.arrow(context, centres[0], top, length(this.now.u, 0.3), colours.estimate, "u");
       this.load.forEach((w, i) => {
-        if (Math.abs(w) > 0.005 * machine.most)
-          this.arrow(context, centres[i], floor - size - (i === 0 ? 28 : 12), clamp(w, -2, 2) * 0.45 * scale, colours.hand, "load");
+        if (Math.abs(w) < 0.005 * machine.most) return;
+        const y = i === 0 ? top - 16 : top; // above u
+        this.arrow(context, centres[i], y, length(w, 0.45), colours.hand, "load");
       });
       const { drag } = this.hand;
       if (drag) this.rope(context, [centres[drag.input] + drag.grip, middle], drag.at);
@@ -723,28 +740,27 @@
 
     drawServo() {
       const [context, width, height] = this.surface(this.canvases[0]);
-      const { cx, cy, radius, tip } = this.places();
+      const { cx, cy, radius } = this.places();
       const { colours, machine } = this;
+      const on = (reach, angle) => [cx + reach * Math.cos(angle), cy - reach * Math.sin(angle)];
       context.lineWidth = 1;
-      context.strokeStyle = colours.grid;
       for (let i = 0; i < 24; i++) {
-        const [c, s] = [Math.cos((i * Math.PI) / 12), Math.sin((i * Math.PI) / 12)];
-        const inner = radius + (i % 6 === 0 ? -8 : -3);
+        const angle = (i * Math.PI) / 12;
         context.strokeStyle = i % 6 === 0 ? colours.soft : colours.grid;
-        stroke(context, [[cx + inner * c, cy - inner * s], [cx + (radius + 3) * c, cy - (radius + 3) * s]]);
+        stroke(context, [on(radius + (i % 6 === 0 ? -8 : -3), angle), on(radius + 3, angle)]);
       }
       context.strokeStyle = colours.r;
       context.lineWidth = 2;
       context.setLineDash([5, 4]);
-      stroke(context, [[cx, cy], [cx + radius * Math.cos(this.reference), cy - radius * Math.sin(this.reference)]]);
+      stroke(context, [[cx, cy], on(radius, this.reference)]);
       context.setLineDash([]);
       context.strokeStyle = colours.y;
       context.lineWidth = 9;
-      stroke(context, [[cx, cy], [cx + (radius - 10) * Math.cos(this.now.x[0]), cy - (radius - 10) * Math.sin(this.now.x[0])]]);
+      stroke(context, [[cx, cy], on(radius - 10, this.now.x[0])]);
       context.fillStyle = colours.body;
       context.strokeStyle = colours.y;
       context.lineWidth = 2;
-      disc(context, [cx + (radius - 10) * Math.cos(this.now.x[0]), cy - (radius - 10) * Math.sin(this.now.x[0])], 10);
+      disc(context, on(radius - 10, this.now.x[0]), 10);
       context.strokeStyle = colours.ink;
       disc(context, [cx, cy], 17);
       context.fillStyle = colours.ink;
@@ -756,10 +772,7 @@
       this.bar(context, cx - side - 40, cy, this.now.u / 4, colours.estimate, "u", height);
       this.bar(context, cx + side + 40, cy, this.load[0] / machine.most, colours.hand, "load", height);
       const { drag } = this.hand;
-      if (drag) {
-        const held = [cx + drag.reach * Math.cos(this.now.x[0]), cy - drag.reach * Math.sin(this.now.x[0])];
-        this.rope(context, held, drag.at);
-      }
+      if (drag) this.rope(context, on(drag.reach, this.now.x[0]), drag.at);
     }
 
     /* Draw a number from -1 to 1 as a bar from the middle. */
@@ -810,7 +823,8 @@
     // ---- numbers in words ----
 
     showNumbers() {
-      if (this.count - (this.shown ?? -1e9) < 0.15 * this.machine.pace / this.machine.dt && this.count > this.shown) return;
+      const pause = (0.15 * this.machine.pace) / this.machine.dt; // numbers that flicker are not read
+      if (this.count >= this.shown && this.count < this.shown + pause) return;
       this.shown = this.count;
       const write = (key, text, alarm = false) => {
         const place = this.element.querySelector(`[data-n=${key}]`);
