@@ -249,7 +249,7 @@
       // The first picture already has a history.
       this.advance(Math.round(0.62 * this.capacity));
       this.draw();
-      this.firstPicture = performance.now();
+      performance.mark("moving-loop"); // the first picture is there
       setTimeout(() => this.showMargins()); // they take longer than the picture
       this.before = null;
       requestAnimationFrame((time) => this.frame(time));
