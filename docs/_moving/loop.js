@@ -649,7 +649,7 @@
           },
         };
       }
-      const size = clamp(width / 11, 34, 62), gap = clamp(0.22 * width, 70, 190);
+      const size = clamp(width / 11, 34, 62), gap = clamp(0.26 * width, 80, 230);
       const [low, high] = [-1, 1.5];
       const scale = (width - gap - 2 * size - 16) / (high - low);
       const first = 8 + size / 2 - low * scale;
@@ -705,7 +705,7 @@
       context.fill();
       // Spring.
       const [from, to] = [centres[0] + size / 2, centres[1] - size / 2];
-      const middle = floor - size / 2, turns = 9;
+      const middle = floor - size / 2, turns = 6;
       const points = [[from, middle], [from + 8, middle]];
       for (let i = 0; i < 2 * turns; i++)
         points.push([from + 8 + ((to - from - 16) * (i + 0.5)) / (2 * turns), middle + (i % 2 ? 9 : -9)]);
