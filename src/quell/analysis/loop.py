@@ -58,8 +58,11 @@ def closed_loop_matrix(A: Matrix, B: Matrix, C: Matrix, law: LinearLaw, inner: M
     ``inner`` is ``law.A + B_u C``, the law with its own output applied. Pass A and ``inner`` both
     as they are, or both less the unit matrix.
     """
-    plant_rows = [A + law.D_y * np.outer(B, C), np.outer(B, law.C)]
-    return np.block([plant_rows, [np.outer(law.B_y + law.B_u * law.D_y, C), inner]])
+    n, size = A.shape[0], A.shape[0] + inner.shape[0]
+    whole = np.empty((size, size))
+    whole[:n, :n], whole[:n, n:] = A + law.D_y * np.outer(B, C), np.outer(B, law.C)
+    whole[n:, :n], whole[n:, n:] = np.outer(law.B_y + law.B_u * law.D_y, C), inner
+    return whole
 
 
 def law_matrix(law: LinearLaw) -> Matrix:

@@ -23,8 +23,9 @@ next one. The terms with r', r'', … are left out: they change no pole.
 Responses of linear loops over time, for objectives and limits of u that are about them.
 
 The closed loop of a sampled plant and a law is linear, so every response is the convolution of a
-pulse response with the input. The pulse response ``D, C B, C A B, …`` is computed in blocks: with
-``R = (C; C A; …; C A^(b−1))`` and ``A^b``, b terms are one product.
+pulse response with the input. The pulse response ``D, C B, C A B, …`` is one product: of the rows
+``C A^i``, i < b, and the columns ``A^(b j) B``. Each set doubles with each squaring of A, which is
+kept less the unit matrix.
 """
 
 from __future__ import annotations
@@ -66,6 +67,8 @@ _LEAST_BOTTOM = 3.0
 _POINTS_PER_DECADE, _TURN, _FALLEN = 24, 0.5, 0.02
 NARROW = 0.1
 """Poles with less damping have peaks beside them that may lie between points of the grid."""
+# Splines whose weights are found together, to bound their memory.
+_UNITS = 64
 # Half the sampling rate itself is a pole of Tustin's rule.
 _BELOW_HALF = 1.0 - 1e-6
 # Points between the neighbours of a maximum, and how often they are placed anew: an interval of
@@ -107,6 +110,8 @@ class PlantSet:
         self.omega = self._grid()
         self.P = self.responses(self.omega)
         self._open = [self._open_poles(self._poles[id(plant)]) for plant in self.plants]
+        #: modes of the plants for a bound of the damping, as ``requirements.counted`` finds them
+        self.modes: dict[float, list[tuple[Complex, int]]] = {}
 
     def responses(self, omega: Vector) -> Complex:
         """Return P (J, k)."""
@@ -131,8 +136,22 @@ class PlantSet:
         found = [self.s_poles(plant) for plant in self.plants]
         return any(np.any((s.imag > 0.0) & (-s.real < NARROW * s.imag)) for s in found)
 
+    @cached_property
+    def spline_weights(self) -> Vector:
+        """Weights (G,) of values on the grid in the integral over log ω of their cubic spline."""
+        from scipy.interpolate import CubicSpline
+
+        x, units = np.log(self.omega), np.eye(self.omega.size)
+        parts = np.array_split(units, -(-self.omega.size // _UNITS))
+        found = [CubicSpline(x, part, axis=1).integrate(x[0], x[-1]) for part in parts]
+        return np.concatenate(found)
+
     def scaled(self) -> list[SampledPlant]:
         """Return the plants with the factors of their gain."""
+        return self._scaled
+
+    @cached_property
+    def _scaled(self) -> list[SampledPlant]:
         return [
             plant if factor == 1.0 else plant._replace(B=plant.B * factor, E=plant.E * factor)
             for plant, factor in zip(self.plants, self.factors.tolist(), strict=True)
@@ -500,7 +519,7 @@ class SetResponses:
         """Return y or u with the controller of values (p,), one array (k,) for each plant."""
         key = id(structure), values.tobytes(), target
         if key not in self._known:
-            law = _law_at(structure, values)
+            law = law_at(structure, values, reference=bool(np.any(self.inputs.r)))
             if len(self._known) >= min(_KEPT, max(_KEPT_SAMPLES // self.inputs.r.size, 4)):
                 self._known.clear()
             self._known[key] = [response(p, law, self.inputs, target) for p in self._scaled]
@@ -512,12 +531,17 @@ class SetResponses:
         It lasts until y is at rest, whatever the samples of the inputs are: bounds of noise may
         make a loop far slower than its plant.
         """
-        law, size = _law_at(structure, values), self.plants.dt * abs(self.inputs.load)
+        law, size = law_at(structure, values), self.plants.dt * abs(self.inputs.load)
         loops = [closed_loop(plant, law, "d", "y") for plant in self._scaled]
         return np.array([size * area_until_rest(loop) for loop in loops])
 
 
-def _law_at(structure: Structure, values: Vector) -> LinearLaw:
+def law_at(structure: Structure, values: Vector, reference: bool = False) -> LinearLaw:
+    """Return the law of a structure with values (p,); without B_r and D_r where it is quicker."""
+    made = None if reference else getattr(structure, "law", None)
+    if made is not None:
+        law, samples = made(values)
+        return _delayed(law, samples) if samples else law
     with warnings.catch_warnings():
         # Of controllers on the way of a search; the result's own is made with warnings.
         warnings.simplefilter("ignore", DesignWarning)
@@ -566,21 +590,26 @@ def _convolved(one: Vector, other: Vector) -> Vector:
 
 def pulse_in_blocks(system: System, size: int) -> Vector:
     """Return ``D, C B, C A B, …`` (size,)."""
-    N, B, C, D = System.balanced(*system)
-    n = N.shape[0]
-    block = max(math.isqrt(size), 1)
-    rows, x = np.empty((block, n)), B.copy()
-    rows[0] = C
-    for i in range(1, block):
-        rows[i] = rows[i - 1] + rows[i - 1] @ N
-    jump = np.linalg.matrix_power(N + np.eye(n), block)
-    count = -(-(size - 1) // block)
-    parts = np.empty((count, block))
+    return _pulse(System.balanced(*system), size)
+
+
+def _pulse(system: System, size: int) -> Vector:
+    """Return the pulse response of a balanced system; rows and columns are found by doubling."""
+    N, B, C, D = system
+    length = 1 << (max(size - 1, 1).bit_length() + 1) // 2
+    count = -(-(size - 1) // length)
+    rows, columns = C[None, :], B[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
-        for i in range(count):
-            parts[i] = rows @ x
-            x = jump @ x
-    return np.append(D, parts.ravel()[: size - 1])
+        while rows.shape[0] < length:
+            rows = np.concatenate([rows, rows + rows @ N])
+            N = 2.0 * N + N @ N
+        while columns.shape[1] < count:
+            columns = np.hstack([columns, columns + N @ columns])
+            N = 2.0 * N + N @ N
+        parts = columns[:, :count].T @ rows.T
+    found = np.empty(count * length + 1)
+    found[0], found[1:] = D, parts.ravel()
+    return found[:size]
 
 
 # Samples of a response one by one; then so many with each distance, which doubles. The distance is
@@ -600,11 +629,16 @@ def area_of_step(system: System, samples: int) -> float:
     All of the first 50 000 count; later ones at distances that double, so that a slow loop with
     fast samples takes as long as any other.
     """
+    return _area(System.balanced(*system), samples)
+
+
+def _area(system: System, samples: int) -> float:
+    """Return the area of the step response of a balanced system."""
     first = min(samples, _ONE_BY_ONE)
-    total = float(np.sum(np.abs(np.cumsum(pulse_in_blocks(system, first)))))
+    total = float(np.sum(np.abs(np.cumsum(_pulse(system, first)))))
     if first == samples:
         return total
-    N, B, C, D = System.balanced(*system)
+    N, B, C, D = system
     n = B.size
     # The step is a state that stays at 1.
     N = np.block([[N, B[:, None]], [np.zeros((1, n + 1))]])
@@ -624,12 +658,13 @@ def area_of_step(system: System, samples: int) -> float:
 
 def area_until_rest(system: System) -> float:
     """Return the sum of ``|y|`` of a system that comes to rest at 0 after a unit step; else inf."""
-    pole = system.largest_pole
+    system = System.balanced(*system)
+    pole = float(np.max(np.abs(1.0 + np.linalg.eigvals(system.N)), initial=0.0))
     if pole >= 1.0:
         return math.inf
     pole = min(max(pole, _FASTEST), _SLOWEST)
     count = math.ceil(_TIME_CONSTANTS / -math.log(pole)) + 1
-    area = area_of_step(system, count)
-    N, B, C, D = System.balanced(*system)
+    area = _area(system, count)
+    N, B, C, D = system
     last = D - float(C @ np.linalg.solve(N, B))
     return math.inf if abs(last) * count > _LAST_VALUE * area else area

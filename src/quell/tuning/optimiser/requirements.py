@@ -41,7 +41,6 @@ Of several plants, the last two take the largest value, or a quantile of them.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -58,11 +57,11 @@ from quell.tuning.optimiser.loops import (
     PlantSet,
     SetResponses,
     dead_samples,
-    law_of,
+    law_at,
     peaks,
 )
 from quell.tuning.structures.base import Structure
-from quell.types import DesignWarning, Matrix, Vector
+from quell.types import Matrix, Vector
 
 # ---- The closed loop's poles ----
 
@@ -106,10 +105,7 @@ class Pole(NamedTuple):
 
 def closed_loop_poles(plants: PlantSet, structure: Structure, values: Vector) -> list[Complex]:
     """Return all poles of the loops of each plant with the controller of values (p,) [rad/s]."""
-    with warnings.catch_warnings():
-        # Of controllers on the way of a search; the result's own is made with warnings.
-        warnings.simplefilter("ignore", DesignWarning)
-        law = law_of(structure.controller(values))
+    law = law_at(structure, values)
     inner, found = law_matrix(law), []
     for plant in plants.scaled():
         whole = closed_loop_matrix(plant.N, plant.B, plant.C, law, inner)
@@ -119,10 +115,19 @@ def closed_loop_poles(plants: PlantSet, structure: Structure, values: Vector) ->
 
 def counted(plants: PlantSet, poles: list[Complex], damping: float) -> list[Pole]:
     """Return the poles that count, of those of each plant's loop, with the damping they need."""
+    if damping not in plants.modes:
+        plants.modes[damping] = [
+            modes_of(
+                (plant.N, plant.B[:, None], plant.C[None, :]),
+                plants.s_poles(plant),
+                damping,
+                plants.dt,
+            )
+            for plant in plants.plants
+        ]
     found: list[Pole] = []
-    for j, (plant, s) in enumerate(zip(plants.plants, poles, strict=True)):
-        matrices = (plant.N, plant.B[:, None], plant.C[None, :])
-        own = modes_of(matrices, plants.s_poles(plant), damping, plants.dt)
+    each = zip(plants.plants, poles, plants.modes[damping], strict=True)
+    for j, (plant, s, own) in enumerate(each):
         found += counted_of(s, own, dead_samples(plant), damping, plants.dt, j)
     return found
 
