@@ -572,6 +572,7 @@ def test_a_verdict_needs_both_significance_and_size() -> None:
     assert alternative(z=-2.9, by_likelihood=True).may_be_as_good
     assert not alternative(z=-3.0, by_likelihood=True).may_be_as_good
     assert not alternative(z=-2.9, gain=-0.5).may_be_as_good
+    assert not alternative(z=-2.9, by_likelihood=True, in_delay=1.0).may_be_as_good
     assert alternative().usable
     stuck = alternative(model=replace(noisy(), converged=False))
     assert not stuck.usable

@@ -372,13 +372,21 @@ def identify(
 
 def _explains_more(found: Identified, late: Identified) -> bool:
     """Return whether a model with a delay leaves less, beyond chance, and has no more faults."""
-    both = found, late
+    ratio, count = ratio_of_models(found, late, _ROUNDED**2)
+    return ratio > 3.0 * math.log(count) and len(late.faults) <= len(found.faults)
+
+
+def ratio_of_models(less: Identified, larger: Identified, exact: float) -> tuple[float, int]:
+    """Return ``likelihood_ratio`` of two models of a record, and how many samples it is of.
+
+    These are the samples of both fits; ``exact`` is the share of y's power that counts as no error.
+    """
+    both = less, larger
     first = max(one.left_out for one in both)
     last = min(one.left_out + one.held_from for one in both)
     errors = [(one.y - one.simulated)[first - one.left_out : last - one.left_out] for one in both]
-    least = _ROUNDED * float(np.sum((late.y - np.mean(late.y)) ** 2)) * _ROUNDED
-    more = likelihood_ratio((errors[0], errors[1]), least) > 3.0 * math.log(last - first)
-    return more and len(late.faults) <= len(found.faults)
+    least = exact * float(np.sum((larger.y - np.mean(larger.y)) ** 2))
+    return likelihood_ratio((errors[0], errors[1]), least), last - first
 
 
 class Options(NamedTuple):

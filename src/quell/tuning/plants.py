@@ -35,7 +35,7 @@ import numpy as np
 from quell import checks
 from quell.identification import FrequencyModel, Measured, identify, not_told_apart
 from quell.identification.result import NOTHING_HELD_OUT, Identified, percent
-from quell.identification.structures import fits_better
+from quell.identification.structures import fits_better, lag_in_delay
 from quell.lti.canonical import canonical
 from quell.parallel import part_of
 from quell.plants.base import PlantBatch
@@ -452,7 +452,8 @@ def record_model(
         alone = held is None and not (
             one.den.size == 2 and one.friction is not None and not friction
         )
-        if not _why_not(one) and (alone or (held is not None and fits_better(held, one))):
+        better = held is not None and (fits_better(held, one) or bool(lag_in_delay(held, one)))
+        if not _why_not(one) and (alone or better):
             held = one
     if held is None:
         return RecordModel(model, tuple(others), held_out)
