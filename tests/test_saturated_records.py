@@ -82,3 +82,30 @@ def test_a_record_that_begins_at_a_limit_is_taken_from_its_first_free_sample() -
     assert found.delay == pytest.approx(0.03, abs=1e-3)
     assert found.den[1] == pytest.approx(-math.log(0.98) / dt, rel=5e-3)
     assert found.shortcomings == ()
+
+
+def test_a_y_that_is_at_its_limit_most_of_the_time_stands_there() -> None:
+    """Two samples in three, without rounding, so that its median step is zero; a y that is held for three samples stands nowhere."""
+    y = np.cumsum(np.random.default_rng(1).standard_normal(1500)) * 0.01 + np.sin(
+        0.03 * np.arange(1500.0)
+    )
+    at = standing(np.minimum(y, np.quantile(y, 0.35)), 0.0)
+    assert at.samples == pytest.approx(0.65 * y.size, abs=2)
+    assert at.is_usable
+    assert standing(np.repeat(y[::3], 3), 0.0).samples == 0
+
+
+@pytest.mark.trial
+def test_three_samples_in_four_at_a_limit_leave_poles_with_deviations_that_hold() -> None:
+    """Of the samples that are free alone: rounds that fit bounds like y go slowly, and count them as known."""
+    u, miss = stairs(2400, of=24), []
+    clean = answer([90.0], [1.0, 1.2, 90.0], u)
+    for seed in range(3):
+        y = np.minimum(clean + noise(u.size, 2e-3, seed), float(np.quantile(clean, 0.25)))
+        found = ql.identify(u, y, DT, order=2, delay=0.0)
+        assert found.at_limits > 0.6 * y.size
+        assert found.shortcomings == ()
+        spread = np.sqrt(np.diag(found.covariance))[:2]
+        assert np.all(spread < 0.01 * np.array([90.0, 1.2]) * np.array([1.0, 5.0]))
+        miss += [*((found.den[:0:-1] - [90.0, 1.2]) / spread)]
+    assert max(abs(each) for each in miss) < 3.5

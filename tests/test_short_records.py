@@ -271,14 +271,15 @@ def test_a_delay_explains_more_where_it_is_there() -> None:
         ({"shortcomings": ("a",)}, {"delay": 0.0}, False, 2),
         ({"shortcomings": ("a",), "early": 1}, {"delay": 0.3}, True, 2),
         ({"shortcomings": ("a",), "bends": True}, {"delay": 0.3}, False, 1),
+        ({"shortcomings": ("a",), "bends": True, "at_limits": 9}, {"delay": 0.3}, True, 2),
         ({"shortcomings": ("a",)}, None, False, 2),
     ],
 )
 def test_a_delay_is_looked_for_where_the_model_without_it_has_shortcomings(
     first: Any, late: Any, takes: bool, asked: int
 ) -> None:
-    """Not where y bends; a record that is too short for it keeps the model without."""
-    none = {"shortcomings": (), "early": 0, "bends": False, "delay": 0.0}
+    """Not where y bends, unless it stands at a limit; a record that is too short for it keeps the model without."""
+    none = {"shortcomings": (), "early": 0, "bends": False, "at_limits": 0, "delay": 0.0}
     models = [SimpleNamespace(**{**none, **first})]
     models += [] if late is None else [SimpleNamespace(**{**none, **late})]
     calls: list[Any] = []

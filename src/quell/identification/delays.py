@@ -32,7 +32,9 @@ from quell.identification.model import (
     output,
 )
 from quell.identification.output_error import (
+    ALL,
     ParameterEstimate,
+    Samples,
     descend,
     likelihood_ratio,
 )
@@ -231,6 +233,7 @@ def nearest_delay(
     delays: tuple[float, float],
     delay: float,
     step: int = 1,
+    fitted: Samples = ALL,
 ) -> tuple[float, ParameterEstimate]:
     """Return the delay of least output error near ``delay``, and the model at it."""
     known = {delay: estimate}
@@ -238,7 +241,7 @@ def nearest_delay(
         for other in (delay + step, delay - step):
             if delays[0] <= other <= delays[1] and other not in known:
                 inputs = with_delay(structure, v, u, other)
-                known[other] = descend(structure, known[delay].theta, inputs, y, _STEPS)
+                known[other] = descend(structure, known[delay].theta, inputs, y, _STEPS, fitted)
         best = min(known, key=lambda one: known[one].cost)
         delay, step = (best, step) if best != delay else (delay, step // 2)
     return delay, known[delay]

@@ -24,7 +24,7 @@ from quell.identification.model import (
     poles_of,
     zeros_of,
 )
-from quell.identification.output_error import likelihood_ratio
+from quell.identification.output_error import ALL, Samples, likelihood_ratio
 from quell.identification.result import Identified
 from quell.identification.saturation import Standing, standing
 from quell.identification.search import Fit, Known, Wanted, fit, without_fast_poles
@@ -214,8 +214,8 @@ ZEROS, LEAST_WITH_ZEROS = 2, 4
 # How often first samples are left out: with u of before in them, the delay is not found at once.
 _CUTS = 3
 # Most rounds in which samples at a limit are bounded, and the change of y, as a share of its range,
-# that ends them; rounds that tell where they lead: chosen by hand.
-_ROUNDS, _SETTLED, _MEMORY = 20, 5e-5, 5
+# that ends them: chosen by hand.
+_ROUNDS, _SETTLED = 20, 5e-5
 # Weight of a sample at a limit where what is beyond it begins: by hand, so that it moves what other
 # samples show by less than their noise.
 _AT_LIMIT = 1e-5
@@ -344,7 +344,9 @@ def identify(
     found = identified(records, dt, options, *given, progress=part_of(progress, 0.0, 0.3, 1.0))
     wants_zeros = wants_zeros and order >= LEAST_WITH_ZEROS and not (friction or records.samples)
     good = not found.shortcomings
-    if found.bends or (good and not (wants_zeros and not found.residuals.white)):
+    # What is free of a limit may be at one side of u alone, where a form that is wrong looks bent.
+    bends = found.bends and not found.at_limits
+    if bends or (good and not (wants_zeros and not found.residuals.white)):
         return found
     # With a delay, and with zeros and poles that the frequency response shows, in turn.
     tried: list[tuple[Options, Known | None]] = []
@@ -461,48 +463,18 @@ def _from_first_free(records: Records, at_limits: Standing, given: tuple[Any, ..
 
 def _bounded(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> Identified:
     """Return the result where y stands at a limit, which is bounded there and not fitted."""
-    y, model = _over_limits(records, at_limits, given), None
-    before: list[tuple[Vector, Vector]] = []
+    y, found = _over_limits(records, at_limits, given), None
     for _ in range(_ROUNDS):
-        found = _identified(records._replace(y=y), *given)
-        model, bounded = found, at_limits.bounded(records.y, found.simulated)
-        change = bounded - y
-        spread = float(np.ptp(bounded))
-        if float(np.max(np.abs(change))) <= _SETTLED * spread or not found.converged:
+        # Where the model is inside a limit, y counts.
+        found = _identified(records._replace(y=y), *given, fitted=y == records.y)
+        before, y = y, at_limits.bounded(records.y, found.simulated)
+        settled = float(np.max(np.abs(y - before))) <= _SETTLED * float(np.ptp(y))
+        if settled or not found.converged:
             break
         # The search goes on from there, as each round is near the last one.
         given = (*given[:5], known_of(found), given[6])
-        # Each round goes part of the way: the last ones tell where it leads (Anderson, *J. ACM*
-        # 12, 1965).
-        before = [*before[-_MEMORY:], (bounded, change)]
-        new = bounded
-        if len(before) > 1:
-            of_y, of_change = (
-                np.column_stack([now - past[k] for past in before[:-1]])
-                for k, now in enumerate(before[-1])
-            )
-            new = bounded - of_y @ np.linalg.lstsq(of_change, change, rcond=1e-6)[0]
-        y = at_limits.bounded(records.y, new)
-    assert model is not None
-    # Where y is bounded it has no error, and counts as known: both make deviations small.
-    factor = y.size / (y.size - at_limits.samples)
-    low, high = (model.gain + factor * (end - model.gain) for end in model.gain_interval)
-    poles, zeros = (
-        tuple(
-            root._replace(real_std=factor * root.real_std, imag_std=factor * root.imag_std)
-            for root in roots
-        )
-        for roots in (model.poles, model.zeros)
-    )
-    return replace(
-        model,
-        at_limits=at_limits.samples,
-        covariance=factor**2 * model.covariance,
-        delay_covariance=factor**2 * model.delay_covariance,
-        gain_interval=(low, high),
-        poles=poles,
-        zeros=zeros,
-    )
+    assert found is not None
+    return replace(found, at_limits=at_limits.samples)
 
 
 def _over_limits(records: Records, at_limits: Standing, given: tuple[Any, ...]) -> Vector:
@@ -550,8 +522,10 @@ def _identified(
     signals: Signals,
     known: Known | None,
     progress: Callable[[float], None] | None,
+    *,
+    fitted: Samples = ALL,
 ) -> Identified:
-    """Return the result for all samples."""
+    """Return the result for all samples; fit and tests are of those that are to be ``fitted``."""
     u, y = records.u, records.y
     order, zeros, integrators, delay, bias, friction, rest, held_out, horizon = options
     if reference is not None:
@@ -604,14 +578,17 @@ def _identified(
         resolution=resolution_of(y),
         known=known,
         report=_counted(progress),
+        fitted=fitted if isinstance(fitted, slice) else fitted[:held_from],
     )
     # An unstable trial of the search may overflow; its cost is then infinite.
     with one_blas_thread(), np.errstate(all="ignore"):
-        fitted = fit(u[:held_from], y[:held_from], records.samples, wanted)
+        found_fit = fit(u[:held_from], y[:held_from], records.samples, wanted)
         if reference is not None:
-            fitted = _with_instruments(fitted, u[:held_from], y[:held_from], reference[:held_from])
+            part = u[:held_from], y[:held_from]
+            found_fit = _with_instruments(found_fit, *part, reference[:held_from])
         rounding = wanted.resolution
-        found = _validated(fitted, u, y, reference, dt, held_from, horizon, other, rounding)
+        how = horizon, other, rounding, fitted
+        found = _validated(found_fit, u, y, reference, dt, held_from, *how)
         # A gain that falls with u looks like an integrator.
         if not friction and integrators is None and found.integrators and found.undecided:
             part = u[:held_from], y[:held_from]
@@ -637,12 +614,13 @@ def _validated(
     horizon: int,
     other: tuple[Vector, Vector] | None,
     resolution: float,
+    counts: Samples,
 ) -> Identified:
     """Return the result in seconds, with fits and tests."""
     structure, v = fitted.structure, fitted.inputs(u)
     first, last = slice(0, held_from), slice(held_from, y.size)
     model = simulate_fit(fitted, v[first])
-    error, tested_u = y[first] - model, u[first]
+    error, tested_u, tested = y[first] - model, u[first], fitted.fitted
     weights = fit_predictor(error, horizon, structure.order + 1)
     fits = {
         "estimation": nrmse(y[first], model),
@@ -651,6 +629,7 @@ def _validated(
     if held_from < y.size:
         fresh = simulate_fit(fitted, v[last], y[last])
         model, error, tested_u = np.append(model, fresh), y[last] - fresh, u[last]
+        tested = counts if isinstance(counts, slice) else counts[last]
         fits |= {
             "held out": nrmse(y[last], fresh),
             "held out, predicted": prediction_fit(y[last], error, horizon, weights),
@@ -658,11 +637,13 @@ def _validated(
     if other is not None:
         tested_u = other[0]
         fresh = simulate_fit(fitted, fitted.inputs(tested_u), other[1])
-        error = other[1] - fresh
+        error, tested = other[1] - fresh, ALL
         fits |= {
             "validation": nrmse(other[1], fresh),
             "validation, predicted": prediction_fit(other[1], error, horizon, weights),
         }
+    # What is bounded by a limit has no error.
+    error, tested_u = error[tested], tested_u[tested]
     seconds = 1.0 / structure.powers(dt)
     theta = fitted.estimate.theta * seconds
     covariance = fitted.estimate.covariance * np.outer(seconds, seconds)

@@ -35,9 +35,10 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.identification.model import (
     Structure,
@@ -70,6 +71,11 @@ _MOST_COLOUR, _PER_COLOUR = 20, 20
 _ROWS = 700
 
 
+Samples: TypeAlias = NDArray[np.bool_] | slice
+"""The samples of a record that count: all, or those where y stands at no limit."""
+ALL: Samples = slice(None)
+
+
 class ParameterEstimate(NamedTuple):
     """The result of a search."""
 
@@ -88,27 +94,27 @@ def refine(
 
 
 def descend(
-    structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: int
+    structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: int, fitted: Samples = ALL
 ) -> ParameterEstimate:
-    """Return what ``refine`` returns, without the covariance."""
-    free, mu = structure.free, _MU
-    best, theta = projected(structure, theta, v, y)
+    """Return what ``refine`` does, without the covariance; only ``fitted`` samples count."""
+    free, mu, count = structure.free, _MU, y[fitted].size
+    best, theta = projected(structure, theta, v, y, fitted)
     # Without noise the error falls to its own rounding, where a step may not reduce it further.
     rounding = _ROUNDING * float(np.mean(y**2))
     converged = best <= rounding or (free == 0 and math.isfinite(best))
-    near = _linearise(structure, theta, v, y)
+    near = _linearise(structure, theta, v, y, fitted)
     for _ in range(steps if free else 0):
         if near is None or best <= rounding:
             break
-        converged = near.gain <= _CONVERGED * max(near.error, best * y.size)
+        converged = near.gain <= _CONVERGED * max(near.error, best * count)
         if converged or mu > _MOST_MU:
             break
         trial = theta.copy()
         trial[:free] += _damped(near.inner, near.right, mu) / near.size[:free]
-        value, trial = projected(structure, trial, v, y)
+        value, trial = projected(structure, trial, v, y, fitted)
         if value < best:
             best, theta, mu = value, trial, 0.1 * mu
-            near = _linearise(structure, theta, v, y)
+            near = _linearise(structure, theta, v, y, fitted)
         else:
             mu = max(10.0 * mu, _LEAST_MU)
     none = np.full((theta.size, theta.size), np.inf)
@@ -117,12 +123,14 @@ def descend(
     )
 
 
-def projected(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
+def projected(
+    structure: Structure, theta: Vector, v: Matrix, y: Vector, fitted: Samples = ALL
+) -> tuple[float, Vector]:
     """Return the least mean square error for the poles of ``theta``, and θ with this error."""
     if not np.all(np.isfinite(theta[: structure.free])):
         return math.inf, theta
     with np.errstate(all="ignore"):
-        columns = linear_columns(structure, structure.denominator(theta), v)
+        columns, y = linear_columns(structure, structure.denominator(theta), v)[fitted], y[fitted]
         size = nonzero_lengths(columns)
         if not np.all(np.isfinite(size)):
             return math.inf, theta
@@ -133,9 +141,14 @@ def projected(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tupl
     return (value, found) if math.isfinite(value) else (math.inf, theta)
 
 
-def covariance(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Matrix:
-    """Return the covariance of θ at an optimum, infinite for a model whose output is not finite."""
-    found = _error_and_gradient(structure, theta, v, y)
+def covariance(
+    structure: Structure, theta: Vector, v: Matrix, y: Vector, fitted: Samples = ALL
+) -> Matrix:
+    """Return the covariance of θ at an optimum, infinite for a model whose output is not finite.
+
+    Only the samples that are ``fitted`` count.
+    """
+    found = _error_and_gradient(structure, theta, v, y, fitted)
     if found is None:
         return np.full((theta.size, theta.size), np.inf)
     error, psi, size = found
@@ -237,9 +250,11 @@ class _Linearisation(NamedTuple):
     error: float  # Σ e²
 
 
-def _linearise(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Linearisation | None:
+def _linearise(
+    structure: Structure, theta: Vector, v: Matrix, y: Vector, fitted: Samples
+) -> _Linearisation | None:
     """Return the linearisation, None for a model whose output is not finite."""
-    free, found = structure.free, _error_and_gradient(structure, theta, v, y)
+    free, found = structure.free, _error_and_gradient(structure, theta, v, y, fitted)
     if found is None:
         return None
     error, psi, size = found
@@ -256,13 +271,14 @@ def _linearise(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Li
 
 
 def _error_and_gradient(
-    structure: Structure, theta: Vector, v: Matrix, y: Vector
+    structure: Structure, theta: Vector, v: Matrix, y: Vector, fitted: Samples = ALL
 ) -> tuple[Vector, Matrix, Vector] | None:
     """Return error, gradient with columns of length 1, and the lengths; None if not all finite."""
     with np.errstate(all="ignore"):
         predicted, psi = output_gradient(structure, theta, v)
+        psi = psi[fitted]
         size = nonzero_lengths(psi)
-        error = y - predicted
+        error = (y - predicted)[fitted]
     if not (np.all(np.isfinite(size)) and np.all(np.isfinite(error))):
         return None
     psi /= size

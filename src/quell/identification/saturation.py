@@ -4,10 +4,14 @@ A signal at its limit has the same largest (or least) value in many samples, and
 it moves fast. A signal that settles at its largest value comes there slowly, and one that has
 levels, as steps or a PRBS, has few values: both are none.
 
-Samples of y at a limit y_max say only that y was y_max or more. They are bounded, not fitted: in
-their place the fit has ``max(ŷ, y_max)`` with the ŷ of the model, and again with the model that
-follows, until it no longer changes (the EM algorithm for censored data, in its limit of small
-noise: Dempster, Laird & Rubin, *J. Royal Statistical Society B* 39, 1977, sec. 4.2).
+Samples of y at a limit y_max say only that y was y_max or more. They are bounded, not fitted, by
+the likelihood of censored data (Tobin, *Econometrica* 26, 1958) in its limit of small noise::
+
+    min  Σ_free (y − ŷ)² + Σ_limit max(y_max − ŷ, 0)²
+
+A sample at a limit counts where the model is inside it, and those that count are found by rounds:
+a search begins with ``max(ŷ, y_max)`` in their place, with the ŷ of the model before, and ends with
+the samples that count alone. Deviations and tests are of these, too.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ _FEWEST, _PILED, _VALUES = 10, 4.0, 20
 # in a rest at begin or end that is none. By hand.
 _FIRST, _SWINGS = 0.8, 1.0
 # Share of the samples beyond which too little is left.
-_MOST = 0.6
+_MOST = 0.9
 
 
 class Standing(NamedTuple):
@@ -69,8 +73,12 @@ def standing(x: Vector, resolution: float, u: Vector | None = None) -> Standing:
     A y that does not answer a ``u`` that moves stands at its limit, at begin and end, too.
     """
     none = np.zeros(x.size, dtype=bool)
-    held = resolution == 0.0 and np.median(np.abs(np.diff(x))) == 0.0
-    if held or np.unique(x).size <= _VALUES:
+    if np.unique(x).size <= _VALUES:
+        return Standing(none, none)
+    # A value that is held for some samples is no limit. What stands at its extremes for most of
+    # them says nothing about the values between.
+    between = x[(np.min(x) < x) & (x < np.max(x))]
+    if resolution == 0.0 and np.median(np.abs(np.diff(between))) == 0.0:
         return Standing(none, none)
     return Standing(_at_top(x, resolution, u), _at_top(-x, resolution, u))
 

@@ -33,7 +33,9 @@ from quell.identification.model import (
     squared_distance_from_zero,
 )
 from quell.identification.output_error import (
+    ALL,
     ParameterEstimate,
+    Samples,
     covariance,
     covariance_of,
     descend,
@@ -97,6 +99,7 @@ class Fit(NamedTuple):
     delay_covariance: Vector  # of the delay with a and b, and its variance
     bias: bool
     rest: AtRest
+    fitted: Samples = ALL  # those in which y stands at no limit
 
     def inputs(self, u: Vector) -> Matrix:
         """Return the inputs (N, inputs) for ``u``; ``free_run`` fills in friction inputs.
@@ -146,6 +149,7 @@ class Wanted(NamedTuple):
     resolution: float  # step that y is rounded to, 0.0 if it is not rounded
     known: Known | None  # a larger model, from which the search begins
     report: Callable[[], None]  # called between parts of the search; may end it by an exception
+    fitted: Samples = ALL  # those in which y stands at no limit
 
 
 def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
@@ -261,10 +265,19 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: K
             if moved.cost >= estimate.cost:
                 break
             delay, estimate, v = again, moved, inputs
+    if wanted.fitted is not ALL:
+        estimate = descend(structure, estimate.theta, v, y, _STEPS, wanted.fitted)
+        delay, estimate = nearest_delay(
+            structure, estimate, u, v, y, searched, delay, fitted=wanted.fitted
+        )
+        v = with_delay(structure, v, u, delay)
+        estimate = descend(structure, estimate.theta, v, y, _STEPS, wanted.fitted)
     estimate = estimate._replace(converged=estimate.converged and start.confirmed)
-    estimate, certain, of_delay = _over_delays(structure, estimate, u, v, y, delay, searched)
+    estimate, certain, of_delay = _over_delays(
+        structure, estimate, u, v, y, delay, searched, wanted.fitted
+    )
     rest = AtRest(False, False, np.nan)
-    return Fit(structure, estimate, delay, certain, searched, of_delay, bias, rest)
+    return Fit(structure, estimate, delay, certain, searched, of_delay, bias, rest, wanted.fitted)
 
 
 def _from_known(
@@ -314,6 +327,7 @@ def _over_delays(
     y: Vector,
     delay: float,
     searched: tuple[float, float],
+    fitted: Samples = ALL,
 ) -> tuple[ParameterEstimate, tuple[float, float], Vector]:
     """Return the estimate with a covariance that has the delays in it, and their 95 % range.
 
@@ -325,13 +339,16 @@ def _over_delays(
     from scipy.signal import lfilter
 
     size = structure.free + structure.degrees[0] + 1
+    if fitted is not ALL:
+        of_fitted = covariance(structure, estimate.theta, v, y, fitted)
+        estimate = estimate._replace(covariance=of_fitted)
     if searched[0] == searched[1]:
         return estimate, (delay, delay), np.zeros(size + 1)
     if not float(delay).is_integer():
-        return _with_part(structure, estimate, u, v, y, delay, size)
-    error = y - output(structure, estimate.theta, v)
+        return _with_part(structure, estimate, u, v, y, delay, size, fitted)
+    error = (y - output(structure, estimate.theta, v))[fitted]
     c, power = noise_model(error)
-    least = max(power, ROUNDING * float(np.mean(y**2))) * y.size
+    least = max(power, ROUNDING * float(np.mean(y**2))) * error.size
     low = high = delay
     found = [(1.0, 0.0, estimate)]
     for step in (-1, 1):
@@ -343,12 +360,12 @@ def _over_delays(
             near = descend(structure, near.theta, inputs, y, _DELAY_STEPS)
             if not np.isfinite(near.cost):
                 break
-            white = lfilter(c, [1.0], y - output(structure, near.theta, inputs))
-            change = y.size * float(np.log(max(white @ white, least) / least))
+            white = lfilter(c, [1.0], (y - output(structure, near.theta, inputs))[fitted])
+            change = error.size * float(np.log(max(white @ white, least) / least))
             if change > _WITHIN_95:
                 break
             low, high = min(low, other), max(high, other)
-            near = near._replace(covariance=covariance(structure, near.theta, inputs, y))
+            near = near._replace(covariance=covariance(structure, near.theta, inputs, y, fitted))
             found.append((float(np.exp(-0.5 * max(change, 0.0))), other - delay, near))
             other += step
     total = sum(weight for weight, _, _ in found)
@@ -369,6 +386,7 @@ def _with_part(
     y: Vector,
     delay: float,
     size: int,
+    fitted: Samples = ALL,
 ) -> tuple[ParameterEstimate, tuple[float, float], Vector]:
     """Return what ``_over_delays`` does, for a delay with a part of a sample.
 
@@ -379,9 +397,9 @@ def _with_part(
         output(structure, estimate.theta, with_delay(structure, v, u, end)) for end in (low, high)
     ]
     predicted, psi = output_gradient(structure, estimate.theta, v)
-    columns = np.column_stack([psi, (ends[1] - ends[0]) / (high - low)])
-    length = nonzero_lengths(columns)
-    cov = covariance_of(structure, columns / length, y - predicted) / np.outer(length, length)
+    columns = np.column_stack([psi, (ends[1] - ends[0]) / (high - low)])[fitted]
+    length, error = nonzero_lengths(columns), (y - predicted)[fitted]
+    cov = covariance_of(structure, columns / length, error) / np.outer(length, length)
     half = WITHIN_95 * math.sqrt(max(float(cov[-1, -1]), 0.0))
     of_delay = np.append(cov[-1, :size], cov[-1, -1])
     found = estimate._replace(covariance=cov[:-1, :-1])
@@ -412,7 +430,7 @@ def without_fast_poles(found: Fit, u: Vector, y: Vector) -> Fit:
     near = refine(lower, start, v, y, _WITHOUT_FAST)
     if not near.cost <= _HARDLY * found.estimate.cost + ROUNDING * float(np.mean(y**2)):
         return found
-    over = _over_delays(lower, near, u, v, y, found.delay, found.searched)
+    over = _over_delays(lower, near, u, v, y, found.delay, found.searched, found.fitted)
     return found._replace(structure=lower, estimate=over[0], delays=over[1])
 
 

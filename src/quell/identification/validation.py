@@ -241,7 +241,7 @@ class Linearised(NamedTuple):
         v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
         predicted, psi = output_gradient(structure, theta, v)
         error = y - predicted
-        return cls(fit, u, error, psi, *noise_model(error))
+        return cls(fit, u, error, psi, *noise_model(error[fit.fitted]))
 
 
 class _Explained(NamedTuple):
@@ -270,7 +270,8 @@ def _explained_by(near: Linearised, extra: Matrix) -> _Explained | None:
 
     columns, known = np.column_stack([near.psi, extra]), near.psi.shape[1]
     length = nonzero_lengths(columns)
-    whitened = lfilter(near.c, [1.0], np.column_stack([columns / length, near.error]), axis=0)
+    scaled = np.column_stack([columns / length, near.error])[near.fit.fitted]
+    whitened = lfilter(near.c, [1.0], scaled, axis=0)
     if not np.all(np.isfinite(whitened)) or not near.variance > 0.0:
         return None
     target, columns = whitened[:, -1], whitened[:, :-1]
@@ -336,7 +337,7 @@ def curvature(near: Linearised) -> float:
     """
     from scipy.stats import chi2
 
-    fit, error = near.fit, near.error
+    fit, error = near.fit, near.error[near.fit.fitted]
     u_late, a = fit.inputs(near.u)[:, 0], fit.structure.denominator(fit.estimate.theta)
     bent = [(u_late - np.mean(u_late)) ** 2]
     bent += [np.abs(u_late)] if np.min(u_late) < 0.0 < np.max(u_late) else []
@@ -346,7 +347,7 @@ def curvature(near: Linearised) -> float:
         return 0.0
     left = []
     for columns in (near.psi, np.column_stack([near.psi, extra])):
-        scaled = columns / nonzero_lengths(columns)
+        scaled = (columns / nonzero_lengths(columns))[fit.fitted]
         rest = error - scaled @ np.linalg.lstsq(scaled, error, rcond=1e-9)[0]
         left.append(float(rest @ rest))
     return 1.0 - left[1] / left[0] if left[0] > 0.0 else 0.0
