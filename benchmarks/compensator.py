@@ -46,7 +46,7 @@ def on_the_axis(quick: bool) -> dict[str, Any]:
     pid = ql.tune(nominal, DT, structure="pid", delay=DT, compare=(), **limits).design.controller
     found = ql.tuning.tune_compensator(nominal, pid, delay=DT)
     CONSOLE.print(str(found))
-    observer = found.compensator.observer
+    observer = found.controller.compensator.observer
     learners: dict[str, Any] = {
         "no learner": {},
         "Kalman, guarded": {"learner": ql.learners.Kalman(), "guard": ql.Guard()},
@@ -61,7 +61,7 @@ def on_the_axis(quick: bool) -> dict[str, Any]:
     headings = ("plant", "load", "PID tuned anew", *learners)
     table = Table(*headings, title="Error over that of the PID alone")
     figures: dict[str, Any] = {
-        "M_s of the tuned compensator": found.after.m_s,
+        "M_s of the tuned compensator": found.details.after.m_s,
     }
     for share in (1.0,) if quick else (1.0, 0.7, 1.3):
         plant = ql.plants.delayed(ql.plants.encoded(axis(share), 2**20), DT, DT)

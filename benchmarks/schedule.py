@@ -228,7 +228,7 @@ def with_load(load: str, period: float, seed: int) -> Any:
 def show_loads(seeds: range) -> dict[str, Any]:
     """Print the RMS error under loads that repeat while the inertia moves."""
     at, plant, found = linear(VISCOUS[1]), loaded(), dict[str, Any]()
-    table = ql.tune_schedule(at, DT, points=POINTS, tables="b0", between=0, **HOW).controller
+    table = ql.tune_schedule(at, DT, points=POINTS, tables="b0", between=0, **HOW).design.controller
     how: dict[str, Any] = {"structure": "bandwidths", "order": 2, "compare": (), **HOW}
     one = ql.tune([at(e) for e in POINTS], DT, **how).controller
     learning = {"guard": ql.Guard()}
@@ -298,7 +298,7 @@ def main() -> None:
             tuned = ql.tune_schedule(
                 at, DT, points=arguments.points, tables=tables, between=0, **HOW
             )
-            scheduled[tables] = tuned.controller
+            scheduled[tables] = tuned.design.controller
         how: dict[str, Any] = {"structure": "bandwidths", "order": 2, "compare": (), **HOW}
         one = ql.tune([at(e) for e in arguments.points], DT, **how).controller
         heavy = ql.tune(at(1.0), DT, **how).controller

@@ -1,4 +1,4 @@
-"""Judge ``tune_axes`` on drawn coupled plants: its bounds, and its cost over the optimum.
+"""Judge ``tune`` of several axes on drawn plants: its bounds, and its cost over the optimum.
 
     python benchmarks/tune_axes.py --plants 40 --seed 1000
     python benchmarks/tune_axes.py --optimum 6 --seed 1000
@@ -23,7 +23,7 @@ from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.analysis import MultivariableLoop, analyse
-from quell.tuning import TunedAxes, tune_axes
+from quell.tuning import Tuned
 from quell.tuning.axes import _nominal
 from quell.tuning.optimiser.coupled import CoupledLoops, Limits
 
@@ -68,14 +68,14 @@ def drawn(seed: int, axes: int | None = None, kind: str | None = None) -> Machin
     return Machine(plant, own, dt, n, kind, 0.03 if kind == "off" else 0.0)
 
 
-def tuned(machine: Machine) -> TunedAxes:
+def tuned(machine: Machine) -> Tuned:
     """Return the tuned axes of a machine."""
     observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=0.1 / machine.dt, dt=machine.dt)
     axes = ql.Axes([ql.ADRC(observer, 0.02 / machine.dt)] * machine.axes, M=machine.M)
-    return tune_axes(machine.plant, axes, B0_off=machine.off)
+    return ql.tune(machine.plant, controller=axes, B0_off=machine.off)
 
 
-def ratios(loop: MultivariableLoop, found: TunedAxes) -> dict[str, float]:
+def ratios(loop: MultivariableLoop, found: Tuned) -> dict[str, float]:
     """Return the largest ratio to each bound, on a dense grid."""
     if not loop.stable:
         return {"unstable": math.inf}
@@ -88,7 +88,7 @@ def ratios(loop: MultivariableLoop, found: TunedAxes) -> dict[str, float]:
         result["M_s"] = max(result["M_s"], float(np.max(np.abs(own))) / bounds.m_s)
         result["M_t"] = max(result["M_t"], float(np.max(np.abs(1.0 - own))) / bounds.m_t)
         at = "outputs" if name == "S_o" else "inputs"
-        result["disk"] = max(result["disk"], found.disk / loop.disk_margin(at).alpha)
+        result["disk"] = max(result["disk"], found.details.disk / loop.disk_margin(at).alpha)
     return result
 
 
@@ -115,7 +115,11 @@ def judge(seeds: range) -> dict[str, Any]:
                 again = ratios(analyse(late, found.controller), found)
                 name, largest = max([(name, largest), *again.items()], key=lambda each: each[1])
         wrong = found.met != (largest <= 1.002)
-        mean = float(np.exp(np.mean(np.log([each.ratio for each in found.axes]))))
+        mean = float(
+            np.exp(
+                np.mean(np.log([each.objective / each.measures["alone"] for each in found.axes]))
+            )
+        )
         costs.append(mean)
         wrong_verdicts += wrong and found.met
         counts.setdefault(machine.kind, []).append(largest if found.met else math.nan)
@@ -143,12 +147,12 @@ def optimum(seed: int, kind: str) -> float | str:
     axes = found.controller
     m_ks = tuple(each.constraints.m_ks for each in found.alone.values())
     bounds = found.constraints
-    limits = Limits(bounds.m_s, bounds.m_t, m_ks, found.disk, bounds.damping)
+    limits = Limits(bounds.m_s, bounds.m_t, m_ks, found.details.disk, bounds.damping)
     plants = _nominal(machine.plant, axes, [None])
-    alone = np.array([each.alone for each in found.axes])
+    alone = np.array([each.measures["alone"] for each in found.axes])
     dead = machine.plant.samples[0]
     loops = CoupledLoops(plants, axes.axes, limits, machine.dt, dead, alone, "load-iae")
-    values = np.array([[each.omega_c, each.omega_o] for each in found.axes])
+    values = np.array([[*each.values.values()] for each in found.axes])
     own = loops.measured(values)
     fastest = math.log(bounds.omega_o_dt / machine.dt)
     centre, width, best = np.full(4, fastest - 3.2), 3.2, (math.inf, None)
@@ -159,7 +163,7 @@ def optimum(seed: int, kind: str) -> float | str:
             if measured.violation <= 1e-3 and measured.cost < best[0]:
                 best = measured.cost, x
         if best[1] is None:
-            print(f"{seed}: the grid found nothing; tune_axes {'met' if found.met else 'NOT met'}")
+            print(f"{seed}: the grid found nothing; tune {'met' if found.met else 'NOT met'}")
             return "the grid found nothing"
         centre, width = best[1], width / (0.5 * (points - 1)) * 0.75
     ratio = math.exp(own.cost - best[0])

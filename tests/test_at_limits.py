@@ -19,7 +19,7 @@ from quell.analysis import analyse
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.prefilters import Prefiltered, ReferenceModel
 from quell.plants.linear import LinearPlant
-from quell.tuning import Constraints, acceptance, axes_at_limits, reference
+from quell.tuning import Constraints, Interaction, acceptance, axes_at_limits, reference
 from quell.tuning import plants as tuning_plants
 from quell.tuning.acceptance import Loop, judge
 from quell.tuning.axes import _made
@@ -121,10 +121,8 @@ def test_axes_become_slower_as_long_as_they_are_not_much_worse() -> None:
 def test_the_sensitivities_of_axes_are_drawn_with_their_bound() -> None:
     """Those of the nominal plant by name, of others in grey; the largest singular value below."""
     loop = analyse(machine(), axes())
-    result = SimpleNamespace(
-        loops=[loop, loop], controller=axes(), constraints=Constraints(m_s=1.7)
-    )
-    first, second = ql.tuning.TunedAxes.plot(result, list(Figure().subplots(2)))  # type: ignore[arg-type]
+    result: Any = SimpleNamespace(loops=[loop, loop], names=("x", "y"))
+    first, second = Interaction.plot(result, 1.7, list(Figure().subplots(2)))
     omega = loop.omega[1:]
     S = np.abs(np.einsum("kii->ki", loop.response("S_o", omega)))
     for k, line in enumerate(first.lines[2:4]):
@@ -137,8 +135,8 @@ def test_the_sensitivities_of_axes_are_drawn_with_their_bound() -> None:
     )
     assert second.lines[1].get_label() == "max σ(S)"
     assert second.get_xlabel() == "frequency [rad/s]"
-    none = SimpleNamespace(loops=[loop], controller=axes(), constraints=Constraints(m_s=None))
-    assert len(ql.tuning.TunedAxes.plot(none, list(Figure().subplots(2)))[0].lines) == 2  # type: ignore[arg-type]
+    none: Any = SimpleNamespace(loops=[loop], names=("x", "y"))
+    assert len(Interaction.plot(none, None, list(Figure().subplots(2)))[0].lines) == 2
 
 
 def test_axes_are_judged_each_by_its_step_and_after_overloads() -> None:

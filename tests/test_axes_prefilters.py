@@ -21,7 +21,7 @@ from quell.controllers.shaping import ProfileGenerator
 from quell.export import c_source
 from quell.setup import made
 from quell.setup.schema import SetupError
-from quell.tuning import axes_at_limits, tune_axes
+from quell.tuning import axes_at_limits
 from quell.tuning.axes_at_limits import held_loads, needs_along, with_prefilters
 from quell.tuning.written import Written
 
@@ -260,7 +260,7 @@ def test_steps_at_the_limits_get_moves_that_are_near_the_quickest() -> None:
     scenario = ql.Scenario(r, duration=2.0)
     file = Written(machine(), scenario, DT)
     bounds = ql.tuning.Constraints(m_ks=8000.0)
-    found = tune_axes(machine(), axes, constraints=bounds, written=file, setup=tables)
+    found = ql.tune(machine(), controller=axes, constraints=bounds, written=file, setup=tables)
     assert found.judged is not None
     assert not found.judged.failures
     for each, height, row in zip(found.judged.others, (1.5, 1.0), M, strict=True):

@@ -185,16 +185,16 @@ def test_a_tuned_compensator_keeps_the_bounds_of_the_whole_loop() -> None:
     """M_s, M_t and M_ks by ``analyse`` are those of the report, at the plant and where all its poles are elsewhere."""
     tuned = ql.tuning.tune_compensator(PLANT, PID)
     loop = ql.analysis.analyse(PLANT, tuned.controller)
-    assert 1.0 / loop.margins.modulus == pytest.approx(tuned.after.m_s, rel=0.01)
-    assert tuned.after.m_s <= 2.0
-    assert loop.noise_to_control_peak <= 1.01 * 3.0 * tuned.before.m_ks
-    assert tuned.after.iae < 0.3 * tuned.before.iae
-    assert tuned.worth
+    assert 1.0 / loop.margins.modulus == pytest.approx(tuned.details.after.m_s, rel=0.01)
+    assert tuned.details.after.m_s <= 2.0
+    assert loop.noise_to_control_peak <= 1.01 * 3.0 * tuned.details.before.m_ks
+    assert tuned.details.after.iae < 0.3 * tuned.details.before.iae
+    assert tuned.details.worth
     assert "NOT" not in str(tuned)
     for factor in (0.88, 1.2):
         den = [1.0, factor, 0.0]
         elsewhere = ql.analysis.analyse(([2.0 * factor**2], den), tuned.controller)
-        assert 1.0 / elsewhere.margins.modulus <= 1.01 * tuned.after.m_s_elsewhere
+        assert 1.0 / elsewhere.margins.modulus <= 1.01 * tuned.details.after.m_s_elsewhere
 
 
 @pytest.mark.trial
@@ -232,7 +232,10 @@ def test_the_integral_of_the_error_beside_a_gentle_controller_has_its_end() -> N
     gentle = ql.baselines.PID(kp=0.05, ki=0.05 / 3.0, kd=0.0, tf=0.2, dt=0.1)
     tuned = ql.tuning.tune_compensator(lags, gentle, speeds=(1.0, 1.0))
     scenario = ql.Scenario(disturbances=(1.0,), duration=1000.0)
-    for law, iae in ((gentle, tuned.before.iae), (tuned.controller, tuned.after.iae)):
+    for law, iae in (
+        (gentle, tuned.details.before.iae),
+        (tuned.controller, tuned.details.after.iae),
+    ):
         run = ql.simulate(ql.plants.LinearPlant.of(lags), law, scenario)
         assert iae == pytest.approx(0.1 * np.sum(np.abs(run["y"])), rel=1e-6)
 
@@ -242,18 +245,18 @@ def test_the_integral_of_an_error_that_stays_is_without_end() -> None:
     """A PD controller leaves a constant error under a load, which no time ends; the compensator removes it."""
     pd = ql.baselines.PID(kp=4.0, ki=0.0, kd=3.0, tf=0.05, dt=0.01)
     tuned = ql.tuning.tune_compensator(([1.0], [1.0, 1.0, 0.0]), pd, speeds=(1.0, 1.0))
-    assert tuned.before.iae == np.inf
-    assert np.isfinite(tuned.after.iae)
-    assert tuned.worth
+    assert tuned.details.before.iae == np.inf
+    assert np.isfinite(tuned.details.after.iae)
+    assert tuned.details.worth
     told = " ".join(str(tuned).split())
-    assert "∫|y| without end: y stays off under a load" in told
+    assert "controller alone: ∫|y| inf, M_s" in told
     assert "leaves no constant error, which the controller alone leaves" in told
     assert tuned.to_json()["before"]["iae"] is None
     run = ql.simulate(
         ql.plants.LinearPlant.of(([1.0], [1.0, 1.0, 0.0])), tuned.controller,
         ql.Scenario(disturbances=(1.0,), duration=100.0),
     )  # fmt: skip
-    assert tuned.after.iae == pytest.approx(0.01 * np.sum(np.abs(run["y"])), rel=1e-6)
+    assert tuned.details.after.iae == pytest.approx(0.01 * np.sum(np.abs(run["y"])), rel=1e-6)
 
 
 @cases(
@@ -292,5 +295,5 @@ def test_where_the_controller_uses_the_margin_itself_no_compensator_is_sold() ->
     noise = ql.analysis.analyse(PLANT, PID).noise_to_control_peak
     quiet = ql.tuning.Constraints(m_s=2.0, m_t=2.0, m_ks=1.001 * noise, damping=None)
     found = ql.tuning.tune_compensator(PLANT, PID, constraints=quiet)
-    assert not found.worth
+    assert not found.details.worth
     assert "NOT worth a compensator" in str(found)

@@ -119,7 +119,7 @@ def test_bandwidths_are_tuned_alike_in_both_forms() -> None:
     """With bounds in units of v; the tuned axes keep their gains."""
     own = ql.Axes({name: axis(name) for name in SETTINGS})
     unit = ql.Axes({name: axis(name, 1.0) for name in SETTINGS}, np.diag([1.7, -0.3]))
-    first, second = (ql.tuning.tune_axes(PLANT, each) for each in (own, unit))
+    first, second = (ql.tune(PLANT, controller=each) for each in (own, unit))
     for one, other in zip(first.controller.axes, second.controller.axes, strict=True):
         assert one.omega_c == pytest.approx(other.omega_c, rel=1e-3)
         assert one.observer.omega_o == pytest.approx(other.observer.omega_o, rel=1e-3)

@@ -107,6 +107,11 @@ def test_a_nonlinear_plant_takes_a_number_or_an_array_for_u() -> None:
         (ql.analysis, "certify_axes", "certify"),
         (ql.setup, "load_axes", "load"),
         (ql.setup, "made_axes", "made"),
+        (ql.tuning, "tune_axes", "tune"),
+        (ql.tuning, "TunedAxes", "Tuned"),
+        (ql.tuning, "AxisResult", "Design"),
+        (ql.tuning, "AxesBound", "Reached"),
+        (ql.tuning, "AxesCheck", "Check"),
     ],
 )
 def test_a_name_of_an_earlier_release_is_the_present_one(of: Any, old: str, new: str) -> None:
@@ -128,10 +133,6 @@ SEVERAL = {
     "MultivariableESO",
     "axes_law",
     "AxesDescription",
-    "AxesBound",
-    "AxesCheck",
-    "TunedAxes",
-    "tune_axes",
 }
 
 

@@ -366,7 +366,7 @@ def test_a_quantile_is_that_of_all_points_together() -> None:
     """Of one table of b0; three tables have a tuning for each point, where it has no effect."""
     how = {"points": (1e-3, 2e-3), "between": 0, "quantile": 0.5}
     one = ql.tune_schedule(axis, DT, **how)
-    assert one.joint.task.quantile == 0.5
+    assert one.details.joint.task.quantile == 0.5
     with pytest.raises(ValueError, match="quantile = 0.5: has no effect: there is one plant"):
         ql.tune_schedule(axis, DT, tables="all", **how)
 
@@ -377,18 +377,19 @@ def test_a_tuned_schedule_keeps_the_constraints_at_and_between_its_points(tmp_pa
     bounds = ql.tuning.Constraints(resolution=6e-6)
     how = {"constraints": bounds, "u_min": -2.0, "u_max": 2.0, "delay": DT}
     tuned = ql.tune_schedule(lambda J: axis(J, 2e-4), DT, points=(4e-4, 2e-3), **how)
-    assert [each.of_table for each in tuned.results] == [True, False, True]
-    assert tuned.m_s <= 1.61
-    assert max(each.m_t for each in tuned.results) <= 1.61
-    assert tuned.worst_ratio <= 1.15
-    ratio = tuned.schedule.b0[0] / tuned.schedule.b0[1]
+    points = tuned.details
+    assert [at in points.own for at in points.loops] == [True, False, True]
+    assert points.m_s <= 1.61
+    assert max(each.measures["M_t"] for each in points.loops.values()) <= 1.61
+    assert points.worst_ratio <= 1.15
+    ratio = points.schedule.b0[0] / points.schedule.b0[1]
     assert ratio == pytest.approx(5.0, rel=1e-6)
-    middle = analyse(axis(1.2e-3, 2e-4), tuned.controller.at(1.2e-3), delay=DT)
-    assert 1.0 / middle.margins.modulus == pytest.approx(tuned.results[1].m_s)
+    middle = analyse(axis(1.2e-3, 2e-4), tuned.design.controller.at(1.2e-3), delay=DT)
+    assert 1.0 / middle.margins.modulus == pytest.approx(points.loops[1.2e-3,].measures["M_s"])
     assert "NOT proved" in tuned.summary()
     tuned.save(tmp_path / "axis.toml")
     setup = load(tmp_path / "axis.toml")
-    assert list(setup.controller.controller.schedule.b0) == tuned.schedule.b0
+    assert list(setup.controller.controller.schedule.b0) == points.schedule.b0
     assert setup.controller.prefilter == tuned.judged.prefilter
     assert not tuned.judged.failures
     found = ql.simulate(setup.plant, setup.controller, setup.scenario)
@@ -400,10 +401,11 @@ def test_of_plants_that_are_known_at_points_only_the_summary_says_so() -> None:
     """They are given as a mapping. Where they are a function, it tells where M_s is above its bound between them."""
     tuned = ql.tune_schedule({0.0: axis(1e-3), 1.0: axis(2e-3)}, DT)
     assert "NOT known between the points" in tuned.summary()
-    assert len(tuned.results) == 2
+    assert len(tuned.designs) == 2
     few = ql.tune_schedule(lambda e: axis(2e-4 + 1.8e-3 * e**2), DT, points=(0.0, 1.0))
-    assert few.results[1].m_s > 1.9
-    assert f"NOT within M_s = 1.6: {few.results[1].m_s:.3f} at 0.5" in few.summary()
+    m_s = few.details.loops[0.5,].measures["M_s"]
+    assert m_s > 1.9
+    assert f"NOT within M_s = 1.6: {m_s:.3f} at 0.5" in few.summary()
 
 
 # ---- b0 online ----

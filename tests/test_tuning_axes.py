@@ -20,8 +20,9 @@ import quell as ql
 from quell.analysis import MultivariableLoop, analyse
 from quell.lti.models import System, zero_order_hold
 from quell.setup import SetupError, load, made
-from quell.tuning import Constraints, TunedAxes, tune_axes
+from quell.tuning import Constraints, Tuned
 from quell.tuning.axes import _exact, _given_gain, _made, _nominal, diagonal_entry
+from quell.tuning.interaction import Interaction
 from quell.tuning.optimiser.coupled import (
     CoupledLoops,
     Law,
@@ -59,9 +60,20 @@ def axes(mass: Any = M, **parts: Any) -> ql.Axes:
 
 
 @cache
-def tuned(own: bool = False) -> TunedAxes:
+def tuned(own: bool = False) -> Tuned:
     """Return tuned axes; ``own``: B0 is that of two single loops."""
-    return tune_axes(machine(), axes(np.diag(np.diag(M)) if own else M))
+    return ql.tune(machine(), controller=axes(np.diag(np.diag(M)) if own else M))
+
+
+def interaction(found: Tuned) -> Interaction:
+    """Return how the axes of a result act on each other."""
+    assert isinstance(found.details, Interaction)
+    return found.details
+
+
+def changed(**parts: Any) -> Tuned:
+    """Return the result with an interaction of other parts."""
+    return replace(tuned(), details=replace(interaction(tuned()), **parts))
 
 
 def channels(loop: MultivariableLoop) -> tuple[float, float]:
@@ -82,18 +94,22 @@ def test_the_bounds_hold_for_the_coupled_loop(own: bool) -> None:
     assert found.met
     assert m_s <= 1.602
     assert m_t <= 1.602
-    assert least >= 0.998 * found.disk
-    assert found.disk == pytest.approx(1.0 / math.sqrt(1.6**2 - 0.25))
+    assert least >= 0.998 * interaction(found).disk
+    assert interaction(found).disk == pytest.approx(1.0 / math.sqrt(1.6**2 - 0.25))
     # Something is at its limit, or the axes would be faster.
-    m_ks = [each.m_ks / found.alone[each.name].constraints.m_ks for each in found.axes]
-    assert max(m_s / 1.6, m_t / 1.6, found.disk / least, *m_ks) > 0.98
+    m_ks = [
+        each.measures["M_ks"] / (found.alone[each.name].constraints.m_ks or math.inf)
+        for each in found.axes
+    ]
+    assert max(m_s / 1.6, m_t / 1.6, interaction(found).disk / least, *m_ks) > 0.98
 
 
 @pytest.mark.trial
 def test_with_the_right_b0_the_coupling_costs_nothing_and_without_it_does() -> None:
     """Behind B0 the axes are two chains of integrators, and each is as good as alone."""
-    assert all(each.ratio == pytest.approx(1.0, abs=0.02) for each in tuned().axes)
-    costs = [math.prod(each.cost for each in tuned(own).axes) for own in (False, True)]
+    for each in tuned().axes:
+        assert each.objective == pytest.approx(each.measures["alone"], rel=0.02)
+    costs = [math.prod(each.objective for each in tuned(own).axes) for own in (False, True)]
     assert costs[1] > 1.5 * costs[0]
     assert "decoupled by this B0" in tuned().summary()
     assert (
@@ -127,20 +143,21 @@ def test_the_bandwidths_are_no_worse_than_those_of_a_grid() -> None:
             if np.min(-s.real / np.abs(s), initial=1.0) < 0.4:
                 continue
             best = min(best, ql.tuning.schedules.load_iae(loop))
-    assert found.axes[0].cost <= 1.02 * best
+    assert found.axes[0].objective <= 1.02 * best
 
 
 @pytest.mark.trial
 def test_b0_that_is_off_is_designed_for_and_checked() -> None:
     """Drawn errors keep the bounds, the loop is slower than with the exact B0, and no line asks for B0_off."""
-    found = tune_axes(machine(), axes(), B0_off=0.03, check_samples=50)
+    found = ql.tune(machine(), controller=axes(), B0_off=0.03, check_samples=50)
     assert found.met
     assert found.check is not None
     assert (found.check.samples, found.check.violating, found.check.unstable) == (50, 0, 0)
     assert all(
-        each.cost > theirs.cost for each, theirs in zip(found.axes, tuned().axes, strict=True)
+        each.objective > theirs.objective
+        for each, theirs in zip(found.axes, tuned().axes, strict=True)
     )
-    assert found.plants == 17
+    assert found.count == 17
     assert "50 drawn errors of B0: 0 exceed" in found.summary()
     assert "NOT known for another B0" in tuned().summary()
     assert "NOT known for another B0" not in found.summary()
@@ -154,7 +171,7 @@ def test_axes_with_limits_are_judged_in_their_file() -> None:
     limited.set_limits(u_min=-3.0, u_max=3.0)
     r = [ql.signals.Step(0.5, 0.1), ql.signals.Step(0.5, 0.5)]
     file = Written(machine(), ql.Scenario(r, duration=1.0), DT)
-    found = tune_axes(machine(), limited, written=file)
+    found = ql.tune(machine(), controller=limited, written=file)
     assert found.judged is not None
     run = ql.simulate(machine(), found.controller, file.scenario)
     for i, each in enumerate(found.judged.others):
@@ -171,9 +188,11 @@ def test_axes_with_limits_are_judged_in_their_file() -> None:
 def test_what_cannot_be_met_is_told_with_what_to_do() -> None:
     """A B0 with the wrong sign of a coupling that all but inverts the machine."""
     strong = np.array([[1.0, 0.97], [0.97, 1.0]]) * 1e-3
-    found = tune_axes(machine(strong), axes(np.array([[1.0, -0.9], [-0.9, 1.0]]) * 1e-3), disk=1.2)
+    found = ql.tune(
+        machine(strong), controller=axes(np.array([[1.0, -0.9], [-0.9, 1.0]]) * 1e-3), disk=1.2
+    )
     assert not found.met
-    assert found.excess > 1e-3
+    assert interaction(found).excess > 1e-3
     line = next(each for each in found.verdicts() if each.startswith("NOT met"))
     assert "give the B0 of the machine" in line
 
@@ -188,10 +207,10 @@ def of_tanks(B0: Any) -> ql.Axes:
 def test_a_zero_in_the_right_half_plane_is_named_and_the_given_b0_not_asked_for_again() -> None:
     """Tanks with their exact B0: no bandwidths are stable, and the inputs to pair are told."""
     plant = tanks((0.43, 0.34))
-    found = tune_axes(plant, of_tanks(plant.C @ plant.B))
+    found = ql.tune(plant, controller=of_tanks(plant.C @ plant.B))
     assert not found.met
-    assert found.given.is_of_plant
-    assert found.given.is_turned
+    assert interaction(found).given.is_of_plant
+    assert interaction(found).given.is_turned
     told = found.summary()
     assert "no bandwidths are stable with this B0" in told
     assert "a zero in the right half plane, at 0.0208" in told
@@ -208,9 +227,9 @@ def test_the_pairs_that_are_proposed_meet_the_bounds() -> None:
     """The same tanks with the other inputs; the B0 of the plant, which is worse, is not asked for."""
     plant = tanks((0.43, 0.34))
     rest = -plant.C @ np.linalg.solve(plant.A, plant.B) / np.array([[62.0], [90.0]])
-    found = tune_axes(plant, of_tanks(rest * [[0.0, 1.0], [1.0, 0.0]]))
+    found = ql.tune(plant, controller=of_tanks(rest * [[0.0, 1.0], [1.0, 0.0]]))
     assert found.met
-    assert found.given.pairing is None
+    assert interaction(found).given.pairing is None
     assert "give the B0" not in found.summary()
     assert "a zero in the right half plane" in found.summary()
 
@@ -246,7 +265,7 @@ def test_a_b0_is_compared_with_that_of_the_plant() -> None:
 def test_learners_and_limits_stay_and_are_not_in_the_bounds() -> None:
     """The axes keep their learner and guard; the margin with them is told beside the others."""
     given = axes(learner=ql.learners.Kalman(), guard=ql.Guard())
-    found = tune_axes(machine(), given)
+    found = ql.tune(machine(), controller=given)
     for before, after in zip(given.axes, found.controller.axes, strict=True):
         assert type(after.learner) is type(before.learner)
         assert before.omega_c == 8.0
@@ -258,6 +277,7 @@ def test_learners_and_limits_stay_and_are_not_in_the_bounds() -> None:
     ("how", "message"),
     [
         ({"B0_off": 1.0}, "B0_off = 1.0: must be a share from 0 to below 1"),
+        ({"B0_off": -0.1}, "B0_off = -0.1"),
         ({"disk": 2.0}, "disk = 2.0: must be below 2"),
         ({"objective": "tracking"}, "objective = 'tracking'"),
         ({"constraints": Constraints(u_max=3.0)}, "u_max is not bounded for axes"),
@@ -273,29 +293,31 @@ def test_learners_and_limits_stay_and_are_not_in_the_bounds() -> None:
 def test_bad_arguments_are_named(how: dict[str, Any], message: str) -> None:
     """By argument, value and rule."""
     with pytest.raises(ValueError, match=message):
-        tune_axes(machine(), axes(), **how)
+        ql.tune(machine(), controller=axes(), **how)
 
 
 def test_an_axis_that_cannot_be_tuned_is_named() -> None:
     """A B0 of the wrong sign, a law that is not linear, a plant of another size."""
     with pytest.raises(ValueError, match="axis x alone: v moves it the wrong way"):
-        tune_axes(machine(), axes(-M))
+        ql.tune(machine(), controller=axes(-M))
     with pytest.raises(ValueError, match="axis x: feedback is not linear"):
-        tune_axes(machine(), axes(feedback=ql.controllers.NonlinearFeedback((0.5, 0.5), 0.1)))
+        ql.tune(
+            machine(), controller=axes(feedback=ql.controllers.NonlinearFeedback((0.5, 0.5), 0.1))
+        )
     with pytest.raises(ValueError, match="the controller has 2 axes"):
-        tune_axes(([[0.0]], [[1.0]], [[1.0]]), axes())
-    with pytest.raises(ValueError, match="must be quell.Axes"):
-        tune_axes(machine(), axes().axes[0])  # type: ignore[arg-type]
+        ql.tune(([[0.0]], [[1.0]], [[1.0]]), controller=axes())
+    with pytest.raises(ValueError, match="must be quell.Axes; for one axis give dt and structure"):
+        ql.tune(machine(), controller=axes().axes[0])
 
 
 def test_axes_that_have_no_bandwidths_of_their_own_are_refused() -> None:
     """Compensators have no law, and axes that share a learner one lag filter; the error says what to do."""
     observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=DT)
     with pytest.raises(ValueError, match="axes: NOT tuned, they are compensators"):
-        tune_axes(machine(), ql.Axes([ql.Compensator(observer)] * 2, M=M))
+        ql.tune(machine(), controller=ql.Axes([ql.Compensator(observer)] * 2, M=M))
     shared = ql.Axes([ql.ADRC(observer, 8.0)] * 2, M=M, learner=of_all())
     with pytest.raises(ValueError, match="learner: NOT tuned with one for all axes"):
-        tune_axes(machine(), shared)
+        ql.tune(machine(), controller=shared)
 
 
 def of_all() -> Any:
@@ -321,17 +343,18 @@ def test_learners_of_all_axes_are_designed_for_the_tuned_bandwidths_and_told() -
         assert repr(mine.parameters.learner) == repr(theirs.parameters.learner)
         assert mine.learner.view.observers[0].omega_o == 300.0
     told = "NOT in any margin: what learners learn from the states of other axes"
-    assert told in replace(tuned(), controller=made).summary()
+    assert told in replace(tuned(), machine=made).summary()
     assert told not in tuned().summary()
 
 
 @pytest.mark.trial
 def test_what_the_margin_with_learners_does_not_have_is_told() -> None:
     """Remarks of that loop on learners; those on other operating points are told in other words."""
-    loop = copy.copy(tuned().loops[0])
+    loop = copy.copy(interaction(tuned()).loops[0])
     loop.remark = "NOT in these margins: how MLP of x adapts\nNOT judged at other points"
-    lines = replace(tuned(), with_learners=loop).verdicts()
-    assert lines[-1] == "NOT in these margins: how MLP of x adapts"
+    lines = changed(with_learners=loop).verdicts()
+    assert "NOT in these margins: how MLP of x adapts" in lines
+    assert not any("other points" in line for line in lines)
 
 
 def test_the_diagonal_entry_has_no_poles_of_the_other_axes() -> None:
@@ -374,8 +397,8 @@ def test_the_command_tunes_all_axes_of_a_setup(quell: Callable[..., Shown], tmp_
     out = tmp_path / "tuned.toml"
     again = load(out)
     for axis, result in zip(again.controller.axes, results["axes"], strict=True):
-        assert (axis.omega_c, axis.observer.omega_o) == (result["omega_c"], result["omega_o"])
-    assert max(each["m_s"] for each in results["axes"]) <= 1.503
+        assert (axis.omega_c, axis.observer.omega_o) == tuple(result["values"].values())
+    assert max(each["measures"]["M_s"] for each in results["axes"]) <= 1.503
     assert again.scenario is not None
 
 
@@ -454,7 +477,7 @@ def test_a_bound_of_damping_is_judged_as_the_others_are() -> None:
     assert found["damping"].ratio > 2.0
     assert found["M_s"].ratio < 1.0
     assert found["disk"].ratio < 1.0
-    told = replace(tuned(), met=False, excess=1.0, bounds=tuple(found.values())).verdicts()
+    told = changed(reached=tuple(found.values())).verdicts()
     line = next(each for each in told if each.startswith("NOT met"))
     assert f"damping of the poles is {found['damping'].value:.4g}, at least 0.99" in line
     assert "M_s" not in line
@@ -468,7 +491,7 @@ def test_a_result_without_enough_damping_does_not_meet_its_bounds() -> None:
     one = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=60.0, dt=DT), 8.0)
     bounds = Constraints(m_s=3.0, m_t=3.0, damping=0.9999)
     late = ql.plants.delayed_inputs(plant, 2 * DT, DT)
-    found = tune_axes(late, ql.Axes([one, one], B0=B0), constraints=bounds, B0_off=0.2)
+    found = ql.tune(late, controller=ql.Axes([one, one], B0=B0), constraints=bounds, B0_off=0.2)
     assert not found.met
     assert "damping of the poles is" in found.summary()
     assert found.to_json()["bounds"][-1]["name"] == "damping of the poles"

@@ -344,17 +344,25 @@ def test_rows_have_the_figures_of_each_design_and_reasons() -> None:
     one = tuned().design
     m = one.measures
     none = impossible("pid", "no controller")
-    first, second = report.rows({"pi": one, "pid": none}, "load")
-    assert first[:3] == ("pi", f"{one.objective:.4g}", f"{m['iae']:.3g}")
-    assert first[3:6] == (f"{m['M_s']:.3f}", f"{m['M_t']:.3f}", f"{m['M_ks']:.4g}")
+    headings, (first, second) = report.rows({"pi": one, "pid": none}, "load")
+    assert headings == ["structure", "k_i", "IAE", "M_s", "M_t", "M_ks", "delay margin"]
+    assert first[:3] == ["pi", f"{one.objective:.4g}", f"{m['iae']:.3g}"]
+    assert first[3:6] == [f"{m['M_s']:.3f}", f"{m['M_t']:.3f}", f"{m['M_ks']:.4g}"]
     assert first[7] == ""
     assert first[6].endswith(" ms")
-    assert second == ("pid", *["–"] * 6, "no controller")
-    (other,) = report.rows({"pi": one}, "load-iae")
-    assert other[2] == f"{one.k_i:.3g}"
+    assert second == ["pid", *["–"] * 6, "no controller"]
+    headings, (other,) = report.rows({"pi": one}, "load-iae")
+    assert (headings[2], other[2]) == ("k_i", f"{one.k_i:.3g}")
     assert (report.quantity("load"), report.quantity("tracking")) == ("k_i", "RMS of r − y")
-    assert (report.quantity("mine"), report.second_quantity("load-iae")) == ("mine", "k_i")
-    assert report.second_quantity("load") == "IAE"
+    assert report.quantity("mine") == "mine"
+
+
+def test_rows_of_axes_have_their_objective_over_that_alone_and_no_empty_column() -> None:
+    """Of what was measured only."""
+    one = replace(tuned().design, measures={"M_s": 1.5, "alone": 0.5 * tuned().design.objective})
+    headings, (row,) = report.rows({"x": one}, "load-iae")
+    assert headings == ["structure", "∫|y|", "k_i", "M_s", "over that alone"]
+    assert row[3:] == ["1.500", "2.000", ""]
 
 
 def test_active_constraints_have_their_frequency_and_plant() -> None:

@@ -16,20 +16,20 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
-from quell.analysis.loop import LoopAnalysis
+from quell.analysis.loop import LoopAnalysis, duration
 from quell.analysis.matrices import high_gains
 from quell.analysis.multivariable import sampled_matrices
-from quell.tuning import Constraints, TunedAxes, tune_axes
+from quell.tuning import Check, Constraints, Reached, Tuned
 from quell.tuning.axes import (
     _are_rows_of,
     _checked_bounds,
     _disk_of,
-    _excess,
     _off_by,
     _tightened,
     _with_errors,
     diagonal_entry,
 )
+from quell.tuning.interaction import GivenB0, excess
 from quell.tuning.optimiser import coupled, requirements
 from quell.tuning.optimiser.coupled import CoupledLoops, Found, Law, Limits, Measured, Plant, closed
 from quell.tuning.optimiser.loops import law_of, load_step, response, samples_of
@@ -43,7 +43,6 @@ from quell.tuning.optimiser.requirements import (
 )
 from quell.tuning.plants import given_plants, model_of, plant_set
 from quell.tuning.structures.registry import make_structure
-from quell.tuning.tuned_axes import AxesBound, AxesCheck, GivenB0
 
 from .cases import cases
 
@@ -63,7 +62,7 @@ def axes(**more: Any) -> ql.Axes:
 
 
 @cache
-def tuned() -> TunedAxes:
+def tuned() -> Tuned:
     """Return them tuned, by a short search, for entries of B0 that are off by 20 %."""
     short: dict[str, Any] = {"_FACTORS": (1.0,), "_ROUNDS": 2, "_ITERATIONS": 3}
     how: dict[str, Any] = {"constraints": Constraints(m_ks=3.0), "objective": "load"}
@@ -79,14 +78,17 @@ def tuned() -> TunedAxes:
         ],
     }
     with patch.multiple(coupled, **short):
-        return tune_axes(machine(), axes(), B0_off=0.2, check_samples=6, setup=setup, **how)
+        return ql.tune(
+            machine(), controller=axes(), B0_off=0.2, check_samples=6, setup=setup, **how
+        )
 
 
-def changed(**parts: Any) -> TunedAxes:
-    """Return the result with other parts; margins, which take long, are those of its own."""
-    found = replace(tuned(), **parts)
-    vars(found).update(disk_margins=tuned().disk_margins, m_s=tuned().m_s)
-    return found
+def changed(**parts: Any) -> Tuned:
+    """Return the result with other parts of its interaction; margins are those of its own."""
+    own = tuned().details
+    found = replace(own, **parts)
+    vars(found).update(disk_margins=own.disk_margins, m_s=own.m_s)
+    return replace(tuned(), details=found)
 
 
 # ---- axes
@@ -97,31 +99,33 @@ def test_decoupled_axes_are_tuned_as_each_alone_less_the_errors_of_b0() -> None:
     """Both the same; a lag of each costs as a single one, a bit more for 20 %; bounds hold."""
     found = tuned()
     assert found.met
-    assert found.excess <= 2e-3
-    assert (found.points, found.plants, found.B0_off) == (1, 1 + 2**3, 0.2)
+    between = found.details
+    assert between.excess <= 2e-3
+    assert (between.points, between.plants, between.B0_off) == (1, 1 + 2**3, 0.2)
     x, y = found.axes
     assert (x.name, y.name) == ("x", "y")
-    assert x.alone == pytest.approx(y.alone, rel=1e-3)
+    assert x.measures["alone"] == pytest.approx(y.measures["alone"], rel=1e-3)
     single = ql.tune(([1.0], [1.0, 1.0]), DT, structure="bandwidths", order=1, compare=(),
                      constraints=Constraints(m_ks=3.0), objective="load", written=False)  # fmt: skip
     # With b0 = 1, which is the gain of the axis, there is less freedom.
-    assert 1.0 < x.alone * single.design.k_i < 3.0
+    assert 1.0 < single.design.k_i / x.measures["alone"] < 3.0
     assert found.alone["x"].design.k_i == pytest.approx(single.design.k_i, rel=1e-4)
     for each in found.axes:
-        assert 1.0 <= each.ratio < 1.2
-        assert each.m_ks <= 3.0 * 1.003
-        assert each.omega_o <= 0.5 / DT * (1.0 + 1e-9)
+        assert 1.0 <= each.measures["alone"] / each.objective < 1.2
+        assert each.objective == each.k_i
+        assert each.measures["M_ks"] <= 3.0 * 1.003
+        assert each.values["omega_o"] <= 0.5 / DT * (1.0 + 1e-9)
     # A loop of one axis with its nominal plant, by ``analyse``.
-    one = ql.ADRC(ql.ESO.model_free(1, 1.0, x.omega_o, DT), x.omega_c)
+    one = ql.ADRC(ql.ESO.model_free(1, 1.0, x.values["omega_o"], DT), x.values["omega_c"])
     loop = analyse(([1.0], [1.0, 1.0]), one)
-    assert 1.0 / loop.margins.modulus <= x.m_s * 1.001
-    assert found.loops[0].stable
-    assert min(found.disk_margins) >= found.disk
-    assert found.controller.axes[0].omega_c == pytest.approx(x.omega_c)
-    assert found.controller.axes[1].observer.omega_o == pytest.approx(y.omega_o)
-    assert found.left is not None
-    assert found.left.factor == pytest.approx(1.0, abs=1e-6)
-    assert found.given.is_of_plant
+    assert 1.0 / loop.margins.modulus <= x.measures["M_s"] * 1.001
+    assert between.loops[0].stable
+    assert min(between.disk_margins) >= between.disk
+    assert found.controller.axes[0].omega_c == pytest.approx(x.values["omega_c"])
+    assert found.controller.axes[1].observer.omega_o == pytest.approx(y.values["omega_o"])
+    assert between.left is not None
+    assert between.left.factor == pytest.approx(1.0, abs=1e-6)
+    assert between.given.is_of_plant
     assert found.check is not None
     assert (found.check.samples, found.check.unstable, found.check.violating) == (6, 0, 0)
 
@@ -132,79 +136,79 @@ def test_the_report_of_axes_has_rows_bounds_and_files() -> None:
     lines = found.summary().splitlines()
     assert lines[0] == f"constraints: {found.constraints} of each channel, all others closed"
     x = found.axes[0]
+    m, between = x.measures, found.details
     assert lines[1] == (
-        f"x: omega_c {x.omega_c:.4g}, omega_o {x.omega_o:.4g}, 1/k_i {x.cost:.4g}, {x.ratio:.3f} of "
-        f"alone, M_s {x.m_s:.3f}, M_t {x.m_t:.3f}, M_ks {x.m_ks:.4g}"
+        f"x: k_i {x.objective:.4g}, M_s {m['M_s']:.3f}, M_t {m['M_t']:.3f}, M_ks {m['M_ks']:.4g}, "
+        f"delay margin {duration(m['delay_margin'])}, over that alone {x.k_i / m['alone']:.3f}"
     )
-    assert lines[3].startswith(f"disk margin {found.disk_margins[0]:.3f} of all inputs, ")
+    assert lines[3].startswith("active: ")
+    assert lines[4].startswith(f"disk margin {between.disk_margins[0]:.3f} of all inputs, ")
     assert any(line.startswith("decoupled by this B0: behind it a gain changes") for line in lines)
-    assert lines[-1].startswith("6 drawn errors of B0: 0 exceed a bound, 0 of them unstable")
-    assert repr(found) == "TunedAxes of 2 axes:\n" + found.summary()
+    assert any(line.startswith("6 drawn errors of B0: 0 exceed a limit, 0 of") for line in lines)
+    assert repr(found) == "Tuned 2 axes:\n" + found.summary()
     tables = tomllib.loads(found.toml())
     for table, axis in zip(tables["axis"], found.axes, strict=True):
-        assert table["observer"]["omega_o"] == axis.omega_o
-        assert table["controller"]["omega_c"] == axis.omega_c
+        assert table["observer"]["omega_o"] == axis.values["omega_o"]
+        assert table["controller"]["omega_c"] == axis.values["omega_c"]
     assert tables["axis"][1]["controller"]["kind"] == "adrc"
     shown = json.loads(json.dumps(found.to_json(), default=float))
-    assert [each["omega_c"] for each in shown["axes"]] == [each.omega_c for each in found.axes]
+    assert [each["values"] for each in shown["axes"]] == [each.values for each in found.axes]
     assert shown["check"]["violating"] == 0
     assert shown["coupled"]["behind_B0"] == pytest.approx(1.0)
     assert shown["met"] is True
     with pytest.raises(ValueError, match="there is no setup to complete"):
-        changed(setup={}).toml()
+        replace(found, setup={}).toml()
 
 
 def test_what_is_not_known_of_axes_is_said() -> None:
     """No B0_off, bounds that are not met, limits of u, a B0 that is not that of the plant."""
-    found = changed(check=None, B0_off=0.0)
-    assert "NOT known for another B0 than this one" in found.verdicts()[-1]
-    bad = AxesBound("M_s of x", 2.0, 1.6, 1.25)
-    fine = AxesBound("M_t of x", 1.0, 1.6, 0.625)
-    missed = {"check": None, "met": False, "bounds": (bad, fine)}
-    plain = changed(**missed, B0_off=0.0)
-    (line,) = [each for each in plain.verdicts() if each.startswith("NOT met")]
-    assert line == (
+
+    def told(**parts: Any) -> str:
+        """Return the line on bounds that are not met."""
+        (line,) = [each for each in changed(**parts).verdicts() if each.startswith("NOT met")]
+        return line
+
+    assert any(
+        each.startswith("NOT known for another B0 than this one")
+        for each in changed(B0_off=0.0).verdicts()
+    )
+    bad = Reached("M_s of x", 2.0, 1.6, 1.25)
+    fine = Reached("M_t of x", 1.0, 1.6, 0.625)
+    missed = {"reached": (bad, fine)}
+    assert told(**missed, B0_off=0.0) == (
         "NOT met with the best bandwidths that were found: M_s of x is 2, at most 1.6 is asked for; "
         "give looser bounds, less delay or faster samples"
     )
-    off = changed(**missed)
-    assert "B0 has to be known better than to 20 %, or the bounds be looser" in off.verdicts()[1]
+    assert "B0 has to be known better than to 20 %, or the bounds be looser" in told(**missed)
     given = GivenB0(False, True, False, (), None)
-    mixed = changed(**missed, given=given, left=None)
-    assert "the axes are coupled through this B0: give the B0 of the machine" in mixed.verdicts()[1]
-    unknown = changed(**missed, left=None, given=given._replace(is_other_better=None))
-    assert "give the B0 of the machine, if this is not it" in unknown.verdicts()[1]
-    dynamic = changed(**missed, left=None, given=given._replace(is_other_better=False))
-    assert "a constant B0 does not undo it" in dynamic.verdicts()[1]
-    turned = changed(**missed, left=None, given=GivenB0(True, False, True, (), (1, 0)))
-    assert "determinant of the wrong sign. To be tried: pair by the gains at rest, x with input 2, y with input 1" in turned.verdicts()[1]  # fmt: skip
-    assert turned.verdicts()[1].endswith(", or choose other inputs or outputs")
-    zeros = changed(**missed, left=None, given=GivenB0(True, False, False, (0.5 + 0j,), None))
-    assert zeros.verdicts()[1].endswith(
-        "To be tried: choose other inputs or outputs, or give looser bounds"
-    )
+    mixed = told(**missed, given=given, left=None)
+    assert "the axes are coupled through this B0: give the B0 of the machine" in mixed
+    unknown = told(**missed, left=None, given=given._replace(is_other_better=None))
+    assert "give the B0 of the machine, if this is not it" in unknown
+    dynamic = told(**missed, left=None, given=given._replace(is_other_better=False))
+    assert "a constant B0 does not undo it" in dynamic
+    turned = told(**missed, left=None, given=GivenB0(True, False, True, (), (1, 0)))
+    assert "determinant of the wrong sign. To be tried: pair by the gains at rest, x with input 2, y with input 1" in turned  # fmt: skip
+    assert turned.endswith(", or choose other inputs or outputs")
+    zeros = told(**missed, left=None, given=GivenB0(True, False, False, (0.5 + 0j,), None))
+    assert zeros.endswith("To be tried: choose other inputs or outputs, or give looser bounds")
 
 
 def test_bounds_and_checks_of_axes_are_sentences() -> None:
     """At most, at least, and one without a value."""
-    assert (
-        str(AxesBound("M_s of x", 1.65, 1.6, 1.03)) == "M_s of x is 1.65, at most 1.6 is asked for"
-    )
-    disk = AxesBound("disk margin of all inputs", 0.5, 0.6, 1.2, True)
+    assert str(Reached("M_s of x", 1.65, 1.6, 1.03)) == "M_s of x is 1.65, at most 1.6 is asked for"
+    disk = Reached("disk margin of all inputs", 0.5, 0.6, 1.2, True)
     assert str(disk) == "disk margin of all inputs is 0.5, at least 0.6 is asked for"
     assert (
-        str(AxesBound("the loop is not stable", math.nan, 1.0, math.inf))
-        == "the loop is not stable"
+        str(Reached("the loop is not stable", math.nan, 1.0, math.inf)) == "the loop is not stable"
     )
-    check = AxesCheck(200, 1, 3, (0.003, 0.043))
+    check = Check(200, 1, 3, (0.003, 0.043), of="drawn errors of B0")
     assert str(check) == (
-        "200 drawn errors of B0: 3 exceed a bound, 1 of them unstable; a share of 0.3 to 4.3 % "
+        "200 drawn errors of B0: 3 exceed a limit, 1 of them unstable; a share of 0.3 to 4.3 % "
         "(95 % interval)"
     )
-    assert _excess([AxesBound("a", 1.0, 1.0, 0.9), AxesBound("b", 1.0, 1.0, 1.2)]) == pytest.approx(
-        0.2
-    )
-    assert _excess([AxesBound("a", 1.0, 1.0, 0.9)]) == 0.0
+    assert excess([Reached("a", 1.0, 1.0, 0.9), Reached("b", 1.0, 1.0, 1.2)]) == pytest.approx(0.2)
+    assert excess([Reached("a", 1.0, 1.0, 0.9)]) == 0.0
 
 
 def test_a_disk_margin_follows_from_m_s_and_m_t() -> None:
@@ -224,20 +228,21 @@ def test_a_disk_margin_follows_from_m_s_and_m_t() -> None:
 @cases(
     ("options", "message"),
     [
-        ({"B0_off": 1.0}, "B0_off = 1.0: must be a share from 0 to below 1"),
-        ({"B0_off": -0.1}, "B0_off = -0.1"),
-        ({"disk": 2.0}, "disk = 2.0: must be below 2"),
-        ({"objective": "tracking"}, "objective = 'tracking'"),
-        ({"check_samples": 0}, "check_samples = 0"),
-        ({"seed": -1}, "seed = -1"),
+        ({"dt": DT}, "dt = 0.05: has no effect: with a controller"),
+        ({"structure": "pi"}, "structure = 'pi': has no effect: with a controller"),
+        ({"u_max": 1.0}, "u_max = 1.0: has no effect: with a controller"),
+        ({"b_range": (0.8, 1.2)}, r"b_range = \(0.8, 1.2\): has no effect"),
     ],
 )
-def test_arguments_of_axes_out_of_range_are_named(options: Any, message: str) -> None:
-    """Before anything is tuned."""
+def test_options_of_one_axis_are_refused_with_a_controller_and_the_reverse(
+    options: Any, message: str
+) -> None:
+    """Before anything is tuned; the error names the option."""
     with pytest.raises(ValueError, match=message):
-        tune_axes(machine(), axes(), **options)
-    with pytest.raises(ValueError, match="of one axis, use tune"):
-        tune_axes(machine(), ql.ADRC(ql.ESO.model_free(1, 1.0, 4.0, DT), 2.0))  # type: ignore[arg-type]
+        ql.tune(machine(), controller=axes(), **options)
+    for name, value in (("disk", 0.5), ("B0_off", 0.1), ("operating_points", [[0.0]])):
+        with pytest.raises(ValueError, match=f"{name} = .*: has no effect: without controller="):
+            ql.tune(([1.0], [1.0, 1.0]), DT, **{name: value})
 
 
 def test_bounds_are_tightened_by_a_share() -> None:

@@ -126,7 +126,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     add_on = ql.tuning.tune_compensator(([1.0], [1.0, 1.0, 0.0]), pid, speeds=(1.0, 1.0))
     axes = ql.Axes([adrc(), adrc()])
     lags = ql.plants.LinearPlant(-np.eye(2), np.eye(2), np.eye(2))
-    coupled = ql.tuning.tune_axes(lags, axes)
+    coupled = ql.tune(lags, controller=axes)
     machine = ql.simulate(lags, axes, ql.Scenario((1.0, 0.5), duration=1.0))
     short = ql.Scenario((1.0, 0.5), duration=0.2)
     machines = ql.simulate([lags] * 2, axes, short)
@@ -152,7 +152,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         "BatchTrajectory": Case(batch.plot, 2),
         "batch of axes": Case(machines.plot, 4),
         "Tuned": Case(tuned.plot, 4),
-        "TunedCompensator": Case(add_on.plot, 1),
+        "tuned compensator": Case(add_on.plot, 1),
         "Identified": Case(model.plot, 7),
         "free swing": Case(swing.plot, 2),
         "frequency response": Case(response.plot, 3),
@@ -210,8 +210,8 @@ _PUBLIC = {
     "tuning/schedules.py plot": "tuned schedule",
     "records/trajectory.py plot": "Trajectory",  # and BatchTrajectory, of one axis and of several
     "tuning/tuned.py plot": "Tuned",
-    "tuning/tuned_axes.py plot": "tuned axes",
-    "tuning/compensator.py plot": "TunedCompensator",
+    "tuning/interaction.py plot": "tuned axes",
+    "tuning/compensator.py plot": "tuned compensator",
     "identification/result.py plot": "Identified",
     "identification/swings.py plot": "free swing",
     "identification/frequencies.py plot": "frequency response",

@@ -31,7 +31,7 @@ _LONGEST = 16
 
 CALLS: dict[str, Callable[..., Any]] = {
     "tune": tuning.tune,
-    "tune_axes": tuning.tune_axes,
+    "tune_axes": lambda plant, axes, **given: tuning.tune(plant, controller=axes, **given),
     "tune_compensator": tuning.tune_compensator,
     "tune_schedule": tuning.tune_schedule,
     "identify": identification.identify,

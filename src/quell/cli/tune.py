@@ -315,7 +315,6 @@ def with_rig_table(tuned: Tuned, rig: Rig) -> Tuned:
 
 
 _BOUNDS = ("m_s", "m_t", "m_ks", "damping", "noise_std", "resolution")
-_HEADINGS = ("M_s", "M_t", "M_ks", "delay\nmargin")
 
 
 def tune(
@@ -455,9 +454,7 @@ def tune(
                 return _tune_compensator(console, setup, options, trust, out, outputs)
         plant, dt, options, name = _plant(setup, num, den, dt, options, works, trust)
         tuned = _tuned(console, plant, dt, options)
-        _print(console, tuned, name)
-        _write(console, tuned, out, outputs)
-        return ExitCode.DONE
+        return _shown(console, tuned, name, out, outputs)
     if num or den or (delay is not None) or (rig.device is not None and setup is not None):
         raise ValueError("setup: a record or --device goes without --num, --den and --delay")
     _bounds(options)
@@ -504,12 +501,10 @@ def _tune_compensator(
     """Tune the compensator of a setup; its controller stays as it is."""
     from quell.controllers.compensated import Compensated
     from quell.controllers.prefilters import without_prefilters
-    from quell.files import written_atomically
     from quell.setup import load, varied
     from quell.setup.loading import unchecked
     from quell.simulation import Scenario
     from quell.tuning import Constraints, tune_compensator
-    from quell.tuning.report import toml_text
     from quell.tuning.tables import late_tables
     from quell.tuning.written import Written
 
@@ -535,25 +530,8 @@ def _tune_compensator(
     with console.status("tuning the compensator"):
         how: dict[str, Any] = {"constraints": bounds, "delay": delay, "file": loop_of}
         tuned = tune_compensator(plant, both.controller, **how)
-    print_line(console, f"{setup.title}, dt = {both.dt:g} s")
-    print_line(console, str(tuned))
-    if out is not None:
-        text = toml_text(file_with(tuned.tables["observer"]).tables(), str(tuned))
-        with written_atomically(out, outputs.overwrite) as part:
-            part.write_text(text, encoding="utf-8")
-        print_line(console, f"Setup: {out}")
-    return _written(console, tuned, tuned.plot() if outputs.figures else None, outputs)
-
-
-def _written(console: Console, tuned: Any, axes: Any, outputs: Outputs) -> int:
-    """Save the figure of ``axes``, if there is one, and the results; return the exit code."""
-    paths = []
-    if outputs.figures is not None and axes is not None:
-        from quell.experiments.common import save_figure
-
-        paths += save_figure(axes.figure, outputs.figures, "tuned", outputs.overwrite)
-    write_results(console, tuned.to_json(), outputs, paths)
-    return ExitCode.DONE
+    tables = file_with(tuned.design.tables["observer"]).tables()
+    return _shown(console, replace(tuned, setup=tables), setup.title, out, outputs)
 
 
 def _tune_schedule(
@@ -567,31 +545,13 @@ def _tune_schedule(
 ) -> int:
     """Tune one controller with a schedule for the operating points of a setup."""
     from quell.setup.points import schedule_task
-    from quell.tuning import report, tune_schedule
+    from quell.tuning import tune_schedule
 
     task = schedule_task(path, options, trust, limits)
     with progress_bar(console, "tuning") as bar:
         progress = partial(_progress, bar)
         tuned = tune_schedule(task.plant, task.dt, progress=progress, **task.options)
-    points = f"{len(tuned.own)} operating points"
-    print_line(console, f"{task.setup.title}, dt = {task.dt:g} s, {points}")
-    print_line(console, f"constraints: {tuned.constraints}")
-    if tuned.noise_bound:
-        print_line(console, tuned.noise_bound)
-    headings = ("b0", "M_s", "M_t", report.quantity("load-iae"), "over that of\nits own tuning")
-    rows = table("Loops at fixed signals", " and ".join(tuned.schedule.signals), *headings)
-    for row in tuned.rows():
-        rows.add_row(*row)
-    console.print(rows)
-    for line in tuned.verdicts():
-        print_line(console, line)
-    controller = tuned.controller
-    observer = f"omega_o = {controller.observer.omega_o:.5g}"
-    print_line(console, f"omega_c = {controller.omega_c:.5g}, {observer}, {tuned.schedule}")
-    if out is not None:
-        tuned.save(out, outputs.overwrite)
-        print_line(console, f"Setup: {out}")
-    return _written(console, tuned, tuned.plot()[0] if outputs.figures else None, outputs)
+    return _shown(console, tuned, task.setup.title, out, outputs)
 
 
 def _tune_axes(
@@ -604,41 +564,31 @@ def _tune_axes(
 ) -> int:
     """Tune the bandwidths of all axes of a setup, for the coupled loop."""
     from quell.setup.axes import axes_task
-    from quell.tuning.axes import tune_axes
-    from quell.tuning.tuned_axes import quantity
     from quell.tuning.written import Written
 
     usable = {"m_s", "m_t", "m_ks", "damping", "objective"}
     rule = "is for one axis; of several m_s, m_t, m_ks, damping and objective count, and [tune]"
     refuse({name: (value, None) for name, value in options.items() if name not in usable}, rule)
     setup, how = axes_task(path, options, trust)
-    plant = setup.needed("plant")
-    axes: Any = setup.controller
-    with progress_bar(console, "tuning") as bar:
-        if setup.scenario is not None:
-            how["written"] = Written(plant, setup.scenario, axes.dt)
-        tuned = tune_axes(plant, axes, progress=partial(_progress, bar), **how)
-    count = len(axes.names)
-    print_line(console, f"{setup.title}, dt = {axes.dt:g} s, {count} axes, {tuned.plants} plants")
-    print_line(console, f"constraints: {tuned.constraints} of each channel, all others closed")
-    cost = (quantity(tuned.objective), "over that\nof alone")
-    rows = table("The coupled loop", "axis", "omega_c", "omega_o", *cost, "M_s", "M_t", "M_ks")
-    for row in tuned.rows():
-        rows.add_row(*row)
-    console.print(rows)
-    for line in tuned.verdicts():
-        print_line(console, line)
-    if out is not None:
-        tuned.save(out, outputs.overwrite)
-        print_line(console, f"Setup: {out}")
-    return _written(console, tuned, tuned.plot()[0] if outputs.figures else None, outputs)
+    plant, axes = setup.needed("plant"), setup.controller
+    if setup.scenario is not None:
+        how["written"] = Written(plant, setup.scenario, axes.dt)
+    tuned = _tuned(console, plant, None, how | {"controller": axes})
+    return _shown(console, tuned, setup.title, out, outputs)
 
 
-def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:
+def _tuned(console: Console, plant: Any, dt: float | None, options: dict[str, Any]) -> Tuned:
     from quell.tuning import tune as tuned_for
 
     with progress_bar(console, "tuning") as report:
         return tuned_for(plant, dt, progress=partial(_progress, report), **options)
+
+
+def _shown(console: Console, tuned: Tuned, name: str, out: Path | None, outputs: Outputs) -> int:
+    """Print a result and write what is asked for; return the exit code."""
+    _print(console, tuned, name)
+    _write(console, tuned, out, outputs)
+    return ExitCode.DONE
 
 
 def _write(
@@ -715,34 +665,24 @@ def _numbers(name: str, text: str) -> list[float]:
 
 
 def _print(console: Console, tuned: Tuned, name: str) -> None:
-    from quell.tuning import report
-
-    count = len(tuned.plants.plants)
-    plants = "1 plant" if count == 1 else f"{count} plants"
-    print_line(console, f"{name}, dt = {tuned.plants.dt:g} s, {plants}")
-    print_line(console, f"constraints: {tuned.constraints}")
-    for line in tuned.noise:
+    plants = "1 plant" if tuned.count == 1 else f"{tuned.count} plants"
+    axes = f", {len(tuned.axes)} axes" if len(tuned.axes) > 1 else ""
+    print_line(console, f"{name}, dt = {tuned.controller.dt:g} s{axes}, {plants}")
+    for line in (tuned.bounds, *tuned.noise):
         print_line(console, line)
-    quantity = report.quantity(tuned.objective)
-    headings = ("structure", quantity, report.second_quantity(tuned.objective), *_HEADINGS)
     # With so little white space 80 columns hold all names.
     tight: dict[str, Any] = {"padding": (0, 1, 0, 0), "pad_edge": False}
+    headings, entries = tuned.rows()
+    headings = [each.replace("delay ", "delay\n").replace("over ", "over\n") for each in headings]
     rows = table("Optima under these constraints", *headings, **tight)
-    reasons = []
-    for label, *cells, reason in report.rows(tuned.designs, tuned.objective):
-        rows.add_row(f"[bold]{label}[/]" if label == tuned.design.name else label, *cells)
+    chosen, reasons = {design.name for design in tuned.axes}, []
+    for label, *cells, reason in entries:
+        bold = len(entries) > len(chosen) and label in chosen
+        rows.add_row(f"[bold]{label}[/]" if bold else label, *cells)
         reasons += [f"{label}: {reason}"] if reason else []
     console.print(rows)
-    for line in (*reasons, f"active: {', '.join(tuned.active) or 'no constraint'}", *tuned.costs):
+    for line in (*reasons, *tuned.lines()):
         print_line(console, line)
-    for line in report.tradeoff_lines(tuned.tradeoff, tuned.objective):
-        print_line(console, f"with {line}")
-    print_line(console, tuned.damping)
-    for line in tuned.in_the_file:
-        print_line(console, line)
-    if tuned.check is not None:
-        print_line(console, str(tuned.check))
-    values = ", ".join(f"{key} = {value:.5g}" for key, value in tuned.design.values.items())
-    print_line(console, f"{tuned.design.name}: {values}")
-    for line in tuned.nots:
-        print_line(console, line)
+    for design in tuned.axes:
+        values = ", ".join(f"{key} = {value:.5g}" for key, value in design.values.items())
+        print_line(console, f"{design.name}: {values}")

@@ -55,8 +55,6 @@ from quell.setup.schema import (
     read,
 )
 from quell.simulation.scenario import Scenario
-from quell.tuning.axes import OBJECTIVES
-from quell.tuning.constraints import Constraints
 from quell.types import Matrix
 
 if TYPE_CHECKING:  # these types are made at run time, which a type checker cannot follow
@@ -181,56 +179,10 @@ def _markov(plant: LinearPlant, orders: Sequence[int]) -> Matrix:
 # ---- Tuning ----
 
 
-def tuning_of_axes(
-    m_s: float | None = 1.6,
-    m_t: float | None = 1.6,
-    m_ks: float | None = None,
-    damping: float | None = 0.4,
-    noise_over_pi: float | None = 10.0,
-    omega_o_dt: float = 0.5,
-    disk: float | None = None,
-    B0_off: float = 0.0,
-    operating_points: Sequence[Sequence[float]] | None = None,
-    objective: str = "load-iae",
-) -> dict[str, Any]:
-    """Return the arguments of ``quell.tuning.tune_axes``.
-
-    Parameters
-    ----------
-    m_s, m_t
-        largest sensitivity and complementary sensitivity of each channel, all others closed.
-    m_ks
-        largest gain from y to v of each axis [1/s^n]; by default from its own tuning.
-    damping
-        least damping of the closed loop's poles.
-    noise_over_pi, omega_o_dt
-        as in `[tune]` of one axis.
-    disk
-        least disk margin of all inputs, and of all outputs, at once; by default what a single loop
-        has with these m_s and m_t.
-    B0_off
-        share by which each entry of B0 may be off.
-    operating_points
-        states of a nonlinear plant at rest, in each of which the bounds hold; by default the start
-        of the scenario alone.
-    objective
-        `load-iae` or `load`.
-    """
-    bounds: dict[str, Any] = {"m_s": m_s, "m_t": m_t, "m_ks": m_ks, "damping": damping}
-    limits: dict[str, Any] = {"noise_over_pi": noise_over_pi, "omega_o_dt": omega_o_dt}
-    return {
-        "constraints": Constraints(**bounds, **limits),
-        "disk": disk,
-        "B0_off": B0_off,
-        "operating_points": operating_points,
-        "objective": checks.one_of("objective", objective, OBJECTIVES),
-    }
-
-
 def axes_task(
     path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None, trust: bool = False
 ) -> tuple[Setup, dict[str, Any]]:
-    """Read a setup file of several axes; return it and the arguments of ``tune_axes``.
+    """Read a setup file of several axes; return it and further arguments of ``tune``.
 
     ``changes`` are values of ``[tune]`` by name. Raises ``SetupError`` as ``load``, and for a
     file without plant.
@@ -242,8 +194,8 @@ def axes_task(
     setup = assembled_axes(name, tables, trust)
     check_windows(setup)
     plant = setup.needed("plant")
-    options = dict(setup.tune or tuning_of_axes())
-    if options["operating_points"] is None and _is_nonlinear(plant):
+    options = dict(setup.tune or {})
+    if options.get("operating_points") is None and _is_nonlinear(plant):
         x0 = None if setup.scenario is None else setup.scenario.x0
         order = getattr(_inner(plant), "order", 0)
         options["operating_points"] = [np.zeros(order) if x0 is None else np.asarray(x0)[:order]]
@@ -323,7 +275,6 @@ SCENARIO = call_table(
     types={"disturbances": list_of(registry.Signal)},
     without=("reference", "noise", "schedule"),
 )
-TUNE = call_table("tune", tuning_of_axes, only=True)
 METRICS = call_table("metrics", Trajectory.metrics, only=True, without=("target",))
 if not TYPE_CHECKING:
     AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
@@ -331,7 +282,7 @@ if not TYPE_CHECKING:
     Observer, Learner = one_of(OBSERVERS), registry.Learner
     AxisDrive, OnTop = one_of(DRIVES, default="pid"), ON_TOP
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
-    Rig, Sweep, Tune = registry.AxesRig, registry.Sweep, TUNE
+    Rig, Sweep, Tune = registry.AxesRig, registry.Sweep, registry.AxesTune
 
 
 class Axis(Table):

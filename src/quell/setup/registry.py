@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -50,8 +50,9 @@ from quell.setup.schema import PLANTS as PLANTS
 from quell.setup.schema import CallTable, Plant, Table, call_table, list_of, one_of
 from quell.simulation.scenario import Scenario as SimulationScenario
 from quell.sweeping.runs import Normal, Range
+from quell.tuning.axes import BOUNDS_TOGETHER, OBJECTIVES
 from quell.tuning.constraints import Constraints
-from quell.tuning.tune import tune
+from quell.tuning.tune import ONLY_TOGETHER, tune
 
 
 class Point(Table):
@@ -388,8 +389,10 @@ _RIG = {
 _BOUNDS = tuple(inspect.signature(Constraints).parameters)
 _NOT_IN_FILES = (
     *("constraints", "operating_point", "uncertain", "setup", "written", "progress"),
-    *("scenario", "search"),
+    *("scenario", "search", "controller", *ONLY_TOGETHER),
 )
+_OF_ALL = {*inspect.signature(tune).parameters, *_BOUNDS, "trials", "storage", "schedule"}
+_OF_SEVERAL = {"objective", "check_samples", "seed", *ONLY_TOGETHER, *BOUNDS_TOGETHER}
 Points = call_table(
     "schedule",
     points_table,
@@ -408,6 +411,17 @@ Tune = call_table(
         "feedforward": one_of(FEEDFORWARDS, flag=True),
     },
     without=_NOT_IN_FILES,
+)
+AxesTune = call_table(
+    "tune",
+    tuning,
+    only=True,
+    forwards_to=(tune, Constraints),
+    types={
+        "objective": Literal[OBJECTIVES],
+        "operating_points": Sequence[Sequence[float]] | None,
+    },
+    without=tuple(_OF_ALL - _OF_SEVERAL),
 )
 _NO_KEYS = ("duration", "on_change", "overwrite")
 Sweep = call_table("sweep", sweep_table, only=True)

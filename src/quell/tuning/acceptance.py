@@ -12,7 +12,7 @@ several axes; and a controller that is meant for a set of plants, for some of th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -175,6 +175,13 @@ def prefilter_table(prefilter: Any) -> dict[str, Any]:
     without = {"rate_limit": math.inf, "smoothing": 0.0}
     known = {key: value for key, value in vars(prefilter).items() if value != without.get(key)}
     return {"kind": "reference-model" if model else "profile-generator"} | known
+
+
+def with_prefilter(tables: Mapping[str, Any], prefilter: Any) -> dict[str, Any]:
+    """Return tables of a setup file with that of a prefilter, if there is one they do not have."""
+    if prefilter is None or "prefilter" in tables:
+        return dict(tables)
+    return {"prefilter": prefilter_table(prefilter), **tables}
 
 
 def time_constant(analysis: LoopAnalysis, plants: PlantSet) -> float:

@@ -1,4 +1,4 @@
-"""``tune_axes``: the bandwidths of coupled axes, so that all bounds hold for the whole.
+"""The bandwidths of coupled axes, so that all bounds hold for the whole; a part of ``tune``.
 
 Each axis is tuned alone first, on its own diagonal entry of the plant behind B0 (``tuning.tune``),
 or on ``b/s^n`` where that entry cannot be stabilised by itself. That is optimal where the axes do
@@ -83,6 +83,7 @@ from quell.tuning.axes_at_limits import (
     with_prefilters,
 )
 from quell.tuning.constraints import Constraints, first_given, given_constraints
+from quell.tuning.interaction import PLACES, TOLERANCE, GivenB0, Interaction, Reached, excess
 from quell.tuning.optimiser.coupled import (
     UNSTABLE,
     CoupledLoops,
@@ -90,20 +91,12 @@ from quell.tuning.optimiser.coupled import (
     Law,
     Limits,
     Plant,
+    integral_gain,
     optimum,
     starts,
 )
-from quell.tuning.tune import tune
-from quell.tuning.tuned import Tuned
-from quell.tuning.tuned_axes import (
-    PLACES,
-    TOLERANCE,
-    AxesBound,
-    AxesCheck,
-    AxisResult,
-    GivenB0,
-    TunedAxes,
-)
+from quell.tuning.report import Design
+from quell.tuning.tuned import Check, Tuned
 from quell.tuning.written import Written, bounded
 from quell.types import Matrix, Progress, Vector
 
@@ -130,92 +123,35 @@ _SAME_B0, _FREQUENCIES = 0.01, 40
 _ROUNDED = 1e-12
 # Least sum of squares that is divided by.
 _TINY = float(np.finfo(np.float64).tiny)
-# Bounds of ``Constraints`` that are not for axes.
-_NOT_HERE = ("u_std", "noise_std", "resolution", "delay_margin", "u_max", "rate_max")
+BOUNDS_TOGETHER = ("m_s", "m_t", "m_ks", "damping", "noise_over_pi", "omega_o_dt")
+"""Bounds of ``Constraints`` that are for several axes."""
 OBJECTIVES = ("load-iae", "load")
 
 
-def tune_axes(
+def tune_together(
+    alone: Callable[..., Tuned],
     plant: Any,
     axes: Axes,
     *,
-    constraints: Constraints | None = None,
-    disk: float | None = None,
-    B0_off: float = 0.0,
-    operating_points: Sequence[Any] | None = None,
-    objective: str = "load-iae",
-    check_samples: int = 200,
-    seed: int = 0,
-    setup: Mapping[str, Any] | None = None,
-    written: Written | None = None,
-    progress: Progress | None = None,
-) -> TunedAxes:
+    constraints: Constraints | None,
+    disk: float | None,
+    B0_off: float,
+    operating_points: Sequence[Any] | None,
+    objective: str,
+    check_samples: int,
+    seed: int,
+    setup: Mapping[str, Any] | None,
+    written: Written | bool,
+    progress: Progress | None,
+) -> Tuned:
     """Return axes with the best bandwidths under bounds for the coupled loop.
 
-    omega_c and omega_o of each axis are chosen; all else of the axes, and B0, stays. Learners are
-    not in the bounds. How it works, and what is bounded, stands in ``quell.tuning.axes``.
-
-    Parameters
-    ----------
-    plant
-        a plant with an output for each axis, as for ``analysis.analyse``, in continuous time:
-        a ``LinearPlant`` or matrices (A, B, C), one behind delays or encoders (which
-        are left out), or a nonlinear one with its operating points.
-    axes
-        the controller, whose orders, forms of observers, B0 and names are kept.
-    constraints
-        bounds m_s, m_t, m_ks [1/s^n], damping, noise_over_pi and omega_o_dt; those of ``tune`` by
-        default, m_ks from the tuning of each axis alone. The others are refused.
-    disk
-        least disk margin of all inputs, and of all outputs, at once; by default what a single loop
-        has with m_s and m_t.
-    B0_off
-        share by which each entry of B0 may be off, 0.2 for 20 %.
-    operating_points
-        of a nonlinear plant, the nominal one first: states x, for which the u that holds them is
-        found, or (x, u). The bounds hold at each of them.
-    objective
-        ``"load-iae"`` or ``"load"``, as for ``tune``.
-    check_samples
-        drawn errors of B0 with which the result is checked.
-    seed
-        of the drawn errors.
-    setup
-        tables of a setup file of these axes, which ``TunedAxes.toml`` completes.
-    written
-        plant and scenario of that file, in which the axes are judged; by default the plant, and a
-        step of each reference that uses 40 % of the range of an actuator.
-    progress
-        called with what is done and its share.
-
-    Returns
-    -------
-    TunedAxes
-        ``met`` says whether all bounds hold; if they can't, a line that begins with NOT says what
-        to do.
-
-    Raises
-    ------
-    ValueError
-        for arguments out of range, a plant that does not fit or is sampled, an axis that cannot be
-        tuned alone (it is named), one whose law is not linear, axes of compensators, and those
-        with one learner for all.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import quell as ql
-    >>> M = np.array([[1.2, 0.35], [0.35, 0.2]])
-    >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron(np.linalg.inv(M), [[0], [1]])
-    >>> arm = ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
-    >>> arm = ql.plants.delayed_inputs(arm, 2e-3, 1e-3)
-    >>> joint = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3), omega_c=8.0)
-    >>> tuned = ql.tuning.tune_axes(arm, ql.Axes([joint, joint], M=M), B0_off=0.1)
-    >>> tuned.met, max(axis.m_s for axis in tuned.axes) <= 1.602
-    (True, True)
+    ``alone`` is ``tune`` of one axis; ``tune`` has the other parameters, and raises the errors.
     """
     if not isinstance(axes, Axes):
-        raise ValueError(f"axes = {axes!r:.80}: must be quell.Axes; of one axis, use tune")
+        raise ValueError(
+            f"controller = {axes!r:.80}: must be quell.Axes; for one axis give dt and structure"
+        )
     checks.one_of("objective", objective, OBJECTIVES)
     B0_off = checks.finite("B0_off", B0_off)
     if not 0.0 <= B0_off < 1.0:
@@ -233,22 +169,21 @@ def tune_axes(
         points = list(held_points("operating_points", plant, operating_points))
     nominal = _nominal(plant, axes, points)
     parts = len(axes.names) + 2
-    alone: dict[str, Tuned] = {}
+    tuned_alone: dict[str, Tuned] = {}
     own = []
     with one_blas_thread():
         for i, name in enumerate(axes.names):
             report(f"{name} alone", i / parts)
-            entry, alone[name] = _alone(plant, axes, i, points[0], bounds, objective)
+            entry, tuned_alone[name] = _alone(alone, plant, axes, i, points[0], bounds, objective)
             own.append(entry)
         patterns = [_with_errors(one, B0_off, seed) for one in nominal]
         plants = [*nominal, *(each for part in patterns for each in part)]
         dead = max(linear_part_of(plant, axes.dt, points[0])[1], default=0)
         loops = partial(CoupledLoops, dt=axes.dt, dead=dead, objective=objective)
-        limits, start, costs = _each_alone(alone, own, dead, axes, bounds, least, loops)
+        limits, start, costs = _each_alone(tuned_alone, own, dead, axes, bounds, least, loops)
         loops = partial(loops, axes=axes.axes, alone=costs)
         report("together", (parts - 2) / parts)
         found, judged, worst = _search(loops, plants, len(nominal), axes, limits, start, bounds)
-        excess = _excess(worst)
         report("check", (parts - 1) / parts)
         checked = None
         if B0_off > 0.0:
@@ -256,9 +191,11 @@ def tune_axes(
             checked = _check(nominal, B0_off, drawn, found, check_samples, seed)
         told, seen = list[str](), None
         stable = all(_loop(each, axes, found.values).stable for each in judged)
-        if bounded(axes) and stable:
+        if bounded(axes) and stable and written is not False:
             report("limits of u", (parts - 1) / parts)
-            file = written or file_at(plant, axes, points[0])
+            file = written
+            if not isinstance(file, Written):
+                file = file_at(plant, axes, points[0])
             held = held_loads(plant, axes, points[0])
 
             def at_limits(each: Found) -> Judged:
@@ -276,35 +213,38 @@ def tune_axes(
             if refused:
                 told.append(refused)
                 worst = _exact(loops(judged, limits=limits), range(len(judged)), axes, found.values)
-                excess = _excess(worst)
         made: Axes = _made(axes, found.values) if seen is None else seen.controller
         A, B, C, R = nominal[0]
         bandwidth, fastest = (
             float(np.max(np.sqrt(values[:, 0] * values[:, 1]))) for values in (found.values, start)
         )
         shown = tuple(_loop(each, made, found.values) for each in judged)
-        return TunedAxes(
-            controller=made,
-            axes=_results(made, shown, judged, found, costs),
-            loops=shown,
-            alone=alone,
+        designs = _designs(made, shown, judged, found, costs, objective, setup)
+        return Tuned(
+            axes=tuple(designs.values()),
+            designs=designs,
+            analysis=shown[0],
             constraints=bounds,
-            disk=least,
-            met=excess <= TOLERANCE,
-            excess=excess,
-            bounds=tuple(worst),
-            B0_off=B0_off,
-            points=len(points),
-            plants=len(plants),
             objective=objective,
-            left=_relative_gains(A, B @ R, C, axes, bandwidth),
-            of_plant=_relative_gains(A, B, C, axes, bandwidth),
-            given=_given_gain(plant, axes, points[0], nominal[0], bandwidth, fastest),
             check=checked,
-            with_learners=_with_learners(plant, made, points[0]),
             setup=dict(setup or {}),
-            judged=seen,
+            judged_at_limits=seen,
             told=(*told, *least_gains(shown)),
+            machine=made,
+            alone=tuned_alone,
+            details=Interaction(
+                names=axes.names,
+                loops=shown,
+                disk=least,
+                reached=tuple(worst),
+                B0_off=B0_off,
+                points=len(points),
+                plants=len(plants),
+                left=_relative_gains(A, B @ R, C, axes, bandwidth),
+                of_plant=_relative_gains(A, B, C, axes, bandwidth),
+                given=_given_gain(plant, axes, points[0], nominal[0], bandwidth, fastest),
+                with_learners=_with_learners(plant, made, points[0]),
+            ),
         )
 
 
@@ -313,7 +253,8 @@ def tune_axes(
 
 def _checked_bounds(given: Constraints | None) -> Constraints:
     bounds = given_constraints(given)
-    if name := first_given(bounds, _NOT_HERE):
+    others = (name for name in Constraints.__dataclass_fields__ if name not in BOUNDS_TOGETHER)
+    if name := first_given(bounds, tuple(others)):
         raise ValueError(
             f"constraints: {name} is not bounded for axes; bound m_ks, the gain from y to v"
         )
@@ -399,7 +340,13 @@ def _off_by(nominal: Plant, B0: Matrix, shares: Vector) -> Plant:
 
 
 def _alone(
-    plant: Any, axes: Axes, i: int, point: Any, bounds: Constraints, objective: str
+    tune: Callable[..., Tuned],
+    plant: Any,
+    axes: Axes,
+    i: int,
+    point: Any,
+    bounds: Constraints,
+    objective: str,
 ) -> tuple[tuple[Vector, Vector], Tuned]:
     """Return the plant that one axis is tuned on alone, and its tuning.
 
@@ -518,7 +465,7 @@ def _search(
     limits: Limits,
     start: Matrix,
     bounds: Constraints,
-) -> tuple[Found, list[Plant], list[AxesBound]]:
+) -> tuple[Found, list[Plant], list[Reached]]:
     """Return the best bandwidths, the plants they are judged on, and the bounds there.
 
     The search has the plants of the operating points, and those with errors of B0 that turned out
@@ -543,18 +490,13 @@ def _search(
         best = min(ends, key=lambda each: each.rank)
         members = _with_worst(every, best, members)
         there = _exact(every, members, axes, best.values)
-        worst = _excess(there)
-        if worst < _excess(reached):
+        worst = excess(there)
+        if worst < excess(reached):
             reached, found = there, best
         if worst <= TOLERANCE or worst > _HOPELESS:
             break
         now, limits = [best.values], _tightened(limits, 1.0 + min(1.2 * worst, _MOST_TIGHTER))
     return found, [plants[j] for j in members], reached
-
-
-def _excess(bounds: Sequence[AxesBound]) -> float:
-    """Return the largest ratio to a bound, less one, or 0."""
-    return max(max(each.ratio for each in bounds) - 1.0, 0.0)
 
 
 def _with_worst(loops: CoupledLoops, found: Found, members: list[int]) -> list[int]:
@@ -614,17 +556,17 @@ def _peaks(loop: MultivariableLoop, plant: Plant) -> _Peaks:
     return _Peaks(outputs, actuators, np.max(np.abs(to_v), axis=0))
 
 
-_NOT_STABLE = AxesBound("the loop is not stable", math.nan, math.nan, math.inf)
+_NOT_STABLE = Reached("the loop is not stable", math.nan, math.nan, math.inf)
 
 
 def _exact(
     loops: CoupledLoops, members: Sequence[int], axes: Axes, values: Matrix
-) -> list[AxesBound]:
+) -> list[Reached]:
     """Return the worst of each bound, over frequency on the grids of ``MultivariableLoop``."""
-    found: dict[str, list[AxesBound]] = {}
+    found: dict[str, list[Reached]] = {}
 
     def add(kind: str, of: str, value: float, limit: float) -> None:
-        found.setdefault(kind, []).append(AxesBound(f"{kind} of {of}", value, limit, value / limit))
+        found.setdefault(kind, []).append(Reached(f"{kind} of {of}", value, limit, value / limit))
 
     limits = loops.limits
     for j in members:
@@ -645,43 +587,63 @@ def _exact(
         for at in PLACES:
             alpha = loop.disk_margin(at).alpha
             found.setdefault("disk", []).append(
-                AxesBound(f"disk margin of all {at}", alpha, limits.disk, limits.disk / alpha, True)
+                Reached(f"disk margin of all {at}", alpha, limits.disk, limits.disk / alpha, True)
             )
         pole = loops.least_damped(values, j)
         if pole is not None:
             found.setdefault("damping", []).append(
-                AxesBound("damping of the poles", pole.damping, pole.least, pole.ratio, True)
+                Reached("damping of the poles", pole.damping, pole.least, pole.ratio, True)
             )
     return [max(each, key=lambda bound: bound.ratio) for each in found.values()]
 
 
-def _results(
+def _designs(
     axes: Axes,
     loops: Sequence[MultivariableLoop],
     plants: Sequence[Plant],
     found: Found,
     alone: Vector,
-) -> tuple[AxisResult, ...]:
+    objective: str,
+    setup: Mapping[str, Any] | None,
+) -> dict[str, Design]:
+    """Return the design of each axis; its measures are the worst of the loops, from y to v."""
     nan = np.full(len(axes.names), math.inf)
     peaks = [
         _peaks(loop, plant) if loop.stable else _Peaks(np.array([nan, nan]), np.array([nan]), nan)
         for loop, plant in zip(loops, plants, strict=True)
     ]
-    rows = []
-    for i, name in enumerate(axes.names):
-        rows.append(
-            AxisResult(
-                name,
-                float(found.values[i, 0]),
-                float(found.values[i, 1]),
-                float(found.measured.costs[i]),
-                float(alone[i]),
-                max(float(each.outputs[0, i]) for each in peaks),
-                max(float(each.outputs[1, i]) for each in peaks),
-                max(float(each.noise[i]) for each in peaks),
-            )
+    designs = {}
+    for i, (name, axis) in enumerate(zip(axes.names, axes.axes, strict=True)):
+        omega_c, omega_o = found.values[i].tolist()
+        k_i = integral_gain(Law(axis).at(omega_c, omega_o), axes.dt)
+        measures = {
+            "M_s": max(float(each.outputs[0, i]) for each in peaks),
+            "M_t": max(float(each.outputs[1, i]) for each in peaks),
+            "M_ks": max(float(each.noise[i]) for each in peaks),
+            "delay_margin": min(
+                loop.channel_margins(name).delay if loop.stable else 0.0 for loop in loops
+            ),
+            "alone": float(alone[i]),
+        }
+        size = float(found.measured.costs[i])
+        if objective == "load":  # the cost is that of the search, 1/k_i
+            size, measures["alone"] = k_i, 1.0 / measures["alone"]
+        own = {} if setup is None or "axis" not in setup else setup["axis"][i]
+        law = own.get("controller", {})
+        law = {**({"kind": law} if isinstance(law, str) else law), "omega_c": omega_c}
+        if axis.feedforward is True:
+            law["feedforward"] = True
+        designs[name] = Design(
+            name=name,
+            controller=axis,
+            values={"omega_c": omega_c, "omega_o": omega_o},
+            objective=size,
+            k_i=k_i,
+            measures=measures,
+            active=(),
+            tables={"observer": {**own.get("observer", {}), "omega_o": omega_o}, "controller": law},
         )
-    return tuple(rows)
+    return designs
 
 
 def _check(
@@ -691,7 +653,7 @@ def _check(
     found: Found,
     samples: int,
     seed: int,
-) -> AxesCheck:
+) -> Check:
     """Return how the result does with drawn errors of B0."""
     rng = np.random.default_rng([seed, 3])
     drawn = []
@@ -703,7 +665,8 @@ def _check(
     ratios = np.exp(-np.min(measured.slacks, axis=1))
     stable = measured.slacks[:, -1] > UNSTABLE
     bad = int(np.sum((ratios > 1.0 + 2.0 * TOLERANCE) | ~stable))
-    return AxesCheck(samples, int(np.sum(~stable)), bad, share_interval(bad, samples))
+    interval = share_interval(bad, samples)
+    return Check(samples, int(np.sum(~stable)), bad, interval, of="drawn errors of B0")
 
 
 def _relative_gains(A: Matrix, B: Matrix, C: Matrix, axes: Axes, at: float) -> Coupling | None:

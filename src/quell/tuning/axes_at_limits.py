@@ -122,7 +122,7 @@ def with_prefilters(
     Parameters
     ----------
     plant, axes, point
-        as for ``tune_axes``.
+        as for ``tune``.
     held
         u that holds each disturbance of 1 (m, q).
     files

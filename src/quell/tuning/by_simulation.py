@@ -174,6 +174,7 @@ def tune_by_simulation(
     found = linear(parts, **kept, objective=linear_objective)
     assert found.design.solution is not None  # ``tune`` returns no other design
     structure = found.design.solution.structure
+    assert found.task is not None
     build = Build(structure, found.task.options(structure))
     bounds = LinearBounds(found.plants, found.constraints)
     progress = how.get("progress")
@@ -193,10 +194,10 @@ def tune_by_simulation(
         checked = later.check(build(best.parameters), best.values)
     law = linear_law(build(best.parameters))
     loop = LoopAnalysis(found.analysis.plant, law, found.plants.dt, found.analysis.b_over_b0)
-    changes: dict[str, Any] = {"design": design, "designs": designs | {own: design}}
     return replace(
         found,
-        **changes,
+        axes=(design,),
+        designs=designs | {own: design},
         check=None,
         analysis=loop,
         objective=first,
@@ -223,12 +224,13 @@ def _later(scenario: Any, count: int) -> Any:
 
 
 def _design(found: Tuned, values: Mapping[str, float], objective: float) -> Design:
-    solution = found.design.solution
+    solution, task = found.design.solution, found.task
     assert solution is not None
+    assert task is not None
     row = vector(solution.structure, values)
     better = Solution(solution.structure, row, 0.0, 0.0)
-    options = found.task.options(solution.structure)
-    made = design_of(found.design.name, found.task.problem(), better, found.constraints, options)
+    options = task.options(solution.structure)
+    made = design_of(found.design.name, task.problem(), better, found.constraints, options)
     return replace(made, objective=objective)
 
 

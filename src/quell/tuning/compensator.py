@@ -38,7 +38,6 @@ from quell.analysis.margins import Response
 from quell.controllers.base import Controller, limits_of
 from quell.controllers.compensated import Compensated, check_takes_compensator
 from quell.controllers.compensator import Compensator
-from quell.files import nonfinite_to_none
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
@@ -60,10 +59,12 @@ from quell.tuning.optimiser.loops import (
     load_step,
     response,
 )
+from quell.tuning.optimiser.requirements import Active
 from quell.tuning.plants import Given, given_plants, model_of, plant_set
-from quell.tuning.report import toml_text
+from quell.tuning.report import ACTIVE, Design
 from quell.tuning.structures.adrc import matrices
 from quell.tuning.tables import late_plant
+from quell.tuning.tuned import Tuned
 from quell.tuning.written import Written
 from quell.types import DesignWarning, Vector
 
@@ -93,14 +94,6 @@ class Measures(NamedTuple):
     """``∫|y|`` after a unit step of the load [y-unit s/u-unit]; infinite if y stays off."""
     m_s_elsewhere: float  #: largest ``|S|`` with the poles and zeros of ``speeds``
 
-    def __str__(self) -> str:
-        area = f"∫|y| {self.iae:.4g} per unit of the load"
-        return (
-            f"M_s {self.m_s:.3g} ({self.m_s_elsewhere:.3g} at other speeds of the plant), "
-            f"M_t {self.m_t:.3g}, M_ks {self.m_ks:.3g}, "
-            + (area if math.isfinite(self.iae) else "∫|y| without end: y stays off under a load")
-        )
-
 
 class _Candidate(NamedTuple):
     observer: ESO
@@ -114,80 +107,56 @@ class _Candidate(NamedTuple):
         return f"omega_o = {self.observer.omega_o:.4g} rad/s"
 
 
-@dataclass(frozen=True)
-class TunedCompensator:
-    """A compensator that was tuned for a controller and a plant.
+@dataclass(frozen=True, eq=False)
+class OnTop:
+    """A compensator beside its controller alone, as the ``details`` of a ``Tuned``."""
 
-    ``print`` it for the figures before and after.
-    """
-
-    controller: Compensated  #: both in one
     name: str  #: form of the observer
     before: Measures  #: of the controller alone
     after: Measures  #: with the compensator
-    constraints: Constraints  #: the bounds of the whole loop
-    tables: dict[str, dict[str, Any]]  #: ``[observer]`` and ``[compensator]`` of a setup file
-    dt: float  #: sample time [s]
     loads: tuple[Vector, Vector]  #: y after the step of the load, before and after [y-unit]
     loads_dt: float  #: time from one y of the loads to the next: ``dt``, or more of slow loops [s]
-    judged: Judged | None = None  #: what it does in the file, if u has limits or there is a file
-    told: tuple[str, ...] = ()  #: a candidate that is left out, and the least gain of the loop
+    plants: int
+    active: tuple[Active, ...]  #: the bounds at their limits
 
-    @property
-    def compensator(self) -> Compensator:
-        """The compensator."""
-        return self.controller.compensator
+    bounded, drawn, met = " of the whole loop", 1, True
 
     @property
     def worth(self) -> bool:
         """Whether the compensator removes at least a twentieth of the load's effect."""
         return self.after.iae <= (1.0 - _WORTH) * self.before.iae
 
-    @property
-    def toml(self) -> str:
-        """The tables ``[observer]`` and ``[compensator]`` as a part of a setup file."""
-        return toml_text(self.tables)
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draw y after a step of the load, with and without compensator; return the axes."""
-        import matplotlib.pyplot as plt
-
-        ax = plt.subplots(layout="constrained")[1] if ax is None else ax
-        for y, label in zip(self.loads, ("controller alone", "with compensator"), strict=True):
-            size = np.abs(y)
-            shown = min(int(np.flatnonzero(size > 0.02 * np.max(size))[-1]) + 2, y.size)
-            ax.plot(np.arange(shown) * self.loads_dt, y[:shown], label=label)
-        ax.set(xlabel="t [s]", ylabel="y [y-unit]", title="Step of the load")
-        ax.legend()
-        return ax
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all results for ``quell.files.write_json``; infinite numbers become None."""
-        figures = {"before": self.before._asdict(), "after": self.after._asdict()}
-        found = {"observer": self.name, "worth": self.worth, **figures, "tables": self.tables}
-        found |= {} if self.judged is None else self.judged.to_json()
-        return dict(nonfinite_to_none(found))
-
-    def __str__(self) -> str:
+    def lines(self, tuned: Tuned) -> list[str]:
+        """Return what the compensator leaves of a load, and whether it is worth it."""
         left = "a load leaves no constant error, which the controller alone leaves"
         if math.isfinite(self.before.iae):
             left = f"a load leaves {self.after.iae / self.before.iae:.3g} of what it leaves without"
-        lines = [
-            f"Compensator with a {self.name} observer, omega_o = "
-            f"{self.compensator.observer.omega_o:.4g} rad/s, b0 = "
-            f"{self.compensator.observer.b0:.4g}",
-            f"controller alone: {self.before}",
-            f"with compensator: {self.after}",
-            f"{left} (bounds: {self.constraints})",
-        ]
+        lines = [f"{self.name} observer: {left}"]
         if not self.worth:
             lines.append(
                 "NOT worth a compensator: within the bounds none removes a twentieth of the load's "
                 "effect; the controller uses the margin itself: tune it more gently (M_s 1.4), or "
                 "allow more with Constraints(m_s=..., m_ks=...)"
             )
-        lines += [*self.told, *([] if self.judged is None else [str(self.judged)])]
-        return "\n".join(lines)
+        return lines
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as a table."""
+        figures = {"before": self.before._asdict(), "after": self.after._asdict()}
+        return {"observer": self.name, "worth": self.worth, **figures}
+
+    def plot(self, m_s: float | None, axes: Any = None) -> Any:
+        """Draw y after a step of the load, with and without compensator; return the axes."""
+        from quell.records.plotting import grid_of_axes, new_figure
+
+        axes = grid_of_axes(axes, lambda: new_figure(6.4, 4.8), 1)[:, 0]
+        for y, label in zip(self.loads, ("controller alone", "with compensator"), strict=True):
+            size = np.abs(y)
+            shown = min(int(np.flatnonzero(size > 0.02 * np.max(size))[-1]) + 2, y.size)
+            axes[0].plot(np.arange(shown) * self.loads_dt, y[:shown], label=label)
+        axes[0].set(xlabel="t [s]", ylabel="y [y-unit]", title="Step of the load")
+        axes[0].legend()
+        return axes
 
 
 def tune_compensator(
@@ -203,7 +172,7 @@ def tune_compensator(
     load: float = 1.0,
     file: Callable[[dict[str, Any]], tuple[Controller, Written]] | None = None,
     **options: Any,
-) -> TunedCompensator:
+) -> Tuned:
     """Return the compensator that rejects loads best on top of a linear controller.
 
     Parameters
@@ -233,6 +202,11 @@ def tune_compensator(
     **options
         ``learner``, ``guard``, ``omega_c``, limits and ``safe_set`` of the ``Compensator``.
 
+    Returns
+    -------
+    Tuned
+        ``controller`` is both in one, ``details`` (``OnTop``) has the figures before and after.
+
     Raises
     ------
     ValueError
@@ -246,7 +220,8 @@ def tune_compensator(
     >>> plant = ([1.0], [1.0, 1.0, 0.0])
     >>> pid = ql.baselines.PID(kp=4.0, ki=1.0, kd=3.0, tf=0.05, dt=0.01)
     >>> tuned = tune_compensator(plant, pid)
-    >>> tuned.after.iae < 0.3 * tuned.before.iae, tuned.after.m_s <= 2.0
+    >>> figures = tuned.details
+    >>> figures.after.iae < 0.3 * figures.before.iae, figures.after.m_s <= 2.0
     (True, True)
     """
     check_takes_compensator(controller)
@@ -269,8 +244,7 @@ def tune_compensator(
     if bounds.m_ks is None:
         bounds = replace(bounds, m_ks=_NOISE * before.m_ks)
     model = model_of(given, plants.all, bounds)
-    alone = _excess(before, bounds)
-    if alone > 0.0:
+    if _excess(before, bounds) > 0.0:
         raise ValueError(
             f"constraints: the controller alone has {before}, and the bounds are {bounds}: a "
             "compensator can not give margin back; raise the bounds or tune the controller gently"
@@ -312,21 +286,48 @@ def tune_compensator(
         others = _less_and_less(candidates) if math.isfinite(limits[1] - limits[0]) else []
         best, judged, refused = accepted(best, others, seen, f"{best.name} with {best.omega_o}")
         told += [refused] if refused else []
-    compensator = Compensator(best.observer, **options)
+    both = Compensated(controller, Compensator(best.observer, **options))
     numbers = {name: value for name, value in options.items() if isinstance(value, int | float)}
-    both = Compensated(controller, compensator)
-    tables = {"observer": best.table, "compensator": numbers}
-    first = plants.all.scaled()[0]
     plain = Compensated(controller, Compensator(best.observer))  # without learner
     members = [each for j, each in enumerate(plants.all.scaled()) if not plants.elsewhere(j)]
-    gains = [LoopAnalysis(each, law_of(plain), dt).margins.gain for each in members]
-    told += conditionally_stable(gains)
-    loads = (
-        response(first, law_of(controller), inputs),
-        response(first, law_of(plain), inputs),
+    loops = [LoopAnalysis(each, law_of(plain), dt) for each in members]
+    told += conditionally_stable(each.margins.gain for each in loops)
+    laws, after = (law_of(controller), law_of(plain)), best.measures
+    loads = response(loops[0].plant, laws[0], inputs), response(loops[0].plant, laws[1], inputs)
+    alone = _design("controller alone", controller, before)
+    design = _design("with compensator", both, after, before)
+    design = replace(
+        design,
+        values={"b0": best.observer.b0, "omega_o": best.observer.omega_o},
+        tables={"observer": best.table, "compensator": numbers},
     )
-    figures, apart = (before, best.measures, bounds, tables, dt, loads), dt * inputs.distance
-    return TunedCompensator(both, best.name, *figures, apart, judged, tuple(told))
+    kinds = ("M_s", "M_t", "M_ks"), after[:3], (bounds.m_s, bounds.m_t, bounds.m_ks)
+    at_limits = tuple(
+        Active(kind, size, limit, math.nan, 0)
+        for kind, size, limit in zip(*kinds, strict=True)
+        if limit is not None and size >= (1.0 - ACTIVE) * limit
+    )
+    apart = dt * inputs.distance
+    return Tuned(
+        axes=(design,),
+        designs={each.name: each for each in (alone, design)},
+        analysis=loops[0],
+        constraints=bounds,
+        objective="load-iae",
+        judged_at_limits=judged,
+        told=tuple(told),
+        details=OnTop(best.name, before, after, loads, apart, len(plants.all.plants), at_limits),
+    )
+
+
+def _design(
+    name: str, controller: Any, measures: Measures, alone: Measures | None = None
+) -> Design:
+    """Return a loop with its figures, beside those of the controller alone."""
+    found = {"M_s": measures.m_s, "M_t": measures.m_t, "M_ks": measures.m_ks}
+    found |= {"M_s elsewhere": measures.m_s_elsewhere}
+    found |= {} if alone is None else {"alone": alone.iae}
+    return Design(name, controller, {}, measures.iae, math.nan, found, (), {})
 
 
 def _less_and_less(candidates: list[_Candidate]) -> list[_Candidate]:

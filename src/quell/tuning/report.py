@@ -18,7 +18,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -52,8 +52,8 @@ from quell.types import Vector
 
 # ---- A structure tuned under constraints, with what it reaches ----
 
-# A constraint within this share of its limit is active.
-_ACTIVE = 5e-3
+ACTIVE = 5e-3
+"""A constraint within this share of its limit is active."""
 _KINDS = ("M_s", "M_t", "M_ks")
 
 
@@ -175,7 +175,7 @@ def measured(
         found = all_peaks(bound, plants, controller, C[0], beside, 0.9 * largest)
         at = max(found, key=lambda entry: entry[1].value)[1]
         measures[kind] = at.value
-        if kind in bounds and at.value >= (1.0 - _ACTIVE) * bounds[kind]:
+        if kind in bounds and at.value >= (1.0 - ACTIVE) * bounds[kind]:
             active.append(Active(kind, at.value, bounds[kind], at.omega, at.plant))
     measures["noise_gain"] = float(noise_gain(plants, C)[0])
     over = SetResponses(plants, load_step(plants))
@@ -183,19 +183,19 @@ def measured(
     measures["delay_margin"] = float(delay_margin(plants, structure, values)[0])
     for extra in problem.extras:
         ratio = float(extra.ratio(structure, values)[0])
-        if ratio >= 1.0 - _ACTIVE:
+        if ratio >= 1.0 - ACTIVE:
             value = extra.limit / ratio if extra.name == "delay margin" else extra.limit * ratio
             active.append(Active(extra.name, value, extra.limit, math.nan, 0))
     least = _least_damped(counted(plants, poles, problem.damping or USUAL_DAMPING))
     measures["damping"] = min((pole.damping for pole in least if not pole.own), default=1.0)
     for pole in least if problem.damping is not None else ():
-        if pole.ratio >= 1.0 - _ACTIVE:
+        if pole.ratio >= 1.0 - ACTIVE:
             name = "damping of the plant's mode" if pole.own else "damping"
             active.append(Active(name, pole.damping, pole.least, abs(pole.s), pole.plant))
     limit, fastest = constraints.omega_o_dt, _fastest(solution, constraints, plants)
-    if np.any(structure.rules(values)[0] < _ACTIVE):  # the faster real pole of a pair
+    if np.any(structure.rules(values)[0] < ACTIVE):  # the faster real pole of a pair
         fastest = limit
-    if fastest >= (1.0 - _ACTIVE) * limit:
+    if fastest >= (1.0 - ACTIVE) * limit:
         active.append(Active("|p| dt", min(fastest, limit), limit, math.nan, 0))
     return measures, tuple(active), least
 
@@ -227,11 +227,6 @@ def quantity(objective: str) -> str:
     return _UNITS.get(objective, objective)
 
 
-def second_quantity(objective: str) -> str:
-    """Return the name of the measure beside the objective."""
-    return "k_i" if objective == "load-iae" else "IAE"
-
-
 def relative(design: Design, other: Design, objective: str) -> float:
     """Return how many times as good ``design`` is as ``other``."""
     better, worse = design.objective, other.objective
@@ -249,20 +244,42 @@ def active_text(active: Active, plants: int) -> str:
     return f"{active.name} = {active.value:.4g} (limit {active.limit:.4g}){where}{which}"
 
 
-def rows(designs: Mapping[str, Design], objective: str) -> list[tuple[str, ...]]:
-    """Return rows: name, objective, IAE (or k_i), M_s, M_t, M_ks, delay margin, a reason."""
-    found: list[tuple[str, ...]] = []
+def rows(designs: Mapping[str, Design], objective: str) -> tuple[list[str], list[list[str]]]:
+    """Return the headings of a table of designs, and a row for each, with a reason behind it.
+
+    Objective, IAE (or k_i), M_s, M_t, M_ks, delay margin; where axes or points were tuned alone,
+    too, the objective over that.
+    """
+    second = ("k_i", "k_i") if objective == "load-iae" else ("IAE", "iae")
+    columns: list[tuple[str, str, Callable[[float], str]]] = [
+        (quantity(objective), "objective", "{:.4g}".format),
+        (*second, "{:.3g}".format),
+        ("M_s", "M_s", "{:.3f}".format),
+        ("at other speeds", "M_s elsewhere", "{:.3f}".format),
+        ("M_t", "M_t", "{:.3f}".format),
+        ("M_ks", "M_ks", "{:.4g}".format),
+        ("delay margin", "delay_margin", duration),
+    ]
+    columns += [("over that alone", "ratio", "{:.3f}".format), ("b0", "b0", "{:.4g}".format)]
+    found, shown = [], set[str]()
     for design in designs.values():
-        if design.controller is None:
-            found.append((design.name, *["–"] * 6, design.reason))
-            continue
-        m = design.measures
-        numbers = (f"{m[kind]:.3f}" for kind in ("M_s", "M_t"))
-        margin = duration(m["delay_margin"])
-        second = design.k_i if objective == "load-iae" else m["iae"]
-        first = (design.name, f"{design.objective:.4g}", f"{second:.3g}")
-        found.append((*first, *numbers, f"{m['M_ks']:.4g}", margin, ""))
-    return found
+        known = {"objective": design.objective, "k_i": design.k_i, **design.measures}
+        if "alone" in known:
+            size = known["iae"] if math.isnan(design.objective) else design.objective
+            known["ratio"] = size / known["alone"]
+        known = {key: value for key, value in known.items() if not math.isnan(value)}
+        shown |= known.keys()
+        found.append((design, known))
+    columns = [each for each in columns if each[1] in shown]
+    table = [
+        [
+            design.name,
+            *(show(known[key]) if key in known else "–" for _, key, show in columns),
+            design.reason,
+        ]
+        for design, known in found
+    ]
+    return ["structure", *(heading for heading, _, _ in columns)], table
 
 
 def costs(chosen: Design, designs: Mapping[str, Design], objective: str) -> list[str]:

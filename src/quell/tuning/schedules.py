@@ -23,11 +23,9 @@ what noise does to u, if its integrals are at most 1.5 times as large.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +34,6 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse_axis
 from quell.controllers.adrc import ADRC
 from quell.controllers.schedule import Schedule
-from quell.files import nonfinite_to_none, written_atomically
 from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
@@ -48,13 +45,13 @@ from quell.tuning.acceptance import (
     conditionally_stable,
     judge,
     place_of,
-    prefilter_table,
 )
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import range_of_u
 from quell.tuning.optimiser.loops import area_until_rest
+from quell.tuning.optimiser.requirements import Active
 from quell.tuning.plants import Given, given_plants, with_known_noise
-from quell.tuning.report import toml_text
+from quell.tuning.report import Design
 from quell.tuning.tables import (
     checked_rest,
     late_plant,
@@ -85,112 +82,76 @@ _MOST_POINTS, _GENTLER = 12, (0.6, 0.35, 0.2)
 _MOST_DERIVATIVES = 3
 
 
-class PointResult(NamedTuple):
-    """The frozen loop at one value of the signals."""
-
-    signals: tuple[float, ...]
-    of_table: bool  #: whether it is a point of the table
-    b0: float
-    m_s: float
-    m_t: float
-    iae: float  #: integral of ``|y|`` after a unit step of the load; infinite if unstable
-    own_iae: float  #: the same of a controller tuned for this point; nan where none was found
-
-    @property
-    def ratio(self) -> float:
-        """The integral over that of the own tuning."""
-        return self.iae / self.own_iae
-
-
 @dataclass(frozen=True, eq=False)
-class TunedSchedule:
-    """A controller with a schedule, tuned at its points; from ``tune_schedule``.
+class AtPoints:
+    """A schedule at its points, as the ``details`` of a ``Tuned``.
 
     Attributes
     ----------
-    controller : ADRC
-        with the schedule.
-    results : tuple of PointResult
-        the frozen loops at the points, and between them where the plant is known.
+    schedule : Schedule
+        that of the controller.
+    loops : Mapping
+        the loops at fixed signals, at the points and between them where the plant is known.
     own : Mapping
         the tuning of each point by itself, by signals.
     joint : Tuned or None
         the tuning for all points at once, of plants with the same b; None with ``tables="all"``.
-    judged : Judged or None
-        what the controller does in the file and at the points, if u has limits; its ``controller``
-        is behind the prefilter of the file.
-    told : tuple
-        lines on a controller that is left out, and on the least gain of the loops.
+    knows_between : bool
+        whether the plant is a function of the signals.
+    m_s_limit : float or None
+        the bound of M_s.
     """
 
-    controller: ADRC
-    results: tuple[PointResult, ...]
+    schedule: Schedule
+    loops: Mapping[tuple[float, ...], Design]
     own: Mapping[tuple[float, ...], Tuned]
     joint: Tuned | None
     knows_between: bool
-    judged: Judged | None = None
-    told: tuple[str, ...] = ()
+    m_s_limit: float | None
+
+    bounded, drawn, met = "", 3, True
 
     @property
-    def schedule(self) -> Schedule:
-        """The schedule."""
-        found = self.controller.schedule
-        assert found is not None
-        return found
+    def plants(self) -> int:
+        """The number of points for which the bounds hold."""
+        return len(self.own)
+
+    @property
+    def active(self) -> tuple[Active, ...]:
+        """The bounds at their limits, of all points that are tuned at once or of each."""
+        if self.joint is not None:
+            return self.joint.design.active
+        return tuple(
+            each._replace(name=f"{each.name} at {_place(at)}", omega=math.nan)
+            for at, own in self.own.items()
+            for each in own.design.active
+        )
 
     @property
     def m_s(self) -> float:
         """The largest M_s of all frozen loops; infinite if one is unstable."""
-        return max(each.m_s for each in self.results)
+        return max(each.measures["M_s"] for each in self.loops.values())
+
+    @property
+    def ratios(self) -> dict[tuple[float, ...], float]:
+        """The integrals of ``|y|`` over those of the points' own tunings."""
+        return {
+            at: each.measures["iae"] / each.measures["alone"] for at, each in self.loops.items()
+        }
 
     @property
     def worst_ratio(self) -> float:
-        """The largest integral of ``|y|`` over that of the point's own tuning."""
-        return max(each.ratio for each in self.results if not math.isnan(each.ratio))
+        """The largest of the ``ratios``."""
+        return max(ratio for ratio in self.ratios.values() if not math.isnan(ratio))
 
-    @property
-    def _tuned(self) -> Tuned:
-        """The joint tuning, or that of the first point."""
-        return self.joint or next(iter(self.own.values()))
-
-    @property
-    def constraints(self) -> Constraints:
-        """The bounds that were tuned for."""
-        return self._tuned.constraints
-
-    @property
-    def noise_bound(self) -> str:
-        """Where the bound for the noise of u comes from, as text."""
-        return self._tuned.noise_bound
-
-    def rows(self) -> list[tuple[str, ...]]:
-        """Return a row for each frozen loop: place, b0, M_s, M_t, integral of ``|y|``, ratio."""
-        found: list[tuple[str, ...]] = []
-        for each in self.results:
-            where = f"{'at' if each.of_table else 'between, at'} {_place(each.signals)}"
-            peaks = (f"{each.m_s:.3f}", f"{each.m_t:.3f}")
-            found.append((where, f"{each.b0:.4g}", *peaks, f"{each.iae:.4g}", f"{each.ratio:.3f}"))
-        return found
-
-    def summary(self) -> str:
-        """Return the frozen loops as lines, and what is not known."""
-        lines = [repr(self.controller)]
-        for where, b0, m_s, m_t, iae, ratio in self.rows():
-            lines.append(
-                f"{where}: b0 {b0}, M_s {m_s}, M_t {m_t}, ∫|y| {iae}, {ratio} of the own tuning's"
-            )
-        return "\n".join([*lines, *self.verdicts()])
-
-    def verdicts(self) -> list[str]:
+    def lines(self, tuned: Tuned) -> list[str]:
         """Return the largest M_s and ratio, and what does not hold or is not known, as lines."""
         lines = [f"largest M_s {self.m_s:.3f}, largest ratio of ∫|y| {self.worst_ratio:.3f}"]
-        lines += [*self.told, *([] if self.judged is None else str(self.judged).splitlines())]
-        bound = self.constraints.m_s
-        above = [each for each in self.results if bound and each.m_s > _MORE * bound]
-        if above:
-            worst = max(above, key=lambda each: each.m_s)
+        bound = self.m_s_limit
+        if bound and self.m_s > _MORE * bound:
+            worst = max(self.loops, key=lambda at: self.loops[at].measures["M_s"])
             lines.append(
-                f"NOT within M_s = {bound:g}: {worst.m_s:.3f} at {_place(worst.signals)}, where "
+                f"NOT within M_s = {bound:g}: {self.m_s:.3f} at {_place(worst)}, where "
                 "the plant is not that of the interpolated gains; give more points around it"
             )
         if self.joint is not None and self.worst_ratio > _MUCH:
@@ -210,58 +171,42 @@ class TunedSchedule:
         return lines
 
     def to_json(self) -> dict[str, Any]:
-        """Return all results for ``quell.files.write_json``; infinite numbers become None."""
-        schedule, tuned = self.schedule, self._tuned
-        tables = ("points", "b0", "omega_c", "omega_o")
-        loops = [each._asdict() | {"ratio": each.ratio} for each in self.results]
-        found: dict[str, Any] = nonfinite_to_none(
-            {
-                "structure": tuned.design.name,
-                "objective": tuned.objective,
-                "constraints": dict(vars(self.constraints)),
-                "noise_bound": tuned.noise_bound,
-                "dt": tuned.plants.dt,
-                "omega_c": self.controller.omega_c,
-                "omega_o": self.controller.observer.omega_o,
-                "schedule": {"signal": _listed(schedule.signal)}
-                | {name: _listed(getattr(schedule, name)) for name in tables},
-                "loops": [{**each, "signals": list(each["signals"])} for each in loops],
-                "m_s": self.m_s,
-                "worst_ratio": self.worst_ratio,
-                "knows_between": self.knows_between,
-                "own": [
-                    {"signals": list(at), "design": each.design.to_json()}
-                    for at, each in self.own.items()
-                ],
-                **({} if self.judged is None else self.judged.to_json()),
-            }
-        )
-        return found
+        """Return it as a table."""
+        return {
+            "schedule": _table(self.schedule),
+            "m_s": self.m_s,
+            "worst_ratio": self.worst_ratio,
+            "knows_between": self.knows_between,
+            "own": [
+                {"signals": list(at), "design": each.design.to_json()}
+                for at, each in self.own.items()
+            ],
+        }
 
-    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
+    def plot(self, m_s: float | None, axes: Any = None) -> Any:
         """Draw b0, M_s with its bound, and the ratio of the integrals over the first signal.
 
         Of two signals there is a line for each value of the second one. Points of the table are
-        filled. Returns the three axes; ``axes`` or ``ax`` are those to draw into, new ones by
-        default.
+        filled. Returns the three axes.
         """
-        from quell.records.plotting import given_axes, grid_of_axes, new_figure
+        from quell.records.plotting import grid_of_axes, new_figure
 
-        axes = grid_of_axes(given_axes(axes, ax), lambda: new_figure(6.4, 6.4), 3, sharex=True)[
-            :, 0
-        ]
-        names = self.schedule.signals
-        for second in sorted({each.signals[1:] for each in self.results}):
-            own = [each for each in self.results if each.signals[1:] == second]
-            x = [each.signals[0] for each in own]
+        axes = grid_of_axes(axes, lambda: new_figure(6.4, 6.4), 3, sharex=True)[:, 0]
+        names, ratios = self.schedule.signals, self.ratios
+        for second in sorted({at[1:] for at in self.loops}):
+            own = [at for at in self.loops if at[1:] == second]
             label = f"{names[1]} {_place(second)}" if second else None
-            columns = zip(*((each.b0, each.m_s, each.ratio) for each in own), strict=True)
+            columns = [
+                [self.loops[at].measures["b0"] for at in own],
+                [self.loops[at].measures["M_s"] for at in own],
+                [ratios[at] for at in own],
+            ]
             for ax, values in zip(axes, columns, strict=True):
-                (line,) = ax.plot(x, values, "o-", mfc="none", label=label)
-                filled = [(a, b) for a, b, e in zip(x, values, own, strict=True) if e.of_table]
+                (line,) = ax.plot([at[0] for at in own], values, "o-", mfc="none", label=label)
+                filled = [(at[0], b) for at, b in zip(own, values, strict=True) if at in self.own]
                 ax.plot(*zip(*filled, strict=True), "o", color=line.get_color())
-        if self.constraints.m_s is not None:
-            axes[1].axhline(self.constraints.m_s, color="black", linestyle="--", label="bound")
+        if m_s is not None:
+            axes[1].axhline(m_s, color="black", linestyle="--", label="bound")
             axes[1].legend()
         quantities = ("b0", "M_s", "∫|y| over that\nof its own tuning")
         for ax, quantity in zip(axes, quantities, strict=True):
@@ -272,48 +217,11 @@ class TunedSchedule:
             axes[0].legend()
         return axes
 
-    def toml(self) -> str:
-        """Return a setup file for ``quell run``.
 
-        Its plant is that of the setup that was given, by default that of the middle point. The
-        external signals of its scenario are those of the middle point, unless that has its own.
-        """
-        keys = list(self.own)
-        middle = keys[len(keys) // 2]
-        tuned = self.own[middle]
-        replaced = ("observer", "controller")
-        tables = {key: value for key, value in tuned.setup.items() if key not in replaced}
-        schedule, observer = self.schedule, self.controller.observer
-        table: dict[str, Any] = {"signal": _listed(schedule.signal)}
-        for name in ("points", "b0", "omega_c", "omega_o"):
-            if getattr(schedule, name) is not None:
-                table[name] = _listed(getattr(schedule, name))
-        own = (self.joint or tuned).design.tables
-        given = {"b0": observer.b0, "omega_o": observer.omega_o}
-        tables["observer"] = {**own["observer"], **given}
-        tables["controller"] = {
-            **own["controller"],
-            "omega_c": self.controller.omega_c,
-            **({"feedforward": True} if self.controller.feedforward else {}),
-            "schedule": table,
-        }
-        if schedule.external and "schedule" not in tables["scenario"]:
-            scenario = dict(tables["scenario"])
-            fixed = zip(schedule.signals, middle, strict=True)
-            scenario["schedule"] = [value for name, value in fixed if name == "external"]
-            tables["scenario"] = scenario
-        comment = f"{tuned.design.name} with a schedule, tuned by quell\n"
-        judged = self.judged
-        if judged is not None:
-            comment += "\n".join([*self.told, str(judged)])
-            if judged.prefilter is not None:
-                tables["prefilter"] = prefilter_table(judged.prefilter)
-        return toml_text(tables, comment)
-
-    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
-        """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
-        with written_atomically(Path(path), overwrite) as part:
-            part.write_text(self.toml(), encoding="utf-8")
+def _table(schedule: Schedule) -> dict[str, Any]:
+    """Return the table of a schedule in a setup file; None where it has none."""
+    names = ("signal", "points", "b0", "omega_c", "omega_o")
+    return {name: _listed(getattr(schedule, name)) for name in names}
 
 
 def _place(signals: Sequence[float]) -> str:
@@ -349,7 +257,7 @@ def tune_schedule(
     written: Written | bool = True,
     progress: Progress | None = None,
     **options: Any,
-) -> TunedSchedule:
+) -> Tuned:
     """Return the best ADRC with a schedule for a plant that changes with one or two signals.
 
     Parameters
@@ -375,7 +283,7 @@ def tune_schedule(
     delay, actuator_lag
         as for ``tune``.
     setup
-        tables of a setup file that ``TunedSchedule.toml`` completes; made from the plant of the
+        tables of a setup file that ``Tuned.toml`` completes; made from the plant of the
         middle point by default.
     rest
         u and y at rest at the middle point, as for ``tune``; the scenario of ``toml`` begins there.
@@ -386,6 +294,12 @@ def tune_schedule(
     **options
         of ``tune``: ``objective``, ``constraints``, ``b_range``, ``u_min``, ``u_max``,
         ``rate_limit``, …
+
+    Returns
+    -------
+    Tuned
+        ``designs`` are the loops at the points and between them, ``details`` (``AtPoints``) has the
+        schedule and what is known of it.
 
     Raises
     ------
@@ -399,7 +313,8 @@ def tune_schedule(
     >>> def axis(inertia):
     ...     return ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0 / inertia], [1.0, 0.0])
     >>> tuned = ql.tune_schedule(axis, 1e-3, points=(2e-4, 2e-3))
-    >>> [round(b0 / tuned.schedule.b0[-1], 3) for b0 in tuned.schedule.b0], round(tuned.m_s, 2)
+    >>> points = tuned.details
+    >>> [round(b0 / points.schedule.b0[-1], 3) for b0 in points.schedule.b0], round(points.m_s, 2)
     ([10.0, 1.0], 1.6)
     """
     checks.one_of("tables", tables, _TABLES)
@@ -537,6 +452,7 @@ def tune_schedule(
         ]
         file = replace(file, others=tuple(others), of_others="points of the schedule, linear")
         task = first.own[middle].task
+        assert task is not None
         shaped = task.objective != "tracking" and not file.moves
         point = checked_rest(rest) or rest_of_plant(plant_at(middle), dt)
         if setup is None or "scenario" not in setup:
@@ -552,16 +468,53 @@ def tune_schedule(
         told += [refused] if refused else []
     loops = [frozen(first, at) for at in grid]
     told += conditionally_stable(each.margins.gain for each in loops if each.stable)
-    checked = [(at, True) for at in grid] + [(at, False) for at in fine]
-    results = []
-    for i, (at, of_table) in enumerate(sorted(checked)):
-        report(f"judging at {_place(at)}", (len(grid) + 1 + i * len(fine) / len(checked)) / parts)
-        alone = first.own[at] if of_table else tune(plant_at(at), dt, **how)
-        parts_of = first.controller, alone.design.controller, late
-        results.append(_result(at, of_table, plant_at(at), *parts_of))
+    found = {}
+    for i, at in enumerate(sorted([*grid, *fine])):
+        share = i / (len(grid) + len(fine))
+        report(f"judging at {_place(at)}", (len(grid) + 1 + share * len(fine)) / parts)
+        alone = first.own[at] if at in first.own else tune(plant_at(at), dt, **how)
+        name = f"{'at' if at in first.own else 'between, at'} {_place(at)}"
+        found[at] = _design(name, plant_at(at), first.controller.at(*at), alone, late)
+    tuned, of_file = first.joint or first.own[middle], first.own[middle]
+    schedule, observer = first.controller.schedule, first.controller.observer
+    assert schedule is not None
+    table = {name: value for name, value in _table(schedule).items() if value is not None}
+    law: dict[str, Any] = {"omega_c": first.controller.omega_c}
+    law |= {"feedforward": True} if first.controller.feedforward else {}
+    law["schedule"] = table
+    given_gains = {"b0": observer.b0, "omega_o": observer.omega_o}
+    design = replace(
+        tuned.design,
+        name=f"{tuned.design.name} with a schedule",
+        controller=first.controller,
+        values={"omega_c": first.controller.omega_c, "omega_o": observer.omega_o},
+        active=(),
+        tables={
+            "observer": {**tuned.design.tables["observer"], **given_gains},
+            "controller": {**tuned.design.tables["controller"], **law},
+        },
+        solution=None,
+    )
+    file_tables = dict(of_file.setup)
+    if schedule.external and "schedule" not in file_tables["scenario"]:
+        fixed = zip(schedule.signals, middle, strict=True)
+        of_signals = {"schedule": [value for name, value in fixed if name == "external"]}
+        file_tables["scenario"] = {**file_tables["scenario"], **of_signals}
     knows = is_function and between > 0
-    return TunedSchedule(
-        first.controller, tuple(results), first.own, first.joint, knows, judged, tuple(told)
+    m_s = tuned.constraints.m_s
+    return Tuned(
+        axes=(design,),
+        designs={each.name: each for each in found.values()},
+        analysis=frozen(first, middle),
+        constraints=tuned.constraints,
+        objective=tuned.objective,
+        setup=file_tables,
+        noise_bound=tuned.noise_bound,
+        signals=of_file.signals,
+        judged_at_limits=judged,
+        told=tuple(told),
+        alone=first.own,
+        details=AtPoints(schedule, found, first.own, first.joint, knows, m_s),
     )
 
 
@@ -612,27 +565,23 @@ def _finer(axis: list[float], between: int) -> list[float]:
     return [value for cell in inner for value in cell] + [axis[-1]]
 
 
-def _result(
-    at: tuple[float, ...],
-    of_table: bool,
-    plant: Any,
-    controller: ADRC,
-    alone: Any,
-    late: Mapping[str, Any],
-) -> PointResult:
-    frozen = controller.at(*at)
+def _design(
+    name: str, plant: Any, controller: ADRC, alone: Tuned, late: Mapping[str, Any]
+) -> Design:
+    """Return the loop of a plant with the controller at fixed signals, beside its own tuning."""
     with one_blas_thread():
-        loop, own = (analyse_axis(plant, each, **late) for each in (frozen, alone))
+        loop, own = (analyse_axis(plant, each, **late) for each in (controller, alone.controller))
         m_t = loop.response("T", loop.omega) if loop.stable else np.array([math.inf])
-        return PointResult(
-            signals=at,
-            of_table=of_table,
-            b0=frozen.observer.b0,
-            m_s=1.0 / loop.margins.modulus if loop.stable else math.inf,
-            m_t=float(np.max(np.abs(m_t))),
-            iae=load_iae(loop),
-            own_iae=load_iae(own),
-        )
+        measures = {
+            "M_s": 1.0 / loop.margins.modulus if loop.stable else math.inf,
+            "M_t": float(np.max(np.abs(m_t))),
+            "iae": load_iae(loop),
+            "alone": load_iae(own),
+            "b0": controller.observer.b0,
+        }
+    objective, nan = alone.objective, math.nan
+    size = measures["iae"] if objective == "load-iae" else nan
+    return Design(name, controller, {}, size, nan, measures, (), {})
 
 
 def load_iae(loop: LoopAnalysis) -> float:

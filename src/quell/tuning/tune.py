@@ -1,4 +1,4 @@
-"""``tune``: the best controller of a structure for a plant or a set of plants."""
+"""``tune``: the best controller for a plant or a set of plants, of one axis or several."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ from quell.tuning.acceptance import (
     time_constant,
     with_others,
 )
+from quell.tuning.axes import tune_together
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import (
@@ -83,6 +84,14 @@ COMPARED = ("pi", "pid", "bandwidths", "reduced", "half-gain", "poles", "model-b
 """The structures that a result is compared with by default; and the cascade at a resonance."""
 # A design without prefilter leaves less of the error in the scenario by this factor.
 _LESS = 0.95
+ONLY_TOGETHER = ("disk", "B0_off", "operating_points")
+"""Options of several axes, which one has not."""
+TOGETHER = (
+    *("constraints", "objective", "check_samples", "seed", "setup", "written", "progress"),
+    *ONLY_TOGETHER,
+)
+"""All options of several axes."""
+_OF_PLANT = ("plant", "controller", "limits")
 # Names of the limits of a controller.
 _LIMITS = ("u_min", "u_max", "rate_limit")
 
@@ -90,8 +99,9 @@ _LIMITS = ("u_min", "u_max", "rate_limit")
 @explained("quell.tune(([1.0], [1.0, 2.0, 1.0]), dt=0.01)")
 def tune(
     plant: Any,
-    dt: float,
+    dt: Any = None,
     *,
+    controller: Any = None,
     structure: str = SIMPLEST,
     order: int | None = None,
     objective: Any = "load-iae",
@@ -116,10 +126,17 @@ def tune(
     scenario: Any = None,
     search: Mapping[str, Any] | None = None,
     in_use: Any = None,
+    disk: float | None = None,
+    B0_off: float = 0.0,
+    operating_points: Sequence[Any] | None = None,
     progress: Progress | None = None,
     **limits: Any,
 ) -> Tuned:
-    """Return the controller of a structure with the best objective under constraints.
+    """Return the controller with the best objective under constraints, for one axis or several.
+
+    Of one axis it is the best controller of a structure. Of several, ``controller`` says all but
+    omega_c and omega_o of each axis, which are chosen; learners are not in the bounds. What is
+    bounded, and how these are searched, stands in ``quell.tuning.axes``.
 
     The loop is linear and sampled exactly; all constraints hold for all plants, at all frequencies
     within 0.1 %. PI, PID and the other structures of ``compare`` are tuned under the same
@@ -130,8 +147,17 @@ def tune(
     plant
         a linear plant of any kind that ``analyse`` accepts; a ``PlantBatch`` or a list of plants,
         of which the first is the nominal one; with ``uncertain``, a function that makes one.
+        Of several axes one with an output for each, in continuous time: a ``LinearPlant`` or
+        matrices (A, B, C), also behind delays or encoders, which are left out; or a nonlinear one
+        with its operating points.
     dt
-        sample time [s].
+        sample time [s]; a controller has its own.
+    controller
+        axes (``quell.Axes``), whose orders, forms of observers, B0 and names are kept. Then
+        ``constraints``, ``objective`` (for the load), ``check_samples``, ``seed``, ``setup``,
+        ``written``, ``progress`` and those below of several axes have an effect, others are
+        refused. Of the constraints m_s, m_t, m_ks [1/s^n], damping, noise_over_pi and omega_o_dt
+        count, for each channel; m_ks is by default that of each axis alone.
     structure
         one of ``quell.tuning.STRUCTURES``: ``"poles"`` is an ADRC with poles of its own,
         ``"p-pi-notch"`` the cascade of servo drives with a notch for each resonance. By default,
@@ -200,22 +226,34 @@ def tune(
     in_use
         a controller that the result replaces. Where the bound of noise is a guess, M_ks may be as
         large as with that one: what noise does to u then is known to be borne.
+    disk
+        of several axes: least disk margin of all inputs, and of all outputs, at once; by default
+        what a single loop has with m_s and m_t.
+    B0_off
+        of several axes: share by which each entry of B0 may be off, 0.2 for 20 %; the result is
+        checked with ``check_samples`` drawn errors.
+    operating_points
+        of several axes, for a nonlinear plant, the nominal one first: states x, for which the u
+        that holds them is found, or (x, u). The bounds hold at each of them.
     progress
-        called with the structure and the share that is done.
+        called with the structure or axis and the share that is done.
     **limits
         ``u_min``, ``u_max``, ``rate_limit`` of the controllers.
 
     Returns
     -------
     Tuned
-        the controller, its analysis, the references, active constraints, trade-off, figures.
+        the controller, its analysis, the references, active constraints, trade-off, figures. Of
+        several axes ``met`` says whether all bounds hold; if they can't, a line that begins with
+        NOT says what to do.
 
     Raises
     ------
     ValueError
         for arguments out of range or without effect, plants with different signs of the gain, a
         plant that no controller of the structure stabilises, constraints that contradict each
-        other (which, and by how much).
+        other (which, and by how much); for an axis that cannot be tuned alone (it is named), one
+        whose law is not linear, axes of compensators, and those with one learner for all.
 
     Examples
     --------
@@ -225,7 +263,29 @@ def tune(
     >>> tuned = ql.tune(([1.0], [1.0, 3.0, 3.0, 1.0]), dt=0.02, constraints=bounds, **how)
     >>> round(tuned.design.values["K"], 2), round(tuned.design.values["T_i"], 2)
     (0.63, 1.96)
+    >>> import numpy as np
+    >>> M = np.array([[1.2, 0.35], [0.35, 0.2]])
+    >>> A, B = np.kron(np.eye(2), [[0, 1], [0, 0]]), np.kron(np.linalg.inv(M), [[0], [1]])
+    >>> arm = ql.plants.LinearPlant(A, B, np.eye(4)[[0, 2]])
+    >>> arm = ql.plants.delayed_inputs(arm, 2e-3, 1e-3)
+    >>> joint = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=60.0, dt=1e-3), omega_c=8.0)
+    >>> tuned = ql.tune(arm, controller=ql.Axes([joint, joint], M=M), B0_off=0.1)
+    >>> tuned.met, max(axis.measures["M_s"] for axis in tuned.axes) <= 1.602
+    (True, True)
     """
+    asked = {**locals(), **limits}
+    if hasattr(dt, "step"):  # a controller in its place
+        asked |= {"dt": None, "controller": dt}
+    if asked["controller"] is not None:
+        why = "with a controller, whose bandwidths are tuned for the coupled loop; change that"
+        _refuse({name: why for name in asked if name not in (*TOGETHER, *_OF_PLANT)}, asked)
+        parts = {name: asked[name] for name in TOGETHER}
+        return tune_together(tune, plant, asked["controller"], **parts)
+    if dt is None:
+        raise ValueError(
+            "tune: needs dt, too, the sample time [s]; of several axes controller=quell.Axes(…)"
+        )
+    _refuse(dict.fromkeys(ONLY_TOGETHER, "without controller=, quell.Axes of several axes"), asked)
     u_limits = range_of_u(limits)
     options = {"reference": reference, "duration": duration, "load": load, "quantile": quantile}
     options |= {"samples": samples, "check_samples": check_samples, "seed": seed}
@@ -321,7 +381,7 @@ def tune(
             report("check", 1.0)
             check = _check(box, given, how, task, chosen, (check_samples, seed))
     return Tuned(
-        design=chosen,
+        axes=(chosen,),
         designs=designs,
         analysis=_analysis(given, plants, chosen),
         constraints=task.constraints,
@@ -331,7 +391,7 @@ def tune(
         setup=tables,
         loop=loop,
         judged_at_limits=judged,
-        refused=refused,
+        told=(refused,) if refused else (),
         noise_bound=noise_bound,
         signals=signals_of(as_list(plant)[0]),
     )
@@ -438,7 +498,7 @@ def _refuse(unused: Mapping[str, str], options: Mapping[str, Any]) -> None:
     """
     parameters = {**inspect.signature(tune).parameters, **inspect.signature(Constraints).parameters}
     for name, why in unused.items():
-        value, default = options[name], parameters[name].default
+        value, default = options[name], getattr(parameters.get(name), "default", None)
         if value is not default and value != default:
             raise ValueError(f"{name} = {value!r}: has no effect: {why}, or leave it out")
 

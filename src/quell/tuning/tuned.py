@@ -15,7 +15,6 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis
-from quell.controllers.base import Controller
 from quell.controllers.feedforward import Feedforward
 from quell.files import nonfinite_to_none, written_atomically
 from quell.parallel import one_blas_thread
@@ -25,11 +24,16 @@ from quell.records.plotting import given_axes
 from quell.sweeping.runs import latin_hypercube
 from quell.sweeping.sweep import share_interval
 from quell.tuning import report
-from quell.tuning.acceptance import Judged, Loop, conditionally_stable, judge, prefilter_table
+from quell.tuning.acceptance import Judged, Loop, conditionally_stable, judge, with_prefilter
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, noise_curve, tradeoff
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.requirements import all_peaks, beside_poles, closed_loop_poles, counted
+from quell.tuning.optimiser.requirements import (
+    all_peaks,
+    beside_poles,
+    closed_loop_poles,
+    counted,
+)
 from quell.tuning.optimiser.search import Problem, Solution
 from quell.tuning.report import Design, draw, toml_text
 from quell.tuning.simulated import Checked, Search
@@ -127,22 +131,26 @@ class Check:
         largest measures of the stable loops, ``M_s``, …
     worst_values
         the parameters of the plant with the largest excess.
+    of
+        what was drawn.
     """
 
     samples: int
     unstable: int
     violating: int
     interval: tuple[float, float]
-    worst: Mapping[str, float]
-    worst_values: Mapping[str, float]
+    worst: Mapping[str, float] = field(default_factory=dict)
+    worst_values: Mapping[str, float] = field(default_factory=dict)
+    of: str = "fresh samples"
 
     def __str__(self) -> str:
         """Return the check as a sentence."""
         low, high = (100.0 * end for end in self.interval)
         worst = ", ".join(f"{name} {value:.4g}" for name, value in self.worst.items())
         return (
-            f"{self.samples} fresh samples: {self.violating} exceed a limit, {self.unstable} of "
-            f"them unstable; a share of {low:.2g} to {high:.2g} % (95 % interval). Largest: {worst}"
+            f"{self.samples} {self.of}: {self.violating} exceed a limit, {self.unstable} of "
+            f"them unstable; a share of {low:.2g} to {high:.2g} % (95 % interval)"
+            + (f". Largest: {worst}" if worst else "")
         )
 
 
@@ -188,24 +196,30 @@ def checked(
 
 @dataclass(frozen=True, eq=False)
 class Tuned(InNotebook):
-    """The controller of a structure with the best objective under constraints; from ``tune``.
+    """The controller with the best objective under constraints, of one axis or several.
+
+    From ``tune``, ``tune_schedule`` and ``tune_compensator``.
 
     Attributes
     ----------
-    design : Design
-        the chosen structure's design; ``controller`` is its controller.
+    axes : tuple of Design
+        the chosen design of each axis. ``design`` is that of a single one.
     designs : Mapping
-        the designs of all structures by name, the chosen one included.
-    analysis : LoopAnalysis
+        what ``rows`` shows, by name: of one axis all structures that were tuned, the chosen one
+        included; else each axis, the loop at each operating point, or that with a compensator
+        behind that of the controller alone.
+    analysis : LoopAnalysis or MultivariableLoop
         ``analyse`` of the first plant with the controller.
     constraints : Constraints
-        the bounds, M_ks included if it follows from the optimal PI controller's.
+        the bounds, M_ks included if it follows from the optimal PI controller's; of several axes
+        those of each channel.
     objective : str
         what was optimised.
-    task : Task
-        what all structures were tuned for.
+    task : Task or None
+        what all structures of one axis were tuned for; None for what ``tune`` did not search as a
+        structure.
     check : Check or None
-        the result on fresh samples, if the plant has ranges.
+        the result on fresh samples, if the plant has ranges or B0 may be off.
     setup : Mapping
         tables of the setup file besides those of the controller.
     search : Search or None
@@ -221,16 +235,24 @@ class Tuned(InNotebook):
         plant and scenario of the setup file that is written, in which the controller is judged.
     judged_at_limits : Judged or None
         what it does there, if u has limits: it decided on the design and the prefilter.
-    refused : str
-        why a design that the objective alone prefers was left out; empty if none was.
+    told : tuple
+        lines on a design that the objective alone prefers and that was left out, and on gains
+        below which the loop is unstable.
+    machine : Controller or None
+        the controller where it is more than that of ``design``: with all axes, at its start.
+    alone : Mapping
+        the tuning of each axis by itself, by name, or of each operating point.
+    details : Interaction, AtPoints, OnTop or None
+        how several axes act on each other, what a schedule is at its points, and how a compensator
+        changes the loop.
     """
 
-    design: Design
+    axes: tuple[Design, ...]
     designs: Mapping[str, Design]
-    analysis: LoopAnalysis
+    analysis: Any
     constraints: Constraints
     objective: str
-    task: Task
+    task: Task | None = None
     check: Check | None = None
     setup: Mapping[str, Any] = field(default_factory=dict)
     noise_bound: str = ""
@@ -240,7 +262,10 @@ class Tuned(InNotebook):
     doubts: tuple[str, ...] = ()
     loop: Loop | None = None
     judged_at_limits: Judged | None = None
-    refused: str = ""
+    told: tuple[str, ...] = ()
+    machine: Any = None
+    alone: Mapping[Any, Tuned] = field(default_factory=dict)
+    details: Any = None
 
     @property
     def nots(self) -> tuple[str, ...]:
@@ -248,25 +273,44 @@ class Tuned(InNotebook):
         return tuple(f"NOT: the margins hold for the model only: {text}" for text in self.doubts)
 
     @property
-    def controller(self) -> Controller:
+    def design(self) -> Design:
+        """The chosen design of a single axis; ``ValueError`` for several."""
+        if len(self.axes) != 1:
+            raise ValueError(f"design: there are {len(self.axes)} axes; axes has a design for each")
+        return self.axes[0]
+
+    @property
+    def controller(self) -> Any:
         """The tuned controller, behind its prefilter if it has one."""
-        controller = self.design.controller
-        assert controller is not None  # ``tune`` raises an error instead
-        judged = self.judged_at_limits
-        return controller if judged is None else judged.controller
+        if self.judged_at_limits is not None:
+            return self.judged_at_limits.controller
+        return self.axes[0].controller if self.machine is None else self.machine
+
+    @property
+    def met(self) -> bool:
+        """Whether all bounds hold; of one axis ``tune`` raises an error instead."""
+        return self.details is None or self.details.met
 
     @property
     def plants(self) -> PlantSet:
-        """The plants, sampled."""
+        """The plants of a single axis, sampled."""
+        assert self.task is not None
         return self.task.plants
+
+    @property
+    def count(self) -> int:
+        """The number of plants for which the bounds hold."""
+        if self.details is not None:
+            return self.details.plants
+        return 1 if self.task is None else len(self.task.plants.plants)
 
     @cached_property
     def tradeoff(self) -> list[tuple[str, float, float]]:
         """Name, limit and objective for limits 10 % below and above the active ones.
 
-        Empty after a tuning by simulation, which would have to be repeated.
+        Empty after a tuning by simulation, which would have to be repeated, and without a task.
         """
-        if self.search is not None:
+        if self.search is not None or self.task is None:
             return []
         with one_blas_thread():
             return tradeoff(self.task, self.design)
@@ -274,7 +318,9 @@ class Tuned(InNotebook):
     @cached_property
     def noise_curve(self) -> list[tuple[float, float]]:
         """Bounds of M_ks and the objective with them, where the bound is a guess; else empty."""
-        if self.search is not None or not self.noise_bound or self.constraints.m_ks is None:
+        if self.search is not None or self.task is None or not self.noise_bound:
+            return []
+        if self.constraints.m_ks is None:
             return []
         with one_blas_thread():
             return noise_curve(self.task, self.design)
@@ -305,18 +351,21 @@ class Tuned(InNotebook):
     @property
     def active(self) -> tuple[str, ...]:
         """The constraints at their limits, as text."""
-        plants = len(self.plants.plants)
-        return tuple(report.active_text(each, plants) for each in self.design.active)
+        found = [each for design in self.axes for each in design.active]
+        found += [] if self.details is None else self.details.active
+        return tuple(report.active_text(each, self.count) for each in found)
 
     @property
     def damping(self) -> str:
         """The least damped pole of the loop, and the plant's own modes in it, as a line."""
+        if self.task is None:
+            return ""
         return report.damping_line(self.design, self.constraints.damping)
 
     @property
     def left_out(self) -> str:
         """The part of the plant that is not in the observer's model as text; empty if all is."""
-        solution = self.design.solution
+        solution = self.axes[0].solution
         reduced = getattr(solution.structure, "reduced", None) if solution is not None else None
         if reduced is None or not str(reduced):
             return ""
@@ -330,11 +379,12 @@ class Tuned(InNotebook):
         """What the written loop does, as lines: step, overloads, what is not as it should be."""
         judged = self.judged
         lines = [] if judged is None else str(judged).splitlines()
-        lines += conditionally_stable(self._gains())
-        return [*([self.refused] if self.refused else []), *lines]
+        return [*self.told, *lines, *conditionally_stable(self._gains())]
 
     def _gains(self) -> list[tuple[float, float]]:
         """Return the margins of gain of the loops with all plants, where they are stable."""
+        if self.task is None:
+            return []
         found = [self.analysis.margins.gain] if self.analysis.stable else []
         if self.design.controller is not None and len(self.plants.plants) > 1:
             law = self.analysis.law
@@ -348,46 +398,77 @@ class Tuned(InNotebook):
 
         And one that was not tried, for a plant with a resonance.
         """
+        if self.task is None:
+            return []
         lines = report.costs(self.design, self.designs, self.objective)
         single = len(self.designs) == 1  # compares nothing
         resonant = not single and bool(resonances(self.task.model))
         return lines + report.not_tried(self.designs, resonant)
 
-    _size = (8.0, 5.5)
+    def rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return the headings of a table of ``designs``, and a row of text for each."""
+        return report.rows(self.designs, self.objective)
 
-    def _draw_small(self, figure: Any) -> None:
-        self.plot(figure.subplots(2, 2).ravel())
-
-    def __repr__(self) -> str:
-        return f"Tuned {self.design.name}:\n{self.summary()}"
-
-    def summary(self) -> str:
-        """Return constraints, measures, costs and trade-off in some lines."""
-        lines = [f"constraints: {self.constraints}"]
-        lines += self.noise
-        quantity = report.quantity(self.objective)
-        second = report.second_quantity(self.objective)
-        for name, value, *rest in report.rows(self.designs, self.objective):
-            lines.append(f"{name}: {quantity} {value}; " + _measures(second, rest))
-        lines += [self.left_out] if self.left_out else []
-        lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
-        lines += [self.damping, *self.in_the_file]
-        forward = getattr(self.design.controller, "feedforward", False)
+    def verdicts(self) -> list[str]:
+        """Return what holds, what does not, and what is not known, as lines."""
+        lines = [self.left_out, f"active: {', '.join(self.active) or 'no constraint'}"]
+        lines += [self.damping]
+        if self.details is not None:
+            lines += self.details.lines(self)
+        lines += self.in_the_file
+        forward = getattr(self.axes[0].controller, "feedforward", False)
         if isinstance(forward, Feedforward):
             lines.append(f"feedforward: {forward.describe()}")
-        lines += report.tradeoff_lines(self.tradeoff, self.objective)
         lines += [str(self.check)] if self.check is not None else []
         for name, each in (self.simulated_check or {}).items():
             ends = f"95 % interval {each.low:.4g} to {each.high:.4g}"
             lines.append(f"{name} on {each.samples} fresh samples: {each.value:.4g} ({ends})")
-        return "\n".join([*lines, self.analysis.summary(), *self.nots])
+        return [*filter(None, lines), *self.nots]
+
+    def lines(self) -> list[str]:
+        """Return what is told below the table: ``verdicts``, ``costs`` and ``tradeoff``."""
+        others = report.tradeoff_lines(self.tradeoff, self.objective)
+        return [*self.verdicts(), *self.costs, *(f"with {line}" for line in others)]
+
+    _size = (8.0, 5.5)
+
+    def _draw_small(self, figure: Any) -> None:
+        count = (2, 2) if self.details is None else (self.details.drawn, 1)
+        self.plot(figure.subplots(*count, squeeze=False).ravel())
+
+    @property
+    def title(self) -> str:
+        """What was tuned, in a few words."""
+        return self.design.name if len(self.axes) == 1 else f"{len(self.axes)} axes"
+
+    def __repr__(self) -> str:
+        return f"Tuned {self.title}:\n{self.summary()}"
+
+    def summary(self) -> str:
+        """Return constraints, measures, costs and trade-off in some lines."""
+        lines = [self.bounds, *self.noise]
+        (_, *headings), rows = self.rows()
+        for name, *cells, reason in rows:
+            figures = (" ".join(each) for each in zip(headings, cells, strict=True))
+            lines.append(f"{name}: {reason or ', '.join(figures)}")
+        lines += self.lines()
+        return "\n".join([*lines, self.analysis.summary()] if self.details is None else lines)
+
+    @property
+    def bounds(self) -> str:
+        """The constraints as a line."""
+        of = "" if self.details is None else self.details.bounded
+        return f"constraints: {self.constraints}{of}"
 
     def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
-        """Draw Bode diagram, sensitivities with their bounds, step and load responses.
+        """Draw sensitivities with their bounds; of one axis Bode diagram and responses, too.
 
-        The references are beside the tuned controller. Returns the array of axes; ``axes`` are four
-        to draw into, new ones by default.
+        The references are beside the tuned controller. Over the signal of a schedule b0, M_s and
+        ``∫|y|``; of a compensator y after a step of the load. Returns the array of axes; ``axes``
+        are those to draw into, new ones by default.
         """
+        if self.details is not None:
+            return self.details.plot(self.constraints.m_s, given_axes(axes, ax))
         named = {name: each for name, each in self.designs.items() if each.controller is not None}
         chosen = {"tuned": self.design}
         others = {key: named[key] for key in ("pi", "pid") if key in named}
@@ -396,45 +477,56 @@ class Tuned(InNotebook):
         return draw(*drawn, given_axes(axes, ax))
 
     @property
-    def tables(self) -> dict[str, Mapping[str, Any]]:
-        """Tables of a setup file for the controller: observer, controller, prefilter."""
-        judged = self.judged_at_limits
-        shaped = judged is not None and judged.prefilter is not None
-        more = {"prefilter": prefilter_table(judged.prefilter)} if judged and shaped else {}
-        return {**more, **self.design.tables}
+    def tables(self) -> dict[str, Any]:
+        """Tables of a setup file for the controller: observer, controller, prefilter.
+
+        Of several axes ``axis`` has those of each, beside what its table in ``setup`` has.
+        """
+        if self.machine is None:
+            judged = self.judged_at_limits
+            return with_prefilter(self.design.tables, None if judged is None else judged.prefilter)
+        if "axis" not in self.setup:
+            raise ValueError("toml: there is no setup to complete; give tune its tables (setup)")
+        parts = zip(self.setup["axis"], self.axes, self.controller.prefilters, strict=True)
+        return {"axis": [with_prefilter({**own, **of.tables}, each) for own, of, each in parts]}
 
     def toml(self) -> str:
         """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``."""
-        comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
-        comment += "\n".join([f"active: {', '.join(self.active) or 'none'}", *self.in_the_file])
-        comment += f"\n{self.left_out}" if self.left_out else ""
-        comment += "".join(f"\n{line}" for line in self.nots)
-        replaced = ("observer", "controller")
-        tables = {key: value for key, value in self.setup.items() if key not in replaced}
-        return toml_text({**tables, **self.tables}, comment)
+        tables, own = dict(self.setup), self.tables
+        for name in ("observer", "controller") if "compensator" not in own else ():
+            tables.pop(name, None)
+        comment = f"{self.title}, tuned by quell\n{self.bounds}\n" + "\n".join(self.verdicts())
+        return toml_text({**tables, **own}, comment)
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
+        text = self.toml()
         with written_atomically(Path(path), overwrite) as part:
-            part.write_text(self.toml(), encoding="utf-8")
+            part.write_text(text, encoding="utf-8")
 
     def to_json(self) -> dict[str, Any]:
-        """Return all results for ``quell.files.write_json``."""
+        """Return all results for ``quell.files.write_json``; infinite numbers become None."""
         check = None
         if self.check is not None:
             check = {**vars(self.check), "interval": list(self.check.interval)}
             check = {k: dict(v) if isinstance(v, Mapping) else v for k, v in check.items()}
+            del check["of"]
         judged: dict[str, Any] = {"reference_step": None, "overloads": [], "not": list(self.nots)}
         judged = judged if self.judged is None else self.judged.to_json()
+        designs = {name: each.to_json() for name, each in self.designs.items()}
+        chosen: dict[str, Any] = {"axes": [*designs.values()]}
+        if len(self.axes) == 1:
+            chosen = {"structure": self.title, "design": self.design.to_json(), "designs": designs}
+        details: dict[str, Any] = {}
+        if self.details is not None:
+            details = {**self.details.to_json(), "verdicts": self.verdicts()}
         found: dict[str, Any] = nonfinite_to_none(
             {
-                "structure": self.design.name,
                 "objective": self.objective,
                 "constraints": dict(vars(self.constraints)),
                 "noise_bound": self.noise_bound,
                 "doubts": self.doubts,
-                "design": self.design.to_json(),
-                "designs": {name: each.to_json() for name, each in self.designs.items()},
+                **chosen,
                 "costs": self.costs,
                 "damping": self.damping,
                 **judged,
@@ -450,16 +542,9 @@ class Tuned(InNotebook):
                 "simulated_check": None
                 if self.simulated_check is None
                 else {name: each._asdict() for name, each in self.simulated_check.items()},
-                "plants": len(self.plants.plants),
-                "dt": self.plants.dt,
+                "plants": self.count,
+                "dt": float(self.controller.dt),
+                **details,
             }
         )
         return found
-
-
-def _measures(second: str, cells: list[str]) -> str:
-    *numbers, reason = cells
-    if reason:
-        return reason
-    value, m_s, m_t, m_ks, margin = numbers
-    return f"{second} {value}, M_s {m_s}, M_t {m_t}, M_ks {m_ks}, delay margin {margin}"

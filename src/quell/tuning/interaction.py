@@ -1,25 +1,19 @@
-"""What ``tune_axes`` returns: bandwidths of coupled axes, their figures, and what is not known."""
+"""How axes that are tuned together act on each other, as a part of a ``Tuned``."""
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell.analysis.coupling import INDEPENDENT, Coupling, about_zeros
 from quell.analysis.multivariable import MultivariableLoop
-from quell.controllers.axes import Axes
-from quell.files import nonfinite_to_none, written_atomically
-from quell.tuning.acceptance import Judged, prefilter_table
-from quell.tuning.constraints import Constraints
-from quell.tuning.report import toml_text
-from quell.tuning.tuned import Tuned
+from quell.tuning.optimiser.requirements import Active
+from quell.tuning.report import ACTIVE
 
 TOLERANCE = 1e-3
 """A bound counts as kept up to this share beyond it, on the exact response."""
@@ -27,25 +21,7 @@ PLACES = ("inputs", "outputs")
 """Where disk margins are bounded."""
 
 
-class AxisResult(NamedTuple):
-    """One axis of a result."""
-
-    name: str
-    omega_c: float  #: [rad/s]
-    omega_o: float  #: [rad/s]
-    cost: float  #: integral of ``|y|`` after a unit step of v, the largest over the plants
-    alone: float  #: the same of the axis alone, tuned for itself
-    m_s: float  #: the largest M_s at its output with the other loops closed
-    m_t: float
-    m_ks: float  #: from y to v [1/s^n]
-
-    @property
-    def ratio(self) -> float:
-        """The cost over that of the axis alone: what the coupling takes."""
-        return self.cost / self.alone
-
-
-class AxesBound(NamedTuple):
+class Reached(NamedTuple):
     """A bound, and what the loops have."""
 
     name: str  #: with the channel, as ``M_s of x``
@@ -60,23 +36,6 @@ class AxesBound(NamedTuple):
             return self.name
         end = "least" if self.least else "most"
         return f"{self.name} is {self.value:.4g}, at {end} {self.limit:.4g} is asked for"
-
-
-class AxesCheck(NamedTuple):
-    """A result on drawn errors of B0."""
-
-    samples: int
-    unstable: int
-    violating: int
-    interval: tuple[float, float]  #: 95 % interval of the share that violates
-
-    def __str__(self) -> str:
-        """Return the check as a sentence."""
-        low, high = (100.0 * end for end in self.interval)
-        return (
-            f"{self.samples} drawn errors of B0: {self.violating} exceed a bound, {self.unstable} "
-            f"of them unstable; a share of {low:.2g} to {high:.2g} % (95 % interval)"
-        )
 
 
 class GivenB0(NamedTuple):
@@ -95,69 +54,66 @@ class GivenB0(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class TunedAxes:
-    """Tuned axes; from ``tune_axes``.
+class Interaction:
+    """How axes that are tuned together act on each other.
 
     Attributes
     ----------
-    controller : Axes
-        axes with the bandwidths, at their start: the kinds of learners, guards and limits are as
-        they were, what was learned before is not in them.
-    axes : tuple of AxisResult
-        bandwidths and figures of each axis.
+    names : tuple of str
+        of the axes.
     loops : tuple of MultivariableLoop
         the loop at each operating point, and with the errors of B0 that are the worst; without
         learners, the nominal one first.
-    alone : Mapping
-        the tuning of each axis by itself, by name.
-    constraints : Constraints
-        the bounds of each channel.
     disk : float
         the least disk margin that was asked for.
-    met : bool
-        whether all bounds hold.
-    excess : float
-        the largest ratio to a bound, less one; 0 if none is exceeded.
-    bounds : tuple of AxesBound
+    reached : tuple of Reached
         what the loops have of M_s, M_t, M_ks, disk margin and damping, the worst of all channels
         and plants.
+    B0_off, points, plants
+        the share by which B0 may be off, and how many operating points and plants there are.
     left : Coupling or None
         relative gains behind B0: how much the axes notice each other through it.
     of_plant : Coupling or None
         those of the plant without B0; None if there are more actuators than axes.
     given : GivenB0
         whether B0 is that of the plant, and whether another one would be better.
-    check : AxesCheck or None
-        drawn errors of B0, if it may be off.
-    setup : Mapping
-        tables of a setup file that ``toml`` completes; empty without.
-    judged : Judged or None
-        what the axes do in the file, each and after overloads, if actuators have limits.
-    told : tuple
-        lines on axes that are left out, and on the least gain of the channels.
+    with_learners : MultivariableLoop or None
+        the nominal loop with learners at rest.
     """
 
-    controller: Axes
-    axes: tuple[AxisResult, ...]
+    names: tuple[str, ...]
     loops: tuple[MultivariableLoop, ...]
-    alone: Mapping[str, Tuned]
-    constraints: Constraints
     disk: float
-    met: bool
-    excess: float
-    bounds: tuple[AxesBound, ...]
+    reached: tuple[Reached, ...]
     B0_off: float
     points: int
     plants: int
-    objective: str
     left: Coupling | None
     of_plant: Coupling | None
     given: GivenB0
-    check: AxesCheck | None = None
     with_learners: MultivariableLoop | None = None
-    setup: Mapping[str, Any] = field(default_factory=dict)
-    judged: Judged | None = None
-    told: tuple[str, ...] = ()
+
+    bounded = " of each channel, all others closed"
+    drawn = 2
+
+    @property
+    def excess(self) -> float:
+        """The largest ratio to a bound, less one; 0 if none is exceeded."""
+        return excess(self.reached)
+
+    @property
+    def met(self) -> bool:
+        """Whether all bounds hold."""
+        return self.excess <= TOLERANCE
+
+    @property
+    def active(self) -> list[Active]:
+        """The bounds at their limits."""
+        return [
+            Active(each.name, each.value, each.limit, math.nan, 0)
+            for each in self.reached
+            if 1.0 - ACTIVE <= each.ratio <= 1.0 + TOLERANCE
+        ]
 
     @cached_property
     def disk_margins(self) -> tuple[float, float]:
@@ -170,43 +126,26 @@ class TunedAxes:
         """The largest singular value of S at the outputs, over the plants; it has units."""
         return max(loop.m_s("outputs").value for loop in self.loops)
 
-    def rows(self) -> list[tuple[str, ...]]:
-        """Return a row for each axis: name, bandwidths, cost, its ratio, M_s, M_t, M_ks."""
-        return [
-            (
-                each.name,
-                f"{each.omega_c:.4g}",
-                f"{each.omega_o:.4g}",
-                f"{each.cost:.4g}",
-                f"{each.ratio:.3f}",
-                f"{each.m_s:.3f}",
-                f"{each.m_t:.3f}",
-                f"{each.m_ks:.4g}",
-            )
-            for each in self.axes
-        ]
-
-    def verdicts(self) -> list[str]:
-        """Return what holds, what does not, and what is not known, as lines."""
+    def lines(self, tuned: Any) -> list[str]:
+        """Return what holds of a controller's loops, what does not, and what is not known."""
+        controller = tuned.controller
         inputs, outputs = self.disk_margins
         lines = [
             f"disk margin {inputs:.3f} of all inputs, {outputs:.3f} of all outputs at once; "
             f"at least {self.disk:.3f} is asked for; max σ(S) {self.m_s:.3f} at the outputs"
         ]
         if not self.met:
-            missed = "; ".join(str(each) for each in self.bounds if each.ratio > 1.0 + TOLERANCE)
+            missed = "; ".join(str(each) for each in self.reached if each.ratio > 1.0 + TOLERANCE)
             lines.append(
                 f"NOT met with the best bandwidths that were found: {missed}; {self._remedy()}"
             )
         lines += self._advice()
-        if self.check is not None:
-            lines.append(str(self.check))
-        elif self.B0_off == 0.0:
+        if self.B0_off == 0.0:
             lines.append(
                 "NOT known for another B0 than this one: give the share by which it may be off, "
                 "B0_off"
             )
-        if callable(self.controller.B0) or callable(self.controller.M):
+        if callable(controller.B0) or callable(controller.M):
             if self.points == 1:
                 lines.append(
                     "NOT judged away from this operating point, where B0 is another: give several, "
@@ -215,8 +154,7 @@ class TunedAxes:
             lines.append(
                 "NOT proved for fast motion: margins are those of B0 held at each operating point"
             )
-        lines += [*self.told, *([] if self.judged is None else str(self.judged).splitlines())]
-        if self.controller.learning.learns:
+        if controller.learning.learns:
             lines.append(
                 "NOT in any margin: what learners learn from the states of other axes; simulate "
                 "with them"
@@ -276,7 +214,7 @@ class TunedAxes:
                 "does not undo it: give looser bounds, less delay or faster samples"
             )
         if given.pairing is not None:
-            names = self.controller.names
+            names = self.names
             pairs = ", ".join(f"{names[i]} with input {j + 1}" for i, j in enumerate(given.pairing))
             remedies.append(f"pair by the gains at rest, {pairs}, with a B0 of these entries only")
         remedies.append("choose other inputs or outputs")
@@ -313,104 +251,48 @@ class TunedAxes:
         rest = f"; {rest}" if self.met else ""
         return [*lines, f"NOT decoupled by this B0{whose}: {changes} {closed}{rest}"]
 
-    def summary(self) -> str:
-        """Return bandwidths, figures and verdicts as lines."""
-        lines = [f"constraints: {self.constraints} of each channel, all others closed"]
-        for name, omega_c, omega_o, cost, ratio, m_s, m_t, m_ks in self.rows():
-            lines.append(
-                f"{name}: omega_c {omega_c}, omega_o {omega_o}, {quantity(self.objective)} "
-                f"{cost}, {ratio} of alone, M_s {m_s}, M_t {m_t}, M_ks {m_ks}"
-            )
-        return "\n".join([*lines, *self.verdicts()])
-
-    def __repr__(self) -> str:
-        return f"TunedAxes of {len(self.axes)} axes:\n{self.summary()}"
-
-    def toml(self) -> str:
-        """Return the setup file that was given with these bandwidths.
-
-        Raises ``ValueError`` without one.
-        """
-        if "axis" not in self.setup:
-            raise ValueError("toml: there is no setup to complete; give tune_axes its tables")
-        tables = dict(self.setup)
-        entries = []
-        made = self.controller
-        parts = zip(tables["axis"], self.axes, made.axes, made.prefilters, strict=True)
-        for table, axis, own, shaper in parts:
-            observer = {**table["observer"], "omega_o": axis.omega_o}
-            law = table["controller"]
-            law = {**({"kind": law} if isinstance(law, str) else law), "omega_c": axis.omega_c}
-            if own.feedforward is True:
-                law["feedforward"] = True
-            entries.append({**table, "observer": observer, "controller": law})
-            if shaper is not None and "prefilter" not in table:
-                entries[-1]["prefilter"] = prefilter_table(shaper)
-        tables["axis"] = entries
-        found = "\n".join(self.verdicts())
-        return toml_text(tables, f"axes tuned by quell\nconstraints: {self.constraints}\n{found}")
-
-    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
-        """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
-        text = self.toml()
-        with written_atomically(Path(path), overwrite) as part:
-            part.write_text(text, encoding="utf-8")
-
     def to_json(self) -> dict[str, Any]:
-        """Return all results for ``quell.files.write_json``; infinite numbers become None."""
+        """Return it as a table."""
         inputs, outputs = self.disk_margins
-        found: dict[str, Any] = nonfinite_to_none(
-            {
-                "objective": self.objective,
-                "constraints": dict(vars(self.constraints)),
-                "disk": self.disk,
-                "met": self.met,
-                "excess": self.excess,
-                "bounds": [each._asdict() for each in self.bounds],
-                "axes": [each._asdict() | {"ratio": each.ratio} for each in self.axes],
-                "disk_margin": {"inputs": inputs, "outputs": outputs},
-                "max_singular_value": self.m_s,
-                "B0_off": self.B0_off,
-                "operating_points": self.points,
-                "plants": self.plants,
-                "coupled": {
-                    "plant": None if self.of_plant is None else self.of_plant.factor,
-                    "behind_B0": None if self.left is None else self.left.factor,
-                    "given_B0": {
-                        **self.given._asdict(),
-                        "zeros": [[zero.real, zero.imag] for zero in self.given.zeros],
-                    },
+        return {
+            "disk": self.disk,
+            "met": self.met,
+            "excess": self.excess,
+            "bounds": [each._asdict() for each in self.reached],
+            "disk_margin": {"inputs": inputs, "outputs": outputs},
+            "max_singular_value": self.m_s,
+            "B0_off": self.B0_off,
+            "operating_points": self.points,
+            "coupled": {
+                "plant": None if self.of_plant is None else self.of_plant.factor,
+                "behind_B0": None if self.left is None else self.left.factor,
+                "given_B0": {
+                    **self.given._asdict(),
+                    "zeros": [[zero.real, zero.imag] for zero in self.given.zeros],
                 },
-                "check": None
-                if self.check is None
-                else {**self.check._asdict(), "interval": list(self.check.interval)},
-                "verdicts": self.verdicts(),
-                **({} if self.judged is None else self.judged.to_json()),
-            }
-        )
-        return found
+            },
+        }
 
-    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
-        """Draw the singular values of S at the outputs and the sensitivities of all channels.
+    def plot(self, m_s: float | None, axes: Any = None) -> Any:
+        """Draw the sensitivities of all channels, with their bound, and the singular values of S.
 
-        Lines are of the nominal plant, grey ones of the others. Returns the two matplotlib axes;
-        ``axes`` or ``ax`` are those to draw into, new ones by default.
+        Lines are of the nominal plant, grey ones of the others. Returns the two matplotlib axes.
         """
-        from quell.records.plotting import given_axes, grid_of_axes, new_figure
+        from quell.records.plotting import grid_of_axes, new_figure
 
-        drawn = grid_of_axes(given_axes(axes, ax), lambda: new_figure(6.4, 5.6), 2, sharex=True)
+        drawn = grid_of_axes(axes, lambda: new_figure(6.4, 5.6), 2, sharex=True)
         first, second = drawn[:, 0]
         for j, loop in reversed([*enumerate(self.loops)]):
             omega = loop.omega[1:]
             grey = {"color": "0.8", "linewidth": 0.8}
             S = np.abs(np.einsum("kii->ki", loop.response("S_o", omega)))
-            for k, name in enumerate(self.controller.names):
+            for k, name in enumerate(self.names):
                 how: dict[str, Any] = {"label": f"|S| of {name}"} if j == 0 else grey
                 first.loglog(omega, S[:, k], **how)
             sigma = loop.singular_values("S_o", omega)[:, 0]
             second.loglog(omega, sigma, **({"label": "max σ(S)"} if j == 0 else grey))
-        if self.constraints.m_s is not None:
-            first.axhline(self.constraints.m_s, color="black", linestyle="--", label="bound")
+        if m_s is not None:
+            first.axhline(m_s, color="black", linestyle="--", label="bound")
         for each in (first, second):
             each.grid(True, alpha=0.3)
             each.legend()
@@ -418,6 +300,6 @@ class TunedAxes:
         return drawn[:, 0]
 
 
-def quantity(objective: str) -> str:
-    """Return what the cost of an axis is, as text."""
-    return "∫|y|" if objective == "load-iae" else "1/k_i"
+def excess(reached: Sequence[Reached]) -> float:
+    """Return the largest ratio to a bound, less one, or 0."""
+    return max(max(each.ratio for each in reached) - 1.0, 0.0)
