@@ -21,7 +21,7 @@ from quell.controllers.shaping import ProfileGenerator
 from quell.export import c_source
 from quell.setup import made
 from quell.setup.schema import SetupError
-from quell.tuning import axes_at_limits
+from quell.tuning import reference
 from quell.tuning.axes_at_limits import held_loads, needs_along, with_prefilters
 from quell.tuning.written import Written
 
@@ -299,7 +299,7 @@ def test_axes_that_friction_brakes_speed_up_at_their_limits() -> None:
         return made, [step.settling for step in steps if step is not None]
 
     quick, times = found()
-    with patch.object(axes_at_limits, "_BEYOND_MOVES", ()):
+    with patch.object(reference, "BEYOND", ()):
         within, slower = found()
     assert times[0] < 0.9 * slower[0]
     (a, b), (before, _) = quick.prefilters, within.prefilters

@@ -8,15 +8,14 @@ give three systems with one matrix, for e of the axis::
 
     K = [A, B; C, 0],   K [x_2; c_0] = [0; e],   K [x_1; c_1] = [x_2; 0],   K [x_0; c_2] = [x_1; 0]
 
-So an axis that needs little u at rest gets a ``ProfileGenerator`` of its c_1 and c_2, as a single
-one does (``tuning/reference.py``), with the feedforward of its order; axes that step in one sample
-share the room for u. Another one gets a ``ReferenceModel``. Each try is a run of the file.
+So an axis that needs little u at rest gets a ``ProfileGenerator`` of its c_1 and c_2, and another
+one a ``ReferenceModel``, each as a single one does (``tuning/reference.py``), one after the other;
+axes that step in one sample share the room for u. Each try is a run of the file.
 """
 
 from __future__ import annotations
 
 import copy
-import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -40,18 +39,15 @@ from quell.tuning.acceptance import (
 )
 from quell.tuning.optimiser.coupled import CoupledLoops, Found, Plant
 from quell.tuning.reference import (
-    BEYOND,
     MOST_RESERVED,
-    SAMPLES,
-    SHARES,
-    SLOWER,
-    TRIES,
     Axis,
-    few_at_limits,
-    with_less,
+    Shaped,
+    behind,
+    profile_for,
+    reference_model_for,
 )
 from quell.tuning.tables import SHARE
-from quell.tuning.written import MOST_OVERSHOOT, StepFigures, Written
+from quell.tuning.written import MOST_OVERSHOOT, Written
 from quell.types import Matrix, Vector
 
 # Factors of all bandwidths with which axes take the place of some that fail at the limits of u.
@@ -60,14 +56,11 @@ _SLOWER = (0.85, 0.7, 0.55)
 _HOLD = 1e3
 # A solution of ``A x + B u = −E w``, ``C x = 0`` within this share of its right side is one.
 _SOLVED = 1e-6
-# Ramps of the acceleration, in time constants of the axis. With the shares of a single axis the
-# best is taken, or the first of slower ones. Chosen by hand; each is simulated.
-_RAMPS = (0.3, 1.0, 3.0)
-_BEYOND_MOVES = tuple(itertools.product(BEYOND, _RAMPS))
-_QUICK_MOVES = tuple(itertools.product(SHARES, _RAMPS))
-_SLOW_MOVES = tuple((SHARES[-1] * SLOWER**i, _RAMPS[-1]) for i in range(1, TRIES + 1))
 # A step that needs more than this share of the room for u at rest is that of a process.
 _PROCESS = 0.5
+# The bandwidth of the reference model of axes whose turn is later, in units of omega_c, and the
+# derivatives that a profile generator has.
+_SLOW_MODEL, _DERIVATIVES = 0.3, 3
 
 
 def file_at(plant: Any, axes: Axes, point: Any) -> Written:
@@ -148,59 +141,40 @@ def with_prefilters(
             for u in needs_along(plant, axes, point)
         ]
 
-    braked = set()  # axes that friction brakes
+    # What each axis needs of the room, with those that step with it; None for another plant.
+    parts: dict[int, tuple[Axis | None, float]] = {}
+    made = copy.copy(axes)
     for i, (first, size) in stepping.items():
+        own = made.axes[i]
         at_rest, viscous, inertia = (float(u[i]) * together[first] for u in needed)
-        if Axis(viscous, inertia).beyond(size, 1.0 - at_rest * size):
-            braked.add(i)
-
-    def steps_of(made: Axes) -> list[StepFigures]:
-        run = files[0].run(made)
-        return [figures for i in stepping if (figures := files[i].figures(made, run)) is not None]
-
-    def tried(share: float, ramp: float) -> Axes:
-        """Return axes behind prefilters; a ``share`` above 1 goes beyond it, of ``braked`` ones."""
-        made = copy.copy(axes)
-        shapers = list(axes.prefilters)
-        for i, (first, size) in stepping.items():
-            axis = made.axes[i]
-            at_rest, viscous, inertia = (float(u[i]) * together[first] for u in needed)
-            if not max(at_rest, viscous, inertia) > 0.0:  # no actuator that moves it has limits
-                continue
-            own = min(share, SHARES[0])
-            left = own * (1.0 - at_rest * size)
-            if axis.observer.order < 2 or not left > own * (1.0 - _PROCESS):
-                omega = min(FASTEST_MODEL * own / ramp * axis.omega_c, 1.0 / axes.dt)
-                shapers[i] = ReferenceModel(omega, axis.observer.order)
-                continue
-            slow = max(ramp / axis.omega_c, SAMPLES[0] * axes.dt)
-            beyond = max(share, 1.0) if i in braked else 1.0
-            shapers[i] = Axis(viscous, inertia).profile(size, left, slow, beyond)
-            if not axis.feedforward and axis.observer.order <= shapers[i].derivatives:
-                axis.feedforward = checked_feedforward(True)
-                axis._initialise()
-        made.prefilters = tuple(shapers)
-        made._initialise()
-        return made
-
-    best: tuple[float, Axes] | None = None
-    for share, ramp in (*(_BEYOND_MOVES if braked else ()), *_QUICK_MOVES, *_SLOW_MOVES):
-        if best is not None and share < SHARES[-1]:
-            break
-        made = tried(share, ramp)
-        steps = steps_of(made)
-        if any(math.isnan(s.settling) or not s.overshoot <= MOST_OVERSHOOT for s in steps):
+        if not max(at_rest, viscous, inertia) > 0.0:  # no actuator that moves it has limits
             continue
-        rank = sum(step.settling for step in steps)
-        if any(s.limited > few_at_limits(s.settling, axes.dt) for s in steps):
-            weaker = steps_of(with_less(made)) if braked else []
-            if not weaker or not all(s.overshoot <= MOST_OVERSHOOT for s in weaker):
-                rank = math.inf
-        if math.isinf(rank) and share > 1.0:
-            continue
-        if best is None or rank < best[0]:
-            best = rank, made
-    return None if best is None else best[1]
+        left = 1.0 - at_rest * size
+        moves = own.observer.order > 1 and left > 1.0 - _PROCESS
+        parts[i] = Axis(viscous, inertia) if moves else None, left
+        if moves and not own.feedforward and own.observer.order <= _DERIVATIVES:
+            own.feedforward = checked_feedforward(True)
+            own._initialise()
+    made._initialise()
+    for i in parts:  # while one is tried the others move slowly
+        slow = ReferenceModel(_SLOW_MODEL * made.axes[i].omega_c, made.axes[i].observer.order)
+        made = behind(made, slow, i)
+    for i, (rigid, left) in parts.items():
+        own, file = made.axes[i], files[i]
+        found = Shaped(None, None)
+        if rigid is not None:
+            found = profile_for(file, made, rigid, 1.0 / own.omega_c, left)
+        if found.step is None:
+            found = reference_model_for(file, made, FASTEST_MODEL * own.omega_c, own.observer.order)
+        if found.step is None:
+            return None
+        made = behind(made, found.prefilter, i)
+    run = files[0].run(made)
+    for i in stepping:
+        step = files[i].figures(made, run)
+        if step is None or not step.overshoot <= MOST_OVERSHOOT or math.isnan(step.settling):
+            return None
+    return made
 
 
 def time_constant(loop: MultivariableLoop) -> float:

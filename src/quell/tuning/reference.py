@@ -170,6 +170,16 @@ class Axis:
         return BEYOND if top > _FRICTION * room else ()
 
 
+def behind(controller: Any, prefilter: Any, axis: int | None = None) -> Any:
+    """Return a controller behind a prefilter of its reference, or of that of an axis."""
+    if axis is None:
+        return controller if prefilter is None else Prefiltered(controller, prefilter)
+    found = copy.copy(controller)
+    found.prefilters = (*found.prefilters[:axis], prefilter, *found.prefilters[axis + 1 :])
+    found._initialise()
+    return found
+
+
 def with_less(controller: Any) -> Any:
     """Return a copy of a controller whose limits of u are nearer."""
     found, limits = copy.copy(controller), controller.limits
@@ -227,7 +237,7 @@ def profile_for(
         most = few_at_limits(own, written.dt)
         if not shown.overshoot <= MOST_OVERSHOOT or math.isnan(shown.settling):
             continue
-        whole = Prefiltered(controller, generator)
+        whole = behind(controller, generator, written.axis)
         if any(not worst_step(each, whole).overshoot <= MOST_OVERSHOOT for each in small):
             continue
         rank = shown.settling
@@ -288,7 +298,7 @@ def _duration(generator: ProfileGenerator, size: float) -> float:
 
 def _with(written: Written, controller: Controller, prefilter: Any, last: int) -> StepFigures:
     """Return the step of the file with a prefilter, up to a sample; the worst of its plants."""
-    return worst_step(written, Prefiltered(controller, prefilter), last)
+    return worst_step(written, behind(controller, prefilter, written.axis), last)
 
 
 def worst_step(written: Written, controller: Controller, last: int | None = None) -> StepFigures:
@@ -324,7 +334,8 @@ def reference_model_for(
     The first one tried has the bandwidth ``omega`` [rad/s], the next ones are slower.
     """
     assert written.largest is not None
-    order = max(order, min(int(getattr(controller, "derivatives", 0)), _LARGEST_ORDER))
+    derivatives = np.ravel(getattr(controller, "derivatives", 0))[written.axis or 0]
+    order = max(order, min(int(derivatives), _LARGEST_ORDER))
     end, at_limits, best = written.largest[1], Shaped(None, None), None
     omega = min(omega, 1.0 / written.dt)
 
@@ -411,7 +422,7 @@ def bounded_rate(
     def larger_with(prefilter: Any, slowest: float) -> StepFigures:
         """Return the larger step behind a prefilter."""
         last = _CONSTANTS_OF_LARGER * tau + _LOOKED * abs(most) / slowest
-        whole = controller if prefilter is None else Prefiltered(controller, prefilter)
+        whole = behind(controller, prefilter)
         return worst_step(written.stepping(most, last, _BEFORE), whole)
 
     first = model or ReferenceModel(min(1.0 / tau, 1.0 / written.dt), _ORDER)
@@ -422,7 +433,7 @@ def bounded_rate(
     well = plain.overshoot <= MOST_OVERSHOOT and not math.isnan(plain.settling)
     if model is None and well:
         return None, plain
-    usual = worst_step(written, controller if model is None else Prefiltered(controller, model))
+    usual = worst_step(written, behind(controller, model))
     best, latest = (model, plain), (1.0 if well else _AS_QUICK) * usual.settling
     for share, factor in itertools.product(_RATES, _FASTER_MODELS):
         omega = min(factor * first.omega, 1.0 / written.dt)
