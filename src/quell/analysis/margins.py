@@ -35,7 +35,7 @@ which is exact. A frequency then costs r³ instead of (r + d)³ operations, and 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -174,6 +174,8 @@ _BESIDE_UNDAMPED = np.logspace(-6.0, -1.0, 11)
 # Numbers in the matrices of the frequencies that are solved together: 16 MB. Chosen by hand; larger
 # blocks are not quicker.
 _BLOCK = 1_000_000
+# What a set takes of each response.
+_PARTS = ("_N", "_B", "_C", "_D", "_steps", "_M", "_C_late")
 
 
 class Response:
@@ -230,6 +232,44 @@ class Response:
         row, column = output[..., 0, :], solved[:, :, 0]
         product = column @ row if row.ndim == 1 else np.sum(column * row, axis=1)
         return np.asarray(product + self._D, dtype=np.complex128)
+
+
+class ResponseSet:
+    """Responses of systems of one input and output, those of equal size found together."""
+
+    def __init__(self, responses: Sequence[Response]) -> None:
+        sizes = [(each._N.shape[0], each._steps.size) for each in responses]
+        self._groups: list[tuple[Any, ...]] = []
+        for size in dict.fromkeys(sizes):
+            numbers = [i for i, other in enumerate(sizes) if other == size]
+            place = np.full(len(responses), -1)
+            place[numbers] = np.arange(len(numbers))
+            parts = [[getattr(responses[i], name) for i in numbers] for name in _PARTS]
+            self._groups.append((place, *map(np.array, parts)))
+
+    def __call__(self, omega: Any, members: NDArray[np.intp], dt: float) -> Complex:
+        """Return the responses (k,) at frequencies (k,), each of the system with that number.
+
+        Raises ``ValueError`` at the frequency of a pole.
+        """
+        found = np.empty(omega.size, dtype=np.complex128)
+        for place, N, B, C, D, steps, M, C_late in self._groups:
+            own = np.flatnonzero(place[members] >= 0)
+            count = math.ceil(own.size * (N[0].size + 1) / _BLOCK)
+            for part in np.array_split(own, count) if count else ():
+                i, w = place[members[part]], omega[part]
+                resolvent, output = (-N[i]).astype(complex), C[i, 0]
+                np.einsum("kii->ki", resolvent)[...] += np.expm1(1j * w * dt)[:, None]
+                if steps.size:
+                    late = np.exp(-1j * dt * w[:, None] * steps[i])[:, None]
+                    resolvent -= (late @ M[i]).reshape(resolvent.shape)
+                    output = output + (late @ C_late[i])[:, 0]
+                try:
+                    solved = np.linalg.solve(resolvent, B[i])[:, :, 0]
+                except np.linalg.LinAlgError:
+                    raise ValueError("omega: the response is infinite at one of them") from None
+                found[part] = np.sum(solved * output, axis=1) + D[i]
+        return found
 
 
 def balancing_scales(N: Matrix, M: NDArray[np.float64]) -> Vector:

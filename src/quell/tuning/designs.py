@@ -245,7 +245,8 @@ def tuned_designs(
             reason = f"no controller of this structure was found that stabilises {which}"
             designs[name] = impossible(name, reason)
         elif not best.feasible:
-            designs[name] = impossible(name, contradiction(problem, best, task.constraints))
+            shown = task.problem(_worst(task, best)) if _is_exchanged(task) else problem
+            designs[name] = impossible(name, contradiction(shown, best, task.constraints))
         else:
             made = (kept.problem(), best, kept.constraints, kept.options(best.structure))
             found = design_of(best.structure.name, *made)
@@ -303,8 +304,7 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     """Return the best solution.
 
     What is about responses over time is slow: it comes in at optima for the integral gain, the best
-    one of them and of ``known``. The worst case of a set is that of few plants: those that are the
-    worst at the optima so far.
+    one of them and of ``known``.
     """
     problem = task.problem()
     quick = replace(_with(task, u_max=None, rate_max=None), objective="load")
@@ -320,24 +320,48 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     first = sorted((each for each in tried if each is not None), key=merit)[:count]
     if not first:
         return None
-    best = first[0]
-    if problem.objective == "load" or task.quantile < 1.0 or len(task.plants.plants) <= _MEMBERS:
+    if not _is_exchanged(task):
         ends = [end for e in first if (end := search(problem, structure, e.values, _ROUNDS))]
         # A search may end worse than it began, and more freedom must not give less.
         return min([*ends, *first], key=_rank)
-    over, members = SetResponses(task.plants, task.inputs), list[int]()
+    return _near(task, structure, first[0], _ROUNDS) or first[0]
+
+
+def _is_exchanged(task: Task) -> bool:
+    """Return whether the objective is the worst case of more plants than a search has at once."""
+    worst = task.objective != "load" and task.quantile == 1.0
+    return worst and len(task.plants.plants) > _MEMBERS
+
+
+def _worst(task: Task, solution: Solution) -> list[int]:
+    """Return the plants with the worst objectives."""
+    over = SetResponses(task.plants, task.inputs)
+    each = scores(task.objective, solution.structure, solution.values, over)
+    found: list[int] = np.argsort(-each)[:_MEMBERS].tolist()
+    return found
+
+
+def _near(task: Task, structure: Structure, start: Solution, rounds: int) -> Solution | None:
+    """Return the optimum that is reached from a solution; None if all rounds end unstable.
+
+    The worst case of a set is that of few plants: those that are the worst at the optima so far.
+    """
+    if not _is_exchanged(task):
+        return search(task.problem(), structure, start.values, rounds)
+    over, members, found = SetResponses(task.plants, task.inputs), list[int](), None
+    best = start
     for _ in range(_EXCHANGES):
         each = scores(task.objective, structure, best.values, over)
-        worst = np.argsort(-each)[:_MEMBERS].tolist()
         if members and float(np.max(each)) <= _WORSE * float(np.max(each[members])):
             break
-        members = list(dict.fromkeys([*members, *worst]))
-        found = search(task.problem(members), structure, best.values, _ROUNDS)
-        if found is None:
+        members = list(dict.fromkeys([*members, *np.argsort(-each)[:_MEMBERS].tolist()]))
+        end = search(task.problem(members), structure, best.values, rounds)
+        if end is None:
             break
-        best = found
-    cost = float(problem.cost(structure, best.values[None, :])[0])
-    return replace(best, cost=cost)
+        best = found = end
+    if found is None:
+        return None
+    return replace(found, cost=float(task.problem().cost(structure, found.values[None, :])[0]))
 
 
 def _best_gains(task: Task, structure: Structure, known: Matrix) -> list[Solution]:
@@ -493,7 +517,7 @@ def tradeoff(task: Task, design: Design) -> list[tuple[str, float, float]]:
                 continue
             near = replace(task, constraints=replace(task.constraints, **{field: limit}))
             solution = design.solution
-            result = search(near.problem(), solution.structure, solution.values, _NEARBY_ROUNDS)
+            result = _near(near, solution.structure, solution, _NEARBY_ROUNDS)
             if result is not None and result.feasible:
                 size = float(np.exp(result.cost))
                 value = 1.0 / size if task.objective == "load" else size
@@ -519,8 +543,10 @@ def noise_curve(task: Task, design: Design) -> list[tuple[float, float]]:
         for factor in _OF_CURVE[len(_OF_CURVE) // 2 :]:
             limit = given * factor**side
             if factor > 1.0:
-                near = _with(task, m_ks=limit).problem()
-                result = search(near, solution.structure, solution.values, _NEARBY_ROUNDS)
+                near = _with(task, m_ks=limit)
+                result = _near(near, solution.structure, solution, _NEARBY_ROUNDS)
+                if result is not None and not result.feasible:
+                    result = _near(near, solution.structure, result, _ROUNDS)
                 if result is None or not result.feasible:
                     break
                 solution = result

@@ -40,7 +40,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.analysis.loop import closed_loop
-from quell.analysis.margins import Complex, Response, eigenvalues, frequencies, in_s_plane
+from quell.analysis.margins import (
+    Complex,
+    Response,
+    ResponseSet,
+    eigenvalues,
+    frequencies,
+    in_s_plane,
+)
 from quell.controllers.base import Controller
 from quell.controllers.compensated import CompensatedDesign
 from quell.controllers.law import AdrcDesign, LinearFeedback, ModelFeedforward, reference_part
@@ -105,6 +112,9 @@ class PlantSet:
         self._responses = {
             key: Response(System(plant.N, plant.B, plant.C, 0.0)) for key, plant in distinct.items()
         }
+        self._set = ResponseSet([*self._responses.values()])
+        places = {key: i for i, key in enumerate(self._responses)}
+        self._of_set = np.array([places[id(plant)] for plant in self.plants])
         self._poles = {key: eigenvalues(plant.N) for key, plant in distinct.items()}
         self.crossover = self._crossover()
         self.omega = self._grid()
@@ -115,19 +125,14 @@ class PlantSet:
 
     def responses(self, omega: Vector) -> Complex:
         """Return P (J, k)."""
-        found = {key: response(omega, self.dt) for key, response in self._responses.items()}
-        rows = [found[id(plant)] for plant in self.plants]
-        P: Complex = np.array(rows) * self.factors[:, None]
+        rows, count = np.arange(len(self._responses)), omega.size
+        found = self._set(np.tile(omega, rows.size), np.repeat(rows, count), self.dt)
+        P: Complex = found.reshape(-1, count)[self._of_set] * self.factors[:, None]
         return P
 
     def responses_of(self, omega: Vector, members: NDArray[np.intp]) -> Complex:
         """Return P (k,) at frequencies (k,), each of the plant with that number."""
-        found = np.empty(omega.size, dtype=np.complex128)
-        keys = np.array([id(plant) for plant in self.plants])[members]
-        for key in np.unique(keys):
-            own = keys == key
-            found[own] = self._responses[int(key)](omega[own], self.dt)
-        P: Complex = found * self.factors[members]
+        P: Complex = self._set(omega, self._of_set[members], self.dt) * self.factors[members]
         return P
 
     @cached_property
@@ -232,21 +237,35 @@ class PlantSet:
         controller
             their numbers of unstable poles (m,).
         """
-        count = np.empty((C.shape[0], len(self.plants)))
-        for j, (unstable, integrators, on_axis) in enumerate(self._open):
-            steps = np.diff(np.angle(1.0 + self.P[j] * C), axis=1)
-            # Whole turns that bring each step to −π up to π; a remainder takes ten times as long.
-            turns = np.count_nonzero(steps < -np.pi, axis=1)
-            turns -= np.count_nonzero(steps >= np.pi, axis=1)
-            at = np.searchsorted(self.omega, on_axis) - 1
-            at = at[(at >= 0) & (at < steps.shape[1])]
-            across = np.remainder(steps[:, at] + np.pi, 2.0 * np.pi) - np.pi
-            turns -= np.count_nonzero(across > 0.0, axis=1)
-            expected = unstable + controller + 0.5 * (integrators + at_one)
-            count[:, j] = np.round(expected - np.sum(steps, axis=1) / np.pi - 2.0 * turns)
-            # A loop whose crossover lies below the grid: its slow poles do not show.
-            count[np.abs(self.P[j, 0] * C[:, 0]) < _LEAST_BOTTOM, j] = np.inf
+        columns = [self._unstable(j, C, controller, at_one) for j in range(len(self.plants))]
+        return np.stack(columns, axis=1)
+
+    def _unstable(self, j: int, C: Complex, controller: Vector, at_one: int) -> Vector:
+        """Return the number (m,) of unstable poles with the j-th plant."""
+        unstable, integrators, on_axis = self._open[j]
+        steps = np.diff(np.angle(1.0 + self.P[j] * C), axis=1)
+        # Whole turns that bring each step to −π up to π; a remainder takes ten times as long.
+        turns = np.count_nonzero(steps < -np.pi, axis=1)
+        turns -= np.count_nonzero(steps >= np.pi, axis=1)
+        at = np.searchsorted(self.omega, on_axis) - 1
+        at = at[(at >= 0) & (at < steps.shape[1])]
+        across = np.remainder(steps[:, at] + np.pi, 2.0 * np.pi) - np.pi
+        turns -= np.count_nonzero(across > 0.0, axis=1)
+        expected = unstable + controller + 0.5 * (integrators + at_one)
+        count = np.round(expected - np.sum(steps, axis=1) / np.pi - 2.0 * turns)
+        # A loop whose crossover lies below the grid: its slow poles do not show.
+        count[np.abs(self.P[j, 0] * C[:, 0]) < _LEAST_BOTTOM] = np.inf
         return np.abs(count)
+
+    def stable_rows(self, C: Complex, controller: Vector, at_one: int = 1) -> NDArray[np.intp]:
+        """Return which controllers stabilise all plants; arguments are those of unstable_loops.
+
+        One that does not stabilise a plant is not tried with the next ones.
+        """
+        rows = np.arange(C.shape[0])
+        for j in range(len(self.plants)):
+            rows = rows[self._unstable(j, C[rows], controller[rows], at_one) < 0.5]
+        return rows
 
 
 def peaks(

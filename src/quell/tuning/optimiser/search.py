@@ -488,13 +488,12 @@ def _gains_of(
     first = gains**structure.gain_power
     gains = gains[(first >= low[0]) & (first <= high[0])]
     tried = gains[:, None] * response
-    unstable = plants.unstable_loops(tried, np.full(gains.size, poles), structure.integrators)
-    ratio = worst_ratio(problem.bounds, plants, tried)
-    good = np.all(unstable < 0.5, axis=1) & np.isfinite(ratio)
-    values = np.repeat(row[None, :], int(np.sum(good)), axis=0)
+    good = plants.stable_rows(tried, np.full(gains.size, poles), structure.integrators)
+    ratio = worst_ratio(problem.bounds, plants, tried[good])
+    good, ratio = good[np.isfinite(ratio)], ratio[np.isfinite(ratio)]
+    values = np.repeat(row[None, :], good.size, axis=0)
     values[:, 0] = gains[good] ** structure.gain_power
     cost = load_cost(structure, values, plants) if values.size else np.zeros(0)
-    ratio = ratio[good]
     if structure.may_swing and values.size:
         swing = load_swing(plants, tried[good], structure.integral_gain(values))
         ratio = np.maximum(ratio, swing / MOST_SWING)
