@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
 import quell as ql
+from quell.cli import output
 from quell.setup import load
 from quell.tuning import STRUCTURES
 from tests.commands import Shown, in_this_process
@@ -230,3 +234,20 @@ def test_operating_points_that_can_not_be_are_one_clear_error(
     shown: Shown = quell(*call)  # type: ignore[operator]
     assert shown.code == 2
     assert message in shown.err
+
+
+def test_in_a_pipe_a_line_says_every_few_seconds_how_far_the_work_is(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """It goes to stderr, with the time that is left at the pace so far; none before it is due."""
+    console = output.Console(file=io.StringIO())
+    line, printed = r"^tuning pi, 25 %, \d+ s, about \d+ s left$", ""
+    with patch.object(output, "_EVERY", 1e-3), output.progress_bar(console, "tuning") as report:
+        report("tuning pi", 0.25)
+        while not re.search(line, printed, re.M) and len(printed) < 1e5:
+            printed += capsys.readouterr().err
+    assert re.search(line, printed, re.M)
+    capsys.readouterr()
+    with output.progress_bar(console, "tuning") as report:
+        report("tuning pi", 0.25)
+    assert capsys.readouterr().err == ""

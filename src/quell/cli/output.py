@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -144,21 +145,55 @@ def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -
         compile_time.seconds = compile_time.told = 0.0
 
 
+# Time between two lines of progress where nobody sees a bar [s].
+_EVERY = 5.0
+
+
 @contextmanager
 def progress_bar(
     console: Console, first: str = "simulating", *more: ProgressColumn, width: int = 0
 ) -> Iterator[ProgressCallback]:
     """Show a progress bar while the work goes on, and return the callback that moves it.
 
+    In a pipe there is a line on stderr every 5 s instead, from the tenth second on with the time
+    that is left at the present pace.
+
     ``first`` is the label until the first call, of at least ``width`` characters; ``more`` are
     further columns of the bar.
     """
     from rich.progress import BarColumn, Progress, TextColumn
 
+    if not console.is_terminal:
+        yield from _lines_of_progress(first)
+        return
     label = TextColumn(f"{{task.description:<{width}}}")
     with Progress(label, BarColumn(), *more, console=console, transient=True) as bar:
         task = bar.add_task(first, total=1.0)
         yield lambda what, share: bar.update(task, description=what, completed=share)
+
+
+def _lines_of_progress(first: str) -> Iterator[ProgressCallback]:
+    """Print a line every few seconds, from a thread; yield the callback that changes it."""
+    began, ended, now = time.monotonic(), threading.Event(), [(first, 0.0)]
+
+    def print_lines() -> None:
+        while not ended.wait(_EVERY):
+            (what, share), passed = now[0], time.monotonic() - began
+            text = f"{what}, {100.0 * share:.0f} %, {passed:.0f} s"
+            if passed >= 2.0 * _EVERY and 0.1 < share < 1.0:
+                text += f", about {passed * (1.0 - share) / share:.0f} s left"
+            print(text, file=sys.stderr, flush=True)
+
+    def report(what: str, share: float) -> None:
+        now[0] = what, share
+
+    thread = threading.Thread(target=print_lines, daemon=True)
+    thread.start()
+    try:
+        yield report
+    finally:
+        ended.set()
+        thread.join()
 
 
 def write_record(console: Console, run: Trajectory, outputs: RunOutputs, name: str) -> None:

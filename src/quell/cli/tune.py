@@ -148,10 +148,12 @@ def identified(console: Console, record: Measured, asked: Asked) -> RecordModel:
     Raises ``ValueError`` for a model with faults that no controller should be tuned for, and for
     what the record does not decide.
     """
+    from rich.progress import TimeRemainingColumn
+
     from quell.tuning.plants import record_model
 
     options = vars(asked.model) | ({} if asked.order is None else {"order": asked.order})
-    with progress_bar(console, "identifying") as report:
+    with progress_bar(console, "identifying", TimeRemainingColumn()) as report:
         progress = partial(report, "identifying")
         found = record_model(record, **options, progress=progress)
     print_line(console, "\n".join(found.lines))
@@ -578,10 +580,15 @@ def _tune_axes(
 
 
 def _tuned(console: Console, plant: Any, dt: float | None, options: dict[str, Any]) -> Tuned:
+    from rich.progress import TimeRemainingColumn
+
     from quell.tuning import tune as tuned_for
 
-    with progress_bar(console, "tuning") as report:
-        return tuned_for(plant, dt, progress=partial(_progress, report), **options)
+    with progress_bar(console, "tuning", TimeRemainingColumn()) as report:
+        tuned = tuned_for(plant, dt, progress=partial(_progress, report), **options)
+        _progress(report, "at other limits", 1.0)
+        _ = tuned.tradeoff, tuned.noise_curve, tuned.judged  # kept, for what is printed
+        return tuned
 
 
 def _shown(console: Console, tuned: Tuned, name: str, out: Path | None, outputs: Outputs) -> int:
