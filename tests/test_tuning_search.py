@@ -16,6 +16,9 @@ from scipy import signal
 
 import quell as ql
 from quell.analysis import analyse
+from quell.analysis.loop import law_matrix
+from quell.analysis.margins import Response
+from quell.lti.models import System
 from quell.tuning import Constraints, designs
 from quell.tuning.optimiser import loops as responses
 from quell.tuning.optimiser import requirements, search
@@ -140,6 +143,36 @@ def test_responses_are_those_of_the_sampled_plants_with_their_factors() -> None:
     np.testing.assert_allclose(second.B, 3.0 * first.B)
     np.testing.assert_allclose(second.E, 3.0 * first.E)
     np.testing.assert_allclose(one.responses_of(omega, members), lag_response(omega) * [1, 3, 3, 1])
+
+
+def test_responses_of_plants_of_different_size_and_delay_are_their_own() -> None:
+    """At frequencies and members in any order, and at points of the s-plane."""
+    plants = [LAG, ([1.0], np.poly([-1.0, -1.0, -1.0])), LAG, ([2.0], [1.0, 3.0])]
+    given = given_plants(plants, DT, delay=[0.0, 0.02, 0.13, 0.0])
+    several, rng = plant_set(given, DT), np.random.default_rng(0)
+    members, omega = rng.integers(0, 4, 60), rng.uniform(0.1, 60.0, 60)
+    for points in (omega, omega * (1.0 - 0.2j)):
+        each = several.responses(points)
+        found = several.responses_of(points, members)
+        np.testing.assert_allclose(found, each[members, np.arange(60)], rtol=1e-12)
+        for j, plant in enumerate(several.plants):
+            system = System(plant.N, plant.B, plant.C, 0.0)
+            np.testing.assert_allclose(each[j], Response(system)(points, DT), rtol=1e-12)
+
+
+@cases("name", ["bandwidths", "reduced", "half-gain-law", "delay-poles", "model-based", "poles-2"])
+def test_the_law_of_a_structure_is_that_of_its_controller(name: str) -> None:
+    """From the matrices of the designs: its C_y is that of the controller and of ``response``."""
+    plant, late = ([1.0], np.poly([-1.0, -2.0])), 0.1 if name == "delay-poles" else 0.0
+    structure = structure_of(name, plant, 2 * (name != "model-based"), delay=late)
+    omega = np.geomspace(1e-2, 50.0, 40)
+    for values in structure.shapes()[::7]:
+        expected = structure.response(values[None], omega)[0]
+        for reference in (False, True):
+            law = responses.law_at(structure, values, reference)
+            into = law.B_y + law.B_u * law.D_y
+            C = Response(System(law_matrix(law), into, -law.C, -law.D_y))(omega, DT)
+            np.testing.assert_allclose(C, expected, rtol=1e-8)
 
 
 def test_open_poles_are_unstable_integrators_or_undamped() -> None:

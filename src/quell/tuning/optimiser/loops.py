@@ -39,7 +39,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.loop import closed_loop
+from quell.analysis.loop import closed_loop, closed_loop_matrix, law_matrix
 from quell.analysis.margins import (
     Complex,
     Response,
@@ -551,8 +551,13 @@ class SetResponses:
         make a loop far slower than its plant.
         """
         law, size = law_at(structure, values), self.plants.dt * abs(self.inputs.load)
-        loops = [closed_loop(plant, law, "d", "y") for plant in self._scaled]
-        return np.array([size * area_until_rest(loop) for loop in loops])
+        inner, none = law_matrix(law), np.zeros(law.C.size)
+        areas = np.empty(len(self._scaled))
+        for j, plant in enumerate(self._scaled):
+            whole = closed_loop_matrix(plant.N, plant.B, plant.C, law, inner)
+            loop = System(whole, np.append(plant.B, none), np.append(plant.C, none), 0.0)
+            areas[j] = size * area_until_rest(loop)
+        return areas
 
 
 def law_at(structure: Structure, values: Vector, reference: bool = False) -> LinearLaw:
