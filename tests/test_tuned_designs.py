@@ -238,7 +238,10 @@ def test_a_tradeoff_moves_each_active_limit_by_a_tenth(objective: str) -> None:
 
 
 def test_the_curve_of_the_noise_goes_from_its_bound_up_and_down() -> None:
-    """By factors of two, each search from the one before; it ends where there is no design."""
+    """By factors of two, each search from the one before.
+
+    One that exceeds a limit goes on; the curve ends where there is no design then.
+    """
     starts: list[Any] = []
 
     def search(near: Any, structure: Any, values: Any, rounds: int) -> Any:
@@ -251,7 +254,7 @@ def test_the_curve_of_the_noise_goes_from_its_bound_up_and_down() -> None:
     with patch.object(designs, "search", search):
         found = designs.noise_curve(task(), design)
     assert found == [pytest.approx((x, x)) for x in (1.5, 3.0, 6.0, 12.0)]
-    assert starts == [(6.0, 9.0), (12.0, 6.0), (1.5, 9.0), (0.75, 1.5)]
+    assert starts == [(6.0, 9.0), (12.0, 6.0), (1.5, 9.0), (0.75, 1.5), (0.75, 0.75)]
 
 
 # ---- the best of a structure
