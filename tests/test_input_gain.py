@@ -18,7 +18,8 @@ import quell as ql
 from quell.controllers.baselines import PID
 from quell.identification import InputGain, identify_b0, identify_b0_by
 from quell.identification.bandwidth import Candidate, Reach, bandwidth, pid_of_margin
-from quell.identification.input_gain import MarginError, mixture, seconds_text, white_where
+from quell.identification.input_gain import MarginError, seconds_text, white_where
+from quell.identification.loop_search import mixture
 from quell.identification.running_loop import Form, Inputs, linear_columns, placed, predicted
 
 from .benchmark_module import benchmark

@@ -10,7 +10,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import quell as ql
 from quell.identification.frequency_starts import continuous, poles_of_record, resonant_poles
-from quell.identification.identify import Records, first_held_out
+from quell.identification.given_records import Records, first_held_out
 from quell.identification.saturation import standing
 from quell.identification.vector_fitting import Spectra, fit_of_record, pair_beside, vector_fit
 

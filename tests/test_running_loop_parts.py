@@ -29,16 +29,18 @@ from quell.identification.gain_matrix import _balanced, _excitation, _names, _si
 from quell.identification.input_gain import (
     _not_reached,
     asked_margin,
-    gain,
-    gains,
     longest_delay,
-    mixture,
-    physical,
     seconds_text,
     time_line,
+    white_where,
+)
+from quell.identification.loop_search import (
+    gain,
+    gains,
+    mixture,
+    physical,
     total_delay,
     visible_up_to,
-    white_where,
 )
 from quell.identification.running_loop import (
     Form,

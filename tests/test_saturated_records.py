@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 import quell as ql
-from quell.identification.identify import resolution_of
+from quell.identification.given_records import resolution_of
 from quell.identification.saturation import standing
 
 from .test_record_faults import DT, answer, noise, random_steps

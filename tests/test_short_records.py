@@ -21,12 +21,8 @@ from quell.identification import (
     search,
     structures,
 )
-from quell.identification.identify import (
-    _explains_more,
-    _with_deviations,
-    known_of,
-    resolution_of,
-)
+from quell.identification.given_records import resolution_of
+from quell.identification.identify import _explains_more, _with_deviations, known_of
 from quell.identification.model import Root, Structure, free_run, output
 from quell.identification.output_error import ParameterEstimate, gauss_newton
 from quell.identification.running_loop import Form

@@ -15,7 +15,7 @@ from scipy import optimize, signal, stats
 
 import quell as ql
 from quell.identification import Identified, alternatives, free_swing, friction_search, structures
-from quell.identification.identify import delay_range, resolution_of
+from quell.identification.given_records import delay_range, resolution_of
 from quell.identification.model import Root, gain_interval, poles_of, zeros_of
 from quell.identification.structures import _EQUAL, Alternative, not_told_apart
 from quell.quantities import Quantity, Signals

@@ -41,14 +41,16 @@ from quell import checks
 from quell.identification.input_gain import (
     UNSEEN,
     check_motion,
+    longest_delay,
+    samples_before,
+    time_line,
+)
+from quell.identification.loop_search import (
     fits,
     gains,
     is_usable,
-    longest_delay,
     mixture,
     physical,
-    samples_before,
-    time_line,
     total_delay,
     visible_up_to,
     weighted,

@@ -40,11 +40,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from quell.identification.given_records import Records
 from quell.identification.identify import (
     LEAST_WITH_ZEROS,
     ZEROS,
     Options,
-    Records,
     identified,
     known_of,
     ratio_of_models,
