@@ -319,17 +319,13 @@ class SinglePrecision(Wrapper):
     def __init__(self, controller: Any) -> None:
         check_controller(controller, several=True)
         self.controller: Any = copy.deepcopy(controller)  # in double: it designs the parameters
+        self._several = hasattr(controller, "inputs")  # r, y and u are arrays; asked in each step
         self._initialise()
         self._use_state(single_state(self.parameters.controller, learned_state(controller)))
 
     def __getattr__(self, name: str) -> Any:
         """Return what a controller of several signals has; other names are those of ``Wrapper``."""
         return getattr(self._acting, name) if name in _OF_SEVERAL else super().__getattr__(name)
-
-    @property
-    def _several(self) -> bool:
-        """Whether r, y and u are arrays."""
-        return hasattr(self.controller, "inputs")
 
     @property
     def _acting(self) -> Any:
