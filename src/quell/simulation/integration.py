@@ -21,7 +21,6 @@ from quell.plants.base import (
     advance,
     as_input,
 )
-from quell.plants.channels import EncodedOutputsModel
 from quell.plants.friction import FrictionModel
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel
 from quell.plants.nonlinear import (
@@ -42,7 +41,7 @@ LARGEST_ERROR = 0.01
 _SPREAD, _SHARPEST = 16, 16
 # Most doublings of the sub-steps that are tried for advice.
 _MOST_DOUBLINGS = 10
-_WRAPPERS = (EncodedPlantModel, DelayedPlantModel, EncodedOutputsModel)
+_WRAPPERS = (EncodedPlantModel, DelayedPlantModel)
 
 
 class Samples(NamedTuple):
