@@ -350,6 +350,7 @@ def model(order: int, fit: float = 90.0, fault: str = "", friction: Any = None, 
         "converged": True,
         "rubs": friction is not None,
         "poles": (),
+        "delay": 0.0,  # no lag of a larger model is in it
     }
     return SimpleNamespace(den=np.ones(order + 1), friction=friction, fit=fit, **{**parts, **more})
 
