@@ -1,22 +1,23 @@
-"""A guard that trusts its learner, and samples for it without a loop."""
+"""A guard that trusts its learner and keeps its account in each sample, and samples for it without a loop."""
 
 from __future__ import annotations
 
 import numpy as np
 
 import quell as ql
-from quell.guard import assess, limit, record_output
-from quell.guard.kernels import bounds_of, removed_share
+from quell.guard import Guard, assess, limit, record_output
+from quell.guard.kernels import PARTS, newest_share, removed_share, update_bounds
 from quell.learners.base import lag_push
 
+GUARD = Guard(every=1)
 OBSERVER = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3)
 
 
 def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
     """A guard that trusts its learner, which has removed half of the squared error: κ_0 = 1.2, the error e, no output before."""
     observer = ql.ESO.model_free(order=4, b0=b0, omega_o=10.0, dt=5e-3)
-    design = ql.Guard().design(observer)
-    memory = ql.Guard().memory(design)
+    design = GUARD.design(observer)
+    memory = GUARD.memory(design)
     memory.sample[0].credit = memory.sample[0].share = 1.0
     memory.sample[0].typical_error = memory.sample[0].peak = memory.sample[0].outside = e
     memory.averages[0].missed, memory.averages[0].gained = e**2, 0.5 * e**2
@@ -25,9 +26,16 @@ def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
     return design, memory
 
 
+def decide(design: object, memory: object, *sample: float) -> tuple[float, float, bool]:
+    """What is permitted in a sample that decides, whatever the account has seen."""
+    memory.interval[0].part = PARTS
+    return limit(design, memory, *sample)
+
+
 def bounds(design: object, memory: object) -> tuple[float, float]:
     """Least and largest correction."""
-    return bounds_of(design, memory, removed_share(design, memory))
+    update_bounds(design, memory, removed_share(design, memory), newest_share(design, memory))
+    return float(memory.interval[0].least), float(memory.interval[0].largest)
 
 
 def feed(design: object, memory: object, f: np.ndarray, g: np.ndarray) -> list[float]:

@@ -13,7 +13,7 @@ import quell as ql
 from quell.guard import assess, limit, nearest_permitted, record_output, start_again
 from quell.guard.kernels import CORRECTED, respond
 from quell.learners.base import lag_of, lag_push
-from tests.guarded_samples import OBSERVER, bounds, trusted
+from tests.guarded_samples import GUARD, OBSERVER, bounds, decide, trusted
 
 from .cases import cases
 
@@ -21,8 +21,9 @@ from .cases import cases
 @pytest.mark.trial
 def test_the_correction_lies_within_its_bound(rng: np.random.Generator) -> None:
     """``|f_L − f_L^F| ≤ β κ e``, without authority κe, with e never above the largest |q|, whatever comes."""
-    design = ql.Guard(bound=0.8).design(OBSERVER)
-    memory = ql.Guard(bound=0.8).memory(design)
+    guard = ql.Guard(bound=0.8, every=1)
+    design = guard.design(OBSERVER)
+    memory = guard.memory(design)
     lag, chain, shadow = lag_of(OBSERVER), np.zeros((1, 5)), np.zeros((1, 5))
     f = f_plain = f_shown = largest = 0.0
     heard = 0
@@ -77,7 +78,7 @@ def test_full_authority_is_reached_and_not_only_approached() -> None:
     design, memory = trusted()
     memory.sample[0].share = 0.95
     for _ in range(round(1.01 * 30.0 * 0.5 / 5e-3)):
-        limit(design, memory, 1.0, 0.0, 0.5, 0.0, 0.0)
+        decide(design, memory, 1.0, 0.0, 0.5, 0.0, 0.0)
         memory.sample[0].target = 0.5
     assert memory.sample[0].share == 1.0
 
@@ -91,7 +92,7 @@ def test_the_authority_follows_a_close_match_eight_times_as_quickly() -> None:
         memory.averages[0].newest_error, memory.averages[0].newest_left = 3.0, 3.0 * left
         memory.sample[0].share = 0.2
         for _ in range(100):  # a lag
-            limit(design, memory, 1.0, 0.0, 0.5, 0.0, 0.0)
+            decide(design, memory, 1.0, 0.0, 0.5, 0.0, 0.0)
         expected = 1.0 - 0.8 * math.exp(-quickness / 30.0)
         assert memory.sample[0].share == pytest.approx(expected, rel=1e-3)
 
@@ -104,6 +105,7 @@ def test_a_target_far_from_the_learners_output_comes_nearer(distance: float, mov
     sample.authority, sample.output, sample.share = 1.0, 3.0, 1.0
     sample.target = start = 3.0 + 2.0 * distance
     record_output(design, memory, start)
+    assess(design, memory, 0.0)
     assert (sample.target - start) / (2.0 * 5e-3 / (1000.0 * 0.5)) == pytest.approx(moves, abs=1e-3)
 
 
@@ -122,7 +124,7 @@ def test_a_change_of_the_authority_over_a_constant_does_nothing() -> None:
     memory.sample[0].output, memory.sample[0].target = 50.0, 7.0
     for credit in (1.0, 0.3, 0.1, 0.4, 0.0):
         memory.sample[0].credit = credit
-        assert limit(design, memory, 50.0, 7.0, 50.0, 0.0, 0.0)[0] == pytest.approx(7.0)
+        assert decide(design, memory, 50.0, 7.0, 50.0, 0.0, 0.0)[0] == pytest.approx(7.0)
 
 
 @pytest.mark.trial
@@ -209,11 +211,12 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
     """ℓ e_L decays as n lags of 2/3 of the observer's do, whatever the learner says, unless κ_0 e is too small."""
     observer = ql.ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=1e-4)
     law = np.array([math.comb(order, i) for i in range(order)], dtype=float)  # omega_c = 1
-    design = ql.Guard().design(observer, law)
-    memory = ql.Guard().memory(design)
+    design = GUARD.design(observer, law)
+    memory = GUARD.memory(design)
     stages, rate = design.stages, 1.5 / observer.lag_time
     memory.effects[CORRECTED] = 1.0
     memory.sample[0].typical_error, memory.sample[0].taking_back = 1e6, design.taking_back
+    memory.sample[0].peak = 1e6
     start, f_shown, samples = memory.effects[CORRECTED].copy(), 0.0, 10_000 * order
     moved, shadow = np.zeros(samples), np.zeros((1, order + 1))
     for k in range(samples):
@@ -221,6 +224,7 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
         memory.filtered[3] = f_shown
         f_learned, _, _ = limit(design, memory, 1.0, f_shown, 0.9 * (-1.0) ** k, 0.0, 0.0)
         record_output(design, memory, f_learned)
+        assess(design, memory, 0.0)
         f_shown = lag_push(design.lag, shadow, 0, f_learned)
     # The chain of stages x' = A x + B e_L with omega_c = 1, closed by u = −K x with all poles at −rate.
     A = np.diag(-np.ones(stages)) + np.diag(np.ones(stages - 1), -1)
@@ -240,8 +244,8 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
 def test_what_was_done_is_taken_back_without_swinging_where_the_bound_is_small() -> None:
     """A chain of four lags comes to rest although the pole placement asks for 300 times κ_0 e."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=20.0, dt=5e-3)
-    design = ql.Guard().design(observer, np.array([1.0, 4.0, 6.0, 4.0]))  # omega_c = 1
-    memory = ql.Guard().memory(design)
+    design = GUARD.design(observer, np.array([1.0, 4.0, 6.0, 4.0]))  # omega_c = 1
+    memory = GUARD.memory(design)
     memory.sample[0].typical_error, memory.sample[0].taking_back = 0.5, 6000.0
     memory.effects[CORRECTED] = start = 0.15
     moved = []
@@ -262,7 +266,7 @@ def test_a_guard_with_kappa_of_the_usual_bound_has_no_wider_one() -> None:
     for bound, expected in ((1.2, 1.2), (0.5, 0.5), (2.0, 2.0)):
         memory.averages[0].newest_left = 0.0
         narrower = design._replace(bound=bound, usual_bound=min(bound, 1.2))
-        limit(narrower, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
+        decide(narrower, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
         assert bounds(narrower, memory)[1] == pytest.approx(expected)
 
 
@@ -281,15 +285,16 @@ def test_a_guard_that_starts_again_is_a_new_one(rng: np.random.Generator) -> Non
     assert memory.sample[0].typical_error == before
     start_again(design, memory)
     memory.sample[0].unsettled = 0.0
-    for array, fresh in zip(memory, ql.Guard().memory(design), strict=True):
+    for array, fresh in zip(memory, GUARD.memory(design), strict=True):
         np.testing.assert_array_equal(array, fresh)
 
 
 @pytest.mark.trial
 def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() -> None:
     """After a NaN it is unheard for T_C/8, the least time in which credit is earned, though it is right; what it did is undone."""
-    design = ql.Guard(time=2.0).design(OBSERVER)
-    memory = ql.Guard(time=2.0).memory(design)
+    guard = ql.Guard(time=2.0, every=1)
+    design = guard.design(OBSERVER)
+    memory = guard.memory(design)
     chain, shown, f_shown, heard = np.zeros((2, 5)), 0.0, 0.0, []
     for k in range(6000):
         f = math.sin(0.7 * k * OBSERVER.dt)
@@ -319,6 +324,7 @@ def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() 
     [
         (lambda: ql.Guard(bound=0.0), "bound = 0.0: must be finite and greater than zero"),
         (lambda: ql.Guard(time=-1.0), "time = -1.0"),
+        (lambda: ql.Guard(every=0), "every = 0: must be a whole number of at least 1"),
         (
             lambda: ql.ADRC(OBSERVER, 1.0, learner=ql.learners.Kalman(), guard=True),
             "guard = True: must be a quell.Guard",
@@ -339,7 +345,7 @@ def test_the_loop_s_response_has_as_many_poles_as_the_relative_degree() -> None:
     for observer, takes_back in ((zeros, False), (chain, True)):
         for options, omega_c in (({}, 5.0), ({"half_gain": True}, 5.0 / math.sqrt(2.0))):
             learner = ql.learners.Kalman()
-            loop = ql.ADRC(observer, 5.0, learner=learner, guard=ql.Guard(), **options)
+            loop = ql.ADRC(observer, 5.0, learner=learner, guard=GUARD, **options)
             design = loop.parameters.guard
             assert design.stages == 2
             assert design.respond == pytest.approx(-math.expm1(-omega_c * 1e-3))

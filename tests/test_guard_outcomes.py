@@ -13,6 +13,7 @@ from quell.analysis.loop import about_learning
 from quell.guard.kernels import authority_of, keep_outcomes
 
 from .benchmark_module import benchmark
+from .guarded_samples import GUARD
 
 coupled_arms = benchmark("coupled_arms")
 
@@ -22,8 +23,8 @@ OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=3.0 / LAG, dt=1.0)
 
 def _guard() -> tuple[object, object]:
     """Return a guard that trusts a learner whose corrections may have caused all of q."""
-    design = ql.Guard().design(OBSERVER)
-    memory = ql.Guard().memory(design)
+    design = GUARD.design(OBSERVER)
+    memory = GUARD.memory(design)
     memory.sample[0].credit = memory.sample[0].authority = 1.0
     memory.averages[0].missed = memory.averages[0].gained = 1.0
     memory.sample[0].outside = memory.sample[0].peak = 1e9  # nothing is withheld for other reasons

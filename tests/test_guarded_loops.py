@@ -25,9 +25,9 @@ from quell.experiments.stress.adversaries import (
     Turncoat,
 )
 from quell.experiments.stress.study import Loop
-from quell.guard.kernels import bounds_of, removed_share
 from quell.learners.base import lag_of, lag_push
 from quell.types import Status
+from tests.guarded_samples import bounds
 
 LOOP = Loop(m1=0.8, m2=1.3, k=1.4, gain_error=1.2, dt=5e-3, omega=0.5, amplitude=1.0, seed=4)
 PLANT = ql.plants.two_mass_spring()
@@ -121,7 +121,7 @@ def test_the_bound_holds_for_the_u_of_the_sample() -> None:
         correction = f_learned - shown
         # The guard records this correction in the next sample, when the applied u is known.
         guard = controller._state.guard
-        least, most = bounds_of(design, guard, removed_share(design, guard))
+        least, most = bounds(design, guard)
         rounding = 1e-9 * (1.0 + abs(f_learned))
         assert least - rounding <= correction <= most + rounding, k
         largest = max(largest, abs(correction))

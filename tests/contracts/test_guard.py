@@ -14,7 +14,7 @@ import pytest
 
 import quell as ql
 from quell.experiments.stress.adversaries import MULTIPLE, Adversary
-from quell.guard import limit, record_output
+from quell.guard import assess, limit, record_output
 from quell.guard.kernels import F_L
 from quell.learners.base import lag_memory, lag_of, lag_push
 from quell.observers.design import FORMS
@@ -209,8 +209,10 @@ def test_without_authority_nothing_acts_after_ten_lags(name: str, sensor: str) -
         trusted = k < 2 * ten_lags
         sample.credit, sample.typical_error = (1.0, 1.0) if trusted else (-1.0, 1.0)
         sample.peak = sample.outside = 1.0
+        memory.averages[0].missed = memory.averages[0].gained = 1.0
+        assess(design, memory, 0.0)
         f_learned, _, _ = limit(design, memory, 1.0, shown, rng.normal(), 0.0, 0.0)
-        if not trusted and k > 3 * ten_lags:
+        if not trusted and k > 3 * ten_lags + 2 * design.every:
             assert f_learned == memory.filtered[F_L]
         acted += f_learned != memory.filtered[F_L]
         record_output(design, memory, f_learned)

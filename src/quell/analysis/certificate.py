@@ -149,7 +149,9 @@ def certify_axis(
     for name, plant in named_plants(plants).items():
         linear, own_delay = linear_part(plant, adrc.dt, operating_point)
         sampled = sampled_plant(linear, adrc.dt, own_delay + delay, actuator_lag)
-        gains[name] = gains_of(name, sampled, adrc.observer, adrc.parameters.law)
+        gains[name] = gains_of(
+            name, sampled, adrc.observer, adrc.parameters.law, guard_samples(adrc)
+        )
         excluded += _not_covered(plant, adrc.parameters.limits)
     not_covered = tuple(dict.fromkeys(excluded))
     return Certificate(guard_bound(adrc), gains, not_covered, condition_of({"": adrc}))
@@ -166,6 +168,14 @@ def linear_adrc(controller: Controller) -> ADRC:
             "only loops with a linear law can be certified, without feedback="
         )
     return controller
+
+
+def guard_samples(controller: ADRC) -> int:
+    """Return the samples in one of the account of a controller's guard, or of ``Guard()``."""
+    design = controller.parameters.guard
+    if isinstance(design, UnguardedDesign):
+        design = Guard().design(controller.observer)
+    return int(design.every)
 
 
 def guard_bound(controller: ADRC) -> float:

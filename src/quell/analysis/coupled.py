@@ -28,15 +28,19 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.certificate import condition_of, guard_bound, linear_adrc
+from quell.analysis.certificate import condition_of, guard_bound, guard_samples, linear_adrc
 from quell.analysis.matrices import estimates_at, gain_at, sampled_matrices
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none
-from quell.guard.guard import check_one_state_of_f, check_stable, state_path
+from quell.guard.guard import (
+    check_one_state_of_f,
+    check_stable,
+    lag_between_samples,
+    state_path,
+)
 from quell.lti.models import MatrixSystem, System, peak_gain
-from quell.observers.design import f_learned_response, response
-from quell.observers.forms import without_delay
+from quell.observers.design import response
 from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.nonlinear import NonlinearPlant
 from quell.types import Matrix, Vector
@@ -321,7 +325,7 @@ def _axis(adrc: ADRC) -> MatrixSystem:
     check_one_state_of_f(observer)
     n, estimates = observer.order, observer.estimates
     whole = response(observer.model, estimates, n)
-    M, g, c, d = f_learned_response(response(without_delay(observer.model), estimates, n))
+    M, g, c, d = lag_between_samples(observer, guard_samples(adrc))
     path = state_path(observer, law)
     check_stable(path, "the observer's answer to a correction")
     # The state: observer, v before, lag filter of f_plain, its output f_plain^F, path of e_L.

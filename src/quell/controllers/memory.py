@@ -91,8 +91,7 @@ class Layout(NamedTuple):
     zeros
         numbers of the image that are zero in any image: flags that are set during a call alone.
     before
-        the layout of images that were saved when the guard had no account of outcomes; None if it
-        is the same.
+        the layout of images that were saved when the guard had fewer arrays; None if there is none.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -139,8 +138,10 @@ class Leaf(NamedTuple):
 _PAIRS = {"axes": ("AxisDesigns", "axis", "NoAxis"), "drives": ("Drives", "controller", "NoDrive")}
 
 
-# Flags that say which parts there are, by the kind of parameters: the parts say it, too.
+# Flags that say which parts there are, by the kind of parameters: the parts say it, too. The rates
+# of a guard say how many samples its account takes together.
 _RESTATED = {
+    "GuardDesign": ("every", "spread", "turns"),
     "AdrcDesign": ("guarded", "scheduled", "has_safe_set", "has_held", "has_model", "nonlinear"),
     "AxesDesign": ("learns_of_all", "has_bands", "gain_moves", "takes_controls"),
 }
@@ -185,7 +186,8 @@ def kept_arrays(state: Any) -> dict[str, NDArray[Any]]:
     return kept
 
 
-_LATER = "guard.trial"
+# Arrays that came later, in this order. They begin with zeros, and so does an image without them.
+_LATER = ("guard.trial", "guard.interval")
 
 
 def images_of(parameters: Any, state: Any, dt: float, names: Sequence[str] = ()) -> Layout:
@@ -194,12 +196,13 @@ def images_of(parameters: Any, state: Any, dt: float, names: Sequence[str] = ())
     ``names`` are those of its axes: an image with the axes in another order is of another one.
     """
     arrays = kept_arrays(state)
-    known = _layout_of(arrays, parameters, state, dt, names)
-    # An account of outcomes begins with zeros.
     older = {name: each for name, each in arrays.items() if not name.endswith(_LATER)}
-    if len(older) == len(arrays):
-        return known
-    return known._replace(before=_layout_of(older, parameters, state, dt, names))
+    known = _layout_of(older, parameters, state, dt, names)
+    for i in range(len(_LATER)):
+        kept = {name: each for name, each in arrays.items() if not name.endswith(_LATER[i + 1 :])}
+        if len(kept) > len(known.arrays):
+            known = _layout_of(kept, parameters, state, dt, names)._replace(before=known)
+    return known
 
 
 def _layout_of(
@@ -376,13 +379,12 @@ def read_image(known: Layout, image: Any, *, running: bool) -> dict[str, NDArray
             f"image is in {names.get(width, 'unknown')} precision: must be in "
             f"{names[known.width]}, as the controller is; restore it into one of its own precision"
         )
-    missing = {}
-    if known.before is not None and (layout, size) == (known.before.layout, known.before.size):
-        kept = known.before.arrays
-        missing = {
-            name: np.zeros_like(each) for name, each in known.arrays.items() if name not in kept
-        }
+    arrays = known.arrays
+    while known.before is not None and (layout, size) != (known.layout, known.size):
         known = known.before
+    missing = {
+        name: np.zeros_like(each) for name, each in arrays.items() if name not in known.arrays
+    }
     if layout != known.layout or size != known.size:
         raise ValueError(
             "image is of another controller: kind, orders, features and scales of the learner, dt, "

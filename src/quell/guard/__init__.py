@@ -3,8 +3,7 @@
 May import ``learners`` and what they import.
 """
 
-from quell.guard.guard import Guard
-from quell.guard.kernels import (
+from quell.guard.base import (
     GUARD_CHANNELS,
     Reason,
     UnguardedDesign,
@@ -17,6 +16,7 @@ from quell.guard.kernels import (
     start_again,
     write_channels,
 )
+from quell.guard.guard import Guard
 
 __all__ = [
     "GUARD_CHANNELS",

@@ -31,9 +31,11 @@ import numpy as np
 import quell.guard.kernels  # noqa: F401  (registers the functions for ``GuardDesign``)
 from quell import checks
 from quell.guard.kernels import (
+    PARTS,
     SETTLING_LAGS,
     GuardAverages,
     GuardDesign,
+    GuardInterval,
     GuardMemory,
     GuardSample,
     GuardTrial,
@@ -46,7 +48,7 @@ from quell.observers.eso import ESO
 from quell.observers.forms import without_delay
 from quell.plants.linear import SampledPlant, sampled_plant
 from quell.plants.linearise import linear_part
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 # ---- Effect of a learner's correction on the loop of a linear plant and the plain observer ----
 
@@ -65,7 +67,9 @@ class CorrectionGains(NamedTuple):
     output: float  #: Γ_y, from e_L to y [s^n]
 
 
-def correction_gains(plant: SampledPlant, observer: ESO, law: Vector) -> CorrectionGains:
+def correction_gains(
+    plant: SampledPlant, observer: ESO, law: Vector, every: int = 1
+) -> CorrectionGains:
     """Return Γ and Γ_y of the loop of a sampled plant.
 
     Raises ``ValueError`` for an unstable loop, a nonlinear observer, or one that models more of f
@@ -79,10 +83,12 @@ def correction_gains(plant: SampledPlant, observer: ESO, law: Vector) -> Correct
         the observer, of any linear form.
     law
         gains k of the law (n,).
+    every
+        number m of samples in one of the guard's account.
     """
     check_one_state_of_f(observer)
     path = state_path(observer, law)
-    to_error, to_output = plain_loop(plant, observer, law)
+    to_error, to_output = plain_loop(plant, observer, law, every)
     check_stable(to_error, "the loop without learner")
     check_stable(path, "the observer's answer to a correction")
     return CorrectionGains(peak_gain(path.then(to_error)), peak_gain(path.then(to_output)))
@@ -120,7 +126,30 @@ def is_invertible(observer: ESO) -> bool:
     return state_path(observer, np.zeros(observer.order)).largest_pole < 1.0 - _MARGINAL
 
 
-def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System, System]:
+def lag_between_samples(observer: ESO, every: int = 1) -> tuple[Matrix, Vector, Vector, float]:
+    """Return ``(M, g, c, d)`` of F, ``s⁺ = M s + g φ`` with ``c·s + d φ`` a sample later.
+
+    With ``every`` = m F takes each m-th sample only, whichever is the first: the state has what
+    comes out of the filter of these samples in the next m ones, and q is that of the guard in each
+    sample in which its account has one.
+    """
+    plain = response(without_delay(observer.model), observer.estimates, observer.order)
+    M, g, c, d = f_learned_response(plain, every)
+    if every == 1:
+        return M, g, c, d
+    inner, size = M.shape[0], every * (M.shape[0] + 1) - 1
+    shift, given = np.zeros((size, size)), np.zeros(size)
+    newest, shown = slice((every - 1) * inner, every * inner), every * inner
+    shift[inner:shown, : shown - inner] = np.eye(shown - inner)
+    shift[shown + 1 :, shown:-1] = np.eye(every - 2)
+    shift[:inner, newest], given[:inner] = M, g
+    shift[shown, newest], given[shown] = c, d
+    return shift, given, np.eye(size)[-1], 0.0
+
+
+def plain_loop(
+    plant: SampledPlant, observer: ESO, law: Vector, every: int = 1
+) -> tuple[System, System]:
     """Return the loop of the plain observer, from w to q and from w to y."""
     if observer.states > _MOST_STATES:
         raise ValueError(
@@ -129,7 +158,7 @@ def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System,
         )
     n, estimates = observer.order, observer.estimates
     whole = response(observer.model, estimates, n)
-    M, g, c, d = f_learned_response(response(without_delay(observer.model), estimates, n))
+    M, g, c, d = lag_between_samples(observer, every)
     # The state: plant, observer, u before, lag filter of f_plain, and its output f_plain^F.
     sizes = (plant.B.size, whole.transition.shape[0], 1, M.shape[0], 1)
     edges = [0, *np.cumsum(sizes).tolist()]
@@ -196,7 +225,7 @@ def _without_constant(system: System, constant: Vector) -> System:
 _LARGEST_PRODUCT = 0.9
 
 
-def certified_bound(bound: float, plants: Any, observer: ESO, law: Vector) -> float:
+def certified_bound(bound: float, plants: Any, observer: ESO, law: Vector, every: int = 1) -> float:
     """Return ``bound``, or less if κΓ would exceed 0.9 for one of the plants.
 
     Raises ``ValueError`` for an unstable loop, and for a plant that is not linear.
@@ -211,19 +240,23 @@ def certified_bound(bound: float, plants: Any, observer: ESO, law: Vector) -> fl
         the observer, of any linear form.
     law
         gains k of the law (n,).
+    every
+        number m of samples in one of the guard's account.
     """
     largest = bound
     for name, plant in named_plants(plants).items():
         linear, delay = linear_part(plant, observer.dt)
-        gains = gains_of(name, sampled_plant(linear, observer.dt, delay), observer, law)
+        gains = gains_of(name, sampled_plant(linear, observer.dt, delay), observer, law, every)
         largest = min(largest, _LARGEST_PRODUCT / gains.error)
     return largest
 
 
-def gains_of(name: str, plant: SampledPlant, observer: ESO, law: Vector) -> CorrectionGains:
+def gains_of(
+    name: str, plant: SampledPlant, observer: ESO, law: Vector, every: int = 1
+) -> CorrectionGains:
     """Return Γ and Γ_y of the loop of a plant; errors begin with the plant's name."""
     try:
-        return correction_gains(plant, observer, law)
+        return correction_gains(plant, observer, law, every)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -268,6 +301,9 @@ _MATCH_TIME = 0.1  # time over which ε compares p with q, over T
 _USUAL_BOUND = 1.2  # κ_0: with 1 a perfect learner is clipped at its peaks
 _CLOSING_LAGS = 2.0 / 3.0  # what a learner has done to y is taken back in this time
 _TAKING_BACK_LAGS = 10.0  # for at most so long: then one without authority moves nothing
+# Samples of the account in a lag, or in T/15 where that is less, and most samples of the loop
+# between two of them: from there on what is left of the price is that of each sample.
+_ACCOUNTS, _MOST_EVERY = 8.0, 16
 
 
 @dataclass(frozen=True)
@@ -288,6 +324,10 @@ class Guard:
     time
         time T [s] over which a learner is judged; by default 15 lags ``(n + 1)/omega_o`` of the
         observer.
+    every
+        number m of samples of the loop in one of the guard's account. With None it is an eighth of
+        a lag, 1 at least and 16 at most, and 1 for an observer in predictor form. Corrections are
+        bounded in each sample of the loop.
     certified_for
         a linear plant, a list of plants or ``{name: plant}``, for which κ is made small enough that
         no learner can make q larger than ten times what it is without learner: κΓ ≤ 0.9, see
@@ -302,11 +342,14 @@ class Guard:
     bound: float = 3.0
     time: float | None = None
     certified_for: Any = None
+    every: int | None = 1
 
     def __post_init__(self) -> None:
         checks.positive("bound", self.bound)
         if self.time is not None:
             checks.positive("time", self.time, "s")
+        if self.every is not None:
+            checks.whole("every", self.every, 1)
 
     def design(self, observer: ESO, law: Vector | None = None) -> GuardDesign:
         """Return the parameters for an observer and the gains k of the law (n,).
@@ -317,39 +360,52 @@ class Guard:
         ------
         ValueError
             for a loop of ``certified_for`` that is unstable without learner, or without gains;
-            for an observer with ``disturbance_order`` above 1.
+            for an observer with ``disturbance_order`` above 1; for ``every`` above half of a lag.
         """
         check_one_state_of_f(observer)
-        bound = float(self.bound)
+        dt, lag_time = observer.dt, observer.lag_time
+        time = _AVERAGING_LAGS * lag_time if self.time is None else self.time
+        lag = min(lag_time, time / _AVERAGING_LAGS)
+        # The filter of each m-th sample of a predictor is no chain, and needs a larger state.
+        longest = 1 if observer.form == "predictor" else _MOST_EVERY
+        every = self.every or min(max(int(lag / (_ACCOUNTS * dt)), 1), longest)
+        bound, step = float(self.bound), every * dt
+        if every > 1 and step > 0.5 * lag:
+            raise ValueError(
+                f"every = {every}: must be at most {max(int(0.5 * lag / dt), 1)}, the samples in "
+                "half of the observer's lag, or of time/15 where that is less; or leave it to the "
+                "guard with every=None"
+            )
         if self.certified_for is not None:
             if law is None:
                 raise ValueError("law = None: certified_for needs the gains k of the law")
-            bound = certified_bound(bound, self.certified_for, observer, law)
-        dt, lag_time = observer.dt, observer.lag_time
-        time = _AVERAGING_LAGS * lag_time if self.time is None else self.time
+            bound = certified_bound(bound, self.certified_for, observer, law, every)
         # b0 + ∂f_L/∂u stays between b0/2 and 2 b0, as with the default gain_interval of Kalman.
         least_slope, largest_slope = sorted([-0.5 * observer.b0, observer.b0])
 
         def share(lags: float) -> float:
-            """Return the share of its distance that a first-order lag covers in a sample."""
-            return -math.expm1(-dt / (lags * lag_time))
+            """Return the share of its distance that a first-order lag covers in the step."""
+            return -math.expm1(-step / (lags * lag_time))
 
         # y responds to f with the law's poles, as many as the relative degree: of a plant with
         # zeros the other gains are zero. Without a law y is taken to be as slow as f̂.
         degree = observer.degree
         omega_c = 1.0 / lag_time if law is None else float(law[0]) ** (1.0 / degree)
-        lag, invertible = lag_of(observer), is_invertible(observer)
+        filter_, invertible = lag_of(observer, every), is_invertible(observer)
         chain = ESO.model_free(observer.order, observer.b0, observer.omega_o, dt)
         return GuardDesign(
-            lag=lag,
-            forget=-math.expm1(-dt / time),
-            earn=dt / (_CREDIT_TIME * time),
+            every=float(every),
+            spread=every > 1,
+            turns=-(-PARTS // every),
+            lag=filter_,
+            forget=-math.expm1(-step / time),
+            earn=step / (_CREDIT_TIME * time),
             stages=degree,
-            respond=-math.expm1(-omega_c * dt),
+            respond=-math.expm1(-omega_c * step),
             closing=share(_CLOSING_LAGS),
             taking_back=_TAKING_BACK_LAGS * lag_time / dt if degree == observer.order else 0.0,
-            forget_account=dt / (_ACCOUNT_LAGS * lag_time),
-            forget_match=-math.expm1(-dt / (_MATCH_TIME * time)),
+            forget_account=step / (_ACCOUNT_LAGS * lag_time),
+            forget_match=-math.expm1(-step / (_MATCH_TIME * time)),
             rise=share(_RISE_LAGS),
             decay=share(_DECAY_LAGS),
             growth=share(_GROWTH_LAGS),
@@ -362,7 +418,7 @@ class Guard:
             home=share(_HOME_LAGS),
             settling=SETTLING_LAGS * lag_time / dt,
             invertible=invertible,
-            fed_lag=lag if invertible else lag_of(chain),
+            fed_lag=filter_ if invertible else lag_of(chain),
             least_slope=least_slope,
             largest_slope=largest_slope,
         )
@@ -373,6 +429,7 @@ class Guard:
         filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
         effects = np.zeros((3, parameters.stages))
         records = GuardAverages.zeros(), GuardSample.zeros(), GuardTrial.zeros()
-        memory = GuardMemory(*filters, effects, *records)
+        memory = GuardMemory(*filters, effects, *records, GuardInterval.zeros())
         withdraw_authority(memory)
+        memory.interval[0].part = PARTS
         return memory

@@ -75,24 +75,37 @@ from then on e_L = 0. With the stages x_i of ℓ e_L, x_1 the first,
 places the n poles of ℓ e_L at −a ω_c; where that asks for more than 4 κ_0 e, a is smaller. A plant
 with zeros responds otherwise, and nothing is taken back there.
 
+**In each m-th sample** (``Guard(every=m)``). What bounds f_L is done in each sample of the loop:
+target, bound, cut-off. The rest, the account, has one sample in m, with dt → m dt in all of its
+rates, the means of g, of e_L and of f_L − target and the largest |e_L| over m samples, and f_plain
+of the last one. F is there the filter of an input that is constant over m samples
+(``observers.design.f_learned_response``). Its parts take turns in the samples that follow.
+
 For observers with which that recursion is unstable (``guard.is_invertible``), F is here the
 filter of a chain of integrators with the same omega_o; for them nothing is certified.
 
-Functions of a guard, registered for the type of its parameters; their defaults limit nothing.
-
-In each sample the controller calls ``assess`` before the learner adapts, ``limit`` after it has
-predicted, ``nearest_permitted`` for each u that it tries, and ``record_output`` when the applied u
-is known.
+In each sample the controller calls ``assess``, in which the parts of the account take turns, before
+the learner adapts, ``limit`` after it has predicted, ``nearest_permitted`` for each u that it
+tries, and ``record_output`` when the applied u is known.
 """
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from quell.kernels.dispatch import generic_with_default, is_finite, kernel
+from quell.guard.base import (
+    Reason,
+    assess,
+    limit,
+    nearest_permitted,
+    record_output,
+    reset_filters,
+    start_again,
+    write_channels,
+)
+from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import copysign, is_single, sqrt
 from quell.kernels.sized import Flag, Scalars, Size, clear
 from quell.learners.base import lag_push, reset_lag
@@ -105,8 +118,11 @@ _TINY, _TINY_SINGLE = 1e-200, 1e-30
 
 
 class GuardDesign(NamedTuple):
-    """Parameters of the guard."""
+    """Parameters of the guard; dt is here that of the account, ``every`` samples of the loop."""
 
+    every: float  # m
+    spread: Flag  # whether that is above one: then the parts of the account take turns
+    turns: int  # parts of the account in a sample of the loop
     lag: Any  # lag filter of the observer
     forget: float  # dt/T
     earn: float  # dt/T_C
@@ -179,6 +195,25 @@ class GuardTrial(Scalars):
     wait: float  # D in samples
 
 
+class GuardInterval(Scalars):
+    """What was decided last, and what goes on between two samples of the account."""
+
+    least: float  # least e_L [y-unit/s^n]
+    largest: float  # largest e_L [y-unit/s^n]
+    reason: float  # a Reason
+    samples: float  # number of samples in these sums
+    output: float  # sum of g [y-unit/s^n]
+    correction: float  # sum of e_L [y-unit/s^n]
+    own: float  # largest |e_L| [y-unit/s^n]
+    apart: float  # sum of f_L − target [y-unit/s^n]
+    part: float  # the part of the account that comes next
+    said: float  # mean of g [y-unit/s^n]
+    f_plain: float  # [y-unit/s^n]
+    q: float  # [y-unit/s^n]
+    bounded: float  # p̄ [y-unit/s^n]
+    earned: float  # what the sample earns
+
+
 class GuardMemory(NamedTuple):
     """State of the guard."""
 
@@ -190,6 +225,7 @@ class GuardMemory(NamedTuple):
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
     trial: NDArray[GuardTrial]  # (1,)
+    interval: NDArray[GuardInterval]  # (1,)
 
 
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.filtered.
@@ -231,110 +267,6 @@ def tiny(guard: GuardDesign) -> float:
     return _TINY_SINGLE if is_single(guard.forget) else _TINY
 
 
-# ---- Functions of a guard, registered for the type of its parameters ----
-
-GUARD_CHANNELS = (("authority", 1), ("error_plain", 1), ("error_learned", 1), ("reason", 1))
-"""Name and width of what ``write_channels`` writes, in order."""
-
-
-class UnguardedDesign(NamedTuple):
-    """Parameters of a controller without guard: none."""
-
-
-class UnguardedMemory(NamedTuple):
-    """State of a controller without guard."""
-
-    nothing: Vector  # (0,)
-
-
-@generic_with_default
-def assess(guard: Any, memory: Any, f_plain: float) -> None:
-    """Update the averages with ``f_plain``, the estimate of an ESO without learner."""
-
-
-@generic_with_default
-def limit(
-    guard: Any,
-    memory: Any,
-    f_plain: float,
-    f_filtered: float,
-    constant: float,
-    slope: float,
-    u_before: float,
-) -> tuple[float, float, bool]:
-    """Return the permitted ``(constant, slope)`` of the output ``constant + slope · u``.
-
-    ``f_filtered`` is f_L^F. The third value is true if the output is not finite: then the learner
-    has to be restarted.
-    """
-    return constant, slope, False
-
-
-@generic_with_default
-def nearest_permitted(guard: Any, memory: Any, f_learned: float) -> float:
-    """Return the permitted f_L next to ``f_learned``, after ``limit``."""
-    return f_learned
-
-
-@generic_with_default
-def record_output(guard: Any, memory: Any, f_learned: float) -> None:
-    """Store the output of this sample and the ``f_learned`` that the observer receives."""
-
-
-@generic_with_default
-def write_channels(guard: Any, memory: Any, row: Vector) -> int:
-    """Write ``GUARD_CHANNELS`` to the start of ``row``; return how many numbers were written."""
-    return 0
-
-
-@generic_with_default
-def start_again(guard: Any, memory: Any) -> None:
-    """Return to the state before the first sample."""
-
-
-@generic_with_default
-def reset_filters(guard: Any, memory: Any) -> None:
-    """Set the filters to zero; keep the learner's averages."""
-
-
-# ---- Reasons for a learner's authority ----
-
-
-class Reason(IntEnum):
-    """Reason for a learner's authority."""
-
-    TRUSTED = 0
-    UNPROVEN = 1
-    TOO_LOUD = 2
-    OUT_OF_BOUNDS = 3
-    WITHHELD = 4
-    EXPLODED = 5
-    NOT_FINITE = 6
-    FAILED = 7
-
-    @property
-    def message(self) -> str:
-        """The reason as a sentence."""
-        return _MESSAGES[self]
-
-
-_MESSAGES = {
-    Reason.TRUSTED: "The learner explains what the observer would have missed; full authority.",
-    Reason.UNPROVEN: "The learner has so far explained too little of what the observer misses.",
-    Reason.TOO_LOUD: "The learner's output is larger than what it should explain; scaled down.",
-    Reason.OUT_OF_BOUNDS: "The learner would change the estimate by more than its bound; clipped.",
-    Reason.WITHHELD: "The error is much larger than what is certainly not the learner's; "
-    "authority is withheld until it is seen whether the loop keeps it up without the learner.",
-    Reason.EXPLODED: "The learner's output is a hundred times larger than f; "
-    "it was cut off and starts again without authority.",
-    Reason.NOT_FINITE: "The learner's output is not finite; "
-    "it was cut off, and the learner was reset and starts again without authority.",
-    Reason.FAILED: "Twice the error fell when authority was withheld: the learner drives what "
-    "it explains. b0 is likely below half of the gain (OnlineGain and quell b0 find it), "
-    "or loops move each other; authority is withheld for a time that doubles.",
-}
-
-
 # ---- Credit and account of a learner, and its authority ----
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
@@ -373,15 +305,19 @@ _OUTSIDE, _OWN_DECAYS, _RAISES = 4.0, 5.0, 4.0
 _FIRST_WAIT, _IN_DOUBT, _AFTER_WAIT, _LONGEST = 100.0, 0.5, 0.25, 2.0**22
 
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
+# Parts of the account that take turns; the next sample decides.
+PARTS = 7
+_DECISION = float(PARTS)
+
 _WITHHELD, _FAILED = int(Reason.WITHHELD), int(Reason.FAILED)
 
 
 @kernel
-def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
-    """Update averages, credit and account with q and p, of which one is not zero."""
+def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> tuple[float, float]:
+    """Update averages and C with q and p, of which one is not zero; return p̄ and what is earned."""
     averages, sample = memory.averages[0], memory.sample[0]
     qq, pp = q * q, p * p
-    is_new = sample.samples * guard.forget < 1.0
+    is_new = _is_new(guard, memory)
     averages.square = _mean_square(guard, averages.square, qq, guard.forget, is_new)
     left, rate = (q - p) * (q - p), guard.forget_match
     averages.square_left = _mean_square(guard, averages.square_left, left, guard.forget, is_new)
@@ -392,16 +328,29 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
     bounded = min(max(p, -most), most)
     earned = _earned(q, bounded, averages.square, tiny(guard))
     if earned > 0.0:
-        earned *= quickness(guard, memory)
+        earned *= quickness(newest_share(guard, memory))
     sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
+    return bounded, earned
+
+
+@kernel
+def _is_new(guard: GuardDesign, memory: GuardMemory) -> bool:
+    """Return whether the loop is younger than T."""
+    return memory.sample[0].samples * guard.forget < guard.every
+
+
+@kernel
+def _judge_at_y(
+    guard: GuardDesign, memory: GuardMemory, q: float, bounded: float, earned: float
+) -> None:
+    """Update C_y and the account, after ``judge``."""
+    sample, is_new = memory.sample[0], _is_new(guard, memory)
     missed = respond(guard, memory, MISSED, q)
     _earn_at_y(guard, memory, missed, respond(guard, memory, EXPLAINED, bounded), is_new)
     if newest_share(guard, memory) > 1.0:
         # The learner adds to q: what y shows late, q shows at once.
         sample.credit_at_y = max(sample.credit_at_y + guard.earn * min(earned, 0.0), -1.0)
     _keep_account(guard, memory, missed, is_new)
-    if guard.stages <= HIGHEST_ORDER:
-        keep_outcomes(guard, memory, qq)
 
 
 @kernel
@@ -440,14 +389,15 @@ def keep_outcomes(guard: GuardDesign, memory: GuardMemory, qq: float) -> None:
     trial.own_lately += guard.within_lag * (sample.own_peak - trial.own_lately)
     own = trial.own + guard.within_lag * (trial.own_lately - trial.own)
     trial.own = max(own, (1.0 - _OWN_DECAYS * guard.decay) * trial.own)
-    trial.doubt = max(trial.doubt - 1.0, 0.0)
+    trial.doubt = max(trial.doubt - guard.every, 0.0)
     newest = averages.newest_error
     if trial.left > 0.0:
         _try(guard, memory, newest)
         return
     is_outside = qq > (_OUTSIDE * trial.own) ** 2
     # Without the learner's doing it at first forgets within the last third of the time.
-    rate = max(3.0 / max(sample.samples, 3.0), guard.decay) if is_outside else guard.decay
+    third = 3.0 * guard.every
+    rate = max(third / max(sample.samples, third), guard.decay) if is_outside else guard.decay
     trial.outside += rate * min(newest - trial.outside, 0.0)
     if is_outside:
         trial.outside = max(trial.outside, qq)
@@ -460,7 +410,7 @@ def keep_outcomes(guard: GuardDesign, memory: GuardMemory, qq: float) -> None:
 def _try(guard: GuardDesign, memory: GuardMemory, newest: float) -> None:
     """Take a sample of a trial, and end it if that was the last."""
     trial = memory.trial[0]
-    trial.left -= 1.0
+    trial.left -= guard.every
     if trial.left > (_TRIAL - _STILL_GROWS) * _lag(guard):
         trial.highest = max(trial.highest, newest)
     if trial.left > 0.0:
@@ -510,9 +460,9 @@ def newest_share(guard: GuardDesign, memory: GuardMemory) -> float:
 
 
 @kernel
-def quickness(guard: GuardDesign, memory: GuardMemory) -> float:
-    """Return how many times as quickly a learner is heard that closely matches q at present."""
-    return 1.0 + (_QUICK - 1.0) * max(1.0 - newest_share(guard, memory) / _MATCHING, 0.0)
+def quickness(newest: float) -> float:
+    """Return how many times as quickly a learner is heard that leaves ε, ``newest``, of q."""
+    return 1.0 + (_QUICK - 1.0) * max(1.0 - newest / _MATCHING, 0.0)
 
 
 @kernel
@@ -573,6 +523,7 @@ def withdraw_authority(memory: GuardMemory) -> None:
     """Set the credit of a learner that has yet to prove itself, and the loudness of one like f."""
     memory.sample[0].credit = memory.sample[0].credit_at_y = -1.0
     memory.averages[0].loudness = 0.5
+    memory.interval[0].reason = _UNPROVEN
 
 
 # ---- The error e, and the bound of a correction in units of it ----
@@ -600,7 +551,7 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     sample = memory.sample[0]
     peak, size = sample.peak, sample.typical_error
     # After T an outlier counts for 5 P at most: one bad measurement must not open all bounds.
-    if sample.samples * guard.forget >= 1.0:
+    if sample.samples * guard.forget >= guard.every:
         error = min(error, _OUTLIER * peak)
     more = guard.rise * (error - peak) if error > peak else -guard.decay * peak
     peak = carried_sum(guard, memory, PEAK, peak, more)
@@ -614,22 +565,22 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
 
 
 @kernel
-def bounds_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[float, float]:
-    """Return the least and the largest e_L; ``removed`` is R."""
-    sample = memory.sample[0]
+def update_bounds(guard: GuardDesign, memory: GuardMemory, removed: float, left: float) -> None:
+    """Decide about the least and the largest e_L; ``removed`` is R, ``left`` is ε."""
+    sample, interval = memory.sample[0], memory.interval[0]
     if sample.authority == 0.0:
         closing = _closing(guard, memory) if sample.taking_back > 0.0 else 0.0
-        return closing, closing
-    left = newest_share(guard, memory)
+        interval.least = interval.largest = closing
+        return
     wider = min(max(removed / _WIDE, 0.0), 1.0)
     wider *= min(max(2.0 * (_CLOSE - left) / _CLOSE, 0.0), 1.0)
     factor = guard.usual_bound + wider * (guard.bound - guard.usual_bound)
     most = sample.authority * factor * sample.typical_error
     narrow = most * min(max(2.0 - left / _WRONG, _NARROWEST), 1.0)
     # What has been pushed too far upwards may be taken back at once, and the other way round.
+    interval.least, interval.largest = -narrow, most
     if memory.effects[CORRECTED, guard.stages - 1] > 0.0:
-        return -most, narrow
-    return -narrow, most
+        interval.least, interval.largest = -most, narrow
 
 
 @kernel
@@ -676,25 +627,105 @@ _NOT_FINITE = int(Reason.NOT_FINITE)
 
 @assess.register(GuardDesign)
 def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
+    if guard.spread:
+        for _ in range(guard.turns):
+            _take_turn(guard, memory, f_plain)
+    elif memory.interval[0].samples > 0.0:
+        _begin_account(guard, memory, f_plain)
+        interval = memory.interval[0]
+        _keep_output(guard, memory, interval.said)
+        if _compare(guard, memory, f_plain):
+            bounded, earned = judge(guard, memory, interval.q, memory.filtered[V])
+            _judge_at_y(guard, memory, interval.q, bounded, earned)
+            if guard.stages <= HIGHEST_ORDER:
+                keep_outcomes(guard, memory, interval.q * interval.q)
+        interval.part = _DECISION
+
+
+@kernel
+def _take_turn(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
+    """Do the part of the account whose turn it is, so that no sample of the loop does all."""
+    interval, part = memory.interval[0], memory.interval[0].part
+    if part == 0.0 or part == _DECISION:
+        if interval.samples >= guard.every:
+            interval.part = 1.0
+            _begin_account(guard, memory, f_plain)
+        return
+    interval.part = part + 1.0
+    if part == 1.0:
+        _keep_output(guard, memory, interval.said)
+    elif part == 2.0:
+        if not _compare(guard, memory, interval.f_plain):
+            interval.part = _DECISION
+    elif part == 3.0:
+        q, p = interval.q, memory.filtered[V]
+        interval.bounded, interval.earned = judge(guard, memory, q, p)
+    elif part == 4.0:
+        _judge_at_y(guard, memory, interval.q, interval.bounded, interval.earned)
+    elif part == 5.0 and guard.stages <= HIGHEST_ORDER:
+        keep_outcomes(guard, memory, interval.q * interval.q)
+
+
+@kernel
+def _begin_account(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
+    """Take f_plain and the means of an interval, and begin the next one."""
+    interval = memory.interval[0]
+    interval.f_plain, interval.said = f_plain, interval.output / interval.samples
+    correction, apart = (
+        interval.correction / interval.samples,
+        interval.apart / interval.samples,
+    )
+    _keep_correction(guard, memory, correction, interval.own, apart)
+    _clear_sums(memory)
+
+
+@kernel
+def _clear_sums(memory: GuardMemory) -> None:
+    """Begin an interval of the account."""
+    interval = memory.interval[0]
+    interval.samples = interval.output = interval.correction = interval.own = interval.apart = 0.0
+
+
+@kernel
+def _compare(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> bool:
+    """Update q, P, e and o; return whether there is something to judge."""
     filtered, sample = memory.filtered, memory.sample[0]
     q, p = f_plain - filtered[F_PLAIN], filtered[V]
+    memory.interval[0].q = q
     if not is_finite(q * q + p * p):
         # For example after a measurement near the largest float: its filters hold nothing useful.
         target = sample.target
         reset_filters(guard, memory)
         sample.target, sample.unsettled = target, guard.settling
-        return
+        return False
     filtered[F_PLAIN] = lag_push(guard.lag, memory.chain, F_PLAIN, f_plain)
     if q * q + p * p < tiny(guard):
         # At rest nothing is judged: averages that began with zeros would take all that follows for
         # a burst.
-        return
-    sample.samples += 1.0
+        return False
+    sample.samples += guard.every
     if sample.unsettled > 0.0:
-        sample.unsettled -= 1.0
-        return
+        sample.unsettled -= guard.every
+        return False
     update_bound(guard, memory, abs(q))
-    judge(guard, memory, q, p)
+    return True
+
+
+@kernel
+def _decide(guard: GuardDesign, memory: GuardMemory) -> None:
+    """Update authority, share and bounds, the last part of the account."""
+    sample, interval = memory.sample[0], memory.interval[0]
+    interval.part = 0.0
+    removed, left = removed_share(guard, memory), newest_share(guard, memory)
+    authority, interval.reason = authority_of(guard, memory, removed)
+    sample.authority = authority
+    quick = quickness(left) if guard.stages <= HIGHEST_ORDER else 1.0
+    missing = authority - sample.share
+    more = quick * guard.smooth * missing
+    if authority >= 1.0:
+        more = min(max(more, guard.smooth * _LAST_SHARE), missing)
+    sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
+    update_bounds(guard, memory, removed, left)
 
 
 @limit.register(GuardDesign)
@@ -707,7 +738,7 @@ def _limit(
     slope: float,
     u_before: float,
 ) -> tuple[float, float, bool]:
-    sample = memory.sample[0]
+    sample, interval = memory.sample[0], memory.interval[0]
     output = constant + slope * u_before
     most = _CUT_OFF * max(abs(f_plain), sample.peak)
     if guard.invertible:
@@ -721,19 +752,14 @@ def _limit(
         sample.target = f_filtered
         clear_carry(memory, TARGET)
         withdraw_authority(memory)
+        update_bounds(guard, memory, 0.0, 0.0)
         return nearest_permitted(guard, memory, f_filtered), 0.0, not finite
     before, sample.output = sample.output, output
     if sample.share < 0.0:
         before, sample.share = output, -sample.share
-    removed = removed_share(guard, memory)
-    authority, sample.reason = authority_of(guard, memory, removed)
-    sample.authority = authority
-    quick = quickness(guard, memory) if guard.stages <= HIGHEST_ORDER else 1.0
-    missing = authority - sample.share
-    more = quick * guard.smooth * missing
-    if authority >= 1.0:
-        more = min(max(more, guard.smooth * _LAST_SHARE), missing)
-    sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
+    if interval.part == _DECISION:
+        _decide(guard, memory)
+    sample.reason = interval.reason
     if is_single(guard.forget):
         step = sample.share * (output - before)
         sample.target = carried_sum(guard, memory, TARGET, sample.target, step)
@@ -741,9 +767,8 @@ def _limit(
     else:
         base = sample.target - sample.share * before
         sample.target = base + sample.share * output
-    least, largest = bounds_of(guard, memory, removed)
-    if not least <= sample.target - f_filtered <= largest:
-        sample.reason = _OUT_OF_BOUNDS if authority > 0.0 else sample.reason
+    if not interval.least <= sample.target - f_filtered <= interval.largest:
+        sample.reason = _OUT_OF_BOUNDS if sample.authority > 0.0 else sample.reason
     elif guard.least_slope <= sample.share * slope <= guard.largest_slope:
         return base + sample.share * constant, sample.share * slope, False
     return nearest_permitted(guard, memory, sample.target), 0.0, False
@@ -751,36 +776,57 @@ def _limit(
 
 @nearest_permitted.register(GuardDesign)
 def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float:
-    least, largest = bounds_of(guard, memory, removed_share(guard, memory))
-    filtered = memory.filtered[F_L]
-    return min(max(f_learned, filtered + least), filtered + largest)
+    filtered, interval = memory.filtered[F_L], memory.interval[0]
+    return min(max(f_learned, filtered + interval.least), filtered + interval.largest)
 
 
 @record_output.register(GuardDesign)
 def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
-    filtered, sample = memory.filtered, memory.sample[0]
-    v = sample.output - filtered[G]
-    filtered[G] = lag_push(guard.lag, memory.chain, G, sample.output)
-    filtered[V] = lag_push(guard.lag, memory.chain, V, v)
-    correction = f_learned - filtered[F_L]
+    filtered, sample, interval = memory.filtered, memory.sample[0], memory.interval[0]
+    correction, apart = f_learned - filtered[F_L], 0.0
     if not guard.invertible:
         filtered[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
+    if sample.authority > 0.0:
+        apart = f_learned - sample.target
+    else:
+        sample.target = f_learned
+        clear_carry(memory, TARGET)
+    # Sums over all samples: what a learner does in one of them is in the account.
+    interval.samples += 1.0
+    interval.output += sample.output
+    interval.correction += correction
+    interval.own = max(interval.own, abs(correction))
+    interval.apart += apart
+
+
+@kernel
+def _keep_output(guard: GuardDesign, memory: GuardMemory, output: float) -> None:
+    """Update p with the mean of g."""
+    filtered = memory.filtered
+    v = output - filtered[G]
+    filtered[G] = lag_push(guard.lag, memory.chain, G, output)
+    filtered[V] = lag_push(guard.lag, memory.chain, V, v)
+
+
+@kernel
+def _keep_correction(
+    guard: GuardDesign, memory: GuardMemory, correction: float, own: float, apart: float
+) -> None:
+    """Update ℓ e_L, d, c_L and the target with mean and size of e_L, and the mean f_L − target."""
+    sample = memory.sample[0]
     effect = respond(guard, memory, CORRECTED, correction)
     sample.late_effect += guard.within_lag * (effect - sample.late_effect)
     decay = guard.own_decay if sample.authority > 0.0 else 1.0 - guard.within_lag
-    sample.own_peak = max(abs(correction), decay * sample.own_peak)
+    sample.own_peak = max(own, decay * sample.own_peak)
     if sample.authority > 0.0:
         sample.taking_back = guard.taking_back
-        more = guard.leak * (f_learned - sample.target)
-        sample.target = carried_sum(guard, memory, TARGET, sample.target, more)
+        sample.target = carried_sum(guard, memory, TARGET, sample.target, guard.leak * apart)
         distance = sample.share * sample.output - sample.target
         if abs(distance) > _FAR * sample.typical_error:
             step = copysign(guard.home * sample.typical_error, distance)
             sample.target = carried_sum(guard, memory, TARGET, sample.target, step)
     else:
-        sample.taking_back = max(sample.taking_back - 1.0, 0.0)
-        sample.target = f_learned
-        clear_carry(memory, TARGET)
+        sample.taking_back = max(sample.taking_back - guard.every, 0.0)
 
 
 @write_channels.register(GuardDesign)
@@ -803,6 +849,8 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     sample.output = sample.target = sample.unsettled = 0.0
     sample.own_peak = sample.late_effect = sample.taking_back = 0.0
     memory.trial[0].own_lately = memory.trial[0].own = 0.0
+    memory.interval[0].part = _DECISION
+    _clear_sums(memory)
     # The next output has none before it: it is a constant.
     sample.share = -abs(sample.share)
 
@@ -813,5 +861,7 @@ def _start_again(guard: GuardDesign, memory: GuardMemory) -> None:
     clear(memory.averages)
     clear(memory.sample)
     clear(memory.trial)
+    clear(memory.interval)
+    memory.interval[0].part = _DECISION
     withdraw_authority(memory)
     memory.sample[0].unsettled = guard.settling

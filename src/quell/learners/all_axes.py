@@ -231,8 +231,8 @@ def _noise_gate(observer: SignalsOfAxes, frequency: float) -> NoiseGateOfAxes:
 
 
 @lag_of.register(SignalsOfAxes)
-def _lag_of(observer: SignalsOfAxes) -> Any:
-    return lag_of(observer.own)
+def _lag_of(observer: SignalsOfAxes, every: int = 1) -> Any:
+    return lag_of(observer.own, every)
 
 
 @group_delay.register(SignalsOfAxes)

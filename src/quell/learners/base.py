@@ -626,17 +626,16 @@ def reset_lag(memory: Matrix) -> None:
 
 
 @functools.singledispatch
-def lag_of(observer: Any) -> Lag | DenseLag:
-    """Return the lag filter of an observer.
+def lag_of(observer: Any, every: int = 1) -> Lag | DenseLag:
+    """Return the lag filter of an observer, or of each m-th of its samples.
 
     It is a ``Lag`` if all poles are in one place, else a ``DenseLag``. A delay of u has no effect:
-    the feedforward is not delayed. Raises ``ValueError`` for a nonlinear observer, which has no lag
-    filter.
+    the feedforward is not delayed. With ``every`` = m it is exact for an input that is constant
+    over m samples. Raises ``ValueError`` for a nonlinear observer, which has no lag filter.
     """
-    if observer.has_one_pole:
-        return _chain(observer)
-    M, g, c, d = f_learned_response(_response(observer))
-    return DenseLag(M, g.copy(), c, d)
+    if observer.has_one_pole and (every == 1 or not without_delay(observer.model).predictor):
+        return _chain(observer, every)
+    return DenseLag(*f_learned_response(_response(observer), every))
 
 
 def _response(observer: ESO) -> Response:
@@ -671,8 +670,8 @@ def group_delay(observer: Any) -> float:
     return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + float(lag.predictor)
 
 
-def _chain(observer: ESO) -> Lag:
-    """Return the filter as a chain of first-order lags.
+def _chain(observer: ESO, every: int = 1) -> Lag:
+    """Return the filter of each m-th sample as a chain of first-order lags.
 
     With ``M = (I − L C) Φ`` and ``g = (I − L C) Γ_f``, the chain is ``s = V v`` with ``V_1 =
     g/(1−β)`` and ``V_{j+1} = (M − βI) V_j/(1−β)``, which ends after N by Cayley-Hamilton; ``c_j =
@@ -685,9 +684,13 @@ def _chain(observer: ESO) -> Lag:
     correct = np.eye(size)
     correct[:, 0] -= model.gain * scale
     transition = correct @ (model.transition * scale[:, None] / scale[None, :])
-    rise = -np.expm1(-observer.omega_o * observer.dt)
+    given = column = correct @ (model.feed * scale)
+    for _ in range(every - 1):
+        column = transition @ column + given
+    transition = np.linalg.matrix_power(transition, every)
+    rise = -np.expm1(-observer.omega_o * observer.dt * every)
     shifted = transition - np.eye(size) + rise * np.eye(size)
-    column = correct @ (model.feed * scale) / rise
+    column = column / rise
     # In predictor form f̂ is the f that is predicted from these states: f itself, or f + dt f' + ….
     row = np.eye(size)[at_f]
     if model.predictor and observer.disturbance_order > 1:
@@ -696,7 +699,7 @@ def _chain(observer: ESO) -> Lag:
     for j in range(size):
         taps[j] = -(row @ column) / scale[at_f]
         column = shifted @ column / rise
-    return Lag(observer.pole, rise, taps, model.predictor)
+    return Lag(observer.pole if every == 1 else 1.0 - rise, rise, taps, model.predictor)
 
 
 @generic

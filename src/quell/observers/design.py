@@ -368,10 +368,19 @@ def response(model: Any, estimates: int, at_f: int) -> Response:
     return Response(transition, given, output, feedthrough, at_f)
 
 
-def f_learned_response(found: Response) -> tuple[Matrix, Vector, Vector, float]:
-    """Return ``(M, g, c, d)`` of ``s⁺ = M s + g f_L``, ``−Δf̂ = c·s + d f_L``, for y = u = 0."""
-    feedthrough = float(found.feedthrough[found.at_f, 2])
-    return found.transition, found.input[:, 2], -found.output[found.at_f], -feedthrough
+def f_learned_response(found: Response, every: int = 1) -> tuple[Matrix, Vector, Vector, float]:
+    """Return ``(M, g, c, d)`` of ``s⁺ = M s + g f_L``, ``−Δf̂ = c·s + d f_L``, for y = u = 0.
+
+    With ``every`` = m they are those of each m-th sample, for an f_L that is constant in between::
+
+        s_(k+m) = M^m s_k + Σ_(i<m) M^i g f_L
+        −Δf̂_(k+m) = c M^(m−1) s_k + (c Σ_(i<m−1) M^i g + d) f_L
+    """
+    M, g, c = found.transition, found.input[:, 2], -found.output[found.at_f]
+    d, given = -float(found.feedthrough[found.at_f, 2]), g.copy()
+    for _ in range(every - 1):
+        c, d, given = c @ M, d + float(c @ g), M @ given + g
+    return np.linalg.matrix_power(M, every), given, c, d
 
 
 def scaled_response(model: Any, units: Vector, at_f: int) -> Response:
