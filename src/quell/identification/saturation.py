@@ -29,6 +29,8 @@ _FEWEST, _PILED, _VALUES = 10, 4.0, 20
 # Share of a rest at the begin in which u is looked at, and how often it moves through its range
 # in a rest at begin or end that is none. By hand.
 _FIRST, _SWINGS = 0.8, 1.0
+# Steps of rounding by which a y leaves a limit at once. By hand.
+_LEAVES = 2.5
 # Share of the samples beyond which too little is left.
 _MOST = 0.9
 
@@ -92,10 +94,14 @@ def _at_top(x: Vector, resolution: float, u: Vector | None) -> NDArray[np.bool_]
     # A plant that rests at the begin or the end of a record may stand at an extreme, too.
     away = np.flatnonzero(~at)
     if away.size:
-        if u is not None and resolution == 0.0:
-            # A delay may be as long as the rest of the first part.
+        if u is not None:
+            # A delay may be as long as the rest of the first part. A rounded y may move within a
+            # step: it stands at a limit only if it leaves it by several steps at once.
             ends = u[: int(_FIRST * away[0])], u[away[-1] + 1 :]
-            moved = max(float(np.sum(np.abs(np.diff(part)))) for part in ends)
+            moved = max(
+                float(np.sum(np.abs(np.diff(part)))) if top - x[k] > _LEAVES * resolution else 0.0
+                for part, k in zip(ends, (away[0], away[-1]), strict=True)
+            )
             if moved > _SWINGS * float(np.ptp(u)) and np.sum(every) >= _FEWEST:
                 return every
         at[: away[0]] = at[away[-1] :] = False
