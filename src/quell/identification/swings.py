@@ -246,6 +246,9 @@ def _checked(y: Vector, decay: ParameterEstimate, modes: int | None) -> Paramete
     ratio = likelihood_ratio((centred, left), _ROUNDING * float(centred @ centred))
     a = float(decay.theta[0])
     which = "y does not decay" if modes == 0 else "y does not ring, nor does it decay"
+    if modes != 0 and y.size < _PER_MODE:
+        least = f"must have at least {_PER_MODE} for each mode"
+        which = f"y has {y.size} samples: {least}, and it does not decay"
     if not math.isfinite(decay.cost) or a >= math.pi or ratio < 4.0 * math.log(y.size):
         raise ValueError(
             f"{which}: no frequency and no time constant explains more of it than chance; begin "
