@@ -783,6 +783,10 @@ def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float
 @record_output.register(GuardDesign)
 def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
     filtered, sample, interval = memory.filtered, memory.sample[0], memory.interval[0]
+    if interval.samples >= guard.every:
+        # While the plant is held nothing is assessed, and the filters go on.
+        _begin_account(guard, memory, interval.f_plain)
+        _keep_output(guard, memory, interval.said)
     correction, apart = f_learned - filtered[F_L], 0.0
     if not guard.invertible:
         filtered[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
