@@ -24,7 +24,14 @@ ROWS = (
     ("envs",),
     ("identification",),
     ("sweeping",),
-    ("tuning.constraints", "tuning.structures", "tuning.optimiser", "tuning.simulated", "tuning"),
+    (
+        "tuning.constraints",
+        "tuning.load_spectrum",
+        "tuning.structures",
+        "tuning.optimiser",
+        "tuning.simulated",
+        "tuning",
+    ),
     # Plants from tables, which twins and rigs are made of.
     ("setup.schema",),
     ("realtime",),

@@ -31,7 +31,8 @@ ALL_STRUCTURES = [
     ("poles", 2), ("poles", 3), ("half-gain", 2), ("half-gain-law", 2), ("reduced", 2),
     ("model-based", 0), ("model-based-poles", 0), ("delay", 1), ("delay-poles", 2),
     ("bandwidths-2", 1), ("bandwidths-2", 2), ("bandwidths-3", 2), ("poles-2", 1), ("poles-2", 2),
-    ("model-based-2", 0),
+    ("poles-3", 1), ("poles-3", 2), ("model-based-2", 0),
+    ("resonator", 1), ("resonator", 2), ("resonator-2", 2),
 ]  # fmt: skip
 
 

@@ -354,7 +354,7 @@ def test_every_observer_form_has_examples_with_more_extended_states() -> None:
         shown = {name.partition(", ")[2].partition("=")[0] for name in names} - {""}
         options = set(inspect.signature(ql.ESO.model_based).parameters)
         assert shown == options - {
-            *("plant", "omega_o", "dt", "b0", "E", "far", "disturbance_order")
+            *("plant", "omega_o", "dt", "b0", "E", "far", "disturbance_order", "frequencies")
         }
         forms = {name.partition("form=")[2] for name in names} - {""}
         assert forms == set(FORMS)

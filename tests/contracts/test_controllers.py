@@ -53,6 +53,9 @@ CONTROLLERS: dict[str, Any] = {
         **LIMITS,
     ),
     "LQG": baseline_room.LQG(CHAIN, 3.0, 12.0, DT, **LIMITS),
+    "AdaptiveNotch": baseline_room.AdaptiveNotch(
+        CHAIN, 3.0, 12.0, DT, count=2, band=(0.5, 5.0), listening=2.0, frequencies=(2.0,), **LIMITS
+    ),
     "ResonanceRatio": baseline_room.ResonanceRatio(omega_o=5.0, dt=DT, **LIMITS),
     "Prefiltered": room.Prefiltered(PID, baseline_room.ZVD(3.0, 0.1)),
     "Prefiltered, Han's": room.Prefiltered(

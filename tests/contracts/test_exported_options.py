@@ -140,6 +140,7 @@ _ORDERS = {
     "delay": 0.02,
     **_EXTENDED,
 }
+_FREQUENCIES = {"frequencies": Several(((2.0,), (2.0, 5.0)))}
 PARTS: dict[str, Part] = {
     # Learners.
     "Kalman": Part(ql.learners.Kalman, _learning, {}, _LINEAR),
@@ -190,12 +191,12 @@ PARTS: dict[str, Part] = {
     }),
     # Observers.
     "ESO.model_free": Part(ql.ESO.model_free, _observing, _ESO, {
-        **_ORDERS, "form": Several(FORMS), "half_gain": True, "poles": Several(([-1.0, -1.2, -1.5], [-1.0, (-1.5, 0.8)])),
+        **_ORDERS, **_FREQUENCIES, "form": Several(FORMS), "half_gain": True, "poles": Several(([-1.0, -1.2, -1.5], [-1.0, (-1.5, 0.8)])),
     }),
     "ESO.model_based": Part(ql.ESO.model_based, _observing, {"plant": ([2.0, 0.3], 1.5), "omega_o": 12.0, "dt": DT}, {
         "plant": Several((PLANT, ([1.0, 2.0, 0.5], 1.5), ([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]))), "omega_o": 10.0, "dt": 0.02, "b0": 2.0,
         "E": With([0.0, 1.0], {"plant": PLANT}), "form": Several(FORMS), "keep_zeros": With(True, {"plant": ([1.5, 6.0], [1.0, 0.5, 2.0, 1.0])}),
-        "half_gain": True, "delay": 0.02, **_EXTENDED, "poles": Several(([-1.0, -1.2, -1.5],)), "far": With(2.0, {"plant": ([1.5, 60.0], [1.0, 0.5, 2.0, 1.0])}),
+        "half_gain": True, "delay": 0.02, **_EXTENDED, **_FREQUENCIES, "poles": Several(([-1.0, -1.2, -1.5],)), "far": With(2.0, {"plant": ([1.5, 60.0], [1.0, 0.5, 2.0, 1.0])}),
     }),
     "ESO.kalman": Part(ql.ESO.kalman, _observing, {"order": 2, "b0": 1.5, "dt": DT, "noise_variance": 1e-6, "drift": 0.03}, {
         "order": Several((1, 3)), "b0": 2.0, "dt": 0.02, "noise_variance": 1e-5, "drift": 0.1, "jitter": 0.1, "form": Several(FORMS[:2]), "delay": 0.02, **_EXTENDED,
@@ -279,6 +280,10 @@ PARTS: dict[str, Part] = {
     "LQG": Part(baseline_room.LQG, _itself, {"plant": PLANT, "omega_c": 3.0, "omega_o": 12.0, "dt": DT, **LIMITS}, {
         "plant": ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), "omega_c": 2.0, "omega_o": 10.0, "dt": 0.02,
         "Q": Several(([[2.0, 0.0], [0.0, 1.0]],)), "rho": 0.5, "process_noise": Several(([[1.0, 0.0], [0.0, 2.0]],)),
+    }),
+    "AdaptiveNotch": Part(baseline_room.AdaptiveNotch, _itself, {"plant": PLANT, "omega_c": 3.0, "omega_o": 12.0, "dt": DT, **LIMITS}, {
+        "plant": ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), "omega_c": 2.0, "omega_o": 10.0, "dt": 0.02, "bandwidth": 0.3, "count": Several((2, With(0, {"waves": (3.0,)}))),
+        "band": (0.5, 6.0), "listening": 2.0, "frequencies": (1.0,), "waves": (5.0,), **_RANGE, "name": "axis",
     }),
     "ResonanceRatio": Part(baseline_room.ResonanceRatio, _itself, {"omega_o": 5.0, "dt": DT, **LIMITS}, {
         "m1": 2.0, "m2": 2.0, "k": 2.0, "omega_o": 6.0, "dt": 0.02, "omega_d": 8.0, "ratio": 2.0, "measured": "motor",

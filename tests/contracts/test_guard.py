@@ -127,7 +127,16 @@ def test_every_observer_form_is_among_them() -> None:
     }
     assert makers - {"nonlinear"} == {name.partition(",")[0] for name in OBSERVERS}
     options = set(inspect.signature(ql.ESO.model_based).parameters)
-    options -= {"plant", "omega_o", "dt", "b0", "delay", "far", "disturbance_order"}  # numbers
+    options -= {
+        "plant",
+        "omega_o",
+        "dt",
+        "b0",
+        "delay",
+        "far",
+        "disturbance_order",
+        "frequencies",
+    }  # numbers
     shown = {name.partition(", ")[2].partition("=")[0] for name in OBSERVERS} - {""}
     assert options == shown
     assert set(FORMS) == {"current", "predictor", "reduced"}

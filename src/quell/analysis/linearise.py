@@ -585,6 +585,9 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
         instant at which the learner is looked at: an ``Adapting`` or a ``Frozen``, a run or a state
         of the controller (its end); by default the present state.
     """
+    if at is not None and hasattr(controller, "law_at"):
+        with_frequencies: LinearLaw = controller.law_at(getattr(at, "final_state", at))
+        return with_frequencies
     if hasattr(controller, "law"):
         given: LinearLaw = controller.law
         return given

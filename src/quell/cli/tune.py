@@ -375,9 +375,9 @@ def tune(
         Dead time of the plant [s].
     structure
         bandwidths, poles, half-gain, half-gain-law, reduced, model-based, model-based-poles,
-        delay, delay-poles, bandwidths-2, bandwidths-3, poles-2, model-based-2, pi, pi-unfiltered,
-        pid, p-pi-notch or lqg; by default simplest: the simplest whose objective is within 5 % of
-        the best.
+        delay, delay-poles, bandwidths-2, bandwidths-3, poles-2, poles-3, resonator, resonator-2,
+        resonator-3, model-based-2, pi, pi-unfiltered, pid, p-pi-notch, lqg or adaptive-notch; by
+        default simplest: the simplest whose objective is within 5 % of the best.
     order
         Order of an ADRC without model; 1 and 2 are tried by default.
     objective

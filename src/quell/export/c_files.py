@@ -19,6 +19,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import control, is_usable, reset_loop, set_applied_control
+from quell.controllers.baselines.adaptive_notch import NotchDesign, NotchState
 from quell.controllers.compensated import CompensatedDesign, CompensatedState
 from quell.controllers.compensator import start_at_rest
 from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
@@ -485,6 +486,11 @@ def _add_flag(design: AdrcDesign, state: AdrcState, flag: int) -> None:
 
 @add_flag.register(LinearDesign)
 def _add_flag_to_linear(design: LinearDesign, state: LinearState, flag: int) -> None:
+    state.loop[0].status = int(state.loop[0].status) | flag
+
+
+@add_flag.register(NotchDesign)
+def _add_flag_to_notch(design: NotchDesign, state: NotchState, flag: int) -> None:
     state.loop[0].status = int(state.loop[0].status) | flag
 
 

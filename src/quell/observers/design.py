@@ -26,6 +26,15 @@ the sample time. If f moved x within the sample as a ramp, the law ``u = (u_0 �
 an error of ``f' dt/(2 k_1)``, and the feedback would have one pole there. A known delay τ of u
 leaves ``f' τ/k_1``, because the law cancels the f of now.
 
+With *sinusoids* of known frequencies ω_1 … ω_k two of the m extended states belong to each, and the
+model of f is that of an internal model (Francis & Wonham, *Automatica* 12, 1976; Johnson, *IEEE
+Trans. Automatic Control* 16, 1971): ``p(d/dt) Δf = 0`` with ::
+
+    p(s) = s^(m−2k) Π_j (s² + ω_j²),        (Δf^(m−1))' = −Σ_i p_i Δf^(i)
+
+sampled exactly, and held within a sample as above. So the feedback has m − 2k poles at z = 1 and
+pairs at ``exp(±i ω_j dt)``: loads of these frequencies are rejected without error.
+
 All eigenvalues of ``(I − L C) Φ`` lie at ``exp(−omega_o dt)`` (the bandwidth parametrisation of
 Gao, ACC 2003, in the z-plane as in Miklosovic, Radke & Gao, ACC 2006), or at ``exp(p_i omega_o
 dt)`` with a pattern of poles p of its own. The *reduced* form is the
@@ -128,9 +137,20 @@ FORMS = ("current", "predictor", "reduced")
 _LARGEST_GAIN = 1e6
 
 
-def checked_disturbance_order(value: Any) -> int:
-    """Return the number m of extended states; raise a ``ValueError`` if it is not 1, 2 or 3."""
-    return checks.whole("disturbance_order", value, 1, 3)
+def checked_disturbance_order(value: Any, frequencies: Any = (), dt: float = 1.0) -> int:
+    """Return the number m of extended states; raise a ``ValueError`` if it is not 1, 2 or 3.
+
+    For each of the ``frequencies`` [rad/s], which lie below π/dt, there are two more.
+    """
+    known = checks.vector("frequencies", frequencies)
+    if not np.all((known > 0.0) & (known * dt < math.pi)):
+        raise ValueError(
+            f"frequencies = {known.tolist()!r}: must be above 0 and below pi/dt = "
+            f"{math.pi / dt:.4g} rad/s"
+        )
+    if np.unique(known).size < known.size:
+        raise ValueError(f"frequencies = {known.tolist()!r}: must differ from each other")
+    return checks.whole("disturbance_order", value, 1, 3) + 2 * known.size
 
 
 def design_model(
@@ -144,11 +164,13 @@ def design_model(
     keep_zeros: bool,
     poles: Any = None,
     disturbance_order: int = 1,
+    frequencies: Any = (),
 ) -> EsoModel:
     """Return the update of the observer of ``plant`` with the bandwidth ``omega_o``.
 
     ``poles`` are those of the observer in units of omega_o, all at −1 by default; the reduced form
-    has one less than the others. ``disturbance_order`` is the number m of extended states.
+    has one less than the others. ``disturbance_order`` is the number m of extended states, two of
+    them for each of ``frequencies`` [rad/s].
     """
     checks.one_of("form", form, FORMS)
     pattern = None
@@ -166,7 +188,8 @@ def design_model(
     kept = np.zeros(0)
     if keep_zeros and plant.matched:
         kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)]
-    model = _sampled_design(plant, b0, omega_o, dt, form, kept, pattern, disturbance_order)
+    motion = motion_of_f(disturbance_order, np.ravel(frequencies) * dt)
+    model = _sampled_design(plant, b0, omega_o, dt, form, kept, pattern, motion)
     return model._replace(gain=0.5 * model.gain) if half_gain else model
 
 
@@ -178,7 +201,7 @@ def _sampled_design(
     form: str,
     kept: Vector,
     pattern: NDArray[np.complex128] | None,
-    m: int,
+    motion: Matrix,
 ) -> EsoModel:
     """Sample the extended model and place the poles; ``kept`` are plant zeros that keep a pole.
 
@@ -187,7 +210,7 @@ def _sampled_design(
     ``f^(j)/omega_o^(q+j)``. There Φ is close to I, but ``Φ − I`` has full precision because it is
     computed as ``∫ e^(A t) A dt``.
     """
-    n, q = plant.a.size, plant.f_degree
+    n, q, m = plant.a.size, plant.f_degree, motion.shape[0]
     size = n + m
     power = np.append(np.arange(n), q + np.arange(m))
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
@@ -198,8 +221,8 @@ def _sampled_design(
         inputs[:-1, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
         inputs[:, 1] = A[:, -1]
         phi, (difference, gammas) = zero_order_hold(A, [A, inputs], 1.0)
-        phi = with_motion_of_f(phi, m, 1.0)
-        difference, gammas = with_motion_of_f(difference, m), with_rates(gammas, m)
+        phi = with_motion_of_f(phi, motion + np.eye(m))
+        difference, gammas = with_motion_of_f(difference, motion), with_rates(gammas, m)
         step = omega_o * dt
         gain = np.full(size, np.nan)
         ratios = step ** (power[None, :] - power[:, None])
@@ -237,21 +260,38 @@ def _sampled_design(
     )
 
 
-def with_motion_of_f(matrix: Matrix, m: int, diagonal: float = 0.0) -> Matrix:
-    """Return Φ, or Φ − I without ``diagonal``, of N = n + m states from that of n + 1.
+def motion_of_f(m: int, angles: Vector) -> Matrix:
+    """Return what a sample adds to f, f', … (m, m) in units of the sample time.
 
-    In units of the sample time f moves from sample to sample by ``f^(i) ← Σ_{j≥i} f^(j)/(j − i)!``,
-    and is held in between.
+    A polynomial moves by ``f^(i) ← Σ_{j≥i} f^(j)/(j − i)!``; ``angles`` are ω_j dt of sinusoids.
     """
+    if angles.size == 0:
+        found = np.zeros((m, m))
+        for i in range(m):
+            for j in range(i + 1, m):
+                found[i, j] = 1.0 / math.factorial(j - i)
+        return found
+    model = np.ones(1)
+    for angle in angles.tolist():
+        model = np.convolve(model, [1.0, 0.0, angle**2])
+    chain = np.diag(np.ones(m - 1), 1)
+    chain[-1, m - model.size + 1 :] = -model[:0:-1]
+    _, (added,) = zero_order_hold(chain, [chain], 1.0)
+    return added
+
+
+def with_motion_of_f(matrix: Matrix, motion: Matrix) -> Matrix:
+    """Return Φ, or Φ − I, of N = n + m states from that of n + 1.
+
+    f moves from sample to sample as ``motion`` (m, m) says, and is held in between.
+    """
+    m = motion.shape[0]
     if m == 1:
         return matrix
     n = matrix.shape[0] - 1
     found = np.zeros((n + m, n + m))
     found[: n + 1, : n + 1] = matrix
-    for i in range(m):
-        found[n + i, n + i] = diagonal
-        for j in range(i + 1, m):
-            found[n + i, n + j] = 1.0 / math.factorial(j - i)
+    found[n:, n:] = motion
     return found
 
 

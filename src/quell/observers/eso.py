@@ -64,6 +64,8 @@ class ESO:
         the pattern of poles in units of omega_o, or None for one pole.
     disturbance_order : int
         number m of extended states: f̂ follows a polynomial of degree m − 1 without error.
+    frequencies : tuple of float
+        of sinusoids that f̂ follows without error [rad/s]; two of the m states belong to each.
 
     Examples
     --------
@@ -81,6 +83,7 @@ class ESO:
     has_one_pole: bool = True
     poles: Any = None
     disturbance_order: int = 1
+    frequencies: tuple[float, ...] = ()
 
     @classmethod
     @explained("quell.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=1e-3)")
@@ -96,6 +99,7 @@ class ESO:
         delay: float = 0.0,
         poles: Sequence[float | tuple[float, float]] | None = None,
         disturbance_order: int = 1,
+        frequencies: Sequence[float] = (),
     ) -> ESO:
         """Design an ESO from the order and nominal gain of the plant only (paper eq. (mfplant)).
 
@@ -121,13 +125,17 @@ class ESO:
             one of a delay with a part of a sample, whose effect is then in f̂.
         poles
             poles in units of omega_o, instead of all at −1: negative numbers, and pairs (real,
-            imaginary) for two conjugate ones; order + disturbance_order in all, or one less for
-            the reduced form.
+            imaginary) for two conjugate ones; order + disturbance_order in all, two more for each
+            of ``frequencies``, one less for the reduced form.
         disturbance_order
             number m of extended states f, f', …, 1 to 3: the observer's model of f is a polynomial
             of degree m − 1 in time. With 2 a ramp of f is rejected without error, with 3 a
             parabola, and slow loads better; the loop comes closer to −1 at the same omega_o
             (docs/forms_extended). A ``Guard`` needs 1.
+        frequencies
+            of sinusoids in the observer's model of f, below pi/dt [rad/s]: it rejects loads of
+            these frequencies without error, as an internal model does. Each needs two more
+            extended states, which ``disturbance_order`` of the result counts.
 
         Raises
         ------
@@ -135,8 +143,8 @@ class ESO:
             naming the argument, its value and the rule.
         """
         chain = canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0))
-        m = disturbance_order
-        return cls._design(chain, b0, omega_o, dt, form, half_gain, False, delay, poles, m)
+        options = form, half_gain, False, delay, poles, disturbance_order, frequencies
+        return cls._design(chain, b0, omega_o, dt, *options)
 
     @classmethod
     @explained("quell.ESO.model_based(plant, omega_o=20.0, dt=1e-3)")
@@ -155,6 +163,7 @@ class ESO:
         poles: Sequence[float | tuple[float, float]] | None = None,
         far: float = 10.0,
         disturbance_order: int = 1,
+        frequencies: Sequence[float] = (),
     ) -> ESO:
         """Design an ESO from a model of the plant (paper eq. (mbplant)), which may have zeros.
 
@@ -166,7 +175,7 @@ class ESO:
         plant, E
             a linear plant, ``control.StateSpace``, ``control.TransferFunction``, matrices,
             coefficients; see ``canonical``.
-        omega_o, dt, form, half_gain, delay, poles, disturbance_order
+        omega_o, dt, form, half_gain, delay, poles, disturbance_order, frequencies
             as for ``model_free``.
         b0
             nominal control gain, from u to y^(relative degree); the model's own by default.
@@ -211,7 +220,7 @@ class ESO:
                 "constant f does not show in y and can not be estimated; measure another output"
             )
         b0 = found.b if b0 is None else b0
-        options = form, half_gain, keep_zeros, delay, poles, disturbance_order
+        options = form, half_gain, keep_zeros, delay, poles, disturbance_order, frequencies
         return cls._design(found, b0, omega_o, dt, *options)
 
     @classmethod
@@ -440,16 +449,20 @@ class ESO:
         delay: float,
         poles: Any,
         disturbance_order: int,
+        frequencies: Any,
     ) -> ESO:
         reason = "it is the gain from u to the first derivative of y that u moves"
         b0 = checks.nonzero("b0", b0, reason)
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         options: dict[str, Any] = {"half_gain": half_gain, "keep_zeros": keep_zeros}
-        m = options["disturbance_order"] = checked_disturbance_order(disturbance_order)
+        m = options["disturbance_order"] = checked_disturbance_order(
+            disturbance_order, frequencies, dt
+        )
+        options["frequencies"] = known = tuple(map(float, frequencies))
         model = design_model(plant, b0, omega_o, dt, form=form, poles=poles, **options)
         has_one_pole = form != "reduced" and not half_gain and poles is None
         model = delayed_model(model, delay, dt)
-        return cls(plant, b0, omega_o, dt, form, model, has_one_pole, poles, m)
+        return cls(plant, b0, omega_o, dt, form, model, has_one_pole, poles, m, known)
 
     def _with_model(self, model: Any, delay: float) -> ESO:
         model = delayed_model(model, delay, self.dt)
@@ -459,8 +472,11 @@ class ESO:
         inner = without_delay(self.model)
         kind = type(inner).__name__.removesuffix("Model")
         more = "" if self.poles is None else f", poles={text(self.poles)}"
-        if self.disturbance_order > 1:
-            more += f", disturbance_order={self.disturbance_order}"
+        polynomial = self.disturbance_order - 2 * len(self.frequencies)
+        if polynomial > 1:
+            more += f", disturbance_order={polynomial}"
+        if self.frequencies:
+            more += f", frequencies={text(self.frequencies)}"
         if inner is not self.model:
             more += f", delay={self.model.samples * self.dt:g}"
         return (
@@ -632,6 +648,7 @@ def redesign(observer: ESO) -> Callable[[float], Vector]:
     def gain(omega_o: float, half_gain: bool = False) -> Vector:
         how: dict[str, Any] = {"form": observer.form, "half_gain": half_gain}
         how |= {"poles": observer.poles, "disturbance_order": observer.disturbance_order}
+        how["frequencies"] = observer.frequencies
         plant, b0, dt = observer.plant, observer.b0, observer.dt
         return design_model(plant, b0, omega_o, dt, keep_zeros=False, **how).gain
 

@@ -35,6 +35,7 @@ from quell.controllers.baselines import (
     PPI,
     ZV,
     ZVD,
+    AdaptiveNotch,
     NotchPID,
     ResonanceRatio,
     Shaper,
@@ -358,6 +359,7 @@ _CONTROLLERS = (
     call_table("notch-pid", NotchPID, forwards_to=_PID, types={"notch": Notch}),
     call_table("p-pi", PPI, forwards_to=_LINEAR, types={"notches": list_of(Notch)}),
     call_table("lqg", LQG, forwards_to=_LINEAR, types=_PLANT, descriptions=_MODEL),
+    call_table("adaptive-notch", AdaptiveNotch, types=_PLANT, descriptions=_MODEL),
     call_table("resonance-ratio", ResonanceRatio, forwards_to=_LINEAR),
 )
 CONTROLLERS = {table.kind_name: table for table in _CONTROLLERS}

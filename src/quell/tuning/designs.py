@@ -14,9 +14,12 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
+from quell.tuning.load_spectrum import LoadSpectrum
 from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of
 from quell.tuning.optimiser.requirements import (
     KINDS,
+    OF_SPECTRUM,
+    WITHOUT_TIME,
     Bound,
     bounds_of,
     cost_of,
@@ -70,6 +73,7 @@ _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
     "delay-poles": ("pi", "pid", "bandwidths", "delay"),
     "model-based-poles": ("model-based",),
     "poles-2": ("bandwidths-2",),
+    "poles-3": ("bandwidths-3",),
 }
 # A PI controller is of use as a reference for noise unless a PID controller with filter has so many
 # times its integral gain; chosen by hand. Plants below this relative degree are not in doubt.
@@ -81,8 +85,9 @@ _NEAR_BEST = 1.05
 # The structures, simple ones first: by what a user has to know, and by the number of parameters.
 _FROM_SIMPLE = (
     *("pi-unfiltered", "pi", "pid", "bandwidths", "reduced", "half-gain", "half-gain-law"),
-    *("p-pi-notch", "bandwidths-2", "bandwidths-3", "poles", "poles-2", "delay", "delay-poles"),
-    *("model-based", "model-based-2", "model-based-poles", "lqg"),
+    *("p-pi-notch", "bandwidths-2", "bandwidths-3", "poles", "poles-2", "poles-3"),
+    *("resonator", "resonator-2", "resonator-3", "delay", "delay-poles"),
+    *("model-based", "model-based-2", "model-based-poles", "lqg", "adaptive-notch"),
 )
 # Largest order of an ADRC that has an equivalent PI or PID controller.
 _LIKE_PID = 2
@@ -101,12 +106,14 @@ class Task:
     order: int | None
     limits: Mapping[str, Any]  # of u, for all controllers
     feedforward: Feedforward | None = None
+    spectrum: LoadSpectrum | None = None  # of the load, where the objective is its RMS of y
 
     def problem(self, members: Sequence[int] | None = None) -> Problem:
         """Return the problem of the optimiser; the objective is that of ``members`` of the set."""
         over = SetResponses(self.plants, self.inputs)
         for_cost = over if members is None else SetResponses(self.plants, self.inputs, members)
-        cost = cost_of(self.objective, for_cost, self.quantile)
+        spectrum = self.spectrum if self.objective == OF_SPECTRUM else None
+        cost = cost_of(self.objective, for_cost, self.quantile, spectrum)
         extras = extras_of(self.constraints, over)
         bounds, damping = bounds_of(self.constraints), self.constraints.damping
         return Problem(self.plants, bounds, extras, self.objective, cost, damping)
@@ -307,10 +314,12 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     one of them and of ``known``.
     """
     problem = task.problem()
-    quick = replace(_with(task, u_max=None, rate_max=None), objective="load")
+    quick = _with(task, u_max=None, rate_max=None)
+    if task.objective not in WITHOUT_TIME:
+        quick = replace(quick, objective="load")
     ends = _best_gains(quick, structure, known)
     is_slow = any(extra.over_time for extra in problem.extras)
-    if not ends or (problem.objective == "load" and not is_slow):
+    if not ends or (problem.objective in WITHOUT_TIME and not is_slow):
         return min(ends, key=_rank, default=None)
     rows, count = [*(end.values for end in ends), *known], 1
     if structure.integrators > 1:
@@ -329,7 +338,7 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
 
 def _is_exchanged(task: Task) -> bool:
     """Return whether the objective is the worst case of more plants than a search has at once."""
-    worst = task.objective != "load" and task.quantile == 1.0
+    worst = task.objective not in WITHOUT_TIME and task.quantile == 1.0
     return worst and len(task.plants.plants) > _MEMBERS
 
 

@@ -35,6 +35,7 @@ from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, load_step, response
 from quell.tuning.optimiser.requirements import (
+    OF_SPECTRUM,
     USUAL_DAMPING,
     Active,
     Bound,
@@ -220,6 +221,7 @@ def _fastest(solution: Solution, constraints: Constraints, plants: PlantSet) -> 
 # ---- The result of a tuning as text ----
 
 _UNITS = {"load": "k_i", "load-iae": "∫|y|", "tracking": "RMS of r − y"}
+_UNITS |= {OF_SPECTRUM: "RMS of y"}
 
 
 def quantity(objective: str) -> str:
@@ -332,7 +334,9 @@ def _integrators_line(chosen: Design, others: Mapping[str, Design], objective: s
     best = max(single, key=lambda each: relative(each, chosen, objective), default=None)
     if best is None or relative(best, chosen, objective) < 1.0:
         return []
-    what = {"tracking": "this reference"}.get(objective, "a step of the load")
+    what = {"tracking": "this reference", OF_SPECTRUM: "this load"}.get(
+        objective, "a step of the load"
+    )
     return [
         f"NOT better with {_integrators(chosen)} integrators: {best.name} has one, and is at least "
         f"as good for {what}; take it, unless the load is a ramp or a slow sinusoid"

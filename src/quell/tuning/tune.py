@@ -43,8 +43,9 @@ from quell.tuning.designs import (
     with_noise_bound,
     without_damping,
 )
+from quell.tuning.load_spectrum import LoadSpectrum
 from quell.tuning.optimiser.loops import Inputs, PlantSet, load_step, samples_of
-from quell.tuning.optimiser.requirements import OBJECTIVES
+from quell.tuning.optimiser.requirements import OBJECTIVES, OF_SPECTRUM
 from quell.tuning.plants import (
     Given,
     as_list,
@@ -57,6 +58,7 @@ from quell.tuning.plants import (
 from quell.tuning.report import Design, relative
 from quell.tuning.structures.base import resonances
 from quell.tuning.structures.registry import (
+    AT_FREQUENCIES,
     CASCADE,
     FEEDING_FORWARD,
     STRUCTURES,
@@ -104,6 +106,7 @@ def tune(
     controller: Any = None,
     structure: str = SIMPLEST,
     order: int | None = None,
+    frequencies: Sequence[float] = (),
     objective: Any = "load-iae",
     constraints: Constraints | None = None,
     compare: Sequence[str] | None = None,
@@ -164,10 +167,15 @@ def tune(
         ``"simplest"``, the simplest of ``compare`` whose objective is within 5 % of the best.
     order
         order of an ADRC without model; 1 and 2 are tried by default.
+    frequencies
+        of a load that is known [rad/s], for the structures ``"resonator"``, ``"resonator-2"`` and
+        ``"resonator-3"``, which reject one, two or three without error; tuned with the rest by
+        default. ``"adaptive-notch"`` starts with them.
     objective
         ``"load-iae"``: least integral of ``|y|`` after a step of the load; ``"load"``: largest
         integral gain, the least integral of y, whose optima may ring, as y of both signs counts
-        for nothing; ``"tracking"``: least RMS of ``r − y``.
+        for nothing; ``"tracking"``: least RMS of ``r − y``; a ``quell.tuning.LoadSpectrum``: least
+        RMS of y under a load of which the spectrum, or a band, is known.
     constraints
         the bounds; by default M_s = M_t = 1.6, a damping of 0.4, and one for what noise does to u,
         which follows from the noise of y and the limits of u where they are given
@@ -297,7 +305,12 @@ def tune(
             f"compare = {compare!r}: must be a list of structures, as compare=['pi', 'pid'], or an "
             "empty list for none"
         )
-    if scenario is not None or not isinstance(objective, str) or objective not in OBJECTIVES:
+    spectrum = objective if isinstance(objective, LoadSpectrum) else None
+    if spectrum is not None and scenario is not None:
+        raise ValueError("objective = LoadSpectrum: is about the linear loop; leave scenario out")
+    if spectrum is not None:
+        objective = OF_SPECTRUM
+    elif scenario is not None or not isinstance(objective, str) or objective not in OBJECTIVES:
         how: dict[str, Any] = {"structure": structure, "order": order, "constraints": constraints}
         how |= {"compare": compare, "delay": delay, "actuator_lag": actuator_lag, "setup": setup}
         how |= {"operating_point": operating_point, "uncertain": uncertain, "b_range": b_range}
@@ -316,7 +329,7 @@ def tune(
     if search is not None:
         raise ValueError("search = {...}: is for a tuning by simulation; give a scenario, too")
     dt = checks.positive("dt", dt, "s")
-    _check_names(structure, compare, objective)
+    _check_names(structure, compare)
     for name, value in limits.items():
         if name not in _LIMITS:
             if name.lower() in Constraints.__dataclass_fields__:
@@ -342,13 +355,19 @@ def tune(
     if reason := beyond_control(plants):
         raise ValueError(reason)
     bounds = given_constraints(constraints)
-    model = model_of(given, plants, bounds)
+    lines = tuple(checks.positive_vector("frequencies", frequencies).tolist())
+    model = model_of(given, plants, bounds)._replace(load=spectrum, frequencies=lines)
     late = float(np.ravel(delay)[0]) + actuator_lag
     known = as_list(plant)[0] if operating_point is None else given.linear[0]
     forward = _by_model(feedforward, known, late)
     if compare is None:
         compare = (*COMPARED, CASCADE) if resonances(model) else COMPARED
     names = [*compare, structure] if structure != SIMPLEST else [*compare] or ["poles"]
+    if lines and not set(names) & set(AT_FREQUENCIES):
+        raise ValueError(
+            f"frequencies = {list(lines)!r}: has no effect: only {', '.join(AT_FREQUENCIES)} have "
+            "them; give one of these structures, or leave frequencies out"
+        )
     if structure in WITH_ONE_INTEGRATOR:
         names.append(WITH_ONE_INTEGRATOR[structure])
     if forward is not None:
@@ -365,6 +384,7 @@ def tune(
     if by_default and math.isfinite(u_limits[1] - u_limits[0]):
         forward = _of_axis(given, written, bool(resonances(model)))
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
+    task = replace(task, spectrum=spectrum)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task, _m_ks_of(in_use, given))
         designs = tuned_designs(list(dict.fromkeys(names)), task, report)
@@ -424,11 +444,10 @@ def _by_model(
     return replace(found, delay=late) if late > 0.0 else found
 
 
-def _check_names(structure: str, compare: Sequence[str] | None, objective: str) -> None:
+def _check_names(structure: str, compare: Sequence[str] | None) -> None:
     checks.one_of("structure", structure, (SIMPLEST, *STRUCTURES))
     for name in compare or ():
         checks.one_of("compare", name, STRUCTURES)
-    checks.one_of("objective", objective, OBJECTIVES)
 
 
 def _check_feedforward(names: Sequence[str], given: bool | Feedforward | None) -> None:
@@ -530,6 +549,8 @@ def _without_effect(objective: str, bounds: Constraints, followed: bool) -> dict
         unused["duration"] = f"∫|y| and k_i are those until y is at rest; {how}"
     if objective == "load" and (unused or followed):
         unused["load"] = "k_i is the same for all loads; give objective = 'load-iae'"
+    if objective == OF_SPECTRUM and (unused or followed):
+        unused["load"] = "the spectrum has the size of the load; scale its power"
     return unused
 
 

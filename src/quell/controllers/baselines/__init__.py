@@ -3,6 +3,7 @@
 May import ``controllers`` with ``adrc``, ``linear`` and ``prefilters``, and what they import.
 """
 
+from quell.controllers.baselines.adaptive_notch import AdaptiveNotch
 from quell.controllers.baselines.pid import PID, PPI, Notch, NotchPID, equivalent_pid
 from quell.controllers.baselines.state_feedback import LQG, ResonanceRatio
 from quell.controllers.shaping import EI, MZV, ZV, ZVD, Shaper
@@ -16,6 +17,7 @@ __all__ = [
     "PPI",
     "ZV",
     "ZVD",
+    "AdaptiveNotch",
     "Notch",
     "NotchPID",
     "ResonanceRatio",

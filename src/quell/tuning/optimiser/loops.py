@@ -49,6 +49,7 @@ from quell.analysis.margins import (
     in_s_plane,
 )
 from quell.controllers.base import Controller
+from quell.controllers.baselines.adaptive_notch import AdaptiveNotch
 from quell.controllers.compensated import CompensatedDesign
 from quell.controllers.law import AdrcDesign, LinearFeedback, ModelFeedforward, reference_part
 from quell.controllers.linear import LinearDesign, LinearLaw
@@ -222,7 +223,9 @@ class PlantSet:
 
     # ---- loops
 
-    def unstable_loops(self, C: Complex, controller: Vector, at_one: int = 1) -> Matrix:
+    def unstable_loops(
+        self, C: Complex, controller: Vector, at_one: int = 1, on_circle: Matrix | None = None
+    ) -> Matrix:
         """Return the number (m, J) of unstable closed-loop poles, by the argument principle.
 
         ``1 + L`` is the closed loop's polynomial over the open loop's. Over the upper half circle
@@ -236,11 +239,16 @@ class PlantSet:
             responses (m, G) of controllers with ``at_one`` poles at z = 1, on the grid.
         controller
             their numbers of unstable poles (m,).
+        on_circle
+            frequencies (m, k) at which they have poles on the unit circle [rad/s].
         """
-        columns = [self._unstable(j, C, controller, at_one) for j in range(len(self.plants))]
+        count = len(self.plants)
+        columns = [self._unstable(j, C, controller, at_one, on_circle) for j in range(count)]
         return np.stack(columns, axis=1)
 
-    def _unstable(self, j: int, C: Complex, controller: Vector, at_one: int) -> Vector:
+    def _unstable(
+        self, j: int, C: Complex, controller: Vector, at_one: int, on_circle: Matrix | None
+    ) -> Vector:
         """Return the number (m,) of unstable poles with the j-th plant."""
         unstable, integrators, on_axis = self._open[j]
         steps = np.diff(np.angle(1.0 + self.P[j] * C), axis=1)
@@ -251,21 +259,34 @@ class PlantSet:
         at = at[(at >= 0) & (at < steps.shape[1])]
         across = np.remainder(steps[:, at] + np.pi, 2.0 * np.pi) - np.pi
         turns -= np.count_nonzero(across > 0.0, axis=1)
+        for omega in () if on_circle is None else on_circle.T:
+            turns -= _across(steps, np.searchsorted(self.omega, omega) - 1)
         expected = unstable + controller + 0.5 * (integrators + at_one)
         count = np.round(expected - np.sum(steps, axis=1) / np.pi - 2.0 * turns)
         # A loop whose crossover lies below the grid: its slow poles do not show.
         count[np.abs(self.P[j, 0] * C[:, 0]) < _LEAST_BOTTOM] = np.inf
         return np.abs(count)
 
-    def stable_rows(self, C: Complex, controller: Vector, at_one: int = 1) -> NDArray[np.intp]:
+    def stable_rows(
+        self, C: Complex, controller: Vector, at_one: int = 1, on_circle: Matrix | None = None
+    ) -> NDArray[np.intp]:
         """Return which controllers stabilise all plants; arguments are those of unstable_loops.
 
         One that does not stabilise a plant is not tried with the next ones.
         """
         rows = np.arange(C.shape[0])
         for j in range(len(self.plants)):
-            rows = rows[self._unstable(j, C[rows], controller[rows], at_one) < 0.5]
+            poles = None if on_circle is None else on_circle[rows]
+            rows = rows[self._unstable(j, C[rows], controller[rows], at_one, poles) < 0.5]
         return rows
+
+
+def _across(steps: Matrix, at: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return 1 for each row (m,) whose step number ``at`` would rise at a pole, where it falls."""
+    rows = np.arange(at.size)
+    inside = (at >= 0) & (at < steps.shape[1])
+    step = steps[rows, np.clip(at, 0, steps.shape[1] - 1)]
+    return (inside & (np.remainder(step + np.pi, 2.0 * np.pi) > np.pi)).astype(np.intp)
 
 
 def peaks(
@@ -326,6 +347,8 @@ def law_of(controller: Controller) -> LinearLaw:
 
     Raises ``ValueError`` for a controller that is not linear.
     """
+    if isinstance(controller, AdaptiveNotch):
+        return controller.law
     law = _law(controller.parameters)
     if law is None:
         raise ValueError(f"controller = {controller!r}: must be linear")

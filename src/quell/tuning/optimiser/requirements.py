@@ -51,6 +51,7 @@ from numpy.typing import NDArray
 from quell.analysis.loop import closed_loop_matrix, law_matrix
 from quell.analysis.margins import Complex, eigenvalues, in_s_plane
 from quell.tuning.constraints import Constraints
+from quell.tuning.load_spectrum import LoadSpectrum
 from quell.tuning.optimiser.loops import (
     NARROW,
     Peak,
@@ -403,6 +404,10 @@ def all_peaks(
 
 OBJECTIVES = ("load", "load-iae", "tracking")
 """Names of the objectives that the optimiser of linear loops knows."""
+OF_SPECTRUM = "load-spectrum"
+"""Name of the objective that a ``LoadSpectrum`` is: the RMS of y under that load."""
+WITHOUT_TIME = ("load", OF_SPECTRUM)
+"""Objectives that need no response over time, which are quick."""
 
 Cost = Callable[[Structure, Matrix], Vector]
 
@@ -437,10 +442,27 @@ def scores(objective: str, structure: Structure, values: Vector, over: SetRespon
     return np.array([np.sqrt(np.mean((over.inputs.r - y) ** 2)) for y in found])
 
 
-def cost_of(objective: str, over: SetResponses, quantile: float) -> Cost:
+def spectrum_cost(over: SetResponses, load: LoadSpectrum, quantile: float) -> Cost:
+    """Return the cost of a load by its spectrum: the logarithm of the RMS of y."""
+    P = over.plants.responses(load.omega)[:, None, :]
+
+    def cost(structure: Structure, values: Matrix) -> Vector:
+        with np.errstate(all="ignore"):
+            y = np.abs(P / (1.0 + P * structure.response(values, load.omega))) ** 2
+            found: Vector = 0.5 * np.log(np.quantile(y @ load.power, quantile, axis=0))
+        return np.where(np.isfinite(found), found, _WORST)
+
+    return cost
+
+
+def cost_of(
+    objective: str, over: SetResponses, quantile: float, spectrum: LoadSpectrum | None = None
+) -> Cost:
     """Return the function from a structure and values (m, p) to costs (m,)."""
     if objective == "load":
         return partial(load_cost, plants=over.plants)
+    if spectrum is not None:
+        return spectrum_cost(over, spectrum, quantile)
 
     def cost(structure: Structure, values: Matrix) -> Vector:
         found = np.empty(values.shape[0])

@@ -47,7 +47,6 @@ from quell.tuning.optimiser.requirements import (
     beside_poles,
     closed_loop_poles,
     counted,
-    load_cost,
     points_of,
     sizes,
     slacks,
@@ -377,7 +376,10 @@ class Iterate:
         if self._poles:
             return all(bool(np.all(s.real < 0.0)) for s in self._poles)
         poles, count = self._structure.unstable_poles(self._values), self._structure.integrators
-        return bool(np.all(self._problem.plants.unstable_loops(self._response, poles, count) < 0.5))
+        found = self._problem.plants.unstable_loops(
+            self._response, poles, count, self._structure.on_circle(self._values)
+        )
+        return bool(np.all(found < 0.5))
 
     @cached_property
     def cost(self) -> float:
@@ -488,12 +490,14 @@ def _gains_of(
     first = gains**structure.gain_power
     gains = gains[(first >= low[0]) & (first <= high[0])]
     tried = gains[:, None] * response
-    good = plants.stable_rows(tried, np.full(gains.size, poles), structure.integrators)
+    count = np.full(gains.size, poles)
+    on_circle = np.repeat(structure.on_circle(row[None, :]), gains.size, axis=0)
+    good = plants.stable_rows(tried, count, structure.integrators, on_circle)
     ratio = worst_ratio(problem.bounds, plants, tried[good])
     good, ratio = good[np.isfinite(ratio)], ratio[np.isfinite(ratio)]
     values = np.repeat(row[None, :], good.size, axis=0)
     values[:, 0] = gains[good] ** structure.gain_power
-    cost = load_cost(structure, values, plants) if values.size else np.zeros(0)
+    cost = problem.cost(structure, values) if values.size else np.zeros(0)
     if structure.may_swing and values.size:
         swing = load_swing(plants, tried[good], structure.integral_gain(values))
         ratio = np.maximum(ratio, swing / MOST_SWING)

@@ -52,7 +52,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -65,7 +66,7 @@ from quell.controllers.feedforward import Feedforward
 from quell.controllers.linear import LinearLaw
 from quell.lti.canonical import Canonical, Reduced, canonical, without_far_zeros
 from quell.lti.models import zero_order_hold
-from quell.observers.design import with_motion_of_f, with_rates
+from quell.observers.design import motion_of_f, with_motion_of_f, with_rates
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
 from quell.tuning.structures.base import Model, Parameter, resonances
@@ -91,9 +92,12 @@ class SampledChain(NamedTuple):
     cancel_f: float
     degree: int
     dt: float
+    integrators: int  # number of poles of the feedback at z = 1
 
 
-def sampled_chain(plant: Canonical, dt: float, extended: int = 1) -> SampledChain:
+def sampled_chain(
+    plant: Canonical, dt: float, extended: int = 1, frequencies: Sequence[float] = ()
+) -> SampledChain:
     """Sample the model of ``plant`` with extended states as ``observers/design`` does."""
     n, q = plant.a.size, plant.f_degree
     A = np.diag(np.ones(n), 1)
@@ -102,12 +106,14 @@ def sampled_chain(plant: Canonical, dt: float, extended: int = 1) -> SampledChai
     column = np.zeros((n + 1, 1))
     column[:-1, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
     _, (difference, gamma) = zero_order_hold(A, [A, column], 1.0)
-    difference, gamma = with_motion_of_f(difference, extended), with_rates(gamma, extended)
+    motion = motion_of_f(extended, np.array(frequencies) * dt)
+    difference, gamma = with_motion_of_f(difference, motion), with_rates(gamma, extended)
     cancel = plant.a if plant.degree == n else -np.eye(n)[plant.degree]
     power = np.append(np.arange(float(n)), q + np.arange(float(extended)))
     matched = 1.0 if plant.matched else 0.0
+    placing, integrators = _placing(difference), extended - 2 * len(frequencies)
     return SampledChain(
-        difference, gamma[:, 0], _placing(difference), power, cancel, matched, plant.degree, dt
+        *(difference, gamma[:, 0], placing, power, cancel, matched, plant.degree, dt, integrators)
     )
 
 
@@ -137,12 +143,12 @@ class Designs:
     column: Matrix  # Γ (m, N)
     delay: int
     dt: float
-    extended: int  # e, number of extended states
+    integrators: int  # number of poles of C_y at z = 1
 
     @cached_property
     def integral_gain(self) -> Vector:
         """``k_i b0 / ω^r`` (m,)."""
-        if self.extended > 1:
+        if self.integrators > 1:
             return np.full(self.gain.shape[0], np.inf)
         left, _, right = np.linalg.svd(self.base + self.closing)
         v, w = right[:, -1, :], left[:, :, -1]
@@ -200,8 +206,17 @@ def designs(
     base[:, :, 0] += gain
     inner = difference - column[:, :, None] * K[:, None, :]
     factor = omega**chain.degree
-    rest = difference, column, delay, chain.dt, size - n
+    rest = difference, column, delay, chain.dt, chain.integrators
     return Designs(gain, K, factor, base, closing, inner, *rest)
+
+
+def joined(parts: Sequence[Designs], order: NDArray[np.intp]) -> Designs:
+    """Return the designs of all parts, which have the same size, in an order."""
+    names = ("gain", "law", "factor", "base", "closing", "inner", "difference", "column")
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(each, name) for each in parts])[order] for name in names
+    }
+    return replace(parts[0], **arrays)
 
 
 def coefficients(roots: NDArray[np.complex128]) -> Matrix:
@@ -221,7 +236,7 @@ def monic(roots: NDArray[np.complex128]) -> Matrix:
 
 def feedback(found: Designs, omega: Vector) -> Complex:
     """Return ``C_y b0 / ω^r`` (m, k) at frequencies (k,) [rad/s]."""
-    if found.extended > 1:
+    if found.integrators > 1:
         return _feedback_by_innovation(found, omega)
     matrix, z = _matrices(found, omega)
     solved = np.linalg.solve(matrix, found.gain[:, None, :, None])[..., 0]
@@ -232,7 +247,7 @@ def feedback(found: Designs, omega: Vector) -> Complex:
 def _feedback_by_innovation(found: Designs, omega: Vector) -> Complex:
     zeta, A = np.expm1(1j * omega * found.dt), found.inner
     count, size = found.gain.shape
-    n = size - found.extended
+    n = size - found.integrators
     given = found.gain + np.einsum("mij,mj->mi", A, found.gain)  # (I + A) L
     given[:, :n] = found.gain[:, :n] + np.einsum("mij,mj->mi", A[:, :n, :n], found.gain[:, :n])
     W = np.empty((count, omega.size, size), dtype=complex)
@@ -276,10 +291,10 @@ def unstable_poles(found: Designs) -> Vector:
     base, closing = found.base, found.closing
     if found.delay == 0:
         shifted: Any = np.linalg.eigvals(-(base + closing))
-        if found.extended > 1:
+        if found.integrators > 1:
             # Rounding moves an e-fold pole by its e-th root: the integrators are those next to 1.
             near = np.argsort(np.abs(shifted), axis=1)
-            shifted = np.take_along_axis(shifted, near[:, found.extended :], axis=1)
+            shifted = np.take_along_axis(shifted, near[:, found.integrators :], axis=1)
         outside = np.abs(1.0 + shifted) > 1.0 + _OUTSIDE
         return np.sum(outside, axis=1).astype(np.float64)
     top, size = np.pi / found.dt, base.shape[1]
@@ -298,6 +313,9 @@ def unstable_poles(found: Designs) -> Vector:
 # 9 %. The observer's poles show in no response to the reference, but while u is at a limit; the
 # equivalents of PID controllers with slow filters have them hardly damped.
 _SLOWEST = 1e-3
+# Free frequencies of resonators lie below this share of half the sampling rate; where the load is
+# not known they start at these shares of the plant's phase crossover.
+_HIGHEST, _PLACES, _BESIDE = 0.5, (0.03, 0.1, 0.3), 1e-3
 _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # Bandwidths to start from: of the law in units of the plant's phase crossover, and of the observer
 # in units of the law's.
@@ -326,7 +344,8 @@ class Form:
     half_law: bool = False
     based: bool = False
     knows_delay: bool = False
-    extended: int = 1  # number of extended states, and of integrators
+    extended: int = 1  # number of extended states
+    resonators: int = 0  # number of sinusoids in the model of f, two of these states for each
 
 
 class _Designed(NamedTuple):
@@ -355,7 +374,7 @@ class AdrcStructure:
         # With s^(n+1) A + b0 B = p_law p_observer the poles of 1/A are as fast as the loop's. With
         # a model, D s A + b0 N B has A less the model's own poles: it may have a slow one.
         self.may_swing = form.based and form.extended == 1
-        self.integrators = form.extended
+        self.integrators = form.extended - 2 * form.resonators
         self.plant: Canonical = (
             canonical(model.plant) if form.based else canonical((np.zeros(order), 1.0))
         )
@@ -364,7 +383,6 @@ class AdrcStructure:
         self.order, self.degree = self.plant.a.size, self.plant.degree
         self._last: tuple[bytes, Any] = b"", None
         self._values = np.zeros((0, 1))  # those of the last designs
-        self._chain = sampled_chain(self.plant, model.dt, form.extended)
         self._delay = round(model.delay / model.dt) if form.knows_delay else 0
         self._fastest = model.constraints.omega_o_dt / model.dt
         self._damping = dict(_DAMPING)
@@ -372,6 +390,8 @@ class AdrcStructure:
         if least is not None and not resonances(model, least):
             low, high = _DAMPING["o"]
             self._damping["o"] = (max(low, least), high)
+            if form.resonators:
+                self._damping["c"] = (max(low, least), high)
         self._observed = self.order + form.extended - form.reduced
         unit = model.gain * model.omega**self.degree
         self.parameters = (
@@ -379,6 +399,32 @@ class AdrcStructure:
             *self._pole_parameters("c", self.degree),
             *self._pole_parameters("o", self._observed),
         )
+        # Frequencies that are not known are further parameters, the last ones.
+        self._known = model.frequencies if form.resonators else ()
+        if self._known and len(self._known) != form.resonators:
+            raise ValueError(
+                f"frequencies = {list(self._known)!r}: {name} has {form.resonators} of them; give "
+                "as many, or none to have them tuned"
+            )
+        self._free = form.resonators - len(self._known)
+        top = _HIGHEST * math.pi / model.dt
+        self.parameters += tuple(
+            Parameter(f"omega_r{i + 1}", "rad/s", min(_SLOWEST * model.omega, 0.1 * top), top)
+            for i in range(self._free)
+        )
+        self._chain = self._chain_of(np.zeros(0)) if self._free == 0 else None
+
+    def _chain_of(self, frequencies: Vector) -> SampledChain:
+        known = (*self._known, *frequencies.tolist())
+        return sampled_chain(self.plant, self.model.dt, self.form.extended, known)
+
+    def _frequencies(self, values: Vector) -> tuple[float, ...]:
+        """Return the frequencies of the resonators [rad/s]."""
+        return (*self._known, *values[len(self.parameters) - self._free :].tolist())
+
+    def on_circle(self, values: Matrix) -> Matrix:
+        """Return the frequencies (m, k) at which C_y has poles on the unit circle [rad/s]."""
+        return np.array([self._frequencies(row) for row in values]).reshape(len(values), -1)
 
     def _pole_parameters(self, which: str, count: int) -> list[Parameter]:
         bounds = (min(_SLOWEST * self.model.omega, 0.1 * self._fastest), self._fastest)
@@ -430,7 +476,7 @@ class AdrcStructure:
         """Return the values with the poles of another form of the same order, if there are any."""
         same = (other.degree, other.order, other.form.based, other.form.extended)
         own = (self.degree, self.order, self.form.based, self.form.extended)
-        if other is self or same != own:
+        if other is self or same != own or self.form.resonators or other.form.resonators:
             return None
         law, observer = (poles[0] for poles in other.poles(values[None, :]))
         if not self.form.free_poles:
@@ -444,7 +490,7 @@ class AdrcStructure:
 
     def shapes(self) -> Matrix:
         """Return bandwidths in wide ranges; free poles start in one place, or in two."""
-        omega, rows = self.model.omega, []
+        omega, rows, where = self.model.omega, [], self._frequencies_to_start()
         b0 = self.model.b if self.degree == self.model.degree else 1.0
         ratios = (
             _OBSERVER_STARTS if self.form.extended == 1 else (_SLOW_OBSERVER, *_OBSERVER_STARTS)
@@ -460,8 +506,20 @@ class AdrcStructure:
             poles = [np.full(n, -p) for n, p in zip(counts, pair, strict=True)]
             found = self.rows_of(b0, *poles)
             if found is not None:
-                rows.append(found)
+                rows += [np.append(found, each) for each in where]
         return np.array(rows)
+
+    def _frequencies_to_start(self) -> list[Vector]:
+        """Return free frequencies of resonators to start from: where the load has its power."""
+        if self._free == 0:
+            return [np.zeros(0)]
+        load, count = self.model.load, self._free
+        if load is None:
+            return [place * self.model.omega * np.arange(1.0, count + 1) for place in _PLACES]
+        share = np.cumsum(load.power) / np.sum(load.power)
+        at = (np.arange(count) + 0.5) / count
+        # Beside them: at a frequency of the spectrum itself C_y is infinite there.
+        return [(1.0 + _BESIDE) * load.omega[np.searchsorted(share, at)]]
 
     def _around_resonance(self, shape: Vector) -> list[Vector]:
         """Return values with a pair of the observer's poles where the plant resonates.
@@ -531,16 +589,29 @@ class AdrcStructure:
         gains = coefficients(law) * (0.5 if self.form.half_law else 1.0)
         is_new = np.ones(len(values), dtype=bool)
         is_new[1:] = np.any(values[1:, 1:] != values[:-1, 1:], axis=1)
-        found = designs(
-            self._chain,
-            gains,
-            observer,
-            np.flatnonzero(is_new),
-            reduced=self.form.reduced,
-            half_gain=self.form.half_observer,
-            delay=self._delay,
-        )
+        how: dict[str, Any] = {"reduced": self.form.reduced, "delay": self._delay}
+        how["half_gain"] = self.form.half_observer
+        kept = np.flatnonzero(is_new)
+        if self._chain is not None:
+            found = designs(self._chain, gains, observer, kept, **how)
+        else:
+            found = self._with_free_frequencies(values, gains, observer, kept, how)
         return _Designed(found, np.cumsum(is_new) - 1)
+
+    def _with_free_frequencies(
+        self, values: Matrix, gains: Matrix, observer: Any, kept: NDArray[np.intp], how: Any
+    ) -> Designs:
+        """Return the designs of rows whose resonators differ; equal ones have one chain."""
+        free = values[kept, len(self.parameters) - self._free :]
+        if kept.size == 0:
+            free = np.ones((1, 1)) * np.arange(1.0, self._free + 1.0)
+        unique, group = np.unique(free, axis=0, return_inverse=True)
+        members = [np.flatnonzero(group == i) for i in range(len(unique))]
+        parts = [
+            designs(self._chain_of(each), gains, observer, kept[own] if kept.size else kept, **how)
+            for each, own in zip(unique, members, strict=True)
+        ]
+        return joined(parts, np.argsort(np.concatenate(members)[: kept.size]))
 
     def response(self, values: Matrix, omega: Vector) -> Complex:
         """Return C_y (m, k)."""
@@ -593,7 +664,8 @@ class AdrcStructure:
             "half_gain": self.form.half_observer,
             "delay": self._delay * dt,
             "poles": observer,
-            "disturbance_order": self.form.extended,
+            "disturbance_order": self.integrators,
+            "frequencies": self._frequencies(values),
         }
         if self.form.based:
             form |= {"far": math.inf}
@@ -651,8 +723,10 @@ class AdrcStructure:
             observer["form"] = "reduced"
         if self.form.half_observer:
             observer["half_gain"] = True
-        if self.form.extended > 1:
-            observer["disturbance_order"] = self.form.extended
+        if self.integrators > 1:
+            observer["disturbance_order"] = self.integrators
+        if self.form.resonators:
+            observer["frequencies"] = list(self._frequencies(values))
         if self._delay:
             observer["delay"] = self._delay * self.model.dt
         controller: dict[str, Any] = {"kind": "adrc", "omega_c": omega_c}

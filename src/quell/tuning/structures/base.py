@@ -17,6 +17,7 @@ from quell.controllers.base import Controller
 from quell.controllers.feedforward import Feedforward
 from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
+from quell.tuning.load_spectrum import LoadSpectrum
 from quell.types import Matrix, Vector
 
 RESONANT = 0.5
@@ -44,6 +45,8 @@ class Model(NamedTuple):
     omega: float  # frequency at which the plant's phase lag is that of two integrators [rad/s]
     gain: float  # |P| around it
     constraints: Constraints
+    load: LoadSpectrum | None = None  # the spectrum of the load, where it is the objective
+    frequencies: tuple[float, ...] = ()  # known ones of the load [rad/s]
 
 
 class Structure(Protocol):
@@ -84,6 +87,10 @@ class Structure(Protocol):
 
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return the number (m,) of poles of C_y outside of the unit circle."""
+        ...
+
+    def on_circle(self, values: Matrix) -> Matrix:
+        """Return the frequencies (m, k) at which C_y has poles on the unit circle [rad/s]."""
         ...
 
     def rules(self, values: Matrix) -> Matrix:

@@ -1,4 +1,4 @@
-"""PI, PID, cascaded P-PI and LQG as structures: the references of every tuning.
+"""PI, PID, cascaded P-PI, LQG and the adaptive notch as structures: references of tunings.
 
 PI and PID controllers with their filters, as the references of every tuning.
 
@@ -31,6 +31,7 @@ import numpy as np
 
 from quell.analysis.loop import law_matrix
 from quell.analysis.margins import Complex, Response, eigenvalues
+from quell.controllers.baselines.adaptive_notch import AdaptiveNotch
 from quell.controllers.baselines.pid import PID, PPI, Notch
 from quell.controllers.baselines.state_feedback import LQG
 from quell.controllers.feedforward import Feedforward
@@ -154,6 +155,10 @@ class FilteredPID:
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return zeros: filters are stable."""
         return np.zeros(values.shape[0])
+
+    def on_circle(self, values: Matrix) -> Matrix:
+        """Return none: integrators are the only poles there."""
+        return np.zeros((values.shape[0], 0))
 
     def rules(self, values: Matrix) -> Matrix:
         """Return nothing: the bounds of T_f say all."""
@@ -279,6 +284,10 @@ class CascadeStructure:
         """Return zeros: filters are stable."""
         return np.zeros(values.shape[0])
 
+    def on_circle(self, values: Matrix) -> Matrix:
+        """Return none: integrators are the only poles there."""
+        return np.zeros((values.shape[0], 0))
+
     def rules(self, values: Matrix) -> Matrix:
         """Return nothing: the bounds of the parameters say all."""
         return np.zeros((values.shape[0], 0))
@@ -363,9 +372,9 @@ class LqgStructure:
         ]
         return np.unique(np.clip(np.array(rows), (1.0, low, low), (1.0, high, high)), axis=0)
 
-    def _made(self, omega_c: float, omega_o: float) -> _Law:
-        dt = self.model.dt
-        law = LQG(self.plant, omega_c, omega_o, dt).law
+    def _made(self, *shape: float) -> _Law:
+        dt, omega_c = self.model.dt, shape[0]
+        law = self._controller(self.plant, *shape).law
         N = law_matrix(law)
         response = Response(System(N, law.B_y + law.B_u * law.D_y, -law.C, -law.D_y))
         low = _LOW * omega_c
@@ -374,7 +383,11 @@ class LqgStructure:
         return _Law(response, abs(gain), unstable)
 
     def _laws(self, values: Matrix) -> list[_Law]:
-        return [self._law(float(row[1]), float(row[2])) for row in values]
+        return [self._law(*map(float, row[1:])) for row in values]
+
+    def _controller(self, plant: LinearPlant, *shape: float, **limits: Any) -> Any:
+        omega_c, omega_o = shape
+        return LQG(plant, omega_c, omega_o, self.model.dt, **limits)
 
     def grid(self) -> tuple[Matrix, float]:
         """Return none."""
@@ -399,15 +412,19 @@ class LqgStructure:
         """Return the number of unstable poles of C_y (m,)."""
         return np.array([float(law.unstable) for law in self._laws(values)])
 
+    def on_circle(self, values: Matrix) -> Matrix:
+        """Return none: integrators are the only poles there."""
+        return np.zeros((values.shape[0], 0))
+
     def rules(self, values: Matrix) -> Matrix:
         """Return no constraints: the bandwidths' bounds are all."""
         return np.zeros((values.shape[0], 0))
 
-    def controller(self, values: Vector, **limits: Any) -> LQG:
+    def controller(self, values: Vector, **limits: Any) -> Any:
         """Return the controller."""
-        factor, omega_c, omega_o = map(float, values)
+        factor, *shape = map(float, values)
         plant = LinearPlant(self.plant.A, factor * self.plant.B, self.plant.C)
-        return LQG(plant, omega_c, omega_o, self.model.dt, **limits)
+        return self._controller(plant, *shape, **limits)
 
     def feedforward(self, of_model: Feedforward) -> dict[str, Any]:
         """Return none: the observer's state does not follow a reference."""
@@ -415,9 +432,66 @@ class LqgStructure:
 
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
         """Return the table of the controller, with its own model of the plant."""
-        factor, omega_c, omega_o = map(float, values)
+        factor, omega_c, omega_o = map(float, values[:3])
         parts = (self.plant.A, factor * self.plant.B, self.plant.C)
         plant = dict(zip("ABC", (part.tolist() for part in parts), strict=True))
         model = {"kind": "linear"} | plant
         table = {"kind": "lqg", "omega_c": omega_c, "omega_o": omega_o, "plant": model}
         return {"controller": table}
+
+
+# ---- The same with oscillators in the filter, whose frequencies are found and followed ----
+
+# Bounds of the oscillators' bandwidth, and values to start from, in units of their frequency.
+_OF_OSCILLATORS, _OSCILLATOR_STARTS = (1e-3, 1.0), (0.02, 0.1)
+# Frequencies are followed within this factor of the lowest and of the highest.
+_AROUND = 2.0
+
+
+class NotchStructure(LqgStructure):
+    """An ``AdaptiveNotch`` by bandwidths; its law is that at the frequencies it starts with."""
+
+    name = "adaptive-notch"
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        frequencies = model.frequencies
+        if not frequencies and model.load is not None:
+            share = np.cumsum(model.load.power) / np.sum(model.load.power)
+            frequencies = (float(model.load.omega[np.searchsorted(share, 0.5)]),)
+        if not frequencies:
+            raise ValueError(
+                "its margins are those with oscillators at frequencies: give frequencies, or an "
+                "objective LoadSpectrum"
+            )
+        self.frequencies = frequencies
+        middle = math.exp(float(np.mean(np.log(frequencies))))
+        low, high = (share * middle for share in _OF_OSCILLATORS)
+        self.parameters += (Parameter("bandwidth", "rad/s", low, high),)
+        self._starts = [share * middle for share in _OSCILLATOR_STARTS]
+
+    def shapes(self) -> Matrix:
+        """Return bandwidths in wide ranges, each with slow and with quick oscillators."""
+        rows = super().shapes()
+        return np.vstack([np.column_stack([rows, np.full(len(rows), b)]) for b in self._starts])
+
+    def on_circle(self, values: Matrix) -> Matrix:
+        """Return the frequencies of the oscillators (m, k) [rad/s]."""
+        return np.tile(np.array(self.frequencies), (len(values), 1))
+
+    def _options(self, bandwidth: float) -> dict[str, Any]:
+        low, high = min(self.frequencies) / _AROUND, max(self.frequencies) * _AROUND
+        band = (low, min(high, 0.9 * math.pi / self.model.dt))
+        options = {"bandwidth": bandwidth, "count": len(self.frequencies), "band": band}
+        return options | {"frequencies": self.frequencies}
+
+    def _controller(self, plant: LinearPlant, *shape: float, **limits: Any) -> Any:
+        omega_c, omega_o, bandwidth = shape
+        options = self._options(bandwidth) | limits
+        return AdaptiveNotch(plant, omega_c, omega_o, self.model.dt, **options)
+
+    def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
+        """Return the table of the controller, with its own model of the plant."""
+        own = self._options(float(values[3]))
+        own |= {"band": list(own["band"]), "frequencies": list(own["frequencies"])}
+        return {"controller": super().tables(values)["controller"] | {"kind": self.name} | own}

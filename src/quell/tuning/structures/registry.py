@@ -6,7 +6,12 @@ from quell import checks
 from quell.lti.canonical import design_models
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
-from quell.tuning.structures.baselines import CascadeStructure, FilteredPID, LqgStructure
+from quell.tuning.structures.baselines import (
+    CascadeStructure,
+    FilteredPID,
+    LqgStructure,
+    NotchStructure,
+)
 
 _PID = {
     "pi": (False, True),
@@ -26,20 +31,27 @@ _ADRC = {
     "bandwidths-2": Form(extended=2),
     "bandwidths-3": Form(extended=3),
     "poles-2": Form(free_poles=True, extended=2),
+    "poles-3": Form(free_poles=True, extended=3),
     "model-based-2": Form(based=True, extended=2),
+    "resonator": Form(free_poles=True, extended=3, resonators=1),
+    "resonator-2": Form(free_poles=True, extended=5, resonators=2),
+    "resonator-3": Form(free_poles=True, extended=7, resonators=3),
 }
-LQG, CASCADE = "lqg", "p-pi-notch"
-STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE)
-"""Names of the structures: forms of ADRC, PI and PID, LQG, and the cascade of servo drives."""
+LQG, CASCADE, NOTCH = "lqg", "p-pi-notch", "adaptive-notch"
+STRUCTURES = (*_ADRC, *_PID, LQG, CASCADE, NOTCH)
+"""Names of the structures: forms of ADRC, PI and PID, LQG, the cascade of servo drives, a notch."""
 WITH_ONE_INTEGRATOR = {
     "bandwidths-2": "bandwidths",
     "bandwidths-3": "bandwidths",
     "poles-2": "poles",
+    "poles-3": "poles",
     "model-based-2": "model-based",
 }
 """The same with one integrator for each structure with several, whose k_i is infinite."""
 SEVERAL_INTEGRATORS = tuple(WITH_ONE_INTEGRATOR)
 """Names of those with more than one integrator."""
+AT_FREQUENCIES = ("resonator", "resonator-2", "resonator-3", NOTCH)
+"""Names of those with models of sinusoids."""
 FEEDING_FORWARD = (*_ADRC, CASCADE)
 """Names of those with the feedforward of a model."""
 
@@ -49,7 +61,7 @@ def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
 
     With a model they are the numbers of the models for a design, the plant itself first.
     """
-    if name in _PID or name in (LQG, CASCADE):
+    if name in _PID or name in (LQG, CASCADE, NOTCH):
         return (0,)
     if _ADRC[name].based:
         return tuple(range(len(design_models(model.plant))))
@@ -74,6 +86,8 @@ def make_structure(name: str, model: Model, order: int = 0) -> Structure:
         return LqgStructure(model)
     if name == CASCADE:
         return CascadeStructure(model)
+    if name == NOTCH:
+        return NotchStructure(model)
     form = _ADRC[name]
     if not form.based:
         return AdrcStructure(model, f"{name} of order {order}", order, form)
