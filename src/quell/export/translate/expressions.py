@@ -321,7 +321,9 @@ class Expressions:
         if type(sign) not in _ARITHMETIC:
             raise self.fail(node, "this operator can not be translated")
         text, level, function = _ARITHMETIC[type(sign)]
-        if one.is_constant and other.is_constant:
+        # Before all of a kernel is read, a number that it changes may still count as its first, zero.
+        is_defined = text != "/" or other.constant != 0
+        if one.is_constant and other.is_constant and is_defined:
             return self.constant(function(one.constant, other.constant))
         if (plain := self._neutral(text, one, other)) is not None:
             return plain
