@@ -5,6 +5,7 @@ import itertools
 import os
 import socket
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -61,7 +62,7 @@ def test_frames_come_out_as_they_went_in(wire):
     endpoint, out = frames.endpoint(frames.COMMAND, 7, 50), frames.buffer()
     own = frames.endpoint(frames.MEASUREMENT, 7, 50)
     for k in range(1, 6):
-        frames.write_next_frame(out, own, frames.COMMAND, 0, float(k), 0)
+        frames.write_next_numbers(out, own, frames.COMMAND, 0, np.array([float(k)]), 0)
         assert send(wire.here, out) == 0
         assert wire.accepted(endpoint) == [float(k)]
     assert endpoint.counters[frames.ACCEPTED] == endpoint.counters.sum() == 5
@@ -150,11 +151,11 @@ def test_a_frame_that_did_not_fit_does_not_spoil_the_next(wire):
     )
     sent, failed = 0, False
     while not failed:
-        frames.write_next_frame(out, own, frames.COMMAND, 0, float(sent + 1), 0)
+        frames.write_next_numbers(out, own, frames.COMMAND, 0, np.array([sent + 1.0]), 0)
         failed = send(wire.here, out) != 0
         sent += not failed
     values = wire.accepted(endpoint)
-    frames.write_next_frame(out, own, frames.COMMAND, 0, -1.0, 0)
+    frames.write_next_numbers(out, own, frames.COMMAND, 0, np.array([-1.0]), 0)
     assert send(wire.here, out) == 0
     assert values + wire.accepted(endpoint) == [float(k + 1) for k in range(sent)] + [-1.0]
 

@@ -359,9 +359,9 @@ def test_a_signal_that_settles_at_its_largest_value_is_not_cut_there() -> None:
     assert standing(np.round(settles / 0.004) * 0.004, 0.004).samples == 0
 
 
-def test_limits_are_of_use_where_two_fifths_of_the_samples_are_free() -> None:
+def test_limits_are_of_use_where_a_tenth_of_the_samples_is_free() -> None:
     """At a limit the model counts where it is beyond."""
-    upper = np.arange(10) < 6
+    upper = np.arange(10) < 9
     none = np.zeros(10, dtype=bool)
     assert Standing(upper, none).is_usable
     assert Standing(none, upper).is_usable

@@ -166,7 +166,7 @@ PARTS: dict[str, Part] = {
     "Online": Part(ql.learners.Online, _learning, {"model": OwnModel()}, {"model": OwnModel(), **_FEATURES, **_SCALED}),
     "NoLearner": Part(ql.learners.NoLearner, lambda learner: ql.ADRC(OBSERVER, 1.5, learner=learner, **LIMITS), {}, {}),
     "Guard": Part(ql.Guard, lambda guard: ql.ADRC(OBSERVER, 1.5, learner=ql.learners.Kalman(), guard=guard, **LIMITS), {}, {
-        "bound": 2.0, "time": 5.0, "certified_for": PLANT,
+        "bound": 2.0, "time": 5.0, "certified_for": PLANT, "every": Several((2, None)),
     }),
     # Features.
     "State": Part(feature_room.State, _with_features, {}, {"count": 1}),

@@ -321,7 +321,7 @@ class Expressions:
         if type(sign) not in _ARITHMETIC:
             raise self.fail(node, "this operator can not be translated")
         text, level, function = _ARITHMETIC[type(sign)]
-        # Before all of a kernel is read, a number that it changes may still count as its first, zero.
+        # Before all kernels are read, a number that one of them changes still counts as zero.
         is_defined = text != "/" or other.constant != 0
         if one.is_constant and other.is_constant and is_defined:
             return self.constant(function(one.constant, other.constant))
