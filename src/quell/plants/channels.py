@@ -22,10 +22,39 @@ from quell.plants.base import (
     measure_all,
     outputs_of,
 )
-from quell.plants.linear import DelayedPlantModel, EncodedPlantModel
+from quell.plants.linear import DelayedPlantModel, EncodedPlantModel, quantized
 from quell.types import Vector
 
 # ---- Encoders and delays of single channels ----
+
+
+class EncodedOutputsModel(NamedTuple):
+    """A sampled plant with encoders."""
+
+    inner: Any
+    resolution: Vector  # q (p,) [y-unit]; zero for an output without encoder
+
+
+as_input.register(EncodedOutputsModel)(all_signals)
+
+
+@measure_all.register(EncodedOutputsModel)
+def _measure_encoders(plant: EncodedOutputsModel, x: Vector, y: Vector) -> None:
+    measure_all(plant.inner, x, y)
+    for i in range(plant.resolution.size):
+        if plant.resolution[i] > 0.0:
+            y[i] = quantized(y[i], plant.resolution[i])
+
+
+@advance.register(EncodedOutputsModel)
+def _advance_encoders(
+    plant: EncodedOutputsModel, x: Vector, scratch: Vector, t: float, u: Vector, w: Vector
+) -> None:
+    advance(plant.inner, x, scratch, t, as_input(plant.inner, u), w)
+
+
+begin_run.register(EncodedOutputsModel)(begin_run.implementations[EncodedPlantModel])
+check_run.register(EncodedOutputsModel)(check_run.implementations[EncodedPlantModel])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,9 +69,9 @@ class EncodedOutputs(PlantWrapper):
         """Name for tables and plots."""
         return f"{self.plant.name}, encoded"
 
-    def sampled(self, dt: float, interpret: bool = False) -> EncodedPlantModel:
+    def sampled(self, dt: float, interpret: bool = False) -> EncodedOutputsModel:
         """Return the parameters for a sample time ``dt`` [s]."""
-        return EncodedPlantModel(self.plant.sampled(dt, interpret), np.array(self.resolution))
+        return EncodedOutputsModel(self.plant.sampled(dt, interpret), np.array(self.resolution))
 
 
 def encoded_outputs(plant: Any, resolution: float | Sequence[float]) -> EncodedOutputs:

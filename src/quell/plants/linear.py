@@ -648,38 +648,26 @@ def lagged(plant: Plant, lag: float) -> Plant:
 
 
 class EncodedPlantModel(NamedTuple):
-    """A sampled plant with encoders."""
+    """A sampled plant with an encoder."""
 
-    inner: Any  # parameters of the plant without encoders
-    resolution: Vector  # q (p,) [y-unit]; zero for an output without encoder
+    inner: Any  # parameters of the plant without encoder
+    resolution: float  # q [y-unit]
 
 
 @kernel
 def quantized(value: float, resolution: float) -> float:
-    """Return the multiple of ``resolution`` nearest to ``value``; itself where that is zero."""
-    return resolution * np.floor(value / resolution + 0.5) if resolution > 0.0 else value
+    """Return the multiple of ``resolution`` nearest to ``value``."""
+    return resolution * np.floor(value / resolution + 0.5)
 
 
 @measure.register(EncodedPlantModel)
 def _measure_encoder(plant: EncodedPlantModel, x: Vector) -> float:
-    return quantized(measure(plant.inner, x), plant.resolution[0])
-
-
-@measure_all.register(EncodedPlantModel)
-def _measure_encoders(plant: EncodedPlantModel, x: Vector, y: Vector) -> None:
-    measure_all(plant.inner, x, y)
-    for i in range(plant.resolution.size):
-        y[i] = quantized(y[i], plant.resolution[i])
-
-
-@as_input.register(EncodedPlantModel)
-def _as_input_encoder(plant: EncodedPlantModel, u: Vector) -> Any:
-    return as_input(plant.inner, u)
+    return quantized(measure(plant.inner, x), plant.resolution)
 
 
 @advance.register(EncodedPlantModel)
 def _advance_encoder(
-    plant: EncodedPlantModel, x: Vector, scratch: Vector, t: float, u: Any, w: Vector
+    plant: EncodedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
 ) -> None:
     advance(plant.inner, x, scratch, t, u, w)
 
@@ -717,7 +705,7 @@ class EncodedPlant(PlantWrapper):
 
     def sampled(self, dt: float, interpret: bool = False) -> EncodedPlantModel:
         """Return the parameters for a sample time ``dt`` [s]."""
-        return EncodedPlantModel(self.plant.sampled(dt, interpret), np.array([self.resolution]))
+        return EncodedPlantModel(self.plant.sampled(dt, interpret), self.resolution)
 
 
 def encoded(plant: Plant, counts: int, turn: float = math.tau) -> EncodedPlant:

@@ -104,7 +104,7 @@ def _measure(plant: TorsionalModel, x: Vector) -> float:
 def _advance(
     plant: TorsionalModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
 ) -> None:
-    applied = quantized(u, plant.step)
+    applied = quantized(u, plant.step) if plant.step > 0.0 else u
     applied = min(max(applied, -plant.u_max), plant.u_max)
     for _ in range(plant.substeps):
         advance(plant.disks, x, scratch, t, applied, w)
@@ -177,8 +177,7 @@ class TorsionalPlant(Described):
         )
         if self.late:
             model = DelayedPlantModel(model, self.linear.order)
-        at = np.array([self.resolution])
-        return model if self.counts is None else EncodedPlantModel(model, at)
+        return model if self.counts is None else EncodedPlantModel(model, self.resolution)
 
 
 def torsional(
@@ -425,8 +424,7 @@ class DcMotor(Described):
             half=0.5 * step,
             cogging=self.cogging,
         )
-        at = np.array([self.resolution])
-        return model if self.counts is None else EncodedPlantModel(model, at)
+        return model if self.counts is None else EncodedPlantModel(model, self.resolution)
 
 
 def dc_motor(

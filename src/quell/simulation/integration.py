@@ -21,6 +21,7 @@ from quell.plants.base import (
     advance,
     as_input,
 )
+from quell.plants.channels import EncodedOutputsModel
 from quell.plants.friction import FrictionModel
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel
 from quell.plants.nonlinear import (
@@ -41,7 +42,7 @@ LARGEST_ERROR = 0.01
 _SPREAD, _SHARPEST = 16, 16
 # Most doublings of the sub-steps that are tried for advice.
 _MOST_DOUBLINGS = 10
-_WRAPPERS = (EncodedPlantModel, DelayedPlantModel)
+_WRAPPERS = (EncodedPlantModel, DelayedPlantModel, EncodedOutputsModel)
 
 
 class Samples(NamedTuple):
