@@ -355,6 +355,9 @@ def model(order: int, fit: float = 90.0, fault: str = "", friction: Any = None, 
     return SimpleNamespace(den=np.ones(order + 1), friction=friction, fit=fit, **{**parts, **more})
 
 
+OTHER = model(5)
+
+
 def taken(
     models: dict[tuple[int, bool], Any], order: int = 4, **how: Any
 ) -> tuple[RecordModel, list[Any]]:
@@ -371,7 +374,7 @@ def taken(
     record = SimpleNamespace(u="u", y="y", dt=0.1, signals=None)
     with (
         patch.object(tuning_plants, "identify", identify),
-        patch.object(tuning_plants, "not_told_apart", lambda first, delay, **_: [first, "other"]),
+        patch.object(tuning_plants, "not_told_apart", lambda first, delay, **_: [first, OTHER]),
         patch.object(tuning_plants, "fits_better", lambda held, one: one.fit > held.fit + 1.0),
     ):
         return record_model(record, order, **how), calls  # type: ignore[arg-type]
@@ -381,10 +384,24 @@ def test_a_model_that_holds_is_taken_with_those_that_are_not_told_apart() -> Non
     """Of the order that is asked for; zeros as they are given, a delay from zero on."""
     good = model(4)
     found, calls = taken({(4, False): good}, zeros=2, max_delay=0.5)
-    assert (found.model, found.others, found.larger) == (good, ("other",), None)
+    assert (found.model, found.others, found.larger) == (good, (OTHER,), None)
     assert calls == [(4, 2, False, (0.0, 0.5))]
     _, calls = taken({(4, False): good}, zeros=4)
     assert calls == [(4, 4, False, None)]
+
+
+def test_another_model_that_samples_cannot_damp_is_told_and_not_tuned_for() -> None:
+    """So it does not refuse the controller of a model that holds."""
+
+    def fast(one: Any) -> str:
+        return "its pair" if one is OTHER else ""
+
+    with patch.object(tuning_plants, "_beyond_control", fast):
+        found, _ = taken({(4, False): model(4)})
+        assert (found.others, found.fast) == ((), (OTHER,))
+        good = SimpleNamespace(describe=lambda: "a", held_from=4, y=np.zeros(5))
+        told = RecordModel(good, (), None, fast=(OTHER,)).lines  # type: ignore[arg-type]
+    assert told[1:] == [f"{OTHER!r} is not tuned for: its pair"]
 
 
 def test_the_simplest_model_that_holds_is_taken_until_a_larger_one_fits_better() -> None:
@@ -403,7 +420,7 @@ def test_the_simplest_model_that_holds_is_taken_until_a_larger_one_fits_better()
     assert all(call[2] for call in calls)
     assert found.model is one
     none, _ = taken({(4, False): bad, (1, False): model(1, fault="b")})
-    assert (none.model, none.others, none.larger) == (bad, ("other",), None)
+    assert (none.model, none.others, none.larger) == (bad, (OTHER,), None)
 
 
 @cases("reason", ["fails", "converged", "undecided"])

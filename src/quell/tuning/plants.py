@@ -309,6 +309,7 @@ class RecordModel:
     others: tuple[Identified, ...]
     held_out: float | None  #: share of the record that was to be held out; None: by itself
     larger: Identified | None = None  #: a model with more poles that does not hold
+    fast: tuple[Identified, ...] = ()  #: others with poles that samples at dt can't damp
 
     @property
     def lines(self) -> list[str]:
@@ -326,6 +327,8 @@ class RecordModel:
             )
         for other in self.others:
             found.append(f"the record does not tell it from {other!r}, which is tuned for, too")
+        for other in self.fast:
+            found.append(f"{other!r} is not tuned for: {_beyond_control(other)}")
         return found
 
     @property
@@ -434,8 +437,10 @@ def record_model(
     first = fitted(order, bool(friction), (0.0, 0.5))
     how: dict[str, Any] = {"integrators": integrators, "friction": friction}
     model, *others = not_told_apart(first, delay, **how, progress=part_of(progress, 0.5, 0.8, 1.0))
+    slow = tuple(each for each in others if not _beyond_control(each))
+    fast = tuple(each for each in others if _beyond_control(each))
     if not _why_not(model):
-        return RecordModel(model, tuple(others), held_out)
+        return RecordModel(model, slow, held_out, fast=fast)
     tried = [(k, bool(friction)) for k in range(1, order)]
     if friction is None and order > 1:
         tried[1:1] = [(1, True), (2, True)]
@@ -456,5 +461,5 @@ def record_model(
         if not _why_not(one) and (alone or better):
             held = one
     if held is None:
-        return RecordModel(model, tuple(others), held_out)
+        return RecordModel(model, slow, held_out, fast=fast)
     return RecordModel(held, (), held_out, model)
