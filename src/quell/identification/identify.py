@@ -445,7 +445,8 @@ def _identified(
         # A gain that falls with u looks like an integrator.
         if not friction and integrators is None and found.integrators and found.undecided:
             part = u[:held_from], y[:held_from]
-            plain = fit(*part, records.samples, wanted._replace(order=1, zeros=0, integrators=0))
+            lag = wanted._replace(order=1, zeros=0, integrators=0, known=None)
+            plain = fit(*part, records.samples, lag)
             found = replace(found, curvature=curvature(Linearised.of(plain, *part)))
     return replace(found, signals=Signals(signals.y, signals.u))
 
