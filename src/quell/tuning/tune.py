@@ -368,6 +368,12 @@ def tune(
             f"frequencies = {list(lines)!r}: has no effect: only {', '.join(AT_FREQUENCIES)} have "
             "them; give one of these structures, or leave frequencies out"
         )
+    without = () if lines or spectrum is not None else set(names) & set(AT_FREQUENCIES)
+    if without:
+        raise ValueError(
+            f"structure {', '.join(sorted(without))} has models of sinusoids: give their "
+            "frequencies, or an objective LoadSpectrum"
+        )
     if structure in WITH_ONE_INTEGRATOR:
         names.append(WITH_ONE_INTEGRATOR[structure])
     if forward is not None:

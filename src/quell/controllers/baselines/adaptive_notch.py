@@ -20,7 +20,7 @@ omega_o.
 
     δφ = (q δp − p δq)/(p² + q²),      ω̂ ← ω̂ + (bandwidth/4) δφ
 
-critically damped, as δφ is ``bandwidth dt`` times the error of the phase. |δφ| counts up to
+critically damped, as δφ is ``bandwidth dt`` times the error of the phase. ``|δφ|`` counts up to
 ``bandwidth dt``, because the direction of an amplitude that is being found says nothing of ω.
 
 *Frequencies are found* from the spectrum of ŵ over a window of ``listening`` seconds, with Hann's
@@ -431,12 +431,6 @@ class AdaptiveNotch(StatefulController):
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
-    Attributes
-    ----------
-    law : LinearLaw
-        the linear law with the frequencies of the present state and the steady gain of its filter;
-        waves do not turn at rest, and are part of the bias there.
-
     Raises
     ------
     ValueError
@@ -574,7 +568,10 @@ class AdaptiveNotch(StatefulController):
 
     @property
     def law(self) -> LinearLaw:
-        """The linear law with the frequencies of the present state."""
+        """The linear law with the frequencies of the present state.
+
+        It has the steady gain of the filter; waves do not turn at rest, and are part of the bias.
+        """
         return self.law_at(self._state)
 
     @property

@@ -459,6 +459,11 @@ class NotchStructure(LqgStructure):
         if not frequencies and model.load is not None:
             share = np.cumsum(model.load.power) / np.sum(model.load.power)
             frequencies = (float(model.load.omega[np.searchsorted(share, 0.5)]),)
+        if not frequencies:
+            raise ValueError(
+                "its margins are those with oscillators at frequencies: give frequencies, or an "
+                "objective LoadSpectrum"
+            )
         self.frequencies = frequencies
         middle = math.exp(float(np.mean(np.log(frequencies))))
         low, high = (share * middle for share in _OF_OSCILLATORS)

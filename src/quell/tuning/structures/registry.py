@@ -79,10 +79,6 @@ def make_structure(name: str, model: Model, order: int = 0) -> Structure:
         for an unknown name, or a structure that the plant does not allow.
     """
     checks.one_of("structure", name, STRUCTURES)
-    if name in AT_FREQUENCIES and not model.frequencies and model.load is None:
-        raise ValueError(
-            "it has models of sinusoids: give their frequencies, or an objective LoadSpectrum"
-        )
     if name in _PID:
         derivative, filtered = _PID[name]
         return FilteredPID(model, derivative=derivative, filtered=filtered)
