@@ -1,4 +1,4 @@
-"""What a controller asks of a guard, and the reasons that a guard gives.
+"""The contract of a guard: functions that a controller calls, and reasons that a guard gives.
 
 Functions of a guard, registered for the type of its parameters; their defaults limit nothing.
 """

@@ -196,7 +196,7 @@ class GuardTrial(Scalars):
 
 
 class GuardInterval(Scalars):
-    """What was decided last, and what goes on between two samples of the account."""
+    """The last decision, and sums between two samples of the account."""
 
     least: float  # least e_L [y-unit/s^n]
     largest: float  # largest e_L [y-unit/s^n]

@@ -437,8 +437,9 @@ def record_model(
     first = fitted(order, bool(friction), (0.0, 0.5))
     how: dict[str, Any] = {"integrators": integrators, "friction": friction}
     model, *others = not_told_apart(first, delay, **how, progress=part_of(progress, 0.5, 0.8, 1.0))
-    slow = tuple(each for each in others if not _beyond_control(each))
-    fast = tuple(each for each in others if _beyond_control(each))
+    judged = [(each, bool(_beyond_control(each))) for each in others]
+    slow = tuple(each for each, is_fast in judged if not is_fast)
+    fast = tuple(each for each, is_fast in judged if is_fast)
     if not _why_not(model):
         return RecordModel(model, slow, held_out, fast=fast)
     tried = [(k, bool(friction)) for k in range(1, order)]

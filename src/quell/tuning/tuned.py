@@ -438,7 +438,7 @@ class Tuned(InNotebook):
 
     @property
     def title(self) -> str:
-        """What was tuned, in a few words."""
+        """The tuned loop in a few words."""
         return self.design.name if len(self.axes) == 1 else f"{len(self.axes)} axes"
 
     def __repr__(self) -> str:

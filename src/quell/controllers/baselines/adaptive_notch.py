@@ -131,7 +131,7 @@ class NotchState(NamedTuple):
     turned: Matrix  # cos and sin of lines times time (G, 2)
     gained: Vector  # work: L (N,)
     moved: Matrix  # work: F P (N, N)
-    angles: Vector  # work: of the rotations (m,)
+    rotations: Matrix  # work: cos and sin of the angles (m, 2)
     used: Vector  # work: 1 where a line belongs to the oscillator (m,)
     loop: NDArray[NotchLoop]  # (1,)
 
@@ -219,8 +219,8 @@ def _predict(design: NotchDesign, state: NotchState, u: float) -> None:
         angle = state.omega[j] * design.dt
         if design.waves[j] != 0.0:
             angle = design.waves[j] * (x[0] - before)
-        state.angles[j] = angle
         c, s, at = cos(angle), sin(angle), n + 1 + 2 * j
+        state.rotations[j, 0], state.rotations[j, 1] = c, s
         x[at], x[at + 1] = c * x[at] + s * x[at + 1], c * x[at + 1] - s * x[at]
     # M = F P, then P = M Fᵀ + Q.
     for column in range(size):
@@ -234,7 +234,7 @@ def _predict(design: NotchDesign, state: NotchState, u: float) -> None:
             M[i, column] = total
         M[n, column] = P[n, column]
         for j in range(state.omega.size):
-            c, s, at = cos(state.angles[j]), sin(state.angles[j]), n + 1 + 2 * j
+            c, s, at = state.rotations[j, 0], state.rotations[j, 1], n + 1 + 2 * j
             M[at, column] = c * P[at, column] + s * P[at + 1, column]
             M[at + 1, column] = c * P[at + 1, column] - s * P[at, column]
     for row in range(size):
@@ -248,7 +248,7 @@ def _predict(design: NotchDesign, state: NotchState, u: float) -> None:
             P[row, i] = total
         P[row, n] = M[row, n]
         for j in range(state.omega.size):
-            c, s, at = cos(state.angles[j]), sin(state.angles[j]), n + 1 + 2 * j
+            c, s, at = state.rotations[j, 0], state.rotations[j, 1], n + 1 + 2 * j
             P[row, at] = c * M[row, at] + s * M[row, at + 1]
             P[row, at + 1] = c * M[row, at + 1] - s * M[row, at]
     P[n, n] += design.bias_noise
@@ -539,7 +539,7 @@ class AdaptiveNotch(StatefulController):
             turned=np.zeros((G, 2)),
             gained=np.zeros(size),
             moved=np.zeros((size, size)),
-            angles=np.zeros(m),
+            rotations=np.zeros((m, 2)),
             used=np.zeros(m),
             loop=NotchLoop.zeros(),
         )
