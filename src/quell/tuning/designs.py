@@ -14,7 +14,6 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
-from quell.tuning.load_spectrum import LoadSpectrum
 from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of
 from quell.tuning.optimiser.requirements import (
     KINDS,
@@ -106,13 +105,12 @@ class Task:
     order: int | None
     limits: Mapping[str, Any]  # of u, for all controllers
     feedforward: Feedforward | None = None
-    spectrum: LoadSpectrum | None = None  # of the load, where the objective is its RMS of y
 
     def problem(self, members: Sequence[int] | None = None) -> Problem:
         """Return the problem of the optimiser; the objective is that of ``members`` of the set."""
         over = SetResponses(self.plants, self.inputs)
         for_cost = over if members is None else SetResponses(self.plants, self.inputs, members)
-        spectrum = self.spectrum if self.objective == OF_SPECTRUM else None
+        spectrum = self.model.load if self.objective == OF_SPECTRUM else None
         cost = cost_of(self.objective, for_cost, self.quantile, spectrum)
         extras = extras_of(self.constraints, over)
         bounds, damping = bounds_of(self.constraints), self.constraints.damping

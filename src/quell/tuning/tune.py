@@ -371,7 +371,7 @@ def tune(
     without = () if lines or spectrum is not None else set(names) & set(AT_FREQUENCIES)
     if without:
         raise ValueError(
-            f"structure {', '.join(sorted(without))} has models of sinusoids: give their "
+            f"structure {', '.join(sorted(without))} has models of sinusoids: give "
             "frequencies, or an objective LoadSpectrum"
         )
     if structure in WITH_ONE_INTEGRATOR:
@@ -390,7 +390,6 @@ def tune(
     if by_default and math.isfinite(u_limits[1] - u_limits[0]):
         forward = _of_axis(given, written, bool(resonances(model)))
     task = Task(plants, model, bounds, objective, inputs, quantile, order, limits, forward)
-    task = replace(task, spectrum=spectrum)
     with one_blas_thread():
         task, noise_bound = with_noise_bound(task, _m_ks_of(in_use, given))
         designs = tuned_designs(list(dict.fromkeys(names)), task, report)
