@@ -29,7 +29,7 @@ def _guard() -> tuple[object, object]:
     memory.averages[0].missed = memory.averages[0].gained = 1.0
     memory.sample[0].outside = memory.sample[0].peak = 1e9  # nothing is withheld for other reasons
     memory.sample[0].own_peak = memory.trial[0].own = memory.trial[0].own_lately = 1e9
-    memory.trial[0].outside = 1.0
+    memory.trial[0].outside = memory.suspect[0].outside = 1.0
     memory.sample[0].samples = 1e6
     return design, memory
 
@@ -90,6 +90,26 @@ def test_a_load_that_jumps_after_a_calm_is_no_reason_for_a_trial() -> None:
         memory.sample[0].own_peak = 1e3  # the learner answers in the same sample
         assert _sample(design, memory, 1e6 if k < LAG else 1e3) == 1.0
     assert memory.trial[0].outside > 0.5e6
+
+
+def test_growth_as_quick_as_a_jump_is_suspect_where_it_lasts() -> None:
+    """|q| of ten times earlier corrections is a load for 8 lags; if it lasts longer, authority is on trial."""
+    design, memory = _guard()
+    seen = []
+    for _ in range(9 * LAG):
+        # The learner's corrections grow with q, so that those of before are always too small.
+        memory.sample[0].own_peak = memory.trial[0].own = memory.trial[0].own_lately = 1.0
+        seen.append(_sample(design, memory, 1e2))
+    assert seen[: 8 * LAG] == [1.0] * (8 * LAG)
+    assert seen[8 * LAG] == 0.0
+    assert memory.trial[0].outside == pytest.approx(1e2)
+
+
+def test_an_image_of_before_has_nothing_against_a_learner() -> None:
+    """A B_s of zero is one that is not known: no trial begins by it."""
+    design, memory = _guard()
+    memory.trial[0].outside, memory.suspect[0].outside = 1e2, 0.0
+    assert [_sample(design, memory, 1e2) for _ in range(30 * LAG)] == [1.0] * (30 * LAG)
 
 
 @pytest.mark.parametrize("axes", [(), ("shoulder", "elbow")])

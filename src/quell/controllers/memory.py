@@ -187,7 +187,7 @@ def kept_arrays(state: Any) -> dict[str, NDArray[Any]]:
 
 
 # Arrays that came later, in this order. They begin with zeros, and so does an image without them.
-_LATER = ("guard.trial", "guard.interval")
+_LATER = ("guard.trial", "guard.interval", "guard.suspect")
 
 
 def images_of(parameters: Any, state: Any, dt: float, names: Sequence[str] = ()) -> Layout:

@@ -38,6 +38,7 @@ from quell.guard.kernels import (
     GuardInterval,
     GuardMemory,
     GuardSample,
+    GuardSuspect,
     GuardTrial,
     withdraw_authority,
 )
@@ -429,7 +430,8 @@ class Guard:
         filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
         effects = np.zeros((3, parameters.stages))
         records = GuardAverages.zeros(), GuardSample.zeros(), GuardTrial.zeros()
-        memory = GuardMemory(*filters, effects, *records, GuardInterval.zeros())
+        later = GuardInterval.zeros(), GuardSuspect.zeros()
+        memory = GuardMemory(*filters, effects, *records, *later)
         withdraw_authority(memory)
         memory.interval[0].part = PARTS
         return memory

@@ -38,11 +38,12 @@ have caused q, q² is from outside:
 
     B ← B + min(F − B, 0) dt/200 lags,      B ← max(B, q²) where |q| > 4 c_B
 
-(there B at first forgets within the last third of the time). From F > 3 B, ε > 0.7 on authority
-is withheld for a trial of 20 lags. If F is below half of its largest value of the first five lags
-then, the trial has failed, and D, at first 100 lags, doubles. Doubt lasts D after a failed trial
-and 3 D after one in doubt: no authority until 2 D of it are left, 0.25 at most until D, then 0.5.
-A trial that has not failed raises B to F, four times at most.
+(there B at first forgets within the last third of the time). B_s is the same of |q| > 20 c_B. With
+ε > 0.7, authority is withheld for a trial of 20 lags from F > 3 B on, or where F > 3 B_s has lasted
+8 lags longer than F ≤ 3 B_s has since. If F is below half of its largest value of the first five
+lags then, the trial has failed, and D, at first 100 lags, doubles. Doubt lasts D after a failed
+trial and 3 D after one in doubt: no authority until 2 D of it are left, 0.25 at most until D, then
+0.5. A trial that has not failed raises B and B_s to F, four times at most.
 
 **Withheld** (r ≤ 3). o ≤ P, the error that is certainly not the learner's, rises to |q| − 1.5 c_L
 as P rises to |q|; M_left is the mean of (q − p)²:
@@ -195,6 +196,13 @@ class GuardTrial(Scalars):
     wait: float  # D in samples
 
 
+class GuardSuspect(Scalars):
+    """What the account of outcomes holds against a motion that grew as quickly as a load jumps."""
+
+    outside: float  # B_s [(y-unit/s^n)²]; zero in an image of before
+    lasted: float  # samples with F > 3 B_s, less those without since
+
+
 class GuardInterval(Scalars):
     """The last decision, and sums between two samples of the account."""
 
@@ -226,6 +234,7 @@ class GuardMemory(NamedTuple):
     sample: NDArray[GuardSample]  # (1,)
     trial: NDArray[GuardTrial]  # (1,)
     interval: NDArray[GuardInterval]  # (1,)
+    suspect: NDArray[GuardSuspect]  # (1,)
 
 
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.filtered.
@@ -297,9 +306,10 @@ HIGHEST_ORDER = 3
 # trial lasts, and its first lags, in which F may still grow; F below that share of its largest
 # fails.
 _SUSPECT, _LEAVES, _TRIAL, _STILL_GROWS, _FALLEN = 3.0, 0.7, 20.0, 5.0, 0.5
-# |q| in units of c_B that is not the learner's; c_B decays so many times as quickly as P; a trial
-# that has not failed raises B so many times at most.
-_OUTSIDE, _OWN_DECAYS, _RAISES = 4.0, 5.0, 4.0
+# |q| in units of c_B that is hardly the learner's, and that is surely not; how many lags it is
+# suspect where it is between them; c_B decays so many times as quickly as P; a trial that has not
+# failed raises B so many times at most.
+_OUTSIDE, _SURELY_OUTSIDE, _LASTS, _OWN_DECAYS, _RAISES = 4.0, 20.0, 8.0, 5.0, 4.0
 # D_1 in lags; most authority in doubt, and after a wait; most samples of D, so that it can be
 # counted in single precision.
 _FIRST_WAIT, _IN_DOUBT, _AFTER_WAIT, _LONGEST = 100.0, 0.5, 0.25, 2.0**22
@@ -386,6 +396,7 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new
 def keep_outcomes(guard: GuardDesign, memory: GuardMemory, qq: float) -> None:
     """Update B with q², begin and end trials."""
     averages, sample, trial = memory.averages[0], memory.sample[0], memory.trial[0]
+    suspect = memory.suspect[0]
     trial.own_lately += guard.within_lag * (sample.own_peak - trial.own_lately)
     own = trial.own + guard.within_lag * (trial.own_lately - trial.own)
     trial.own = max(own, (1.0 - _OWN_DECAYS * guard.decay) * trial.own)
@@ -394,22 +405,36 @@ def keep_outcomes(guard: GuardDesign, memory: GuardMemory, qq: float) -> None:
     if trial.left > 0.0:
         _try(guard, memory, newest)
         return
-    is_outside = qq > (_OUTSIDE * trial.own) ** 2
+    trial.outside = _keep_outside(guard, memory, trial.outside, qq, _OUTSIDE)
+    suspect.outside = _keep_outside(guard, memory, suspect.outside, qq, _SURELY_OUTSIDE)
+    at_once = newest > _SUSPECT * trial.outside
+    is_large = at_once or newest > _SUSPECT * suspect.outside > 0.0
+    if is_large and averages.newest_left > _LEAVES * newest and sample.authority > 0.0:
+        suspect.lasted += guard.every
+        if at_once or suspect.lasted > _LASTS * _lag(guard):
+            trial.left, trial.highest, suspect.lasted = _TRIAL * _lag(guard), newest, 0.0
+    else:
+        suspect.lasted = max(suspect.lasted - guard.every, 0.0)
+
+
+@kernel
+def _keep_outside(
+    guard: GuardDesign, memory: GuardMemory, outside: float, qq: float, factor: float
+) -> float:
+    """Return B after a sample, of |q| that is above so many c_B."""
+    samples, newest = memory.sample[0].samples, memory.averages[0].newest_error
+    if qq <= (factor * memory.trial[0].own) ** 2:
+        return outside + guard.decay * min(newest - outside, 0.0)
     # Without the learner's doing it at first forgets within the last third of the time.
     third = 3.0 * guard.every
-    rate = max(third / max(sample.samples, third), guard.decay) if is_outside else guard.decay
-    trial.outside += rate * min(newest - trial.outside, 0.0)
-    if is_outside:
-        trial.outside = max(trial.outside, qq)
-    suspect = newest > _SUSPECT * trial.outside and averages.newest_left > _LEAVES * newest
-    if suspect and sample.authority > 0.0:
-        trial.left, trial.highest = _TRIAL * _lag(guard), newest
+    rate = max(third / max(samples, third), guard.decay)
+    return max(outside + rate * min(newest - outside, 0.0), qq)
 
 
 @kernel
 def _try(guard: GuardDesign, memory: GuardMemory, newest: float) -> None:
     """Take a sample of a trial, and end it if that was the last."""
-    trial = memory.trial[0]
+    trial, suspect = memory.trial[0], memory.suspect[0]
     trial.left -= guard.every
     if trial.left > (_TRIAL - _STILL_GROWS) * _lag(guard):
         trial.highest = max(trial.highest, newest)
@@ -420,6 +445,7 @@ def _try(guard: GuardDesign, memory: GuardMemory, newest: float) -> None:
         trial.doubt = 3.0 * trial.wait if trial.doubt > 0.0 else trial.wait
     else:
         trial.outside = max(trial.outside, min(newest, _RAISES * trial.outside))
+        suspect.outside = max(suspect.outside, min(newest, _RAISES * suspect.outside))
 
 
 @kernel
@@ -866,6 +892,7 @@ def _start_again(guard: GuardDesign, memory: GuardMemory) -> None:
     clear(memory.sample)
     clear(memory.trial)
     clear(memory.interval)
+    clear(memory.suspect)
     memory.interval[0].part = _DECISION
     withdraw_authority(memory)
     memory.sample[0].unsettled = guard.settling
