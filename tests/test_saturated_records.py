@@ -67,6 +67,19 @@ def test_a_u_at_the_limits_of_its_actuator_is_named_without_not() -> None:
     assert found.gain == pytest.approx(1.0, rel=0.02)
 
 
+def test_a_position_that_is_constant_while_it_has_noise_elsewhere_is_at_its_limit() -> None:
+    """A quarter of a record of steps; a position without noise may rest there."""
+    rng = np.random.default_rng(1)
+    u = np.repeat([-0.5, -0.6, -0.5, -0.6, 0.1, -0.3, -0.1, 0.4, -0.2, 0.0], 300)
+    clean = answer([600.0], [1.0, 3.0, 0.0], u)
+    y = np.minimum(clean + 1e-3 * rng.standard_normal(u.size), clean[700])
+    assert 600 < standing(y, 0.0, u).samples < 800
+    assert standing(np.minimum(clean, clean[700]), 0.0, u).samples == 0
+    found = ql.identify(u, y, DT, order=2, integrators=1, delay=0.0)
+    assert found.gain == pytest.approx(200.0, rel=0.01)
+    assert found.shortcomings == ()
+
+
 @pytest.mark.parametrize("quantum", [0.0, pytest.param(0.004, marks=pytest.mark.trial)])
 def test_a_record_that_begins_at_a_limit_is_taken_from_its_first_free_sample(
     quantum: float,

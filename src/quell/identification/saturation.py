@@ -29,6 +29,9 @@ _FEWEST, _PILED, _VALUES = 10, 4.0, 20
 # Share of a rest at the begin in which u is looked at, and how often it moves through its range
 # in a rest at begin or end that is none. By hand.
 _FIRST, _SWINGS = 0.8, 1.0
+# Share of the third differences that turn their sign, from which a signal has noise: of noise alone
+# 0.8 of them do, of a smooth signal few. By hand.
+_NOISY = 0.5
 # Steps of rounding by which a y leaves a limit at once. By hand.
 _LEAVES = 2.5
 # Share of the samples beyond which too little is left.
@@ -72,7 +75,8 @@ class Standing(NamedTuple):
 def standing(x: Vector, resolution: float, u: Vector | None = None) -> Standing:
     """Return where a signal stands at its limits; ``resolution`` is the step it is rounded to.
 
-    A y that does not answer a ``u`` that moves stands at its limit, at begin and end, too.
+    A y that does not answer a ``u`` that moves stands at its limit, at begin and end, too, and so
+    does one that is constant there, and noisy elsewhere: noise does not rest.
     """
     none = np.zeros(x.size, dtype=bool)
     if np.unique(x).size <= _VALUES:
@@ -102,7 +106,8 @@ def _at_top(x: Vector, resolution: float, u: Vector | None) -> NDArray[np.bool_]
                 float(np.sum(np.abs(np.diff(part)))) if top - x[k] > _LEAVES * resolution else 0.0
                 for part, k in zip(ends, (away[0], away[-1]), strict=True)
             )
-            if moved > _SWINGS * float(np.ptp(u)) and np.sum(every) >= _FEWEST:
+            enough = moved > _SWINGS * float(np.ptp(u)) or (resolution == 0.0 and _is_noisy(x[~at]))
+            if enough and np.sum(every) >= _FEWEST:
                 return every
         at[: away[0]] = at[away[-1] :] = False
     count = int(np.sum(at))
@@ -124,3 +129,9 @@ def _at_top(x: Vector, resolution: float, u: Vector | None) -> NDArray[np.bool_]
     typical = 0.5 * float(np.median(np.abs(np.diff(x[~at]))))
     fast = bool(steps) and (resolution > 0.0 or float(np.median(steps)) > typical)
     return every if fast else nowhere
+
+
+def _is_noisy(x: Vector) -> bool:
+    """Return whether a signal has noise: its differences turn their sign again and again."""
+    turns = np.diff(x, 3)
+    return bool(np.mean(turns[1:] * turns[:-1] < 0.0) > _NOISY) if turns.size > _FEWEST else False
