@@ -1,6 +1,6 @@
 """What a compensator leaves of the error of a controller that stays as it is.
 
-    python benchmarks/compensator.py
+    python benchmarks/compensator.py [--part axis|joint]
 
 *Axis*: two inertias (3.2e-4 and 9.5e-4 kg m², 180 N m/rad, 0.02 N m s/rad), encoder of 2²⁰ counts
 at the motor, 4 kHz, torque one sample late, a load of 0.4 N m at several frequencies on the load
@@ -164,11 +164,15 @@ def joint_figures(light: float, heavy: float, alone: Any, most: float) -> dict[s
     }
 
 
+PARTS = {"axis": on_the_axis, "joint": on_the_joint}
+
+
 def main() -> None:
-    """Measure both."""
-    options = options_of(parser_of(__doc__))
-    on_axis, on_joint = on_the_axis(options.quick), on_the_joint(options.quick)
-    write(options, {"axis": on_axis, "joint": on_joint})
+    """Measure both, or one of them."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--part", choices=PARTS, action="append")
+    options = options_of(parser)
+    write(options, {name: PARTS[name](options.quick) for name in options.part or PARTS})
 
 
 if __name__ == "__main__":
