@@ -10,7 +10,7 @@ import pytest
 import quell as ql
 from quell import analysis
 from quell.analysis import linearise
-from quell.learners import BatchGradient, Harmonic, Kalman, Repetitive
+from quell.learners import RLS, BatchGradient, Harmonic, Kalman, Repetitive
 
 from .analysed_loops import PLANT, adrc, chain
 
@@ -173,3 +173,49 @@ def test_advise_tells_what_a_bias_takes_of_the_margin() -> None:
     )
     assert found(Kalman(bias_bandwidth=0.9 * named)) == []
     assert found(ql.learners.NoLearner()) == []
+
+
+def trained(law: Any) -> Any:
+    """Return a controller of one axis or two after 15 s on a plant for each, sample by sample."""
+    count = getattr(law, "outputs", 1)
+    x, B = np.zeros((count, 2)), np.ravel(PLANT.B)
+    for k in range(1500):
+        r = np.sin(DT * k) + np.sin(2.7 * DT * k)
+        u = np.atleast_1d(law.step([r] * 2, x[:, 0]) if count == 2 else law.step(r, x[0, 0]))
+        x = x + DT * (x @ np.asarray(PLANT.A).T + np.outer(u, B))
+    return law
+
+
+def test_the_summary_says_what_it_assumes_of_a_learner_with_a_gate_of_noise() -> None:
+    """And the margin without: that of a loop whose learner feeds back nothing that it learned; not for one that has learned nothing, and not for ``Kalman``."""
+    law = trained(controller(RLS()))
+    found = analysis.adapting(law)
+    assert np.any(found.known.gain)
+    nothing = linearise.Frozen(np.zeros(3), 0.0, 0.0)
+    alone = analysis.analyse(LOADED, law, at=found._replace(known=nothing))
+    said = analysis.analyse(LOADED, law).summary()
+    assert "assumed of RLS: all signals move by more than the noise." in said
+    assert f"the modulus margin is {alone.margins.modulus:.3f}" in said
+    for other in (controller(RLS()), controller(Kalman())):
+        assert "assumed" not in analysis.analyse(LOADED, other).summary()
+    assert "assumed" not in analysis.analyse(LOADED, law, at=analysis.frozen(law)).summary()
+    assert "assumed" not in alone.summary()
+
+
+@pytest.mark.trial
+def test_the_summary_of_several_axes_says_it_of_each() -> None:
+    """With M_s of the whole loop without what the axes have learned."""
+    A, B = np.kron(np.eye(2), PLANT.A), np.kron(np.eye(2), np.reshape(PLANT.B, (2, 1)))
+    plant = ql.plants.LinearPlant(A, B, np.eye(4)[::2])
+
+    def joint() -> ql.ADRC:
+        observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=12.0, dt=DT)
+        return ql.ADRC(observer, omega_c=OMEGA_C, learner=RLS())
+
+    axes = ql.Axes({"x": joint(), "y": joint()}, B0=2.0 * np.eye(2))
+    assert "assumed" not in analysis.analyse(plant, axes).remark
+    said = analysis.analyse(plant, trained(axes)).remark
+    assert "assumed of RLS of x, RLS of y: all signals move by more than the noise." in said
+    alone = analysis.analyse(LOADED, trained(controller(RLS()))).without_learned
+    assert alone is not None
+    assert f"M_s is {1.0 / alone[1].margins.modulus:.2f}" in said

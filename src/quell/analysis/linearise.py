@@ -446,6 +446,26 @@ def adapting(controller: Controller, run: Any = None, t: float | None = None) ->
     return Adapting(known, rates, lag, float(controller.dt), seen_parts)
 
 
+def within_noise(controller: Controller, at: Any = None) -> Adapting | None:
+    """Return a learner as motions meet it that its gate takes for noise; None if it is the same.
+
+    None of its signals moves then, so what it has learned of the state and u is not fed back; its
+    bias adapts as in motion. ``at`` is that of ``linear_law``; a ``Frozen`` learner has no gate.
+    """
+    part = compensating_part(controller)
+    if part is None or isinstance(at, Frozen):
+        return None
+    memory: Any = part._state.learner
+    if not hasattr(memory.inner if isinstance(memory, SeeingMemory) else memory, "gate"):
+        return None
+    found = at if isinstance(at, Adapting) else adapting(controller, at)
+    known = found.known
+    if not (np.any(known.gain) or known.before or known.slope):
+        return None
+    nothing = Frozen(np.zeros_like(known.gain), 0.0, 0.0, known.authority)
+    return found._replace(known=nothing)
+
+
 def adaptation_memory(learner: Adapting) -> AdaptingMemory:
     """Return its state with a bias and oscillators of zero."""
     rates = learner.rates

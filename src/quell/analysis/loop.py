@@ -21,7 +21,13 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.analysis.certificate import Certificate, certify_axis
-from quell.analysis.linearise import Frozen, is_known, knows_other_axes, linear_law
+from quell.analysis.linearise import (
+    Frozen,
+    is_known,
+    knows_other_axes,
+    linear_law,
+    within_noise,
+)
 from quell.analysis.margins import (
     Complex,
     Margins,
@@ -202,7 +208,21 @@ def analyse_axis(
     learners = [] if part is None else [part.learner]
     ratios = [] if b_over_b0 is None else [b_over_b0]
     note = "\n".join(filter(None, [note, *about_learning(learners, ratios)]))
-    return LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note)
+    found, hidden = LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note), None
+    if part is not None:
+        hidden = within_noise(controller, at)
+    if hidden is not None:
+        alone = LoopAnalysis(sampled, linear_law(controller, hidden), dt)
+        found.without_learned = type(learners[0]).__name__, alone
+    return found
+
+
+def assumed_of(names: str, left: str) -> str:
+    """Return the line on learners with a gate of noise; ``left`` says what is without them."""
+    return (
+        f"assumed of {names}: all signals move by more than the noise. One that does not is not "
+        f"fed back; with nothing fed back of what was learned of the state and u {left}"
+    )
 
 
 def about_learning(learners: Sequence[Any], ratios: ArrayLike) -> list[str]:
@@ -234,6 +254,8 @@ class LoopAnalysis(InNotebook):
         C_r and C_y.
     dt : float
         sample time [s].
+    without_learned : tuple or None
+        name of a learner with a gate of noise, and the loop of motions within the noise.
     b_over_b0 : float or None
         the plant's gain over the b0 of the controller; None without b0, for a plant that was given
         sampled, and if the first derivative of y that u reaches is not the one that the controller
@@ -251,6 +273,7 @@ class LoopAnalysis(InNotebook):
     ) -> None:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
         self._certify, self._note = certify, note
+        self.without_learned: tuple[str, LoopAnalysis] | None = None
         self._N = law_matrix(law)
         names = ("P", "C_r", "C_y")
         self._open = {name: Response(subsystem(plant, law, name)) for name in names}
@@ -285,8 +308,16 @@ class LoopAnalysis(InNotebook):
             f"white noise of 1 in y makes u move by {noise:.3g} RMS, "
             f"at most by a factor of {peak:.3g} at one frequency"
             + (f"\n{self._note}" if self._note else "")
+            + self._assumed()
             + self._certificate_lines()
         )
+
+    def _assumed(self) -> str:
+        if self.without_learned is None:
+            return ""
+        name, alone = self.without_learned
+        left = f"the modulus margin is {alone.margins.modulus:.3f}"
+        return f"\n{assumed_of(name, left if alone.stable else 'the loop is unstable')}"
 
     @cached_property
     def certificate(self) -> Certificate | None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.analysis.linearise import linear_law
+from quell.analysis.linearise import linear_law, within_noise
 from quell.controllers.allocation import update_gain
 from quell.controllers.axes import Axes
 from quell.controllers.linear import LinearLaw
@@ -159,15 +159,19 @@ def gain_ratios(plant: Any, axes: Axes, operating_point: Any = None) -> Any:
     return np.linalg.eigvals(B @ gain_at(axes, estimates_at(axes, plant, operating_point))[1])
 
 
-def law_of_axes(axes: Axes, x: Any = None) -> MatrixLaw:
+def law_of_axes(axes: Axes, x: Any = None, noise_hides: bool = False) -> MatrixLaw:
     """Return the linear law of axes without limits, learners at rest, B0 as in ``gain_at``.
+
+    With ``noise_hides`` it is that of motions which the learners' gates take for noise.
 
     The references are those of the axes; of compensators without drives u_0 (m,) takes their
     place. With drives the law is that of drives and compensators together. Raises ``ValueError``
     for a drive without a linear law.
     """
     B0, inverse = gain_at(axes, x)
-    law = joined([linear_law(axis) for axis in axes.unit_axes], inverse)
+    learners = [within_noise(axis) if noise_hides else None for axis in axes.unit_axes]
+    laws = [linear_law(axis, at) for axis, at in zip(axes.unit_axes, learners, strict=True)]
+    law = joined(laws, inverse)
     if not axes.compensates:
         return law
     # Each compensator is asked for (B0 u_0)_i; what B0 does not see of u_0 passes (more actuators

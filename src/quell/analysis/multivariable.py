@@ -45,8 +45,8 @@ from quell.analysis.disk import (
     singular,
     worst_change,
 )
-from quell.analysis.linearise import is_known, knows_other_axes
-from quell.analysis.loop import about_learning, duration
+from quell.analysis.linearise import is_known, knows_other_axes, within_noise
+from quell.analysis.loop import about_learning, assumed_of, duration
 from quell.analysis.margins import (
     Complex,
     Margins,
@@ -498,6 +498,16 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
     lines = not_in_margins(axes)
     learners = [axis.learner for axis in axes.axes]
     lines += about_learning(learners, gain_ratios(plant, axes, operating_point))
+    gated = [
+        f"{type(axis.learner).__name__} of {name}"
+        for name, axis in zip(axes.names, axes.unit_axes, strict=True)
+        if within_noise(axis) is not None
+    ]
+    if gated:
+        alone = law_of_axes(axes, estimates_at(axes, plant, operating_point), noise_hides=True)
+        hidden = MultivariableLoop(matrices, alone, axes.dt, outputs=axes.names)
+        left = f"M_s is {hidden.m_s('inputs').value:.3f} at the inputs" if hidden.stable else ""
+        lines.append(assumed_of(", ".join(gated), left or "the loop is unstable"))
     if callable(axes.B0) or callable(axes.M):
         lines.append(
             "NOT judged at other operating points than this one, where B0 is another: "
