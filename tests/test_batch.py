@@ -502,7 +502,7 @@ def test_a_plot_has_two_axes_and_draws_into_given_ones(law: ql.ADRC) -> None:
         ),
         (
             lambda: ql.simulate(PLANTS, controller(), SHORT)["x"],
-            "channel = 'x': must be one of r, y, u",
+            r"channel = 'x': was not recorded; .*, and with simulate\(…, record='all'\)",
         ),
         (
             lambda: ql.simulate(PLANTS, controller(), SHORT).plot([None]),

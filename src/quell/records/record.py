@@ -78,6 +78,11 @@ _NAMED = {
 }
 
 
+def is_channel(name: str) -> bool:
+    """Return whether a channel, or one of an axis, can have this name."""
+    return name.rpartition(".")[2] in _DESCRIPTIONS or name == "f_hat"
+
+
 def describe(name: str, signals: Any = UNKNOWN) -> tuple[str, str]:
     """Return a channel's description and unit, those of the plant's ``signals`` if known.
 

@@ -17,7 +17,7 @@ from quell.quantities import UNKNOWN
 from quell.records.metrics import MEASURES, SETTLING_BAND, BatchMetrics, Metrics, Window, measured
 from quell.records.netcdf import Stored, load_record
 from quell.records.notebook import InNotebook
-from quell.records.record import Record
+from quell.records.record import Record, is_channel
 from quell.types import LOST, Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
@@ -400,11 +400,16 @@ class BatchTrajectory(Record, InNotebook):
         return " ".join(sentences) or f"No step reported a problem in any of {len(self)} runs."
 
     def __getitem__(self, name: Any) -> Vector:
-        """Return a channel; a ``ValueError`` names the channels, or ``run`` for a number."""
+        """Return a channel; a ``ValueError`` says which there are, how to record more, or ``run``."""
         if isinstance(name, int | np.integer):
             raise ValueError(
                 f"channel = {name!r}: must be a name, as runs['y']; run number {name} is "
                 f"runs.run({name})"
+            )
+        if isinstance(name, str) and name not in self.names and is_channel(name):
+            raise ValueError(
+                f"channel = {name!r}: was not recorded; a batch records r, y and u, and with "
+                f"simulate(…, record='all') or record=('r', 'y', 'u', {name!r}) more"
             )
         return super().__getitem__(name)
 

@@ -365,7 +365,7 @@ def simulate(
         called with the share done, 0 to 1, every few thousand samples, or every few runs.
     record
         for a batch: channels to record, ``("r", "y", "u")`` by default, of several axes ``"v"``,
-        too. A single run records all.
+        too, or ``"all"``, with the estimates and a guard's authority. A single run records all.
     workers
         for a batch: number of threads; the number of cores by default.
 
