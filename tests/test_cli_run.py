@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,6 +73,93 @@ def test_a_setup_is_simulated_printed_written_drawn_and_saved(
         "short.svg",
         "short.pdf",
     }
+
+
+# A load with a period of 2 s, and a learner that waits for one with another period.
+WRONG_PERIOD = """
+dt = 0.02
+plant = {kind = "linear", num = [1.0], den = [1.0, 0.4, 0.0]}
+observer = {kind = "model-free", order = 2, b0 = 1.0, omega_o = 10.0}
+controller = {omega_c = 4.0}
+learner = {kind = "repetitive", period = 1.7}
+[scenario]
+duration = 12.0
+disturbances = [{kind = "sinusoid", omega = 3.1416}]
+[[metrics]]
+start = 6.0
+"""
+WRONG_AXES = """
+dt = 0.02
+plant = {kind = "linear", A = [[0, 1, 0, 0], [0, -0.4, 0, 0], [0, 0, 0, 1], [0, 0, 0, -1]], B = [[0, 0], [1, 0], [0, 0], [0, 1]], E = [[0, 0], [1, 0], [0, 0], [0, 1]], C = [[1, 0, 0, 0], [0, 0, 1, 0]]}
+axes = {B0 = "plant"}
+scenario = {duration = 12.0, disturbances = [{kind = "sinusoid", omega = 3.1416}, {kind = "sinusoid", omega = 3.1416}]}
+[[axis]]
+name = "x"
+observer = {kind = "model-free", order = 2, omega_o = 10.0}
+controller = {omega_c = 4.0}
+learner = {kind = "repetitive", period = 1.7}
+[[axis]]
+name = "y"
+observer = {kind = "model-free", order = 2, omega_o = 10.0}
+controller = {omega_c = 4.0}
+learner = {kind = "harmonic", omegas = [3.1416]}
+guard = {}
+[[metrics]]
+start = 6.0
+"""
+
+
+def run_of(quell: Callable[..., Shown], text: str, folder: Path) -> tuple[str, dict[str, Any]]:
+    """Return what ``quell run`` prints for a setup, in one line, and its results."""
+    (folder / "setup.toml").write_text(text)
+    shown = quell("run", "setup.toml", "--json", "out.json", "--no-figures", "--overwrite")
+    return " ".join(shown.out.split()), json.loads((folder / "out.json").read_text())
+
+
+@pytest.mark.trial
+def test_a_learner_without_guard_that_makes_the_error_worse_is_said(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """With the RMS of the last window, and that of the same run without learner."""
+    said, result = run_of(quell, WRONG_PERIOD, tmp_path)
+    plain = run_of(quell, WRONG_PERIOD.replace("learner =", "# learner ="), tmp_path)[1]
+    pair = result["without_learner"]["y"]
+    assert pair["rms"] == result["metrics"][-1]["rms"] > 1.2 * pair["rms_without"]
+    assert pair["rms_without"] == plain["metrics"][-1]["rms"]
+    assert f"RMS of r − y is {pair['rms']:.4g} in the last window" in said
+    assert f"{pair['rms_without']:.4g} without; give it a guard" in said
+    guarded, result = run_of(
+        quell, WRONG_PERIOD.replace("[scenario]", "guard = {}\n[scenario]"), tmp_path
+    )
+    assert "NOT" not in guarded
+    assert "without_learner" not in result
+    right, result = run_of(quell, WRONG_PERIOD.replace("1.7", "2.0"), tmp_path)
+    assert "NOT" not in right
+    assert result["without_learner"]["y"]["rms"] < result["without_learner"]["y"]["rms_without"]
+
+
+@pytest.mark.trial
+def test_of_several_axes_the_one_is_named_whose_learner_makes_it_worse(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """All learners are left out of the run beside it."""
+    said, result = run_of(quell, WRONG_AXES, tmp_path)
+    assert "NOT better than without a learner: the RMS of r − y of x is" in said
+    assert "r − y of y is" not in said
+    assert set(result["without_learner"]) == {"x", "y"}
+
+
+@pytest.mark.trial
+def test_a_run_that_is_lost_with_a_learner_alone_says_so(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Algorithm 1 with a rate that is far too large."""
+    text = WRONG_PERIOD.replace(
+        '{kind = "repetitive", period = 1.7}', '{kind = "batch-gradient", rate = 0.1}'
+    )
+    said, result = run_of(quell, text, tmp_path)
+    assert result["diverged"]
+    assert "NOT with this learner: without it the run goes on to its end" in said
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -109,6 +110,7 @@ def run(
         title = f"{given.title}: {result.plant}, dt = {result.dt:g} s"
         print_metrics(console, title, scores, result.signals)
         learned = print_outcome(console, result)
+    alone = _without_learner(console, given, data, result)
     paths = save_run_figure(result, given.title, outputs, setup.stem)
     write_record(console, result, outputs, "Record")
     results = {
@@ -122,8 +124,70 @@ def run(
         "learned": learned,
         "setup": given.as_json(),
     }
+    if alone:
+        results["without_learner"] = alone
     write_results(console, results, outputs, paths)
     exit_if_diverged([result])
+
+
+# With more than this share of the error without learner, a learner makes it worse.
+_WORSE = 1.01
+_ALONE = "simulating without the learner, to compare"
+
+
+def _without_learner(
+    console: Console, given: Setup, data: Mapping[str, Any], run: Any
+) -> dict[str, Any]:
+    """Return the RMS of r − y of the same run without learners; say it where they make it worse.
+
+    The figures are those of the last window, with a learner and without, for each axis by its name;
+    there are none where the run or the window has none, where each learner has a guard, which
+    judges that itself, and without learner.
+    """
+    from quell.setup import made
+    from quell.simulation import simulate
+
+    tables = [data, data.get("axes", {}), *data.get("axis", ())]
+    present = [{key for key, value in table.items() if value != "none"} for table in tables]
+    if not any("learner" in keys and "guard" not in keys for keys in present):
+        return {}
+    parts = {key: value for key, value in _unlearned(data).items() if key != "sweep"}
+    if "axes" in parts:
+        parts["axes"] = _unlearned(parts["axes"])
+    if "axis" in parts:
+        parts["axis"] = [_unlearned(table) for table in parts["axis"]]
+    controller = made(given.file, parts, given.trust).controller
+    with progress_bar(console, _ALONE) as report, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it is not the run that was asked for
+        progress = partial(report, _ALONE)
+        plain = simulate(given.plant, controller, given.scenario, progress=progress)
+    if run.lost and not plain.lost:
+        print_line(
+            console,
+            "NOT with this learner: without it the run goes on to its end; give it a guard, or "
+            "leave it out (docs/choose).",
+        )
+    found = {}
+    for name in run.axis_names or ("",):
+        pair = (one.axis(name) if name else one for one in (run, plain))
+        learned, alone = (windowed_metrics(each, given)[-1].get("rms") for each in pair)
+        if learned is None or alone is None:
+            continue
+        found[name or "y"] = {"rms": learned, "rms_without": alone}
+        if learned > _WORSE * alone:
+            of = f" of {name}" if name else ""
+            print_line(
+                console,
+                f"NOT better than without a learner: the RMS of r − y{of} is {learned:.4g} in the "
+                f"last window, {alone:.4g} without; give it a guard, or leave it out "
+                "(docs/choose).",
+            )
+    return found
+
+
+def _unlearned(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table of a setup without its learner and guard."""
+    return {key: value for key, value in table.items() if key not in ("learner", "guard")}
 
 
 # ---- quell sweep ----

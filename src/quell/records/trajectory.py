@@ -400,7 +400,7 @@ class BatchTrajectory(Record, InNotebook):
         return " ".join(sentences) or f"No step reported a problem in any of {len(self)} runs."
 
     def __getitem__(self, name: Any) -> Vector:
-        """Return a channel; a ``ValueError`` says which there are, how to record more, or ``run``."""
+        """Return a channel; a ``ValueError`` says which there are, and how to record more."""
         if isinstance(name, int | np.integer):
             raise ValueError(
                 f"channel = {name!r}: must be a name, as runs['y']; run number {name} is "
