@@ -19,14 +19,15 @@ SOURCE = Path(__file__).with_name("reference.c")
 
 
 def c_reference(
-    folder: Path, settings: study.Settings, duration: float = study.END
+    folder: Path, settings: study.Settings, duration: float = study.END, learns: bool = True
 ) -> Callable[[bool], np.ndarray]:
     """Build ``reference.c``; return a function that runs the study's L-ESO in it.
 
-    The function returns the log if its argument is true. Design and noise are computed in advance,
-    so only the loop itself is timed.
+    Without ``learns`` it is MF-ESO, the same loop without learner. The function returns the log if
+    its argument is true. Design and noise are computed in advance, so only the loop itself is
+    timed.
     """
-    library = folder / "reference.so"
+    library = folder / ("reference.so" if learns else "plain.so")
     command = [
         "gcc",
         "-O3",
@@ -38,6 +39,7 @@ def c_reference(
         str(library),
         str(SOURCE),
         "-lm",
+        *(() if learns else ("-DPLAIN",)),
     ]
     subprocess.run(command, check=True)
     run = ctypes.CDLL(str(library)).run
@@ -50,7 +52,7 @@ def c_reference(
     )
 
     def reference(record: bool) -> np.ndarray:
-        log = np.empty((samples, 22) if record else 0)
+        log = np.empty((samples, 22 if learns else 17) if record else 0)
         run(
             *(
                 numbers.ctypes.data_as(pointer),

@@ -2,7 +2,8 @@
  * control law, and the lag-compensated Kalman learner with state and bias features. All sizes are
  * compile-time constants, all arrays are static or on the stack, as in a careful implementation by
  * hand. c_reference.py builds it with gcc -O3 -march=native and passes the design (Phi, L, the taps
- * of the lag filter), so that the trajectory can be compared with that of quell.
+ * of the lag filter), so that the trajectory can be compared with that of quell. With -DPLAIN it is the
+ * loop without learner, whose rows end with the status.
  *
  * Each row of the log holds r, y, measured y, u, w1, w2, x (4), x-hat (4), residual f, learned f, status, theta (5): 22 numbers. */
 #include <math.h>
@@ -12,7 +13,11 @@
 #define N (NX + 1)
 #define P (NX + 1)
 #define M (P + 1)
+#ifdef PLAIN
+#define ROW 17
+#else
 #define ROW 22
+#endif
 
 typedef struct {
     double dt;
@@ -45,6 +50,7 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
         double error = y - pred[0];
         for (int i = 0; i < N; i++) s->z[i] = pred[i] + d->gain[i] * error;
 
+#ifndef PLAIN
         double target = s->z[N - 1] + s->filtered[P], innovation = target, deviation = y - s->z[0], rounding = 1e-8 * y;
         for (int i = 0; i < P; i++) innovation -= s->theta[i] * s->filtered[i];
         double doubt = 0.1 * target;
@@ -80,16 +86,19 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
                 s->cov[P - 1][P - 1] += d->walk_bias * d->dt;
             }
         }
+#endif
     }
-    double f = s->theta[P - 1], u0 = d->law[0] * r;
-    for (int i = 0; i < NX; i++) {
-        f += s->theta[i] * d->scale[i] * s->z[i];
-        u0 -= d->law[i] * s->z[i];
-    }
+    double f = 0.0, u0 = d->law[0] * r;
+    for (int i = 0; i < NX; i++) u0 -= d->law[i] * s->z[i];
+#ifndef PLAIN
+    f = s->theta[P - 1];
+    for (int i = 0; i < NX; i++) f += s->theta[i] * d->scale[i] * s->z[i];
+#endif
     double u = (u0 - f - s->z[N - 1]) / d->b0;
     s->u = u;
     s->f_learned = f;
 
+#ifndef PLAIN
     for (int i = 0; i < M; i++) {
         double input = i < NX ? d->scale[i] * s->z[i] : i < P ? 1.0 : f;
         double carry = d->rise * input, sum = 0.0;
@@ -102,6 +111,7 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
         }
         s->filtered[i] = sum;
     }
+#endif
     return u;
 }
 
@@ -139,7 +149,9 @@ double run(const design_t *design, size_t samples, double rest_at, const double 
             row[0] = r, row[1] = y, row[2] = measured, row[3] = u, row[4] = 0.0, row[5] = w2;
             for (int i = 0; i < NX; i++) row[6 + i] = s.x[i], row[10 + i] = s.z[i];
             row[14] = s.z[N - 1], row[15] = s.f_learned, row[16] = 0.0;
+#ifndef PLAIN
             for (int i = 0; i < P; i++) row[17 + i] = s.theta[i] * (i < NX ? d.scale[i] : 1.0);
+#endif
         }
         double next[NX];
         for (int i = 0; i < NX; i++) {

@@ -1,9 +1,9 @@
 """Speed of quell, as ratios to references timed in the same run.
 
-    python benchmarks/speed.py [--quick] [--json FILE]
+    python benchmarks/speed.py [--part c|algorithm-1|call|python-control] [--quick] [--json FILE]
 
 The ratios use the best of several interleaved trials, because times on a shared machine vary. The
-references are the same loop in C (``reference.c``, which must give the same trajectory), pyadrc on
+references are the same loops in C (``reference.c``, which must give the same trajectory), pyadrc on
 the same second-order loop, and python-control on the same two-mass loop. ``learners.py`` measures
 the learners.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 import importlib.util
 import tempfile
 import timeit
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,34 +32,35 @@ def each(*runs: float) -> str:
 
 
 def against_c(rows: list[dict[str, object]], trials: int) -> None:
-    """Time the whole closed loop with the Kalman learner."""
-    settings, plant = study.Settings(), ql.plants.two_mass_spring()
-    controller, scenario = study.controllers(settings)[study.L], study.scenario(settings)
-    with tempfile.TemporaryDirectory() as folder:
-        reference = c_reference(Path(folder), settings)
-        log, run = reference(True), ql.simulate(plant, controller, scenario)
-        apart = max(np.max(np.abs(run["y"] - log[:, 1])), np.max(np.abs(run["u"] - log[:, 3])))
-        assert apart < 1e-6, f"quell and C differ by {apart}"
-        c_all, ours_all, c_bare, ours_bare = best(
-            lambda: reference(True),
-            lambda: ql.simulate(plant, controller, scenario),
-            lambda: reference(False),
-            lambda: ql.simulate(plant, controller, scenario, record_every=SAMPLES),
-            trials=trials,
-        )
-    for label, c, ours, bar in (
-        ("every sample recorded", c_all, ours_all, "≤ 1.4"),
-        ("nothing recorded", c_bare, ours_bare, "≤ 1.25"),
-    ):
-        rows.append(
-            row(
-                f"closed loop, Kalman learner, {label}: quell / C",
-                ours / c,
-                bar,
-                f"{each(ours, c)}, apart by {apart:.0e}",
-                apart=apart,
+    """Time the whole closed loop of order 4 under the study's load, with and without learner."""
+    for learner, name in (("no learner", study.MF), ("Kalman learner", study.L)):
+        settings, plant = study.Settings(), ql.plants.two_mass_spring()
+        controller, scenario = study.controllers(settings)[name], study.scenario(settings)
+        with tempfile.TemporaryDirectory() as folder:
+            reference = c_reference(Path(folder), settings, learns=name == study.L)
+            log, run = reference(True), ql.simulate(plant, controller, scenario)
+            apart = max(np.max(np.abs(run[of] - log[:, at])) for of, at in (("y", 1), ("u", 3)))
+            assert apart < 1e-6, f"quell and C differ by {apart}"
+            c_all, ours_all, c_bare, ours_bare = best(
+                partial(reference, True),
+                partial(ql.simulate, plant, controller, scenario),
+                partial(reference, False),
+                partial(ql.simulate, plant, controller, scenario, record_every=SAMPLES),
+                trials=trials,
             )
-        )
+        for label, c, ours, bar in (
+            ("every sample recorded", c_all, ours_all, "≤ 1.4"),
+            ("nothing recorded", c_bare, ours_bare, "≤ 1.25"),
+        ):
+            rows.append(
+                row(
+                    f"closed loop, {learner}, {label}: quell / C",
+                    ours / c,
+                    bar if name == study.L else "",
+                    f"{each(ours, c)}, apart by {apart:.0e}",
+                    apart=apart,
+                )
+            )
 
 
 def algorithm_1(rows: list[dict[str, object]], trials: int) -> None:
@@ -163,18 +165,29 @@ def against_python_control(rows: list[dict[str, object]], trials: int) -> None:
     )
 
 
+PARTS = {
+    "c": against_c,
+    "algorithm-1": algorithm_1,
+    "call": one_call,
+    "python-control": against_python_control,
+}
+
+
 def main() -> None:
-    """Run all benchmarks and print one table."""
+    """Run the benchmarks and print one table."""
     parser = parser_of(__doc__)
+    parser.add_argument("--part", choices=PARTS, action="append")
     parser.add_argument("--trials", type=int, default=15, help="of which the best counts")
     options = options_of(parser, trials=1)
     check_present(options, ["gcc"])
-    for module in ("pyadrc", "control"):
+    parts = options.part or list(PARTS)
+    needed = {"call": "pyadrc", "python-control": "control"}
+    for module in (needed[part] for part in parts if part in needed):
         if importlib.util.find_spec(module) is None:
             not_run(options, f"no package {module} here")
     rows: list[dict[str, object]] = []
-    for measure in (against_c, algorithm_1, one_call, against_python_control):
-        measure(rows, options.trials)
+    for part in parts:
+        PARTS[part](rows, options.trials)
     write(options, show(rows))
 
 
