@@ -110,9 +110,9 @@ def run(
         title = f"{given.title}: {result.plant}, dt = {result.dt:g} s"
         print_metrics(console, title, scores, result.signals)
         learned = print_outcome(console, result)
-    alone = _without_learner(console, given, data, result)
     paths = save_run_figure(result, given.title, outputs, setup.stem)
     write_record(console, result, outputs, "Record")
+    alone = _without_learner(console, given, data, result)
     results = {
         "title": given.title,
         "plant": result.plant,
@@ -144,23 +144,28 @@ def _without_learner(
     there are none where the run or the window has none, where each learner has a guard, which
     judges that itself, and without learner.
     """
-    from quell.setup import made
+    from quell.setup import SetupError, made
     from quell.simulation import simulate
 
     tables = [data, data.get("axes", {}), *data.get("axis", ())]
     present = [{key for key, value in table.items() if value != "none"} for table in tables]
     if not any("learner" in keys and "guard" not in keys for keys in present):
         return {}
-    parts = {key: value for key, value in _unlearned(data).items() if key != "sweep"}
+    others = ("sweep", "tune", "rig")
+    parts = {key: value for key, value in _unlearned(data).items() if key not in others}
     if "axes" in parts:
         parts["axes"] = _unlearned(parts["axes"])
     if "axis" in parts:
         parts["axis"] = [_unlearned(table) for table in parts["axis"]]
-    controller = made(given.file, parts, given.trust).controller
+    try:
+        controller = made(given.file, parts, given.trust).controller
+    except SetupError as error:
+        print_line(console, f"NOT compared with the run without a learner: {error}")
+        return {}
+    plant, scenario = given.needed("plant"), given.needed("scenario")
     with progress_bar(console, _ALONE) as report, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it is not the run that was asked for
-        progress = partial(report, _ALONE)
-        plain = simulate(given.plant, controller, given.scenario, progress=progress)
+        plain = simulate(plant, controller, scenario, progress=partial(report, _ALONE))
     if run.lost and not plain.lost:
         print_line(
             console,
