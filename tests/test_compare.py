@@ -57,6 +57,65 @@ def test_any_controllers_on_any_plant_are_judged_alike() -> None:
     }
 
 
+def test_the_energy_that_u_puts_in_is_what_the_plant_has_in_the_end() -> None:
+    """Two masses without friction keep what u put in and did not take back; half of k x² and m v² say how much."""
+    plant = ql.plants.two_mass_spring(m1=2.0, m2=0.5, k=3.0)
+    run = ql.simulate(
+        plant, ql.baselines.LQG(plant, 1.0, 10.0, 1e-3), ql.Scenario(1.0, 4.0), interpret=True
+    )
+    flow = plant.flow  # type: ignore[attr-defined]
+    back = flow._replace(state=tuple(-weight for weight in flow.state))
+    got, returned = (compare.power_scores(each, run)["energy"] for each in (flow, back))
+    x1, x2, v1, v2 = run["x"][-1]
+    held = 0.5 * (2.0 * v1**2 + 0.5 * v2**2 + 3.0 * (x1 - x2) ** 2)
+    assert got is not None
+    assert returned is not None
+    assert returned > 0.05 * got
+    assert got - returned == pytest.approx(held, rel=1e-4)
+
+
+@cases("inductance", [None, 2e-3])
+def test_the_energy_of_a_motor_is_that_of_its_supply(inductance: float | None) -> None:
+    """It becomes heat in the winding, viscous friction, motion, and the field of the inductance; a voltage beyond the limit is cut."""
+    motor = ql.plants.dc_motor(inductance=inductance, coulomb=0.0, counts=4096, voltage_limit=12.0)
+    dt = 1e-4
+    result = compare.compare(
+        motor, {"on": ql.baselines.PID(1e9, dt=dt)}, ql.Scenario(1e3, 0.03), record_every=1
+    )
+    run, score = result.runs["on"], result.scores["on"]
+    assert result.no_power == ""
+    speed = run["x"][:, 1]
+    i = (12.0 - 0.05 * speed) / 0.5 if inductance is None else run["x"][:, 2]
+    lost = np.trapezoid(0.5 * i**2 + 1e-4 * speed**2, run.t)
+    held = 0.5 * (2e-4 * speed[-1] ** 2 + (inductance or 0.0) * i[-1] ** 2)
+    assert score["energy"] == pytest.approx(lost + held, rel=2e-3)
+    assert score["peak_power"] == pytest.approx(12.0 * np.max(i), rel=1e-9)
+
+
+@cases(
+    ("plant", "every", "said"),
+    [
+        (LAG, 1, "does not say how fast u moves it"),
+        (ql.plants.delayed(ql.plants.two_mass_spring(), 0.02, 0.01), 1, "acts on u late"),
+        (ql.plants.two_mass_spring(), 2, "each nth sample"),
+    ],
+)
+def test_energy_that_is_not_known_has_its_reason(plant: object, every: int, said: str) -> None:
+    """None and a sentence, in place of a number; the plant of a user may have weights of its states."""
+    some: dict[str, ql.Controller] = {"P": ql.baselines.PID(0.1, dt=0.01)}
+    scenario = ql.Scenario(reference=1.0, duration=1.0)
+    result = compare.compare(plant, some, scenario, record_every=every)  # type: ignore[arg-type]
+    assert said in result.no_power
+    assert result.to_json()["no_power"] == result.no_power
+    assert (result.scores["P"]["energy"], result.scores["P"]["peak_power"]) == (None, None)
+    cart = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
+    known = compare.compare(ql.plants.labelled(cart, flow=[0.0, 1.0]), some, scenario)
+    v = known.runs["P"]["x"][:, 1]
+    assert known.scores["P"]["energy"] == pytest.approx(0.5 * v[-1] ** 2)
+    with pytest.raises(ValueError, match="flow"):
+        ql.plants.labelled(cart, flow=[0.0, 1.0, 0.0])
+
+
 def test_a_run_that_diverges_is_shown_as_one() -> None:
     """No number where there is none; the others are judged as ever, and the figure is drawn."""
     some = {
@@ -66,6 +125,7 @@ def test_a_run_that_diverges_is_shown_as_one() -> None:
     result = compare.compare(LAG, some, ql.Scenario(reference=1.0, duration=5.0))
     assert result.runs["wrong sign"].diverged
     assert set(result.scores["wrong sign"].values()) == {None}
+    assert result.scores["right"]["control_energy"] is not None
     assert result.scores["right"]["settling_time"] is not None
     axes = compare.draw(result)
     assert "wrong sign (diverged)" in axes[0].get_legend_handles_labels()[1]

@@ -253,7 +253,11 @@ def test_a_variation_of_u_that_cannot_be_compared_is_no_number(
     assert np.all(np.isnan(found.values["control_variation"]))
     assert np.all(np.isnan(found.values["total_variation"]))
     assert np.all(found.values["rms"] > 0.0)
-    assert found.describe().splitlines()[-1].startswith("NOT compared: variation of u: B0 of one")
+    assert (
+        found.describe()
+        .splitlines()[-1]
+        .startswith("NOT compared: variation and ∫u² dt of u: B0 of one")
+    )
 
 
 def in_windows(*windows: Any) -> Any:

@@ -57,7 +57,7 @@ def test_metrics_judge_the_window_as_a_step(run: ql.Trajectory) -> None:
     """The target is where the reference ends; a window at rest has no overshoot to speak of."""
     found = run.metrics(0.0, 10.0)
     assert set(found) == {
-        "overshoot", "settling_time", "rise_time", "peak_error", "rms", "iae", "ise", "itae", "control_variation", "total_variation",
+        "overshoot", "settling_time", "rise_time", "peak_error", "rms", "iae", "ise", "itae", "control_variation", "total_variation", "control_energy",
     }  # fmt: skip
     assert found.missing == {}
     assert found["peak_error"] == 1.0
@@ -185,6 +185,16 @@ def test_the_total_variation_has_the_first_jump_of_u() -> None:
     assert (run.metrics()["control_variation"], run.metrics()["total_variation"]) == (3.0, 6.0)
     later = run.metrics(0.1)
     assert (later["control_variation"], later["total_variation"]) == (1.0, 3.0)
+
+
+def test_the_energy_of_u_is_that_of_a_held_u() -> None:
+    """Each sample counts until the next one, and the last one, which lasts for no time, not."""
+    run = record_of([1] * 5, [0] * 5, [3, 5, 4, 4, 7])
+    assert run.metrics()["control_energy"] == pytest.approx(0.1 * (9 + 25 + 16 + 16))
+    assert run.metrics(0.1, 0.3)["control_energy"] == pytest.approx(0.1 * 25)
+    assert record_of([1.0], [0.0], [2.0]).metrics()["control_energy"] == 0.0
+    huge = record_of([1.0] * 2, [0.0] * 2, [1e200] * 2).metrics()
+    assert huge.missing["control_energy"] == "the number is too large for a float"
 
 
 @cases(

@@ -100,6 +100,25 @@ def print_scores(
     console.print(rows)
 
 
+def print_effort(console: Console, result: Comparison) -> None:
+    """Print the integral of u², energy and peak power of each run, or why there is no power."""
+    unit = next(iter(result.runs.values())).signals.unit("u-unit² s")
+    headings = ["∫u² dt" + ("" if "u-unit" in unit else f" [{unit}]")]
+    keys = ["control_energy"]
+    if not result.no_power:
+        keys += ["energy", "peak_power"]
+        headings += ["energy [J]", "peak power [W]"]
+    rows = table("What u costs, over the whole run", "controller", *headings)
+    for name, score in result.scores.items():
+        values = [score[key] for key in keys]
+        rows.add_row(name, *("–" if value is None else f"{value:.4g}" for value in values))
+    console.print(rows)
+    text = "Energy: what u puts in, without what it takes back; power: u times the flow."
+    if result.no_power:
+        text = f"Energy and peak power: none, {result.no_power}."
+    print_line(console, text)
+
+
 def print_two_mass(console: Console, settings: Benchmark) -> None:
     """Print what the scores of the benchmark are."""
     from quell.experiments.compare import BAND, END, FORCE, FORCE_AT
@@ -262,6 +281,7 @@ def compare(
     title = f"Designed for m1 = m2 = k = 1, run on {m1:g}, {m2:g}, {k:g}"
     print_scores(console, title, result, stable)
     print_two_mass(console, settings)
+    print_effort(console, result)
     print_gains(console, gains, entries, bounds)
     for name, proof in proofs.items():
         console.print(f"{name}: {proof}", soft_wrap=True, highlight=False)
@@ -436,6 +456,7 @@ def _compare_setup(
     console.print(
         f"In the units of the setup{scored}. –: not settled, no step, or diverged before."
     )
+    print_effort(console, run.result)
     print_gains(console, gains, run.entries, run.constraints)
     for note in run.notes:
         print_line(console, note)

@@ -29,7 +29,14 @@ COLUMNS = (
     Column("rms", "RMS of\nr − y", 1.0, ".4g"),
     Column("control_variation", "variation\nof u", 1.0, ".4g"),
     Column("total_variation", "with first\njump", 1.0, ".4g"),
+    Column("control_energy", "∫u² dt", 1.0, ".4g"),
 )
+# Units of columns that depend on those of y and u.
+_UNITS = {
+    **dict.fromkeys(("peak_error", "rms"), "y-unit"),
+    **dict.fromkeys(("control_variation", "total_variation"), "u-unit"),
+    "control_energy": "u-unit² s",
+}
 
 
 def windowed_metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
@@ -84,10 +91,9 @@ def _nothing_to_judge(run: Trajectory, start: float, stop: float, cut_off: bool)
 
 def _heading(column: Column, units: dict[str, str]) -> str:
     """Return the heading of a column with the unit of its signal, if that is known."""
-    which = "u" if "variation" in column.key else "y"
-    in_unit = column.key in ("peak_error", "rms", "control_variation", "total_variation")
-    known = in_unit and units[which] not in ("", f"{which}-unit")
-    return f"{column.heading}\n[{units[which]}]" if known else column.heading
+    unit = _UNITS.get(column.key, "")
+    known = units.get(unit, "")
+    return f"{column.heading}\n[{known}]" if known not in ("", unit) else column.heading
 
 
 def print_metrics(
@@ -97,7 +103,7 @@ def print_metrics(
 
     ``signals`` has the units of y and u.
     """
-    units = {key: signals.unit(f"{key}-unit") if signals else "" for key in "yu"}
+    units = {unit: signals.unit(unit) for unit in _UNITS.values()} if signals else {}
     headings = [_heading(column, units) for column in COLUMNS]
     rows = table(title, "from … to\n[s]", *headings, padding=(0, 1, 0, 0), pad_edge=False)
     for scores in windows:

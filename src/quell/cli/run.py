@@ -298,6 +298,8 @@ def _varies(given: Any) -> bool:
 
 def _notes(given: Setup, plan: Mapping[str, Any], varied: Sequence[str]) -> list[str]:
     """Return lines with NOT about what the measures of a sweep can not be compared over."""
+    from quell.records.metrics import OF_U
+
     cases = plan["build"].cases.values()
     paths = [*varied, *(path for case in cases for path in case)]
     dt = float(given.controller.dt)
@@ -312,7 +314,7 @@ def _notes(given: Setup, plan: Mapping[str, Any], varied: Sequence[str]) -> list
     of_u = [
         name
         for name, each in plan["metrics"].items()
-        if getattr(each, "axis", "") and each.name in ("control_variation", "total_variation")
+        if getattr(each, "axis", "") and each.name in OF_U
     ]
     by = [path for path in paths if path == "axes" or path.startswith(gains)]
     if of_u and by:

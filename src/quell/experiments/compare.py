@@ -57,8 +57,8 @@ from quell.learners import Kalman
 from quell.observers import ESO
 from quell.parallel import in_parallel, one_blas_thread
 from quell.plants import Plant, two_mass_spring
-from quell.plants.base import one_at_a_time
-from quell.plants.linear import delayed
+from quell.plants.base import Flow, PlantWrapper, one_at_a_time
+from quell.plants.linear import EncodedPlant, delayed
 from quell.plants.linearise import linear_model, linear_part
 from quell.records import metrics
 from quell.records.plotting import draw_line, given_axes, grid_of_axes, new_figure
@@ -295,7 +295,7 @@ BAND = metrics.SETTLING_BAND  # half width of the settling band, as a fraction o
 
 _KEYS = (
     *("overshoot", "settling_time", "disturbance_peak", "rms"),
-    *("control_variation", "total_variation"),
+    *("control_variation", "total_variation", "control_energy", "energy", "peak_power"),
 )
 
 
@@ -305,6 +305,7 @@ class Comparison:
 
     runs: dict[str, Trajectory]
     scores: dict[str, Scores]  #: None for a number that a run does not have
+    no_power: str = ""  #: why no run has energy and peak power; empty if the plant has them
 
     def to_json(self) -> dict[str, Any]:
         """Return scores and statuses, for programs."""
@@ -312,7 +313,9 @@ class Comparison:
             name: {"status": run.status.name or "OK", "diverged": run.diverged, "lost": run.lost}
             for name, run in self.runs.items()
         }
-        return {"controllers": {name: score | ends[name] for name, score in self.scores.items()}}
+        why = {"no_power": self.no_power} if self.no_power else {}
+        scores = {name: score | ends[name] for name, score in self.scores.items()}
+        return {"controllers": scores} | why
 
 
 def compare(
@@ -347,8 +350,11 @@ def compare(
     Comparison
         with ``overshoot`` (fraction), ``settling_time`` [s], ``disturbance_peak`` (largest ``|r −
         y|`` from ``load_at`` on) and ``rms`` of r − y over the whole run [y-unit], and
-        ``control_variation`` and ``total_variation`` over the whole run [u-unit]; the latter has
-        the first jump of u from zero.
+        ``control_variation`` and ``total_variation`` over the whole run [u-unit], of which the
+        latter has the first jump of u from zero, and ``control_energy``, ∫u² dt [u-unit² s]. A
+        plant that has a ``Flow`` also gives ``energy``, what u puts into it without what it takes
+        back, ∫max(P, 0) dt [J], and ``peak_power``, max |P| [W], of the power P = u · flow;
+        for others ``no_power`` of the result says why they are None.
 
     Examples
     --------
@@ -378,7 +384,53 @@ def compare(
     runs = dict(zip(controllers, in_parallel(jobs, progress, workers), strict=True))
     duration = scenario.duration
     scores = {name: score(run, duration, load_at, band) for name, run in runs.items()}
-    return Comparison(runs, scores)
+    flow, fault = _flow_of(plant, record_every)
+    if flow is not None:
+        for name, run in runs.items():
+            if not run.diverged and len(run) > 1:
+                scores[name] |= power_scores(flow, run)
+    return Comparison(runs, scores, fault)
+
+
+def _flow_of(plant: Any, every: int) -> tuple[Flow | None, str]:
+    """Return the flow of a plant, or why energy and peak power are not known."""
+    inner = plant
+    while isinstance(inner, EncodedPlant):  # with the states of the plant inside
+        inner = inner.plant
+    flow = getattr(inner, "flow", None)
+    if isinstance(flow, Flow):
+        fault = "only each nth sample is recorded" if every > 1 else ""
+        return (None, fault) if fault else (flow, "")
+    if isinstance(inner, PlantWrapper):
+        return None, f"{plant.name!r} acts on u late"
+    return None, (
+        f"{plant.name!r} does not say how fast u moves it; labelled(plant, flow=weights of the "
+        "states) does, for a force or torque u"
+    )
+
+
+def power_scores(flow: Flow, run: Trajectory) -> Scores:
+    """Return the energy that u puts into a plant [J], and its peak power [W], of a complete run.
+
+    u is held, so its power has two ends in each sample; between them the flow is taken as a line.
+    """
+    u = np.clip(run["u"][:-1], -flow.largest, flow.largest)
+    moved = run["x"] @ np.array(flow.state)
+    with np.errstate(over="ignore", invalid="ignore"):
+        begin, end = (u * (part + flow.direct * u) for part in (moved[:-1], moved[1:]))
+        found = {
+            "energy": float(np.sum(_positive_part(begin, end)) * run.dt),
+            "peak_power": float(np.max(np.abs([begin, end]))),
+        }
+    return {name: value if math.isfinite(value) else None for name, value in found.items()}
+
+
+def _positive_part(begin: Vector, end: Vector) -> Vector:
+    """Return the means of the positive parts of lines from ``begin`` to ``end``."""
+    high, low = np.maximum(begin, end), np.minimum(begin, end)
+    crosses = (high > 0.0) & (low < 0.0)
+    triangle = 0.5 * high * high / np.where(crosses, high - low, 1.0)
+    return np.where(crosses, triangle, 0.5 * np.maximum(begin + end, 0.0))
 
 
 def score(
@@ -401,6 +453,7 @@ def score(
         if run.every == 1:
             found["control_variation"] = metrics.control_variation(run["u"])
             found["total_variation"] = metrics.total_variation(run["u"])
+            found["control_energy"] = metrics.control_energy(t, run["u"])
     return found
 
 

@@ -37,7 +37,7 @@ from quell.parallel import in_parallel, part_of
 from quell.plants.base import one_at_a_time, signals_of
 from quell.quantities import UNKNOWN, Conversion, Quantity, conversion
 from quell.records.gains import OneGain, gain_factor, one_gain, with_gain
-from quell.records.metrics import MEASURES, worsened
+from quell.records.metrics import MEASURES, OF_U, worsened
 from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.setup.axes import signals_in
 from quell.setup.description import is_of_axes
@@ -55,8 +55,6 @@ ALL_AXES = "all axes"
 """Name of the verdict on all axes together."""
 # Seeds by default: with ten, differences of a third of their spread are decided for two axes.
 SEEDS = 10
-# Measures of u, of an axis of several v.
-_OF_U = ("control_variation", "total_variation")
 # A smaller difference is called alike: no model is as exact. Chosen by hand.
 _ALIKE = 1e-3
 # A criterion is rounding up to this part of the largest |r| or |y| of its axis: loops at rest with
@@ -342,13 +340,13 @@ def over_seeds(
     largest = np.moveaxis(largest.reshape(shape[:4]), 0, -1)
     values = {name: np.moveaxis(table[..., k], 0, -1) for k, name in enumerate(MEASURES)}
     if fault:
-        values |= {name: np.full_like(values[name], math.nan) for name in _OF_U}
+        values |= {name: np.full_like(values[name], math.nan) for name in OF_U}
     names = tuple(controllers)
     rounding = _rounding(largest, diverged.T, spans, criterion)
     level = _level(confidence, names, axes, spans)
     verdicts = _verdicts(names, axes, spans, values[criterion], diverged.T, level, rounding)
     found = names, axes, spans, numbers, criterion, values, diverged.T
-    notes = [f"NOT compared: variation of u: {fault}"] if fault else gain.describe()
+    notes = [f"NOT compared: variation and ∫u² dt of u: {fault}"] if fault else gain.describe()
     return SeedComparison(*found, rounding, verdicts, notes=tuple(notes))
 
 

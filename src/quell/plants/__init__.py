@@ -5,7 +5,7 @@ May import ``lti``, ``kernels`` and what stands before them. A new machine needs
 """
 
 from quell.lazy import imported_on_use, public_names
-from quell.plants.base import Plant, PlantBatch, batch, labelled, signals_of
+from quell.plants.base import Flow, Plant, PlantBatch, batch, labelled, signals_of
 from quell.plants.channels import delayed_inputs, encoded_outputs
 from quell.plants.flexible import (
     CubicSpringPlant,
@@ -22,7 +22,7 @@ from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.testbeds import DcMotor, TorsionalPlant, dc_motor, torsional, torsional_identified
 
 __all__ = [
-    "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "LinearPlant", "NMassPlant",
+    "FMU", "Arm", "Craft", "CubicSpringPlant", "DcMotor", "Flow", "LinearPlant", "NMassPlant",
     "NonlinearPlant", "Plant", "PlantBatch", "TorsionalPlant", "arm", "batch", "dc_motor",
     "delayed", "delayed_inputs", "encoded", "encoded_outputs", "labelled", "lagged",
     "lagged_two_mass_spring", "linearised", "n_mass", "quadrotor_attitude", "rotor_levers",

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Protocol, TypeVar, overload
+from typing import Any, NamedTuple, Protocol, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,11 +201,25 @@ def is_destroyed(x: Vector, x0: Vector) -> bool:
 P = TypeVar("P")
 
 
+class Flow(NamedTuple):
+    """What the control signal moves: times u it is the power that u puts into the plant [W].
+
+    For a force [N] it is the speed of the point where it acts [m/s], for a torque [N m] that of its
+    shaft [rad/s], for a voltage [V] the current [A]: effort and flow of a bond graph (Karnopp,
+    Margolis & Rosenberg, *System Dynamics*, chapter 2).
+    """
+
+    state: tuple[float, ...]  #: weights of the states (n,)
+    direct: float = 0.0  #: weight of u itself, as of a current that follows the voltage at once
+    largest: float = math.inf  #: the largest ``|u|`` that acts; what is beyond is cut off [u-unit]
+
+
 def labelled(
     plant: P,
     y: str | Quantity = "",
     u: str | Quantity = "",
     w: str | Sequence[str | Quantity] = (),
+    flow: Flow | Sequence[float] | None = None,
 ) -> P:
     """Return a plant whose output, input and disturbances have names and units.
 
@@ -218,11 +233,16 @@ def labelled(
         name and unit of output and control signal: ``angle [rad]``; one of both may be left out.
     w
         name and unit of each disturbance.
+    flow
+        what u times gives power in W, for the energy in comparisons: weights of the states (n,),
+        which give the speed where a force or torque u acts, or a ``Flow``; by default what the
+        plant has.
 
     Raises
     ------
     ValueError
-        for a text that is not like ``name [unit]``, and more names than disturbances.
+        for a text that is not like ``name [unit]``, more names than disturbances, and another
+        number of weights than states.
 
     Examples
     --------
@@ -239,6 +259,10 @@ def labelled(
         raise ValueError(f"w has {len(signals.w)} names: the plant has {count} disturbances")
     made = copy.copy(plant)
     object.__setattr__(made, "signals", signals)
+    if flow is not None:
+        given = flow if isinstance(flow, Flow) else Flow(flow)  # type: ignore[arg-type]
+        weights = checks.vector("flow", given.state, plant.order)  # type: ignore[attr-defined]
+        object.__setattr__(made, "flow", given._replace(state=tuple(weights.tolist())))
     return made
 
 

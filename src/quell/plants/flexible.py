@@ -38,7 +38,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -46,7 +46,7 @@ from quell import checks
 from quell.checks import Described
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Size
-from quell.plants.base import advance, labelled, measure
+from quell.plants.base import Flow, advance, labelled, measure
 from quell.plants.linear import LinearModel, LinearPlant
 from quell.quantities import Signals
 from quell.types import Matrix, Vector
@@ -169,6 +169,11 @@ class NMassPlant:
         return self.linear.order
 
     @property
+    def flow(self) -> Flow:
+        """The speed of the driven inertia."""
+        return cast(Flow, getattr(self.linear, "flow"))  # noqa: B009  no field of a linear plant
+
+    @property
     def disturbances(self) -> int:
         """Number of disturbance inputs: torques on the loads."""
         return self.linear.disturbances
@@ -265,7 +270,7 @@ def n_mass(
         "angle [rad]", "torque [N m]", tuple(f"torque on inertia {i + 1} [N m]" for i in columns)
     )
     linear = LinearPlant(A, E[:, 0], np.eye(2 * n)[at], E[:, columns], name="chain of inertias")
-    linear = labelled(linear, *signals[:3])
+    linear = labelled(linear, *signals[:3], flow=np.eye(2 * n)[n].tolist())
     if not any(p):
         return linear
     return NMassPlant(linear, J, k, d, p, signals)
@@ -335,7 +340,8 @@ def two_mass_spring(
             "c1 = 0.0, c2 = 0.0: at least one must differ from zero, or nothing is measured"
         )
     C = [c1, c2, 0.0, 0.0]
-    return labelled(LinearPlant(A, E[:, 0], C, E, name="two-mass-spring"), *SIGNALS[:3])
+    plant = LinearPlant(A, E[:, 0], C, E, name="two-mass-spring")
+    return labelled(plant, *SIGNALS[:3], flow=[0.0, 0.0, 1.0, 0.0])
 
 
 # ---- Two masses, a spring that may harden or soften, and an actuator with lag ----

@@ -60,7 +60,7 @@ from quell import checks
 from quell.checks import Described
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Buffer
-from quell.plants.base import advance, labelled, measure
+from quell.plants.base import Flow, advance, labelled, measure
 from quell.plants.flexible import chain_matrices
 from quell.plants.linear import (
     DelayedPlantModel,
@@ -387,6 +387,7 @@ class DcMotor(Described):
     cogging: Vector  # T at equal steps of a revolution [N m]
     u_max: float  # largest voltage [V]
     counts: int | None
+    flow: Flow  # the current [A]
     name: str = "DC motor"
     compiled = True
     signals = _SIGNALS_DC_MOTOR
@@ -509,6 +510,8 @@ def dc_motor(
     else:
         A = [[0.0, 1.0, 0.0], [0.0, -c / J, k / J], [0.0, -k / L, -R / L]]
         B = [0.0, 0.0, 1.0 / L]
+    current = Flow((0.0, -k / R), 1.0 / R) if L is None else Flow((0.0, 0.0, 1.0))
+    most_u = checks.positive("voltage_limit", voltage_limit, "V")
     n = len(B)
     ends = np.eye(n)
     linear = LinearPlant(A, B, ends[0], ends[:, 1:2] / J, name="DC motor without friction")
@@ -519,8 +522,9 @@ def dc_motor(
         stiction=most,
         stribeck=checks.positive("stribeck_speed", stribeck_speed, "rad/s"),
         cogging=_table(cogging, cogging_map),
-        u_max=checks.positive("voltage_limit", voltage_limit, "V"),
+        u_max=most_u,
         counts=checks.optional(checks.whole, "counts", counts, 1),
+        flow=current._replace(largest=most_u),
     )
 
 

@@ -129,6 +129,16 @@ def total_variation(u: Vector, before: float = 0.0) -> float:
     return first + control_variation(u)
 
 
+def control_energy(t: Vector, u: Vector) -> float:
+    """Return ``∫ u² dt`` of a u that is held from each sample to the next [u-unit² s].
+
+    It is what LQ designs weigh, and the heat in a winding whose current is u; not the energy of a
+    drive in general, which depends on the speed, too (``quell.experiments.compare``).
+    """
+    t, u = _pair(t, u)
+    return float(np.sum(np.square(u[:-1]) * np.diff(t)))
+
+
 def _ending(y: Vector) -> int:
     """Return the number of samples at the end of a record over which rest is judged."""
     return max(round(_END * y.size), 1)
@@ -257,9 +267,12 @@ STEP_MEASURES = ("overshoot", "settling_time", "rise_time")
 """Measures that only a step has."""
 MEASURES = (
     *STEP_MEASURES,
-    *("peak_error", "rms", "iae", "ise", "itae", "control_variation", "total_variation"),
+    *("peak_error", "rms", "iae", "ise", "itae"),
+    *("control_variation", "total_variation", "control_energy"),
 )
 """All measures, in the order of ``Metrics``."""
+OF_U = MEASURES[-3:]
+"""Those of u alone."""
 
 _TOO_LARGE = "the number is too large for a float"
 
@@ -340,6 +353,9 @@ def measured(
         values["control_variation"] = control_variation(u)
     if "total_variation" in names:
         values["total_variation"] = total_variation(u, u_before)
+    if "control_energy" in names:
+        with np.errstate(over="ignore"):
+            values["control_energy"] = control_energy(t, u)
     unexplained = values.keys() - missing.keys()
     missing |= {name: _TOO_LARGE for name in unexplained if not math.isfinite(values[name])}
     return Metrics(values, missing, band)

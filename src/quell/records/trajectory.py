@@ -158,7 +158,8 @@ class Trajectory(Record, InNotebook):
         Metrics
             a dictionary with ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y,
             ``control_variation`` and ``total_variation`` of u, which also has the jump from the u
-            before the window (zero before the run); if the reference steps once in the window, and
+            before the window (zero before the run), and ``control_energy``, ∫u² dt with u held
+            between samples; if the reference steps once in the window, and
             from there on, or ``target`` is given, also ``overshoot`` (fraction of the step),
             ``settling_time`` and ``rise_time`` [s], NaN if y does not come to rest there. Its
             ``missing`` has the reason for each of these that does not exist. If the run diverged in
@@ -474,8 +475,8 @@ class BatchTrajectory(Record, InNotebook):
         BatchMetrics
             a dictionary of arrays (runs,): ``peak_error`` and ``rms`` [y-unit], ``iae`` [y-unit s],
             ``ise`` [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` and
-            ``total_variation`` [u-unit]; for a step ``overshoot`` (fraction of the step),
-            ``settling_time`` and ``rise_time`` [s]. Its ``missing[name]`` has the reason for each
+            ``total_variation`` [u-unit], ``control_energy`` [u-unit² s]; for a step ``overshoot``
+            (fraction of the step), ``settling_time`` and ``rise_time`` [s]. Its ``missing[name]`` has the reason for each
             run that does not have a measure.
 
         Raises

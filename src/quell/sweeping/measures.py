@@ -24,6 +24,7 @@ UNITS = {
     "itae": ("integral of t |r - y|", "y-unit s^2"),
     "control_variation": ("sum of the moves of u, without the first", "u-unit"),
     "total_variation": ("sum of the moves of u", "u-unit"),
+    "control_energy": ("integral of u^2", "u-unit^2 s"),
 }
 """Description and unit of each measure, in files."""
 
@@ -36,7 +37,7 @@ class Measure:
     ----------
     name
         ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae``, ``control_variation``,
-        ``total_variation``, ``overshoot``, ``settling_time`` or ``rise_time``.
+        ``total_variation``, ``control_energy``, ``overshoot``, ``settling_time`` or ``rise_time``.
     start, stop, target, band
         as those of ``Trajectory.metrics``.
     axis
