@@ -320,6 +320,16 @@ def with_one_gain(
     return {**runs, **several}, found
 
 
+def are_channels(
+    paths: Sequence[Path], columns: str, dt: float | None, max_size: float = MAX_SIZE
+) -> bool:
+    """Return whether two files have a channel each, as an oscilloscope's, of one record."""
+    from quell.identification.record_file import is_one_channel
+
+    asked = columns or dt is not None
+    return len(paths) == 2 and not asked and all(is_one_channel(path, max_size) for path in paths)
+
+
 def measured_records(
     paths: Sequence[Path],
     columns: str = "",
@@ -331,6 +341,8 @@ def measured_records(
 
     Sample times that differ by rounding or drift are replaced by their mean, by samples. Units that
     differ are converted to those of the first record that has some, and a ``UserWarning`` says so.
+    Two tables of times and one other column, without ``columns`` and ``dt``, are u and y of one
+    record.
 
     Raises
     ------
@@ -338,8 +350,12 @@ def measured_records(
         as ``measured``; and if there is no file, or two files have different sample times, or units
         that do not convert.
     """
+    from quell.identification import read_record
+
     if not paths:
         raise ValueError("data: missing; give a file of a record")
+    if are_channels(paths, columns, dt, max_size):
+        return [read_record(paths, time_unit=time_unit, max_size=max_size)]
     each = [measured(path, columns, dt, time_unit, max_size) for path in paths]
     again = [list(paths[:i]).count(path) for i, path in enumerate(paths)]
     names = [f"{path} ({k + 1})" if k else f"{path}" for path, k in zip(paths, again, strict=True)]

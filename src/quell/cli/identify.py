@@ -72,7 +72,8 @@ def identify(
     data
         Records: tables t,u,y in text, recordings of quell run-rig, saved runs (.nc). Several have
         one model, each its own initial state and constant force. A further column of --columns is
-        the external input of a closed loop.
+        the external input of a closed loop. Two files of times and one channel each, as an
+        oscilloscope writes them, are u and y.
     order
         Number of poles, 4 by default; of a table of frequencies the simplest that holds.
     delay
@@ -105,6 +106,8 @@ def identify(
         return
     records = measured_records(data, *how)
     record, several = records[0], len(records) > 1
+    if len(records) < len(data) and validate is not None:
+        raise ValueError("--validate: goes with files of u and y, not with one for each channel")
     unused = options_of(of_model, MODEL_OPTIONS)
     unused |= {"order": (order, None), "delay": (delay, None), "validate": (validate, None)}
     unused |= {"horizon": (horizon, 10), "no-alternatives": (alternatives, True)}

@@ -20,6 +20,7 @@ from quell.identification.record_layout import (
     UNITS,
     Layout,
     Stamps,
+    cells_of,
     counts_samples,
     found_in,
     has_decimal_comma,
@@ -87,7 +88,7 @@ _Row = tuple[int, list[str]]  # line number and cells
 
 
 def read_record(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     columns: Sequence[str] = ("t", "u", "y"),
     dt: float | None = None,
     *,
@@ -114,7 +115,9 @@ def read_record(
     Parameters
     ----------
     path
-        the file.
+        the file; or two files with a channel each, the one of u first, as oscilloscopes write them:
+        times and values in two columns, or beside a list of settings (Tektronix TDS), whose unit is
+        taken. Both must have the same times; there are neither ``columns`` nor ``dt`` then.
     columns
         columns of time, input and output, and optionally of the external signal of a closed loop:
         names if the file has them, or numbers from 1 on. With ``dt`` there is no time. Names may
@@ -134,6 +137,10 @@ def read_record(
         names line and column of a fault in the file, and what to do; and if the name of the column
         of times has another unit than s, and ``time_unit`` is not given.
     """
+    if not isinstance(path, str | os.PathLike):
+        if dt is not None or tuple(columns) != ROLES[:3]:
+            raise ValueError("columns, dt: two files of a channel each have none; leave them out")
+        return _read_channels(path, time_unit, max_size)
     if dt is not None:
         checks.positive("dt", dt, "s")
     if time_unit is not None:
@@ -145,7 +152,7 @@ def read_record(
     opened = open_table(path, columns, timed, max_size)
     where, layout = opened.where, opened.layout
     places = [
-        _place(where, layout, name, role)
+        _place(where, layout, name, role, timed)
         for role, name in enumerate(columns, start=0 if timed else 1)
     ]
     table, first, numbers, values = _numbers(opened, places, columns, timed)
@@ -166,6 +173,89 @@ def read_record(
         for role, place in zip(roles, places, strict=False)
     }
     return found._replace(signals=Signals(known["y"], known["u"]), r=known.get("r", Quantity()))
+
+
+# ---- Files of one channel each ----
+
+# Lines that begin with one of these have the unit of a channel, as Tektronix writes it.
+_UNIT_OF_CHANNEL = ("vertical units", "vertical unit")
+# Times of two channels of one acquisition differ by less than this share of a sample: by rounding.
+_SAME_TIMES = 0.1
+
+
+def is_one_channel(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> bool:
+    """Return whether a file is a table of times and of one other column of numbers."""
+    try:
+        layout = open_table(path, max_size=max_size).layout
+    except ValueError:
+        return False
+    return _has_one_channel(layout)
+
+
+def _has_one_channel(layout: Layout) -> bool:
+    names, places = layout.names, layout.numeric
+    if len(places) != 2:
+        return False
+    return names is None or places[0] in found_in(names, layout.units, ROLES[0], ROLES[0])
+
+
+class _Channel(NamedTuple):
+    """A channel of a file."""
+
+    where: str
+    t: Vector  # [s]
+    lines: Vector  # numbers of its lines in the file
+    values: Vector
+    known: Quantity  # name and unit
+
+
+def _read_channels(
+    paths: Sequence[str | os.PathLike[str]], time_unit: str | None, max_size: float
+) -> Measured:
+    """Return the record of two files, of u and of y."""
+    if not checks.is_sequence(paths) or len(paths) != 2:
+        raise ValueError(f"path = {paths!r:.60}: must be a file, or two, of u and of y")
+    u, y = (_channel(one, role, time_unit, max_size) for one, role in zip(paths, "uy", strict=True))
+    rule = "give two channels of one acquisition"
+    if u.t.size != y.t.size:
+        raise ValueError(f"{y.where}: has {y.t.size} samples, {u.where} {u.t.size}; {rule}")
+    apart = float(np.max(np.abs(y.t - u.t)))
+    if not apart <= _SAME_TIMES * abs(float(u.t[-1] - u.t[0])) / (u.t.size - 1):
+        fault = f"its times are up to {apart:.3g} s from those of {u.where}"
+        raise ValueError(f"{y.where}: {fault}; {rule}")
+    dt, values = on_even_grid(u.where, u.t, u.lines, np.column_stack((u.values, y.values)))
+    signals = Signals(y.known, u.known)
+    return Measured(values[:, 0].copy(), values[:, 1].copy(), dt, None, signals)
+
+
+def _channel(
+    path: str | os.PathLike[str], role: str, time_unit: str | None, max_size: float
+) -> _Channel:
+    """Return the channel of a file, for a role."""
+    opened = open_table(path, max_size=max_size)
+    where, layout = opened.where, opened.layout
+    if not _has_one_channel(layout):
+        raise ValueError(
+            f"{where}: must have times and one other column of numbers, and has "
+            f"{len(layout.numeric)} columns of numbers; give a table of t, u and y as one file"
+        )
+    time, place = layout.numeric
+    table, _, lines, values = _numbers(opened, layout.numeric, (ROLES[0], role), True)
+    name, known = "", Quantity("", _unit_of_channel(opened))
+    if layout.names is not None:
+        name = layout.names[time]
+        known = quantity_of(layout.names[place], layout.units[place], role)
+    t = _times(where, table, name, layout.units[time], values[:, 0], lines, time_unit)
+    return _Channel(where, t, lines, values[:, 1], known)
+
+
+def _unit_of_channel(opened: OpenTable) -> str:
+    """Return the unit that a line of the file's settings has for its channel; empty without one."""
+    for line in opened.head:
+        title, unit, *_ = (*cells_of(line.strip(), opened.layout.separator), "", "")
+        if title.strip().lower() in _UNIT_OF_CHANNEL:
+            return unit.strip()
+    return ""
 
 
 class OpenTable(NamedTuple):
@@ -330,7 +420,7 @@ def _times(
         return np.asarray(t * UNITS[unit or "s"])
 
 
-def _place(where: str, layout: Layout, name: str, role: int) -> int:
+def _place(where: str, layout: Layout, name: str, role: int, timed: bool) -> int:
     """Return the index of a column; in a file without names the first are time, input, output."""
     names, width = layout.names, layout.width
     found = [] if names is None else found_in(names, layout.units, name, ROLES[role])
@@ -348,14 +438,17 @@ def _place(where: str, layout: Layout, name: str, role: int) -> int:
             raise ValueError(f"{where}: column {name} is missing; {rule}")
         return int(name) - 1
     if names is None and name == ROLES[role]:
-        place = role - (role > 0 and width < 3)
-        if place < width:
+        place = role - (not timed and width < 3)
+        if place < width and (place in layout.numeric or not _has_one_channel(layout)):
             return place
     has = f"no line names columns, there are {width}"
     if names is not None:
         line = "the first line" if layout.named_at == 1 else f"line {layout.named_at}"
         has = f"{line} names {listed(names)}"
     remedy = "say which with --columns"
+    if name == ROLES[role] and _has_one_channel(layout):
+        rule = "there are times and one channel; give two such files to quell identify, u first"
+        raise ValueError(f"{where}: column {name} is missing; {rule}")
     if role == 0 and name == ROLES[0]:
         remedy += ", or give the sample time in its place (--dt)"
     raise ValueError(f"{where}: column {name} is missing; {has}; {remedy}")

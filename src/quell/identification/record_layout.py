@@ -342,6 +342,7 @@ class Layout(NamedTuple):
     units: list[str]  #: of each column, from a line below the names; empty ones without it
     width: int  #: number of columns
     before: int  #: lines in front of the first line of numbers
+    numeric: list[int]  #: columns that have numbers
 
 
 class _Line(NamedTuple):
@@ -384,7 +385,7 @@ def layout_of(where: str, head: Sequence[str], columns: Sequence[str], timed: bo
             if sum(map(is_value, row)) < 2 or not all(is_value(c) or is_missing(c) for c in row):
                 break
             start = line.at
-        return Layout(separator, None, 0, [""] * width, width, start)
+        return Layout(separator, None, 0, [""] * width, width, start, numeric)
     at, names = named
     width = len(names)
     units = [""] * width
@@ -396,7 +397,7 @@ def layout_of(where: str, head: Sequence[str], columns: Sequence[str], timed: bo
                 break
             if not any(units) and any(c.isalpha() for c in "".join(row)):
                 units = [*row, ""][:width]
-    return Layout(separator, names, at + 1, units, width, start)
+    return Layout(separator, names, at + 1, units, width, start, numeric)
 
 
 def cells_of(line: str, separator: str | None) -> list[str]:

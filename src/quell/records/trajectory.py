@@ -476,8 +476,8 @@ class BatchTrajectory(Record, InNotebook):
             a dictionary of arrays (runs,): ``peak_error`` and ``rms`` [y-unit], ``iae`` [y-unit s],
             ``ise`` [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` and
             ``total_variation`` [u-unit], ``control_energy`` [u-unit² s]; for a step ``overshoot``
-            (fraction of the step), ``settling_time`` and ``rise_time`` [s]. Its ``missing[name]`` has the reason for each
-            run that does not have a measure.
+            (fraction of the step), ``settling_time`` and ``rise_time`` [s]. Its ``missing[name]``
+            has the reason for each run that does not have a measure.
 
         Raises
         ------
