@@ -78,3 +78,23 @@ def test_a_batch_a_model_and_a_tuning_are_texts_and_figures() -> None:
         assert len(repr(each)) < 3000
     assert len(repr(batch)) < 300
     assert plt.get_fignums() == before
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        ql.learners.Kalman(),
+        ql.learners.Harmonic(count=2, u=True),
+        ql.learners.Repetitive(period=0.5),
+        ql.learners.BatchGradient(),
+        ql.Guard(bound=2.0),
+        ql.Scenario(reference=ql.signals.Step(at=1.0), duration=3.0, seed=2),
+    ],
+    ids=lambda made: type(made).__name__,
+)
+def test_what_a_loop_is_made_of_prints_as_a_short_call(made: Any) -> None:
+    """Only what differs from the defaults; the text makes the same object again."""
+    names: dict[str, Any] = {"Guard": ql.Guard, "Scenario": ql.Scenario, "Step": ql.signals.Step}
+    names |= {name: getattr(ql.learners, name) for name in ql.learners.__all__}
+    assert len(repr(made)) < 80
+    assert eval(repr(made), names) == made

@@ -64,6 +64,7 @@ OF_CONTROLLERS = {
     "export": "quell.export.c(controller, folder)",
     **dict.fromkeys(("margins", "bode"), "quell.analysis.analyse(plant, controller)"),
 }
+# Where there are several, the first that the call has.
 OF_ARGUMENTS = {
     **dict.fromkeys(("wo", "omegaobserver", "observerbandwidth", "ωo"), "omega_o"),
     **dict.fromkeys(("wc", "omegacontroller", "controllerbandwidth", "bandwidth"), "omega_c"),
@@ -72,9 +73,13 @@ OF_ARGUMENTS = {
     **dict.fromkeys(("umax", "max", "upper", "limit"), "u_max"),
     **dict.fromkeys(("umin", "min", "lower"), "u_min"),
     **dict.fromkeys(("limits", "saturation", "sat"), "u_min, u_max"),
-    **dict.fromkeys(("ref", "r", "setpoint", "target", "sp"), "reference"),
+    **dict.fromkeys(("ref", "setpoint", "target", "sp"), "reference"),
+    "r": "reference|resistance",
+    **dict.fromkeys(("freq", "frequency", "f", "hz"), "omega"),
+    **dict.fromkeys(("j", "mass"), "inertia|inertias"),
+    **dict.fromkeys(("amp", "size"), "amplitude|height"),
     **dict.fromkeys(("disturbance", "load", "loads", "w", "d"), "disturbances"),
-    **dict.fromkeys(("t", "tend", "tfinal", "time", "seconds", "stoptime"), "duration"),
+    **dict.fromkeys(("t", "tend", "tfinal", "time", "seconds", "stoptime"), "duration|at"),
     **dict.fromkeys(("n", "degree"), "order"),
     **dict.fromkeys(("model", "sys", "system", "process", "g"), "plant"),
 }
@@ -165,6 +170,17 @@ def explained(example: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return decorate
 
 
+def _meant(name: str, parameters: Iterable[str]) -> str:
+    """Return the arguments that stand for one that does not exist; empty if none is known."""
+    known = {plain(each): each for each in parameters}
+    if plain(name) in known:
+        return known[plain(name)]
+    for near in OF_ARGUMENTS.get(plain(name), "").split("|"):
+        if near and all(each in known.values() for each in near.split(", ")):
+            return near
+    return _nearest(name, known.values())
+
+
 def _said(function: Callable[..., Any], arguments: Any, named: Mapping[str, Any]) -> str:
     """Return what is wrong with the arguments of a call."""
     import inspect  # only where there is an error
@@ -175,9 +191,7 @@ def _said(function: Callable[..., Any], arguments: Any, named: Mapping[str, Any]
     title = function.__qualname__.removesuffix(".__init__")
     for name in named:
         if name not in parameters:
-            near = OF_ARGUMENTS.get(plain(name), "")
-            if not all(each in parameters for each in near.split(", ")):
-                near = _nearest(name, parameters)
+            near = _meant(name, parameters)
             more = f", did you mean {near}?" if near else f"; it takes {', '.join(parameters)}"
             return f"{title}: {name} is no argument{more}"
     by_place = [

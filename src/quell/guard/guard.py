@@ -30,6 +30,7 @@ import numpy as np
 
 import quell.guard.kernels  # noqa: F401  (registers the functions for ``GuardDesign``)
 from quell import checks
+from quell.checks import Described
 from quell.guard.kernels import (
     PARTS,
     SETTLING_LAGS,
@@ -42,6 +43,7 @@ from quell.guard.kernels import (
     GuardTrial,
     withdraw_authority,
 )
+from quell.hints import explained
 from quell.learners.base import lag_memory, lag_of
 from quell.lti.models import System, peak_gain
 from quell.observers.design import f_learned_response, response, scaled_response
@@ -307,8 +309,9 @@ _TAKING_BACK_LAGS = 10.0  # for at most so long: then one without authority move
 _ACCOUNTS, _MOST_EVERY = 8.0, 16
 
 
-@dataclass(frozen=True)
-class Guard:
+@explained("quell.Guard()")
+@dataclass(frozen=True, repr=False)
+class Guard(Described):
     """Limits a learner to the authority that it has earned: ``ADRC(…, learner=…, guard=Guard())``.
 
     ``kernels.py`` has the equations. They do not depend on the units of y and u. The observer must

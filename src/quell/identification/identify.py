@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.hints import explained
 from quell.identification.delays import delayed
 from quell.identification.frequency_starts import resonant_poles
 from quell.identification.given_records import (
@@ -78,6 +79,7 @@ _HALF = 30.0
 _SAMPLES_PER_PARAMETER = 10
 
 
+@explained("quell.identify(u, y, dt=1e-3)")
 def identify(
     u: Any,
     y: Any,

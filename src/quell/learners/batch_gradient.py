@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.checks import Described
 from quell.features import Features
 from quell.features.base import (
     Indices,
@@ -353,8 +354,8 @@ def _coefficients_batch_gradient(learner: BatchDesign, memory: Buffers, theta: V
         theta[i] = memory.theta[i]
 
 
-@dataclass(frozen=True)
-class BatchGradient:
+@dataclass(frozen=True, repr=False)
+class BatchGradient(Described):
     """Algorithm 1 of the paper, with the features ``(x̂_1 … x̂_n, u, 1)`` and θ from zero.
 
     It is included for comparison. As printed it is fragile: it is stable in a small range of rates,

@@ -51,6 +51,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.checks import Described
+from quell.hints import explained
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.single import add_symmetrically
@@ -403,8 +405,9 @@ def _meaning(learner: KalmanDesign) -> Any:
 # ---- The learner Kalman ----
 
 
-@dataclass(frozen=True)
-class Kalman:
+@explained("quell.learners.Kalman()")
+@dataclass(frozen=True, repr=False)
+class Kalman(Described):
     """A linear learner that compensates the observer's lag: ``f_L = θ · (x̂_1 … x̂_n, 1, u)``.
 
     It does not depend on the units of y and u. The docstring of this module has the equations.
@@ -578,7 +581,7 @@ _PAIR_BANDWIDTH = 2.5
 _MOST_PAIRS, _HIGHEST_ORDER = 16, 1000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Harmonic(Kalman):
     """A ``Kalman`` learner with sinusoids of unknown frequency.
 

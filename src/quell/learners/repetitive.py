@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.checks import Described
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single
 from quell.kernels.sized import Buffer, Scalars, clear
@@ -229,8 +230,8 @@ _SETTLING_LAGS = 8.0
 _SHARE = 0.25
 
 
-@dataclass(frozen=True)
-class Repetitive:
+@dataclass(frozen=True, repr=False)
+class Repetitive(Described):
     """A table of f over the phase of a cycle, learned from repetition to repetition.
 
     It suits moves that are repeated (``signals.Repeated``), and loads of any shape that repeat with

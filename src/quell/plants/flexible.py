@@ -44,6 +44,7 @@ import numpy as np
 
 from quell import checks
 from quell.checks import Described
+from quell.hints import explained
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Size
 from quell.plants.base import Flow, advance, labelled, measure
@@ -204,6 +205,7 @@ class NMassPlant:
         )
 
 
+@explained("quell.plants.n_mass([3e-4, 9e-4], [180.0])")
 def n_mass(
     inertias: Sequence[float],
     stiffnesses: Sequence[float],

@@ -503,6 +503,7 @@ class DelayedPlant(PlantWrapper):
         return DelayedPlantModel(self.plant.sampled(dt, interpret), self.plant.order)
 
 
+@explained("quell.plants.delayed(plant, 0.01, dt=1e-3)")
 def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     """Return a plant that u reaches ``delay`` seconds late.
 

@@ -58,6 +58,7 @@ import numpy as np
 
 from quell import checks
 from quell.checks import Described
+from quell.hints import explained
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Buffer
 from quell.plants.base import Flow, advance, labelled, measure
@@ -428,6 +429,7 @@ class DcMotor(Described):
         return model if self.counts is None else EncodedPlantModel(model, self.resolution)
 
 
+@explained("quell.plants.dc_motor(resistance=0.5, inertia=2e-4)")
 def dc_motor(
     resistance: float = 0.5,
     inductance: float | None = None,

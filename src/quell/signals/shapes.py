@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.hints import explained
 from quell.types import Vector, warn
 
 # ---- The base class of signals, and how signals are combined ----
@@ -217,6 +218,7 @@ def check_finite_fields(signal: Signal, *names: str) -> None:
 # ---- Signals of a given shape ----
 
 
+@explained("quell.signals.Step(height=1.0, at=0.5)")
 @dataclass(frozen=True)
 class Step(Signal):
     """Zero before ``at`` [s], ``height`` from it on."""
@@ -258,6 +260,7 @@ class Ramp(Signal):
         return rising if math.isinf(self.stop) else rising - Step(self.slope, self.stop)
 
 
+@explained("quell.signals.Sinusoid(amplitude=1.0, omega=6.28)")
 @dataclass(frozen=True)
 class Sinusoid(Signal):
     """``amplitude · sin(omega (t − start) + phase)``, zero before ``start`` [s].

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
+from quell.checks import Described
 from quell.controllers.base import (
     Controller,
 )
@@ -33,8 +34,8 @@ from quell.types import Matrix, Vector, warn
 
 
 @explained("quell.Scenario(reference=1.0, duration=10.0, disturbances=(load,))")
-@dataclass(frozen=True)
-class Scenario:
+@dataclass(frozen=True, repr=False)
+class Scenario(Described):
     """Signals, duration and initial state of a run.
 
     Parameters

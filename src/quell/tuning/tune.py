@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse_axis
 from quell.controllers.feedforward import Feedforward, checked_feedforward
-from quell.hints import explained
+from quell.hints import explained, plain
 from quell.lti.canonical import canonical
 from quell.parallel import one_blas_thread
 from quell.plants.base import signals_of
@@ -332,11 +333,14 @@ def tune(
     _check_names(structure, compare)
     for name, value in limits.items():
         if name not in _LIMITS:
-            if name.lower() in Constraints.__dataclass_fields__:
-                bound = f"constraints=quell.tuning.Constraints({name.lower()}={value!r})"
+            bounds = {plain(field): field for field in Constraints.__dataclass_fields__}
+            if field := bounds.get(plain(name)):
+                bound = f"constraints=quell.tuning.Constraints({field}={value!r})"
                 raise ValueError(f"{name} = {value!r}: is a bound of the loop; give {bound}")
             known = [*inspect.signature(tune).parameters][:-1] + list(_LIMITS)
-            raise ValueError(f"{name}: tune has no such argument, {checks.nearest(name, known)}")
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f", did you mean {near[0]}?" if near else "; help(quell.tune) has all"
+            raise ValueError(f"{name}: tune has no such argument{hint}")
     if not 0.0 < checks.finite("quantile", quantile) <= 1.0:
         raise ValueError(f"quantile = {quantile!r}: must be above 0 and at most 1, the worst case")
     report = progress or (lambda part, share: None)

@@ -80,12 +80,14 @@ from quell import checks
 from quell.controllers.adrc import ADRC
 from quell.controllers.base import RateLimit
 from quell.controllers.linear import LinearController, realised, sampled_law
+from quell.hints import explained
 from quell.learners.base import NoLearner
 from quell.observers.eso import ESO
 
 # ---- The filtered PID controller of two degrees of freedom ----
 
 
+@explained("quell.baselines.PID(kp=2.0, ki=1.0, dt=1e-3)")
 class PID(LinearController):
     """A filtered PID controller of two degrees of freedom, sampled by Tustin's rule.
 

@@ -69,6 +69,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.linear import LinearController, LinearLaw
+from quell.hints import explained
 from quell.lti.models import gramian, leading_gain, zero_order_hold
 from quell.plants import two_mass_spring
 from quell.plants.linear import LinearPlant
@@ -166,6 +167,7 @@ def feedback_law(model: SampledModel, L: Vector, K: Vector, N: float) -> LinearL
 # ---- LQG ----
 
 
+@explained("quell.baselines.LQG(plant, omega_c=3.0, omega_o=20.0, dt=1e-3)")
 class LQG(LinearController):
     """Linear-quadratic state feedback with a Kalman filter and a disturbance state.
 
