@@ -333,8 +333,8 @@ def tune(
     _check_names(structure, compare)
     for name, value in limits.items():
         if name not in _LIMITS:
-            bounds = {plain(field): field for field in Constraints.__dataclass_fields__}
-            if field := bounds.get(plain(name)):
+            fields = {plain(each): each for each in Constraints.__dataclass_fields__}
+            if field := fields.get(plain(name)):
                 bound = f"constraints=quell.tuning.Constraints({field}={value!r})"
                 raise ValueError(f"{name} = {value!r}: is a bound of the loop; give {bound}")
             known = [*inspect.signature(tune).parameters][:-1] + list(_LIMITS)
