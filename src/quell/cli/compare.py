@@ -388,14 +388,18 @@ def _print_means(console: Console, found: SeedComparison, window: int) -> None:
     """Print the mean of each measure that any axis and setup has."""
     from math import isfinite
 
+    parts = [
+        (f"{axis} {name}".strip(), name, i)
+        for i, axis in enumerate(found.axes)
+        for name in found.names
+    ]
     means = {
-        f"{axis} {name}".strip(): {
+        label: {
             each.key: value
             for each in COLUMNS
             if isfinite(value := found.mean(each.key, name, window, i)[0])
         }
-        for i, axis in enumerate(found.axes)
-        for name in found.names
+        for label, name, i in parts
     }
     columns = [each for each in COLUMNS if any(each.key in row for row in means.values())]
     headings = [column.heading for column in columns]
@@ -403,6 +407,10 @@ def _print_means(console: Console, found: SeedComparison, window: int) -> None:
     for label, row in means.items():
         rows.add_row(escape(label), *(column.cell(row) for column in columns))
     console.print(rows)
+    energy = {label: found.mean("control_energy", name, window, i)[0] for label, name, i in parts}
+    if known := {label: each for label, each in energy.items() if isfinite(each)}:
+        said = ", ".join(f"{label} {each:.4g}" for label, each in known.items())
+        print_line(console, f"∫u² dt, means: {said}")
     if any(len(row) < len(columns) for row in means.values()):
         print_line(console, "–: not in all runs: no step, not settled, or diverged.")
     if len(found.axes) > 1:

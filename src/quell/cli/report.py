@@ -29,13 +29,11 @@ COLUMNS = (
     Column("rms", "RMS of\nr − y", 1.0, ".4g"),
     Column("control_variation", "variation\nof u", 1.0, ".4g"),
     Column("total_variation", "with first\njump", 1.0, ".4g"),
-    Column("control_energy", "∫u² dt", 1.0, ".4g"),
 )
 # Units of columns that depend on those of y and u.
 _UNITS = {
     **dict.fromkeys(("peak_error", "rms"), "y-unit"),
     **dict.fromkeys(("control_variation", "total_variation"), "u-unit"),
-    "control_energy": "u-unit² s",
 }
 
 
