@@ -29,6 +29,8 @@ class Board(NamedTuple):
     flags: tuple[str, ...]
 
 
+STM32 = Board("netduinoplus2", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16"))
+"""A Netduino Plus 2: the STM32F405 of ``stm32/board.c``, with its timers and its serial line."""
 BOARDS = {
     "Cortex-M4F": Board("mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16")),
     "Cortex-M7": Board("mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-d16")),
@@ -43,6 +45,7 @@ FLAGS = (
 # newlib's semihosting, kept by -u: the emulator prints and takes the result of main.
 LINK = (
     *("-nostartfiles", "--specs=rdimon.specs", "-T", str(HERE / "target.ld")),
+    *("-L", str(HERE)),
     "-Wl,--gc-sections,-u,exit,-u,initialise_monitor_handles",
 )
 
@@ -57,6 +60,21 @@ def build(board: Board, program: Path, sources: Sequence[Path], *flags: str) -> 
     parts = ["-I", str(HERE), str(HERE / "startup.c"), *map(str, sources), "-lm"]
     command = [COMPILER, *board.flags, *FLAGS, *LINK, *flags, *parts, "-o", str(program)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)}:\n{done.stderr}")
+
+
+def build_stm32(program: Path, firmware: Path, sources: Sequence[Path], *flags: str) -> None:
+    """Compile and link ``stm32/board.c`` with a controller in ``firmware``, as its page does.
+
+    It has nothing of the emulator: semihosting neither, so that it runs without a debugger.
+    """
+    parts = [HERE / "startup.c", HERE / "stm32" / "board.c", HERE / "motor.c"]
+    parts += [firmware / "src" / "axis.c", *sources]
+    folders = (f"-I{HERE}", f"-I{firmware / 'src'}", f"-L{HERE}", f"-T{HERE}/stm32/stm32f405.ld")
+    link = ("-nostartfiles", "--specs=nosys.specs", "-Wl,--gc-sections")
+    command = [COMPILER, *STM32.flags, *FLAGS, *link, *folders, *flags, *map(str, parts), "-lm"]
+    done = subprocess.run([*command, "-o", str(program)], capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)}:\n{done.stderr}")
 
@@ -90,6 +108,13 @@ def run(board: Board, program: Path, *options: str, timeout: float = 60.0) -> tu
     command = emulated(board, program, "-serial", "none", *options)
     done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
     return done.returncode, done.stdout + done.stderr
+
+
+def run_stm32(program: Path, timeout: float = 60.0) -> tuple[int, str]:
+    """Run a program for the STM32 until it exits; return its exit code and its serial line."""
+    command = emulated(STM32, program, "-serial", "stdio")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+    return done.returncode, done.stdout
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 /* Start of a Cortex-M4F or M7 without vendor code: vector table, memory, floating-point unit.
  *
  * target.ld gives the memory. A board of your own needs its addresses there, its clocks before
- * main(), and the interrupts that it uses in the table below.
+ * main(), and the interrupts that it uses in the table below, or in one of its own (stm32/board.c).
  */
 #include <stdint.h>
 

@@ -353,7 +353,7 @@ def compare(
         ``control_variation`` and ``total_variation`` over the whole run [u-unit], of which the
         latter has the first jump of u from zero, and ``control_energy``, ∫u² dt [u-unit² s]. A
         plant that has a ``Flow`` also gives ``energy``, what u puts into it without what it takes
-        back, ∫max(P, 0) dt [J], and ``peak_power``, max |P| [W], of the power P = u · flow;
+        back, ∫max(P, 0) dt [J], and ``peak_power``, the largest ``|P|`` [W], of P = u · flow;
         for others ``no_power`` of the result says why they are None.
 
     Examples
