@@ -170,3 +170,51 @@ class Driven:
     def free(self) -> None:
         """Free the instance."""
         self.fmu.fmi3FreeInstance(self.fmu.component)
+
+
+class DrivenOlder(Driven):
+    """The same of an FMU of FMI 2.0."""
+
+    def __init__(self, path: Path, folder: Path) -> None:
+        import fmpy
+        from fmpy.fmi2 import FMU2Slave
+
+        self.description = fmpy.read_model_description(str(path))
+        self.references = {v.name: v.valueReference for v in self.description.modelVariables}
+        self.fmu = FMU2Slave(
+            guid=self.description.guid,
+            unzipDirectory=fmpy.extract(str(path), str(folder)),
+            modelIdentifier=self.description.coSimulation.modelIdentifier,
+            instanceName="driven",
+        )
+        self.instantiate()
+
+    def instantiate(self) -> None:
+        """Make the instance, which has not begun its initialisation."""
+        self.fmu.instantiate()
+        self.time = 0.0
+
+    def begin(self, **start: float) -> Driven:
+        """Set start values and go through the initialisation."""
+        self.set(start)
+        self.fmu.setupExperiment(startTime=0.0)
+        self.fmu.enterInitializationMode()
+        self.fmu.exitInitializationMode()
+        return self
+
+    def set(self, values: Mapping[str, float]) -> None:
+        """Set variables by name."""
+        for name, value in values.items():
+            write = self.fmu.setBoolean if name == "held" else self.fmu.setReal
+            write([self.references[name]], [int(value) if name == "held" else value])
+
+    def get(self, name: str) -> float:
+        """Return a variable."""
+        whole = name in ("status", "reason")
+        read = self.fmu.getInteger if whole else self.fmu.getReal
+        read = self.fmu.getBoolean if name == "held" else read
+        return float(read([self.references[name]])[0])
+
+    def free(self) -> None:
+        """Free the instance."""
+        self.fmu.fmi2FreeInstance(self.fmu.component)

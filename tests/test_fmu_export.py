@@ -28,8 +28,9 @@ from quell.kernels.dispatch import as_python
 from quell.simulation.scenario import SampledScenario
 
 from .cases import cases
+from .commands import Shown
 from .contracts.test_controllers import SEVERAL
-from .fmus import Driven
+from .fmus import Driven, DrivenOlder
 from .in_c import STRICT, needs_gcc
 
 pytest.importorskip("fmpy", reason="FMPy, which checks and runs FMUs, is missing")
@@ -133,6 +134,103 @@ def test_fmpy_finds_no_fault(name: str, files: dict[str, Path]) -> None:
     from fmpy.validation import validate_fmu
 
     assert validate_fmu(str(files[name])) == []
+
+
+OLDER = {"servo": plain, "loop": lambda: (MASS, learning())}
+
+
+@pytest.fixture(scope="module")
+def older(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The FMUs of FMI 2.0 that the tests share."""
+    folder = tmp_path_factory.mktemp("older")
+    for name, part in OLDER.items():
+        x0 = X0 if name == "loop" else None
+        fmu(part(), folder / f"{name}.fmu", x0=x0, version="2.0")
+    return {name: folder / f"{name}.fmu" for name in OLDER}
+
+
+@pytest.mark.trial
+@pytest.mark.parametrize("name", OLDER)
+def test_fmi_2_has_the_bits_of_fmi_3(
+    name: str, files: dict[str, Path], older: dict[str, Path], tmp_path: Path
+) -> None:
+    """FMPy finds no fault in it; outputs, estimates and status of 200 samples are equal, through a state that is kept as bytes."""
+    from fmpy.validation import validate_fmu
+
+    assert validate_fmu(str(older[name])) == []
+    new, old = Driven(files[name], tmp_path / "new"), DrivenOlder(older[name], tmp_path / "old")
+    assert new.references == old.references
+    both = [each.begin(r=0.5) for each in (new, old)]
+    outputs = [each.name for each in new.description.modelVariables if each.causality == "output"]
+    assert {"u", "status", "f_hat"} <= {*outputs}
+
+    def sampled(k: int) -> dict[str, float]:
+        values = {"r": np.sin(0.03 * k)}
+        values |= {"y": np.sin(0.03 * k - 0.2)} if name == "servo" else {"w[1]": 0.3, "noise": 1e-3}
+        return values | ({"u_max": 2.0} if k == 60 else {})
+
+    for k in range(100):
+        for each in both:
+            each.advance(DT, sampled(k))
+        assert [new.get(one) for one in outputs] == [old.get(one) for one in outputs]
+    state = old.fmu.getFMUState()
+    kept = old.fmu.serializeFMUState(state)
+    later = []
+    for again in range(2):
+        if again:
+            old.fmu.setFMUState(old.fmu.deSerializeFMUstate(kept))
+            old.time = 100 * DT
+        for k in range(100, 200):
+            old.advance(DT, sampled(k))
+        later.append([old.get(one) for one in outputs])
+    assert later[0] == later[1]
+    old.fmu.freeFMUState(state)
+    for each in both:
+        each.free()
+
+
+@pytest.mark.trial
+def test_fmi_2_refuses_what_it_does_not_have(older: dict[str, Path], tmp_path: Path) -> None:
+    """A parameter that is fixed, a step from elsewhere, model exchange; another version is a ValueError."""
+    running = DrivenOlder(older["loop"], tmp_path / "loop").begin()
+    for wrong in (
+        lambda: running.set({"x0[1]": 1.0}),
+        lambda: running.fmu.doStep(5.0, DT),
+        lambda: running.fmu.getString([0]),
+    ):
+        with pytest.raises(Exception, match="fmi2Error|status 3"):
+            wrong()
+    running.free()
+    with pytest.raises(ValueError, match="version = '1.0': must be one of 3.0, 2.0"):
+        fmu(plain(), tmp_path / "servo.fmu", version="1.0")
+
+
+def test_the_version_is_an_option_of_the_command(
+    tmp_path: Path, quell: Callable[..., Shown]
+) -> None:
+    """Of an FMU alone."""
+    setup = tmp_path / "loop.toml"
+    setup.write_text(
+        "dt = 0.01\nobserver = { kind = 'model-free', order = 2, b0 = 1.0, omega_o = 20.0 }\n"
+        "controller = { kind = 'adrc', omega_c = 3.0 }\n"
+    )
+    path = tmp_path / "loop.fmu"
+    assert quell("export", str(setup), "--to", "fmu", "--fmi", "2.0", "--out", str(path)).code == 0
+    with zipfile.ZipFile(path) as archive:
+        assert b'fmiVersion="2.0"' in archive.read("modelDescription.xml")
+    wrong = quell("export", str(setup), "--fmi", "2.0", "--out", str(tmp_path / "c"))
+    assert wrong.code == 2
+    assert "is for --to fmu" in wrong.err
+
+
+@pytest.mark.trial
+def test_a_plant_of_fmi_2_is_a_plant_again(tmp_path: Path) -> None:
+    """Imported, it is simulated as the plant itself."""
+    fmu(MASS, tmp_path / "mass.fmu", dt=DT, version="2.0")
+    again = ql.plants.FMU(tmp_path / "mass.fmu", w=["w[1]", "w[2]"])
+    scenario = ql.Scenario(1.0, 0.5, disturbances=(0.1, 0.2))
+    runs = [ql.simulate(plant, plain(), scenario, interpret=True) for plant in (MASS, again)]
+    np.testing.assert_array_equal(runs[0]["u"], runs[1]["u"])
 
 
 @pytest.mark.trial
@@ -521,17 +619,19 @@ def test_a_plant_with_several_signals_is_refused_with_a_reason(plant: Any, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["servo", "learner", "mass", "loop"])
+@pytest.mark.parametrize("name", ["servo", "learner", "mass", "loop", "of FMI 2.0"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_the_sources_compile_without_a_warning(
-    compiler: str, name: str, files: dict[str, Path], tmp_path: Path
+    compiler: str, name: str, files: dict[str, Path], older: dict[str, Path], tmp_path: Path
 ) -> None:
-    """Those that the FMU contains, with the strictest options."""
+    """Those that the FMU contains, with the strictest options; in FMI 2.0 fmi3.c is a part of fmi2.c."""
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is missing")
-    with zipfile.ZipFile(files[name]) as archive:
+    with zipfile.ZipFile(older["servo"] if name == "of FMI 2.0" else files[name]) as archive:
         archive.extractall(tmp_path)
     units = sorted(each.name for each in (tmp_path / "sources").glob("*.c"))
+    if name == "of FMI 2.0":
+        units.remove("fmi3.c")
     subprocess.run(
         [compiler, *STRICT, "-fsyntax-only", *units], cwd=tmp_path / "sources", check=True
     )

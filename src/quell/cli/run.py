@@ -388,6 +388,7 @@ def export(
     name: str | None = None,
     precision: Literal["double", "single"] = "double",
     what: Literal["controller", "plant", "loop"] = "controller",
+    fmi: Literal["3.0", "2.0"] = "3.0",
     resolution: float | None = None,
     memory: Path | None = None,
     accept: Switch = False,
@@ -407,8 +408,8 @@ def export(
     setup
         The file, in TOML; docs/setup_keys has all keys.
     to
-        c; fmu, which is an FMU of FMI 3.0 for co-simulation; ros2, a package with a chainable
-        controller of ros2_control; or st, a function block in Structured Text for a PLC.
+        c; fmu, which is an FMU for co-simulation; ros2, a package with a chainable controller of
+        ros2_control; or st, a function block in Structured Text for a PLC.
     out
         The folder, or the file .fmu.
     name
@@ -417,6 +418,8 @@ def export(
         Of the code: double, or single for a processor that has no double precision.
     what
         Of an FMU: controller, plant or loop.
+    fmi
+        Of an FMU: the version of FMI; 2.0 for tools that do not read 3.0.
     resolution
         Of an encoder [y-unit per count]: adds NAME_step_counts to the C code, which takes r and y
         as integers.
@@ -448,12 +451,13 @@ def export(
         refuse({"accept": (accept, False)}, "goes with --precision single, which it accepts")
     if to != "fmu":
         refuse({"what": (what, "controller")}, f"is for --to fmu; {to} is of the controller")
+        refuse({"fmi": (fmi, "3.0")}, "is for --to fmu")
     if what == "plant":
         refuse({"memory": (memory, None)}, "is of a controller; a plant has none")
     given = made(*read(setup), trust)
     controller = _learned(given.controller, memory, precision)
     if to == "fmu":
-        _to_fmu(given, what, out, name or "", overwrite)
+        _to_fmu(given, what, out, name or "", fmi, overwrite)
         return
     if to == "ros2":
         _to_ros2(controller, given.title, out, name or "controller", overwrite)
@@ -509,7 +513,7 @@ def _learned(controller: Any, memory: Path | None, precision: str) -> Any:
     return controller
 
 
-def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> None:
+def _to_fmu(given: Setup, what: str, out: Path, name: str, fmi: str, overwrite: bool) -> None:
     from quell.export import fmu
 
     controller, dt = given.controller, given.controller.dt
@@ -518,7 +522,7 @@ def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> N
         part = part, controller
     scenario = given.scenario
     x0 = None if what == "controller" or scenario is None else scenario.x0
-    fmu(part, out, name=name, dt=dt, x0=x0, overwrite=overwrite)
+    fmu(part, out, name=name, dt=dt, x0=x0, version=fmi, overwrite=overwrite)
     print_line(Console(), f"FMU of the {what}: {out}")
 
 

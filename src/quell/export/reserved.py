@@ -8,7 +8,7 @@ controller, which the user types in his own program, is never changed but refuse
 
 Sources: ISO/IEC 9899:2018 and 9899:2024 (C17, C23), ISO/IEC 14882:2020 (C++20), glibc and newlib,
 ``Arduino.h`` and ``binary.h`` of the AVR core 1.8, IEC 61131-3:2013 (edition 3) with what CODESYS
-and TIA Portal add, REP 144 of ROS, FMI 3.0.
+and TIA Portal add, REP 144 of ROS, FMI 2.0 and 3.0.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ CMAKE = _words("""
     rebuild_cache run_tests test uninstall zero_check
 """)
 """Targets of CMake, or of a program for which it writes; in lower case."""
-FMI = frozenset(("fmi3", "fmi3_refused", "model", "refuse"))
+FMI = frozenset(("fmi2", "fmi3", "fmi3_refused", "model", "refuse"))
 """Files beside those with the name of the model in an FMU."""
 ROS2 = _words("""
     ament_cmake controller_interface controller_manager hardware_interface pluginlib rclcpp

@@ -1,4 +1,4 @@
-"""``fmu``: a controller, a plant or a loop as a co-simulation FMU of FMI 3.0.
+"""``fmu``: a controller, a plant or a loop as a co-simulation FMU of FMI 3.0 or 2.0.
 
 ``model.h`` and ``model.c``: what an FMU samples, between ``sources/fmi3.c`` and generated code.
 
@@ -58,6 +58,16 @@ from quell.lazy import install
 from quell.lti.models import is_linear_model
 from quell.plants.base import check_plant, is_several
 from quell.plants.linear import LinearPlant
+
+# ---- The two versions ----
+
+VERSIONS = ("3.0", "2.0")
+"""Versions of FMI that ``fmu`` writes."""
+# The C files that each FMU has; those of the first line are compiled, fmi3.c is a part of fmi2.c.
+_SOURCES = {
+    "3.0": (("fmi3.c", "fmi3_refused.c"), ("refuse.h",)),
+    "2.0": (("fmi2.c",), ("fmi3.c", "refuse.h")),
+}
 
 # ---- modelDescription.xml and buildDescription.xml of an FMU (FMI 3.0.1, 2.4 and 2.5) ----
 
@@ -121,6 +131,58 @@ def model_description(
     return _text(root)
 
 
+def older_description(
+    name: str,
+    title: str,
+    token: str,
+    dt: float,
+    variables: Sequence[Variable],
+    files: Sequence[str],
+) -> bytes:
+    """Return the description of a co-simulation FMU of FMI 2.0 (2.0.4, 2.2 and 4.3).
+
+    Parameters are those of ``model_description``; ``files`` are the C files to compile.
+    """
+    root = ElementTree.Element(
+        "fmiModelDescription",
+        fmiVersion="2.0",
+        modelName=name,
+        guid=token,
+        description=title,
+        generationTool="quell",
+        variableNamingConvention="structured",
+    )
+    slave = _add(
+        root,
+        "CoSimulation",
+        modelIdentifier=name,
+        canHandleVariableCommunicationStepSize="true",
+        canGetAndSetFMUstate="true",
+        canSerializeFMUstate="true",
+    )
+    sources = _add(slave, "SourceFiles")
+    for file in files:
+        _add(sources, "File", name=file)
+    units = _add(root, "UnitDefinitions")
+    for unit, powers in _UNITS.items():
+        _add(_add(units, "Unit", name=unit), "BaseUnit", **powers)
+    categories = _add(root, "LogCategories")
+    _add(categories, "Category", name="error", description="reasons of fmi2Error")
+    _add(root, "DefaultExperiment", startTime="0", stepSize=number(dt))
+    elements = _add(root, "ModelVariables")
+    for reference, variable in enumerate(variables):
+        attributes, value = _attributes(reference, variable)
+        kind = "Boolean" if variable.flag else "Integer" if variable.whole else "Real"
+        _add(_add(elements, "ScalarVariable", **attributes), kind, **value)
+    structure = _add(root, "ModelStructure")
+    outputs, unknowns = _add(structure, "Outputs"), _add(structure, "InitialUnknowns")
+    for place_, variable in enumerate(variables, start=1):
+        if variable.role == OUTPUT:
+            _add(outputs, "Unknown", index=str(place_), dependencies="")
+            _add(unknowns, "Unknown", index=str(place_))
+    return _text(root)
+
+
 def build_description(name: str, files: Sequence[str]) -> bytes:
     """Return the description of the sources, C files in the folder of this file."""
     root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
@@ -132,7 +194,8 @@ def build_description(name: str, files: Sequence[str]) -> bytes:
     return _text(root)
 
 
-def _add_variable(parent: ElementTree.Element, reference: int, variable: Variable) -> None:
+def _attributes(reference: int, variable: Variable) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the attributes of a variable, and those of its value: unit and start."""
     attributes = {
         "name": variable.name,
         "valueReference": str(reference),
@@ -143,15 +206,19 @@ def _add_variable(parent: ElementTree.Element, reference: int, variable: Variabl
     elif variable.whole or variable.held or variable.flag:
         attributes["variability"] = "discrete"
     attributes["description"] = variable.description
-    if variable.unit:
-        attributes["unit"] = variable.unit
+    value = {"unit": variable.unit} if variable.unit else {}
     if variable.role in (INPUT, *_CAUSALITY):
         start = str(bool(variable.start)).lower() if variable.flag else number(variable.start)
-        attributes["start"] = start
+        value["start"] = start
     elif variable.role in (OUTPUT, LOCAL):
         attributes["initial"] = "calculated"
+    return attributes, value
+
+
+def _add_variable(parent: ElementTree.Element, reference: int, variable: Variable) -> None:
+    attributes, value = _attributes(reference, variable)
     kind = "Boolean" if variable.flag else "Int32" if variable.whole else "Float64"
-    _add(parent, kind, **attributes)
+    _add(parent, kind, **attributes, **value)
 
 
 def _add(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
@@ -464,8 +531,11 @@ _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 _LONGEST = 300.0
 
 
-def place(name: str) -> str:
-    """Return the path of the binary of the model ``name`` in an FMU, for this machine."""
+def place(name: str, version: str = "3.0") -> str:
+    """Return the path of the binary of the model ``name`` in an FMU, for this machine.
+
+    FMI 2.0 has names of folders for processors of Intel and AMD alone.
+    """
     if sys.platform not in _SYSTEMS:
         raise ValueError(
             f"binary = True: is not supported on {sys.platform}; give binary=False and compile the "
@@ -473,6 +543,13 @@ def place(name: str) -> str:
         )
     system, suffix = _SYSTEMS[sys.platform]
     machine = platform.machine().lower()
+    if version == "2.0":
+        if _MACHINES.get(machine, machine) != "x86_64":
+            raise ValueError(
+                f"binary = True: FMI 2.0 has no folder for {machine}; give version='3.0', or "
+                "binary=False and compile the sources"
+            )
+        return f"binaries/{system}64/{name}{suffix}"
     return f"binaries/{_MACHINES.get(machine, machine)}-{system}/{name}{suffix}"
 
 
@@ -530,9 +607,10 @@ def fmu(
     x0: ArrayLike | None = None,
     sources: Sequence[str | os.PathLike[str]] = (),
     binary: bool = True,
+    version: str = "3.0",
     overwrite: bool = False,
 ) -> None:
-    """Write an FMU of FMI 3.0 for co-simulation, with C sources and a binary for this machine.
+    """Write an FMU of FMI 3.0 or 2.0 for co-simulation: C sources, a binary for this machine.
 
     The FMU samples at its own fixed time: in a communication step of any length it takes the
     samples from its beginning to before its end, with inputs as they are held; outputs are those
@@ -557,6 +635,8 @@ def fmu(
         C files of yours that the parts call, of ``features.Custom(…, c_function=…)``.
     binary
         whether to compile a binary. Without one, other tools compile the sources.
+    version
+        of FMI: ``3.0``, or ``2.0`` for tools that do not read it. Both compute the same bits.
     overwrite
         whether an existing file may be replaced.
 
@@ -583,15 +663,16 @@ def fmu(
         raise ValueError(f"path = {str(target)!r}: must end in .fmu")
     name = checked_name(name or target.stem, "FMI")
     check_writable(target, checks.flag("overwrite", overwrite))
-    fixed = headers()
+    checks.one_of("version", version, VERSIONS)
+    fixed = headers(version)
     plant, controller = _parts(part)
     own = _own_sources(sources)
     model, files = _model(plant, controller, name, dt, x0)
     for each in own.keys() & files.keys():
         raise _two_files(each)
     if checks.flag("binary", binary):
-        place(name)
-    content = _content(model, fixed | files | own, name, binary)
+        place(name, version)
+    content = _content(model, fixed | files | own, name, binary, version)
     with (
         written_atomically(target, overwrite) as file,
         zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -691,11 +772,14 @@ def _model(
 
 
 # The headers of the standard, which come from FMPy.
-_HEADERS = ("fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h")
+_HEADERS = {
+    "3.0": ("fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h"),
+    "2.0": ("fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h"),
+}
 
 
-def headers() -> dict[str, str]:
-    """Return the headers of FMI 3.0 of the Modelica Association, as the installed FMPy has them.
+def headers(version: str = "3.0") -> dict[str, str]:
+    """Return the headers of FMI of the Modelica Association, as the installed FMPy has them.
 
     Raises
     ------
@@ -705,7 +789,8 @@ def headers() -> dict[str, str]:
     fmpy = import_extra("fmpy", "fmi", "an FMU, whose headers come from it,")
     folder = Path(fmpy.__file__).parent / "c-code"
     try:
-        return {name: (folder / name).read_text(encoding="utf-8") for name in _HEADERS}
+        names = (*_HEADERS["3.0"], *(_HEADERS["2.0"] if version == "2.0" else ()))
+        return {name: (folder / name).read_text(encoding="utf-8") for name in names}
     except OSError as error:
         raise ImportError(
             f"FMPy {fmpy.__version__} has no {Path(str(error.filename)).name}: {install('fmi')}"
@@ -713,24 +798,28 @@ def headers() -> dict[str, str]:
 
 
 def _content(
-    model: Model, generated: Mapping[str, str], name: str, binary: bool
+    model: Model, generated: Mapping[str, str], name: str, binary: bool, version: str
 ) -> dict[str, bytes]:
     """Return the files of the FMU."""
     folder = resources.files(__package__) / "sources"
-    fixed = {each.name: each.read_bytes() for each in folder.iterdir() if each.is_file()}
+    own, included = _SOURCES[version]
+    fixed = {each: (folder / each).read_bytes() for each in (*own, *included)}
     token = _token(generated, model, fixed)
     sources = fixed | {
         each: text.encode() for each, text in (dict(generated) | model.files(token)).items()
     }
-    units = sorted(each for each in sources if each.endswith(".c"))
-    description = model_description(name, model.title, token, model.dt, model.variables)
+    units = sorted(each for each in sources if each.endswith(".c") and each not in included)
+    about = name, model.title, token, model.dt, model.variables
+    older = version == "2.0"
+    description = older_description(*about, units) if older else model_description(*about)
     content = {"modelDescription.xml": description}
     if binary:
         with tempfile.TemporaryDirectory(prefix="quell-fmu-") as folder_name:
             for each, data in sources.items():
                 (Path(folder_name) / each).write_bytes(data)
-            content[place(name)] = compiled(Path(folder_name), units, name)
-    content["sources/buildDescription.xml"] = build_description(name, units)
+            content[place(name, version)] = compiled(Path(folder_name), units, name)
+    if not older:
+        content["sources/buildDescription.xml"] = build_description(name, units)
     return content | {f"sources/{each}": data for each, data in sorted(sources.items())}
 
 
