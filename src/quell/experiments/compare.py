@@ -395,8 +395,8 @@ def compare(
 def _flow_of(plant: Any, every: int) -> tuple[Flow | None, str]:
     """Return the flow of a plant, or why energy and peak power are not known."""
     inner = plant
-    while isinstance(inner, EncodedPlant):  # with the states of the plant inside
-        inner = inner.plant
+    while isinstance(inner, EncodedPlant) and not hasattr(inner, "flow"):
+        inner = inner.plant  # whose states are those of the encoded one
     flow = getattr(inner, "flow", None)
     if isinstance(flow, Flow):
         fault = "only each nth sample is recorded" if every > 1 else ""
