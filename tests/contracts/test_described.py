@@ -46,6 +46,7 @@ OTHERS: dict[str, Any] = {
     "in single precision": in_single_precision(CONTROLLERS["PID"]),
     "guard": ql.Guard(bound=2.25),
     "Arm": plant_room.arm(),
+    "Flow": plant_room.Flow((0.0, 1.25)),
     "Craft": plant_room.quadrotor_attitude(),
     "LinearPlant": plant_room.LinearPlant([[-1.25]], [[2.0, 3.0]], [[1.0]]),
     "Axes": ql.Axes({"x": ql.ADRC(ql.ESO.model_free(2, 1.0, 12.0, 0.01), 1.75)}, [[2.25]]),

@@ -104,6 +104,7 @@ _TWIN = (
 )
 _TWIN = (*_TWIN, "--y-min=-9", "--y-max=9")
 _EXPORT = (*_SETUP, "--out", "c")
+_FMU = (*_SETUP, "--to", "fmu", "--out", "c.fmu")
 _PLANT = ("--num", "2", "--den", "1,1", "--dt", "0.05", *_FIGURES)
 _BENCHMARK = ("--controllers", "pid", *_FIGURES)
 _OF_SETUP = (*_SETUP, *_FIGURES)
@@ -175,7 +176,7 @@ CASES: dict[str, dict[str, Case]] = {
         "--repeat": ("--repeat", "0"), "--worst": (("real",), ("--worst", "1", "--repeat", "0")), "--save": ("--save", "run.nc"),
     },
     "export": {
-        "SETUP": ("other.toml",), "--to": ("--to", "fmu"), "--out": ("--out", "d"), "--name": ("--name", "servo"), "--precision": ("--precision", "single"), "--what": ("--what", "loop"),
+        "SETUP": ("other.toml",), "--to": ("--to", "fmu"), "--out": ("--out", "d"), "--name": ("--name", "servo"), "--precision": ("--precision", "single"), "--what": ("--what", "loop"), "--fmi": (_FMU, (*_FMU, "--fmi", "2.0")),
         "--resolution": ("--resolution", "0.01"), "--memory": ("--memory", "servo.qllm"), "--accept": ("--accept",),
         "--prove": ("--prove",), "--spread": ((*_EXPORT, "--prove"), (*_EXPORT, "--prove", "--spread", "0.2")),
     },
