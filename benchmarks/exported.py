@@ -42,7 +42,7 @@ from rich.table import Table
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.controllers.base import reset_loop
-from quell.controllers.compensator import samples_to_settle
+from quell.controllers.bumpless import samples_to_settle
 from quell.controllers.prefilters import without_prefilters
 from quell.experiments import two_mass_spring as study
 from quell.export import TranslationError

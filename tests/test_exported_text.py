@@ -18,20 +18,12 @@ import pytest
 import quell as ql
 from quell.export import NoCompilerError, TranslationError, c_source, reserved, ros2, st, st_source
 from quell.export.axes_source import names_in_c
+from quell.export.c_structure import Structure, structure
 from quell.export.controller_source import limits_path
 from quell.export.fmi.fmu import build_description
 from quell.export.fmi.parts import ControllerPart
 from quell.export.library import exported, vectors
-from quell.export.proof import (
-    Alarm,
-    Findings,
-    Proof,
-    Structure,
-    narrower_limits,
-    proof_files,
-    read_findings,
-    structure,
-)
+from quell.export.proof import Alarm, Findings, Proof, narrower_limits, proof_files, read_findings
 from quell.export.ros2 import _class_name, _rate
 from quell.export.structured_text import places
 from quell.export.structured_text.c_reader import CFile

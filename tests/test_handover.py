@@ -13,7 +13,7 @@ import pytest
 import quell as ql
 from quell.controllers import Prefiltered, ReferenceModel, in_single_precision
 from quell.controllers.base import control
-from quell.controllers.compensator import samples_to_settle
+from quell.controllers.bumpless import samples_to_settle
 from quell.controllers.law import unlimited_control
 from quell.observers.eso import ESO
 from quell.observers.forms import expected_measurement

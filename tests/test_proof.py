@@ -13,8 +13,9 @@ import pytest
 
 import quell as ql
 from quell.export.c_files import CSource
+from quell.export.c_structure import structure
 from quell.export.library.exported import Exported
-from quell.export.proof import proof_files, prove, read_findings, structure
+from quell.export.proof import proof_files, prove, read_findings
 from quell.export.separate import separated
 from quell.features import Custom
 

@@ -51,11 +51,8 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import RateLimit, checked_limits, set_reference_derivatives
-from quell.controllers.compensator import (
-    Compensator,
-    check_replacement,
-    padded,
-)
+from quell.controllers.bumpless import check_replacement
+from quell.controllers.compensator import Compensator, padded
 from quell.controllers.feedforward import (
     Feedforward,
     checked_feedforward,

@@ -60,12 +60,9 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.bumpless import samples_to_settle
 from quell.controllers.compensated import takes_control
-from quell.controllers.compensator import (
-    Compensator,
-    Estimate,
-    samples_to_settle,
-)
+from quell.controllers.compensator import Compensator, Estimate
 from quell.controllers.each_axis import (
     ask_axes,
     axes_started,

@@ -47,7 +47,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.compensator import Compensator, manual_operation
+from quell.controllers.bumpless import manual_operation
+from quell.controllers.compensator import Compensator
 from quell.controllers.held import rests_at_y
 from quell.controllers.law import AdrcDesign, AdrcState, known_now, unlimited_control
 from quell.controllers.prefilters import Wrapper, without_prefilters

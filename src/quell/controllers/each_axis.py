@@ -17,7 +17,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.compensator import start_at_rest
+from quell.controllers.bumpless import start_at_rest
 from quell.kernels.dispatch import for_each
 from quell.types import Matrix, Vector
 

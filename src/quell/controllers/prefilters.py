@@ -66,7 +66,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.compensator import Compensator, manual_operation
+from quell.controllers.bumpless import manual_operation
+from quell.controllers.compensator import Compensator
 from quell.controllers.stateful import Retuning, StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.functions import copysign, sqrt

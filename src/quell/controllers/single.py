@@ -35,8 +35,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.bumpless import manual_operation
 from quell.controllers.compensated import Compensated, CompensatedDesign
-from quell.controllers.compensator import manual_operation
 from quell.controllers.held import HeldDesign
 from quell.controllers.law import AdrcDesign
 from quell.controllers.linear import LinearLaw, delta_law

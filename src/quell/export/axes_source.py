@@ -23,7 +23,7 @@ from quell.controllers.base import (
     is_usable,
     write_row,
 )
-from quell.controllers.compensator import change_design
+from quell.controllers.bumpless import change_design
 from quell.controllers.several import control_all, start_all, tell_applied
 from quell.export.c_files import CFiles
 from quell.export.estimates import estimate_lines, estimate_struct

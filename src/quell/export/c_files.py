@@ -20,8 +20,8 @@ import numpy as np
 from quell import checks
 from quell.controllers.base import control, is_usable, reset_loop, set_applied_control
 from quell.controllers.baselines.adaptive_notch import NotchDesign, NotchState
+from quell.controllers.bumpless import start_at_rest
 from quell.controllers.compensated import CompensatedDesign, CompensatedState
-from quell.controllers.compensator import start_at_rest
 from quell.controllers.law import AdrcDesign, AdrcState, has_reference_at_start
 from quell.controllers.linear import LinearDesign, LinearState
 from quell.controllers.memory import Layout

@@ -23,8 +23,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
+from quell.controllers.bumpless import samples_to_settle
 from quell.controllers.compensated import compensating_part, takes_control
-from quell.controllers.compensator import samples_to_settle
 from quell.controllers.held import HeldDesign, rests_at_y
 from quell.controllers.memory import images_of, learned_state
 from quell.controllers.prefilters import Prefiltered, stopping_point, without_prefilters

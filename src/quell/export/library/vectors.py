@@ -29,7 +29,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.compensator import samples_to_settle
+from quell.controllers.bumpless import samples_to_settle
 from quell.controllers.memory import (
     CHECK,
     Layout,
