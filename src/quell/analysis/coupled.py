@@ -33,12 +33,7 @@ from quell.analysis.matrices import estimates_at, gain_at, sampled_matrices
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
 from quell.files import nonfinite_to_none
-from quell.guard.guard import (
-    check_one_state_of_f,
-    check_stable,
-    lag_between_samples,
-    state_path,
-)
+from quell.guard.guard import check_one_state_of_f, check_stable, lag_between_samples, state_path
 from quell.lti.models import MatrixSystem, System, peak_gain
 from quell.observers.design import response
 from quell.plants.channels import DelayedInputs, EncodedOutputs

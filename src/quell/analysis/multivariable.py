@@ -38,13 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.analysis.disk import (
-    DiskMargin,
-    factors_of,
-    largest_scaled,
-    singular,
-    worst_change,
-)
+from quell.analysis.disk import DiskMargin, factors_of, largest_scaled, singular, worst_change
 from quell.analysis.linearise import is_known, knows_other_axes, within_noise
 from quell.analysis.loop import about_learning, assumed_of, duration
 from quell.analysis.margins import (

@@ -10,13 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quell.cli.exit_codes import ExitCode
-from quell.cli.options import (
-    READ_OPTIONS,
-    RESULT_OUTPUTS,
-    ReadOptions,
-    ResultOutputs,
-    WholeOrNone,
-)
+from quell.cli.options import READ_OPTIONS, RESULT_OUTPUTS, ReadOptions, ResultOutputs, WholeOrNone
 from quell.cli.output import Console, check_outputs, number, print_line, table, write_results
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from cyclopts import Parameter
 
+from quell.cli import output, report
 from quell.cli.exit_codes import ExitCode, exit_on_signal
 from quell.cli.options import (
     RUN_OUTPUTS,
@@ -23,22 +24,6 @@ from quell.cli.options import (
     WholeOrNone,
     options_of,
     refuse,
-)
-from quell.cli.output import (
-    Console,
-    check_outputs,
-    number,
-    print_line,
-    table,
-    write_record,
-    write_results,
-)
-from quell.cli.report import (
-    print_axes,
-    print_metrics,
-    print_outcome,
-    save_run_figure,
-    windowed_metrics,
 )
 from quell.files import MAX_SIZE
 from quell.realtime.registry import examples
@@ -449,14 +434,14 @@ def _run(
     scenario, options = setup.needed("scenario"), dict(setup.needed("rig"))
     files = [*map(Path, options.pop("telemetry", ())), *files]
     check_recordings(files, outputs.overwrite)
-    outputs = check_outputs(outputs, [Path(setup.file).stem, "timing"], files)
+    outputs = output.check_outputs(outputs, [Path(setup.file).stem, "timing"], files)
     options["overwrite"] = outputs.overwrite
     (port, origins), live = viewers, options.pop("live")
     port = live if port is None else port
     url, dt = options.pop("device"), setup.controller.dt
-    console = Console()
+    console = output.Console()
     what = f"{setup.title}: {url}, dt = {dt:g} s, for {scenario.duration:g} s"
-    print_line(console, f"{what}. Ctrl-C ramps u to zero.")
+    output.print_line(console, f"{what}. Ctrl-C ramps u to zero.")
     if port is None:
         refuse({"live_origin": (origins, [])}, "goes with --live, a port to watch at")
     # The port first: if it is in use no file is created.
@@ -471,14 +456,14 @@ def _run(
     scores: Any
     learned: Any
     if record.several:
-        scores, learned = print_axes(console, record, setup)
+        scores, learned = report.print_axes(console, record, setup)
     else:
-        scores = windowed_metrics(record, setup)
-        print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
-        learned = print_outcome(console, record)
+        scores = report.windowed_metrics(record, setup)
+        report.print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
+        learned = report.print_outcome(console, record)
     code = exit_code(run)
     if watching is not None:
-        print_line(console, watching.describe())
+        output.print_line(console, watching.describe())
     results = {
         "title": setup.title,
         "device": url,
@@ -499,7 +484,7 @@ def _run(
     return code
 
 
-def _watching(console: Console, path: Path, setup: Setup) -> WatchSink:
+def _watching(console: output.Console, path: Path, setup: Setup) -> WatchSink:
     """Return the sink that watches the machine."""
     from quell.monitoring import Machine, WatchSink
 
@@ -507,23 +492,23 @@ def _watching(console: Console, path: Path, setup: Setup) -> WatchSink:
     observers = [getattr(each, "observer", None) for each in parts]
     orders = [min(getattr(observer, "degree", 2), 2) for observer in observers]
     machine = Machine(order=orders[0] if len(set(orders)) == 1 else orders)
-    return WatchSink(path, machine, lambda alarm: print_line(console, alarm.describe()))
+    return WatchSink(path, machine, lambda alarm: output.print_line(console, alarm.describe()))
 
 
 def _write(
-    console: Console, run: RigRun, setup: Setup, results: dict[str, Any], outputs: RunOutputs
+    console: output.Console, run: RigRun, setup: Setup, results: dict[str, Any], outputs: RunOutputs
 ) -> None:
     """Write figures, record and results where they are asked for."""
     record, paths = run.trajectory, []
     if outputs.figures and len(record):
-        paths = save_run_figure(record, setup.title, outputs, Path(setup.file).stem)
+        paths = report.save_run_figure(record, setup.title, outputs, Path(setup.file).stem)
         paths += _save_timing_figure(run, setup, outputs.figures, outputs.overwrite)
-    write_record(console, record, outputs, "Record")
-    write_results(console, results, outputs, paths)
+    output.write_record(console, record, outputs, "Record")
+    output.write_results(console, results, outputs, paths)
 
 
 def _close_loop(
-    console: Console, setup: Setup, url: str, options: dict[str, Any], sinks: list[Any]
+    console: output.Console, setup: Setup, url: str, options: dict[str, Any], sinks: list[Any]
 ) -> RigRun | None:
     """Run the loop and print each change of mode; return None if the device failed."""
     from quell.realtime import LiveSink, Safety, run_rig
@@ -537,13 +522,13 @@ def _close_loop(
         for sink in live:
             console.print(f"Live: {sink.url}")
         began = True
-        print_line(console, str(change))
+        output.print_line(console, str(change))
 
     settings = {"telemetry": sinks, "on_change": print_change, **options}
     controller, scenario = setup.controller, setup.needed("scenario")
     try:
         rules = (options.get("safety") or Safety()).rules(controller, scenario)
-        print_line(console, f"Safety: {rules.text(controller.dt)}.")
+        output.print_line(console, f"Safety: {rules.text(controller.dt)}.")
         device = _device(url, setup)
         with exit_on_signal(device.close):
             return run_rig(device, controller, scenario, **settings)
@@ -608,11 +593,11 @@ def exit_code(run: RigRun) -> int:
     return ExitCode.INTERRUPTED if asked else ExitCode.ENDED_BY_SAFETY
 
 
-def _print_timing(console: Console, run: RigRun) -> None:
+def _print_timing(console: output.Console, run: RigRun) -> None:
     from quell.realtime.run import counters_text
 
     histograms = {"lateness": run.timing.lateness, "step time": run.timing.step}
-    rows = table("Punctuality", "[µs]", "p50", "p99", "p99.9", "max")
+    rows = output.table("Punctuality", "[µs]", "p50", "p99", "p99.9", "max")
     for label, histogram in histograms.items():
         values = [1e6 * value for value in histogram.summary().values()]
         rows.add_row(label, *("–" if value != value else f"{value:.1f}" for value in values))
@@ -621,12 +606,12 @@ def _print_timing(console: Console, run: RigRun) -> None:
         bars = "\n".join(histogram.text().splitlines()[1:])
         heading = f"{label.capitalize()}, cycles (bars are logarithmic):"
         console.print(f"{heading}\n{bars}\n", highlight=False)
-    print_line(console, f"Loop: {counters_text(run.tally._asdict())}")
+    output.print_line(console, f"Loop: {counters_text(run.tally._asdict())}")
     if run.counters:
-        print_line(console, f"Device: {counters_text(run.counters)}")
+        output.print_line(console, f"Device: {counters_text(run.counters)}")
     for note in run.notes:
         if not note.startswith("telemetry: "):  # these were logged at once
-            print_line(console, f"Note: {note}")
+            output.print_line(console, f"Note: {note}")
 
 
 def _save_timing_figure(run: RigRun, setup: Setup, folder: Path, overwrite: bool) -> list[Path]:
@@ -705,8 +690,8 @@ def replay(
     several = is_of_axes(data)
     given = made(file, data, trust)
     name = f"{record.stem}-replayed"
-    outputs = check_outputs(outputs, [name])
-    console = Console()
+    outputs = output.check_outputs(outputs, [name])
+    console = output.Console()
     # The controller is made for the units of the setup's plant, if it has some.
     plant = UNKNOWN if given.plant is None else signals_of(given.plant)
     known = signals_in(given.description, given.controller) if several else plant
@@ -714,7 +699,7 @@ def replay(
     alike, notes = runs_in_common_units(of_record, known, given.file)
     recorded = alike[record.name]
     for note in notes:
-        print_line(console, note)
+        output.print_line(console, note)
     try:  # replay refuses a controller that is no ADRC
         names = (given.rig or {}).get("channels", ())
         if several:
@@ -731,7 +716,7 @@ def replay(
         for axis in replayed.axis_names:
             pair = recorded.axis(replayed.axis_names.index(axis)), replayed.axis(axis)
             scores[axis] = _print_scores(console, f"{title}: {axis}", *pair, part)
-            learned[axis] = print_outcome(console, pair[1])
+            learned[axis] = report.print_outcome(console, pair[1])
     else:
         title = f"{record.name} through {given.title}"
         scores = _print_scores(console, title, recorded, replayed, part)
@@ -745,10 +730,10 @@ def replay(
         "samples under control."
     )
     if not several:
-        learned = print_outcome(console, replayed)
+        learned = report.print_outcome(console, replayed)
     draw = None if several else _draw_wished
-    paths = save_run_figure(replayed, given.title, outputs, name, draw)
-    write_record(console, replayed, outputs, "Replay")
+    paths = report.save_run_figure(replayed, given.title, outputs, name, draw)
+    output.write_record(console, replayed, outputs, "Replay")
     results = {
         "record": str(record),
         "title": given.title,
@@ -758,7 +743,7 @@ def replay(
         "learned": learned,
         "setup": given.as_json(),
     }
-    write_results(console, results, outputs, paths)
+    output.write_results(console, results, outputs, paths)
 
 
 def _check_actuators(recorded: Any, given: Setup) -> None:
@@ -774,14 +759,14 @@ def _check_actuators(recorded: Any, given: Setup) -> None:
 
 
 def _print_scores(
-    console: Console, title: str, recorded: Trajectory, replayed: Trajectory, part: slice
+    console: output.Console, title: str, recorded: Trajectory, replayed: Trajectory, part: slice
 ) -> dict[str, dict[str, float | None]]:
     """Print and return the measures of a recorded run and of its replay."""
     scores = {"recorded": _scores(recorded, part), "replayed": _scores(replayed, part)}
-    rows = table(title, "", *_HEADINGS)
+    rows = output.table(title, "", *_HEADINGS)
     for name, values in scores.items():
         pairs = zip(values.values(), _FACTORS, strict=True)
-        rows.add_row(name, *(number(value, ".4g", factor) for value, factor in pairs))
+        rows.add_row(name, *(output.number(value, ".4g", factor) for value, factor in pairs))
     console.print(rows)
     return scores
 
@@ -803,7 +788,7 @@ def _scores(run: Trajectory, part: slice) -> dict[str, float | None]:
     }
 
 
-def _print_gaps(console: Console, recorded: Trajectory) -> None:
+def _print_gaps(console: output.Console, recorded: Trajectory) -> None:
     from quell.realtime.recordings import Event
 
     if "events" not in recorded.names:
@@ -813,7 +798,7 @@ def _print_gaps(console: Console, recorded: Trajectory) -> None:
         first = f"the first at {recorded.t[gaps[0]]:.3f} s"
         skipped = f"{gaps.size} of {len(recorded)} samples were skipped by the loop, {first}"
         meaning = "to the replay, as to the loop, they are samples without a measurement."
-        print_line(console, f"{skipped}: {meaning}")
+        output.print_line(console, f"{skipped}: {meaning}")
 
 
 def _draw_wished(run: Trajectory, axes: Any) -> None:

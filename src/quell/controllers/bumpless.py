@@ -17,36 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from quell.controllers.base import (
-    change_parameters,
-    reset_loop,
-)
+from quell.controllers.base import change_parameters, reset_loop
 from quell.controllers.held import look_anew
-from quell.controllers.law import (
-    AdrcDesign,
-    AdrcState,
-    known_share,
-    unlimited_control,
-)
-from quell.controllers.safe_set import (
-    settle_at_rest,
-    settle_safe_set,
-    shift_f,
-)
-from quell.controllers.schedule import (
-    gain_in_use,
-    known_of_model,
-)
-from quell.guard import (
-    limit,
-)
-from quell.kernels.dispatch import (
-    call_specialised,
-    compiled,
-)
-from quell.learners.base import (
-    predict,
-)
+from quell.controllers.law import AdrcDesign, AdrcState, known_share, unlimited_control
+from quell.controllers.safe_set import settle_at_rest, settle_safe_set, shift_f
+from quell.controllers.schedule import gain_in_use, known_of_model
+from quell.guard import limit
+from quell.kernels.dispatch import call_specialised, compiled
+from quell.learners.base import predict
 from quell.observers.design import scaled_response
 from quell.observers.eso import ESO
 from quell.observers.forms import (

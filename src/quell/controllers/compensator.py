@@ -37,12 +37,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers import bumpless
-from quell.controllers.base import (
-    Limits,
-    RateLimit,
-    changed_limits,
-    checked_limits,
-)
+from quell.controllers.base import Limits, RateLimit, changed_limits, checked_limits
 from quell.controllers.held import HeldPlant, NoHeldMemory, NoHeldPlant, check_rest
 from quell.controllers.law import (
     AdrcDesign,
@@ -54,11 +49,7 @@ from quell.controllers.law import (
     has_reference_at_start,
     law_gains,
 )
-from quell.controllers.safe_set import (
-    NoSafeSet,
-    NoSafeSetMemory,
-    SafeSet,
-)
+from quell.controllers.safe_set import NoSafeSet, NoSafeSetMemory, SafeSet
 from quell.controllers.schedule import (
     NoSchedule,
     NoScheduleMemory,

@@ -58,12 +58,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.allocation import (
-    ActuatorLimits,
-    GainMemory,
-    RangeMemory,
-    solve_free,
-)
+from quell.controllers.allocation import ActuatorLimits, GainMemory, RangeMemory, solve_free
 from quell.controllers.safe_set import BOUNDS, write_bounds
 from quell.kernels.dispatch import for_each, generic_with_default, is_finite, kernel
 from quell.kernels.functions import is_single, sqrt

@@ -28,13 +28,7 @@ from quell.controllers.allocation import (
     cut_to_range,
     range_memory,
 )
-from quell.controllers.base import (
-    RateLimit,
-    is_usable,
-    reset_loop,
-    status_flags,
-    write_row,
-)
+from quell.controllers.base import RateLimit, is_usable, reset_loop, status_flags, write_row
 from quell.controllers.feedback_gains import regulator
 from quell.controllers.several import (
     control_all,

@@ -12,30 +12,14 @@ from collections.abc import Iterator
 from typing import Any
 
 from quell.controllers.allocation import apply_to_axes
-from quell.controllers.axes import (
-    AxesDesign,
-    AxesState,
-    begin_manual,
-    end_manual,
-)
-from quell.controllers.base import (
-    change_parameters,
-    is_usable,
-    write_row,
-)
+from quell.controllers.axes import AxesDesign, AxesState, begin_manual, end_manual
+from quell.controllers.base import change_parameters, is_usable, write_row
 from quell.controllers.bumpless import change_design
 from quell.controllers.several import control_all, start_all, tell_applied
 from quell.export.c_files import CFiles
 from quell.export.estimates import estimate_lines, estimate_struct
 from quell.export.translate.structs import ascii_text
-from quell.export.translate.text import (
-    Array,
-    Number,
-    Value,
-    identifier,
-    unique,
-    wrapped,
-)
+from quell.export.translate.text import Array, Number, Value, identifier, unique, wrapped
 from quell.kernels.dispatch import for_each, is_finite, kernel
 from quell.types import Channels, Status, Vector
 

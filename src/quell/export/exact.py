@@ -23,13 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.controllers import axes_learning
 from quell.controllers.allocation import ActuatorLimits
-from quell.controllers.axes_learning import (
-    LearningDesign,
-    LearningMemory,
-    NoLearning,
-    NoLearningMemory,
-)
 from quell.controllers.base import NO_LIMITS, Limits, check_controller
 from quell.controllers.held import NoHeldPlant
 from quell.controllers.law import AdrcDesign, AdrcState
@@ -325,10 +320,10 @@ def _without_learning(part: Any) -> Any:
         return part._replace(learner=NoLearnerDesign(), guard=UnguardedDesign(), learns=False)
     if isinstance(part, AdrcState):
         return part._replace(learner=NoLearnerMemory(nothing), guard=UnguardedMemory(nothing))
-    if isinstance(part, LearningDesign):
-        return NoLearning()
-    if isinstance(part, LearningMemory):
-        return NoLearningMemory(nothing)
+    if isinstance(part, axes_learning.LearningDesign):
+        return axes_learning.NoLearning()
+    if isinstance(part, axes_learning.LearningMemory):
+        return axes_learning.NoLearningMemory(nothing)
     if isinstance(part, tuple):
         return remade(part, map(_without_learning, part))
     return part

@@ -29,26 +29,8 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.export.enclosure import (
-    DIGITS,
-    Plant,
-    PlantSet,
-    held,
-    loop_rows,
-    plant_of,
-    radius_of,
-)
-from quell.export.exact import (
-    PRECISIONS,
-    Bounded,
-    Exact,
-    ExactLaw,
-    Sample,
-    as_rational,
-    law_of,
-    learns,
-    sample_of,
-)
+from quell.export import exact
+from quell.export.enclosure import DIGITS, Plant, PlantSet, held, loop_rows, plant_of, radius_of
 from quell.types import Matrix, Vector
 
 # Samples after which a pulse response has to be small for an l1 norm.
@@ -60,7 +42,9 @@ _LONGEST = 20_000_000
 class _Closed:
     """The closed loop with one plant in double precision, for l1 norms."""
 
-    def __init__(self, law: ExactLaw, plant: Plant, dt: float, radius: float, flint: Any) -> None:
+    def __init__(
+        self, law: exact.ExactLaw, plant: Plant, dt: float, radius: float, flint: Any
+    ) -> None:
         with flint.ctx.workprec(DIGITS):
             self.M = _middle(loop_rows(law, plant, dt, flint))
             _, now, before = held(plant, dt, flint)
@@ -112,7 +96,9 @@ def _floats(part: Any) -> Matrix:
     return np.array([float(each) for each in array.ravel()]).reshape(array.shape)
 
 
-def _rounding(sample: Sample, law: ExactLaw, closed: _Closed, size: float, unit: float) -> Vector:
+def _rounding(
+    sample: exact.Sample, law: exact.ExactLaw, closed: _Closed, size: float, unit: float
+) -> Vector:
     """Return the bound (4) of the change of each u (m,)."""
     k, m, r = len(law.A), closed.m, sample.references
     # Magnitudes of x, ξ and y for references of the given size, with what r does at once.
@@ -122,10 +108,10 @@ def _rounding(sample: Sample, law: ExactLaw, closed: _Closed, size: float, unit:
     xi = states[closed.at :]
     places = {name: i for i, (_, _, name) in enumerate(sample.places)}
     entries = [places[name] for name in law.names]
-    given = [Bounded(size, 0.0, unit)] * r
-    given += [Bounded(float(each), 0.0, unit) for each in y]
+    given = [exact.Bounded(size, 0.0, unit)] * r
+    given += [exact.Bounded(float(each), 0.0, unit) for each in y]
     moved, u = sample.moved(
-        {at: Bounded(float(each), 0.0, unit) for at, each in zip(entries, xi, strict=True)},
+        {at: exact.Bounded(float(each), 0.0, unit) for at, each in zip(entries, xi, strict=True)},
         dict(enumerate(given)),
     )
     place = {i: j for j, i in enumerate(sample.free)}
@@ -150,7 +136,9 @@ def _rounding(sample: Sample, law: ExactLaw, closed: _Closed, size: float, unit:
     return total + gains @ (unit * np.array([*[size] * r, *y]))
 
 
-def _carries(sample: Sample, law: ExactLaw, entries: list[int]) -> dict[int, tuple[Matrix, Matrix]]:
+def _carries(
+    sample: exact.Sample, law: exact.ExactLaw, entries: list[int]
+) -> dict[int, tuple[Matrix, Matrix]]:
     """Return entries whose sums are compensated, with what a carry of 1 does to ξ and to u.
 
     What such a sum loses is in its carry, exactly where the increment is smaller than the sum
@@ -162,10 +150,10 @@ def _carries(sample: Sample, law: ExactLaw, entries: list[int]) -> dict[int, tup
     for at in sample.free:
         if at in entries:
             continue
-        moved, u = sample.moved({at: Exact(one)}, {})
+        moved, u = sample.moved({at: exact.Exact(one)}, {})
         change = [(moved[place[each]] - still[place[each]]) / one for each in entries]
         if any(change) and moved[place[at]] == still[place[at]]:
-            of_u = [(as_rational(each) - as_rational(own)) / one
+            of_u = [(exact.as_rational(each) - exact.as_rational(own)) / one
                     for each, own in zip(u, rest, strict=True)]  # fmt: skip
             i = max(range(len(entries)), key=lambda j: change[j] == 1)
             found[i] = _floats(change)[:, None], _floats(of_u)[:, None]
@@ -302,8 +290,8 @@ def stability(
     if share >= 1.0:
         raise ValueError(f"spread = {spread!r}: must be below 1, a share of each coefficient")
     size = checks.positive("size", size, "y-unit")
-    sample = sample_of(controller, precision)
-    law, found = law_of(sample), plant_of(plant, controller)
+    sample = exact.sample_of(controller, precision)
+    law, found = exact.law_of(sample), plant_of(plant, controller)
     dt = float(controller.dt)
     radius = radius_of(law, found, dt, flint)
     stable: bool | None = radius[1] < 1.0 or (False if radius[0] >= 1.0 else None)
@@ -318,12 +306,12 @@ def stability(
     if radius[1] < 1.0:
         closed = _Closed(law, found, dt, radius[1], flint)
         if closed.samples <= _LONGEST:
-            bound = _rounding(sample, law, closed, size, PRECISIONS[precision])
+            bound = _rounding(sample, law, closed, size, exact.PRECISIONS[precision])
             rounding = tuple(bound.tolist())
     name = getattr(plant, "name", "") or "the plant"
     return Stability(
         *(name, precision, radius, share, stable, largest, where, parts, size, rounding),
-        learns(controller),
+        exact.learns(controller),
     )
 
 

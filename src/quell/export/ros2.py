@@ -16,12 +16,7 @@ from quell import checks
 from quell.controllers.base import check_controller
 from quell.controllers.state_space import StateFeedback
 from quell.export.c_files import CSource
-from quell.export.controller_source import (
-    c_source,
-    in_double_precision,
-    is_in_single,
-    limits_path,
-)
+from quell.export.controller_source import c_source, in_double_precision, is_in_single, limits_path
 from quell.export.library.vectors import fill, golden_vectors, test_program
 from quell.export.translate.text import TranslationError, checked_name
 from quell.files import check_folder, write_folder

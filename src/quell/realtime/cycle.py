@@ -38,11 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.base import (
-    bumpless_transfer,
-    set_reference_derivatives,
-    write_row,
-)
+from quell.controllers.base import bumpless_transfer, set_reference_derivatives, write_row
 from quell.controllers.several import (
     axes_of,
     control_all,

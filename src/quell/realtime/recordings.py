@@ -38,39 +38,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from quell import checks
+from quell import checks, files
 from quell.checks import import_extra
-from quell.files import (
-    MAX_SIZE,
-    GrowingFile,
-    TooLargeError,
-    byte_lines,
-    bytes_of,
-    check_regular,
-    check_size,
-    check_writable,
-    whole_text,
-    written_atomically,
-)
 from quell.quantities import OF_AXES, AxesSignals, signals_from
-from quell.realtime.mcap_reader import (
-    MAGIC,
-    MARK,
-    RECORD,
-    SCHEMA,
-    TOPIC,
-    read_mcap,
-    whole_part,
-)
-from quell.records.record import (
-    check_steps,
-    check_times,
-    columns_of,
-    describe,
-    flags_of,
-    is_vector,
-    units_of,
-)
+from quell.realtime.mcap_reader import MAGIC, MARK, RECORD, SCHEMA, TOPIC, read_mcap, whole_part
+from quell.records import record
 from quell.records.trajectory import Trajectory
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -203,7 +175,7 @@ class Header:
         names: list[str] = []
         for name, width in self.channels:
             own, labels = in_column(name), self.labels(name, width)
-            vector = is_vector(name, width)
+            vector = record.is_vector(name, width)
             names += [f"{own}[{each}]" for each in labels] if vector else [own] * width
         return tuple(names)
 
@@ -270,23 +242,23 @@ class CsvSink:
         self.path, self.overwrite = Path(path), overwrite
         self.name = str(self.path)
         self.stored = 0  #: rows that are in the file; after a failure it ends with the last one
-        self._file: GrowingFile | None = None
+        self._file: files.GrowingFile | None = None
         self._dt = 0.0
         self._first = True
 
     def check(self) -> None:
         """Raise a ``ValueError`` if a file can't be written or may not be replaced."""
         for path in (self.path, header_path(self.path)):
-            check_writable(path, self.overwrite)
+            files.check_writable(path, self.overwrite)
 
     def open(self, header: Header) -> None:
         """Write the line of names, and the header beside the file."""
         self.check()
         self.path.unlink(missing_ok=True)
-        with written_atomically(header_path(self.path), self.overwrite) as part:
+        with files.written_atomically(header_path(self.path), self.overwrite) as part:
             part.write_text(header.to_json() + "\n", encoding="utf-8")
         self._dt, self._first, self.stored = header.dt, True, 0
-        self._file = GrowingFile(self.path)
+        self._file = files.GrowingFile(self.path)
         try:
             self._file.add(",".join(("time", *header.columns)) + "\n")
         except OSError:
@@ -339,7 +311,7 @@ def is_recording(path: Path) -> bool:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) == MAGIC:
                 return True
-        names = _names_in(next(byte_lines(path), b""))
+        names = _names_in(next(files.byte_lines(path), b""))
     except (OSError, ValueError):  # whatever reads the file tells why it can't be read
         return False
     return names[: R + 1] == ["time", *(name for name, _ in LOOP_CHANNELS[:R])]
@@ -356,12 +328,12 @@ def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
     Without the header beside it, dt comes from the column ``time``; ``features`` are unknown. The
     rows may take ``most`` bytes. Times that contradict the header are refused.
     """
-    lines = byte_lines(path)
+    lines = files.byte_lines(path)
     names = _names_in(next(lines, b""))
     if names[:2] != ["time", "k"]:
         raise ValueError("its first line is not the names of a recording's columns: time, k, …")
     beside = header_path(path)
-    header = Header.from_json(whole_text(beside)) if beside.is_file() else None
+    header = Header.from_json(files.whole_text(beside)) if beside.is_file() else None
     channels = _channels(names[1:]) if header is None else header.channels
     table = _table(lines, len(names), most)
     time, rows = table[:, 0], np.ascontiguousarray(table[:, 1:])
@@ -372,7 +344,7 @@ def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
         others = f"those in {beside.name}" if beside.is_file() else "those of a recording"
         raise ValueError(f"its columns differ from {others}")
     place = f"in {beside.name}" if beside.is_file() else "of its last row"
-    check_steps(time, rows[:, K], header.dt, f"dt = {header.dt:g} s {place}")
+    record.check_steps(time, rows[:, K], header.dt, f"dt = {header.dt:g} s {place}")
     return header, rows
 
 
@@ -382,7 +354,7 @@ def _table(lines: Iterator[bytes], width: int, most: int) -> Matrix:
     blocks, size = [np.empty((0, width))], 0
     while block := list(islice(filled, max(1, _BLOCK // width))):
         size += 8 * width * len(block)
-        check_size(size, most)
+        files.check_size(size, most)
         rows = _numbers([line for _, line in block])
         if rows is None or rows.shape[1] != width:
             numbers = (number for number, line in block if not _is_row(line, width))
@@ -466,8 +438,8 @@ def definition(header: Header) -> str:
     for name, width in header.channels:
         if not width:
             continue
-        text, unit = describe(name, header.signals)
-        units = units_of(name, width, header.signals)
+        text, unit = record.describe(name, header.signals)
+        units = record.units_of(name, width, header.signals)
         unit = header.units.get(name, unit)
         if header.axis_names and width > 1 and name in (*OF_AXES, "u"):
             # A field for each signal, with its name: the same bytes as an array.
@@ -475,7 +447,7 @@ def definition(header: Header) -> str:
                 own = field_of(f"{name}_{label}")
                 lines.append(f"float64 {own}  # {text}, {label} [{of_it}]")
         else:
-            kind = f"float64[{width}]" if is_vector(name, width) else "float64"
+            kind = f"float64[{width}]" if record.is_vector(name, width) else "float64"
             lines.append(f"{kind} {field_of(name)}  # {text} [{unit}]")
     return "\n".join(lines) + "\n"
 
@@ -577,7 +549,7 @@ class McapSink:
 
     def check(self) -> None:
         """Raise a ``ValueError`` if the file can't be written or may not be replaced."""
-        check_writable(self.path, self.overwrite)
+        files.check_writable(self.path, self.overwrite)
 
     def open(self, header: Header) -> None:
         """Begin the file; the header is on disk at once, or an ``OSError`` says why it is not."""
@@ -637,7 +609,7 @@ class McapSink:
 _LAST = 2.0**53
 
 
-def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Any:
+def load(path: str | os.PathLike[str], max_size: float = files.MAX_SIZE) -> Any:
     """Read a recorded run, CSV or MCAP, also if its process was killed.
 
     A sample of the trajectory is a deadline; time counts from the first one in the file. If
@@ -665,10 +637,10 @@ def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Any:
     ImportError
         if an MCAP file can't be read because the package mcap is missing.
     """
-    file, most = Path(path), bytes_of(max_size)
+    file, most = Path(path), files.bytes_of(max_size)
     where = f"path = {os.fspath(path)!r}"
     try:
-        check_regular(file, where)
+        files.check_regular(file, where)
     except FileNotFoundError as error:
         raise ValueError(str(error)) from None
     try:
@@ -683,7 +655,7 @@ def load(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Any:
         return trajectory_of(header, rows.reshape(-1, header.width), most)
     except OSError as error:
         raise ValueError(f"{where}: can't be read ({error.strerror})") from None
-    except TooLargeError as error:
+    except files.TooLargeError as error:
         raise ValueError(f"{where}: {error}") from None
     except ValueError as error:
         raise ValueError(f"{where}: must be a recording by quell, CSV or MCAP: {error}") from None
@@ -702,7 +674,7 @@ def check_one(run: Any, where: str) -> Trajectory:
     return found
 
 
-def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE)) -> Any:
+def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * files.MAX_SIZE)) -> Any:
     """Return rows (rows, width) as a trajectory with gaps filled in, see ``load``.
 
     It may take ``most`` bytes.
@@ -710,10 +682,10 @@ def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE
     if rows.shape[0] == 0:
         raise ValueError("it has no row")
     log, status = _filled(header.channels, rows, most), 0
-    check_times(log.shape[0], header.dt)
+    record.check_times(log.shape[0], header.dt)
     if any(name == "status" for name, _ in header.channels):
-        column = rows[:, columns_of(header.channels, "status").start]
-        status = int(np.bitwise_or.reduce(flags_of(column)))
+        column = rows[:, record.columns_of(header.channels, "status").start]
+        status = int(np.bitwise_or.reduce(record.flags_of(column)))
     common: dict[str, Any] = {
         "log": log,
         "channels": header.channels,
@@ -735,7 +707,7 @@ def _filled(channels: Channels, rows: Matrix, most: int) -> Matrix:
     if not (np.all(np.abs(k) <= _LAST) and np.all(k == np.rint(k)) and np.all(np.diff(k) >= 1.0)):
         raise ValueError("the indices of its deadlines are not whole numbers that increase")
     recorded = (k - k[0]).astype(np.int64)
-    check_size(8 * rows.shape[1] * (int(recorded[-1]) + 1), most)
+    files.check_size(8 * rows.shape[1] * (int(recorded[-1]) + 1), most)
     every = np.arange(recorded[-1] + 1)
     if every.size == recorded.size:
         return rows
@@ -744,7 +716,7 @@ def _filled(channels: Channels, rows: Matrix, most: int) -> Matrix:
     gaps[recorded] = False
     filled[:, K] = k[0] + every
     for name in ("y_measured", "lateness", "step_time"):
-        filled[gaps, columns_of(channels, name)] = np.nan
+        filled[gaps, record.columns_of(channels, name)] = np.nan
     filled[gaps, EVENTS] = Event.GAP
     return filled
 

@@ -30,11 +30,7 @@ from typing import Any, Self
 
 from quell import checks
 from quell.realtime.transports import UdpListener, resolved
-from quell.realtime.wire import (
-    COMMAND,
-    LENGTH,
-    MEASUREMENT,
-)
+from quell.realtime.wire import COMMAND, LENGTH, MEASUREMENT
 
 DIRECTIONS = ("loop", "rig")
 

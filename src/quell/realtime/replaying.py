@@ -16,18 +16,8 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.axes import Axes
-from quell.controllers.base import (
-    bumpless_transfer,
-    check_controller,
-    status_flags,
-    write_row,
-)
-from quell.controllers.several import (
-    control_all,
-    inputs_of,
-    set_applied_controls,
-    write_applied,
-)
+from quell.controllers.base import bumpless_transfer, check_controller, status_flags, write_row
+from quell.controllers.several import control_all, inputs_of, set_applied_controls, write_applied
 from quell.kernels.dispatch import call_specialised, compiled, explain_compile_errors, kernel
 from quell.realtime.channels import ChannelInputs, channel_inputs, checked_channels, pass_channels
 from quell.realtime.devices import SignalCounts, counts_text

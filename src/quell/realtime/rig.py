@@ -56,20 +56,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
 from quell.files import GrowingFile, check_writable
-from quell.kernels.dispatch import (
-    call_specialised,
-    compiled,
-    generic_with_default,
-    kernel,
-)
-from quell.plants.base import (
-    Plant,
-    advance,
-    as_input,
-    check_plant,
-    is_destroyed,
-    measure_all,
-)
+from quell.kernels.dispatch import call_specialised, compiled, generic_with_default, kernel
+from quell.plants.base import Plant, advance, as_input, check_plant, is_destroyed, measure_all
 from quell.realtime import wire
 from quell.realtime.devices import Listener, counts_of
 from quell.realtime.system import (

@@ -15,48 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.controllers.axes import Axes
-from quell.controllers.base import (
-    Controller,
-    check_controller,
-)
+from quell.controllers.base import Controller, check_controller
 from quell.quantities import UNKNOWN, AxesSignals, Signals
-from quell.realtime.channels import (
-    await_channels,
-    channel_inputs,
-    checked_channels,
-)
+from quell.realtime.channels import await_channels, channel_inputs, checked_channels
 from quell.realtime.cycle import ControlLoop
-from quell.realtime.devices import (
-    Device,
-    PythonHandle,
-    check_counts,
-    counts_of,
-    handle_of,
-)
+from quell.realtime.devices import Device, PythonHandle, check_counts, counts_of, handle_of
 from quell.realtime.memory_file import MemoryFile, memory_file
-from quell.realtime.recordings import (
-    Event,
-    Header,
-    MemorySink,
-    Sink,
-    file_sink,
-    row_channels,
-)
-from quell.realtime.safety import (
-    Safety,
-    as_scenario,
-    check_takes_reference,
-    reference_samples,
-)
-from quell.realtime.supervisor import (
-    RESERVED,
-    Cause,
-    Ending,
-    Mode,
-    Request,
-    Rules,
-    SupervisorState,
-)
+from quell.realtime.recordings import Event, Header, MemorySink, Sink, file_sink, row_channels
+from quell.realtime.safety import Safety, as_scenario, check_takes_reference, reference_samples
+from quell.realtime.supervisor import RESERVED, Cause, Ending, Mode, Request, Rules, SupervisorState
 from quell.realtime.system import (
     Timing,
     checked_cpu,

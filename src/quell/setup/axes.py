@@ -31,29 +31,8 @@ from quell.plants.multibody import Arm, Craft
 from quell.plants.nonlinear import NonlinearPlant
 from quell.quantities import AxesSignals
 from quell.records.trajectory import Trajectory
-from quell.setup import registry
+from quell.setup import loading, registry, schema
 from quell.setup.description import DT, TITLE, Title, optional
-from quell.setup.loading import (
-    REPLACED,
-    Known,
-    Setup,
-    check_windows,
-    made_once,
-    title_of,
-    windows_of,
-)
-from quell.setup.schema import (
-    Builder,
-    Plant,
-    SetupError,
-    Table,
-    call_table,
-    from_validation,
-    immutable,
-    list_of,
-    one_of,
-    read,
-)
 from quell.simulation.scenario import Scenario
 from quell.types import Matrix
 
@@ -181,18 +160,18 @@ def _markov(plant: LinearPlant, orders: Sequence[int]) -> Matrix:
 
 def axes_task(
     path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None, trust: bool = False
-) -> tuple[Setup, dict[str, Any]]:
+) -> tuple[loading.Setup, dict[str, Any]]:
     """Read a setup file of several axes; return it and further arguments of ``tune``.
 
     ``changes`` are values of ``[tune]`` by name. Raises ``SetupError`` as ``load``, and for a
     file without plant.
     """
-    name, data = read(path)
+    name, data = schema.read(path)
     tables = dict(data)
     if changes:
         tables["tune"] = {**data.get("tune", {}), **changes}
     setup = assembled_axes(name, tables, trust)
-    check_windows(setup)
+    loading.check_windows(setup)
     plant = setup.needed("plant")
     options = dict(setup.tune or {})
     if options.get("operating_points") is None and _is_nonlinear(plant):
@@ -231,30 +210,30 @@ def _with_unit_gain(make: Callable[..., Any]) -> Callable[..., Any]:
 
 
 OBSERVERS = {
-    kind: call_table(
+    kind: schema.call_table(
         kind,
         _with_unit_gain(table.function),
-        types={"plant": Plant | None},
+        types={"plant": schema.Plant | None},
         descriptions={"plant": "model of the axis, of b0 = 1.", "E": "how f enters; as u."},
     )
     for kind, table in registry.OBSERVERS.items()
 }
 _OF_ACTUATORS = ("u_min", "u_max", "rate_limit", "schedule")
-CONTROLLER = call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
-ON_TOP = call_table(
+CONTROLLER = schema.call_table("adrc", ADRC, only=True, types=registry.LAW, without=_OF_ACTUATORS)
+ON_TOP = schema.call_table(
     "compensator", Compensator, only=True, types=registry.PARTS, without=_OF_ACTUATORS
 )
 # Controllers without observer, that are not designed for the linear part of a plant.
 _DRIVES = ("pid", "pid-simc", "notch-pid", "p-pi", "resonance-ratio")
 DRIVES = {kind: registry.CONTROLLERS[kind] for kind in _DRIVES}
 _ACTUATORS = "names and units of the control signals, `torque [N m]`, for files."
-AXES = call_table(
+AXES = schema.call_table(
     "axes",
     coupled,
     only=True,
     without=("axes", "plant", "drives", "of_axes"),
     beside={
-        "actuators": (list_of(str), Field((), description=_ACTUATORS)),
+        "actuators": (schema.list_of(str), Field((), description=_ACTUATORS)),
         "learner": (
             registry.Learner | None,
             optional(
@@ -268,24 +247,24 @@ AXES = call_table(
         ),
     },
 )
-SCENARIO = call_table(
+SCENARIO = schema.call_table(
     "scenario",
     Scenario,
     only=True,
-    types={"disturbances": list_of(registry.Signal)},
+    types={"disturbances": schema.list_of(registry.Signal)},
     without=("reference", "noise", "schedule"),
 )
-METRICS = call_table("metrics", Trajectory.metrics, only=True, without=("target",))
+METRICS = schema.call_table("metrics", Trajectory.metrics, only=True, without=("target",))
 if not TYPE_CHECKING:
-    AxesPlant, Guard = one_of(registry.AXES_PLANTS), registry.Guard
+    AxesPlant, Guard = schema.one_of(registry.AXES_PLANTS), registry.Guard
     Prefilter = registry.Prefilter
-    Observer, Learner = one_of(OBSERVERS), registry.Learner
-    AxisDrive, OnTop = one_of(DRIVES, default="pid"), ON_TOP
+    Observer, Learner = schema.one_of(OBSERVERS), registry.Learner
+    AxisDrive, OnTop = schema.one_of(DRIVES, default="pid"), ON_TOP
     AxesTable, Controller, ScenarioTable, Metrics = AXES, CONTROLLER, SCENARIO, METRICS
     Rig, Sweep, Tune = registry.AxesRig, registry.Sweep, registry.AxesTune
 
 
-class Axis(Table):
+class Axis(schema.Table):
     """A table ``[[axis]]``."""
 
     name: str = Field("", description="its name; axis1 and so on by default.")
@@ -301,7 +280,7 @@ class Axis(Table):
     noise: registry.Signal = Field(0.0, description="signal added to y before the controller.")
 
 
-class AxesDescription(Table):
+class AxesDescription(schema.Table):
     """The tables and keys of a setup of several axes."""
 
     title: Title = TITLE
@@ -324,12 +303,12 @@ class AxesDescription(Table):
 # ---- From a file to objects ----
 
 # Tables of a setup of one axis, and where they are here.
-_ELSEWHERE = dict.fromkeys(REPLACED, "belongs into each [[axis]]")
+_ELSEWHERE = dict.fromkeys(loading.REPLACED, "belongs into each [[axis]]")
 
 
 def assembled_axes(
-    name: str, data: Mapping[str, Any], trust: bool = False, known: Known | None = None
-) -> Setup:
+    name: str, data: Mapping[str, Any], trust: bool = False, known: loading.Known | None = None
+) -> loading.Setup:
     """Build the objects that ``data`` describes: the content of a file of several axes.
 
     ``known`` has the plant of an earlier call, which is not built again if its table is the same.
@@ -341,23 +320,23 @@ def assembled_axes(
     """
     mistakes = [f"{name}: {key}: {rule}" for key, rule in _ELSEWHERE.items() if key in data]
     if mistakes:
-        raise SetupError(mistakes)
-    values = immutable(data)
+        raise schema.SetupError(mistakes)
+    values = schema.immutable(data)
     try:
         tables = AxesDescription.model_validate(values)
     except ValidationError as error:
-        raise _explained(from_validation(name, error, values)) from None
+        raise _explained(schema.from_validation(name, error, values)) from None
     if not tables.axis:
-        raise SetupError([f"{name}: axis: is empty; give a table [[axis]] for each axis"])
-    builder = Builder(name, trust)
+        raise schema.SetupError([f"{name}: axis: is empty; give a table [[axis]] for each axis"])
+    builder = schema.Builder(name, trust)
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
     plant = None
     if tables.plant is not None:
         make = partial(builder.build, tables.plant, "plant", dt=dt)
-        plant = made_once({} if known is None else known, "plant", (tables.plant, dt), make)
+        plant = loading.made_once({} if known is None else known, "plant", (tables.plant, dt), make)
     names = [axis.name or f"axis{i + 1}" for i, axis in enumerate(tables.axis)]
     if len(set(names)) < len(names):
-        raise SetupError([f"{name}: axis: names {', '.join(names)} must be different"])
+        raise schema.SetupError([f"{name}: axis: names {', '.join(names)} must be different"])
     made = {
         key: _axis(builder, axis, f"axis[{i}]", dt)
         for i, (key, axis) in enumerate(zip(names, tables.axis, strict=True))
@@ -379,8 +358,8 @@ def assembled_axes(
     scenario = _scenario(builder, tables, dt)
     if plant is not None:
         builder.attempt("plant", (), _check_fit, plant, controller, scenario)
-    windows = windows_of(builder, tables.metrics)
-    title = tables.title or title_of(name)
+    windows = loading.windows_of(builder, tables.metrics)
+    title = tables.title or loading.title_of(name)
     tune = None if tables.tune is None else builder.build(tables.tune, "tune")
     sweep = None if tables.sweep is None else builder.build(tables.sweep, "sweep")
     rig = None if tables.rig is None else builder.build(tables.rig, "rig", dt=dt)
@@ -388,7 +367,7 @@ def assembled_axes(
     if rig is not None and signals.known:
         rig = {"signals": signals, **rig}
     parts = (controller, plant, scenario, rig, sweep, windows)
-    return Setup(name, title, *parts, tables, tune, trust)
+    return loading.Setup(name, title, *parts, tables, tune, trust)
 
 
 def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:
@@ -407,12 +386,12 @@ def signals_in(tables: AxesDescription, axes: Any) -> AxesSignals:
     )
 
 
-def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:
+def _axis(builder: schema.Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]:
     """Return the controller of an axis; with its learner and guard if they are of all axes."""
     if (axis.controller is None) == (axis.compensator is None):
         has = "neither" if axis.controller is None else "both"
         rule = f"has {has}; give a controller, which is an ADRC, or a compensator"
-        raise SetupError([f"{builder.name}: {path}: {rule}"])
+        raise schema.SetupError([f"{builder.name}: {path}: {rule}"])
     parts = {
         key: None if table is None else builder.build(table, f"{path}.{key}", dt=dt)
         for key, table in (("observer", axis.observer), ("guard", axis.guard))
@@ -432,7 +411,7 @@ def _axis(builder: Builder, axis: Axis, path: str, dt: float) -> tuple[Any, ...]
     return made, *outside
 
 
-def _scenario(builder: Builder, tables: AxesDescription, dt: float) -> Scenario | None:
+def _scenario(builder: schema.Builder, tables: AxesDescription, dt: float) -> Scenario | None:
     """Return the scenario, with the references and noises of the axes; None without one."""
     if tables.scenario is None:
         return None
@@ -456,7 +435,7 @@ def _check_fit(plant: Any, controller: Axes, scenario: Scenario | None) -> None:
         SampledScenario.of(scenario, plant, controller, None)
 
 
-def _explained(error: SetupError) -> SetupError:
+def _explained(error: schema.SetupError) -> schema.SetupError:
     """Return the errors, with the rule of keys that axes do not have."""
     rules = {
         ".observer.b0: unknown": "is 1 for an axis; the gain of the actuators is B0 in [axes]",
@@ -473,4 +452,4 @@ def _explained(error: SetupError) -> SetupError:
                 line = f"{line.partition(': unknown')[0]}: {rule}"
                 break
         lines.append(line)
-    return SetupError(lines)
+    return schema.SetupError(lines)

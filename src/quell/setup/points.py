@@ -14,17 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from quell import checks
 from quell.plants.linearise import linear_model
-from quell.setup.loading import (
-    NO_CONTROLLER,
-    REPLACED,
-    Setup,
-    changed,
-    check_windows,
-    tuned_tables,
-    tuning_options,
-    unchecked,
-    written_loop,
-)
+from quell.setup import loading
 from quell.setup.schema import SetupError, read
 from quell.tuning.tables import rest_of_plant
 
@@ -52,7 +42,7 @@ class ScheduleTask(NamedTuple):
     plant: Any  # a function of the signals, or plants by point
     dt: float  # [s]
     options: dict[str, Any]  # all others
-    setup: Setup  # with the plant of the tuned file
+    setup: loading.Setup  # with the plant of the tuned file
 
 
 def has_schedule(data: Mapping[str, Any]) -> bool:
@@ -83,7 +73,7 @@ def schedule_task(
     asked = {**data["tune"], **(changes or {})}
     _check(name, data, asked)
     first = {"dt": data["dt"]} if "dt" in data else {}
-    alone = unchecked(name, first | {"controller": NO_CONTROLLER, "tune": asked})
+    alone = loading.unchecked(name, first | {"controller": loading.NO_CONTROLLER, "tune": asked})
     given = (alone.tune or {})["schedule"]
     how: dict[str, Any] = dict(given["options"])
     at = _Points(name, data, given, asked["schedule"], trust)
@@ -93,18 +83,20 @@ def schedule_task(
     external = "external" in ((names,) if isinstance(names, str) else names)
     has_signals = isinstance(scenario, Mapping) and (not external or "schedule" in scenario)
     table = data["plant"] if "plant" in data and has_signals else at.table(middle)
-    whole = {key: value for key, value in data.items() if key not in REPLACED}
+    whole = {key: value for key, value in data.items() if key not in loading.REPLACED}
     whole |= {"plant": table, "tune": asked}
-    setup = unchecked(name, {**whole, "controller": NO_CONTROLLER}, trust)
-    check_windows(setup)
-    options = tuning_options(setup, data.get("controller"), setup.plant, limits or {})
+    setup = loading.unchecked(name, {**whole, "controller": loading.NO_CONTROLLER}, trust)
+    loading.check_windows(setup)
+    options = loading.tuning_options(setup, data.get("controller"), setup.plant, limits or {})
     del options["schedule"]
     options |= how
     if "scenario" not in data:
         with suppress(ValueError):  # of a plant without operating point, which tune refuses
             options["rest"] = rest_of_plant(plants[middle], setup.controller.dt)
-    options["setup"] = tuned_tables(setup, {**whole, "tune": data["tune"]}, setup.plant, options)
-    options["written"] = written_loop(setup, options["setup"])
+    options["setup"] = loading.tuned_tables(
+        setup, {**whole, "tune": data["tune"]}, setup.plant, options
+    )
+    options["written"] = loading.written_loop(setup, options["setup"])
     if given["parameter"] is not None:
         options["points"] = at.axes if len(at.axes) > 1 else at.axes[0]
         return ScheduleTask(at.linear, setup.controller.dt, options, setup)
@@ -169,19 +161,23 @@ class _Points:
         """Return the table of the plant at a point."""
         if self.parameters:
             values = dict(zip(self.parameters, at, strict=True))
-            found: Mapping[str, Any] = changed(self.name, self.data, values)["plant"]
+            found: Mapping[str, Any] = loading.changed(self.name, self.data, values)["plant"]
             return found
         return _merged(self.data.get("plant", {}), self.changes[at][1])
 
     def plant(self, *at: float) -> Any:
         """Return the plant at a point; the place of the point stands in front of its errors."""
-        tables = {"dt": self.data.get("dt"), "plant": self.table(at), "controller": NO_CONTROLLER}
+        tables = {
+            "dt": self.data.get("dt"),
+            "plant": self.table(at),
+            "controller": loading.NO_CONTROLLER,
+        }
         place = ", ".join(f"{value:g}" for value in at)
         where = f"tune.schedule, at {place}"
         if at in self.changes:
             where = f"tune.schedule.points[{self.changes[at][0]}]"
         try:
-            setup = unchecked(self.name, tables, self.trust)
+            setup = loading.unchecked(self.name, tables, self.trust)
             if getattr(setup.description.plant, "uncertain", None) is not None:
                 raise SetupError([f"plant.uncertain: {_RANGES}; b_range of [tune] is a range of b"])
         except SetupError as error:

@@ -17,12 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.base import (
-    reset_loop,
-    set_reference_derivatives,
-    status_flags,
-    write_row,
-)
+from quell.controllers.base import reset_loop, set_reference_derivatives, status_flags, write_row
 from quell.controllers.several import control_all, references_of
 from quell.kernels.dispatch import (
     compiled_loop,
@@ -32,14 +27,7 @@ from quell.kernels.dispatch import (
     kernel,
     specialised,
 )
-from quell.plants.base import (
-    advance,
-    as_input,
-    begin_run,
-    check_run,
-    inputs_of,
-    measure_all,
-)
+from quell.plants.base import advance, as_input, begin_run, check_run, inputs_of, measure_all
 from quell.plants.base import outputs_of as outputs_of_plant
 from quell.records.metrics import runs_away
 from quell.records.record import columns_of

@@ -12,15 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.kernels.dispatch import (
-    call_specialised,
-    compiled,
-    interpreted,
-)
-from quell.plants.base import (
-    advance,
-    as_input,
-)
+from quell.kernels.dispatch import call_specialised, compiled, interpreted
+from quell.plants.base import advance, as_input
 from quell.plants.channels import EncodedOutputsModel
 from quell.plants.friction import FrictionModel
 from quell.plants.linear import DelayedPlantModel, EncodedPlantModel

@@ -16,9 +16,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.checks import Described
-from quell.controllers.base import (
-    Controller,
-)
+from quell.controllers.base import Controller
 from quell.controllers.several import inputs_of, outputs_of, references_of
 from quell.hints import explained
 from quell.plants.base import Plant

@@ -28,15 +28,7 @@ from quell.setup import made
 from quell.setup.description import is_of_axes, parsed
 from quell.setup.loading import Known, Setup
 from quell.simulation import simulate
-from quell.studio.messages import (
-    MOST_BYTES,
-    Columns,
-    Granted,
-    checked,
-    files_of,
-    frame,
-    with_models,
-)
+from quell.studio import messages
 from quell.tuning.report import toml_text
 from quell.types import Vector
 
@@ -159,7 +151,7 @@ def run_frames(
         "compiled": compile_time.seconds - compiled,
         "axes": list(getattr(whole, "axis_names", ())),
     }
-    yield frame(header | dict(about), _curves(run, columns, actuators))
+    yield messages.frame(header | dict(about), _curves(run, columns, actuators))
     if told is not None:
         told |= {f"run.{i}": dict(each) for i, each in enumerate(header["metrics"])}
     if stale():
@@ -175,7 +167,7 @@ def run_frames(
     if told is not None:
         told["loop"] = dict(numbers)
     more = {"kind": "loop", "loop": numbers, "seconds": time.perf_counter() - began}
-    yield frame(more | dict(about), curves)
+    yield messages.frame(more | dict(about), curves)
 
 
 def loop_of(setup: Setup) -> LoopAnalysis:
@@ -221,7 +213,7 @@ def _curves(run: Trajectory, columns: int, actuators: Mapping[str, Vector]) -> d
     """
     names = [name for name in _CHANNELS if name in run.names and not (actuators and name == "u")]
     t = np.asarray(run.t, dtype=np.float64)
-    cut = Columns(len(run), columns)
+    cut = messages.Columns(len(run), columns)
     curves = {name: run[name] for name in names} | dict(actuators)
     return {"t": cut.times(t)} | {name: cut.points(each) for name, each in curves.items()}
 
@@ -418,20 +410,22 @@ def _in_docstring(title: str) -> str:
     return " ".join(plain.replace('"', "'").replace("\\", "/").split())
 
 
-def tables_of_text(text: Any, granted: Granted, models: Any = None) -> dict[str, Any]:
+def tables_of_text(text: Any, granted: messages.Granted, models: Any = None) -> dict[str, Any]:
     """Return the tables of the text of a setup file; raise a ``SetupError`` or ``ValueError``.
 
     ``models`` has the texts of files of identified models by name.
     """
-    if not isinstance(text, str) or len(text) > MOST_BYTES:
-        raise ValueError(f"text: must be the content of a TOML file, at most {MOST_BYTES} bytes")
+    if not isinstance(text, str) or len(text) > messages.MOST_BYTES:
+        raise ValueError(
+            f"text: must be the content of a TOML file, at most {messages.MOST_BYTES} bytes"
+        )
     texts = models or {}
     if not isinstance(texts, Mapping) or not all(isinstance(each, str) for each in texts.values()):
         raise ValueError("models: must be texts of files by name")
     tables = parsed(NAME, text)
-    if not files_of(tables) <= granted.files:
-        tables = with_models(tables, texts)
-    return checked(tables, granted)
+    if not messages.files_of(tables) <= granted.files:
+        tables = messages.with_models(tables, texts)
+    return messages.checked(tables, granted)
 
 
 def _without_none(value: Any) -> Any:

@@ -39,13 +39,7 @@ from quell.plants.linear import LinearPlant
 from quell.records.record import netcdf_of
 from quell.simulation.scenario import Scenario, check_scenario, is_random
 from quell.simulation.simulate import simulate
-from quell.sweeping.measures import (
-    Measure,
-    Measures,
-    check_axis,
-    describe_measures,
-    measure_runs,
-)
+from quell.sweeping.measures import Measure, Measures, check_axis, describe_measures, measure_runs
 from quell.types import Matrix, Vector
 
 # ---- The values of a sweep's parameters ----

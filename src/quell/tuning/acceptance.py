@@ -23,21 +23,8 @@ from quell.controllers.base import Controller
 from quell.controllers.prefilters import Prefiltered, ReferenceModel
 from quell.plants.linear import LinearPlant
 from quell.simulation import Scenario
+from quell.tuning import reference
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.reference import (
-    ORDER_OF_AXIS,
-    Axis,
-    Shaped,
-    bounded_rate,
-    few_at_limits,
-    largest_step,
-    model_of_linear_step,
-    needs_none,
-    profile_for,
-    reference_model_for,
-    room_of_u,
-    worst_step,
-)
 from quell.tuning.structures.base import Model, resonances
 from quell.tuning.tables import SHARE, held_load, held_state, held_step, late_plant
 from quell.tuning.written import (
@@ -190,7 +177,7 @@ def time_constant(analysis: LoopAnalysis, plants: PlantSet) -> float:
     return 1.0 / (omega if math.isfinite(omega) and omega > 0.0 else plants.crossover)
 
 
-def axis_of(linear: LinearPlant | None, tau: float, plants: PlantSet) -> Axis | None:
+def axis_of(linear: LinearPlant | None, tau: float, plants: PlantSet) -> reference.Axis | None:
     """Return the rigid part of a plant that needs no u at rest; None for another one.
 
     ``tau`` is the time constant of the closed loop [s].
@@ -198,7 +185,7 @@ def axis_of(linear: LinearPlant | None, tau: float, plants: PlantSet) -> Axis | 
     if linear is None:
         return None
     gain = abs(complex(plants.responses(np.array([1.0 / tau]))[0, 0]))
-    return Axis.of(linear, 1.0 / gain)
+    return reference.Axis.of(linear, 1.0 / gain)
 
 
 def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
@@ -217,15 +204,17 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
     if loop.shaped and both and axis is not None:
         modes = [] if loop.model is None else resonances(loop.model)
         period = 2.0 * math.pi / modes[0] if modes else 0.0
-        room = room_of_u(written, loop.linear, limits, loop.rest)
+        room = reference.room_of_u(written, loop.linear, limits, loop.rest)
         every = [axis, *(axis_of(each.linear, tau, loop.plants) for each in written.others)]
-        heaviest = Axis.heaviest([each for each in every if each is not None])
-        found = Shaped(None, None)
+        heaviest = reference.Axis.heaviest([each for each in every if each is not None])
+        found = reference.Shaped(None, None)
         if not modes or written.largest is not None:
-            found = profile_for(written, controller, heaviest, tau, room, period)
+            found = reference.profile_for(written, controller, heaviest, tau, room, period)
         if modes:
-            fastest = FASTEST_MODEL * ORDER_OF_AXIS / tau
-            model = reference_model_for(written, controller, fastest, ORDER_OF_AXIS)
+            fastest = FASTEST_MODEL * reference.ORDER_OF_AXIS / tau
+            model = reference.reference_model_for(
+                written, controller, fastest, reference.ORDER_OF_AXIS
+            )
             if found.step is None or (
                 model.step is not None and model.step.settling < found.step.settling
             ):
@@ -233,10 +222,10 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
         prefilter = found.prefilter
     process = loop.shaped and both and axis is None and written.largest is not None
     if prefilter is None and written.largest is not None:
-        step = worst_step(written, controller)
+        step = reference.worst_step(written, controller)
         if step.overshoot > MOST_OVERSHOOT:
             if loop.shaped and limited:
-                model = reference_model_for(
+                model = reference.reference_model_for(
                     written, controller, FASTEST_MODEL / tau, within=not process
                 )
                 prefilter = model.prefilter
@@ -244,8 +233,8 @@ def judge(loop: Loop, controller: Controller, analysis: LoopAnalysis) -> Judged:
                 offered, offered_step = _offer(written, loop.plants, controller, tau)
     larger = None
     if process:
-        most = largest_step(written, loop.linear, limits, loop.rest)
-        prefilter, larger = bounded_rate(written, controller, prefilter, most, tau)
+        most = reference.largest_step(written, loop.linear, limits, loop.rest)
+        prefilter, larger = reference.bounded_rate(written, controller, prefilter, most, tau)
     whole = controller if prefilter is None else Prefiltered(controller, prefilter)
     held = np.array([[held_load(loop.linear)]])
     remedy = ""
@@ -273,8 +262,8 @@ def quick_without(loop: Loop, controller: Controller, analysis: LoopAnalysis) ->
     tau = time_constant(analysis, loop.plants)
     if axis_of(loop.linear, tau, loop.plants) is not None:
         return False
-    most = largest_step(loop.written, loop.linear, loop.limits, loop.rest)
-    return needs_none(loop.written, controller, most, tau)
+    most = reference.largest_step(loop.written, loop.linear, loop.limits, loop.rest)
+    return reference.needs_none(loop.written, controller, most, tau)
 
 
 def judge_axes(
@@ -356,7 +345,7 @@ def _needs_prefilter(axis: Seen, dt: float) -> bool:
     if step is None or axis.prefilter is not None:
         return False
     over = not step.overshoot <= MOST_OVERSHOOT or math.isnan(step.settling)
-    return over or step.limited > few_at_limits(step.settling, dt)
+    return over or step.limited > reference.few_at_limits(step.settling, dt)
 
 
 def _seen(
@@ -521,9 +510,9 @@ def _offer(
     """Return a prefilter for a loop without limits of u, and the step with it."""
     model = None
     if not getattr(controller, "derivatives", 0) and not written.others:
-        model = model_of_linear_step(plants, controller)
+        model = reference.model_of_linear_step(plants, controller)
     if model is None:
-        model = reference_model_for(written, controller, FASTEST_MODEL / tau).prefilter
+        model = reference.reference_model_for(written, controller, FASTEST_MODEL / tau).prefilter
     if model is None:
         return None, None
     shaped = Prefiltered(controller, model)

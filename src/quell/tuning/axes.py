@@ -45,6 +45,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.analysis import matrices
 from quell.analysis.coupling import (
     ABOVE_BANDWIDTH,
     INDEPENDENT,
@@ -53,14 +54,6 @@ from quell.analysis.coupling import (
     coupling,
     is_turned,
     unstable_zeros,
-)
-from quell.analysis.matrices import (
-    estimates_at,
-    gain_at,
-    high_gains,
-    joined,
-    linear_part_of,
-    sampled_matrices,
 )
 from quell.analysis.multivariable import MultivariableLoop, analyse_axes
 from quell.controllers.axes import Axes
@@ -84,17 +77,7 @@ from quell.tuning.axes_at_limits import (
 )
 from quell.tuning.constraints import Constraints, first_given, given_constraints
 from quell.tuning.interaction import PLACES, TOLERANCE, GivenB0, Interaction, Reached, excess
-from quell.tuning.optimiser.coupled import (
-    UNSTABLE,
-    CoupledLoops,
-    Found,
-    Law,
-    Limits,
-    Plant,
-    integral_gain,
-    optimum,
-    starts,
-)
+from quell.tuning.optimiser import coupled
 from quell.tuning.report import Design
 from quell.tuning.tuned import Check, Tuned
 from quell.tuning.written import Written, bounded
@@ -178,8 +161,8 @@ def tune_together(
             own.append(entry)
         patterns = [_with_errors(one, B0_off, seed) for one in nominal]
         plants = [*nominal, *(each for part in patterns for each in part)]
-        dead = max(linear_part_of(plant, axes.dt, points[0])[1], default=0)
-        loops = partial(CoupledLoops, dt=axes.dt, dead=dead, objective=objective)
+        dead = max(matrices.linear_part_of(plant, axes.dt, points[0])[1], default=0)
+        loops = partial(coupled.CoupledLoops, dt=axes.dt, dead=dead, objective=objective)
         limits, start, costs = _each_alone(tuned_alone, own, dead, axes, bounds, least, loops)
         loops = partial(loops, axes=axes.axes, alone=costs)
         report("together", (parts - 2) / parts)
@@ -198,7 +181,7 @@ def tune_together(
                 file = file_at(plant, axes, points[0])
             held = held_loads(plant, axes, points[0])
 
-            def at_limits(each: Found) -> Judged:
+            def at_limits(each: coupled.Found) -> Judged:
                 """Return what the axes do with these bandwidths in the file."""
                 whole = _made(axes, each.values)
                 tau = time_constant(_loop(nominal[0], axes, each.values))
@@ -292,22 +275,22 @@ def _check_tunable(axes: Axes) -> None:
             )
 
 
-def _nominal(plant: Any, axes: Axes, points: Sequence[Any]) -> list[Plant]:
+def _nominal(plant: Any, axes: Axes, points: Sequence[Any]) -> list[coupled.Plant]:
     """Return the plant at each operating point."""
     found = []
     for point in points:
-        A, B, C = sampled_matrices(plant, axes.dt, point)
+        A, B, C = matrices.sampled_matrices(plant, axes.dt, point)
         if (C.shape[0], B.shape[1]) != (axes.outputs, axes.inputs):
             raise ValueError(
                 f"plant has {B.shape[1]} inputs and {C.shape[0]} outputs: the controller has "
                 f"{axes.outputs} axes and {axes.inputs} actuators"
             )
-        R = gain_at(axes, estimates_at(axes, plant, point))[1]
-        found.append(Plant(A, B, C, R))
+        R = matrices.gain_at(axes, matrices.estimates_at(axes, plant, point))[1]
+        found.append(coupled.Plant(A, B, C, R))
     return found
 
 
-def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
+def _with_errors(nominal: coupled.Plant, off: float, seed: int) -> list[coupled.Plant]:
     """Return the plants whose B0 differs from the controller's by a share."""
     if off == 0.0:
         return []
@@ -321,7 +304,7 @@ def _with_errors(nominal: Plant, off: float, seed: int) -> list[Plant]:
     return [_off_by(nominal, B0, off * signs) for signs in patterns]
 
 
-def _gain_of(nominal: Plant) -> Matrix:
+def _gain_of(nominal: coupled.Plant) -> Matrix:
     """Return B0 of its inverse; an entry that is rounding beside its row and column is zero."""
     B0 = np.asarray(np.linalg.pinv(nominal.R), dtype=np.float64)
     size = np.abs(B0)
@@ -329,7 +312,7 @@ def _gain_of(nominal: Plant) -> Matrix:
     return np.where(size > _ROUNDED * least, B0, 0.0)
 
 
-def _off_by(nominal: Plant, B0: Matrix, shares: Vector) -> Plant:
+def _off_by(nominal: coupled.Plant, B0: Matrix, shares: Vector) -> coupled.Plant:
     """Return the plant with the entries of B0 that are not zero off by shares."""
     error = np.zeros(B0.shape)
     error[B0 != 0.0] = shares * B0[B0 != 0.0]
@@ -361,7 +344,7 @@ def _alone(
         structure = "reduced"
     elif not observer.has_one_pole and observer.poles is None:
         structure = "half-gain"
-    waiting = linear_part_of(plant, axes.dt, point)[1]
+    waiting = matrices.linear_part_of(plant, axes.dt, point)[1]
     how: dict[str, Any] = {"structure": structure, "order": observer.order, "compare": ()}
     how |= {"objective": objective, "constraints": bounds}
     late = max(waiting, default=0) * axes.dt
@@ -380,8 +363,8 @@ def _alone(
 
 def diagonal_plant(plant: Any, axes: Axes, i: int, point: Any) -> tuple[Vector, Vector]:
     """Return the transfer function from v_i to y_i, without delays."""
-    linear = linear_part_of(plant, axes.dt, point)[0]
-    R = gain_at(axes, estimates_at(axes, plant, point))[1]
+    linear = matrices.linear_part_of(plant, axes.dt, point)[0]
+    R = matrices.gain_at(axes, matrices.estimates_at(axes, plant, point))[1]
     return diagonal_entry(linear.A, linear.B @ R[:, i], linear.C[i])
 
 
@@ -420,8 +403,8 @@ def _each_alone(
     axes: Axes,
     bounds: Constraints,
     least: float,
-    loops: Callable[..., CoupledLoops],
-) -> tuple[Limits, Matrix, Vector]:
+    loops: Callable[..., coupled.CoupledLoops],
+) -> tuple[coupled.Limits, Matrix, Vector]:
     """Return the bounds, the best bandwidths of each axis alone with b0 = 1, and their costs.
 
     ``tune`` has another b0, which is the gain of the axis here.
@@ -435,17 +418,17 @@ def _each_alone(
         linear = LinearPlant.of(own_plants[i])
         one = linear
         late = delayed_inputs(one, dead * axes.dt, axes.dt) if dead else one
-        single = Plant(*sampled_matrices(late, axes.dt), np.eye(1))
-        task = loops([single], [axes.axes[i]], Limits(*own), alone=np.ones(1))
+        single = coupled.Plant(*matrices.sampled_matrices(late, axes.dt), np.eye(1))
+        task = loops([single], [axes.axes[i]], coupled.Limits(*own), alone=np.ones(1))
         start = np.array([[values["omega_c"], values["omega_o"]]])
         low, high = _ends(start, bounds, axes.dt)
-        first = starts(task, start, low, high, _STARTS)
-        ends = [optimum(task, each.values, low, high) for each in first]
+        first = coupled.starts(task, start, low, high, _STARTS)
+        ends = [coupled.optimum(task, each.values, low, high) for each in first]
         best = min(ends, key=lambda each: each.rank)
         rows.append(best.values[0])
         costs.append(best.measured.costs[0])
     of_noise = None if None in known else tuple(each for each in known if each is not None)
-    limits = Limits(bounds.m_s, bounds.m_t, of_noise, least, bounds.damping)
+    limits = coupled.Limits(bounds.m_s, bounds.m_t, of_noise, least, bounds.damping)
     return limits, np.array(rows), np.array(costs)
 
 
@@ -458,14 +441,14 @@ def _ends(start: Matrix, bounds: Constraints, dt: float) -> tuple[Vector, Vector
 
 
 def _search(
-    loops: Callable[..., CoupledLoops],
-    plants: Sequence[Plant],
+    loops: Callable[..., coupled.CoupledLoops],
+    plants: Sequence[coupled.Plant],
     points: int,
     axes: Axes,
-    limits: Limits,
+    limits: coupled.Limits,
     start: Matrix,
     bounds: Constraints,
-) -> tuple[Found, list[Plant], list[Reached]]:
+) -> tuple[coupled.Found, list[coupled.Plant], list[Reached]]:
     """Return the best bandwidths, the plants they are judged on, and the bounds there.
 
     The search has the plants of the operating points, and those with errors of B0 that turned out
@@ -474,19 +457,19 @@ def _search(
     low, high = _ends(start, bounds, axes.dt)
     every = loops(plants, limits=limits)
     members = list(range(points))
-    first = starts(every, start, low, high, _STARTS)
+    first = coupled.starts(every, start, low, high, _STARTS)
     for i in range(len(start) if len(start) > 1 and first[0].rank[0] else 0):
         apart = start.copy()
         apart[i] /= _APART
-        first += starts(every, apart, low, high, 1)
+        first += coupled.starts(every, apart, low, high, 1)
     first = sorted(first, key=lambda each: each.rank)[:_STARTS]
     for each in first:
         members = _with_worst(every, each, members)
     now, found, reached = [each.values for each in first], first[0], [_NOT_STABLE]
     for _ in range(_REPAIRS):
         few = loops([plants[j] for j in members], limits=limits)
-        ends = [optimum(few, each, low, high) for each in now]
-        ends = [Found(each.values, every.measured(each.values)) for each in ends]
+        ends = [coupled.optimum(few, each, low, high) for each in now]
+        ends = [coupled.Found(each.values, every.measured(each.values)) for each in ends]
         best = min(ends, key=lambda each: each.rank)
         members = _with_worst(every, best, members)
         there = _exact(every, members, axes, best.values)
@@ -499,15 +482,15 @@ def _search(
     return found, [plants[j] for j in members], reached
 
 
-def _with_worst(loops: CoupledLoops, found: Found, members: list[int]) -> list[int]:
+def _with_worst(loops: coupled.CoupledLoops, found: coupled.Found, members: list[int]) -> list[int]:
     """Return the members of a set, and the plants with the least slacks at a result."""
     slacks = np.min(loops.measured(found.values).slacks, axis=1)
     return sorted({*members, *np.argsort(slacks)[:_WORST].tolist()})
 
 
-def _tightened(limits: Limits, share: float) -> Limits:
+def _tightened(limits: coupled.Limits, share: float) -> coupled.Limits:
     """Return bounds that are tighter by a share."""
-    return Limits(
+    return coupled.Limits(
         None if limits.m_s is None else max(limits.m_s / share, 1.001),
         None if limits.m_t is None else max(limits.m_t / share, 1.001),
         None if limits.m_ks is None else tuple(value / share for value in limits.m_ks),
@@ -531,10 +514,12 @@ def _made(axes: Axes, values: Matrix) -> Axes:
     return made
 
 
-def _loop(plant: Plant, axes: Axes, values: Matrix) -> MultivariableLoop:
+def _loop(plant: coupled.Plant, axes: Axes, values: Matrix) -> MultivariableLoop:
     """Return the loop of a plant with plain axes of these bandwidths."""
-    laws = [Law(axis).at(*map(float, row)) for axis, row in zip(axes.axes, values, strict=True)]
-    law = joined(laws, plant.R)
+    laws = [
+        coupled.Law(axis).at(*map(float, row)) for axis, row in zip(axes.axes, values, strict=True)
+    ]
+    law = matrices.joined(laws, plant.R)
     return MultivariableLoop((plant.A, plant.B, plant.C), law, axes.dt, outputs=axes.names)
 
 
@@ -546,7 +531,7 @@ class _Peaks(NamedTuple):
     noise: Vector  # |C S| from y_i to v_i (p,)
 
 
-def _peaks(loop: MultivariableLoop, plant: Plant) -> _Peaks:
+def _peaks(loop: MultivariableLoop, plant: coupled.Plant) -> _Peaks:
     omega = loop.omega[1:]
     S_o, S_i = (np.einsum("kii->ki", loop.response(name, omega)) for name in ("S_o", "S_i"))
     to_v = np.einsum("kii->ki", np.linalg.pinv(plant.R) @ loop.response("CS", omega))
@@ -560,7 +545,7 @@ _NOT_STABLE = Reached("the loop is not stable", math.nan, math.nan, math.inf)
 
 
 def _exact(
-    loops: CoupledLoops, members: Sequence[int], axes: Axes, values: Matrix
+    loops: coupled.CoupledLoops, members: Sequence[int], axes: Axes, values: Matrix
 ) -> list[Reached]:
     """Return the worst of each bound, over frequency on the grids of ``MultivariableLoop``."""
     found: dict[str, list[Reached]] = {}
@@ -600,8 +585,8 @@ def _exact(
 def _designs(
     axes: Axes,
     loops: Sequence[MultivariableLoop],
-    plants: Sequence[Plant],
-    found: Found,
+    plants: Sequence[coupled.Plant],
+    found: coupled.Found,
     alone: Vector,
     objective: str,
     setup: Mapping[str, Any] | None,
@@ -615,7 +600,7 @@ def _designs(
     designs = {}
     for i, (name, axis) in enumerate(zip(axes.names, axes.axes, strict=True)):
         omega_c, omega_o = found.values[i].tolist()
-        k_i = integral_gain(Law(axis).at(omega_c, omega_o), axes.dt)
+        k_i = coupled.integral_gain(coupled.Law(axis).at(omega_c, omega_o), axes.dt)
         measures = {
             "M_s": max(float(each.outputs[0, i]) for each in peaks),
             "M_t": max(float(each.outputs[1, i]) for each in peaks),
@@ -647,10 +632,10 @@ def _designs(
 
 
 def _check(
-    nominal: Sequence[Plant],
+    nominal: Sequence[coupled.Plant],
     off: float,
-    loops: Callable[..., CoupledLoops],
-    found: Found,
+    loops: Callable[..., coupled.CoupledLoops],
+    found: coupled.Found,
     samples: int,
     seed: int,
 ) -> Check:
@@ -663,7 +648,7 @@ def _check(
         drawn.append(_off_by(one, B0, rng.uniform(-off, off, int(np.count_nonzero(B0)))))
     measured = loops(drawn).measured(found.values)
     ratios = np.exp(-np.min(measured.slacks, axis=1))
-    stable = measured.slacks[:, -1] > UNSTABLE
+    stable = measured.slacks[:, -1] > coupled.UNSTABLE
     bad = int(np.sum((ratios > 1.0 + 2.0 * TOLERANCE) | ~stable))
     interval = share_interval(bad, samples)
     return Check(samples, int(np.sum(~stable)), bad, interval, of="drawn errors of B0")
@@ -686,7 +671,7 @@ def _coupling(A: Matrix, B: Matrix, C: Matrix, axes: Axes, at: float) -> Couplin
 
 
 def _given_gain(
-    plant: Any, axes: Axes, point: Any, nominal: Plant, at: float, fastest: float
+    plant: Any, axes: Axes, point: Any, nominal: coupled.Plant, at: float, fastest: float
 ) -> GivenB0:
     """Return what is known of the controller's B0 at a bandwidth: whether another one is better.
 
@@ -697,9 +682,9 @@ def _given_gain(
     """
     A, B, C, R = nominal
     N = A - np.eye(A.shape[0])
-    linear = linear_part_of(plant, axes.dt, point)[0]
-    B0 = gain_at(axes, estimates_at(axes, plant, point))[0]
-    high, degrees = high_gains(linear.A, linear.B, linear.C)
+    linear = matrices.linear_part_of(plant, axes.dt, point)[0]
+    B0 = matrices.gain_at(axes, matrices.estimates_at(axes, plant, point))[0]
+    high, degrees = matrices.high_gains(linear.A, linear.B, linear.C)
     is_of_plant = _are_rows_of(high, B0)
     for omega in np.geomspace(min(at, 0.5 / axes.dt), math.pi / axes.dt, _FREQUENCIES):
         if is_of_plant:

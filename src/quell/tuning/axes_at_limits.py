@@ -31,21 +31,9 @@ from quell.controllers.feedforward import checked_feedforward
 from quell.controllers.prefilters import ReferenceModel
 from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.nonlinear import checked_point
-from quell.tuning.acceptance import (
-    FASTEST_MODEL,
-    WORSE,
-    conditionally_stable,
-    file_without_step,
-)
+from quell.tuning import reference
+from quell.tuning.acceptance import FASTEST_MODEL, WORSE, conditionally_stable, file_without_step
 from quell.tuning.optimiser.coupled import CoupledLoops, Found, Plant
-from quell.tuning.reference import (
-    MOST_RESERVED,
-    Axis,
-    Shaped,
-    behind,
-    profile_for,
-    reference_model_for,
-)
 from quell.tuning.tables import SHARE
 from quell.tuning.written import MOST_OVERSHOOT, Written
 from quell.types import Matrix, Vector
@@ -133,7 +121,7 @@ def with_prefilters(
     t = np.arange(round(files[0].scenario.duration / axes.dt)) * axes.dt
     loads = np.array([float(np.max(np.abs(load(t)), initial=0.0)) for load in files[0].loads])
     if held.shape[1] == loads.size:
-        room = room - np.minimum(np.abs(held) @ loads, MOST_RESERVED * room)
+        room = room - np.minimum(np.abs(held) @ loads, reference.MOST_RESERVED * room)
     together = Counter(first for first, _ in stepping.values())
     with np.errstate(divide="ignore", invalid="ignore"):
         needed = [
@@ -142,7 +130,7 @@ def with_prefilters(
         ]
 
     # What each axis needs of the room, with those that step with it; None for another plant.
-    parts: dict[int, tuple[Axis | None, float]] = {}
+    parts: dict[int, tuple[reference.Axis | None, float]] = {}
     made = copy.copy(axes)
     for i, (first, size) in stepping.items():
         own = made.axes[i]
@@ -151,24 +139,26 @@ def with_prefilters(
             continue
         left = 1.0 - at_rest * size
         moves = own.observer.order > 1 and left > 1.0 - _PROCESS
-        parts[i] = Axis(viscous, inertia) if moves else None, left
+        parts[i] = reference.Axis(viscous, inertia) if moves else None, left
         if moves and not own.feedforward and own.observer.order <= _DERIVATIVES:
             own.feedforward = checked_feedforward(True)
             own._initialise()
     made._initialise()
     for i in parts:  # while one is tried the others move slowly
         slow = ReferenceModel(_SLOW_MODEL * made.axes[i].omega_c, made.axes[i].observer.order)
-        made = behind(made, slow, i)
+        made = reference.behind(made, slow, i)
     for i, (rigid, left) in parts.items():
         own, file = made.axes[i], files[i]
-        found = Shaped(None, None)
+        found = reference.Shaped(None, None)
         if rigid is not None:
-            found = profile_for(file, made, rigid, 1.0 / own.omega_c, left)
+            found = reference.profile_for(file, made, rigid, 1.0 / own.omega_c, left)
         if found.step is None:
-            found = reference_model_for(file, made, FASTEST_MODEL * own.omega_c, own.observer.order)
+            found = reference.reference_model_for(
+                file, made, FASTEST_MODEL * own.omega_c, own.observer.order
+            )
         if found.step is None:
             return None
-        made = behind(made, found.prefilter, i)
+        made = reference.behind(made, found.prefilter, i)
     run = files[0].run(made)
     for i in stepping:
         step = files[i].figures(made, run)

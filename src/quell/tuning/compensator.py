@@ -41,24 +41,9 @@ from quell.controllers.compensator import Compensator
 from quell.lti.canonical import Reduced, design_models
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
-from quell.tuning.acceptance import (
-    WORSE,
-    Judged,
-    Loop,
-    accepted,
-    conditionally_stable,
-    file_without_step,
-    judge,
-    with_others,
-)
+from quell.tuning import acceptance
 from quell.tuning.constraints import Constraints, first_given, given_constraints
-from quell.tuning.optimiser.loops import (
-    PlantSet,
-    area_until_rest,
-    law_of,
-    load_step,
-    response,
-)
+from quell.tuning.optimiser.loops import PlantSet, area_until_rest, law_of, load_step, response
 from quell.tuning.optimiser.requirements import Active
 from quell.tuning.plants import Given, given_plants, model_of, plant_set
 from quell.tuning.report import ACTIVE, Design
@@ -263,35 +248,39 @@ def tune_compensator(
     best, judged, told = candidates[0], None, list[str]()
     linear = LinearPlant.of(known.linear[0])
 
-    def seen(each: _Candidate) -> Judged:
+    def seen(each: _Candidate) -> acceptance.Judged:
         """Return what a candidate does in the file."""
         both: Controller = Compensated(controller, Compensator(each.observer, **options))
         plain = Compensated(controller, Compensator(each.observer))
         late = actuator_lag, float(known.delays[0])
         if file is None:
-            written = file_without_step(late_plant(linear, *late, dt), dt)
+            written = acceptance.file_without_step(late_plant(linear, *late, dt), dt)
         else:
             both, written = file(each.table)
         if len(plants.all.plants) > plants.distinct or count > 1:
             parts = [LinearPlant.of(one) for one in known.linear]
             every = [(actuator_lag, float(delay)) for delay in known.delays]
-            written = with_others(written, parts, every, plant_set(known, dt))
+            written = acceptance.with_others(written, parts, every, plant_set(known, dt))
         analysis = LoopAnalysis(plants.all.scaled()[0], law_of(plain), dt)
-        return judge(
-            Loop(written, linear, None, plants.all, limits_of(both), 0.0, False), both, analysis
+        return acceptance.judge(
+            acceptance.Loop(written, linear, None, plants.all, limits_of(both), 0.0, False),
+            both,
+            analysis,
         )
 
     limits = limits_of(Compensated(controller, Compensator(best.observer, **options)))
     if file is not None or any(map(math.isfinite, limits)):
         others = _less_and_less(candidates) if math.isfinite(limits[1] - limits[0]) else []
-        best, judged, refused = accepted(best, others, seen, f"{best.name} with {best.omega_o}")
+        best, judged, refused = acceptance.accepted(
+            best, others, seen, f"{best.name} with {best.omega_o}"
+        )
         told += [refused] if refused else []
     both = Compensated(controller, Compensator(best.observer, **options))
     numbers = {name: value for name, value in options.items() if isinstance(value, int | float)}
     plain = Compensated(controller, Compensator(best.observer))  # without learner
     members = [each for j, each in enumerate(plants.all.scaled()) if not plants.elsewhere(j)]
     loops = [LoopAnalysis(each, law_of(plain), dt) for each in members]
-    told += conditionally_stable(each.margins.gain for each in loops)
+    told += acceptance.conditionally_stable(each.margins.gain for each in loops)
     laws, after = (law_of(controller), law_of(plain)), best.measures
     loads = response(loops[0].plant, laws[0], inputs), response(loops[0].plant, laws[1], inputs)
     alone = _design("controller alone", controller, before)
@@ -333,7 +322,7 @@ def _design(
 def _less_and_less(candidates: list[_Candidate]) -> list[_Candidate]:
     """Return candidates behind the best one, with integrals up to 1.5 times its own."""
     best = candidates[0].measures.iae
-    ends = np.geomspace(1.0, WORSE, _MOST_OTHERS + 1)
+    ends = np.geomspace(1.0, acceptance.WORSE, _MOST_OTHERS + 1)
     found = []
     for low, high in itertools.pairwise(ends.tolist()):
         # The slowest observer of each part: it is the most different one.

@@ -14,17 +14,8 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser import requirements
 from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of
-from quell.tuning.optimiser.requirements import (
-    KINDS,
-    OF_SPECTRUM,
-    WITHOUT_TIME,
-    Bound,
-    bounds_of,
-    cost_of,
-    scores,
-    worst_ratio,
-)
 from quell.tuning.optimiser.search import (
     FEW,
     Extra,
@@ -110,10 +101,10 @@ class Task:
         """Return the problem of the optimiser; the objective is that of ``members`` of the set."""
         over = SetResponses(self.plants, self.inputs)
         for_cost = over if members is None else SetResponses(self.plants, self.inputs, members)
-        spectrum = self.model.load if self.objective == OF_SPECTRUM else None
-        cost = cost_of(self.objective, for_cost, self.quantile, spectrum)
+        spectrum = self.model.load if self.objective == requirements.OF_SPECTRUM else None
+        cost = requirements.cost_of(self.objective, for_cost, self.quantile, spectrum)
         extras = extras_of(self.constraints, over)
-        bounds, damping = bounds_of(self.constraints), self.constraints.damping
+        bounds, damping = requirements.bounds_of(self.constraints), self.constraints.damping
         return Problem(self.plants, bounds, extras, self.objective, cost, damping)
 
     def options(self, structure: Structure) -> dict[str, Any]:
@@ -313,11 +304,11 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
     """
     problem = task.problem()
     quick = _with(task, u_max=None, rate_max=None)
-    if task.objective not in WITHOUT_TIME:
+    if task.objective not in requirements.WITHOUT_TIME:
         quick = replace(quick, objective="load")
     ends = _best_gains(quick, structure, known)
     is_slow = any(extra.over_time for extra in problem.extras)
-    if not ends or (problem.objective in WITHOUT_TIME and not is_slow):
+    if not ends or (problem.objective in requirements.WITHOUT_TIME and not is_slow):
         return min(ends, key=_rank, default=None)
     rows, count = [*(end.values for end in ends), *known], 1
     if structure.integrators > 1:
@@ -336,14 +327,14 @@ def _best(task: Task, structure: Structure, known: Matrix) -> Solution | None:
 
 def _is_exchanged(task: Task) -> bool:
     """Return whether the objective is the worst case of more plants than a search has at once."""
-    worst = task.objective not in WITHOUT_TIME and task.quantile == 1.0
+    worst = task.objective not in requirements.WITHOUT_TIME and task.quantile == 1.0
     return worst and len(task.plants.plants) > _MEMBERS
 
 
 def _worst(task: Task, solution: Solution) -> list[int]:
     """Return the plants with the worst objectives."""
     over = SetResponses(task.plants, task.inputs)
-    each = scores(task.objective, solution.structure, solution.values, over)
+    each = requirements.scores(task.objective, solution.structure, solution.values, over)
     found: list[int] = np.argsort(-each)[:_MEMBERS].tolist()
     return found
 
@@ -358,7 +349,7 @@ def _near(task: Task, structure: Structure, start: Solution, rounds: int) -> Sol
     over, members, found = SetResponses(task.plants, task.inputs), list[int](), None
     best = start
     for _ in range(_EXCHANGES):
-        each = scores(task.objective, structure, best.values, over)
+        each = requirements.scores(task.objective, structure, best.values, over)
         if members and float(np.max(each)) <= _WORSE * float(np.max(each[members])):
             break
         members = list(dict.fromkeys([*members, *np.argsort(-each)[:_MEMBERS].tolist()]))
@@ -410,8 +401,8 @@ def _tightened(task: Task, structure: Structure, best: Solution, share: float) -
     """Return the task with bounds that the solution does not reach at a share of what it has."""
     given, bounds = task.constraints, dict[str, float]()
     C = structure.response(best.values[None, :], task.plants.omega)
-    for name, kind in KINDS.items():
-        size = float(worst_ratio((Bound(kind, 1.0),), task.plants, C)[0])
+    for name, kind in requirements.KINDS.items():
+        size = float(requirements.worst_ratio((requirements.Bound(kind, 1.0),), task.plants, C)[0])
         limit = getattr(given, name)
         is_reached = limit is not None and size >= _REACHED * limit
         if is_reached or (name == "m_ks" and given.u_std is not None):
@@ -494,7 +485,7 @@ def contradiction(problem: Problem, solution: Solution, constraints: Constraints
 
 def relaxed(problem: Problem, factor: float) -> Problem:
     """Return the problem with all limits larger by a factor."""
-    bounds = tuple(Bound(kind, factor * limit) for kind, limit in problem.bounds)
+    bounds = tuple(requirements.Bound(kind, factor * limit) for kind, limit in problem.bounds)
     extras = tuple(
         extra._replace(limit=factor * extra.limit, ratio=partial(_share, extra, factor))
         for extra in problem.extras

@@ -37,28 +37,14 @@ from quell.controllers.schedule import Schedule
 from quell.observers.eso import with_gains
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
-from quell.tuning.acceptance import (
-    WORSE,
-    Judged,
-    Loop,
-    accepted,
-    conditionally_stable,
-    judge,
-    place_of,
-)
+from quell.tuning import acceptance
 from quell.tuning.constraints import Constraints, given_constraints
 from quell.tuning.designs import range_of_u
 from quell.tuning.optimiser.loops import area_until_rest
 from quell.tuning.optimiser.requirements import Active
 from quell.tuning.plants import Given, given_plants, with_known_noise
 from quell.tuning.report import Design
-from quell.tuning.tables import (
-    checked_rest,
-    late_plant,
-    rest_of_plant,
-    rest_within,
-    scenario_of,
-)
+from quell.tuning.tables import checked_rest, late_plant, rest_of_plant, rest_within, scenario_of
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 from quell.tuning.written import Written
@@ -425,7 +411,7 @@ def tune_schedule(
             own = first.own if tables == "b0" else tuned_points(tight)
             other = made(tight, own)
             worse = [load_iae(frozen(other, at)) for at in grid]
-            if max(a / b for a, b in zip(worse, usual, strict=True)) > WORSE:
+            if max(a / b for a, b in zip(worse, usual, strict=True)) > acceptance.WORSE:
                 return
             yield other
 
@@ -447,7 +433,9 @@ def tune_schedule(
         spread = np.linspace(0, len(grid) - 1, min(_MOST_POINTS, len(grid)))
         members = [grid[i] for i in np.unique(np.round(spread).astype(int))]
         others = [
-            place_of(file, linear[at], (actuator_lag, waiting[at]), f"at {_place(at)}", at)
+            acceptance.place_of(
+                file, linear[at], (actuator_lag, waiting[at]), f"at {_place(at)}", at
+            )
             for at in members
         ]
         file = replace(file, others=tuple(others), of_others="points of the schedule, linear")
@@ -458,16 +446,16 @@ def tune_schedule(
         if setup is None or "scenario" not in setup:
             point = rest_within(linear[middle], point, ends)
         at_rest = 0.0 if point is None else point.u
-        loop = Loop(file, linear[middle], task.model, task.plants, ends, at_rest, shaped)
+        loop = acceptance.Loop(file, linear[middle], task.model, task.plants, ends, at_rest, shaped)
 
-        def seen(each: _Made) -> Judged:
-            return judge(loop, each.controller, frozen(each, middle))
+        def seen(each: _Made) -> acceptance.Judged:
+            return acceptance.judge(loop, each.controller, frozen(each, middle))
 
         report("limits of u", len(grid) / parts)
-        first, judged, refused = accepted(first, gentler(), seen, "the first controller")
+        first, judged, refused = acceptance.accepted(first, gentler(), seen, "the first controller")
         told += [refused] if refused else []
     loops = [frozen(first, at) for at in grid]
-    told += conditionally_stable(each.margins.gain for each in loops if each.stable)
+    told += acceptance.conditionally_stable(each.margins.gain for each in loops if each.stable)
     found = {}
     for i, at in enumerate(sorted([*grid, *fine])):
         share = i / (len(grid) + len(fine))

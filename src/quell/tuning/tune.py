@@ -21,17 +21,7 @@ from quell.parallel import one_blas_thread
 from quell.plants.base import signals_of
 from quell.plants.linear import LinearPlant
 from quell.signals.shapes import Signal, as_signal
-from quell.tuning.acceptance import (
-    WORSE,
-    Judged,
-    Loop,
-    accepted,
-    axis_of,
-    judge,
-    quick_without,
-    time_constant,
-    with_others,
-)
+from quell.tuning import acceptance
 from quell.tuning.axes import tune_together
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints, given_constraints
@@ -686,7 +676,7 @@ def _file(
     rest: Rest | None,
     limits: Limits,
     design: Design,
-) -> tuple[dict[str, Any], Loop | None]:
+) -> tuple[dict[str, Any], acceptance.Loop | None]:
     """Return the tables of a setup file, ``known`` ones first, and the loop that they describe.
 
     By default they have the first plant, a step and a load. What is not in ``known`` is added:
@@ -712,8 +702,8 @@ def _file(
         last = float(f"{step.r.size * step.distance * dt:.2g}")
         rest = None if rest is None or not any((*rest[:2], *rest.x0)) else rest
         analysis = _analysis(given, plants, design)
-        tau = time_constant(analysis, plants)
-        axis = axis_of(linear, tau, plants)
+        tau = acceptance.time_constant(analysis, plants)
+        axis = acceptance.axis_of(linear, tau, plants)
         needed = 0.0 if axis is None else axis.needs(tau)
         sizes = held_sizes(linear, rest, limits, needed)
         tables |= scenario_tables(last, linear.disturbances, rest, sizes)
@@ -727,8 +717,8 @@ def _file(
     if shaped and any(map(math.isfinite, limits)):
         parts = [LinearPlant.of(each) for each in given.linear]
         late = [(lag, float(each)) for each in given.delays]
-        file = with_others(file, parts, late, plants)
-    return tables, Loop(file, linear, task.model, plants, limits, at, shaped)
+        file = acceptance.with_others(file, parts, late, plants)
+    return tables, acceptance.Loop(file, linear, task.model, plants, limits, at, shaped)
 
 
 def _of_axis(given: Given, written: Written | bool, flexible: bool) -> Feedforward | None:
@@ -765,8 +755,8 @@ def _accepted(
     structure: str,
     task: Task,
     given: Given,
-    loop: Loop,
-) -> tuple[Design, Judged, str]:
+    loop: acceptance.Loop,
+) -> tuple[Design, acceptance.Judged, str]:
     """Return the design that is accepted at the limits of u, with what it does, and what is not.
 
     Of a structure that is named it is the only one. A process whose step overshoots at the limits
@@ -779,22 +769,22 @@ def _accepted(
         for name, each in designs.items()
         if name in able and each is not first and each.controller is not None
         if each.undamped <= first.undamped
-        if relative(first, each, task.objective) <= WORSE
+        if relative(first, each, task.objective) <= acceptance.WORSE
     ]
     others.sort(key=lambda each: -relative(each, first, task.objective))
 
-    def judged(design: Design) -> Judged:
-        return judge(loop, _controller(design), _analysis(given, task.plants, design))
+    def judged(design: Design) -> acceptance.Judged:
+        return acceptance.judge(loop, _controller(design), _analysis(given, task.plants, design))
 
     others = others if structure == SIMPLEST else []
-    found, its, refused = accepted(first, others, judged, first.name)
+    found, its, refused = acceptance.accepted(first, others, judged, first.name)
     if its.prefilter is None:
         return found, its, refused
     slowed = least = loop.written.error(its.controller)
     best = found
     for each in others:
         analysis = _analysis(given, task.plants, each)
-        if each is best or not quick_without(loop, _controller(each), analysis):
+        if each is best or not acceptance.quick_without(loop, _controller(each), analysis):
             continue
         other, left = judged(each), loop.written.error(_controller(each))
         if not other.failures and left < _LESS * least:

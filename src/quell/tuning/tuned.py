@@ -28,12 +28,7 @@ from quell.tuning.acceptance import Judged, Loop, conditionally_stable, judge, w
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, noise_curve, tradeoff
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.requirements import (
-    all_peaks,
-    beside_poles,
-    closed_loop_poles,
-    counted,
-)
+from quell.tuning.optimiser.requirements import all_peaks, beside_poles, closed_loop_poles, counted
 from quell.tuning.optimiser.search import Problem, Solution
 from quell.tuning.report import Design, draw, toml_text
 from quell.tuning.simulated import Checked, Search

@@ -21,12 +21,7 @@ from typing import Any, NamedTuple
 from quell import checks
 from quell.controllers.base import check_controller
 from quell.export.c_files import CSource
-from quell.export.controller_source import (
-    c_source,
-    in_double_precision,
-    is_in_single,
-    limits_path,
-)
+from quell.export.controller_source import c_source, in_double_precision, is_in_single, limits_path
 from quell.export.library.packages import package_files, package_note
 from quell.export.library.precision import Comparison, checked_comparison
 from quell.export.library.vectors import (

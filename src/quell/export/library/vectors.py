@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell.controllers import memory
 from quell.controllers.base import (
     change_parameters,
     reset_loop,
@@ -30,14 +31,6 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.bumpless import samples_to_settle
-from quell.controllers.memory import (
-    CHECK,
-    Layout,
-    images_of,
-    named_arrays,
-    start_from_rest,
-    written_image,
-)
 from quell.export.c_files import CSource
 from quell.export.controller_source import Parts, at_path, limits_path, parts_of
 from quell.export.translate.text import Literals
@@ -406,7 +399,7 @@ def golden_vectors(controller: Any, source: CSource) -> Vectors:
     """
     player, path = Player(controller, source.precision), limits_path(controller)
     available, (_, p, m) = source.operations, player.sizes
-    fresh = written_image(_layout(player))[-CHECK.size :]
+    fresh = memory.written_image(_layout(player))[-memory.CHECK.size :]
     amplitude = _amplitude(controller, source.precision, path)
     signals = _AllSignals(player, amplitude)
     for _ in range(2):  # before the first measurement
@@ -460,21 +453,23 @@ def golden_vectors(controller: Any, source: CSource) -> Vectors:
     return Vectors(*played, images, parts, fresh)
 
 
-def _layout(player: Player) -> Layout:
+def _layout(player: Player) -> memory.Layout:
     controller = player.parts.controller
-    return images_of(player.design, player.state, controller.dt, getattr(controller, "names", ()))
+    return memory.images_of(
+        player.design, player.state, controller.dt, getattr(controller, "names", ())
+    )
 
 
 def _images(player: Player) -> tuple[tuple[bytes, bytes], list[tuple[int, float]]]:
     """Return the images of a player's state, and numbers and sizes of their parts."""
     state, known = player.state, _layout(player)
-    running = written_image(known)
+    running = memory.written_image(known)
     parts = [(each.size, float(np.max(np.abs(each[np.isfinite(each)]), initial=0.0)))
              for each in known.arrays.values() if each.size]  # fmt: skip
-    kept = {name: array.copy() for name, array in named_arrays(state).items()}
-    start_from_rest(player.design, state)
-    at_rest = written_image(known)
-    for name, array in named_arrays(state).items():
+    kept = {name: array.copy() for name, array in memory.named_arrays(state).items()}
+    memory.start_from_rest(player.design, state)
+    at_rest = memory.written_image(known)
+    for name, array in memory.named_arrays(state).items():
         array[...] = kept[name]
     return (running, at_rest), parts
 

@@ -16,15 +16,8 @@ from quell.controllers.axes import Axes
 from quell.controllers.base import check_controller
 from quell.controllers.prefilters import without_prefilters
 from quell.controllers.state_space import StateFeedback
+from quell.export import controller_source
 from quell.export.c_files import CSource
-from quell.export.controller_source import (
-    at_path,
-    c_source,
-    in_double_precision,
-    is_in_single,
-    limits_path,
-    parameters_of,
-)
 from quell.export.library.precision import Comparison, checked_comparison
 from quell.export.library.vectors import fill
 from quell.export.structured_text.c_reader import Assign, CFile, Evaluate, Member
@@ -99,7 +92,7 @@ def st(
     """
     check_folder(folder, checks.flag("overwrite", overwrite))
     text, values = _written(controller, name, precision)
-    single = precision == "single" or is_in_single(controller)
+    single = precision == "single" or controller_source.is_in_single(controller)
     comparison = checked_comparison(controller, single, plant, scenario, accept)
     templates = resources.files("quell.export") / "templates"
     readme = fill((templates / "structured_text.md").read_text("utf-8"), values)
@@ -122,7 +115,7 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
     """Return the function block, and the values of its README."""
     check_controller(controller, several=True)
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
-    given = in_double_precision(controller)
+    given = controller_source.in_double_precision(controller)
     if isinstance(given, Axes):
         raise TranslationError(
             f"controller has {controller.outputs} axes: a function block is of one u and one y; "
@@ -140,7 +133,9 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
             "(learner=None), or use --to c"
         )
     _check_limits(controller)
-    source = c_source(controller, name, precision="single" if single else "double")
+    source = controller_source.c_source(
+        controller, name, precision="single" if single else "double"
+    )
     if source.externals:
         raise TranslationError(
             f"controller calls {', '.join(source.externals)} in C: has no Structured Text; leave "
@@ -150,7 +145,7 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
         block = _Block(source)
         return block.text(controller), block.values(controller)
     except TranslationError as error:
-        kind = type(in_double_precision(controller)).__name__
+        kind = type(controller_source.in_double_precision(controller)).__name__
         raise TranslationError(
             f"controller = {kind}: {error}; take a controller without the part that needs it, or "
             "--to c"
@@ -167,10 +162,10 @@ def _check_name(name: str) -> None:
 
 def _check_limits(controller: Any) -> None:
     """Raise a ``ValueError`` for a u without limits: Structured Text has no infinity."""
-    path = limits_path(controller)
+    path = controller_source.limits_path(controller)
     if not path:
         return
-    limits = at_path(parameters_of(controller), path)
+    limits = controller_source.at_path(controller_source.parameters_of(controller), path)
     low, high = float(limits.low), float(limits.high)
     if not (np.isfinite(low) and np.isfinite(high)):
         raise TranslationError(
@@ -286,7 +281,7 @@ class _Block:
             writer.variables["state"] = [
                 each for each in writer.variables["state"] if each.name != started
             ]
-        kind = type(in_double_precision(controller)).__name__
+        kind = type(controller_source.in_double_precision(controller)).__name__
         inputs = "".join(
             f"        {name} : {real if of == 'REAL' else of};\n" for name, of in self.inputs
         )
@@ -330,7 +325,7 @@ class _Block:
             "dt": repr(float(controller.dt)),
             "given": self.given,
             "given_text": "reference" if self.given == "r" else "u of another controller",
-            "kind": type(in_double_precision(controller)).__name__,
+            "kind": type(controller_source.in_double_precision(controller)).__name__,
             "further": "".join(
                 f"| `{each}` | {_meaning(each)} |\n" for each in self.source.further),
             "manual": "| `manual`, `u_manual` | manual operation: u is `u_manual`, which is NOT "

@@ -7,18 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from quell.export.translate import structs
 from quell.export.translate.expressions import Calls, Expressions
 from quell.export.translate.statements import Function
-from quell.export.translate.structs import (
-    Findings,
-    Source,
-    Structs,
-    doc_of,
-    into_procedure,
-    local_names,
-    module_doc,
-    read_function,
-)
 from quell.export.translate.text import (
     Array,
     Kind,
@@ -79,10 +70,10 @@ class Program:
         of earlier translations of the same program.
     """
 
-    def __init__(self, prefix: str, single: bool, findings: Findings) -> None:
+    def __init__(self, prefix: str, single: bool, findings: structs.Findings) -> None:
         self.findings = findings
         self.literals = Literals(single)
-        self.structs = Structs(prefix, self.literals, findings)
+        self.structs = structs.Structs(prefix, self.literals, findings)
         self.calls = Calls(self)
         self.functions: list[Function] = []
         self.helpers: set[str] = set()
@@ -108,11 +99,11 @@ class Program:
         key = (python, into_array, *((a.kind, a.mutable and not a.is_number) for a in arguments))
         found = self._found.get(key)
         if found is None:
-            source = read_function(python)
+            source = structs.read_function(python)
             if declaration is not None and not source.doc:
-                source = replace(source, doc=doc_of(declaration))
+                source = replace(source, doc=structs.doc_of(declaration))
             if into_array:
-                source = into_procedure(source, len(arguments[-1].kind.shape))
+                source = structs.into_procedure(source, len(arguments[-1].kind.shape))
             found = Function(self, source, arguments, hints, key)
             self._found[key] = found
             if found.inline is None:
@@ -123,10 +114,10 @@ class Program:
         return found
 
     def _function_name(
-        self, source: Source, arguments: list[Value], declaration: Callable[..., Any] | None
+        self, source: structs.Source, arguments: list[Value], declaration: Callable[..., Any] | None
     ) -> str:
         name = function_name(declaration.__name__ if declaration else source.name)
-        if name in local_names(source.module):
+        if name in structs.local_names(source.module):
             name = f"{name}_value"
         head = arguments[0].kind if arguments else None
         if name in self._names and isinstance(head, Struct):
@@ -253,7 +244,7 @@ class Program:
         modules: set[str] = set()
         for function in self.functions:
             source = function.source
-            if source.module not in modules and (doc := module_doc(source.module)):
+            if source.module not in modules and (doc := structs.module_doc(source.module)):
                 modules.add(source.module)
                 lines += ["", *comment_block(f"---- {source.module} ----\n\n{doc}")]
             if len(function.result_members) > 1:

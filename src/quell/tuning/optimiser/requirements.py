@@ -52,15 +52,7 @@ from quell.analysis.loop import closed_loop_matrix, law_matrix
 from quell.analysis.margins import Complex, eigenvalues, in_s_plane
 from quell.tuning.constraints import Constraints
 from quell.tuning.load_spectrum import LoadSpectrum
-from quell.tuning.optimiser.loops import (
-    NARROW,
-    Peak,
-    PlantSet,
-    SetResponses,
-    dead_samples,
-    law_at,
-    peaks,
-)
+from quell.tuning.optimiser import loops
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
 
@@ -104,9 +96,11 @@ class Pole(NamedTuple):
         return (1.0 - self.damping) / (1.0 - self.least)
 
 
-def closed_loop_poles(plants: PlantSet, structure: Structure, values: Vector) -> list[Complex]:
+def closed_loop_poles(
+    plants: loops.PlantSet, structure: Structure, values: Vector
+) -> list[Complex]:
     """Return all poles of the loops of each plant with the controller of values (p,) [rad/s]."""
-    law = law_at(structure, values)
+    law = loops.law_at(structure, values)
     inner, found = law_matrix(law), []
     for plant in plants.scaled():
         whole = closed_loop_matrix(plant.N, plant.B, plant.C, law, inner)
@@ -114,7 +108,7 @@ def closed_loop_poles(plants: PlantSet, structure: Structure, values: Vector) ->
     return found
 
 
-def counted(plants: PlantSet, poles: list[Complex], damping: float) -> list[Pole]:
+def counted(plants: loops.PlantSet, poles: list[Complex], damping: float) -> list[Pole]:
     """Return the poles that count, of those of each plant's loop, with the damping they need."""
     if damping not in plants.modes:
         plants.modes[damping] = [
@@ -129,7 +123,7 @@ def counted(plants: PlantSet, poles: list[Complex], damping: float) -> list[Pole
     found: list[Pole] = []
     each = zip(plants.plants, poles, plants.modes[damping], strict=True)
     for j, (plant, s, own) in enumerate(each):
-        found += counted_of(s, own, dead_samples(plant), damping, plants.dt, j)
+        found += counted_of(s, own, loops.dead_samples(plant), damping, plants.dt, j)
     return found
 
 
@@ -167,12 +161,12 @@ def _upper(s: Complex) -> Complex:
     return kept
 
 
-def beside_poles(plants: PlantSet, poles: list[Complex]) -> Vector:
+def beside_poles(plants: loops.PlantSet, poles: list[Complex]) -> Vector:
     """Return the frequencies (k,) at and beside poles with little damping [rad/s]."""
     if not poles:
         return np.zeros(0)
     s = np.concatenate([_upper(each) for each in poles])
-    s = s[np.abs(_damping(s)) < NARROW]
+    s = s[np.abs(_damping(s)) < loops.NARROW]
     width = np.maximum(np.abs(s.real), 1e-7 * s.imag)
     near = np.ravel(s.imag[:, None] + width[:, None] * _BESIDE)
     near = near[(near > plants.omega[0]) & (near < plants.omega[-1])]
@@ -183,7 +177,7 @@ def beside_poles(plants: PlantSet, poles: list[Complex]) -> Vector:
 class Followed:
     """Poles of a loop, as functions of the controller near the present one."""
 
-    def __init__(self, plants: PlantSet, poles: list[Pole]) -> None:
+    def __init__(self, plants: loops.PlantSet, poles: list[Pole]) -> None:
         kept = [
             pole
             for pole in poles
@@ -306,7 +300,7 @@ def _sensitivities(kind: str, P: Complex, C: Complex) -> tuple[Complex, Complex]
     return S, (L if kind == "M_t" else C) * S
 
 
-def worst_ratio(bounds: tuple[Bound, ...], plants: PlantSet, C: Complex) -> Vector:
+def worst_ratio(bounds: tuple[Bound, ...], plants: loops.PlantSet, C: Complex) -> Vector:
     """Return the largest ratio (m,) on the grid, for controllers (m, G)."""
     worst, gain = np.zeros(C.shape[0]), np.abs(C)
     for P in plants.P:
@@ -366,12 +360,12 @@ def slopes_of_slacks(points: Points, C: Complex, dC: NDArray[np.complex128]) -> 
 
 def all_peaks(
     bounds: tuple[Bound, ...],
-    plants: PlantSet,
+    plants: loops.PlantSet,
     controller: Callable[[Vector], Complex],
     C: Complex,
     beside: Vector,
     least: float,
-) -> list[tuple[int, Peak]]:
+) -> list[tuple[int, loops.Peak]]:
     """Return the refined maxima with a ratio above ``least``, each with the number of its bound.
 
     ``controller`` is a function from frequencies to C_y (k,), and C (G,) are its values on the
@@ -396,7 +390,7 @@ def all_peaks(
         P = np.hstack([P, plants.responses(beside)])[:, order]
         C, omega = np.append(C, controller(beside))[order], omega[order]
     values = np.vstack([sizes(kind, P, C) / limit for kind, limit in bounds])
-    found = peaks(ratios, omega, values, least)
+    found = loops.peaks(ratios, omega, values, least)
     return [(peak.plant // count, peak._replace(plant=peak.plant % count)) for peak in found]
 
 
@@ -415,7 +409,7 @@ Cost = Callable[[Structure, Matrix], Vector]
 _WORST = 200.0
 
 
-def load_cost(structure: Structure, values: Matrix, plants: PlantSet) -> Vector:
+def load_cost(structure: Structure, values: Matrix, plants: loops.PlantSet) -> Vector:
     """Return ``−log k_i`` (m,); with more integrators the logarithm of the root of the ISE."""
     if structure.integrators > 1:
         return _log_root_ise(plants, structure.response(values, plants.omega))
@@ -424,7 +418,7 @@ def load_cost(structure: Structure, values: Matrix, plants: PlantSet) -> Vector:
     return np.where(np.isfinite(cost), cost, _WORST)
 
 
-def _log_root_ise(plants: PlantSet, C: Complex) -> Vector:
+def _log_root_ise(plants: loops.PlantSet, C: Complex) -> Vector:
     worst, omega = np.zeros(C.shape[0]), plants.omega
     for P in plants.P:
         density = np.abs(P / (1.0 + P * C)) ** 2 / omega  # over log ω
@@ -434,7 +428,9 @@ def _log_root_ise(plants: PlantSet, C: Complex) -> Vector:
     return np.where(np.isfinite(cost), cost, _WORST)
 
 
-def scores(objective: str, structure: Structure, values: Vector, over: SetResponses) -> Vector:
+def scores(
+    objective: str, structure: Structure, values: Vector, over: loops.SetResponses
+) -> Vector:
     """Return the objective of each plant (J,)."""
     if objective == "load-iae":
         return over.areas(structure, values)
@@ -442,7 +438,7 @@ def scores(objective: str, structure: Structure, values: Vector, over: SetRespon
     return np.array([np.sqrt(np.mean((over.inputs.r - y) ** 2)) for y in found])
 
 
-def spectrum_cost(over: SetResponses, load: LoadSpectrum, quantile: float) -> Cost:
+def spectrum_cost(over: loops.SetResponses, load: LoadSpectrum, quantile: float) -> Cost:
     """Return the cost of a load by its spectrum: the logarithm of the RMS of y."""
     P = over.plants.responses(load.omega)[:, None, :]
 
@@ -456,7 +452,7 @@ def spectrum_cost(over: SetResponses, load: LoadSpectrum, quantile: float) -> Co
 
 
 def cost_of(
-    objective: str, over: SetResponses, quantile: float, spectrum: LoadSpectrum | None = None
+    objective: str, over: loops.SetResponses, quantile: float, spectrum: LoadSpectrum | None = None
 ) -> Cost:
     """Return the function from a structure and values (m, p) to costs (m,)."""
     if objective == "load":

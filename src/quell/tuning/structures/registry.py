@@ -4,14 +4,9 @@ from __future__ import annotations
 
 from quell import checks
 from quell.lti.canonical import design_models
+from quell.tuning.structures import baselines
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
-from quell.tuning.structures.baselines import (
-    CascadeStructure,
-    FilteredPID,
-    LqgStructure,
-    NotchStructure,
-)
 
 _PID = {
     "pi": (False, True),
@@ -81,13 +76,13 @@ def make_structure(name: str, model: Model, order: int = 0) -> Structure:
     checks.one_of("structure", name, STRUCTURES)
     if name in _PID:
         derivative, filtered = _PID[name]
-        return FilteredPID(model, derivative=derivative, filtered=filtered)
+        return baselines.FilteredPID(model, derivative=derivative, filtered=filtered)
     if name == LQG:
-        return LqgStructure(model)
+        return baselines.LqgStructure(model)
     if name == CASCADE:
-        return CascadeStructure(model)
+        return baselines.CascadeStructure(model)
     if name == NOTCH:
-        return NotchStructure(model)
+        return baselines.NotchStructure(model)
     form = _ADRC[name]
     if not form.based:
         return AdrcStructure(model, f"{name} of order {order}", order, form)
