@@ -30,6 +30,7 @@ from measured import options_of, parser_of, write
 from numba import njit
 from rich.console import Console
 from rich.table import Table
+from spender import pulse_response
 
 from quell.analysis import certify
 from quell.experiments.stress.loops import draw_loop
@@ -37,7 +38,7 @@ from quell.experiments.stress.study import draw_loops, errors
 from quell.guard import Guard
 from quell.guard.guard import plain_loop, state_path
 from quell.learners import Harmonic
-from quell.lti.models import System, pulse_response
+from quell.lti.models import System
 from quell.parallel import in_parallel
 from quell.plants.linear import sampled_plant
 

@@ -4,7 +4,7 @@ Random linear loops of the trial (``quell.experiments.stress.general``: stable, 
 delayed, two masses; modulus margin 0.35 and more; their references, loads and noise). Their guard
 is certified for the plant. The learners see everything, the guard's state included: random ones
 that earn trust and spend it, and for each loop what the cross-entropy method makes of them. In
-chains of integrators there are also spenders (``stress.spender``), which push with the signs of the
+chains of integrators there are also spenders (``spender.py``), which push with the signs of the
 pulse response backwards.
 
 A run's score is the larger of sup |q| and sup |y − y_0|, each over its bound from the certificate
@@ -23,15 +23,14 @@ import numpy as np
 from measured import options_of, parser_of, write
 from rich.console import Console
 from rich.table import Table
+from spender import Spender, draw_push, pulse_response
 
 import quell as ql
 from quell.analysis import Certificate, certify, observer_error
-from quell.experiments.stress.adversaries import Spender, draw_push
 from quell.experiments.stress.general import adversary_at, earn_and_spend
 from quell.experiments.stress.loops import GeneralLoop, draw_loop
 from quell.guard import Guard
 from quell.guard.guard import plain_loop, state_path
-from quell.lti.models import pulse_response
 from quell.parallel import in_parallel
 from quell.plants.linear import sampled_plant
 from quell.simulation.simulate import simulate

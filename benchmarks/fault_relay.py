@@ -1,6 +1,6 @@
 """A relay that injects faults between a loop and a rig, over any wire; for ``faults.py``.
 
-Over UDP it is ``quell.realtime.relay.Relay``. Over a serial line (two
+Over UDP it is ``Relay`` of ``frame_faults.py``. Over a serial line (two
 pseudoterminals) and shared memory it takes the frames from one wire, changes them by the same plan,
 and puts them on the other. Shared memory carries frames of 40 bytes only: shorter ones are filled
 with zeros, longer ones cut. On the serial line the changed frame is framed again, so that its
@@ -16,12 +16,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
+from frame_faults import Fault, FaultInjector, Relay
 
 from quell.kernels.dispatch import compiled, specialised
 from quell.realtime import transports
 from quell.realtime import wire as frames
 from quell.realtime.registry import listen
-from quell.realtime.relay import Fault, FaultInjector, Relay
 from quell.realtime.transports import SerialDevice
 from quell.realtime.wire import receive, wait_for_frame
 

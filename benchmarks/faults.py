@@ -41,13 +41,13 @@ from typing import Any
 import numpy as np
 from fault_judges import DELAY, DT, LIMIT, SAFETY, WATCHDOG, judged
 from fault_relay import WIRES, relay, rig_url
+from frame_faults import KINDS, Fault
 from measured import options_of, parser_of, write
 
 import quell as ql
 from quell.files import nonfinite_to_none, write_json
 from quell.kernels import dispatch
 from quell.realtime import LiveSink, open_device, run_rig
-from quell.realtime.relay import KINDS, Fault
 from quell.realtime.rig import LOG
 from quell.realtime.supervisor import Cause
 

@@ -11,15 +11,16 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse, certify, observer_error
-from quell.experiments.stress.adversaries import Spender, draw_push
 from quell.guard.guard import is_invertible
 from quell.lti.models import System, peak_gain
 from quell.observers.forms import observe
 from tests.injected import Injected
 
+from .benchmark_module import benchmark
 from .cases import cases
 
 DT = 0.02
+spending = benchmark("spender")
 RAMPING = ([1.3], [1.0, 0.0, 0.0])
 
 
@@ -177,8 +178,8 @@ def test_no_learner_that_a_search_finds_exceeds_the_bound_of_its_guard() -> None
     found = certify(plant, ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard))
     trusted = 0
     for seed in range(4):
-        push = draw_push(np.random.default_rng(seed), pulse, samples, lag)
-        spender = Spender(1.6 * load.evaluate(DT * np.arange(samples)), push, 0.6)
+        push = spending.draw_push(np.random.default_rng(seed), pulse, samples, lag)
+        spender = spending.Spender(1.6 * load.evaluate(DT * np.arange(samples)), push, 0.6)
         hostile = ql.ADRC(observer, omega_c=1.0, learner=spender, guard=guard)
         run = ql.simulate(plant, hostile, scenario)
         trusted += np.max(run["authority"]) > 0.5
@@ -335,7 +336,7 @@ def test_a_clipped_learner_does_not_run_away_where_the_states_would() -> None:
     scenario = ql.Scenario(duration=40.0, disturbances=(load,))
     t = DT * np.arange(2001)
     push = np.where(t < 25.0, np.nan, np.sign(np.sin(5.0 * t)))
-    learner = Spender(2.0 * load.evaluate(t), push, 0.0)
+    learner = spending.Spender(2.0 * load.evaluate(t), push, 0.0)
     alone = ql.simulate(plant, ql.ADRC(observer, omega_c=1.0), scenario)
     hostile = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=ql.Guard())
     run = ql.simulate(plant, hostile, scenario, limit=1e6)

@@ -529,17 +529,6 @@ def peak_gain(system: System) -> float:
     )
 
 
-def pulse_response(system: System, samples: int) -> Vector:
-    """Return ``D, C B, C A B, …`` (samples,)."""
-    N, B, C, D = System.balanced(*system)
-    found, x = np.zeros(samples), B.copy()
-    found[:1] = D
-    for k in range(1, samples):
-        found[k] = C @ x
-        x = x + N @ x
-    return found
-
-
 def h2_squared(system: System) -> float:
     """Return the sum of the squared impulse response of a stable system.
 

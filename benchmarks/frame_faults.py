@@ -3,7 +3,7 @@
 To test a loop of your own, start the rig at one port, the relay in front of it, and connect the
 loop to the relay::
 
-    from quell.realtime.relay import Fault, Relay
+    from frame_faults import Fault, Relay
 
     plan = [Fault("drop", towards="rig", first=500, count=10)]
     with Relay("udp://127.0.0.1:0", "udp://127.0.0.1:5005", plan) as relay:
