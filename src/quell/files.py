@@ -65,7 +65,13 @@ def written_atomically(path: str | os.PathLike[str], overwrite: bool = False) ->
         if overwrite:
             part.replace(target)
         else:
-            _link(part, target)
+            try:
+                os.link(part, target)
+            except FileExistsError:
+                check_free(target)
+            except OSError:  # a file system without hard links
+                check_free(target)
+                part.replace(target)
     except OSError as error:  # of a library, its text may be a page
         if error.errno is None:
             raise
@@ -234,17 +240,6 @@ def nonfinite_to_none(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [nonfinite_to_none(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _link(part: Path, target: Path) -> None:
-    """Name the file ``part`` as ``target``, unless there is such a file already."""
-    try:
-        os.link(part, target)
-    except FileExistsError:
-        check_free(target)
-    except OSError:  # a file system without hard links
-        check_free(target)
-        part.replace(target)
 
 
 def _new_file_beside(target: Path) -> Path:

@@ -80,7 +80,7 @@ class LoopsAtPoints:
     def channel_m_s(self) -> tuple[float, str, int]:
         """Return the largest M_s of a single channel, the others closed, its name and its point."""
         rows = [
-            (_m_s_of(loop, name), name, i)
+            (1.0 / loop.channel_margins(name).modulus if loop.stable else math.inf, name, i)
             for i, loop in enumerate(self.loops)
             for name in (*loop.inputs, *loop.outputs)
         ]
@@ -219,10 +219,6 @@ def _stiffness(
         column = B0 @ ((moved[0] - moved[1]) @ v) / (2.0 * _STEP)
         largest = max(largest, float(np.max(np.abs(column) / own)))
     return largest
-
-
-def _m_s_of(loop: MultivariableLoop, name: str) -> float:
-    return 1.0 / loop.channel_margins(name).modulus if loop.stable else math.inf
 
 
 def _listed(x: Vector) -> str:

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
         Identified,
         InputGain,
         Measured,
-        Root,
     )
 
 # ---- quell identify ----
@@ -324,7 +323,10 @@ def _print(console: Console, model: Identified, source: str) -> None:
     roots = table("Poles and zeros", "", *_HEADINGS)
     for name, group in (("pole", model.poles), ("zero", model.zeros)):
         for root in group:
-            roots.add_row(name, *_cells(root))
+            place = (f"{part:.6g}" for part in (root.value.real, root.value.imag))
+            spread = (f"{part:.2g}" for part in (root.real_std, root.imag_std))
+            damping = "–" if root.value == 0.0 else f"{root.damping:.4f}"
+            roots.add_row(name, *place, *spread, f"{root.omega:.6g}", damping)
     console.print(roots)
     fits = table("Fit (NRMSE)", "on", "%")
     for name, value in model.fits.items():
@@ -333,13 +335,6 @@ def _print(console: Console, model: Identified, source: str) -> None:
     console.print(fits)
     rest = lines[next(i for i, line in enumerate(lines) if line.startswith("gain ")) :]
     print_line(console, "\n".join(line for line in rest if not line.startswith("fit, ")))
-
-
-def _cells(root: Root) -> tuple[str, ...]:
-    place = (f"{part:.6g}" for part in (root.value.real, root.value.imag))
-    spread = (f"{part:.2g}" for part in (root.real_std, root.imag_std))
-    damping = "–" if root.value == 0.0 else f"{root.damping:.4f}"
-    return (*place, *spread, f"{root.omega:.6g}", damping)
 
 
 # ---- quell b0 ----

@@ -419,21 +419,18 @@ class ADRC(Compensator):
         if self._packed is None:
             self.prepare()
         if derivatives or self.feedforward:  # an attribute: this is called in every sample
-            self._set_derivatives(derivatives)
+            if len(derivatives) > self.derivatives:
+                usable = f"it uses {self.derivatives} at most"
+                rule = usable if self.derivatives else "make the controller with feedforward=True"
+                given = f"step was given {len(derivatives)} derivatives of the reference"
+                raise ValueError(f"{given}: {rule}")
+            values = np.array(derivatives, dtype=np.float64)
+            set_reference_derivatives(self.parameters, self._state, values)
         try:
             u: float = self._step(self._packed, r, y)
         except TypeError:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
         return u
-
-    def _set_derivatives(self, derivatives: tuple[float, ...]) -> None:
-        if len(derivatives) > self.derivatives:
-            usable = f"it uses {self.derivatives} at most"
-            rule = usable if self.derivatives else "make the controller with feedforward=True"
-            given = f"step was given {len(derivatives)} derivatives of the reference"
-            raise ValueError(f"{given}: {rule}")
-        values = np.array(derivatives, dtype=np.float64)
-        set_reference_derivatives(self.parameters, self._state, values)
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, without a bump; allowed in every sample.

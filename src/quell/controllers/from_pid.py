@@ -161,7 +161,9 @@ class PidEqual(NamedTuple):
         dt = self.observer.dt
         model = sampled_plant(plant, dt)
         omega = _grid(1e-6 / dt, 0.9999 * math.pi / dt, _FREQUENCIES)
-        P = _plant_response(model, omega, dt)
+        one = np.eye(model.C.size)
+        steps = np.expm1(1j * omega * dt)
+        P = np.array([model.C @ np.linalg.solve(z * one - model.N, model.B) for z in steps])
         C, other = self.response(omega), self.pid_response(omega, sampled)
         return float(np.max(np.abs(P * (C - other) / (1.0 + P * C))))
 
@@ -522,13 +524,6 @@ def _not_possible(
         f"{text}, with any filter: its loop around b0/s^{problem.order} is stable and damped by "
         f"{_LEAST_DAMPING:g} for no b0; lower ki, or sample faster"
     )
-
-
-def _plant_response(model: Any, omega: Vector, dt: float) -> Complex:
-    """Return the frequency response of a sampled plant from u to y."""
-    one = np.eye(model.C.size)
-    steps = np.expm1(1j * omega * dt)
-    return np.array([model.C @ np.linalg.solve(z * one - model.N, model.B) for z in steps])
 
 
 def _frequencies(omega: Any) -> Vector:

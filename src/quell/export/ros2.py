@@ -79,7 +79,10 @@ def ros2(
             "controller is StateFeedback: a package is of one u and y, or of axes; write its C "
             "with quell.export.c and call it in a controller of your own"
         )
-    _check_name(name)
+    checked_name(name, "CMake", "ROS 2")
+    if not re.fullmatch(r"[a-z](_?[a-z0-9])+", name):
+        rule = "a package of ROS has lower-case letters, digits and single _; choose another name"
+        raise TranslationError(f"name = {name!r}: {rule}")
     check_folder(folder, checks.flag("overwrite", overwrite))
     if is_in_single(controller):
         raise TranslationError(
@@ -107,14 +110,6 @@ def ros2(
         "LICENSE": (resources.files("quell.export.library") / "templates/LICENSE").read_text(),
     }
     return write_folder(folder, texts | own, overwrite)
-
-
-def _check_name(name: str) -> None:
-    """Raise a ``ValueError`` for a name that no package of ROS has (REP 144)."""
-    checked_name(name, "CMake", "ROS 2")
-    if not re.fullmatch(r"[a-z](_?[a-z0-9])+", name):
-        rule = "a package of ROS has lower-case letters, digits and single _; choose another name"
-        raise TranslationError(f"name = {name!r}: {rule}")
 
 
 def _rate(dt: float) -> int:

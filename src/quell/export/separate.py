@@ -54,7 +54,7 @@ def separated(source: CSource) -> Separated:
     structs: dict[str, list[_Member]] = {}
     unions: dict[str, list[_Member]] = {}
     for body, kind in _STRUCT.findall(source.header):
-        code = _without_comments(body)
+        code = re.sub(r"/\*.*?\*/", "", body, flags=re.S)
         structs[kind] = _members(_UNION.sub(r"    union \2;", code))
         unions |= {f"{kind}.{union}": _members(inside) for inside, union in _UNION.findall(code)}
     state = f"{name}_state"
@@ -104,10 +104,6 @@ def _members(body: str) -> list[_Member]:
         _Member(kind, member, tuple(map(int, re.findall(r"\d+", sizes))), bool(star))
         for kind, star, member, sizes in _MEMBER.findall(body)
     ]
-
-
-def _without_comments(text: str) -> str:
-    return re.sub(r"/\*.*?\*/", "", text, flags=re.S)
 
 
 def _reached(structs: dict[str, list[_Member]], kind: str) -> set[str]:

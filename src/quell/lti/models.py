@@ -512,7 +512,8 @@ def peak_gain(system: System) -> float:
         if contraction > _DIVERGED:
             break
         if contraction < 1.0:
-            total = _sum_of_products(rows, columns)
+            parts = range(0, rows.shape[0], _ROWS)
+            total = float(sum(np.sum(np.abs(rows[i : i + _ROWS] @ columns)) for i in parts))
             # The maximum norm of vectors X, the sum norm of rows R, and the norm of M they induce.
             sizes = float(np.sum(np.abs(rows)) * np.sum(np.max(np.abs(columns), axis=0)))
             rest = contraction / (1.0 - contraction) * sizes
@@ -544,9 +545,3 @@ def h2_squared(system: System) -> float:
             break
         M = M @ M
     return float(system.C @ X @ system.C) + system.D**2
-
-
-def _sum_of_products(rows: Matrix, columns: Matrix) -> float:
-    """Return ``Σ |R_j X_i|`` over all rows and columns."""
-    parts = range(0, rows.shape[0], _ROWS)
-    return float(sum(np.sum(np.abs(rows[i : i + _ROWS] @ columns)) for i in parts))

@@ -137,7 +137,10 @@ class Alarm(NamedTuple):
     def describe(self) -> str:
         """Return the change in a line."""
         change = self.after - self.before
-        before, after = _apart(self.before, self.after)
+        texts = [
+            (f"{self.before:.{digits}g}", f"{self.after:.{digits}g}") for digits in range(4, 10)
+        ]
+        before, after = next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
         hint = _HINTS.get((self.feature.rpartition(": ")[2], 1 if change > 0.0 else -1))
         return (
             f"ALARM: {self.feature} {'rose' if change > 0.0 else 'fell'} from "
@@ -145,12 +148,6 @@ class Alarm(NamedTuple):
             f"({self.since_at}), seen at window {self.window} ({self.at})"
             f"{f': {hint}' if hint else ''}"
         )
-
-
-def _apart(one: float, other: float) -> tuple[str, str]:
-    """Return two values as text, with four digits or as many as they need to differ."""
-    texts = [(f"{one:.{digits}g}", f"{other:.{digits}g}") for digits in range(4, 10)]
-    return next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
 
 
 def _step(value: float) -> int:

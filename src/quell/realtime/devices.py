@@ -406,7 +406,14 @@ class TwinDevice:
         self._x0 = x.copy()
         self.signals = signals_of(plant)
         begin_run(model, x, scratch)
-        given, t = _checked_rows(channels), np.array([0.0, dt])
+        try:
+            rows = np.atleast_2d(np.array(channels, dtype=np.float64))
+        except (TypeError, ValueError):
+            rows = np.zeros(0)
+        if rows.ndim != 2 or rows.shape[0] == 0:
+            rule = "must be numbers, or a row of numbers for each sample"
+            raise ValueError(f"channels = {channels!r:.60}: {rule}")
+        given, t = np.ascontiguousarray(rows), np.array([0.0, dt])
         self.signal_counts, self._channels = counts_of(plant), given
         y, u = np.full(outputs_of(plant), np.nan), np.zeros(inputs_of(plant))
         self._handle = TwinHandle(model, x, scratch, w, t, given, y, u)
@@ -457,18 +464,6 @@ class TwinDevice:
         if is_destroyed(handle.x, self._x0):
             handle.x[:], handle.t[0] = self._x0, 0.0
             begin_run(handle.plant, handle.x, handle.scratch)
-
-
-def _checked_rows(channels: ArrayLike) -> Matrix:
-    """Return channels as rows of samples (N, c); NaN is a value that does not come."""
-    try:
-        rows = np.atleast_2d(np.array(channels, dtype=np.float64))
-    except (TypeError, ValueError):
-        rows = np.zeros(0)
-    if rows.ndim != 2 or rows.shape[0] == 0:
-        rule = "must be numbers, or a row of numbers for each sample"
-        raise ValueError(f"channels = {channels!r:.60}: {rule}")
-    return np.ascontiguousarray(rows)
 
 
 def twin_device(url: str, dt: float, trust: bool = False) -> TwinDevice:

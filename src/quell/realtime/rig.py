@@ -545,6 +545,8 @@ class Rig:
         room = 1 if outputs == inputs == 1 else wire.MOST_SIGNALS
         self.listener = listener
         self.dt, self.signal_counts = dt, several
+        if checks.non_negative("wait", wait, "s") > _LONGEST:
+            raise ValueError(f"wait = {wait!r} s: must be at most {_LONGEST:g} s")
         self.model = RigModel(
             plant=model,
             transport=listener.transport,
@@ -555,7 +557,7 @@ class Rig:
             u_max=largest,
             watchdog=watchdog,
             patience=max(round(_PATIENCE / dt), 1),
-            wait=round(1e9 * _checked_wait(wait)),
+            wait=round(1e9 * wait),
             rest=checks.flag("rest", rest),
             x=start.copy(),
             x0=start,
@@ -769,12 +771,6 @@ def _checked_limits(u_max: ArrayLike, inputs: int) -> Vector:
     if limits.size not in (1, inputs):
         raise ValueError(f"u_max = {given!r:.60}: must be one number, or {inputs}, one for each u")
     return np.full(inputs, limits[0]) if limits.size == 1 else limits
-
-
-def _checked_wait(wait: float) -> float:
-    if checks.non_negative("wait", wait, "s") > _LONGEST:
-        raise ValueError(f"wait = {wait!r} s: must be at most {_LONGEST:g} s")
-    return wait
 
 
 def checked_seconds(name: str, seconds: float) -> float:

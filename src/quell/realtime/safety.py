@@ -147,7 +147,11 @@ def reference_samples(scenario: Scenario, controller: Any, approach: float) -> R
 
 def reference_columns(scenario: Scenario, controller: Any) -> tuple[Matrix, Matrix]:
     """Return a controller's references (samples, n), and their derivatives (samples, d)."""
-    t = _sample_times(scenario, controller.dt)
+    dt = controller.dt
+    if scenario.duration / dt > _MOST_SAMPLES:
+        times = f"duration = {scenario.duration!r} s with dt = {dt!r} s"
+        raise ValueError(f"{times}: must be at most {_MOST_SAMPLES:.0e} samples")
+    t = np.asarray(np.arange(math.floor(in_steps(scenario.duration, dt)) + 1) * dt)
     counts = references_of(controller), len(scenario.disturbances), outputs_of(controller)
     signals, _, _ = scenario.seeded(*counts)
     derivatives = derivatives_in(signals, controller)
@@ -160,13 +164,6 @@ def reference_columns(scenario: Scenario, controller: Any) -> tuple[Matrix, Matr
         _check_finite(f"reference of {names[i]}" if names else "reference", columns[0][:, [i]], t)
     _check_finite("reference", columns[1], t)
     return columns[0], columns[1]
-
-
-def _sample_times(scenario: Scenario, dt: float) -> Vector:
-    if scenario.duration / dt > _MOST_SAMPLES:
-        times = f"duration = {scenario.duration!r} s with dt = {dt!r} s"
-        raise ValueError(f"{times}: must be at most {_MOST_SAMPLES:.0e} samples")
-    return np.asarray(np.arange(math.floor(in_steps(scenario.duration, dt)) + 1) * dt)
 
 
 def _check_finite(name: str, columns: Matrix, t: Vector) -> None:
@@ -400,6 +397,8 @@ class Safety:
             for i, name in enumerate(("y_min", "y_max"))
         )
         watched = [self.check_direction and adrc is not None for adrc in adrcs]
+        counts = {count.samples: self._samples(count, controller.dt) for count in _COUNTS}
+        more = max(round(_START_MORE / controller.dt), _START_SAMPLES)
         return Rules(
             axes.names if axes else (),
             RunLimits(
@@ -415,15 +414,9 @@ class Safety:
                 v_low=v_low,
                 v_high=v_high,
                 most_opposed=opposed,
-                **self._counts(controller.dt),
+                **counts | {"longest_start": _START_FACTOR * counts["settle"] + more},
             ),
         )
-
-    def _counts(self, dt: float) -> dict[str, int]:
-        """Return the rules that are numbers of samples."""
-        counts = {count.samples: self._samples(count, dt) for count in _COUNTS}
-        more = max(round(_START_MORE / dt), _START_SAMPLES)
-        return counts | {"longest_start": _START_FACTOR * counts["settle"] + more}
 
     def _each(self, name: str, count: int, axes: Axes | None) -> Vector:
         """Return a limit of each signal, of several ``axes`` or of one."""

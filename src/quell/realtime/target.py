@@ -97,7 +97,10 @@ def record_target(
         newest = int(np.max(values[values[:, _CHANNEL] < 0.0, _TICK], initial=newest))
         if newest > answered:
             device.write(float(r[min(newest + 1 - first, rows) if first else 0]))
-    return _trajectory(device, recorded, log)
+    record = Trajectory(log, recorded, device.dt, ended=(len(log) - 1) * device.dt)
+    flags = record["status"] if "status" in record.names else np.zeros(0)
+    status = Status(int(np.bitwise_or.reduce(flags_of(flags))))
+    return dataclasses.replace(record, status=status, plant=device.url)
 
 
 def _check_channels(channels: Channels) -> None:
@@ -172,10 +175,3 @@ def _store(log: Matrix, values: Matrix, first: int) -> None:
         )
     within = (row >= 0) & (row < log.shape[0])
     log[row[within], column[within]] = values[within, _NUMBER]
-
-
-def _trajectory(device: WireDevice, channels: Channels, log: Matrix) -> Trajectory:
-    record = Trajectory(log, channels, device.dt, ended=(len(log) - 1) * device.dt)
-    flags = record["status"] if "status" in record.names else np.zeros(0)
-    status = Status(int(np.bitwise_or.reduce(flags_of(flags))))
-    return dataclasses.replace(record, status=status, plant=device.url)

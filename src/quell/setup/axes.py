@@ -174,7 +174,7 @@ def axes_task(
     loading.check_windows(setup)
     plant = setup.needed("plant")
     options = dict(setup.tune or {})
-    if options.get("operating_points") is None and _is_nonlinear(plant):
+    if options.get("operating_points") is None and isinstance(_inner(plant), NonlinearPlant):
         x0 = None if setup.scenario is None else setup.scenario.x0
         order = getattr(_inner(plant), "order", 0)
         options["operating_points"] = [np.zeros(order) if x0 is None else np.asarray(x0)[:order]]
@@ -185,10 +185,6 @@ def _inner(plant: Any) -> Any:
     while isinstance(plant, PlantWrapper):
         plant = plant.plant
     return plant
-
-
-def _is_nonlinear(plant: Any) -> bool:
-    return isinstance(_inner(plant), NonlinearPlant)
 
 
 # ---- The tables ----

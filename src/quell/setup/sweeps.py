@@ -191,7 +191,8 @@ class Variation:
         if is_of_axes(data):
             return assembled_axes(self.name, data, self.trust)
         tables = self._described(data, {str(steps_of(self.name, path)[0]) for path in changes})
-        return assembled(self.name, tables, self._known, self.trust)
+        known: dict[str, Any] = self._local.__dict__.setdefault("known", {})
+        return assembled(self.name, tables, known, self.trust)
 
     def _described(self, data: dict[str, Any], keys: set[str]) -> Description:
         """Return the tables of ``data``, of which only some keys were changed."""
@@ -208,12 +209,6 @@ class Variation:
     @cached_property
     def _local(self) -> threading.local:
         return threading.local()
-
-    @property
-    def _known(self) -> dict[str, Any]:
-        """Parts of the last call, of this thread."""
-        known: dict[str, Any] = self._local.__dict__.setdefault("known", {})
-        return known
 
 
 # Readers of the tables of a file by their key; other keys are read with all tables.

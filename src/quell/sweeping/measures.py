@@ -152,7 +152,8 @@ def measure_run(run: Trajectory, measures: Measures) -> dict[str, float]:
             windows.setdefault((each.axis, *each.window), {})[name] = each.name
     values: dict[str, float] = {}
     for (axis, start, stop, target, band), wanted in windows.items():
-        one = _one_axis(run, axis, wanted)
+        check_axis(axis, next(iter(wanted.values())), run.axis_names if run.several else None)
+        one = run.axis(axis) if run.several else run
         if one.diverged and one.window(start, np.inf).start >= len(one):  # ended before it
             values |= dict.fromkeys(wanted, np.nan)
             continue
@@ -160,12 +161,6 @@ def measure_run(run: Trajectory, measures: Measures) -> dict[str, float]:
         values |= {name: found.get(measure, np.nan) for name, measure in wanted.items()}
     own = {name: each for name, each in measures.items() if not isinstance(each, Measure)}
     return values | {name: float(function(run)) for name, function in own.items()}
-
-
-def _one_axis(run: Trajectory, axis: str, wanted: Mapping[str, str]) -> Trajectory:
-    """Return the record that measures of an axis are taken of."""
-    check_axis(axis, next(iter(wanted.values())), run.axis_names if run.several else None)
-    return run.axis(axis) if run.several else run
 
 
 def check_axis(axis: str, name: str, axes: Sequence[str] | None) -> None:

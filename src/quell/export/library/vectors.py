@@ -326,7 +326,10 @@ class Player:
                 samples = self.settling
                 kernels.start(old, state, samples[0] if self.one else samples, y_, given_, r_)
             if action is Action.LEARN:
-                self._block(u)
+                assert self.loops is not None
+                for _ in range(BLOCK):
+                    self._step(*self.loops.measure(), u)
+                    self.loops.advance(u)
             elif action is Action.TRACK:
                 self._set_derivatives(r)
                 returned = kernels.track(self.design, state, r_, y_, given_)
@@ -356,13 +359,6 @@ class Player:
             u[0] = self.parts.kernels.step(*given)
         else:
             self.parts.kernels.step(*given, u)
-
-    def _block(self, u: Vector) -> None:
-        """Play a block of samples in the loop."""
-        assert self.loops is not None
-        for _ in range(BLOCK):
-            self._step(*self.loops.measure(), u)
-            self.loops.advance(u)
 
     def _set_derivatives(self, r: Vector) -> None:
         """Set each derivative of the references, and each signal, to half the reference."""

@@ -125,7 +125,10 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
         raise TranslationError(
             "controller is StateFeedback: a function block is of one u and one y; use --to c"
         )
-    _check_name(name)
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name):
+        rule = "must be a letter, and then letters, digits and single _, for Structured Text"
+        raise TranslationError(f"name = {name!r}: {rule}")
+    checked_name(name, "Structured Text")
     learner = getattr(without_prefilters(given), "learner", None)
     if not isinstance(learner, NoLearner | None):
         raise TranslationError(
@@ -150,14 +153,6 @@ def _written(controller: Any, name: str, precision: str) -> tuple[str, dict[str,
             f"controller = {kind}: {error}; take a controller without the part that needs it, or "
             "--to c"
         ) from None
-
-
-def _check_name(name: str) -> None:
-    """Raise a ``ValueError`` for a name that no function block has."""
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name):
-        rule = "must be a letter, and then letters, digits and single _, for Structured Text"
-        raise TranslationError(f"name = {name!r}: {rule}")
-    checked_name(name, "Structured Text")
 
 
 def _check_limits(controller: Any) -> None:
@@ -191,7 +186,9 @@ class _Block:
         self.parameters = Record(f"{name}_parameters", "", "parameter", declared)  # type: ignore[arg-type]
         self.state = Record(f"{name}_state", "", "state")
         self.state.members["parameters"] = self.parameters
-        self.status = Node(_flags(), lambda: "status", 9, True)
+        kind = Whole()
+        kind.use("DWORD")
+        self.status = Node(kind, lambda: "status", 9, True)
         self._write()
 
     # ---- The body ----
@@ -346,9 +343,3 @@ def _text(place: Place) -> str:
     if not isinstance(place, Node):
         raise AssertionError
     return place.text()
-
-
-def _flags() -> Whole:
-    kind = Whole()
-    kind.use("DWORD")
-    return kind
