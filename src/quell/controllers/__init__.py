@@ -42,41 +42,13 @@ from quell.controllers.state_space import StateFeedback
 from quell.lazy import imported_on_use, public_names
 
 __all__ = [
-    "ADRC",
-    "Axes",
-    "Compensated",
-    "Compensator",
-    "Controller",
-    "DeadTimeTuning",
-    "Estimate",
-    "Feedforward",
-    "GainEstimate",
-    "HeldPlant",
-    "LinearController",
-    "LinearLaw",
-    "NonlinearFeedback",
-    "OnlineGain",
-    "PidEqual",
-    "Prefilter",
-    "Prefiltered",
-    "ProfileGenerator",
-    "ReferenceModel",
-    "Regulator",
-    "SafeSet",
-    "Schedule",
-    "StateFeedback",
-    "TrackingDifferentiator",
-    "adrc_for_dead_time",
-    "baselines",
-    "dead_time_tuning",
-    "equal_to_pid",
-    "in_single_precision",
-    "omega_c_for",
-    "quadratic_feedback",
-    "regulator",
-    "state_feedback",
-    "warn_if_unwise",
-]
+    "ADRC", "Axes", "Compensated", "Compensator", "Controller", "DeadTimeTuning", "Estimate",
+    "Feedforward", "GainEstimate", "HeldPlant", "LinearController", "LinearLaw",
+    "NonlinearFeedback", "OnlineGain", "PidEqual", "Prefilter", "Prefiltered", "ProfileGenerator",
+    "ReferenceModel", "Regulator", "SafeSet", "Schedule", "StateFeedback", "TrackingDifferentiator",
+    "adrc_for_dead_time", "baselines", "dead_time_tuning", "equal_to_pid", "in_single_precision",
+    "omega_c_for", "quadratic_feedback", "regulator", "state_feedback", "warn_if_unwise"
+]  # fmt: skip
 
 __getattr__ = imported_on_use(__name__, {})
 

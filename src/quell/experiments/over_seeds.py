@@ -677,16 +677,3 @@ def save(
 ) -> list[Path]:
     """Write the figure into ``folder``, created if missing; return the paths."""
     return save_figures({name: partial(draw, result)}, folder, overwrite=overwrite)
-
-
-__all__ = [
-    "ALL_AXES",
-    "CRITERIA",
-    "Pair",
-    "SeedComparison",
-    "Verdict",
-    "draw",
-    "of_setups",
-    "over_seeds",
-    "save",
-]

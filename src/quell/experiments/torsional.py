@@ -427,23 +427,3 @@ def _line(ax: Any, run: Trajectory, values: Vector, span: tuple[float, ...], **s
     if part.stop > part.start:
         draw_line(ax, run.t[part] - PROFILE_AT, values[part], **style)
     ax.set_xlim(*span)
-
-
-__all__ = [
-    "CASES",
-    "NAMES",
-    "PLANTS",
-    "STARTS",
-    "Case",
-    "Outcome",
-    "Result",
-    "Settings",
-    "controllers",
-    "draw",
-    "model_off",
-    "plant",
-    "run",
-    "save",
-    "scenarios",
-    "score",
-]

@@ -678,23 +678,3 @@ _DRAWINGS: Mapping[str, Callable[[Result, Any], Any]] = {
     "learning": _learning,
     "algorithm-1": _algorithm_1,
 }
-
-
-__all__ = [
-    "Range",
-    "Result",
-    "Settings",
-    "Trial",
-    "controller",
-    "controllers",
-    "draw",
-    "further_controllers",
-    "gradient_rate",
-    "ranges",
-    "run",
-    "save",
-    "scenario",
-    "score",
-    "stable_up_to",
-    "trials",
-]

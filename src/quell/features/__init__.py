@@ -10,19 +10,9 @@ from quell.features.basis import RBF, Friction, Periodic, RandomFourier
 from quell.lazy import imported_on_use, public_names
 
 __all__ = [
-    "RBF",
-    "AllAxes",
-    "Bias",
-    "Custom",
-    "Features",
-    "Friction",
-    "Input",
-    "Joined",
-    "Periodic",
-    "Polynomial",
-    "RandomFourier",
-    "State",
-]
+    "RBF", "AllAxes", "Bias", "Custom", "Features", "Friction", "Input", "Joined", "Periodic",
+    "Polynomial", "RandomFourier", "State"
+]  # fmt: skip
 
 __getattr__ = imported_on_use(__name__, {})
 

@@ -85,30 +85,9 @@ except ImportError as error:
 check_version(numba.__version__)
 
 __all__ = [
-    "REMEDY",
-    "AnalysisPass",
-    "CompileResultCacheImpl",
-    "CompilerBase",
-    "ConfigStack",
-    "DataModel",
-    "DefaultPassBuilder",
-    "FunctionCache",
-    "FunctionPass",
-    "IRProcessing",
-    "JITCodeLibrary",
-    "NativeLowering",
-    "NumbaError",
-    "build_definitions",
-    "check_version",
-    "event",
-    "get_item_pointer",
-    "ir",
-    "is_tested",
-    "llvm",
-    "make_function",
-    "memset",
-    "normalize_ir_text",
-    "numba_ir",
-    "pointer_add",
-    "register_pass",
-]
+    "REMEDY", "AnalysisPass", "CompileResultCacheImpl", "CompilerBase", "ConfigStack", "DataModel",
+    "DefaultPassBuilder", "FunctionCache", "FunctionPass", "IRProcessing", "JITCodeLibrary",
+    "NativeLowering", "NumbaError", "build_definitions", "check_version", "event",
+    "get_item_pointer", "ir", "is_tested", "llvm", "make_function", "memset", "normalize_ir_text",
+    "numba_ir", "pointer_add", "register_pass"
+]  # fmt: skip

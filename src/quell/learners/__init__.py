@@ -16,26 +16,10 @@ from quell.learners.repetitive import Repetitive
 from quell.learners.rls import RLS
 
 __all__ = [
-    "MLP",
-    "NLMS",
-    "RLS",
-    "BatchGradient",
-    "GaussianProcess",
-    "Harmonic",
-    "JaxModel",
-    "Kalman",
-    "Learner",
-    "Model",
-    "NoLearner",
-    "Online",
-    "PythonModel",
-    "Repetitive",
-    "RiverModel",
-    "SklearnModel",
-    "TorchModel",
-    "infer",
-    "learn",
-]
+    "MLP", "NLMS", "RLS", "BatchGradient", "GaussianProcess", "Harmonic", "JaxModel", "Kalman",
+    "Learner", "Model", "NoLearner", "Online", "PythonModel", "Repetitive", "RiverModel",
+    "SklearnModel", "TorchModel", "infer", "learn"
+]  # fmt: skip
 
 __getattr__ = imported_on_use(__name__, {})
 

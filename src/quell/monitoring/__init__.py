@@ -9,17 +9,8 @@ from quell.monitoring.watch import Alarm, Machine, Watch, WatchSink
 from quell.monitoring.windows import Signals, features_of, windows_of
 
 __all__ = [
-    "Alarm",
-    "Comparison",
-    "Machine",
-    "Ranking",
-    "Scores",
-    "Signals",
-    "Watch",
-    "WatchSink",
-    "features_of",
-    "rank",
-    "windows_of",
-]
+    "Alarm", "Comparison", "Machine", "Ranking", "Scores", "Signals", "Watch", "WatchSink",
+    "features_of", "rank", "windows_of"
+]  # fmt: skip
 
 __dir__ = public_names(__name__)

@@ -34,19 +34,9 @@ _HOMES = {
 }
 
 __all__ = [
-    "EXAMPLES",
-    "AxesDescription",
-    "Description",
-    "Setup",
-    "SetupError",
-    "controllers_of",
-    "load",
-    "made",
-    "plant_given",
-    "plant_of",
-    "read",
-    "varied",
-]
+    "EXAMPLES", "AxesDescription", "Description", "Setup", "SetupError", "controllers_of", "load",
+    "made", "plant_given", "plant_of", "read", "varied"
+]  # fmt: skip
 
 # Names of the last release.
 _RENAMED = {"load_axes": "load", "made_axes": "made"}

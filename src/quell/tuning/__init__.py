@@ -19,21 +19,9 @@ from quell.tuning.tune import tune
 from quell.tuning.tuned import Check, Tuned
 
 __all__ = [
-    "STRUCTURES",
-    "AtPoints",
-    "Check",
-    "Constraints",
-    "Design",
-    "Interaction",
-    "LoadSpectrum",
-    "OnTop",
-    "Reached",
-    "Tuned",
-    "identified_plants",
-    "tune",
-    "tune_compensator",
-    "tune_schedule",
-]
+    "STRUCTURES", "AtPoints", "Check", "Constraints", "Design", "Interaction", "LoadSpectrum",
+    "OnTop", "Reached", "Tuned", "identified_plants", "tune", "tune_compensator", "tune_schedule"
+]  # fmt: skip
 
 # Names of an earlier release.
 _RENAMED = {

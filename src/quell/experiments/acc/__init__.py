@@ -33,28 +33,8 @@ from quell.experiments.acc.study import (
 from quell.sweeping.sweep import share_interval as interval
 
 __all__ = [
-    "DT",
-    "PUBLISHED",
-    "SPRINGS",
-    "CaseResult",
-    "Judged",
-    "Result",
-    "TransferFunction",
-    "against_spread",
-    "boxed",
-    "designs",
-    "draw",
-    "generated",
-    "interval",
-    "judge",
-    "judge_published",
-    "judge_sampled",
-    "plant",
-    "read",
-    "records",
-    "run",
-    "save",
-    "study_cases",
-    "unstable",
-    "widened",
-]
+    "DT", "PUBLISHED", "SPRINGS", "CaseResult", "Judged", "Result", "TransferFunction",
+    "against_spread", "boxed", "designs", "draw", "generated", "interval", "judge",
+    "judge_published", "judge_sampled", "plant", "read", "records", "run", "save", "study_cases",
+    "unstable", "widened"
+]  # fmt: skip

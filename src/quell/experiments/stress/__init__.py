@@ -21,22 +21,7 @@ from quell.experiments.stress.study import (
 )
 
 __all__ = [
-    "DRAWS",
-    "HONEST",
-    "KINDS",
-    "Adversary",
-    "Bar",
-    "Errors",
-    "Loop",
-    "Outcome",
-    "Result",
-    "Turncoat",
-    "draw",
-    "draw_adversary",
-    "draw_loops",
-    "errors",
-    "run",
-    "run_one",
-    "save",
-    "summary",
-]
+    "DRAWS", "HONEST", "KINDS", "Adversary", "Bar", "Errors", "Loop", "Outcome", "Result",
+    "Turncoat", "draw", "draw_adversary", "draw_loops", "errors", "run", "run_one", "save",
+    "summary"
+]  # fmt: skip

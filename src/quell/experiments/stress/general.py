@@ -763,31 +763,8 @@ def judge(
 
 
 __all__ = [
-    "FAMILIES",
-    "INPUTS",
-    "KINDS",
-    "Case",
-    "Found",
-    "GeneralLoop",
-    "GeneralOutcome",
-    "GeneralPlant",
-    "GeneralResult",
-    "Measures",
-    "Program",
-    "Watched",
-    "adversary_at",
-    "centre",
-    "draw_attack",
-    "draw_loop",
-    "error_of",
-    "errors",
-    "exact_weights",
-    "harm",
-    "judge",
-    "measure_error",
-    "run",
-    "run_named",
-    "run_one",
-    "search",
-    "spread",
-]
+    "FAMILIES", "INPUTS", "KINDS", "Case", "Found", "GeneralLoop", "GeneralOutcome", "GeneralPlant",
+    "GeneralResult", "Measures", "Program", "Watched", "adversary_at", "centre", "draw_attack",
+    "draw_loop", "error_of", "errors", "exact_weights", "harm", "judge", "measure_error", "run",
+    "run_named", "run_one", "search", "spread"
+]  # fmt: skip

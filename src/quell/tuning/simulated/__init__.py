@@ -20,18 +20,6 @@ from quell.tuning.simulated.problem import (
 from quell.tuning.simulated.search import Candidate, Search, search
 
 __all__ = [
-    "Candidate",
-    "Checked",
-    "FailureRate",
-    "Mean",
-    "Objective",
-    "Problem",
-    "Quantile",
-    "Sample",
-    "Search",
-    "SearchRange",
-    "Space",
-    "Statistic",
-    "Worst",
-    "search",
-]
+    "Candidate", "Checked", "FailureRate", "Mean", "Objective", "Problem", "Quantile", "Sample",
+    "Search", "SearchRange", "Space", "Statistic", "Worst", "search"
+]  # fmt: skip
